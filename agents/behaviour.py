@@ -11,20 +11,20 @@ import random
 from typing import Protocol
 
 from agents.context import Context
-from agents.means import STAND as STAND
-from agents.means import Means
+from agents.motion import STAND as STAND
+from agents.motion import MotionCapabilities
 from drivers.reading import Action, Observation
-from middleware.consensus.deployed import BEHAVIOUR, Deployed, is_deployed, maker_of
+from middleware.consensus.deployed_modules import BEHAVIOUR, DeployedModules, find_factory, is_deployed
 from middleware.errors import MissingExtra, UnknownTask
 from middleware.tasks.task import Task
 
 KINDS = {
     "find-target": "agents.search:SearchAndApproach",
-    "turn-around": "agents.turn:TurnAround",
-    "watch-target": "agents.watch:WatchTarget",
+    "turn-around": "agents.turn_around:TurnAround",
+    "watch-target": "agents.watch_target:WatchTarget",
 }
-ENTRY_POINTS = "swarm_node.behaviours"
-VISION = ("cv2", "numpy")
+ENTRY_POINT_GROUP = "swarm_node.behaviours"
+VISION_MODULES = ("cv2", "numpy")
 
 
 class Behaviour(Protocol):
@@ -37,7 +37,7 @@ class Behaviour(Protocol):
     - ``progress``: the share of the task that is done, 0 to 1
     - ``valid_for``: seconds for which the cost is valid; default: while the node is present
     - ``angle`` and ``take_post``: see ``agents.formation``
-    - ``embody``: a method that gets the robot's motion capabilities before the first ``look``, see ``agents.means``
+    - ``embody``: a method that gets the robot's motion capabilities before the first ``look``, see ``agents.motion``
     - ``close``: a method that is called after the agent has left the task
 
     Some strategies also read ``value`` (a tuple: a number, or a place in metres), ``choice`` (the option that it votes
@@ -61,8 +61,8 @@ class Behaviour(Protocol):
         """Return the next action of the task; None if the task is done."""
 
 
-def behaviour_for(
-    task: Task, rng: random.Random, deployed: Deployed | None = None, means: Means | None = None
+def create_behaviour(
+    task: Task, rng: random.Random, deployed: DeployedModules | None = None, means: MotionCapabilities | None = None
 ) -> Behaviour:
     """Create the behaviour for ``task.kind``: a built-in one, or an entry point of ``swarm_node.behaviours``.
 
@@ -85,7 +85,7 @@ def _create_installed(task: Task, rng: random.Random) -> Behaviour:
     if target is None:
         from importlib.metadata import entry_points  # slow to import, and rarely needed
 
-        found = {point.name: point.value for point in entry_points(group=ENTRY_POINTS)}
+        found = {point.name: point.value for point in entry_points(group=ENTRY_POINT_GROUP)}
         target = found.get(task.kind)
         if target is None:
             known = ", ".join(sorted(KINDS | found))
@@ -94,7 +94,7 @@ def _create_installed(task: Task, rng: random.Random) -> Behaviour:
     try:
         factory = getattr(importlib.import_module(module), attribute)
     except (ImportError, AttributeError) as error:
-        if (getattr(error, "name", None) or "").split(".")[0] in VISION:
+        if (getattr(error, "name", None) or "").split(".")[0] in VISION_MODULES:
             raise MissingExtra(f"the behaviour for {task.kind!r}", "vision") from error
         raise UnknownTask(f"the behaviour for {task.kind!r} cannot be loaded: {error}") from error
     try:
@@ -104,7 +104,7 @@ def _create_installed(task: Task, rng: random.Random) -> Behaviour:
     return behaviour
 
 
-def _create_deployed(task: Task, rng: random.Random, deployed: Deployed) -> Behaviour:
-    from agents.guarded import Guarded  # rarely needed
+def _create_deployed(task: Task, rng: random.Random, deployed: DeployedModules) -> Behaviour:
+    from agents.behaviour_proxy import BehaviourProxy  # rarely needed
 
-    return Guarded(maker_of(BEHAVIOUR, task.kind, deployed)(task.parameters, rng), STAND)
+    return BehaviourProxy(find_factory(BEHAVIOUR, task.kind, deployed)(task.parameters, rng), STAND)

@@ -7,19 +7,19 @@ from dataclasses import replace
 from middleware.errors import UnknownTask
 from middleware.tasks.task import Task
 
-DEMO = "find-red-target"
-STOP = 0.1
+DEMO_TASK = "find-red-target"
+STOP_TIME_S = 0.1
 """Seconds that a dog needs to stop from walking or from a turn at 1.2 rad/s."""
 
 TASKS = {
-    DEMO: Task(
+    DEMO_TASK: Task(
         task_id="",
         kind="find-target",
         title="Find the red target",
         requirements={"base2d": {}, "camera": {"width": 104}, "odometry": {}},
         parameters={"target_radius": 0.08, "target_height": 0.22},
         waiting_period=15.0,
-        stop_time=STOP,
+        stop_time=STOP_TIME_S,
     ),
     "turn-around": Task(
         task_id="",
@@ -27,7 +27,7 @@ TASKS = {
         title="Turn around once",
         requirements={"base2d": {}, "odometry": {}, "power": {}},
         waiting_period=1.0,
-        stop_time=STOP,
+        stop_time=STOP_TIME_S,
     ),
     # Any device with a camera can do it: a dog turns itself, a phone is turned by its user.
     "watch-target": Task(
@@ -38,7 +38,7 @@ TASKS = {
         parameters={"seconds": 20.0, "target_radius": 0.08, "target_height": 0.22},
         waiting_period=8.0,
         stall_limit=12.0,
-        stop_time=STOP,
+        stop_time=STOP_TIME_S,
     ),
     "fetch-the-ball": Task(
         task_id="",
@@ -49,7 +49,7 @@ TASKS = {
 }
 
 
-def task_named(name: str, task_id: str, created: float) -> Task:
+def create_task(name: str, task_id: str, created: float) -> Task:
     """Return the predefined task ``name`` as a new task; raises ``UnknownTask``, whose text lists the known names."""
     template = TASKS.get(name)
     if template is None:

@@ -9,13 +9,13 @@ from __future__ import annotations
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
-from middleware.consensus.bidding.panel import PATIENCE
-from middleware.consensus.strategy import Consensus, ConsensusAlgorithm, Report, agreement
-from middleware.consensus.view import view_of
+from middleware.consensus.bidding.reporters import ANNOUNCEMENT_TIMEOUT_S
+from middleware.consensus.report_view import make_view
+from middleware.consensus.strategy import Consensus, ConsensusAlgorithm, Report, format_agreement
 from middleware.directory.presence import EXECUTING
 from middleware.tasks.task import Member
 
-REASON = 100
+MAX_REASON_CHARS = 100
 """Maximum characters of a strategy's reason for assigning no agent: each report carries it."""
 
 
@@ -35,7 +35,7 @@ class Decision:
     assigned: str | None
     digest: str
     why: str
-    order: tuple[str, ...] = ()
+    ranking: tuple[str, ...] = ()
     basis: tuple[object, ...] = ()
     fault: str = ""
     consensus: Consensus | None = None
@@ -61,9 +61,9 @@ def decide(
     the best agent of all; until then, for a limited time, no agent is assigned.
     """
     present = {m.uuid: m for m in members}
-    view = view_of(strategy)
-    reports = {m.uuid: report for m in present.values() if (report := view.report(m)) is not None}
-    acting = sorted((m for m in present.values() if m.status == EXECUTING and m.uuid in reports), key=_acting_order)
+    view = make_view(strategy)
+    reports = {m.uuid: report for m in present.values() if (report := view.make_report(m)) is not None}
+    acting = sorted((m for m in present.values() if m.status == EXECUTING and m.uuid in reports), key=_acting_sort_key)
     basis: tuple[object, ...] = (
         tuple(sorted(present)),
         tuple(sorted(reports.values(), key=lambda report: report.agent)),
@@ -74,7 +74,7 @@ def decide(
         return Decision(None, "", "no agent has reported yet", basis=basis)
     missing = sorted(m.name for m in present.values() if m.uuid not in reports and m.available)
     if has_word is not None:
-        if not (has_word or acting) and since_first < waiting_period + PATIENCE:
+        if not (has_word or acting) and since_first < waiting_period + ANNOUNCEMENT_TIMEOUT_S:
             return Decision(None, "", "waiting for the quorum members", basis=basis)
     elif missing and since_first < waiting_period and not acting:
         return Decision(None, "", f"waiting for {', '.join(missing)}", basis=basis)
@@ -82,11 +82,11 @@ def decide(
     consensus, best = _choose(list(reports.values()), holder, strategy, hysteresis)
     fault = consensus.reason if consensus.strategy not in ("", strategy.name) else ""
     if best is None:
-        why_not = consensus.reason[:REASON] or "no report counts"
+        why_not = consensus.reason[:MAX_REASON_CHARS] or "no report counts"
         return Decision(None, consensus.digest, why_not, basis=basis, fault=fault, consensus=consensus)
     name, cost = present[best].name, reports[best].cost
-    agreed = agreement(consensus.value, consensus.choice)
-    among = consensus.reason[:REASON] if consensus.task and not fault else f"best of {len(reports)}"
+    agreed = format_agreement(consensus.value, consensus.choice)
+    among = consensus.reason[:MAX_REASON_CHARS] if consensus.task and not fault else f"best of {len(reports)}"
     why = f"{name}, {cost:.2f}, {among}" + (f"; agreed on {agreed}" if agreed else "")
     rest = (agent for agent in (consensus.assigned_agent, *consensus.standby) if agent is not None)
     order = tuple(dict.fromkeys((best, *rest)))
@@ -104,7 +104,7 @@ def _choose(
     return consensus, None if best is None else best.agent
 
 
-def _acting_order(member: Member) -> tuple[int, float, str]:
+def _acting_sort_key(member: Member) -> tuple[int, float, str]:
     """Of several agents that report to act, the one with the newest fencing token does.
 
     The others do not know it yet.

@@ -14,7 +14,7 @@ from twisted.internet.interfaces import IReactorThreads
 from twisted.internet.threads import deferToThreadPool
 from twisted.logger import Logger
 
-Run = Callable[[Callable[[], Any]], Deferred[Any]]
+Executor = Callable[[Callable[[], Any]], Deferred[Any]]
 """Calls a function, now or in a thread, and fires with its result in the reactor's thread."""
 
 
@@ -23,7 +23,7 @@ def run_now(function: Callable[[], Any]) -> Deferred[Any]:
     return maybeDeferred(function)
 
 
-def run_in_thread(clock: object) -> Run:
+def run_in_thread(clock: object) -> Executor:
     """Return a ``Run`` with the thread pool of ``clock``, or ``run_now`` if the clock has no threads."""
     if not IReactorThreads.providedBy(clock):
         return run_now
@@ -36,7 +36,7 @@ class Detector:
 
     _log = Logger()
 
-    def __init__(self, run: Run = run_now) -> None:
+    def __init__(self, run: Executor = run_now) -> None:
         self.run = run
         self.dropped = 0
         """Number of pictures that were replaced by a newer one."""

@@ -15,59 +15,59 @@ from typing import Any, Protocol
 from twisted.internet.defer import Deferred
 
 from agents.behaviour import Behaviour
-from agents.claim import STANDBYS, Claim
-from agents.conference import Conference
+from agents.decider import Decider
 from agents.decision import Decision
-from agents.division import Division
 from agents.execution import Execution
 from agents.formation import Formation
-from agents.means import STAND
-from agents.report import Reporter
-from agents.state import Course, Effect, Event, State
+from agents.motion import STAND
+from agents.report import ReportBuilder
+from agents.state import Effect, Event, State, StateMachine
+from agents.task_group import TaskGroup
+from agents.task_lease import STANDBYS, TaskLease
 from drivers.driver import Permit
 from drivers.reading import Action, Observation
-from middleware.consensus.bidding.panel import Panel
-from middleware.consensus.lease.lessee import Lease, Lessee
-from middleware.consensus.strategy import ConsensusAlgorithm, reads_of
-from middleware.consensus.verdict import Verdict
+from middleware.consensus.bidding.reporters import Reporters
+from middleware.consensus.decision_record import DecisionRecord
+from middleware.consensus.lease.lease_client import Lease, LeaseClient
+from middleware.consensus.strategy import ConsensusAlgorithm, find_read_fields
 from middleware.directory.presence import EXECUTING
 from middleware.entangled.contact import Contact
 from middleware.tasks.order import PAUSE, Order
 from middleware.tasks.task import COMPLETED, FAILED, Member, Result, Task
 
-SEARCH_TTL = 0.5
+SEARCH_TTL_S = 0.5
 """Seconds for which a motion without a lease (looking around) is permitted at a time."""
-SETTLED = State.RELEASING, State.DONE
-NOBODY = Decision(None, "", "")
+SETTLED_STATES = State.RELEASING, State.DONE
+NO_DECISION = Decision(None, "", "")
 
 
 @dataclass(frozen=True)
-class Deed:
+class RobotCommand:
     """An action for the robot and its permit."""
 
     action: Action
     permit: Permit
 
 
-class Ports(Protocol):
+class EngagementOutputs(Protocol):
     """The outputs of an engagement."""
 
-    def tell(self, member: Member) -> None:
+    def publish_report(self, member: Member) -> None:
         """Publish this agent's report."""
 
-    def conclude(self, result: Result) -> None:
+    def record_outcome(self, result: Result) -> None:
         """Record the outcome."""
 
-    def say(self, text: str) -> None:
+    def log_event(self, text: str) -> None:
         """Write a line to the device's log on the page."""
 
-    def halt(self) -> float:
+    def stop_robot(self) -> float:
         """Stop the robot; return the seconds for which it may still move if it does not respond."""
 
-    def justify(self, verdict: Verdict) -> None:
+    def publish_decision_record(self, verdict: DecisionRecord) -> None:
         """Publish the record of a decision."""
 
-    def reached(self, uuids: Sequence[str]) -> Sequence[Contact]:
+    def find_contacts(self, uuids: Sequence[str]) -> Sequence[Contact]:
         """Return the known contacts of the agents with these uuids."""
 
 
@@ -85,97 +85,103 @@ class Engagement:
         me: Member,
         behaviour: Behaviour,
         strategy: ConsensusAlgorithm,
-        ports: Ports,
-        panel: Panel,
+        ports: EngagementOutputs,
+        panel: Reporters,
         token: int,
         now: float,
         age: float = 0.0,
     ) -> None:
         self.task = task
-        self.course = Course()
-        self.me = replace(me, status=self.course.state.status)
+        self.state_machine = StateMachine()
+        self.me = replace(me, status=self.state_machine.state.status)
         self.result: Result | None = None
         self.is_paused = False
-        self.claim = Claim(token)
-        self._ports = ports
-        self._reporter = Reporter(behaviour, reads_of(strategy))
+        self.task_lease = TaskLease(token)
+        self._outputs = ports
+        self._report_builder = ReportBuilder(behaviour, find_read_fields(strategy))
         self._execution = Execution(behaviour, task.stall_limit)
-        self._conference = Conference(task, me.uuid, strategy, panel)
+        self._decider = Decider(task, me.uuid, strategy, panel)
         self._formation = Formation(me.uuid, behaviour)
         self._joined_at = now
         self._age = age
 
     @property
-    def lessee(self) -> Lessee | None:
+    def lease_client(self) -> LeaseClient | None:
         """The client of the task's lease; None while another task has the robot."""
-        return self.claim.lessee
+        return self.task_lease.lease_client
 
     @property
     def is_over(self) -> bool:
         """Whether the task has an outcome."""
-        return self.course.state is State.DONE
+        return self.state_machine.state is State.DONE
 
     @property
     def is_acting(self) -> bool:
         """Whether the robot acts for this task or is about to."""
-        return self.course.state in (State.CLAIMING, State.EXECUTING)
+        return self.state_machine.state in (State.CLAIMING, State.EXECUTING)
 
     @property
-    def may_be_put_aside(self) -> bool:
+    def can_yield_robot(self) -> bool:
         """Whether the robot may be given to a task of higher priority now."""
-        if self.course.state is State.RELEASING:
+        if self.state_machine.state is State.RELEASING:
             return False
         return not self.is_acting or (self.task.preemptible and self._execution.is_safe)
 
     @property
-    def division(self) -> Division | None:
+    def task_group(self) -> TaskGroup | None:
         """The group with which the task is assigned, or None."""
-        return self._conference.division
+        return self._decider.task_group
 
-    def keeps_council(self, now: float) -> bool:
+    def is_council_maintainer(self, now: float) -> bool:
         """Return whether this agent maintains the quorum: it acts, or it is the first while no agent acts."""
-        return self.course.state not in SETTLED and self._may_end_task(now)
+        return self.state_machine.state not in SETTLED_STATES and self._may_end_task(now)
 
     # -- inputs -----------------------------------------------------------------------------------------------------
 
-    def join(self, division: Division, now: float) -> None:
+    def join_group(self, division: TaskGroup, now: float) -> None:
         """Decide the task together with its group."""
-        self._conference.division = division
-        division.join(self.task, lambda now: [self.me, *self._conference.others(now)], now)
+        self._decider.task_group = division
+        division.join(self.task, lambda now: [self.me, *self._decider.others(now)], now)
 
-    def heard(self, members: list[Member], outcome: Result | None, now: float) -> None:
+    def process_reports(self, members: list[Member], outcome: Result | None, now: float) -> None:
         """Process the present members, their reports, and the outcome if there is one; the outcome is final."""
         if outcome is not None and (self.result is None or outcome.rank > self.result.rank):
             self.result = outcome
-            self.on(Event.OUTCOME, now)
-        self.me = self._conference.hear(members, self.me, now)
+            self.apply_event(Event.OUTCOME, now)
+        self.me = self._decider.update_reports(members, self.me, now)
         if self.is_over:
             return
-        if self.lessee is not None and self.me.assigned not in ("", self.me.uuid, *(member.uuid for member in members)):
-            self.lessee.suspect()
-        left = self._formation.hear(self._conference.others(now))
-        if left and self._conference.counts(now):
-            self._ports.say(f"a member left, {len(self._conference) + 1} remain: changes its place in the formation")
+        if self.lease_client is not None and self.me.assigned not in (
+            "",
+            self.me.uuid,
+            *(member.uuid for member in members),
+        ):
+            self.lease_client.suspect_holder()
+        left = self._formation.update_members(self._decider.others(now))
+        if left and self._decider.is_report_visible(now):
+            self._outputs.log_event(
+                f"a member left, {len(self._decider) + 1} remain: changes its place in the formation"
+            )
 
-    def ordered(self, order: Order | None) -> None:
+    def process_order(self, order: Order | None) -> None:
         """Process the operator's newest order for the task."""
         was_paused, self.is_paused = self.is_paused, order is not None and order.word == PAUSE
         if order is not None and was_paused != self.is_paused and not self.is_over:
-            self._ports.say(f"{'paused' if self.is_paused else 'resumed'} by {order.by}")
+            self._outputs.log_event(f"{'paused' if self.is_paused else 'resumed'} by {order.by}")
 
-    def renewed(self, task: Task) -> None:
+    def update_task(self, task: Task) -> None:
         """Process a changed record of the task; the newest quorum is kept."""
         self.task = task.with_newer_council(self.task)
-        if self.lessee is not None:
-            self.lessee.council.learn(self.task.charter)
+        if self.lease_client is not None:
+            self.lease_client.proposer.learn_charter(self.task.charter)
 
-    def hand_council(self, members: Sequence[Contact]) -> None:
+    def schedule_council_change(self, members: Sequence[Contact]) -> None:
         """Change the quorum of the task to ``members`` at the behaviour's next safe point."""
-        self.claim.successors = tuple(members)
+        self.task_lease.next_members = tuple(members)
 
     def set_load(self, load: int) -> None:
         """Set the number of tasks that the agent has."""
-        self._reporter.load = load
+        self._report_builder.load = load
 
     def look(self, seen: Observation, now: float) -> None:
         """Process an observation, and report changes."""
@@ -183,80 +189,84 @@ class Engagement:
         if not self._is_free or self.is_over or self._execution.has_stalled(now):
             return
         # In a group the robot is free between tasks, so a task that is nearly done must report its reduced cost.
-        is_acting = self.course.state is State.EXECUTING and self.division is None
-        news = self._reporter.news(self.me, is_acting, seen, now)
+        is_acting = self.state_machine.state is State.EXECUTING and self.task_group is None
+        news = self._report_builder.find_changes(self.me, is_acting, seen, now)
         if news is not None:
             if "cost" in news:
                 cost = news["cost"]
-                self._ports.say("has lost the target" if cost is None else f"reports {cost:.2f} m")
+                self._outputs.log_event("has lost the target" if cost is None else f"reports {cost:.2f} m")
             self._publish(again=True, **news)
 
     # -- the robot --------------------------------------------------------------------------------------------------
 
-    def take_body(self, lessee: Lessee, token: int) -> None:
+    def take_robot(self, lessee: LeaseClient, token: int) -> None:
         """Assign the robot to this task; it has obeyed ``token``, and ``lessee`` is the client of the task's lease."""
-        self.claim.lessee, self.claim.token = lessee, token
+        self.task_lease.lease_client, self.task_lease.token = lessee, token
 
-    def lend_body(self, is_lent: bool, now: float) -> None:
+    def set_robot_lent(self, is_lent: bool, now: float) -> None:
         """Record whether another task of the group has the robot; if this task had it, it stops acting."""
-        if is_lent and self.lessee is not None:
-            if self.course.state in SETTLED:
+        if is_lent and self.lease_client is not None:
+            if self.state_machine.state in SETTLED_STATES:
                 return  # the lease is kept until the outcome is known
-            self.on(Event.LENT, now)
-            self.claim.lessee = None
-        self.claim.is_lent = is_lent
+            self.apply_event(Event.LENT, now)
+            self.task_lease.lease_client = None
+        self.task_lease.is_lent = is_lent
 
-    def put_aside(self, why: str, now: float) -> None:
+    def yield_robot(self, why: str, now: float) -> None:
         """Give the robot to another task: stop it, release the lease, and report that the agent is not available."""
-        if self.course.state not in SETTLED:
-            self.on(Event.NO_BODY, now, replace(NOBODY, why=why))
-            self.claim.lessee = None
+        if self.state_machine.state not in SETTLED_STATES:
+            self.apply_event(Event.NO_BODY, now, replace(NO_DECISION, why=why))
+            self.task_lease.lease_client = None
 
-    def lose_body(self) -> None:
+    def on_robot_lost(self) -> None:
         """Withdraw the report, because the robot does not respond; the next observation reports again."""
         if self.me.available and not self.is_over:
-            self._ports.say("has lost its robot")
+            self._outputs.log_event("has lost its robot")
             self._publish(cost=None, available=False)
 
-    def abandon(self, now: float) -> Deferred[object]:
+    def leave(self, now: float) -> Deferred[object]:
         """Leave the task: stop the robot if it acts, and release the lease.
 
         Fires when the quorum members know.
         """
-        self.on(Event.LEAVE, now)
-        return self.claim.released
+        self.apply_event(Event.LEAVE, now)
+        return self.task_lease.when_released
 
     # -- one turn ---------------------------------------------------------------------------------------------------
 
-    def step(self, now: float) -> Deed | None:
+    def step(self, now: float) -> RobotCommand | None:
         """Decide again and return the next action; None if there is nothing to do for this task."""
-        if self.course.state in SETTLED:
+        if self.state_machine.state in SETTLED_STATES:
             return None
-        lease = self.claim.lease
-        if self._is_past_deadline(now) and self.lessee is not None and self._may_end_task(now):
-            return self.on(Event.EXPIRED if lease else Event.LATE, now, lease=lease)
+        lease = self.task_lease.lease
+        if self._is_past_deadline(now) and self.lease_client is not None and self._may_end_task(now):
+            return self.apply_event(Event.EXPIRED if lease else Event.LATE, now, lease=lease)
         if not self._is_free:
-            return self.on(Event.NO_BODY, now, replace(NOBODY, why="paused" if self.is_paused else self.me.why))
-        if self.course.state is State.IDLE:
-            self.on(Event.FREE, now)
+            return self.apply_event(
+                Event.NO_BODY, now, replace(NO_DECISION, why="paused" if self.is_paused else self.me.why)
+            )
+        if self.state_machine.state is State.IDLE:
+            self.apply_event(Event.FREE, now)
         if self._execution.has_stalled(now) and self.me.cost is not None:
-            self._ports.say("makes no progress")
+            self._outputs.log_event("makes no progress")
             self._publish(cost=None, available=False)
-        if self.course.state is State.EXECUTING:
-            if self.claim.successors and self._execution.is_safe:
-                self.on(Event.MOVE, now)
-                lease = self.claim.lease
-            if self.claim.is_moving(now):
+        if self.state_machine.state is State.EXECUTING:
+            if self.task_lease.next_members and self._execution.is_safe:
+                self.apply_event(Event.MOVE, now)
+                lease = self.task_lease.lease
+            if self.task_lease.is_changing_council(now):
                 return None
-        is_successor = self.course.state is State.WAITING and lease is not None
-        decision = self._conference.decide(self.task, self.me, now, is_successor)
-        fault = self._conference.new_fault(decision)
+        is_successor = self.state_machine.state is State.WAITING and lease is not None
+        decision = self._decider.decide(self.task, self.me, now, is_successor)
+        fault = self._decider.get_new_fault(decision)
         if fault:
-            self._ports.say(fault)
-        return self.on(self._event_of(decision, lease), now, decision, lease)
+            self._outputs.log_event(fault)
+        return self.apply_event(self._determine_event(decision, lease), now, decision, lease)
 
-    def _event_of(self, decision: Decision, lease: Lease | None) -> Event:
-        must_go_on = self.course.state is State.EXECUTING and self.me.cost is not None and not self._execution.is_safe
+    def _determine_event(self, decision: Decision, lease: Lease | None) -> Event:
+        must_go_on = (
+            self.state_machine.state is State.EXECUTING and self.me.cost is not None and not self._execution.is_safe
+        )
         if decision.assigned == self.me.uuid or (must_go_on and decision.assigned is not None):
             return Event.GRANTED if lease else Event.NAMED
         if self.me.cost is None:
@@ -268,30 +278,34 @@ class Engagement:
     @property
     def _is_free(self) -> bool:
         """Whether the robot is free for the task, or for another of its group."""
-        return not self.is_paused and (self.lessee is not None or self.claim.is_lent)
+        return not self.is_paused and (self.lease_client is not None or self.task_lease.is_lent)
 
     def _may_end_task(self, now: float) -> bool:
         """Return whether this agent may end the task as failed: it acts, or is the first of the present agents."""
-        return self.course.state is State.EXECUTING or self._conference.is_first(now)
+        return self.state_machine.state is State.EXECUTING or self._decider.is_first(now)
 
     def _is_past_deadline(self, now: float) -> bool:
         return 0.0 < self.task.deadline < self._age + now - self._joined_at
 
     # -- events and effects ----------------------------------------------------------------------------------------
 
-    def on(self, event: Event, now: float, decision: Decision = NOBODY, lease: Lease | None = None) -> Deed | None:
+    def apply_event(
+        self, event: Event, now: float, decision: Decision = NO_DECISION, lease: Lease | None = None
+    ) -> RobotCommand | None:
         """Apply ``event``, perform its effects in order, and return the resulting action for the robot, if any."""
-        order, deed = decision.order, None
+        order, deed = decision.ranking, None
         rank = order.index(self.me.uuid) if self.me.uuid in order else 0
-        for effect in self.course.go(event, rank if order else None):
-            deed = self._do(effect, now, decision, lease)
+        for effect in self.state_machine.apply(event, rank if order else None):
+            deed = self._perform_effect(effect, now, decision, lease)
         return deed
 
-    def _do(self, effect: Effect, now: float, decision: Decision, lease: Lease | None) -> Deed | None:
-        claim, ports = self.claim, self._ports
+    def _perform_effect(
+        self, effect: Effect, now: float, decision: Decision, lease: Lease | None
+    ) -> RobotCommand | None:
+        claim, ports = self.task_lease, self._outputs
         match effect:  # the effects of every turn come first
             case Effect.WANT:
-                claim.want()
+                claim.request()
             case Effect.EXECUTE:
                 assert lease is not None
                 return self._execute(decision, lease, now)
@@ -300,96 +314,98 @@ class Engagement:
             case Effect.STAND_BY:
                 claim.stand_by(self._standby_rank(decision, now))
             case Effect.STOP:
-                claim.stop(ports.halt(), now)
+                claim.record_stop(ports.stop_robot(), now)
             case Effect.RELEASE:
                 claim.release(now)
             case Effect.GIVE_BACK:
-                ports.say("releases the task")
+                ports.log_event("releases the task")
                 claim.release(now)
             case Effect.HAND_OVER:
-                claim.released = claim.release(now, ports.reached(claim.standbys))
+                claim.when_released = claim.release(now, ports.find_contacts(claim.standbys))
             case Effect.CLAIM:
-                claim.begin(now)
+                claim.start_request(now)
             case Effect.INSIST:
-                if claim.insist(now):
+                if claim.retry_request(now):
                     self._publish(again=True)
             case Effect.CHANGE_COUNCIL:
-                ports.say(f"replaces the quorum after the loss of a member: {len(claim.successors)} members")
-                claim.move(now, self.task.lease_ttl)
+                ports.log_event(f"replaces the quorum after the loss of a member: {len(claim.next_members)} members")
+                claim.change_council(now, self.task.lease_ttl)
             case Effect.OFFER:
                 self.me = replace(self.me, available=True)
             case Effect.WITHDRAW:
                 nothing: dict[str, Any] = {"cost": None, "assigned": "", "digest": "", "token": 0, "progress": None}
                 self._publish(available=False, why=decision.why, post=None, **nothing)
             case Effect.START:
-                ports.say(f"acts: {decision.why}")
+                ports.log_event(f"acts: {decision.why}")
             case Effect.COMPLETE:
-                self._conclude(COMPLETED, lease, now)
+                self._record_outcome(COMPLETED, lease, now)
             case Effect.FAIL:
-                self._conclude(FAILED, lease, now, f"past its deadline of {self.task.deadline:g} s")
+                self._record_outcome(FAILED, lease, now, f"past its deadline of {self.task.deadline:g} s")
             case Effect.END:
                 assert self.result is not None
                 by_me = self.result.outcome == COMPLETED and self.result.by == self.me.name
                 why = f": {self.result.why}" if self.result.why else ""
-                ports.say("done" if by_me else f"{self.result.outcome.lower()} by {self.result.by}{why}")
+                ports.log_event("done" if by_me else f"{self.result.outcome.lower()} by {self.result.by}{why}")
                 self._publish()
         return None
 
-    def _execute(self, decision: Decision, lease: Lease, now: float) -> Deed:
-        self.claim.token = max(self.claim.token, lease.token)
-        turn = self._execution.go_on(now, lease.token, lease.deadline, decision.consensus)
+    def _execute(self, decision: Decision, lease: Lease, now: float) -> RobotCommand:
+        self.task_lease.token = max(self.task_lease.token, lease.token)
+        turn = self._execution.step(now, lease.token, lease.deadline, decision.consensus)
         self._publish_decision(decision, lease.token, now, turn.progress)
         if turn.action is None:
-            self.on(Event.FINISHED, now, lease=lease)
-        return Deed(STAND if turn.action is None else turn.action, Permit(lease.token, lease.deadline))
+            self.apply_event(Event.FINISHED, now, lease=lease)
+        return RobotCommand(STAND if turn.action is None else turn.action, Permit(lease.token, lease.deadline))
 
-    def _hold(self, decision: Decision, now: float) -> Deed | None:
-        if self.lessee is None:  # another task of its group has the robot
+    def _hold(self, decision: Decision, now: float) -> RobotCommand | None:
+        if self.lease_client is None:  # another task of its group has the robot
             self._publish_decision(decision, 0, now)
             return None
         post = None
-        if self._conference.counts(now):  # only members with a visible report take a place in the formation
-            post = self._formation.close_up(self.me, self._conference.others(now), decision.assigned)
+        if self._decider.is_report_visible(now):  # only members with a visible report take a place in the formation
+            post = self._formation.assign_post(self.me, self._decider.others(now), decision.assigned)
         self._publish_decision(decision, 0, now, post=post)
-        action = self._execution.stand_by(self.me.cost is None, now)
-        return Deed(action, Permit(self.claim.token, now + SEARCH_TTL))
+        action = self._execution.step_without_lease(self.me.cost is None, now)
+        return RobotCommand(action, Permit(self.task_lease.token, now + SEARCH_TTL_S))
 
     def _standby_rank(self, decision: Decision, now: float) -> int:
         """Return the standby rank, from 1, of an agent that is to take over at once; 0 otherwise.
 
         The assigned agent counts until it acts.
         """
-        if not 0 < self.course.rank <= STANDBYS:
+        if not 0 < self.state_machine.rank <= STANDBYS:
             return 0
-        others = self._conference.others(now)
+        others = self._decider.others(now)
         is_acting = any(member.uuid == decision.assigned and member.status == EXECUTING for member in others)
-        return self.course.rank + (not is_acting)
+        return self.state_machine.rank + (not is_acting)
 
-    def _conclude(self, outcome: str, lease: Lease | None, now: float, why: str = "") -> None:
-        members = [self.me, *self._conference.others(now)]
+    def _record_outcome(self, outcome: str, lease: Lease | None, now: float, why: str = "") -> None:
+        members = [self.me, *self._decider.others(now)]
         bids = sorted((m.name, m.cost) for m in members if m.cost is not None)
         token = 0 if lease is None else lease.token
-        self._ports.conclude(Result(outcome, self.me.name, round(now - self._joined_at, 2), token, tuple(bids), why))
+        self._outputs.record_outcome(
+            Result(outcome, self.me.name, round(now - self._joined_at, 2), token, tuple(bids), why)
+        )
 
     def _publish_decision(
         self, decision: Decision, token: int, now: float, progress: float | None = None, post: float | None = None
     ) -> None:
         assigned = decision.assigned or ""
         if assigned and assigned != self.me.assigned and assigned != self.me.uuid:
-            self._ports.say(f"standby: {decision.why}")
+            self._outputs.log_event(f"standby: {decision.why}")
         decided: dict[str, Any] = {"assigned": assigned, "digest": decision.digest, "why": decision.why}
         self._publish(token=token, progress=progress, post=post, **decided)
-        self.claim.standbys = tuple(uuid for uuid in decision.order if uuid != self.me.uuid)[:STANDBYS]
-        verdict = self._conference.account(decision, self.me, token, now)
+        self.task_lease.standbys = tuple(uuid for uuid in decision.ranking if uuid != self.me.uuid)[:STANDBYS]
+        verdict = self._decider.make_record(decision, self.me, token, now)
         if verdict is not None:
-            self._ports.justify(verdict)
+            self._outputs.publish_decision_record(verdict)
 
     def _publish(self, again: bool = False, **changes: object) -> None:
-        changes |= {"status": self.course.state.status, "state": str(self.course)}
+        changes |= {"status": self.state_machine.state.status, "state": str(self.state_machine)}
         # a new round alone is sent with the next report
         if again or any(getattr(self.me, name) != value for name, value in changes.items()):
-            epoch = self._conference.epoch
+            epoch = self._decider.epoch
             serial = self.me.serial + 1 if epoch == self.me.epoch else 0
-            changes |= {"epoch": epoch, "serial": serial, "load": self._reporter.load}
+            changes |= {"epoch": epoch, "serial": serial, "load": self._report_builder.load}
             self.me = replace(self.me, **changes)  # type: ignore[arg-type]
-            self._ports.tell(self.me)
+            self._outputs.publish_report(self.me)

@@ -23,7 +23,7 @@ PROGRESS_STEP = 0.25
 
 
 @dataclass(frozen=True)
-class Turn:
+class Step:
     """The next action (None: the task is done), and the progress from 0 to 1 if the behaviour reports it."""
 
     action: Action | None
@@ -48,11 +48,11 @@ class Execution:
         """Pass an observation to the behaviour."""
         self._behaviour.look(seen, now)
 
-    def stand_by(self, is_searching: bool, now: float) -> Action:
+    def step_without_lease(self, is_searching: bool, now: float) -> Action:
         """Return the action without a lease: search for the data that the cost depends on, or hold."""
         return self._behaviour.search(now) if is_searching else self._behaviour.hold(now)
 
-    def go_on(self, now: float, token: int, deadline: float, consensus: Consensus | None = None) -> Turn:
+    def step(self, now: float, token: int, deadline: float, consensus: Consensus | None = None) -> Step:
         """Continue under the lease with ``token``; ``consensus`` is the current decision."""
         is_resumed = token == self._token
         if now - self._called_at > MAX_PAUSE_S:
@@ -66,13 +66,13 @@ class Execution:
         action = self._behaviour.execute(Context(now, token, deadline, self._began_at, is_resumed, *self._agreement))
         progress = getattr(self._behaviour, "progress", None)
         if not isinstance(progress, int | float) or not math.isfinite(progress):
-            return Turn(action, None)
+            return Step(action, None)
         progress = min(1.0, max(0.0, progress))
         if progress >= self._best_progress + MIN_PROGRESS:
             self._best_progress, self._best_at = progress, now
         elif 0.0 < self._stall_limit < now - self._best_at:
             self._stalled_at, self._best_at = now, now
-        return Turn(action, math.floor(max(progress, self._best_progress) / PROGRESS_STEP + 1e-9) * PROGRESS_STEP)
+        return Step(action, math.floor(max(progress, self._best_progress) / PROGRESS_STEP + 1e-9) * PROGRESS_STEP)
 
     def has_stalled(self, now: float) -> bool:
         """Return whether progress stalled within the last ``stall_limit`` seconds.

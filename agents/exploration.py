@@ -8,26 +8,26 @@ from __future__ import annotations
 import math
 import random
 
-from agents.means import STAND, Means
+from agents.motion import STAND, MotionCapabilities
 from drivers.reading import Action
 
 TURN_GAIN = 2.2
-LEG = 0.6
+LEG_M = 0.6
 """Metres to walk before looking around again."""
-CLEARANCE = 0.38
+CLEARANCE_M = 0.38
 """Metres ahead at which a leg ends because of an obstacle."""
-OPEN = 1.5
+OPEN_RANGE_M = 1.5
 """Range in metres of the far ranger: a direction without an obstacle within it counts as open."""
-AIMED = math.radians(8.0)
-HERE = 0.5
+AIM_TOLERANCE_RAD = math.radians(8.0)
+BUMP_RADIUS_M = 0.5
 """Metres within which a bump excludes its heading."""
-BUMPS = 3
-BACK = 0.10
+MAX_BUMPS = 3
+BACK_OFF_M = 0.10
 """Metres that a detour backs off; no sensor looks behind."""
-BACK_SPEED = 0.08
-DETOUR_LEG = 0.35
-AWAY = math.radians(70.0)
-DETOUR_PATIENCE_S = 4.0
+BACK_OFF_SPEED_MPS = 0.08
+DETOUR_LEG_M = 0.35
+DETOUR_TURN_RAD = math.radians(70.0)
+DETOUR_LEG_TIMEOUT_S = 4.0
 """Seconds for each of the three legs of a detour; a stuck robot continues with the next leg."""
 
 Pose = tuple[float, float, float]
@@ -36,8 +36,8 @@ Pose = tuple[float, float, float]
 class Exploration:
     """Exploration by one robot; a ``pose`` is its odometry: x and y in metres, yaw in radians."""
 
-    def __init__(self, rng: random.Random, means: Means | None = None) -> None:
-        self.means = Means() if means is None else means
+    def __init__(self, rng: random.Random, means: MotionCapabilities | None = None) -> None:
+        self.motion = MotionCapabilities() if means is None else means
         self._rng = rng
         self._side = rng.choice((-1.0, 1.0))
         self._turned_rad = 0.0
@@ -48,32 +48,32 @@ class Exploration:
         self.sector: tuple[float, float] | None = None
         """The middle and the width of the headings that this robot searches; None: all."""
 
-    def saw(self, pose: Pose, turned: float, ahead: float) -> None:
+    def update(self, pose: Pose, turned: float, ahead: float) -> None:
         """Process the pose, the turn since the last call, and the range ahead (NaN: nothing in range)."""
         if self._heading is None:
             self._turned_rad += abs(turned)
-            self._openness.append((OPEN if math.isnan(ahead) else ahead, pose[2]))
+            self._openness.append((OPEN_RANGE_M if math.isnan(ahead) else ahead, pose[2]))
 
-    def bumped(self, pose: Pose) -> None:
+    def on_bump(self, pose: Pose) -> None:
         """Process a bump at ``pose``: end the leg, and avoid its heading while it is near."""
-        self._bumps = [*self._bumps, pose][-BUMPS:]
+        self._bumps = [*self._bumps, pose][-MAX_BUMPS:]
         self._start_looking()
 
     def step(self, pose: Pose, ahead: float) -> Action:
         """Return the next action."""
         if self._heading is None:
             if self._turned_rad < math.tau:
-                return self.means.spin(self._side * self.means.look_turn)
+                return self.motion.spin(self._side * self.motion.look_turn)
             self._heading = self._choose_heading(pose)
         off = math.remainder(self._heading - pose[2], math.tau)
         if self._leg_from is None:
-            if (turn := turn_to(self.means, off)) is not None:
+            if (turn := turn_to(self.motion, off)) is not None:
                 return turn
             self._leg_from = pose[:2]
-        if is_blocked(ahead) or math.dist(self._leg_from, pose[:2]) >= LEG:
+        if is_blocked(ahead) or math.dist(self._leg_from, pose[:2]) >= LEG_M:
             self._start_looking()
             return STAND
-        return walk_to(self.means, off)
+        return walk_to(self.motion, off)
 
     def _choose_heading(self, pose: Pose) -> float:
         """Return a heading with a large range, in the own sector if possible; chosen at random among the best."""
@@ -81,8 +81,8 @@ class Exploration:
         if self.sector is not None:
             middle, width = self.sector
             own = [(o, yaw) for o, yaw in seen if abs(math.remainder(yaw - middle, math.tau)) <= width / 2]
-            seen = own if any(openness >= CLEARANCE + LEG for openness, _ in own) else seen
-        blocked_headings = [bump[2] for bump in self._bumps if math.dist(bump[:2], pose[:2]) <= HERE]
+            seen = own if any(openness >= CLEARANCE_M + LEG_M for openness, _ in own) else seen
+        blocked_headings = [bump[2] for bump in self._bumps if math.dist(bump[:2], pose[:2]) <= BUMP_RADIUS_M]
         free = [
             one
             for one in seen
@@ -103,34 +103,34 @@ class Exploration:
 class Detour:
     """A detour around an obstacle: back off, turn away, and walk on a little."""
 
-    def __init__(self, means: Means) -> None:
-        self.means = means
+    def __init__(self, means: MotionCapabilities) -> None:
+        self.motion = means
         self._legs: list[str] = []
         self._heading = 0.0
         self._from: Pose = (0.0, 0.0, 0.0)
         self._since = 0.0
 
-    def is_on(self, now: float) -> bool:
+    def is_active(self, now: float) -> bool:
         """Return whether the robot is on the detour and does not look at the target."""
-        return bool(self._legs) and now - self._since <= DETOUR_PATIENCE_S
+        return bool(self._legs) and now - self._since <= DETOUR_LEG_TIMEOUT_S
 
-    def begin(self, pose: Pose, side: float, now: float, has_touched: bool) -> None:
+    def start(self, pose: Pose, side: float, now: float, has_touched: bool) -> None:
         """Start a detour on ``side`` (1: left) from ``pose``.
 
         The robot backs off first if it has touched the obstacle.
         """
         self._legs = ["back", "turn", "walk"] if has_touched else ["turn", "walk"]
-        self._heading = pose[2] + side * AWAY
+        self._heading = pose[2] + side * DETOUR_TURN_RAD
         self._from, self._since = pose, now
 
-    def end(self) -> None:
+    def cancel(self) -> None:
         """Cancel the detour."""
         self._legs = []
 
     def step(self, pose: Pose, ahead: float, now: float) -> Action | None:
         """Return the next action; None after the detour.  ``ahead`` is the range ahead (NaN: nothing in range)."""
         while self._legs:
-            action = None if now - self._since > DETOUR_PATIENCE_S else self._leg_action(self._legs[0], pose, ahead)
+            action = None if now - self._since > DETOUR_LEG_TIMEOUT_S else self._leg_action(self._legs[0], pose, ahead)
             if action is not None:
                 return action
             self._legs.pop(0)
@@ -141,29 +141,33 @@ class Detour:
         off = math.remainder(self._heading - pose[2], math.tau)
         walked = math.dist(pose[:2], self._from[:2])
         if leg == "back":
-            return None if walked >= BACK else self.means.go(-BACK_SPEED)
+            return None if walked >= BACK_OFF_M else self.motion.go(-BACK_OFF_SPEED_MPS)
         if leg == "turn":
-            return turn_to(self.means, off)
-        if walked >= DETOUR_LEG or is_blocked(ahead):
+            return turn_to(self.motion, off)
+        if walked >= DETOUR_LEG_M or is_blocked(ahead):
             return None
-        return walk_to(self.means, off)
+        return walk_to(self.motion, off)
 
 
-def clipped(value: float, limit: float) -> float:
+def clip(value: float, limit: float) -> float:
     """Return ``value``, limited to ``limit`` in magnitude."""
     return max(-limit, min(limit, value))
 
 
-def turn_to(means: Means, off: float) -> Action | None:
+def turn_to(means: MotionCapabilities, off: float) -> Action | None:
     """Turn on the spot to a heading ``off`` radians to the left; None if the robot faces it already."""
-    return None if abs(off) <= max(AIMED, means.aim) else means.spin(clipped(TURN_GAIN * off, means.look_turn))
+    return (
+        None
+        if abs(off) <= max(AIM_TOLERANCE_RAD, means.facing_tolerance)
+        else means.spin(clip(TURN_GAIN * off, means.look_turn))
+    )
 
 
-def walk_to(means: Means, off: float) -> Action:
+def walk_to(means: MotionCapabilities, off: float) -> Action:
     """Walk towards a heading ``off`` radians to the left."""
-    return means.go(means.walk, clipped(TURN_GAIN * off, means.look_turn))
+    return means.go(means.walk, clip(TURN_GAIN * off, means.look_turn))
 
 
 def is_blocked(ahead: float) -> bool:
     """Return whether an obstacle is near, by the range ahead (NaN: nothing in range)."""
-    return not math.isnan(ahead) and ahead < CLEARANCE
+    return not math.isnan(ahead) and ahead < CLEARANCE_M

@@ -14,11 +14,11 @@ from dataclasses import dataclass
 
 from agents.behaviour import Behaviour
 from agents.exploration import Pose, is_blocked, turn_to, walk_to
-from agents.means import Means
+from agents.motion import MotionCapabilities
 from drivers.reading import Action
 from middleware.tasks.task import Member
 
-CLOSE = math.radians(20.0)
+POST_TOLERANCE_RAD = math.radians(20.0)
 """A robot within this angle of its post has arrived."""
 
 
@@ -33,7 +33,7 @@ class Post:
     sector: tuple[float, float]
 
 
-def posts(angles: Sequence[tuple[str, float]], assigned: str | None) -> dict[str, float]:
+def assign_posts(angles: Sequence[tuple[str, float]], assigned: str | None) -> dict[str, float]:
     """Return the post of each robot in ``angles`` (its uuid and its direction as seen from the target).
 
     The ``assigned`` robot keeps its place; without one the posts are rotated so that the paths are short overall.
@@ -50,7 +50,7 @@ def posts(angles: Sequence[tuple[str, float]], assigned: str | None) -> dict[str
     return {uuid: math.remainder(turn + n * step, math.tau) for n, (uuid, _) in enumerate(order)}
 
 
-def sector(uuid: str, present: Collection[str]) -> tuple[float, float]:
+def assign_sector(uuid: str, present: Collection[str]) -> tuple[float, float]:
     """Return the sector of ``uuid``: the present robots share the full circle evenly, sorted by uuid."""
     width = math.tau / len(present)
     return math.remainder(width * (sorted(present).index(uuid) + 0.5), math.tau), width
@@ -60,59 +60,63 @@ class Formation:
     """The formation at one task, from the view of the robot ``uuid`` with ``behaviour``."""
 
     def __init__(self, uuid: str, behaviour: Behaviour) -> None:
-        self.is_open = False
+        self.has_gap = False
         """Whether a member has left, so that there is a gap to close."""
         self._uuid = uuid
         self._take_post = getattr(behaviour, "take_post", None)
         self._present: set[str] = set()
         self._post: float | None = None
 
-    def hear(self, members: Sequence[Member]) -> list[str]:
+    def update_members(self, members: Sequence[Member]) -> list[str]:
         """Process the other present members; return the uuids of the departed ones."""
         present = {member.uuid for member in members}
         left, self._present = sorted(self._present - present), present
-        self.is_open = self.is_open or bool(left)
+        self.has_gap = self.has_gap or bool(left)
         return left if self._take_post is not None else []
 
-    def close_up(self, me: Member, others: Sequence[Member], assigned: str | None) -> float | None:
+    def assign_post(self, me: Member, others: Sequence[Member], assigned: str | None) -> float | None:
         """Send the robot to its post and return the angle; None without a post, as for the ``assigned`` robot."""
-        if self._take_post is None or not self.is_open:
+        if self._take_post is None or not self.has_gap:
             return None
         available_members = [member for member in (me, *others) if member.available]
         angles = [(member.uuid, member.angle) for member in available_members if member.angle is not None]
-        placed = posts(angles, assigned)
+        placed = assign_posts(angles, assigned)
         angle = placed.get(self._uuid) if len(angles) > 1 and self._uuid != assigned else None
-        if angle is not None and self._post is not None and abs(math.remainder(angle - self._post, math.tau)) <= CLOSE:
+        if (
+            angle is not None
+            and self._post is not None
+            and abs(math.remainder(angle - self._post, math.tau)) <= POST_TOLERANCE_RAD
+        ):
             angle = self._post  # others report their angles rarely: small changes do not move the post
         self._post = None if angle is None else round(angle, 2)
-        self._take_post(Post(self._post, sector(self._uuid, {member.uuid for member in (me, *others)})))
+        self._take_post(Post(self._post, assign_sector(self._uuid, {member.uuid for member in (me, *others)})))
         return self._post
 
 
-LONGEST = 0.45
+MAX_CHORD_M = 0.45
 """Metres of a chord at most: an ERS-7 walks it in three seconds, without seeing the target."""
-NEAREST = 0.45
+MIN_CIRCLING_RADIUS_M = 0.45
 """Metres from the target; a nearer robot keeps its place, so that it does not obstruct the acting robot."""
 
 
-class Circling:
+class PostPath:
     """The path of one robot to its post around the target at constant distance, in short chords.
 
     A robot sees and ranges only ahead, so it turns along the circle, walks a chord while the path is free, and turns
     back to the target before the next one.  A robot without a ranger keeps its place.
     """
 
-    def __init__(self, means: Means | None = None) -> None:
-        self.means = Means() if means is None else means
+    def __init__(self, means: MotionCapabilities | None = None) -> None:
+        self.motion = MotionCapabilities() if means is None else means
         self._post: float | None = None
         self._is_blocked = False
         self._heading: float | None = None
-        self._leg = 0.0
+        self._leg_m = 0.0
         self._leg_from: tuple[float, float] | None = None
 
-    def send(self, post: float | None) -> None:
+    def set_post(self, post: float | None) -> None:
         """Set the post (radians as seen from the target, by the compass; None: stay)."""
-        if post is None or self._post is None or abs(math.remainder(post - self._post, math.tau)) > CLOSE:
+        if post is None or self._post is None or abs(math.remainder(post - self._post, math.tau)) > POST_TOLERANCE_RAD:
             self._post, self._is_blocked = post, False
 
     @property
@@ -133,32 +137,32 @@ class Circling:
         assert self._heading is not None
         off = math.remainder(self._heading - pose[2], math.tau)
         if self._leg_from is None:
-            if (turn := turn_to(self.means, off)) is not None:
+            if (turn := turn_to(self.motion, off)) is not None:
                 return turn
             self._leg_from = pose[:2]
         if is_blocked(ahead):
             self._is_blocked = True  # a wall or another robot: as near to the post as possible
-            return self.rest()
-        if math.dist(self._leg_from, pose[:2]) >= self._leg:
-            return self.rest()
-        return walk_to(self.means, off)
+            return self.end_leg()
+        if math.dist(self._leg_from, pose[:2]) >= self._leg_m:
+            return self.end_leg()
+        return walk_to(self.motion, off)
 
-    def rest(self) -> Action | None:
+    def end_leg(self) -> Action | None:
         """End the leg; the robot faces the target next."""
         self._heading = self._leg_from = None
         return None
 
     def _start_leg(self, pose: Pose, target: tuple[float, float], angle: float | None, is_facing: bool) -> bool:
         """Start a leg if one is due, and return whether it was started."""
-        if self._post is None or angle is None or self._is_blocked or not is_facing or not self.means.ranges:
+        if self._post is None or angle is None or self._is_blocked or not is_facing or not self.motion.ranges:
             return False
         arc = math.remainder(self._post - angle, math.tau)
         radius = math.dist(pose[:2], target)
-        if abs(arc) <= CLOSE or radius < NEAREST:
+        if abs(arc) <= POST_TOLERANCE_RAD or radius < MIN_CIRCLING_RADIUS_M:
             return False
         outward = math.atan2(pose[1] - target[1], pose[0] - target[0])
         # A chord leans inwards by half its angle, so that the distance is kept.
-        half = min(abs(arc) / 2, math.asin(LONGEST / 2 / radius))
-        self._leg = 2 * radius * math.sin(half)
+        half = min(abs(arc) / 2, math.asin(MAX_CHORD_M / 2 / radius))
+        self._leg_m = 2 * radius * math.sin(half)
         self._heading = outward + math.copysign(math.pi / 2 + half, arc)
         return True

@@ -15,10 +15,10 @@ from middleware.errors import UnknownAgent
 from middleware.node import SwarmNode
 
 BUILT_IN = {"search": "agents.loop:Agent"}
-MakeAgent = Callable[[SwarmNode, Driver, IReactorTime, random.Random], Service]
+AgentFactory = Callable[[SwarmNode, Driver, IReactorTime, random.Random], Service]
 
 
-def agent_named(name: str) -> MakeAgent:
+def load_agent(name: str) -> AgentFactory:
     """Return the factory of the agent called ``name``: a built-in one, or ``module:Class`` on this machine.
 
     Raises ``UnknownAgent``, whose text lists the known names.

@@ -86,66 +86,66 @@ class Row(NamedTuple):
 
 
 _S, _V, _E = State, Event, Effect
-_RESTING = _S.OBSERVING, _S.REPORTED, _S.WAITING, _S.FENCED
-_PRESENT = *_RESTING, _S.CLAIMING
-_ASIDE = _S.IDLE, *_PRESENT
-_ACTING = (_S.EXECUTING,)
-_SETTLED = _S.RELEASING, _S.DONE
-_NOT_ACTING = *_ASIDE, *_SETTLED
-_STANDS_BY = _E.STAND_BY, _E.HOLD
-_GIVES_BACK = _E.STOP, _E.GIVE_BACK
+_WAITING_STATES = _S.OBSERVING, _S.REPORTED, _S.WAITING, _S.FENCED
+_PRESENT_STATES = *_WAITING_STATES, _S.CLAIMING
+_INACTIVE_STATES = _S.IDLE, *_PRESENT_STATES
+_ACTING_STATES = (_S.EXECUTING,)
+_SETTLED_STATES = _S.RELEASING, _S.DONE
+_NOT_ACTING_STATES = *_INACTIVE_STATES, *_SETTLED_STATES
+_STAND_BY_EFFECTS = _E.STAND_BY, _E.HOLD
+_GIVE_BACK_EFFECTS = _E.STOP, _E.GIVE_BACK
 
 ROWS = (
-    Row(_V.NO_BODY, _ASIDE, _S.IDLE, (_E.RELEASE, _E.WITHDRAW)),
-    Row(_V.NO_BODY, _ACTING, _S.IDLE, (*_GIVES_BACK, _E.WITHDRAW)),
-    Row(_V.NO_BODY, _SETTLED),
+    Row(_V.NO_BODY, _INACTIVE_STATES, _S.IDLE, (_E.RELEASE, _E.WITHDRAW)),
+    Row(_V.NO_BODY, _ACTING_STATES, _S.IDLE, (*_GIVE_BACK_EFFECTS, _E.WITHDRAW)),
+    Row(_V.NO_BODY, _SETTLED_STATES),
     Row(_V.FREE, (_S.IDLE,), _S.OBSERVING, (_E.OFFER,)),
-    Row(_V.FREE, (*_PRESENT, *_ACTING, *_SETTLED)),
+    Row(_V.FREE, (*_PRESENT_STATES, *_ACTING_STATES, *_SETTLED_STATES)),
     # An agent ends only a task whose lease it holds.
-    Row(_V.LATE, _ASIDE, None, (_E.WANT,)),
-    Row(_V.LATE, _ACTING, _S.FENCED, (_E.STOP, _E.WANT)),
-    Row(_V.LATE, _SETTLED),
-    Row(_V.EXPIRED, _ASIDE, _S.RELEASING, (_E.FAIL,)),
-    Row(_V.EXPIRED, _ACTING, _S.RELEASING, (_E.STOP, _E.FAIL)),
-    Row(_V.EXPIRED, _SETTLED),
-    Row(_V.BLIND, _PRESENT, _S.OBSERVING, (_E.RELEASE, _E.HOLD)),
-    Row(_V.BLIND, _ACTING, _S.OBSERVING, (*_GIVES_BACK, _E.HOLD)),
-    Row(_V.BLIND, (_S.IDLE, *_SETTLED)),
-    Row(_V.UNDECIDED, _PRESENT, _S.REPORTED, (_E.RELEASE, _E.HOLD)),
-    Row(_V.UNDECIDED, _ACTING, _S.REPORTED, (*_GIVES_BACK, _E.HOLD)),
-    Row(_V.UNDECIDED, (_S.IDLE, *_SETTLED)),
+    Row(_V.LATE, _INACTIVE_STATES, None, (_E.WANT,)),
+    Row(_V.LATE, _ACTING_STATES, _S.FENCED, (_E.STOP, _E.WANT)),
+    Row(_V.LATE, _SETTLED_STATES),
+    Row(_V.EXPIRED, _INACTIVE_STATES, _S.RELEASING, (_E.FAIL,)),
+    Row(_V.EXPIRED, _ACTING_STATES, _S.RELEASING, (_E.STOP, _E.FAIL)),
+    Row(_V.EXPIRED, _SETTLED_STATES),
+    Row(_V.BLIND, _PRESENT_STATES, _S.OBSERVING, (_E.RELEASE, _E.HOLD)),
+    Row(_V.BLIND, _ACTING_STATES, _S.OBSERVING, (*_GIVE_BACK_EFFECTS, _E.HOLD)),
+    Row(_V.BLIND, (_S.IDLE, *_SETTLED_STATES)),
+    Row(_V.UNDECIDED, _PRESENT_STATES, _S.REPORTED, (_E.RELEASE, _E.HOLD)),
+    Row(_V.UNDECIDED, _ACTING_STATES, _S.REPORTED, (*_GIVE_BACK_EFFECTS, _E.HOLD)),
+    Row(_V.UNDECIDED, (_S.IDLE, *_SETTLED_STATES)),
     # A standby without a lease keeps its rank.
-    Row(_V.PASSED_OVER, _RESTING, _S.WAITING, _STANDS_BY),
-    Row(_V.PASSED_OVER, (_S.CLAIMING,), _S.WAITING, (_E.RELEASE, *_STANDS_BY)),
-    Row(_V.PASSED_OVER, _ACTING, _S.WAITING, (*_GIVES_BACK, *_STANDS_BY)),
-    Row(_V.PASSED_OVER, (_S.IDLE, *_SETTLED)),
-    Row(_V.LEASED_IN_VAIN, _PRESENT, _S.WAITING, (_E.RELEASE, *_STANDS_BY)),
-    Row(_V.LEASED_IN_VAIN, _ACTING, _S.WAITING, (*_GIVES_BACK, *_STANDS_BY)),
-    Row(_V.LEASED_IN_VAIN, (_S.IDLE, *_SETTLED)),
-    Row(_V.NAMED, _RESTING, _S.CLAIMING, (_E.CLAIM, _E.HOLD)),
+    Row(_V.PASSED_OVER, _WAITING_STATES, _S.WAITING, _STAND_BY_EFFECTS),
+    Row(_V.PASSED_OVER, (_S.CLAIMING,), _S.WAITING, (_E.RELEASE, *_STAND_BY_EFFECTS)),
+    Row(_V.PASSED_OVER, _ACTING_STATES, _S.WAITING, (*_GIVE_BACK_EFFECTS, *_STAND_BY_EFFECTS)),
+    Row(_V.PASSED_OVER, (_S.IDLE, *_SETTLED_STATES)),
+    Row(_V.LEASED_IN_VAIN, _PRESENT_STATES, _S.WAITING, (_E.RELEASE, *_STAND_BY_EFFECTS)),
+    Row(_V.LEASED_IN_VAIN, _ACTING_STATES, _S.WAITING, (*_GIVE_BACK_EFFECTS, *_STAND_BY_EFFECTS)),
+    Row(_V.LEASED_IN_VAIN, (_S.IDLE, *_SETTLED_STATES)),
+    Row(_V.NAMED, _WAITING_STATES, _S.CLAIMING, (_E.CLAIM, _E.HOLD)),
     Row(_V.NAMED, (_S.CLAIMING,), None, (_E.INSIST, _E.HOLD)),
-    Row(_V.NAMED, _ACTING, _S.FENCED, (_E.STOP, _E.WANT, _E.HOLD)),
-    Row(_V.NAMED, (_S.IDLE, *_SETTLED)),
-    Row(_V.GRANTED, _PRESENT, _S.EXECUTING, (_E.WANT, _E.START, _E.EXECUTE)),
-    Row(_V.GRANTED, _ACTING, None, (_E.WANT, _E.EXECUTE)),
-    Row(_V.GRANTED, (_S.IDLE, *_SETTLED)),
+    Row(_V.NAMED, _ACTING_STATES, _S.FENCED, (_E.STOP, _E.WANT, _E.HOLD)),
+    Row(_V.NAMED, (_S.IDLE, *_SETTLED_STATES)),
+    Row(_V.GRANTED, _PRESENT_STATES, _S.EXECUTING, (_E.WANT, _E.START, _E.EXECUTE)),
+    Row(_V.GRANTED, _ACTING_STATES, None, (_E.WANT, _E.EXECUTE)),
+    Row(_V.GRANTED, (_S.IDLE, *_SETTLED_STATES)),
     # The agent remains the acting one, so that no other is assigned; it stands still until it has a lease again.
-    Row(_V.MOVE, _ACTING, None, (_E.STOP, _E.CHANGE_COUNCIL)),
-    Row(_V.MOVE, _NOT_ACTING),
-    Row(_V.FINISHED, _ACTING, _S.RELEASING, (_E.STOP, _E.COMPLETE)),
-    Row(_V.FINISHED, _NOT_ACTING),
+    Row(_V.MOVE, _ACTING_STATES, None, (_E.STOP, _E.CHANGE_COUNCIL)),
+    Row(_V.MOVE, _NOT_ACTING_STATES),
+    Row(_V.FINISHED, _ACTING_STATES, _S.RELEASING, (_E.STOP, _E.COMPLETE)),
+    Row(_V.FINISHED, _NOT_ACTING_STATES),
     # A standby ignores it: the robot remembers a token from an earlier run of the agent.
-    Row(_V.OUTRANKED, _ACTING, _S.FENCED, (_E.STOP, _E.RELEASE)),
-    Row(_V.OUTRANKED, _NOT_ACTING),
-    Row(_V.LENT, _ASIDE, None, (_E.RELEASE,)),
-    Row(_V.LENT, _ACTING, _S.FENCED, _GIVES_BACK),
-    Row(_V.LENT, _SETTLED),
-    Row(_V.LEAVE, _NOT_ACTING, None, (_E.HAND_OVER,)),
-    Row(_V.LEAVE, _ACTING, _S.FENCED, (_E.STOP, _E.HAND_OVER)),
+    Row(_V.OUTRANKED, _ACTING_STATES, _S.FENCED, (_E.STOP, _E.RELEASE)),
+    Row(_V.OUTRANKED, _NOT_ACTING_STATES),
+    Row(_V.LENT, _INACTIVE_STATES, None, (_E.RELEASE,)),
+    Row(_V.LENT, _ACTING_STATES, _S.FENCED, _GIVE_BACK_EFFECTS),
+    Row(_V.LENT, _SETTLED_STATES),
+    Row(_V.LEAVE, _NOT_ACTING_STATES, None, (_E.HAND_OVER,)),
+    Row(_V.LEAVE, _ACTING_STATES, _S.FENCED, (_E.STOP, _E.HAND_OVER)),
     Row(_V.REOPENED, (_S.RELEASING,), _S.FENCED, (_E.RELEASE,)),
-    Row(_V.REOPENED, (*_ASIDE, *_ACTING, _S.DONE)),
-    Row(_V.OUTCOME, (*_ASIDE, _S.RELEASING), _S.DONE, (_E.END,)),
-    Row(_V.OUTCOME, _ACTING, _S.DONE, (_E.STOP, _E.END)),
+    Row(_V.REOPENED, (*_INACTIVE_STATES, *_ACTING_STATES, _S.DONE)),
+    Row(_V.OUTCOME, (*_INACTIVE_STATES, _S.RELEASING), _S.DONE, (_E.END,)),
+    Row(_V.OUTCOME, _ACTING_STATES, _S.DONE, (_E.STOP, _E.END)),
     Row(_V.OUTCOME, (_S.DONE,)),
 )
 
@@ -159,7 +159,7 @@ TABLE = build_table(ROWS)
 """(state, event) to (next state, effects in order)."""
 
 
-class Course:
+class StateMachine:
     """The state of one agent in one task; ``rank`` is its rank among the standbys, from 1."""
 
     def __init__(self) -> None:
@@ -170,7 +170,7 @@ class Course:
         """Return the state for display."""
         return f"{self.state.name}({self.rank})" if self.state is State.WAITING and self.rank else self.state.name
 
-    def go(self, event: Event, rank: int | None = None) -> tuple[Effect, ...]:
+    def apply(self, event: Event, rank: int | None = None) -> tuple[Effect, ...]:
         """Apply ``event`` and return its effects; ``rank`` is the new rank, if the event gives one."""
         self.state, effects = TABLE[self.state, event]
         if rank is not None:

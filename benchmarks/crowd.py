@@ -16,12 +16,12 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from benchmarks.measure import MIB, memory_bytes
+from benchmarks.measure import MIB, read_memory_bytes
 
 TICK_MS = 32.0
-LOOK_S = 2.0
+POLL_S = 2.0
 """Virtual seconds for which attached agents are measured, after they have settled."""
-SETTLING_S = 4.0
+SETTLE_S = 4.0
 TASK_S = 3.0
 """Virtual seconds after the assignment of a task for which its datagrams are counted."""
 ARGOS = "ARGoS is quoted with 10,000 e-pucks at 1.7 x real time, by many threads on a machine of 2012"
@@ -83,28 +83,28 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 def _measure_robots(bodies: int, controller: str, seconds: float) -> dict[str, float]:
     """Measure the simulation without agents: the mean time of a step and of its parts, including neighbour search."""
-    from sim.robots.crowd.controller import CONTROLLERS, Senses
+    from sim.robots.crowd.controller import CONTROLLERS, Readings
     from sim.robots.crowd.crowd import Crowd
-    from sim.robots.crowd.ground import roomy
+    from sim.robots.crowd.scene import make_square_scene
 
     class Timed(Crowd):
         rays = 0.0
 
-        def cast(self) -> Any:
+        def cast_rays(self) -> Any:
             began = time.process_time()
-            met = super().cast()
+            met = super().cast_rays()
             self.rays = 1e3 * (time.process_time() - began)
             return met
 
-    before = memory_bytes("VmHWM") / MIB
-    crowd = Timed(1, roomy(bodies))
+    before = read_memory_bytes("VmHWM") / MIB
+    crowd = Timed(1, make_square_scene(bodies))
     crowd.place_target_at_random()
-    senses, control = Senses(crowd), CONTROLLERS[controller]
+    senses, control = Readings(crowd), CONTROLLERS[controller]
     parts: dict[str, list[float]] = {"rays": [], "moves": [], "control": [], "step": []}
     end = time.process_time() + seconds
     while time.process_time() < end or len(parts["step"]) < 20:
         began = time.process_time()
-        crowd.wish[:] = control(senses)
+        crowd.commands[:] = control(senses)
         controlled = time.process_time()
         crowd.step()
         stepped = time.process_time()
@@ -113,20 +113,25 @@ def _measure_robots(bodies: int, controller: str, seconds: float) -> dict[str, f
         parts["rays"].append(crowd.rays)
         parts["moves"].append(1e3 * (stepped - controlled) - crowd.rays)
     means = {key: statistics.fmean(costs) for key, costs in parts.items()}
-    return {"robots": bodies, **means, "factor": TICK_MS / means["step"], "mib": memory_bytes("VmHWM") / MIB - before}
+    return {
+        "robots": bodies,
+        **means,
+        "factor": TICK_MS / means["step"],
+        "mib": read_memory_bytes("VmHWM") / MIB - before,
+    }
 
 
 def _measure_agents(agents: int) -> dict[str, float]:
     """Measure agents with nodes and drivers on 1,000 robots without a task, with and without cameras."""
-    from sim.robots.crowd.ground import roomy
+    from sim.robots.crowd.scene import make_square_scene
     from swarmnode.crowd import CAMERA_FPS, CrowdTeam
 
     began = time.process_time()
-    team = CrowdTeam(1, agents, roomy(max(1000, agents)), stopwatch=time.process_time)
-    team.clock.advance(SETTLING_S)
+    team = CrowdTeam(1, agents, make_square_scene(max(1000, agents)), stopwatch=time.process_time)
+    team.clock.advance(SETTLE_S)
     figures = {"agents": float(agents), "joining": time.process_time() - began}
     _print_line(
-        f"\n{agents} agents attached to {team.yard.crowd.ground.bodies:,} robots, without a task; ms a virtual second"
+        f"\n{agents} agents attached to {team.simulator.crowd.scene.robots:,} robots, without a task; ms a virtual second"
     )
     _print_line(f"{'':24}{'moves, rays':>12}{'telling':>9}{'agents':>9}{'yard alone':>13}{'all':>9}{'datagrams':>11}")
     for part, fps in ((f"{CAMERA_FPS:g} pictures a second", CAMERA_FPS), ("no camera", 0.0)):
@@ -135,12 +140,12 @@ def _measure_agents(agents: int) -> dict[str, float]:
             if driver is not None:
                 driver.set_camera_fps(fps)
         team.clock.advance(0.5)
-        moving, telling, sent = team.yard.moving, team.yard.telling, team.board.counters["sent"]
+        moving, telling, sent = team.simulator.moving_s, team.simulator.reporting_s, team.switchboard.counters["sent"]
         began = time.process_time()
-        team.clock.advance(LOOK_S)
-        whole = (time.process_time() - began) / LOOK_S
-        moving, telling = (team.yard.moving - moving) / LOOK_S, (team.yard.telling - telling) / LOOK_S
-        rate = (team.board.counters["sent"] - sent) / LOOK_S
+        team.clock.advance(POLL_S)
+        whole = (time.process_time() - began) / POLL_S
+        moving, telling = (team.simulator.moving_s - moving) / POLL_S, (team.simulator.reporting_s - telling) / POLL_S
+        rate = (team.switchboard.counters["sent"] - sent) / POLL_S
         yard = moving + telling
         costs = "".join(f"{1e3 * cost:{wide}.0f}" for cost, wide in ((moving, 12), (telling, 9), (whole - yard, 9)))
         _print_line(f"{part:24}{costs}{1 / yard:11.1f} x{1 / whole:7.2f} x{rate:11,.0f}")
@@ -151,7 +156,7 @@ def _measure_agents(agents: int) -> dict[str, float]:
 
 def _measure_tasks(sizes: Sequence[int]) -> list[dict[str, float]]:
     """Count the datagrams of the agents after the assignment of one task, and in the same time without a task."""
-    from sim.robots.crowd.ground import roomy
+    from sim.robots.crowd.scene import make_square_scene
     from swarmnode.crowd import CrowdTeam
 
     rows = []
@@ -160,18 +165,18 @@ def _measure_tasks(sizes: Sequence[int]) -> list[dict[str, float]]:
             f"\n{'agents':>8}{'at the task':>13}{'datagrams':>11}{'without':>9}   in the first {TASK_S:g} s of a task"
         )
     for agents in sizes:
-        team = CrowdTeam(1, agents, roomy(max(100, agents)))
+        team = CrowdTeam(1, agents, make_square_scene(max(100, agents)))
         team.clock.advance(TASK_S)
         sent = []
         for begin in (lambda: None, team.assign):
-            before = team.board.counters["sent"]
+            before = team.switchboard.counters["sent"]
             begin()
             team.clock.advance(TASK_S)
-            sent.append(float(team.board.counters["sent"] - before))
+            sent.append(float(team.switchboard.counters["sent"] - before))
         rows.append(
-            {"agents": float(agents), "taking part": float(len(team.words())), "idle": sent[0], "task": sent[1]}
+            {"agents": float(agents), "taking part": float(len(team.get_statuses())), "idle": sent[0], "task": sent[1]}
         )
-        _print_line(f"{agents:>8}{len(team.words()):>13}{sent[1]:>11,.0f}{sent[0]:>9,.0f}")
+        _print_line(f"{agents:>8}{len(team.get_statuses()):>13}{sent[1]:>11,.0f}{sent[0]:>9,.0f}")
         team.stop()
     return rows
 

@@ -24,27 +24,27 @@ from pathlib import Path
 from typing import Any
 from urllib.parse import urlsplit
 
-from benchmarks.measure import maps_mib, processor_s, udp_count
+from benchmarks.measure import read_cpu_s, read_maps_mib, read_udp_counter
 from middleware.admission import operator as operators
-from middleware.admission.membership import MembershipFile, made
+from middleware.admission.membership import MembershipFile, create_membership_file
 
-START_S = 60.0
-TASK_S = 120.0
+START_LIMIT_S = 60.0
+TASK_LIMIT_S = 120.0
 TARGETS = {"pss": 300.0, "cores": 1.0, "page": 60_000, "plain": 40.0}
 """MiB of all processes, cores of all processes, bytes of the page, MiB of a robot's node without vision."""
 
 
-class Page:
+class PageClient:
     """An HTTP client for the demonstration's page at ``url``."""
 
     def __init__(self, url: str) -> None:
         self._host = urlsplit(url).netloc
         self.headers = {"X-Swarm": "1"}
         code = urlsplit(url).fragment.removeprefix("code=")
-        signed = json.loads(self.ask("/api/v1/session", "POST", body=json.dumps({"code": code}))[1])
+        signed = json.loads(self.request("/api/v1/session", "POST", body=json.dumps({"code": code}))[1])
         self.headers["Authorization"] = f"Bearer {signed['token']}"
 
-    def ask(
+    def request(
         self, path: str, method: str = "GET", limit_s: float = 10.0, body: str | None = None
     ) -> tuple[http.client.HTTPResponse, bytes]:
         """Send one request on a new connection."""
@@ -56,12 +56,12 @@ class Page:
         finally:
             connection.close()
 
-    def state(self) -> dict[str, Any]:
+    def read_state(self) -> dict[str, Any]:
         """Return the state that the page shows."""
-        state: dict[str, Any] = json.loads(self.ask("/api/v1/state")[1])
+        state: dict[str, Any] = json.loads(self.request("/api/v1/state")[1])
         return state
 
-    def weight(self) -> dict[str, int]:
+    def measure_size(self) -> dict[str, int]:
         """Return the uncompressed bytes of the page and of everything that it loads from the node."""
         sizes: dict[str, int] = {}
         waiting = ["/"]
@@ -69,7 +69,7 @@ class Page:
             path = waiting.pop()
             if path in sizes:
                 continue
-            body = self.ask(path)[1]
+            body = self.request(path)[1]
             sizes[path] = len(body)
             found = re.findall(rb'(?:href|src)="(/static/[^"]+)"', body) if path == "/" else []
             if path.endswith(".js"):
@@ -81,7 +81,7 @@ class Page:
 class Viewer:
     """An open page: the event stream, and the pictures of each camera at full rate."""
 
-    def __init__(self, page: Page, host: str) -> None:
+    def __init__(self, page: PageClient, host: str) -> None:
         self._page = page
         self._host = host
         self._is_stopping = False
@@ -91,8 +91,10 @@ class Viewer:
 
     def open(self) -> None:
         """Open the streams."""
-        cameras = [device["uuid"] for device in self._page.state()["devices"] if "camera" in device["capabilities"]]
-        works: list[Callable[[], None]] = [self._events, *(self._camera_of(uuid) for uuid in cameras)]
+        cameras = [
+            device["uuid"] for device in self._page.read_state()["devices"] if "camera" in device["capabilities"]
+        ]
+        works: list[Callable[[], None]] = [self._stream_events, *(self._make_camera_stream(uuid) for uuid in cameras)]
         self._threads = [threading.Thread(target=work, daemon=True) for work in works]
         for thread in self._threads:
             thread.start()
@@ -103,7 +105,7 @@ class Viewer:
         for thread in self._threads:
             thread.join(6.0)
 
-    def _camera_of(self, uuid: str) -> Callable[[], None]:
+    def _make_camera_stream(self, uuid: str) -> Callable[[], None]:
         def look() -> None:
             connection = http.client.HTTPConnection(self._host, timeout=10)
             after = "0"
@@ -119,7 +121,7 @@ class Viewer:
 
         return look
 
-    def _events(self) -> None:
+    def _stream_events(self) -> None:
         connection = http.client.HTTPConnection(self._host, timeout=10)
         connection.request("GET", "/events", headers=self._page.headers)
         response = connection.getresponse()
@@ -129,7 +131,7 @@ class Viewer:
         connection.close()
 
 
-def family(root: int) -> dict[int, str]:
+def list_descendants(root: int) -> dict[int, str]:
     """Return ``root`` and its descendant processes by id, each with its name."""
     parents: dict[int, int] = {}
     for entry in Path("/proc").iterdir():
@@ -154,7 +156,7 @@ def _process_name(pid: int) -> str:
 
 
 @contextmanager
-def demonstration(run_dir: Path, seed: int) -> Iterator[tuple[subprocess.Popen[str], str, float]]:
+def run_demonstration(run_dir: Path, seed: int) -> Iterator[tuple[subprocess.Popen[str], str, float]]:
     """Start the demonstration; yield its process, the page's address, and the seconds until it was ready."""
     began = time.monotonic()
     command = [sys.executable, "-m", "sim.demo", "--seed", str(seed), "--run-dir", str(run_dir)]
@@ -174,14 +176,16 @@ def demonstration(run_dir: Path, seed: int) -> Iterator[tuple[subprocess.Popen[s
 
 
 @contextmanager
-def plain_node(run_dir: Path) -> Iterator[int]:
+def run_plain_node(run_dir: Path) -> Iterator[int]:
     """Start a robot's node without agent and camera in the team of ``run_dir``; yield its process id."""
     dog = tomllib.loads((run_dir / "dog1.toml").read_text())["node"]
     known = json.dumps(dog["known_nodes"])
     file, path = run_dir / "plain.toml", run_dir / "plain.membership"
     secret = MembershipFile(Path(dog["membership"])).membership.secrets[0][1]
-    operator = operators.load(run_dir / "operator.key")
-    made(path, operator.founded("plain", ("device",), time.time(), random.SystemRandom(), secret))
+    operator = operators.load_operator(run_dir / "operator.key")
+    create_membership_file(
+        path, operator.create_membership("plain", ("device",), time.time(), random.SystemRandom(), secret)
+    )
     file.write_text(
         f'[node]\nname = "plain"\nmembership = "{path.name}"\nknown_nodes = {known}\nstore = "plain.sqlite"\n'
         '[driver]\nkind = "sim"\noptions = { robot = "dog1", camera = false }\n'
@@ -196,14 +200,14 @@ def plain_node(run_dir: Path) -> Iterator[int]:
         process.wait(15)
 
 
-def task_run(page: Page, least_s: float) -> float:
+def measure_task(page: PageClient, least_s: float) -> float:
     """Press Run Demo and return the seconds until the task is completed; wait at least ``least_s``."""
-    task = json.loads(page.ask("/api/v1/demo", "POST")[1])["id"]
+    task = json.loads(page.request("/api/v1/demo", "POST")[1])["id"]
     began, took = time.monotonic(), 0.0
     while not took or time.monotonic() - began < least_s:
-        if time.monotonic() - began > TASK_S:
-            raise SystemExit(f"bench-demo: the task was not completed within {TASK_S:g} s")
-        done = [row["id"] for row in page.state()["tasks"] if row["status"] == "COMPLETED"]
+        if time.monotonic() - began > TASK_LIMIT_S:
+            raise SystemExit(f"bench-demo: the task was not completed within {TASK_LIMIT_S:g} s")
+        done = [row["id"] for row in page.read_state()["tasks"] if row["status"] == "COMPLETED"]
         if not took and task in done:
             took = time.monotonic() - began
         time.sleep(0.5)
@@ -216,29 +220,33 @@ def _format_line(what: str, value: float, unit: str, target: str, note: str = ""
     return f"{what:20}{shown} {unit:9} target {limit:g}: {'held' if value <= limit else 'MISSED'}{note}"
 
 
-def measured(seed: int, seconds: float, run_dir: Path) -> list[str]:
+def measure(seed: int, seconds: float, run_dir: Path) -> list[str]:
     """Measure and return the lines of the table."""
-    with demonstration(run_dir, seed) as (process, url, ready_s):
-        page = Page(url)
+    with run_demonstration(run_dir, seed) as (process, url, ready_s):
+        page = PageClient(url)
         host = urlsplit(url).netloc
-        names = family(process.pid)
+        names = list_descendants(process.pid)
         viewer = Viewer(page, host)
         viewer.open()
         time.sleep(2.0)
-        before, heard, began = {pid: processor_s(pid) for pid in names}, udp_count("InDatagrams"), time.monotonic()
+        before, heard, began = (
+            {pid: read_cpu_s(pid) for pid in names},
+            read_udp_counter("InDatagrams"),
+            time.monotonic(),
+        )
         pictures, carried = viewer.pictures, viewer.bytes
-        took = task_run(page, seconds)
+        took = measure_task(page, seconds)
         span = time.monotonic() - began
-        shares = {pid: (processor_s(pid) - before[pid]) / span for pid in names}
-        rate = (udp_count("InDatagrams") - heard) / span
+        shares = {pid: (read_cpu_s(pid) - before[pid]) / span for pid in names}
+        rate = (read_udp_counter("InDatagrams") - heard) / span
         pictures, carried = viewer.pictures - pictures, viewer.bytes - carried
-        sizes = {pid: maps_mib(pid) for pid in names}
+        sizes = {pid: read_maps_mib(pid) for pid in names}
         viewer.close()
-        with plain_node(run_dir) as plain:
+        with run_plain_node(run_dir) as plain:
             time.sleep(6.0)
-            plain_maps = maps_mib(plain)
-            joined = "plain" in [device["name"] for device in page.state()["devices"]]
-        weight = page.weight()
+            plain_maps = read_maps_mib(plain)
+            joined = "plain" in [device["name"] for device in page.read_state()["devices"]]
+        weight = page.measure_size()
     lines = [f"{'process':12}{'PSS MiB':>9}{'RSS MiB':>9}{'cores':>8}"]
     for pid, name in names.items():
         lines.append(f"{name:12}{sizes[pid]['Pss']:9.1f}{sizes[pid]['Rss']:9.1f}{shares[pid]:8.3f}")
@@ -271,7 +279,7 @@ def main(arguments: Sequence[str]) -> int:
     )
     given = parser.parse_args(arguments)
     with tempfile.TemporaryDirectory() as folder:
-        lines = measured(given.seed, given.seconds, Path(folder) / "run")
+        lines = measure(given.seed, given.seconds, Path(folder) / "run")
     sys.stdout.write("\n".join(lines) + "\n")
     return 1 if any("MISSED" in line or "NOT JOINED" in line for line in lines) else 0
 

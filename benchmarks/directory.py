@@ -16,21 +16,21 @@ from bisect import bisect_left
 from collections import Counter
 from collections.abc import Iterator, Sequence
 
-from benchmarks.dissemination import BITS, K, Ring
+from benchmarks.bidding import BITS, K, Ring
 from middleware.directory.listing import Listing
-from middleware.directory.prefix import WHOLE, depth_for, lease_at, places_of, size_of
-from middleware.directory.presence import MAX_DEPTH, Device, device_of
+from middleware.directory.prefix import MAX_UNDIVIDED, choose_depth, compute_lease, compute_places, estimate_size
+from middleware.directory.presence import MAX_DEPTH, Device, parse_device
 from middleware.entangled.contact import Contact
-from middleware.entangled.kademlia.distance import closest
-from middleware.entangled.network.switchboard import Weather
+from middleware.entangled.kademlia.distance import select_closest
+from middleware.entangled.network.switchboard import LinkConditions
 from middleware.entangled.record import Record
-from sim.team.world import SwarmFleet
+from sim.team.simulation import SwarmTeam
 
-SHARE = 0.01
+MAX_SHARE = 0.01
 """The maximum share of the directory at one node, for 10,000 devices."""
-LINK = Weather(delay_s=0.02, jitter_s=0.01)
-SMALL = 40
-PAUSE = 0.05
+LINK = LinkConditions(delay_s=0.02, jitter_s=0.01)
+SMALL_TEAM = 40
+PAUSE_S = 0.05
 """Seconds between two joins."""
 ALIVE_BYTES = 57
 """The encrypted datagram of a keep-alive; measured."""
@@ -46,46 +46,46 @@ class Model:
         self.depths: list[int] = []
         self.places: dict[bytes, list[Record]] = {}
         for contact in self.contacts:
-            near = self.nearest(contact.node_id, K + 1)[1:]
-            depth = depth_for(n if n <= WHOLE else size_of(contact.node_id, near))
+            near = self.find_nearest(contact.node_id, K + 1)[1:]
+            depth = choose_depth(n if n <= MAX_UNDIVIDED else estimate_size(contact.node_id, near))
             if rng.random() < wrong:
                 depth = min(MAX_DEPTH, max(0, depth + rng.choice((-1, 1))))
             self.depths.append(depth)
             device = Device(contact.node_id.hex(), "d", depth=depth)
-            for key in places_of(contact.node_id, depth):
-                record = Record(key, "d", contact.public, 1, "leased", 1.0, device.packed(), bytes(64))
+            for key in compute_places(contact.node_id, depth):
+                record = Record(key, "d", contact.public, 1, "leased", 1.0, device.pack(), bytes(64))
                 self.places.setdefault(key, []).append(record)
         self.held: Counter[bytes] = Counter()
         for key, records in self.places.items():
-            self.held.update({holder.node_id: len(records) for holder in self.nearest(key, K)})
+            self.held.update({holder.node_id: len(records) for holder in self.find_nearest(key, K)})
 
-    def nearest(self, target: bytes, count: int) -> list[Contact]:
+    def find_nearest(self, target: bytes, count: int) -> list[Contact]:
         """Return the ``count`` nodes closest to ``target``, from the narrowest id range with that many nodes."""
         number = int.from_bytes(target)
         for bit in range(BITS + 1):
             low = number >> bit << bit
             first, end = bisect_left(self._ids, low), bisect_left(self._ids, low + (1 << bit))
             if end - first >= min(count, len(self._ids)):
-                return closest(self.contacts[first:end], target, count)
+                return select_closest(self.contacts[first:end], target, count)
         return []
 
-    def listed(self, reader: int) -> Listing:
+    def make_listing(self, reader: int) -> Listing:
         """Return the listing that the device with that index obtains."""
         listing = Listing(floor=max(0, self.depths[reader] - 1))
-        while (place := listing.next()) is not None:
-            listing.read(place, self.places.get(place.key, []))
+        while (place := listing.take_next()) is not None:
+            listing.add_records(place, self.places.get(place.key, []))
         return listing
 
 
-def modelled(n: int, seed: int, wrong: float) -> list[str]:
+def make_model_row(n: int, seed: int, wrong: float) -> list[str]:
     """Return a row of the table for ``n`` devices."""
     model = Model(n, seed, wrong)
     loads = sorted(model.held.get(contact.node_id, 0) for contact in model.contacts)
-    listing = model.listed(0)
+    listing = model.make_listing(0)
     places = sum(map(len, model.places.values())) / n
-    lease = sum(lease_at(depth, 1.0) for depth in model.depths) / n
+    lease = sum(compute_lease(depth, 1.0) for depth in model.depths) / n
     signs = sum(
-        len(places_of(c.node_id, d)) * K * 3 / lease_at(d, 1.0)
+        len(compute_places(c.node_id, d)) * K * 3 / compute_lease(d, 1.0)
         for c, d in zip(model.contacts, model.depths, strict=True)
     )
     return [
@@ -104,7 +104,7 @@ def modelled(n: int, seed: int, wrong: float) -> list[str]:
     ]
 
 
-HEAD = [
+MODEL_HEADER = [
     *(
         "devices",
         "wrong",
@@ -122,17 +122,17 @@ HEAD = [
 ]
 
 
-class Team(SwarmFleet):
+class Team(SwarmTeam):
     """``n`` real nodes that join one after the other through the first, in virtual time."""
 
     def __init__(self, n: int, seed: int) -> None:
-        super().__init__(n, seed, LINK, PAUSE)
+        super().__init__(n, seed, LINK, PAUSE_S)
 
-    def held(self) -> list[int]:
+    def count_held(self) -> list[int]:
         """Return the number of device records at each live node."""
-        return [sum(device_of(r) is not None for r in node.store.records()) for node in self.nodes if node.running]
+        return [sum(parse_device(r) is not None for r in node.store.records()) for node in self.nodes if node.running]
 
-    def listed(self, place: int) -> Listing:
+    def make_listing(self, place: int) -> Listing:
         """Return the listing of one node, obtained within ten seconds."""
         work = self.nodes[place].list_devices()
         found: list[Listing] = []
@@ -140,19 +140,19 @@ class Team(SwarmFleet):
         self.clock.advance(10.0)
         return found[0] if found else Listing()
 
-    def row(self, what: str) -> list[str]:
+    def make_row(self, what: str) -> list[str]:
         """Return a row of the table for the present state of the team."""
-        began, sent, at = time.process_time(), self.board.counters["sent"], self.clock.seconds()
+        began, sent, at = time.process_time(), self.switchboard.counters["sent"], self.clock.seconds()
         self.clock.advance(20.0)
         running = [node for node in self.nodes if node.running]
-        n, held = len(running), self.held()
+        n, held = len(running), self.count_held()
         each = n * (self.clock.seconds() - at)
-        cpu, datagrams = (time.process_time() - began) / each, (self.board.counters["sent"] - sent) / each
+        cpu, datagrams = (time.process_time() - began) / each, (self.switchboard.counters["sent"] - sent) / each
         depths = [node.presence.device.depth for node in running]
         here = {node.uuid for node in running}
         unseen, strange, reads = 0, 0, 0
         for place in [place for place, node in enumerate(self.nodes) if node.running][:: max(1, n // 4)]:
-            listing = self.listed(place)
+            listing = self.make_listing(place)
             listed = {device.uuid for device, _ in listing.devices}
             unseen, strange = max(unseen, len(here - listed)), max(strange, len(listed - here))
             reads = max(reads, listing.reads)
@@ -163,38 +163,38 @@ class Team(SwarmFleet):
         ]
 
 
-TEAM_HEAD = [
+TEAM_HEADER = [
     *("team", "nodes", "depths", "held", "most", "share", "reads", "unseen", "gone but listed"),
     *("datagrams/s", "CPU ms/s"),
 ]
 
 
-def lived(n: int, seed: int) -> Iterator[list[str]]:
+def run_team(n: int, seed: int) -> Iterator[list[str]]:
     """Yield rows of a team of real nodes that settles, loses a quarter at once, and shrinks gracefully to 40."""
     team = Team(n, seed)
     team.clock.advance(40.0)
-    yield team.row("settled")
+    yield team.make_row("settled")
     rng = random.Random(f"{seed}/death")
     for node in rng.sample(team.nodes[1:], n // 4):
-        node.vanish()
-    yield team.row("quarter gone, 20 s")
+        node.stop_silently()
+    yield team.make_row("quarter gone, 20 s")
     team.clock.advance(60.0)
-    yield team.row("120 s and more")
+    yield team.make_row("120 s and more")
     running = [node for node in team.nodes if node.running]
-    for node in rng.sample(running[1:], max(0, len(running) - SMALL)):
+    for node in rng.sample(running[1:], max(0, len(running) - SMALL_TEAM)):
         node.stopService()
-        team.clock.advance(PAUSE)
+        team.clock.advance(PAUSE_S)
     team.clock.advance(80.0)
-    yield team.row("40 stay")
+    yield team.make_row("40 stay")
     for node in team.nodes:
         if node.running:
             node.stopService()
 
 
-MOST, UNSEEN = HEAD.index("most"), HEAD.index("unseen")
+MOST, UNSEEN = MODEL_HEADER.index("most"), MODEL_HEADER.index("unseen")
 
 
-def table(rows: Sequence[Sequence[str]]) -> str:
+def format_table(rows: Sequence[Sequence[str]]) -> str:
     """Format rows in columns, each as wide as its widest entry."""
     widths = [max(len(row[n]) for row in rows) for n in range(len(rows[0]))]
     return "\n".join("  ".join(cell.rjust(width) for cell, width in zip(row, widths, strict=True)) for row in rows)
@@ -209,15 +209,15 @@ def main(arguments: Sequence[str]) -> int:
     parser.add_argument("--team", type=int, default=0, help="number of real nodes, in a second table")
     parser.add_argument("--seed", type=int, default=1)
     chosen = parser.parse_args(arguments)
-    rows = [modelled(n, chosen.seed, wrong) for n in chosen.devices for wrong in (0.0, 0.2)]
-    print(table([HEAD, *rows]), flush=True)
+    rows = [make_model_row(n, chosen.seed, wrong) for n in chosen.devices for wrong in (0.0, 0.2)]
+    print(format_table([MODEL_HEADER, *rows]), flush=True)
     if chosen.team:
-        for row in lived(chosen.team, chosen.seed):  # each row takes minutes of processor time for large teams
-            print(", ".join(f"{name} {cell}" for name, cell in zip(TEAM_HEAD, row, strict=True)), flush=True)
+        for row in run_team(chosen.team, chosen.seed):  # each row takes minutes of processor time for large teams
+            print(", ".join(f"{name} {cell}" for name, cell in zip(TEAM_HEADER, row, strict=True)), flush=True)
     # Only rows with unmodified estimates count: with deliberate errors a listing may miss one device in some thousands.
     right = [row for row in rows if row[1] == "0%"]
     is_good = all(row[UNSEEN] == "0" for row in right)
-    return 0 if is_good and all(int(row[MOST]) <= max(100, SHARE * int(row[0])) for row in right) else 1
+    return 0 if is_good and all(int(row[MOST]) <= max(100, MAX_SHARE * int(row[0])) for row in right) else 1
 
 
 if __name__ == "__main__":

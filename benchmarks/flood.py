@@ -24,17 +24,17 @@ from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
-from benchmarks.measure import Child, percentile
-from middleware.admission import knock, membership
-from middleware.admission.operator import drawn
+from benchmarks.measure import ChildProcess, percentile
+from middleware.admission import join_codec, membership
+from middleware.admission.operator import create_operator
 from middleware.entangled.identity import Identity
-from middleware.entangled.wire import greeting, hail, session
+from middleware.entangled.wire import discovery, probe, session
 
-RATE = 20_000
-SECONDS = 20.0
+RATE_PER_S = 20_000
+DURATION_S = 20.0
 SOURCES = 1000
 PAUSE_S = 0.002
-FIRST_S = 4.0
+WARM_UP_S = 4.0
 """Seconds without a flood, for the reference values."""
 KINDS = ("random", "init", "data", "replay", "who", "hail", "knock", "mixed")
 TARGETS = {"good": 0.99, "late_ms": 100.0, "amplification": 1.0, "growth_mib": 16.0, "cost_us": 25.0, "rate": 0.9}
@@ -46,8 +46,8 @@ CAPS = {"responses": 512, "unconfirmed": 512, "peers": 4096, "sessions": 4096, "
 def main(arguments: Sequence[str] | None = None) -> int:
     """Measure and print; return 1 if a target is missed."""
     parser = argparse.ArgumentParser(prog="python -m benchmarks.flood", description=(__doc__ or "").splitlines()[0])
-    parser.add_argument("--seconds", type=float, default=SECONDS, help="duration of the flood (default %(default)s)")
-    parser.add_argument("--rate", type=int, default=RATE, help="datagrams a second (default %(default)s)")
+    parser.add_argument("--seconds", type=float, default=DURATION_S, help="duration of the flood (default %(default)s)")
+    parser.add_argument("--rate", type=int, default=RATE_PER_S, help="datagrams a second (default %(default)s)")
     parser.add_argument("--out", type=Path, help="write the figures to this file, as JSON")
     parser.add_argument("--fire", help=argparse.SUPPRESS)
     given = parser.parse_args(arguments)
@@ -66,7 +66,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 # -- the attacker --------------------------------------------------------------------------------------------------
 
 
-def makers(order: dict[str, Any]) -> dict[str, Callable[[], bytes]]:
+def make_generators(order: dict[str, Any]) -> dict[str, Callable[[], bytes]]:
     """Return a generator of datagrams for each kind, from the knowledge of an eavesdropper."""
     rng = random.Random(7)
     rubbish = rng.randbytes(1 << 20)
@@ -90,9 +90,9 @@ def makers(order: dict[str, Any]) -> dict[str, Callable[[], bytes]]:
         "init": lambda: bytes([session.INIT]) + some(1283) + bytes(16),
         "data": data,
         "replay": lambda: rng.choice(recorded),
-        "who": lambda: bytes([greeting.WHO]) + some(greeting.GREETING_BYTES - 1),
-        "hail": lambda: hail.hail(some(hail.TOKEN)),
-        "knock": lambda: bytes([knock.KNOCK]) + some(knock.KNOCK_BYTES - 1),
+        "who": lambda: bytes([discovery.DISCOVERY]) + some(discovery.DISCOVERY_BYTES - 1),
+        "hail": lambda: probe.pack_probe(some(probe.TOKEN_BYTES)),
+        "knock": lambda: bytes([join_codec.JOIN_REQUEST]) + some(join_codec.JOIN_REQUEST_BYTES - 1),
     }
     return {**single, "mixed": lambda: rng.choice(list(single.values()))()}
 
@@ -107,7 +107,7 @@ def _send_flood(order: dict[str, Any]) -> int:
         sender.setblocking(False)
         senders.append(sender)
     to = ("127.0.0.1", order["port"])
-    made = makers(order)
+    made = make_generators(order)
     fired = {}
     for kind, seconds in order["kinds"]:
         made_one = made[kind]
@@ -131,19 +131,19 @@ def _send_flood(order: dict[str, Any]) -> int:
 
 def _measure(seconds: float, rate: int) -> dict[str, Any]:
     rng = random.SystemRandom()
-    operator = drawn("flooded", rng)
-    first = operator.founded("target", ("device", "bootstrap", "gateway"), time.time(), rng)
-    second = operator.founded("friend", ("device", "gateway"), time.time(), rng, first.secrets[0][1])
-    children: list[Child] = []
+    operator = create_operator("flooded", rng)
+    first = operator.create_membership("target", ("device", "bootstrap", "gateway"), time.time(), rng)
+    second = operator.create_membership("friend", ("device", "gateway"), time.time(), rng, first.secrets[0][1])
+    children: list[ChildProcess] = []
     with tempfile.TemporaryDirectory(prefix="flood") as folder:
         paths = [Path(folder) / name for name in ("target", "friend")]
         for path, paper in zip(paths, (first, second), strict=True):
-            membership.made(path, paper)
+            membership.create_membership_file(path, paper)
         keys = [Identity(paper.seed).public.hex() for paper in (first, second)]
         try:
-            children.append(Child("benchmarks.flood_node", str(paths[0]), "", keys[1]))
+            children.append(ChildProcess("benchmarks.flood_node", str(paths[0]), "", keys[1]))
             port = children[0].read()["ready"]
-            children.append(Child("benchmarks.flood_node", str(paths[1]), f"127.0.0.1:{port}", keys[0]))
+            children.append(ChildProcess("benchmarks.flood_node", str(paths[1]), f"127.0.0.1:{port}", keys[0]))
             children[1].read()
             return _measure_kinds(children, port, seconds, rate)
         finally:
@@ -151,25 +151,25 @@ def _measure(seconds: float, rate: int) -> dict[str, Any]:
                 child.end()
 
 
-def _measure_kinds(children: list[Child], port: int, seconds: float, rate: int) -> dict[str, Any]:
+def _measure_kinds(children: list[ChildProcess], port: int, seconds: float, rate: int) -> dict[str, Any]:
     target, friend = children[:2]
     time.sleep(1.5)
-    begun = [target.asked(), friend.asked()]
-    time.sleep(FIRST_S)
-    quiet = [target.asked(), friend.asked()]
-    sender = Child("benchmarks.flood", "--fire", "yes")
+    begun = [target.request_report(), friend.request_report()]
+    time.sleep(WARM_UP_S)
+    quiet = [target.request_report(), friend.request_report()]
+    sender = ChildProcess("benchmarks.flood", "--fire", "yes")
     children.append(sender)
     each = seconds / len(KINDS)
     order = {"port": port, "rate": rate, "kinds": [(kind, each) for kind in KINDS]}
-    sender.say(json.dumps({**order, "recorded": quiet[0]["recorded"], "index": quiet[0]["index"]}))
-    idle = _share(begun[0], quiet[0])
+    sender.write(json.dumps({**order, "recorded": quiet[0]["recorded"], "index": quiet[0]["index"]}))
+    idle = _measure_core_share(begun[0], quiet[0])
     before, found = quiet[0], []
     calls, gaps, lags, trips = _sum_calls(()), [], [], []
     peak = quiet[0]["rss"]
     for kind in KINDS:
         fired = sender.read()
         time.sleep(0.05)  # datagrams in the socket buffer
-        now, other = target.asked(), friend.asked()
+        now, other = target.request_report(), friend.request_report()
         calls = _sum_calls((calls, now["calls"], other["calls"]))
         gaps += now["gaps"] + other["gaps"]
         lags += now["lags"]
@@ -177,7 +177,7 @@ def _measure_kinds(children: list[Child], port: int, seconds: float, rate: int) 
         peak = max(peak, now["rss"])
         found.append({"kind": kind, "fired": fired["fired"], **_compare(before, now, idle)})
         before = now
-        sender.say()
+        sender.write()
     return {
         "seconds": seconds,
         "rate": rate,
@@ -204,7 +204,7 @@ def _sum_calls(several: Sequence[dict[str, int]]) -> dict[str, int]:
     return {name: sum(each[name] for each in several) for name in ("good", "bad")}
 
 
-def _share(one: dict[str, Any], other: dict[str, Any]) -> float:
+def _measure_core_share(one: dict[str, Any], other: dict[str, Any]) -> float:
     """Return the share of a core between two reports."""
     return float((other["cpu"] - one["cpu"]) / (other["at"] - one["at"]))
 
@@ -217,7 +217,7 @@ def _compare(before: dict[str, Any], now: dict[str, Any], idle: float) -> dict[s
     return {
         "received": count,
         "cost_us": 1e6 * spent / max(1, count),
-        "core": _share(before, now),
+        "core": _measure_core_share(before, now),
         "in": bytes_in,
         "out": bytes_out,
         "late_ms": _p99_ms(now["gaps"]),

@@ -22,7 +22,7 @@ from twisted.internet import reactor as running  # noqa: E402
 from twisted.internet.protocol import Protocol  # noqa: E402
 from twisted.internet.stdio import StandardIO  # noqa: E402
 
-from benchmarks.measure import memory_bytes  # noqa: E402
+from benchmarks.measure import read_memory_bytes  # noqa: E402
 from middleware.admission.membership import MembershipFile  # noqa: E402
 from middleware.admission.team import Team  # noqa: E402
 from middleware.entangled.contact import Contact  # noqa: E402
@@ -31,11 +31,11 @@ from middleware.entangled.network.network import Address  # noqa: E402
 from middleware.entangled.network.udp import UdpNetwork  # noqa: E402
 from middleware.entangled.node import EntangledNode  # noqa: E402
 
-BEAT = 0.1
-CALL = 0.02
-TICK = 0.02
-KEPT = 64
-FOES = "127.66."
+HEARTBEAT_S = 0.1
+CALL_INTERVAL_S = 0.02
+TICK_S = 0.02
+MAX_RECORDED = 64
+FLOOD_PREFIX = "127.66."
 """Source addresses of the flood."""
 reactor: Any = running
 
@@ -56,7 +56,7 @@ class Node(Protocol):
             reactor,
             rng,
             wall=time.time,
-            door=self.team.door,
+            door=self.team.admission,
         )
         self.team.attach(self.node, reactor)
         self.endpoint = self.node.endpoint
@@ -72,7 +72,7 @@ class Node(Protocol):
         self._count_traffic()
         self.team.start()
         self.node.join(known)
-        for every, call in ((CALL, self._call), (BEAT, self._send_heartbeat), (TICK, self._tick)):
+        for every, call in ((CALL_INTERVAL_S, self._call), (HEARTBEAT_S, self._send_heartbeat), (TICK_S, self._tick)):
             self._repeat(every, call)
 
     def _clear(self) -> None:
@@ -104,15 +104,15 @@ class Node(Protocol):
         assert receive is not None
 
         def received(datagram: bytes, source: Address) -> None:
-            if source.host.startswith(FOES):
+            if source.host.startswith(FLOOD_PREFIX):
                 self._bytes["in"] += len(datagram)
                 self._bytes["count"] += 1
-            elif len(self._recorded) < KEPT:
+            elif len(self._recorded) < MAX_RECORDED:
                 self._recorded.append(datagram.hex())
             receive(datagram, source)
 
         def sent(datagram: bytes, to: Address) -> None:
-            if to.host.startswith(FOES):
+            if to.host.startswith(FLOOD_PREFIX):
                 self._bytes["out"] += len(datagram)
             send(datagram, to)
 
@@ -129,7 +129,7 @@ class Node(Protocol):
 
         again()
 
-    def _contacts(self) -> list[Contact]:
+    def _list_contacts(self) -> list[Contact]:
         return [contact for contact in self.node.overlay.contacts() if contact.public in self._others]
 
     def _call(self) -> None:
@@ -143,33 +143,33 @@ class Node(Protocol):
         def failed(failure: object) -> None:
             self.calls["bad"] += 1
 
-        for contact in self._contacts():
+        for contact in self._list_contacts():
             self.node.call(contact, "device.settings", value).addCallbacks(done, failed)
 
     def _send_heartbeat(self) -> None:
-        for contact in self._contacts():
-            self.endpoint.tell(contact, "stream.part", "beat")
+        for contact in self._list_contacts():
+            self.endpoint.notify(contact, "stream.part", "beat")
 
     def _record_heartbeat(self, peer: Contact, text: str) -> None:
         now = reactor.seconds()
         if self._beat_at:
-            self.gaps.append(now - self._beat_at - BEAT)
+            self.gaps.append(now - self._beat_at - HEARTBEAT_S)
         self._beat_at = now
 
     def _tick(self) -> None:
         now = reactor.seconds()
         if self._tick_at:
-            self.lags.append(now - self._tick_at - TICK)
+            self.lags.append(now - self._tick_at - TICK_S)
         self._tick_at = now
 
     def _report(self) -> dict[str, Any]:
         times = os.times()
         endpoint = self.endpoint
-        half, reach = endpoint._half_open, self.node.reach
+        half, reach = endpoint._half_open, self.node.nat
         report = {
             "at": reactor.seconds(),
             "cpu": times.user + times.system,
-            "rss": memory_bytes(),
+            "rss": read_memory_bytes(),
             "bytes": dict(self._bytes),
             "calls": self.calls,
             "gaps": self.gaps,
@@ -183,9 +183,9 @@ class Node(Protocol):
                 "responses": len(half._responses),
                 "unconfirmed": len(half._unconfirmed),
                 "peers": len(endpoint._peers._peers),
-                "assemblies": len(endpoint._courier._assemblies),
+                "assemblies": len(endpoint._fragmenter._incoming),
                 "led": len(self.network._port_by_target),
-                "seen": len(reach.outside._seen),
+                "seen": len(reach.external._reports),
             },
         }
         self._clear()

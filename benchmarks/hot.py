@@ -21,29 +21,29 @@ from twisted.internet.defer import Deferred
 
 from benchmarks.idle import Team
 from middleware.entangled.node import EntangledNode
-from middleware.entangled.record import hashed_key
+from middleware.entangled.record import hash_key
 
-STEP = 0.0001
-SETTLE = 5.0
+STEP_S = 0.0001
+SETTLE_S = 5.0
 QUARTERS = 4
 
 
-class Hot:
+class OperationBenchmark:
     """A settled team of ``n`` nodes, measured one operation after the other."""
 
     def __init__(self, n: int) -> None:
         self.team = Team(n, 1)
-        self.team.clock.advance(SETTLE)
+        self.team.clock.advance(SETTLE_S)
         self.failed = 0
 
     def wait(self, work: Deferred[Any]) -> None:
         """Advance the clock until ``work`` is done."""
         ended: list[Any] = []
-        work.addErrback(self._count).addCallback(ended.append)
+        work.addErrback(self._count_failure).addCallback(ended.append)
         while not ended:
-            self.team.clock.advance(STEP)
+            self.team.clock.advance(STEP_S)
 
-    def each(self, work: Callable[[int], Deferred[Any]], times: int, wide: int = 1) -> str:
+    def measure_each(self, work: Callable[[int], Deferred[Any]], times: int, wide: int = 1) -> str:
         """Return the cost of one of ``times`` operations, ``wide`` of them in parallel; the best quarter counts."""
         self.failed = 0
         gc.collect()
@@ -59,13 +59,13 @@ class Hot:
         cost = f"{best * 1e6:7.0f} us of CPU {(self.team.total_traffic.sent - sent) / times:6.1f} datagrams"
         return f"{cost} {span / times * 1e3:6.2f} ms, {self.failed} failed"
 
-    def _count(self, failure: Any) -> None:
+    def _count_failure(self, failure: Any) -> None:
         self.failed += 1
 
-    def join(self, place: int) -> str:
+    def measure_join(self, place: int) -> str:
         """Return the cost of a new node: its join, its first read of an existing key, and the five seconds after."""
         clock = self.team.clock
-        newcomer = self.team.made(place)
+        newcomer = self.team.make_node(place)
         lines = []
         sent, moment, began = self.team.total_traffic.sent, clock.seconds(), time.process_time()
 
@@ -76,7 +76,7 @@ class Hot:
         newcomer.start()
         self.wait(newcomer.join([self.team.address(0)]))
         lap("joined:")
-        self.wait(newcomer.get(hashed_key("h7"), "fast"))
+        self.wait(newcomer.get(hash_key("h7"), "fast"))
         lap("read:")
         clock.advance(5.0)
         lap("5 s later:")
@@ -93,9 +93,9 @@ def main() -> int:
     parser.add_argument("--flood", type=int, default=0, help="number of puts of one node, 64 at a time")
     parser.add_argument("--profile", action="store_true", help="print a profile of the puts and gets")
     arguments = parser.parse_args()
-    hot = Hot(arguments.nodes)
+    hot = OperationBenchmark(arguments.nodes)
     nodes, times = list(hot.team.nodes), arguments.times
-    key = [hashed_key(f"h{number}") for number in range(times)]
+    key = [hash_key(f"h{number}") for number in range(times)]
     profile = cProfile.Profile()
     if arguments.profile:
         profile.enable()
@@ -103,24 +103,24 @@ def main() -> int:
     def remote(number: int) -> EntangledNode:
         """Return a node that does not store the key, if there is one."""
         at = key[number % 50]
-        others = [node for node in nodes if not node.replica.held(at)] or nodes
+        others = [node for node in nodes if not node.replica.get_held(at)] or nodes
         return others[number % len(others)]
 
-    print("put         ", hot.each(lambda n: nodes[n % len(nodes)].put(key[n], "v", b"x" * 100), times))
+    print("put         ", hot.measure_each(lambda n: nodes[n % len(nodes)].put(key[n], "v", b"x" * 100), times))
     asker = {number: remote(number) for number in range(times)}
-    print("get fast    ", hot.each(lambda n: asker[n].get(key[n % 50], "fast"), times))
-    print("get majority", hot.each(lambda n: asker[n].get(key[n % 50], "majority"), times))
+    print("get fast    ", hot.measure_each(lambda n: asker[n].get(key[n % 50], "fast"), times))
+    print("get majority", hot.measure_each(lambda n: asker[n].get(key[n % 50], "majority"), times))
     if arguments.profile:
         profile.disable()
         pstats.Stats(profile).sort_stats("tottime").print_stats(35)
     if arguments.flood:
-        flooded = hot.each(lambda n: nodes[1].put(hashed_key(f"f{n}"), "v", b"x" * 100), arguments.flood, 64)
+        flooded = hot.measure_each(lambda n: nodes[1].put(hash_key(f"f{n}"), "v", b"x" * 100), arguments.flood, 64)
         dropped: Counter[str] = Counter()
         for node in nodes:
             dropped += node.endpoint.counters
         print("flood       ", flooded, dict(dropped))
     for place in range(arguments.joins):
-        print("join", hot.join(200 + place))
+        print("join", hot.measure_join(200 + place))
     return 0
 
 

@@ -16,38 +16,40 @@ from typing import Any
 from twisted.internet.defer import Deferred
 
 from middleware.entangled.errors import EntangledError
-from middleware.entangled.network.switchboard import Weather
+from middleware.entangled.network.switchboard import LinkConditions
 from middleware.entangled.node import EntangledNode
-from middleware.entangled.record import hashed_key
-from sim.team.world import Fleet
+from middleware.entangled.record import hash_key
+from sim.team.simulation import EntangledTeam
 
 MAX_BYTES_S = 1000.0
-MAX_CORE = 0.001
-HEADER = 28
+MAX_CORE_SHARE = 0.001
+IP_UDP_HEADER_BYTES = 28
 """Bytes of the IP and UDP headers of a datagram."""
 
 
-class Team(Fleet):
+class Team(EntangledTeam):
     """``n`` nodes in one network with a one-way delay of 0.2 ms."""
 
     def __init__(self, n: int, seed: int) -> None:
-        super().__init__(n, seed, Weather(delay_s=0.0002))
+        super().__init__(n, seed, LinkConditions(delay_s=0.0002))
         self.random = random.Random(seed)
 
-    def sent(self) -> tuple[int, int]:
+    def count_sent(self) -> tuple[int, int]:
         """Return the datagrams and bytes that all nodes have sent."""
-        return self.total_traffic.sent, self.total_traffic.sent_bytes + HEADER * self.total_traffic.sent
+        return self.total_traffic.sent, self.total_traffic.sent_bytes + IP_UDP_HEADER_BYTES * self.total_traffic.sent
 
-    def spent(self, seconds: float) -> tuple[float, float, float]:
+    def measure_idle(self, seconds: float) -> tuple[float, float, float]:
         """Return the datagrams and bytes that an idle node sends per second, and its share of a core."""
-        before, began = self.sent(), time.process_time()
+        before, began = self.count_sent(), time.process_time()
         self.clock.advance(seconds)
         took = time.process_time() - began
         each = seconds * len(self.nodes)
-        datagrams, octets = self.sent()
+        datagrams, octets = self.count_sent()
         return (datagrams - before[0]) / each, (octets - before[1]) / each, took / each
 
-    def cost(self, work: Callable[[EntangledNode], Deferred[Any]], times: int) -> tuple[float, list[float], int]:
+    def measure_operations(
+        self, work: Callable[[EntangledNode], Deferred[Any]], times: int
+    ) -> tuple[float, list[float], int]:
         """Return datagrams per operation (``times`` operations at random nodes), durations, and failures."""
         before, failed = self.total_traffic.sent, 0
         took: list[float] = []
@@ -73,36 +75,39 @@ def main() -> int:
     arguments = parser.parse_args()
     team = Team(arguments.nodes, 1)
     team.clock.advance(30.0)
-    datagrams, octets, core = team.spent(arguments.seconds)
+    datagrams, octets, core = team.measure_idle(arguments.seconds)
     idle = f"{datagrams:.1f} datagrams/s, {octets:.0f} bytes/s, {core:.3%} of a core each"
-    say(f"idle, {arguments.nodes} nodes: {idle}")
+    print_line(f"idle, {arguments.nodes} nodes: {idle}")
     numbers = iter(range(10**6))
-    puts = team.cost(lambda node: node.put(hashed_key(f"k{next(numbers)}"), "v", b"x" * 100), 200)
-    report("put", puts)
-    report("get fast", team.cost(lambda node: node.get(some(team.random), "fast"), 200))
-    report("get majority", team.cost(lambda node: node.get(some(team.random), "majority"), 200))
+    puts = team.measure_operations(lambda node: node.put(hash_key(f"k{next(numbers)}"), "v", b"x" * 100), 200)
+    print_row("put", puts)
+    print_row("get fast", team.measure_operations(lambda node: node.get(choose_key(team.random), "fast"), 200))
+    print_row("get majority", team.measure_operations(lambda node: node.get(choose_key(team.random), "majority"), 200))
     if arguments.loss:
         for node in team.random.sample(team.nodes, len(team.nodes) // 2):
-            node.vanish()
-        report("get fast, half silent", team.cost(lambda node: node.get(some(team.random), "fast"), 100))
-    return int(octets > MAX_BYTES_S or core > MAX_CORE)
+            node.stop_silently()
+        print_row(
+            "get fast, half silent",
+            team.measure_operations(lambda node: node.get(choose_key(team.random), "fast"), 100),
+        )
+    return int(octets > MAX_BYTES_S or core > MAX_CORE_SHARE)
 
 
-def some(rng: random.Random) -> bytes:
+def choose_key(rng: random.Random) -> bytes:
     """Return one of the stored keys."""
-    return hashed_key(f"k{rng.randrange(200)}")
+    return hash_key(f"k{rng.randrange(200)}")
 
 
-def say(line: str) -> None:
+def print_line(line: str) -> None:
     """Print a line."""
     sys.stdout.write(line + "\n")
 
 
-def report(what: str, figures: tuple[float, list[float], int]) -> None:
+def print_row(what: str, figures: tuple[float, list[float], int]) -> None:
     """Print one row."""
     datagrams, took, failed = figures
     p50, p95 = took[len(took) // 2], took[len(took) * 95 // 100]
-    say(
+    print_line(
         f"{what}: {datagrams:.1f} datagrams, p50 {p50 * 1000:.1f} ms, p95 {p95 * 1000:.1f} ms, "
         f"max {took[-1] * 1000:.1f} ms, {failed} of {len(took)} without a result"
     )

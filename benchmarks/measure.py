@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any
 
 MIB = 2**20
-TICKS = os.sysconf("SC_CLK_TCK")
+TICKS_PER_S = os.sysconf("SC_CLK_TCK")
 
 
 def percentile(values: Sequence[float], share: float) -> float:
@@ -21,25 +21,25 @@ def percentile(values: Sequence[float], share: float) -> float:
     return ordered[min(len(ordered) - 1, int(share * len(ordered)))] if ordered else math.inf
 
 
-def processor_s(pid: int) -> float:
+def read_cpu_s(pid: int) -> float:
     """Return the processor seconds of a process."""
     fields = Path(f"/proc/{pid}/stat").read_text(encoding="ascii").rpartition(")")[2].split()
-    return (int(fields[11]) + int(fields[12])) / TICKS
+    return (int(fields[11]) + int(fields[12])) / TICKS_PER_S
 
 
-def memory_bytes(field: str = "VmRSS", pid: int | str = "self") -> int:
+def read_memory_bytes(field: str = "VmRSS", pid: int | str = "self") -> int:
     """Return the memory of a process in bytes: resident now (``VmRSS``), or the maximum (``VmHWM``)."""
     lines = dict(line.split(":", 1) for line in Path(f"/proc/{pid}/status").read_text(encoding="ascii").splitlines())
     return int(lines[field].split()[0]) * 1024
 
 
-def maps_mib(pid: int) -> dict[str, float]:
+def read_maps_mib(pid: int) -> dict[str, float]:
     """Return the memory of a process in MiB by kind: ``Rss``, ``Pss``, ``Private_Clean`` and others."""
     lines = Path(f"/proc/{pid}/smaps_rollup").read_text().splitlines()[1:]
     return {line.split(":")[0]: float(line.split()[1]) / 1024 for line in lines if line.endswith("kB")}
 
 
-def udp_count(name: str) -> int:
+def read_udp_counter(name: str) -> int:
     """Return a UDP counter of this machine, such as ``InDatagrams``, which counts the datagrams of all processes.
 
     In a separate network namespace (``benchmarks/README.md``) it counts only the nodes.
@@ -48,7 +48,7 @@ def udp_count(name: str) -> int:
     return int(rows[1][rows[0].index(name)])
 
 
-class Child:
+class ChildProcess:
     """A child process that answers requests in lines of JSON."""
 
     def __init__(self, module: str, *arguments: object) -> None:
@@ -64,15 +64,15 @@ class Child:
         found: dict[str, Any] = json.loads(line)
         return found
 
-    def say(self, what: str = "") -> None:
+    def write(self, what: str = "") -> None:
         """Write a line."""
         assert self.process.stdin is not None
         self.process.stdin.write(what + "\n")
         self.process.stdin.flush()
 
-    def asked(self) -> dict[str, Any]:
+    def request_report(self) -> dict[str, Any]:
         """Request and return a report."""
-        self.say()
+        self.write()
         return self.read()
 
     def end(self) -> None:

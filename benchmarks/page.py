@@ -20,9 +20,9 @@ import time
 from collections.abc import Callable, Coroutine, Sequence
 from typing import Any
 
-from benchmarks.measure import Child, percentile
-from benchmarks.page_team import CODE, MARK, ROBOTS
-from sim.demo import port
+from benchmarks.measure import ChildProcess, percentile
+from benchmarks.page_team import CODE, JPEG_START, ROBOTS
+from sim.demo import free_ports
 
 ADDRESSES = 64
 DRIBBLE_S = 1.0
@@ -55,7 +55,7 @@ class Connection:
     async def __aexit__(self, *_: object) -> None:
         self.writer.close()
 
-    async def ask(self, path: str, method: str = "GET", body: str = "") -> tuple[int, dict[str, str]]:
+    async def request(self, path: str, method: str = "GET", body: str = "") -> tuple[int, dict[str, str]]:
         """Send one request; return the status and the headers of the answer."""
         head = f"{method} {path} HTTP/1.1\r\nHost: 127.0.0.1\r\nX-Swarm: 1\r\nContent-Length: {len(body)}\r\n\r\n"
         self.writer.write(head.encode() + body.encode())
@@ -63,13 +63,13 @@ class Connection:
         headers = {name.lower(): value.strip() for name, _, value in (line.partition(":") for line in lines[1:])}
         return int(lines[0].split()[1]), headers
 
-    async def whole(self, path: str, method: str = "GET", body: str = "") -> tuple[int, dict[str, str], bytes]:
+    async def request_body(self, path: str, method: str = "GET", body: str = "") -> tuple[int, dict[str, str], bytes]:
         """Send one request; return status, headers and body."""
-        status, headers = await self.ask(path, method, body)
+        status, headers = await self.request(path, method, body)
         return status, headers, await self.reader.readexactly(int(headers.get("content-length", 0)))
 
 
-class Load:
+class PageLoad:
     """All clients of one web node, and their measurements."""
 
     def __init__(self, where: int, ticket: str, uuids: Sequence[str]) -> None:
@@ -84,16 +84,16 @@ class Load:
         self._ticket = ticket
         self._uuids = uuids
 
-    def forget(self) -> None:
+    def reset(self) -> None:
         """Restart the measurements, after all clients have connected."""
         self.longest = 0.0
         for each in (self.ages, self.slow, self.answers):
             each.clear()
 
-    async def events(self, number: int) -> None:
+    async def run_page(self, number: int) -> None:
         """Run one open page."""
         async with Connection(self._where, number) as line:
-            await line.ask(f"/events?ticket={self._ticket}")
+            await line.request(f"/events?ticket={self._ticket}")
             self.beats[number] = time.monotonic()
             while True:
                 if (await line.reader.readline()).startswith(b"event: beat"):
@@ -101,31 +101,31 @@ class Load:
                     self.longest = max(self.longest, now - self.beats[number])
                     self.beats[number] = now
 
-    async def camera(self, number: int) -> None:
+    async def run_camera_viewer(self, number: int) -> None:
         """Run one viewer of a camera at full rate."""
         async with Connection(self._where, number) as line:
             after = ""
             while True:
-                status, headers, body = await line.whole(self._shot(number, after))
+                status, headers, body = await line.request_body(self._make_image_path(number, after))
                 if status == 200:
                     after = headers["x-seq"]
-                    self.ages.append(_age(body))
+                    self.ages.append(_read_age(body))
 
-    async def slowly(self, number: int) -> None:
+    async def run_slow_viewer(self, number: int) -> None:
         """Run one viewer on a slow link, and measure the age of each picture when it is complete."""
         async with Connection(self._where, number, 4096) as line:
             after = ""
             while True:
-                status, headers = await line.ask(self._shot(number, after))
+                status, headers = await line.request(self._make_image_path(number, after))
                 size, body = int(headers.get("content-length", 0)), b""
                 while len(body) < size:
                     body += await line.reader.read(min(1000, size - len(body)))
                     await asyncio.sleep(1000 / SLOW_BYTES)
                 if status == 200:
                     after = headers["x-seq"]
-                    self.slow.append(_age(body))
+                    self.slow.append(_read_age(body))
 
-    async def dribble(self, number: int) -> None:
+    async def run_dribbler(self, number: int) -> None:
         """Run one client that sends a byte a second, until it is disconnected."""
         async with Connection(self._where, number) as line:
             began = time.monotonic()
@@ -136,36 +136,36 @@ class Load:
                     break
             self.closed.append(time.monotonic() - began)
 
-    async def requests(self, rate: float) -> None:
+    async def send_requests(self, rate: float) -> None:
         """Send ``rate`` requests a second in total, each timed from its scheduled time."""
-        await asyncio.gather(*(self._requests(number, rate / 20, number / rate) for number in range(20)))
+        await asyncio.gather(*(self._send_requests_of(number, rate / 20, number / rate) for number in range(20)))
 
-    async def _requests(self, number: int, rate: float, first: float) -> None:
+    async def _send_requests_of(self, number: int, rate: float, first: float) -> None:
         due = time.monotonic() + first
         async with Connection(self._where, number) as line:
             while True:
                 await asyncio.sleep(max(0.0, due - time.monotonic()))
-                status, _, _ = await line.whole(f"/api/v1/state?ticket={self._ticket}")
+                status, _, _ = await line.request_body(f"/api/v1/state?ticket={self._ticket}")
                 self.answers.append(time.monotonic() - due)
                 self.refused += status != 200
                 due += 1 / rate
 
-    def _shot(self, number: int, after: str) -> str:
+    def _make_image_path(self, number: int, after: str) -> str:
         uuid = self._uuids[number % len(self._uuids)]
         return f"/shot/{uuid}?after={after}&viewer=bench{number}&ticket={self._ticket}"
 
 
-def _age(picture: bytes) -> float:
-    return time.monotonic() - float(struct.unpack("!d", picture[len(MARK) : len(MARK) + 8])[0])
+def _read_age(picture: bytes) -> float:
+    return time.monotonic() - float(struct.unpack("!d", picture[len(JPEG_START) : len(JPEG_START) + 8])[0])
 
 
-async def signed_in(where: int) -> tuple[str, list[str]]:
+async def sign_in(where: int) -> tuple[str, list[str]]:
     """Return a ticket, and the robots' uuids as soon as all robots are present."""
     async with Connection(where, 0) as line:
-        _, _, body = await line.whole("/api/v1/session", "POST", json.dumps({"code": CODE}))
+        _, _, body = await line.request_body("/api/v1/session", "POST", json.dumps({"code": CODE}))
         ticket = json.loads(body)["ticket"]
         for _ in range(200):
-            _, _, body = await line.whole(f"/api/v1/devices?ticket={ticket}")
+            _, _, body = await line.request_body(f"/api/v1/devices?ticket={ticket}")
             found = {device["name"]: device["uuid"] for device in json.loads(body)}
             if set(ROBOTS) <= set(found):
                 return ticket, [found[name] for name in ROBOTS]
@@ -173,24 +173,28 @@ async def signed_in(where: int) -> tuple[str, list[str]]:
     raise SystemExit("bench-page: the robots did not join in time")
 
 
-async def measured(given: Any, web: Child, where: int) -> list[str]:
+async def measure(given: Any, web: ChildProcess, where: int) -> list[str]:
     """Measure and return the lines of the table."""
-    ticket, uuids = await signed_in(where)
-    load = Load(where, ticket, uuids)
+    ticket, uuids = await sign_in(where)
+    load = PageLoad(where, ticket, uuids)
     await asyncio.sleep(2)
-    before = web.asked()
-    kinds = [(load.events, given.streams), (load.camera, given.cameras), (load.dribble, given.dribblers)]
+    before = web.request_report()
+    kinds = [
+        (load.run_page, given.streams),
+        (load.run_camera_viewer, given.cameras),
+        (load.run_dribbler, given.dribblers),
+    ]
     tasks = [
         asyncio.ensure_future(_run_after(ARRIVAL_S * number / count, client, number))
         for client, count in kinds
         for number in range(count)
     ]
-    tasks += [asyncio.ensure_future(load.slowly(1)), asyncio.ensure_future(load.requests(given.rate))]
+    tasks += [asyncio.ensure_future(load.run_slow_viewer(1)), asyncio.ensure_future(load.send_requests(given.rate))]
     await asyncio.sleep(ARRIVAL_S + 1)
-    load.forget()
-    midway = web.asked()
+    load.reset()
+    midway = web.request_report()
     await asyncio.sleep(given.seconds)
-    after = web.asked()
+    after = web.request_report()
     unfed = given.streams - sum(time.monotonic() - at < 2 for at in load.beats.values())
     open_still = given.dribblers - len(load.closed)
     broken = [task for task in tasks if task.done() and task.exception() is not None]
@@ -240,13 +244,16 @@ def main(arguments: Sequence[str]) -> int:
     most = resource.getrlimit(resource.RLIMIT_NOFILE)[1]
     # Both ends of each connection are files; the child processes inherit this limit.
     resource.setrlimit(resource.RLIMIT_NOFILE, (min(4096, most), most))
-    udp, where = port.free("udp", "127.0.0.1", 1)[0], port.free("tcp", "127.0.0.1", 1)[0]
-    web = Child("benchmarks.page_team", "web", udp, where)
-    robots = Child("benchmarks.page_team", "robots", udp)
+    udp, where = (
+        free_ports.find_free_ports("udp", "127.0.0.1", 1)[0],
+        free_ports.find_free_ports("tcp", "127.0.0.1", 1)[0],
+    )
+    web = ChildProcess("benchmarks.page_team", "web", udp, where)
+    robots = ChildProcess("benchmarks.page_team", "robots", udp)
     try:
         for child in (web, robots):
             child.read()
-        lines = asyncio.run(measured(given, web, where))
+        lines = asyncio.run(measure(given, web, where))
     finally:
         robots.end()
         web.end()

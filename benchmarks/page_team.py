@@ -16,14 +16,14 @@ from typing import Any
 from twisted.internet.stdio import StandardIO
 from twisted.protocols.basic import LineReceiver
 
-from benchmarks.measure import MIB, memory_bytes, percentile
+from benchmarks.measure import MIB, percentile, read_memory_bytes
 from middleware.config.settings import Settings
 from middleware.entangled.clock import use_monotonic_time
 from middleware.node import CAMERA
-from swarmnode.ballast import STARTED_S, drop_tls, warmed_up
+from swarmnode.environment import make_dependencies
+from swarmnode.memory_savings import STARTUP_S, block_tls_import, release_memory
 from swarmnode.service import NodeService
-from swarmnode.web import web_page
-from swarmnode.world import real_seams
+from swarmnode.web import make_web_page
 
 ROBOTS = ("dog1", "dog2", "dog3")
 CODE = "page-bench"
@@ -33,10 +33,10 @@ FPS, PICTURE = 30.0, 6000
 WORDS_S = 0.5
 """Seconds between two messages of each robot, which change the state."""
 TICK_S = 0.002
-MARK = b"\xff\xd8"
+JPEG_START = b"\xff\xd8"
 
 
-def settings(name: str, port: int, **tables: Any) -> Settings:
+def make_settings(name: str, port: int, **tables: Any) -> Settings:
     """Return the settings of a node on this machine without stored data; ``port`` is the web node's."""
     known = [] if "web" in tables else [f"127.0.0.1:{port}"]
     node = {"name": name, "host": "127.0.0.1", "port": port if "web" in tables else 0, "known_nodes": known}
@@ -44,7 +44,7 @@ def settings(name: str, port: int, **tables: Any) -> Settings:
     return Settings.from_mapping({"node": {**node, "team_key": KEY, "roles": roles, "store": ":memory:"}, **tables}, "")
 
 
-class Orders(LineReceiver):
+class ReportProtocol(LineReceiver):
     """Answer each line with measurements; exit at the end of the input."""
 
     delimiter = b"\n"
@@ -65,7 +65,7 @@ class Orders(LineReceiver):
         told = {
             "late_ms": 1000 * late[-1],
             "late_p99_ms": 1000 * percentile(late, 0.99),
-            "rss": memory_bytes() / MIB,
+            "rss": read_memory_bytes() / MIB,
             "processor_s": time.process_time(),
         }
         self.sendLine(json.dumps(told).encode())
@@ -79,16 +79,16 @@ class Orders(LineReceiver):
 def main(arguments: list[str]) -> None:
     """Run the web node, or the robots."""
     use_monotonic_time()
-    drop_tls()
+    block_tls_import()
     from twisted.internet import reactor as made
 
     reactor: Any = made
     late: list[float] = []
     if arguments[0] == "web":
         ports = [int(word) for word in arguments[1:]]
-        wanted = settings("vaio", ports[0], web={"host": "127.0.0.1", "port": ports[1], "code": CODE})
-        seams = real_seams(wanted, reactor)
-        services = [NodeService(wanted, seams, [partial(web_page, wanted, seams, reactor)])]
+        wanted = make_settings("vaio", ports[0], web={"host": "127.0.0.1", "port": ports[1], "code": CODE})
+        seams = make_dependencies(wanted, reactor)
+        services = [NodeService(wanted, seams, [partial(make_web_page, wanted, seams, reactor)])]
 
         def tick(due: float) -> None:
             now = reactor.seconds()
@@ -98,18 +98,18 @@ def main(arguments: list[str]) -> None:
         reactor.callWhenRunning(lambda: tick(reactor.seconds()))
     else:
         port = int(arguments[1])
-        services = [robot(name, port, reactor) for name in ROBOTS]
+        services = [make_robot(name, port, reactor) for name in ROBOTS]
     for service in services:
         reactor.callWhenRunning(service.startService)
         reactor.addSystemEventTrigger("before", "shutdown", service.stopService)
-    reactor.callLater(STARTED_S, warmed_up)
-    reactor.callWhenRunning(lambda: StandardIO(Orders(reactor, {"is": arguments[0]}, late), reactor=reactor))
+    reactor.callLater(STARTUP_S, release_memory)
+    reactor.callWhenRunning(lambda: StandardIO(ReportProtocol(reactor, {"is": arguments[0]}, late), reactor=reactor))
     reactor.run()
 
 
-def robot(name: str, port: int, reactor: Any) -> NodeService:
+def make_robot(name: str, port: int, reactor: Any) -> NodeService:
     """Run a robot with a camera that encodes the time in its pictures, and that sends a message from time to time."""
-    wanted = settings(name, port)
+    wanted = make_settings(name, port)
     camera = {CAMERA: {"width": 208, "height": 160, "fps": FPS}}
     wanted = Settings.from_mapping(
         {
@@ -125,15 +125,15 @@ def robot(name: str, port: int, reactor: Any) -> NodeService:
         },
         "",
     )
-    service = NodeService(wanted, real_seams(wanted, reactor))
+    service = NodeService(wanted, make_dependencies(wanted, reactor))
     node = service.assembly.node
 
     def shoot(number: int) -> None:
-        node.streams.offer(CAMERA, number, MARK + struct.pack("!d", time.monotonic()) + bytes(PICTURE))
+        node.streams.publish(CAMERA, number, JPEG_START + struct.pack("!d", time.monotonic()) + bytes(PICTURE))
         reactor.callLater(1 / FPS, shoot, number + 1)
 
     def say(number: int) -> None:
-        node.presence.say(time.time(), f"word {number}")
+        node.presence.add_message(time.time(), f"word {number}")
         reactor.callLater(WORDS_S, say, number + 1)
 
     reactor.callWhenRunning(shoot, 1)

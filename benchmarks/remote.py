@@ -9,15 +9,15 @@ from pathlib import Path
 from typing import Any
 
 
-class Lost(Exception):
+class OrderFailed(Exception):
     """A process exited, did not answer an order in time, or could not execute it."""
 
 
-class Unable(Lost):
+class OrderImpossible(OrderFailed):
     """The error that a process reports for an order that it cannot execute."""
 
 
-class Remote:
+class RemoteProcess:
     """A child process, called ``name`` in errors; the file ``errors`` has its standard error.
 
     It sends an answer with the id 0 when it is ready for orders.
@@ -33,11 +33,11 @@ class Remote:
         self._waiting: dict[int, asyncio.Future[dict[str, Any]]] = {0: asyncio.get_running_loop().create_future()}
         self._reading = asyncio.ensure_future(self._read())
 
-    async def up(self, limit_s: float) -> None:
+    async def wait_ready(self, limit_s: float) -> None:
         """Wait until it is ready for orders."""
         await self._await_answer(0, "come up", limit_s)
 
-    async def order(self, do: str, patience_s: float, /, **fields: Any) -> dict[str, Any]:
+    async def run_order(self, do: str, patience_s: float, /, **fields: Any) -> dict[str, Any]:
         """Execute an order and return its answer; raises ``Lost``."""
         self._number += 1
         self._waiting[self._number] = asyncio.get_running_loop().create_future()
@@ -45,18 +45,18 @@ class Remote:
         self._process.stdin.write(json.dumps({"do": do, "id": self._number, **fields}).encode() + b"\n")
         answer = await self._await_answer(self._number, do, patience_s)
         if "cannot" in answer:
-            raise Unable(answer["cannot"])
+            raise OrderImpossible(answer["cannot"])
         return answer
 
-    def send(self, number: signal.Signals) -> None:
+    def send_signal(self, number: signal.Signals) -> None:
         """Kill or stop the process; either way it accepts no more orders."""
         self.is_alive = False
         if self._process.returncode is None:
             self._process.send_signal(number)
 
-    async def ended(self) -> None:
+    async def kill(self) -> None:
         """Kill it, also if it is stopped, and wait until it has exited."""
-        self.send(signal.SIGKILL)
+        self.send_signal(signal.SIGKILL)
         await self._process.wait()
         self._reading.cancel()
 
@@ -64,7 +64,7 @@ class Remote:
         try:
             return await asyncio.wait_for(self._waiting[number], limit_s)
         except TimeoutError:
-            raise Lost(f"{self.name} did not {what} within {limit_s:g} s") from None
+            raise OrderFailed(f"{self.name} did not {what} within {limit_s:g} s") from None
         finally:
             self._waiting.pop(number, None)
 
@@ -78,5 +78,5 @@ class Remote:
         last = (self._errors.read_text(errors="replace").strip() or "without a word").splitlines()[-1]
         for waiting in self._waiting.values():
             if not waiting.done():
-                waiting.set_exception(Lost(f"the process of {self.name} ended: {last}"))
+                waiting.set_exception(OrderFailed(f"the process of {self.name} ended: {last}"))
                 waiting.exception()

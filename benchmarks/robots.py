@@ -16,13 +16,13 @@ import time
 from collections.abc import Sequence
 from typing import Any
 
-from benchmarks.measure import MIB, memory_bytes, processor_s
+from benchmarks.measure import MIB, read_cpu_s, read_memory_bytes
 from drivers.reading import Observation
 
 DOGS = 3
-SERVICES = ("main", "estop", "state", "walk", "head", "camera")
-START_S = 30.0
-COMMAND_S = 0.1
+AIBO_SERVICES = ("main", "estop", "state", "walk", "head", "camera")
+START_LIMIT_S = 30.0
+COMMAND_INTERVAL_S = 0.1
 TARGETS = {"frame_s": 0.032, "late_s": 0.020, "fps": 30.0, "wheel_ms": 20.0, "core": 0.05, "rss_mib": 45.0}
 """Seconds between world states and the delay of 95 of 100, pictures a second, and the limits of a driver."""
 
@@ -57,15 +57,15 @@ def _emulate(ports: list[dict[str, int]]) -> int:
     from sim.robots.dog import LIMITS
     from sim.robots.emulator.aibo import AiboServer
     from sim.robots.emulator.aibo_dog import AiboEmulator
-    from sim.robots.scene import loaded
-    from sim.robots.yard import Yard
+    from sim.robots.scene import load_scene
+    from sim.robots.simulator import RobotSimulator
 
     reactor: Any = running
-    yard = Yard(reactor, Random(1), loaded("three-dogs"))
+    yard = RobotSimulator(reactor, Random(1), load_scene("three-dogs"))
     # The output is read at the end only, and a full pipe would block the simulator.
     legs: list[tuple[int, float, float]] = []
     for number, served in enumerate(ports):
-        body: Any = yard.lend(f"dog{number + 1}", LIMITS)
+        body: Any = yard.reserve_for_emulator(f"dog{number + 1}", LIMITS)
         drive = body.drive
 
         def stamped(vx: float, vy: float, wz: float, number: int = number, drive: Any = drive) -> None:
@@ -86,15 +86,15 @@ def _emulate(ports: list[dict[str, int]]) -> int:
 # -- one driver ---------------------------------------------------------------------------------------------------
 
 
-class Driven:
+class DriverProcess:
     """One driver process: it sends a command each ``COMMAND_S``, and records the times of all received data."""
 
     def __init__(self, reactor: Any, options: dict[str, Any], seconds: float) -> None:
-        from drivers.registry import driver_for
+        from drivers.registry import create_driver
 
         self._reactor = reactor
         self._seconds = seconds
-        self._driver: Any = driver_for("aibo", options, "dog", reactor)
+        self._driver: Any = create_driver("aibo", options, "dog", reactor)
         self._frames: list[float] = []
         self._pictures: set[int] = set()
         self._commands: list[tuple[float, float]] = []
@@ -110,7 +110,7 @@ class Driven:
 
     def _begin(self) -> None:
         self._ends_at = self._reactor.seconds() + self._seconds
-        self._before = (time.monotonic(), processor_s(os.getpid()))
+        self._before = (time.monotonic(), read_cpu_s(os.getpid()))
         self._driver.subscribe(self._on_observation)
         self._command()
 
@@ -130,7 +130,7 @@ class Driven:
         vx = 0.05 + (self._count % 1000) * 1e-5
         self._commands.append((vx, time.monotonic()))
         self._driver.act({"base.vx": vx}, Permit(1, now + 0.5))
-        self._reactor.callLater(COMMAND_S, self._command)
+        self._reactor.callLater(COMMAND_INTERVAL_S, self._command)
 
     def _write_report(self) -> None:
         began, spent = self._before
@@ -139,8 +139,8 @@ class Driven:
             "frames": self._frames,
             "pictures": len(self._pictures) / took,
             "commands": self._commands,
-            "core": (processor_s(os.getpid()) - spent) / took,
-            "rss_mib": memory_bytes() / MIB,
+            "core": (read_cpu_s(os.getpid()) - spent) / took,
+            "rss_mib": read_memory_bytes() / MIB,
             "bad": self._driver.diagnostics()["bad_frames"],
         }
         print(json.dumps(told), flush=True)
@@ -152,7 +152,7 @@ def _drive(options: dict[str, Any], seconds: float) -> int:
     sys.modules.setdefault("OpenSSL", None)  # type: ignore[arg-type]
     from twisted.internet import reactor
 
-    Driven(reactor, options, seconds).start()
+    DriverProcess(reactor, options, seconds).start()
     reactor.run()
     return 0
 
@@ -161,10 +161,10 @@ def _drive(options: dict[str, Any], seconds: float) -> int:
 
 
 def _measure(seconds: float) -> int:
-    from sim.demo.port import free
+    from sim.demo.free_ports import find_free_ports
 
-    numbers = iter(free("tcp", "127.0.0.1", DOGS * len(SERVICES)))
-    ports = [{service: next(numbers) for service in SERVICES} for _ in range(DOGS)]
+    numbers = iter(find_free_ports("tcp", "127.0.0.1", DOGS * len(AIBO_SERVICES)))
+    ports = [{service: next(numbers) for service in AIBO_SERVICES} for _ in range(DOGS)]
     module = [sys.executable, "-m", "benchmarks.robots"]
     yard = subprocess.Popen([*module, "--yard", json.dumps(ports)], stdout=subprocess.PIPE, text=True)
     assert yard.stdout is not None
@@ -173,7 +173,7 @@ def _measure(seconds: float) -> int:
         if yard.stdout.readline().strip() != "ready":
             raise SystemExit("bench-robots: the robot simulator did not start")
         parts = {}
-        spent = processor_s(yard.pid)
+        spent = read_cpu_s(yard.pid)
         began = time.monotonic()
         for part, fps in (("30 pictures a second", 30.0), ("no camera", 0.0)):
             drivers.clear()
@@ -181,8 +181,8 @@ def _measure(seconds: float) -> int:
                 options = json.dumps({"host": "127.0.0.1", "ports": served, "camera_fps": fps, "camera": fps > 0})
                 command = [*module, "--seconds", str(seconds), "--drive", options]
                 drivers.append(subprocess.Popen(command, stdout=subprocess.PIPE, text=True))
-            parts[part] = [json.loads(one.communicate(timeout=seconds + START_S)[0]) for one in drivers]
-        share = (processor_s(yard.pid) - spent) / (time.monotonic() - began)
+            parts[part] = [json.loads(one.communicate(timeout=seconds + START_LIMIT_S)[0]) for one in drivers]
+        share = (read_cpu_s(yard.pid) - spent) / (time.monotonic() - began)
     finally:
         for one in drivers:
             one.kill()
@@ -203,7 +203,7 @@ def _report(parts: dict[str, list[dict[str, Any]]], legs: list[list[str]], share
             p95 = gaps[int(0.95 * len(gaps))]
             row = f"{rate:10.2f}{p95 * 1e3:8.1f}{gaps[-1] * 1e3:8.1f}{dog['pictures']:12.2f}{dog['core']:8.3f}"
             print(f"{part:22}{number + 1:4}{row}{dog['rss_mib']:9.1f}{dog['bad']:5.0f}")
-            waits += _delays(dog["commands"], [line for line in legs if line[0] == str(number)])
+            waits += _measure_delays(dog["commands"], [line for line in legs if line[0] == str(number)])
             is_even = rate >= 0.98 / TARGETS["frame_s"] and p95 <= TARGETS["frame_s"] + TARGETS["late_s"]
             has_camera = part != "no camera"
             held &= is_even and not dog["bad"]
@@ -224,7 +224,7 @@ def _report(parts: dict[str, list[dict[str, Any]]], legs: list[list[str]], share
     return 0 if held else 1
 
 
-def _delays(commands: list[list[float]], legs: list[list[str]]) -> list[float]:
+def _measure_delays(commands: list[list[float]], legs: list[list[str]]) -> list[float]:
     """Return the seconds from each command to the first motion of the legs with its velocity."""
     found = []
     place = 0

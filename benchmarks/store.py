@@ -19,27 +19,27 @@ from typing import cast
 
 from twisted.internet.interfaces import IReactorFromThreads
 
-from benchmarks.measure import MIB, memory_bytes, percentile
+from benchmarks.measure import MIB, percentile, read_memory_bytes
 from middleware.entangled.data.sqlite import SqliteStore
-from middleware.entangled.record import MAX_VALUE, Record, hashed_key
+from middleware.entangled.record import MAX_VALUE_BYTES, Record, hash_key
 
 ROOT = Path(__file__).resolve().parents[1]
-KEY = hashed_key("kills")
+KEY = hash_key("kills")
 OWNER = bytes(range(32))
 SLOTS = 3000
-TTL = 1e6
-RESTART_S = 2.0
-STALL_S = 0.05
+TTL_S = 1e6
+RESTART_LIMIT_S = 2.0
+STALL_LIMIT_S = 0.05
 """Maximum additional delay of the reactor at the 99th percentile, compared with an idle one, while the store writes."""
 
 
-def written_as(number: int) -> Record:
+def make_record(number: int) -> Record:
     """Return the record with the index ``number``; all of it follows from the number."""
     rng = random.Random(number)
-    size = min(MAX_VALUE, 200_000) if number % 97 == 0 else rng.randrange(300)
+    size = min(MAX_VALUE_BYTES, 200_000) if number % 97 == 0 else rng.randrange(300)
     value = None if number % 7 == 0 else rng.randbytes(size)
     signature = hashlib.blake2b(str(number).encode()).digest()
-    return Record(KEY, str(number % SLOTS), OWNER, number, "team", TTL, value, signature)
+    return Record(KEY, str(number % SLOTS), OWNER, number, "team", TTL_S, value, signature)
 
 
 def _print_line(*words: object) -> None:
@@ -57,14 +57,14 @@ def write_until_killed(path: str, first: int) -> None:
     number = first
     while True:
         for _ in range(random.Random(number).choice((1, 1, 3, 20, 50))):
-            store.put(written_as(number), TTL)
+            store.put(make_record(number), TTL_S)
             number += 1
         store.flush(60.0)
         _print_line(number - 1)
 
 
 @dataclass
-class Kills:
+class KillResults:
     """The results of a number of kills."""
 
     kills: int = 0
@@ -78,10 +78,10 @@ class Kills:
         return not self.lost and not self.damaged
 
 
-def killed(path: str, count: int, seed: int) -> Kills:
+def run_kills(path: str, count: int, seed: int) -> KillResults:
     """Kill a process that writes to the store ``path``, ``count`` times, and check the file after each kill."""
     rng = random.Random(seed)
-    seen = Kills()
+    seen = KillResults()
     safe = 0
     for kill in range(1, count + 1):
         first = _highest_number(path) + 1
@@ -114,18 +114,18 @@ def _highest_number(path: str) -> int:
         return max((record.sequence for record in store.records()), default=0)
 
 
-def _check_file(path: str, safe: int, kill: int, seen: Kills) -> None:
+def _check_file(path: str, safe: int, kill: int, seen: KillResults) -> None:
     with closing(sqlite3.connect(path)) as connection:
         (verdict,) = connection.execute("PRAGMA integrity_check").fetchone()
         if verdict != "ok":
             seen.damaged.append(f"kill {kill}: {verdict}")
     with closing(SqliteStore.open(path, 0.0)) as store:
-        if (kill > 1 and store.origin != "kept") or store.rotten:
-            seen.damaged.append(f"kill {kill}: the store is {store.origin}, {store.rotten} rows are rotten")
+        if (kill > 1 and store.origin != "kept") or store.corrupt_rows:
+            seen.damaged.append(f"kill {kill}: the store is {store.origin}, {store.corrupt_rows} rows are rotten")
         held = {record.name: record for record in store.records()}
         for number in range(max(1, safe - SLOTS + 1), safe + 1):
             record = held.get(str(number % SLOTS))
-            if record is None or record.sequence < number or record != written_as(record.sequence):
+            if record is None or record.sequence < number or record != make_record(record.sequence):
                 seen.lost.append(f"kill {kill}: row {number}")
 
 
@@ -134,29 +134,29 @@ def _check_file(path: str, safe: int, kill: int, seen: Kills) -> None:
 
 def serve(path: str) -> None:
     """Run a complete node on the store ``path``; print when it serves, its number of rows, and its memory."""
-    from swarmnode.ballast import drop_tls
+    from swarmnode.memory_savings import block_tls_import
 
-    drop_tls()
+    block_tls_import()
     from twisted.internet import reactor
 
     from middleware.config.settings import Settings
+    from swarmnode.environment import make_dependencies
     from swarmnode.service import NodeService
-    from swarmnode.world import real_seams
 
     settings = Settings.from_mapping({"node": {"name": "bench", "host": "127.0.0.1", "port": 0}}, "benchmark")
     settings = settings.with_flags(store=path, team_key="of the benchmark, and of nobody else")
-    seams = real_seams(settings, reactor)
+    seams = make_dependencies(settings, reactor)
     service = NodeService(settings, seams)
 
     def serving() -> None:
         service.startService()
-        _print_line(len(seams.store), memory_bytes(), memory_bytes("VmHWM"))
+        _print_line(len(seams.store), read_memory_bytes(), read_memory_bytes("VmHWM"))
 
     reactor.callWhenRunning(serving)
     reactor.run()
 
 
-def restarted(folder: str, rows: int, times: int = 5) -> bool:
+def check_restarts(folder: str, rows: int, times: int = 5) -> bool:
     """Print the time until a node with ``rows`` rows serves; return False if it is too long."""
     _print_line(f"{'rows':>8} {'file MiB':>9} {'serving after s':>16} {'worst s':>8} {'RSS MiB':>8} {'peak MiB':>9}")
     held = True
@@ -167,7 +167,7 @@ def restarted(folder: str, rows: int, times: int = 5) -> bool:
             for number in range(count):
                 value, signature = rng.randbytes(200), rng.randbytes(64)
                 name, owner = str(number), rng.choice((OWNER, OWNER[::-1]))
-                store.put(Record(rng.randbytes(20), name, owner, 1, "team", TTL, value, signature), TTL)
+                store.put(Record(rng.randbytes(20), name, owner, 1, "team", TTL_S, value, signature), TTL_S)
         took, said = [], [0, 0, 0]
         for _ in range(times):
             started = time.monotonic()
@@ -184,18 +184,18 @@ def restarted(folder: str, rows: int, times: int = 5) -> bool:
         size = os.path.getsize(path) / MIB
         median = sorted(took)[times // 2]
         _print_line(f"{count:8} {size:9.1f} {median:16.2f} {max(took):8.2f} {said[1] / MIB:8.1f} {said[2] / MIB:9.1f}")
-        held = held and max(took) <= RESTART_S
-    _print_line(f"target: at most {RESTART_S:g} s, the worst of {times}: {'held' if held else 'MISSED'}")
+        held = held and max(took) <= RESTART_LIMIT_S
+    _print_line(f"target: at most {RESTART_LIMIT_S:g} s, the worst of {times}: {'held' if held else 'MISSED'}")
     return held
 
 
 # -- rate -------------------------------------------------------------------------------------------------------------
 
 
-class Rate:
+class PutRate:
     """Run puts that wait for their commit, ``in_flight`` at a time, and measure the delay of the reactor."""
 
-    TICK = 0.002
+    TICK_S = 0.002
 
     def __init__(self, store: SqliteStore, size: int, count: int, in_flight: int, base: int) -> None:
         self._store = store
@@ -218,7 +218,7 @@ class Rate:
             now = time.monotonic()
             self.late.append(now - due)
             if running:
-                reactor.callLater(self.TICK, tick, now + self.TICK)
+                reactor.callLater(self.TICK_S, tick, now + self.TICK_S)
 
         tick(time.monotonic())
         self._left = self._count
@@ -234,34 +234,36 @@ class Rate:
             self._left -= 1
             number = self._base + self._left
             rng = random.Random(number)
-            record = Record(rng.randbytes(20), str(number), OWNER, 1, "team", TTL, rng.randbytes(self._size), bytes(64))
+            record = Record(
+                rng.randbytes(20), str(number), OWNER, 1, "team", TTL_S, rng.randbytes(self._size), bytes(64)
+            )
             started = time.monotonic()
-            self._store.put(record, TTL)
-            await self._store.written()
+            self._store.put(record, TTL_S)
+            await self._store.wait_for_write()
             self.latencies.append(time.monotonic() - started)
 
 
-async def _rates(folder: str, outcome: list[bool]) -> None:
+async def _measure_rates(folder: str, outcome: list[bool]) -> None:
     from twisted.internet import reactor
 
     deliver = cast(IReactorFromThreads, reactor).callFromThread
-    _print_line(f"disk: {_sync_s(folder) * 1000:.2f} ms for a write and fsync of 4 KiB (median of 100)")
+    _print_line(f"disk: {_measure_sync_s(folder) * 1000:.2f} ms for a write and fsync of 4 KiB (median of 100)")
     _print_line(
         f"{'value':>9} {'in flight':>10} {'puts/s':>8} {'safe after p50':>15} {'p99 ms':>8} {'max ms':>8}"
         f" {'late p99 ms':>12} {'max ms':>8} {'gets/s':>9} {'RSS MiB':>8}"
     )
     base = 0
     with closing(SqliteStore.open(os.path.join(folder, "idle.sqlite"), 0.0, deliver=deliver)) as store:
-        idle = Rate(store, 0, 0, 0, 0)
+        idle = PutRate(store, 0, 0, 0, 0)
         await idle.run()
     usual = percentile(idle.late, 0.99)
     _print_line(f"{'idle':>9} {'':61} {usual * 1000:12.2f} {max(idle.late) * 1000:8.2f}")
     for size, count, in_flight in ((200, 1500, 1), (200, 6000, 64), (10_000, 400, 16), (MIB, 24, 4)):
-        if size > MAX_VALUE and size > 10_000:
-            _print_line(f"{size:9} (a record carries at most {MAX_VALUE} bytes)")
+        if size > MAX_VALUE_BYTES and size > 10_000:
+            _print_line(f"{size:9} (a record carries at most {MAX_VALUE_BYTES} bytes)")
         path = os.path.join(folder, f"rate-{size}-{in_flight}.sqlite")
         with closing(SqliteStore.open(path, 0.0, max_bytes=64 * MIB, deliver=deliver)) as store:
-            rate = Rate(store, size, count, in_flight, base)
+            rate = PutRate(store, size, count, in_flight, base)
             seconds = await rate.run()
             base += count
             keys = list({record.key for record in store.records()})
@@ -270,15 +272,15 @@ async def _rates(folder: str, outcome: list[bool]) -> None:
                 store.get(key)
             gets = len(keys) * max(1, 20_000 // len(keys)) / (time.perf_counter() - started)
         late = percentile(rate.late, 0.99)
-        outcome.append(late <= usual + STALL_S)
+        outcome.append(late <= usual + STALL_LIMIT_S)
         _print_line(
             f"{size:9} {in_flight:10} {count / seconds:8.0f} {percentile(rate.latencies, 0.5) * 1000:15.2f}"
             f" {percentile(rate.latencies, 0.99) * 1000:8.2f} {max(rate.latencies) * 1000:8.2f}"
-            f" {late * 1000:12.2f} {max(rate.late) * 1000:8.2f} {gets:9.0f} {memory_bytes() / MIB:8.1f}"
+            f" {late * 1000:12.2f} {max(rate.late) * 1000:8.2f} {gets:9.0f} {read_memory_bytes() / MIB:8.1f}"
         )
 
 
-def _sync_s(folder: str) -> float:
+def _measure_sync_s(folder: str) -> float:
     took = []
     with open(os.path.join(folder, "sync"), "wb", buffering=0) as file:
         for _ in range(100):
@@ -289,7 +291,7 @@ def _sync_s(folder: str) -> float:
     return percentile(took, 0.5)
 
 
-def rated(folder: str) -> bool:
+def check_rates(folder: str) -> bool:
     """Print the operations per second of the store; return False if the reactor was delayed too much."""
     from twisted.internet import task
 
@@ -297,12 +299,12 @@ def rated(folder: str) -> bool:
     try:
         from twisted.internet.defer import Deferred
 
-        task.react(lambda reactor: Deferred.fromCoroutine(_rates(folder, outcome)))
+        task.react(lambda reactor: Deferred.fromCoroutine(_measure_rates(folder, outcome)))
     except SystemExit as ended:
         outcome.append(not ended.code)
     held = all(outcome)
     _print_line(
-        f"target: the reactor at most {STALL_S * 1000:g} ms later than an idle one at p99:"
+        f"target: the reactor at most {STALL_LIMIT_S * 1000:g} ms later than an idle one at p99:"
         f" {'held' if held else 'MISSED'}"
     )
     return held
@@ -330,7 +332,7 @@ def main() -> int:
     with tempfile.TemporaryDirectory(dir=options.folder) as folder:
         if options.kills:
             started = time.monotonic()
-            seen = killed(os.path.join(folder, "kills.sqlite"), options.kills, options.seed)
+            seen = run_kills(os.path.join(folder, "kills.sqlite"), options.kills, options.seed)
             _print_line(
                 f"{'kills':>6} {'before any':>14} {'acknowledged':>13} {'lost':>5} {'damaged':>8} {'seconds':>8}"
             )
@@ -342,9 +344,9 @@ def main() -> int:
                 _print_line(line)
             held = seen.is_clean() and held
         if options.restart:
-            held = restarted(folder, options.restart) and held
+            held = check_restarts(folder, options.restart) and held
         if options.rate:
-            held = rated(folder) and held
+            held = check_rates(folder) and held
     return 0 if held else 1
 
 

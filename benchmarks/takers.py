@@ -11,8 +11,8 @@ import sys
 import time
 from collections import Counter
 
-from sim.team.takers.light import LightTrial
-from sim.team.takers.trial import Trial
+from sim.team.takers.shared_store import SharedStoreTrial
+from sim.team.takers.trial import TakingTrial
 
 
 def main(arguments: list[str] | None = None) -> int:
@@ -29,7 +29,7 @@ def main(arguments: list[str] | None = None) -> int:
     )
     parser.add_argument("--calm", action="store_true", help="kill no nodes and cut no links")
     wanted = parser.parse_args(arguments)
-    kind = LightTrial if wanted.light else Trial
+    kind = SharedStoreTrial if wanted.light else TakingTrial
     low, _, high = wanted.loss.partition("-")
     least, most = float(low), float(high or low)
     print("seed  loss  churn  tuples  confirmed  twice  lost  seen again  simulated s  datagrams/tuple  real s")
@@ -38,17 +38,17 @@ def main(arguments: list[str] | None = None) -> int:
         loss = least + (most - least) * number / max(1, wanted.trials - 1)
         began = time.monotonic()
         tuples = wanted.tuples * (number + 1) // wanted.trials - wanted.tuples * number // wanted.trials
-        trial = kind(wanted.seed + number, tuples, loss, not wanted.calm, wanted.takers, wanted.nodes)
-        sent = trial.board.counters["sent"]
-        trial.play()
-        found = trial.violations()
+        trial = kind(wanted.seed + number, tuples, loss, not wanted.quiet_conditions, wanted.takers, wanted.nodes)
+        sent = trial.switchboard.counters["sent"]
+        trial.run_trial()
+        found = trial.find_violations()
         trial.stop()
         broken = Counter(line[:2] for line in found)
-        confirmed = len(trial.witness.posted) - len(trial.witness.open())
+        confirmed = len(trial.recorder.tuples) - len(trial.recorder.list_undecided())
         print(
-            f"{trial.seed:4d}  {loss:4.2f}  {'no' if wanted.calm else 'yes':>5}  {tuples:6d}  {confirmed:9d}"
+            f"{trial.seed:4d}  {loss:4.2f}  {'no' if wanted.quiet_conditions else 'yes':>5}  {tuples:6d}  {confirmed:9d}"
             f"  {broken['T1']:5d}  {broken['T2'] + broken['T5']:4d}  {broken['T3']:10d}"
-            f"  {trial.clock.seconds():11.0f}  {(trial.board.counters['sent'] - sent) / max(1, tuples):15.0f}"
+            f"  {trial.clock.seconds():11.0f}  {(trial.switchboard.counters['sent'] - sent) / max(1, tuples):15.0f}"
             f"  {time.monotonic() - began:6.0f}",
             flush=True,
         )

@@ -21,7 +21,7 @@ API = {
     "The peer-to-peer library": ("middleware.entangled.node", "middleware.entangled.space.tuplespace"),
     "A node of a team": ("middleware.node", "middleware.tasks.task", "middleware.directory.presence"),
     "Strategies": ("middleware.consensus.strategy", "middleware.consensus.conformance"),
-    "Behaviours and agents": ("agents.behaviour", "agents.context", "agents.means", "agents.loop"),
+    "Behaviours and agents": ("agents.behaviour", "agents.context", "agents.motion", "agents.loop"),
     "Drivers": ("drivers.driver", "drivers.reading", "drivers.base", "drivers.conformance"),
     "Errors": ("middleware.errors", "middleware.entangled.errors", "drivers.errors"),
 }
@@ -66,9 +66,9 @@ def _help_of(main: Main, words: tuple[str, ...]) -> Iterator[tuple[tuple[str, ..
 def write_settings() -> str:
     """Return the page of the settings file: each key with its type, range, default and meaning."""
     from middleware.config import settings
-    from swarmnode.schema import json_schema
+    from swarmnode.schema import make_json_schema
 
-    tables = json_schema()["$defs"]
+    tables = make_json_schema()["$defs"]
     lead = "A node reads its settings from one TOML file. `swarm schema` prints the JSON schema for editors.\n"
     parts = ["# Settings\n", lead]
     for cls in (kind for kind in vars(settings).values() if isinstance(kind, type) and is_dataclass(kind)):

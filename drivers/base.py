@@ -14,11 +14,11 @@ from twisted.internet.defer import Deferred, fail, gatherResults, succeed
 from twisted.internet.interfaces import IReactorTime
 from twisted.logger import Logger
 
-from drivers.deadman.switch import DeadMan, LastWord
+from drivers.deadman.switch import DeadManSwitch, HaltCommand
 from drivers.driver import Permit
 from drivers.errors import LinkLost, NoReply, NotEnabled, Unsupported, UsageError
 from drivers.gate import Gate
-from drivers.link import Connector, Line, Link
+from drivers.link import Connector, Link, Reconnector
 from drivers.reading import Action, Description, Frame, Observation, Value
 from drivers.subscribers import Subscribers
 from drivers.timer import Timer
@@ -27,7 +27,7 @@ ENGAGED = "estop.engaged"
 """Key of the robot's motor switch: true while the motors are off.  A robot without such a switch omits the key."""
 
 
-def heard_at(moment: float, due: float, now: float) -> float:
+def correct_last_data_time(moment: float, due: float, now: float) -> float:
     """Return the time of a robot's last data, corrected for a check that runs late.
 
     The check was due at ``due`` and runs at ``now``.  The delay does not count as silence of the robot: the process was
@@ -52,22 +52,22 @@ class BaseDriver:
     """Seconds within which the robot must confirm that it switched its motors."""
 
     def __init__(
-        self, description: Description, name: str, clock: IReactorTime, dead_man: DeadMan | None = None
+        self, description: Description, name: str, clock: IReactorTime, dead_man: DeadManSwitch | None = None
     ) -> None:
         self._description = description
         self._name = name
         self._clock = clock
         self._dead_man = dead_man
         self._gate = Gate()
-        self._is_open = self._is_closed = self._is_up = self._is_heard = False
+        self._is_open = self._is_closed = self._is_up = self._has_data = False
         self._connecting: Deferred[Description] | None = None
         self._wants_motors: bool | None = None
         self._switching: list[tuple[bool, Deferred[bool]]] = []
-        self._switch_end = Timer(clock)
+        self._switch_timer = Timer(clock)
         self._motion = dict.fromkeys(description.limits, 0.0)
-        self._end = Timer(clock)
+        self._deadline_timer = Timer(clock)
         self._newest: Observation | None = None
-        self._seen = Subscribers[Observation](name, self.log)
+        self._subscribers = Subscribers[Observation](name, self.log)
         self._counts = dict.fromkeys(("frames", "bad_frames", "pictures", "bytes", "links", "refused"), 0)
 
     # -- the interface ----------------------------------------------------------------------------------------------
@@ -86,7 +86,7 @@ class BaseDriver:
             return "idle"
         if self._newest is None:
             return "connecting"
-        if not self._is_heard or self._clock.seconds() - self._newest.t_host > self.STALE_S:
+        if not self._has_data or self._clock.seconds() - self._newest.t_host > self.STALE_S:
             return "stale"
         return "stopped" if self._wants_motors is False else "ready"
 
@@ -141,7 +141,7 @@ class BaseDriver:
         if self._newest.values.get(ENGAGED, False) is not False:
             raise NotEnabled(f"{self._name}'s motors are off; call enable() first")
         now = self._clock.seconds()
-        if self._gate.is_over(now):
+        if self._gate.is_motion_over(now):
             # This process was frozen beyond the deadline of the last motion.
             self.stop()
         self._gate.admit(permit, now)
@@ -149,14 +149,14 @@ class BaseDriver:
             low, high = self._description.limits[key]
             self._motion[key] = min(max(float(value), low), high)
         if self._dead_man is not None:
-            self._dead_man.until(permit.deadline - now)
+            self._dead_man.arm(permit.deadline - now)
         done = self._drive(self._motion, permit)
-        self._end.set(permit.deadline - now, self.stop)
+        self._deadline_timer.set(permit.deadline - now, self.stop)
         return dict(done)
 
     def stop(self) -> Action:
         """Set the motion to zero now; safe in any state and never refused."""
-        self._rest()
+        self._clear_motion()
         if self._is_up:
             self._halt()
         return dict(self._motion)
@@ -167,7 +167,7 @@ class BaseDriver:
 
     def subscribe(self, seen: Callable[[Observation], None]) -> Callable[[], None]:
         """Call ``seen`` with each observation; return a function that ends the subscription."""
-        return self._seen.add(seen)
+        return self._subscribers.add(seen)
 
     def invoke(self, name: str, **arguments: float | str) -> Deferred[Mapping[str, Value]]:
         """Run one of ``description.skills``, or query a value that is not part of the observations."""
@@ -207,7 +207,7 @@ class BaseDriver:
     def _halt(self) -> None:
         """Command the robot to stand still."""
 
-    def _last_word(self) -> LastWord | None:
+    def _make_halt_command(self) -> HaltCommand | None:
         """Return the command by which the dead man's switch halts the robot; None if the robot stops by itself."""
         return None
 
@@ -217,16 +217,16 @@ class BaseDriver:
         """Report that the link has opened, for the first time or again."""
         self._is_up = True
         self._counts["links"] += 1
-        self._guard()
+        self._update_halt_command()
         if self._wants_motors:
             self._power(True)
 
     def _down(self) -> None:
         """Report that the link is lost; the motion counts as zero."""
-        self._is_up = self._is_heard = False
-        self._rest()
+        self._is_up = self._has_data = False
+        self._clear_motion()
         if self._dead_man is not None:
-            self._dead_man.leave()
+            self._dead_man.on_link_lost()
         self._fail_switching(LinkLost(f"the link to {self._name} was lost; the driver is reconnecting"))
 
     def _observed(
@@ -239,12 +239,12 @@ class BaseDriver:
         """Publish a new observation of the robot."""
         rows = {key: tuple(row) for key, row in (samples or {}).items()}
         observation = self._newest = Observation(self._clock.seconds(), t_robot, values, rows, frame)
-        self._is_heard = True
+        self._has_data = True
         self._settle_switching(values.get(ENGAGED))
         connecting, self._connecting = self._connecting, None
         if connecting is not None:
             connecting.callback(self._description)
-        self._seen.tell(observation)
+        self._subscribers.notify(observation)
 
     def _refused(self, error: Exception) -> None:
         """Close the driver because this robot does not exist; reconnecting cannot help."""
@@ -255,19 +255,19 @@ class BaseDriver:
         self._fail_connecting(error)
 
     @property
-    def _may_move(self) -> bool:
+    def _is_motion_permitted(self) -> bool:
         """Whether a motion is in force and its deadline lies ahead.
 
         Code that repeats a motion has to check this: after a freeze of the node all timers are late, and the timer that
         repeats a motion may fire before the timer that ends it.
         """
-        return self._gate.deadline is not None and not self._gate.is_over(self._clock.seconds())
+        return self._gate.deadline is not None and not self._gate.is_motion_over(self._clock.seconds())
 
-    def _guard(self) -> None:
+    def _update_halt_command(self) -> None:
         """Pass the current halt command to the dead man's switch."""
-        command = None if self._dead_man is None else self._last_word()
+        command = None if self._dead_man is None else self._make_halt_command()
         if self._dead_man is not None and command is not None:
-            self._dead_man.guard(command)
+            self._dead_man.set_halt_command(command)
 
     def _switch(self, on: bool) -> Deferred[bool]:
         if not self._is_up or self._newest is None:
@@ -280,19 +280,19 @@ class BaseDriver:
         switched: Deferred[bool] = Deferred()
         self._switching.append((on, switched))
         late = NoReply(f"{self._name} did not switch its motors within {self.SWITCH_S:g} s")
-        self._switch_end.set(self.SWITCH_S, self._fail_switching, late)
+        self._switch_timer.set(self.SWITCH_S, self._fail_switching, late)
         return switched
 
     def _settle_switching(self, is_engaged: object) -> None:
         done = [switched for on, switched in self._switching if is_engaged is (not on)]
         self._switching = [(on, switched) for on, switched in self._switching if is_engaged is not (not on)]
         if not self._switching:
-            self._switch_end.cancel()
+            self._switch_timer.cancel()
         for switched in done:
             switched.callback(True)
 
     def _fail_switching(self, error: Exception) -> None:
-        self._switch_end.cancel()
+        self._switch_timer.cancel()
         waiting, self._switching = self._switching, []
         for _, switched in waiting:
             switched.errback(error)
@@ -306,17 +306,17 @@ class BaseDriver:
         if connecting is not None:
             connecting.errback(error)
 
-    def _rest(self) -> None:
-        self._end.cancel()
-        self._gate.close()
+    def _clear_motion(self) -> None:
+        self._deadline_timer.cancel()
+        self._gate.end_motion()
         if self._dead_man is not None:
-            self._dead_man.rest()
+            self._dead_man.disarm()
         for key in self._motion:
             self._motion[key] = 0.0
 
     def _mark_closed(self) -> Deferred[None] | None:
         self._is_closed = True
-        self._rest()
+        self._clear_motion()
         self._fail_switching(LinkLost(f"{self._name}: disconnected"))
         return None if self._dead_man is None else self._dead_man.close()
 
@@ -358,12 +358,12 @@ class LinkedDriver(BaseDriver):
         clock: IReactorTime,
         connector: Connector,
         place: tuple[str, int],
-        dead_man: DeadMan | None = None,
+        dead_man: DeadManSwitch | None = None,
     ) -> None:
         super().__init__(description, name, clock, dead_man)
         self._connector = connector
-        self._place = place
-        self._line: Line | None = None
+        self._endpoint = place
+        self._reconnector: Reconnector | None = None
         self._link: Link | None = None
         self._reader: Reader
         self._timer = Timer(clock)
@@ -372,9 +372,9 @@ class LinkedDriver(BaseDriver):
     @property
     def problem(self) -> str:
         """The reason why no data arrives from the robot, and the remedy; empty while data arrives."""
-        return str(getattr(self._line, "problem", "")) or self._problem
+        return str(getattr(self._reconnector, "problem", "")) or self._problem
 
-    def received(self, data: bytes) -> None:
+    def data_received(self, data: bytes) -> None:
         """Take bytes from the robot; called by the link."""
         self._counts["bytes"] += len(data)
         reader = self._reader
@@ -382,25 +382,25 @@ class LinkedDriver(BaseDriver):
         for message in reader.read(data):
             if self._is_closed:
                 return
-            self._heard(message)
+            self._on_message(message)
         self._counts["bad_frames"] += reader.bad_frames - bad
 
-    def _heard(self, message: Any) -> None:
+    def _on_message(self, message: Any) -> None:
         """Handle one message of the robot."""
         raise NotImplementedError
 
     def _open(self) -> None:
-        self._line = self._connector.call(*self._place, self)  # type: ignore[arg-type]
+        self._reconnector = self._connector.connect(*self._endpoint, self)  # type: ignore[arg-type]
 
     def _close(self) -> Deferred[None]:
         self._timer.cancel()
-        return succeed(None) if self._line is None else self._line.hang_up()
+        return succeed(None) if self._reconnector is None else self._reconnector.disconnect()
 
     def _send(self, data: bytes) -> None:
         if self._link is not None:
             self._link.send(data)
 
-    def _name_problem(self, problem: str) -> None:
+    def _set_problem(self, problem: str) -> None:
         """Store and log the reason why no data arrives from the robot; the same reason is not logged twice in a row."""
         if problem != self._problem:
             self.log.warn("{robot}: {problem}", robot=self._name, problem=problem)

@@ -28,16 +28,16 @@ from drivers.link import Link, MemoryConnector, Receiver
 from drivers.reading import Action, Description, Observation
 
 STATES = ("idle", "connecting", "ready", "stale", "stopped", "closed")
-COUNTS = ("frames", "bad_frames", "bytes", "reconnects", "age", "accepted", "lower token", "late")
+COUNTER_NAMES = ("frames", "bad_frames", "bytes", "reconnects", "age", "accepted", "lower token", "late")
 """Keys that ``diagnostics`` must contain."""
-AT_REST = 0.01
+REST_SPEED_MPS = 0.01
 """Speed in m/s or rad/s below which a robot counts as standing still."""
 HALT_S = 0.2
 """Seconds within which a robot must stand still after a stop or its deadline."""
-NO_NUMBERS = (math.nan, math.inf, -math.inf, True, None, "0.1")
+INVALID_NUMBERS = (math.nan, math.inf, -math.inf, True, None, "0.1")
 
 
-class Bench(Protocol):
+class Rig(Protocol):
     """A test rig with a robot or its emulator.
 
     ``settle_s`` is the time in seconds that connecting, switching the motors, or closing may take.
@@ -61,7 +61,7 @@ class Bench(Protocol):
         """Break the link; it can be reopened.  Raises ``NotImplementedError`` if there is no link."""
 
 
-class StandIn(Protocol):
+class EmulatedRobot(Protocol):
     """An emulated robot for ``MemoryBench``; it is created with its clock."""
 
     def accept(self, link: Link) -> Receiver:
@@ -71,7 +71,7 @@ class StandIn(Protocol):
         """Return its current speed in m/s."""
 
 
-class MemoryBench:
+class MemoryRig:
     """A driver and an emulated robot connected in memory, each with a clock in virtual time.
 
     ``make`` creates the driver, with the arguments (options, name, clock, connector).
@@ -83,7 +83,7 @@ class MemoryBench:
     def __init__(
         self,
         make: Callable[[Mapping[str, object], str, Any, Any], Driver],
-        robot: Callable[[Any], StandIn],
+        robot: Callable[[Any], EmulatedRobot],
         options: Mapping[str, object],
     ) -> None:
         self._make = make
@@ -119,15 +119,15 @@ class MemoryBench:
         return len(self._clock.getDelayedCalls())
 
 
-class Breach(AssertionError):
+class RuleViolation(AssertionError):
     """A driver breaks a rule; the message gives the details."""
 
 
-class Faulty(Exception):
+class SubscriberError(Exception):
     """Raised deliberately by a subscriber."""
 
 
-def check_describes(bench: Bench) -> None:
+def check_describes(bench: Rig) -> None:
     """The driver describes its robot before it connects, and the description does not change."""
     driver = bench.make_driver()
     robot = driver.description
@@ -145,12 +145,12 @@ def check_describes(bench: Bench) -> None:
     try:
         json.dumps({name: dict(about) for name, about in robot.capabilities.items()}, allow_nan=False)
     except (TypeError, ValueError) as error:
-        raise Breach(f"its capabilities are not valid JSON: {error}") from error
+        raise RuleViolation(f"its capabilities are not valid JSON: {error}") from error
     _connect(bench, driver)
     _require(driver.description == robot, "its description changes when it connects")
 
 
-def check_connects(bench: Bench) -> None:
+def check_connects(bench: Rig) -> None:
     """The Deferred of ``connect`` fires when the first observation has arrived, and not before."""
     driver = bench.make_driver()
     has_seen: list[bool] = []
@@ -169,10 +169,10 @@ def check_connects(bench: Bench) -> None:
     _require(_Result(driver.connect()).is_error(DriverError), "a connected driver can be connected again")
 
 
-def check_motors(bench: Bench) -> None:
+def check_motors(bench: Rig) -> None:
     """Nothing moves before ``enable`` or after ``disable``; ``enable`` permits motion again."""
     driver = bench.make_driver()
-    action = _half_speed(driver)
+    action = _make_half_speed_action(driver)
     _check_refused(NotEnabled, driver, action, _grant(bench), "before it is connected")
     _connect(bench, driver)
     if action:
@@ -192,9 +192,9 @@ def check_motors(bench: Bench) -> None:
     driver.act(action, _grant(bench))
 
 
-def check_clips(bench: Bench) -> None:
+def check_clips(bench: Rig) -> None:
     """``act`` returns the action that is really performed, within the limits of the description."""
-    driver = _ready_driver(bench)
+    driver = _make_ready_driver(bench)
     for key, (low, high) in driver.description.limits.items():
         for wanted in (low - 99.0, high + 99.0):
             done = driver.act({**dict.fromkeys(driver.description.limits, 0.0), key: wanted}, _grant(bench))
@@ -205,58 +205,58 @@ def check_clips(bench: Bench) -> None:
                     isinstance(value, float | int) and least - 1e-9 <= value <= most + 1e-9,
                     f"commanded {key} = {wanted:g} it performs {name} = {value!r}, beyond its limits",
                 )
-    axis = _axis_of(driver)
+    axis = _select_axis(driver)
     if axis:
         high = driver.description.limits[axis][1]
         done = driver.act({**dict.fromkeys(driver.description.limits, 0.0), axis: high + 99.0}, _grant(bench))
         _require(done[axis] > 0.5 * high, f"beyond its limit it performs {axis} = {done[axis]:g}, not {high:g}")
 
 
-def check_keeps(bench: Bench) -> None:
+def check_keeps(bench: Rig) -> None:
     """A key that an action omits keeps its value while the last command holds, and is zero after a stop."""
-    driver = _ready_driver(bench)
-    axis = _axis_of(driver)
+    driver = _make_ready_driver(bench)
+    axis = _select_axis(driver)
     if not axis:
         return
-    first = driver.act(_half_speed(driver), _grant(bench))[axis]
+    first = driver.act(_make_half_speed_action(driver), _grant(bench))[axis]
     _require(driver.act({}, _grant(bench)).get(axis) == first, f"{axis} changes though the next action omits it")
     driver.stop()
     after = driver.act({}, _grant(bench)).get(axis)
     _require(after == 0.0, f"after a stop an empty action performs {axis} = {after!r}")
 
 
-def check_refuses(bench: Bench) -> None:
+def check_refuses(bench: Rig) -> None:
     """An unknown key, or a value that is not a finite number, raises ``Unsupported``, and nothing moves."""
-    driver = _ready_driver(bench)
+    driver = _make_ready_driver(bench)
     _check_refused(Unsupported, driver, {"base.warp": 1.0}, _grant(bench), "with an unknown key")
-    for value in NO_NUMBERS if _axis_of(driver) else ():
-        action: Any = {_axis_of(driver): value}
+    for value in INVALID_NUMBERS if _select_axis(driver) else ():
+        action: Any = {_select_axis(driver): value}
         _check_refused(Unsupported, driver, action, _grant(bench), f"with {value!r}")
-        action = {**_half_speed(driver), "base.warp": 1.0}
+        action = {**_make_half_speed_action(driver), "base.warp": 1.0}
         _check_refused(Unsupported, driver, action, _grant(bench), "with a key too many")
     bench.pass_time(HALT_S)
     _require_rest(bench, driver, "after a refused action")
 
 
-def check_deadline(bench: Bench) -> None:
+def check_deadline(bench: Rig) -> None:
     """The robot moves until its permit expires and then stops by itself; a new permit extends the motion."""
-    driver = _ready_driver(bench)
-    if not _axis_of(driver):
+    driver = _make_ready_driver(bench)
+    if not _select_axis(driver):
         return
-    wanted = abs(driver.act(_half_speed(driver), _grant(bench, 0.6))[_axis_of(driver)])
+    wanted = abs(driver.act(_make_half_speed_action(driver), _grant(bench, 0.6))[_select_axis(driver)])
     bench.pass_time(0.5)
     _require(bench.true_speed() > 0.5 * wanted, f"it reports {wanted:g} m/s and moves at {bench.true_speed():g}")
-    driver.act(_half_speed(driver), _grant(bench, 0.6))
+    driver.act(_make_half_speed_action(driver), _grant(bench, 0.6))
     bench.pass_time(0.5)
     _require(bench.true_speed() > 0.5 * wanted, "it stops at the deadline of a command that was renewed")
     bench.pass_time(0.1 + HALT_S)
     _require_rest(bench, driver, "after its deadline")
 
 
-def check_token(bench: Bench) -> None:
+def check_token(bench: Rig) -> None:
     """A lower token than one seen, or a deadline that has passed, raises ``StaleCommand`` and is counted."""
-    driver = _ready_driver(bench)
-    action = _half_speed(driver)
+    driver = _make_ready_driver(bench)
+    action = _make_half_speed_action(driver)
     driver.act(action, _grant(bench, token=5))
     _require(driver.token == 5, f"after it obeyed token 5 its token is {driver.token!r}")
     _check_refused(StaleCommand, driver, action, _grant(bench, token=4), "with a lower token")
@@ -270,7 +270,7 @@ def check_token(bench: Bench) -> None:
     _require((counts["accepted"], counts["lower token"], counts["late"]) == (2, 2, 4), "it miscounts commands")
 
 
-def check_stops(bench: Bench) -> None:
+def check_stops(bench: Rig) -> None:
     """``stop`` is never refused, in any state, and ends the motion."""
     driver = bench.make_driver()
     driver.stop()
@@ -279,7 +279,7 @@ def check_stops(bench: Bench) -> None:
     bench.pass_time(bench.settle_s)
     connecting.value("connect, after stop,")
     _enable(bench, driver)
-    driver.act(_half_speed(driver), _grant(bench, 30.0))
+    driver.act(_make_half_speed_action(driver), _grant(bench, 30.0))
     bench.pass_time(0.3)
     done = driver.stop()
     _require(set(done) == set(driver.description.limits), "the result of stop lacks a key of the limits")
@@ -298,7 +298,7 @@ def check_stops(bench: Bench) -> None:
     driver.stop()
 
 
-def check_ends(bench: Bench) -> None:
+def check_ends(bench: Rig) -> None:
     """``disconnect`` stops the motion first, is final, and may be called twice and in any state."""
     idle = bench.make_driver()
     left = _Result(idle.disconnect())
@@ -310,8 +310,8 @@ def check_ends(bench: Bench) -> None:
     _Result(early.disconnect())
     bench.pass_time(bench.settle_s)
     _require(connecting.is_error(DriverError), "disconnect during connect does not make connect fail")
-    driver = _ready_driver(bench)
-    driver.act(_half_speed(driver), _grant(bench, 30.0))
+    driver = _make_ready_driver(bench)
+    driver.act(_make_half_speed_action(driver), _grant(bench, 30.0))
     bench.pass_time(0.3)
     first, second = _Result(driver.disconnect()), _Result(driver.disconnect())
     _require(driver.state == "closed", f"disconnected its state is {driver.state!r}, not 'closed'")
@@ -320,13 +320,13 @@ def check_ends(bench: Bench) -> None:
     second.value("disconnect, called twice,")
     _require_rest(bench, driver, "after disconnect")
     _require(_Result(driver.connect()).is_error(DriverError), "after disconnect it can be connected again")
-    _check_refused(DriverError, driver, _half_speed(driver), _grant(bench), "after disconnect")
+    _check_refused(DriverError, driver, _make_half_speed_action(driver), _grant(bench), "after disconnect")
 
 
-def check_leaves(bench: Bench) -> None:
+def check_leaves(bench: Rig) -> None:
     """After ``disconnect``, or a cancelled ``connect``, it is closed and has no pending calls on its clock."""
-    driver = _ready_driver(bench)
-    driver.act(_half_speed(driver), _grant(bench, 30.0))
+    driver = _make_ready_driver(bench)
+    driver.act(_make_half_speed_action(driver), _grant(bench, 30.0))
     _Result(driver.disconnect())
     bench.pass_time(bench.settle_s)
     _require_no_pending_calls(bench, "")
@@ -347,26 +347,26 @@ def check_leaves(bench: Bench) -> None:
         _require_no_pending_calls(bench, "after a cancelled connect ")
 
 
-def check_link(bench: Bench) -> None:
+def check_link(bench: Rig) -> None:
     """A lost link makes it stale and ends the motion; it reconnects by itself, at rest."""
-    driver = _ready_driver(bench)
-    driver.act(_half_speed(driver), _grant(bench, 30.0))
+    driver = _make_ready_driver(bench)
+    driver.act(_make_half_speed_action(driver), _grant(bench, 30.0))
     bench.pass_time(0.3)
     if not _try_cut_link(bench, driver):
         return
     _require(driver.state == "stale", f"without its link its state is {driver.state!r}, not 'stale'")
-    _check_refused(NotEnabled, driver, _half_speed(driver), _grant(bench), "without its link")
+    _check_refused(NotEnabled, driver, _make_half_speed_action(driver), _grant(bench), "without its link")
     bench.pass_time(max(1.0, 2.0 * bench.settle_s))
     _require(driver.state == "ready", f"with its link back its state is {driver.state!r}, not 'ready'")
     _require_rest(bench, driver, "after a lost link")
     counts = driver.diagnostics()
     _require(counts["reconnects"] == 1.0, f"it reconnected once and counts {counts['reconnects']:g} reconnects")
-    driver.act(_half_speed(driver), _grant(bench))
+    driver.act(_make_half_speed_action(driver), _grant(bench))
 
 
-def check_times(bench: Bench) -> None:
+def check_times(bench: Rig) -> None:
     """Observations arrive in order of time, none from the future, and ``observe`` returns the newest."""
-    driver = _ready_driver(bench)
+    driver = _make_ready_driver(bench)
     seen: list[Observation] = []
     driver.subscribe(seen.append)
     bench.pass_time(2.0 * bench.settle_s)
@@ -382,13 +382,13 @@ def check_times(bench: Bench) -> None:
         _require(isinstance(value, str) or not math.isinf(value), f"{key} is infinite; use NaN for nothing in range")
 
 
-def check_subscribers(bench: Bench) -> None:
+def check_subscribers(bench: Rig) -> None:
     """Each subscriber is called until it unsubscribes, even if another one raises."""
-    driver = _ready_driver(bench)
+    driver = _make_ready_driver(bench)
     seen: list[Observation] = []
 
     def faulty(_observation: Observation) -> None:
-        raise Faulty("raised by the conformance test")
+        raise SubscriberError("raised by the conformance test")
 
     end_faulty = driver.subscribe(faulty)
     end = driver.subscribe(seen.append)
@@ -402,13 +402,13 @@ def check_subscribers(bench: Bench) -> None:
     _require(len(seen) == count, "a subscriber is called after it unsubscribed")
 
 
-def check_counts(bench: Bench) -> None:
+def check_counts(bench: Rig) -> None:
     """``diagnostics`` returns numbers under the agreed names in any state; ``age`` is the newest observation's."""
     driver = bench.make_driver()
     _require(driver.diagnostics().get("age") == math.inf, "before the first observation its age is not infinite")
     _connect(bench, driver)
     counts: Mapping[str, Any] = driver.diagnostics()
-    missing = [name for name in COUNTS if name not in counts]
+    missing = [name for name in COUNTER_NAMES if name not in counts]
     _require(not missing, f"diagnostics lack {', '.join(missing)}")
     for name, value in counts.items():
         _require(isinstance(value, float | int), f"{name} is {value!r}, not a number")
@@ -420,16 +420,16 @@ def check_counts(bench: Bench) -> None:
     _require(driver.state in STATES, f"its state is {driver.state!r}")
 
 
-def check_invoke(bench: Bench) -> None:
+def check_invoke(bench: Rig) -> None:
     """``invoke`` fails with ``Unsupported`` for an unknown skill."""
-    driver = _ready_driver(bench)
+    driver = _make_ready_driver(bench)
     for name in ("no such skill", ""):
         answer = _Result(driver.invoke(name))
         bench.pass_time(0.1)
         _require(answer.is_error(Unsupported), f"invoke({name!r}) does not fail with Unsupported")
 
 
-CHECKS: dict[str, Callable[[Bench], None]] = {
+CHECKS: dict[str, Callable[[Rig], None]] = {
     name.removeprefix("check_"): check for name, check in list(globals().items()) if name.startswith("check_")
 }
 """The rules: each ``check_NAME`` of this module, in order."""
@@ -441,19 +441,19 @@ class Conformance:
     It has a method ``test_NAME`` for each rule of ``CHECKS``.
     """
 
-    bench: Any = None
+    rig: Any = None
     settle_s = 0.3
 
-    def _bench(self) -> Bench:
-        bench = type(self).bench
-        return cast(Bench, self if bench is None else bench())
+    def _make_rig(self) -> Rig:
+        bench = type(self).rig
+        return cast(Rig, self if bench is None else bench())
 
 
-def _make_test(check: Callable[[Bench], None]) -> Callable[[Conformance], None]:
+def _make_test(check: Callable[[Rig], None]) -> Callable[[Conformance], None]:
     def test(case: Conformance) -> None:
-        check(case._bench())
+        check(case._make_rig())
         # Trial fails a test on logged errors; the driver logs the one of the faulty subscriber.
-        getattr(case, "flushLoggedErrors", lambda _: None)(Faulty)
+        getattr(case, "flushLoggedErrors", lambda _: None)(SubscriberError)
 
     test.__doc__ = check.__doc__
     return test
@@ -463,14 +463,14 @@ for _name, _check in CHECKS.items():
     setattr(Conformance, f"test_{_name}", _make_test(_check))
 
 
-def broken(bench: Callable[[], Bench]) -> dict[str, str]:
+def find_violations(bench: Callable[[], Rig]) -> dict[str, str]:
     """Return each broken rule with its message; an exception breaks the rule.  Each rule gets a new ``bench``."""
     found = {}
     for name, check in CHECKS.items():
         try:
             check(bench())
         except Exception as error:  # the driver is third-party code
-            found[name] = str(error) if isinstance(error, Breach) else f"{type(error).__name__}: {error}"
+            found[name] = str(error) if isinstance(error, RuleViolation) else f"{type(error).__name__}: {error}"
     return found
 
 
@@ -489,49 +489,49 @@ class _Result:
     def value(self, what: str) -> Any:
         _require(bool(self._results), f"{what} does not fire in time")
         if isinstance(self._results[0], Failure):
-            raise Breach(f"{what} fails: {self._results[0].getErrorMessage()}")
+            raise RuleViolation(f"{what} fails: {self._results[0].getErrorMessage()}")
         return self._results[0]
 
     def is_error(self, kind: type[Exception]) -> bool:
         return bool(self._results) and isinstance(self._results[0], Failure) and bool(self._results[0].check(kind))
 
 
-def _connect(bench: Bench, driver: Driver) -> None:
+def _connect(bench: Rig, driver: Driver) -> None:
     connected = _Result(driver.connect())
     bench.pass_time(bench.settle_s)
     connected.value("connect")
 
 
-def _enable(bench: Bench, driver: Driver) -> None:
+def _enable(bench: Rig, driver: Driver) -> None:
     enabled = _Result(driver.enable())
     bench.pass_time(bench.settle_s)
     _require(enabled.value("enable") is True, "enable does not fire with True")
 
 
-def _ready_driver(bench: Bench) -> Driver:
+def _make_ready_driver(bench: Rig) -> Driver:
     driver = bench.make_driver()
     _connect(bench, driver)
     _enable(bench, driver)
     return driver
 
 
-def _grant(bench: Bench, seconds: float = 0.5, token: int = 1) -> Permit:
+def _grant(bench: Rig, seconds: float = 0.5, token: int = 1) -> Permit:
     return Permit(token, bench.now() + seconds)
 
 
-def _axis_of(driver: Driver) -> str:
+def _select_axis(driver: Driver) -> str:
     """Return the key of the motion that ``Bench.true_speed`` measures; empty if the device does not move."""
     limits = driver.description.limits
     return "base.vx" if "base.vx" in limits else next(iter(limits), "")
 
 
-def _half_speed(driver: Driver) -> Action:
+def _make_half_speed_action(driver: Driver) -> Action:
     """Return a motion at half of the limit; empty if the device does not move."""
-    axis = _axis_of(driver)
+    axis = _select_axis(driver)
     return {axis: driver.description.limits[axis][1] / 2.0} if axis else {}
 
 
-def _try_cut_link(bench: Bench, driver: Driver) -> bool:
+def _try_cut_link(bench: Rig, driver: Driver) -> bool:
     try:
         bench.cut_link()
     except NotImplementedError:
@@ -547,17 +547,17 @@ def _check_refused(kind: type[Exception], driver: Driver, action: Action, permit
     except kind:
         return
     except Exception as error:
-        raise Breach(f"act {when} raises {type(error).__name__}, not {kind.__name__}") from error
-    raise Breach(f"act {when} does not raise {kind.__name__}")
+        raise RuleViolation(f"act {when} raises {type(error).__name__}, not {kind.__name__}") from error
+    raise RuleViolation(f"act {when} does not raise {kind.__name__}")
 
 
-def _require_rest(bench: Bench, driver: Driver, when: str) -> None:
+def _require_rest(bench: Rig, driver: Driver, when: str) -> None:
     if driver.description.limits:
         speed = bench.true_speed()
-        _require(speed < AT_REST, f"{when} the robot moves at {speed:.3g}")
+        _require(speed < REST_SPEED_MPS, f"{when} the robot moves at {speed:.3g}")
 
 
-def _require_no_pending_calls(bench: Bench, when: str) -> None:
+def _require_no_pending_calls(bench: Rig, when: str) -> None:
     left_over = getattr(bench, "left_over", None)
     count = 0 if left_over is None else left_over()
     _require(count == 0, f"{when}it leaves {count} pending calls on its clock")
@@ -565,4 +565,4 @@ def _require_no_pending_calls(bench: Bench, when: str) -> None:
 
 def _require(is_so: bool, otherwise: str) -> None:
     if not is_so:
-        raise Breach(otherwise)
+        raise RuleViolation(otherwise)

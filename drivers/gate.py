@@ -59,10 +59,10 @@ class Gate:
         self._token = permit.token
         self._deadline = permit.deadline
 
-    def is_over(self, now: float) -> bool:
+    def is_motion_over(self, now: float) -> bool:
         """Return whether the motion in force has reached its deadline and must be stopped now."""
         return self._deadline is not None and now >= self._deadline
 
-    def close(self) -> None:
+    def end_motion(self) -> None:
         """Clear the motion in force after a stop; the token stays, so that fencing holds."""
         self._deadline = None

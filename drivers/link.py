@@ -19,12 +19,12 @@ from zope.interface import implementer
 from drivers.timer import Timer
 
 FIRST_RETRY_S = 0.1
-LAST_RETRY_S = 2
+MAX_RETRY_S = 2
 RETRY_FACTOR = 1.6
-CALL_S = 2.0
-NEWS = 5
+CONNECT_TIMEOUT_S = 2.0
+MIN_LOGGED_FAILURES = 5
 """Number of consecutive failed calls before the log reports it."""
-HUNG_UP = "it closes each new connection at once; does it already serve another client, and is the port right?"
+CLOSED_AT_ONCE = "it closes each new connection at once; does it already serve another client, and is the port right?"
 PROBLEMS: Sequence[tuple[type[Exception], str]] = (
     (error.ConnectionRefusedError, "nothing listens at this port; is the port right, and is its server running?"),
     (error.TCPTimedOutError, "it does not answer; is it switched on, and in this network?"),
@@ -52,31 +52,31 @@ class Link(Protocol):
 class Receiver(Protocol):
     """Receives the data and the close of a link."""
 
-    def received(self, data: bytes) -> None:
+    def data_received(self, data: bytes) -> None:
         """Take bytes from the stream, in pieces of any size."""
 
     def link_down(self) -> None:
         """Handle the close of the link, by either side."""
 
 
-class Caller(Receiver, Protocol):
+class LinkClient(Receiver, Protocol):
     """A receiver on the side that connects; it is given each new link."""
 
     def link_up(self, link: Link) -> None:
         """Use the link that has just opened."""
 
 
-class Line(Protocol):
+class Reconnector(Protocol):
     """A connection that is reopened whenever it is lost."""
 
-    def hang_up(self) -> Deferred[None]:
+    def disconnect(self) -> Deferred[None]:
         """Close the link and stop reconnecting; fires when it is closed."""
 
 
 class Connector(Protocol):
     """Opens links."""
 
-    def call(self, host: str, port: int, caller: Caller) -> Line:
+    def connect(self, host: str, port: int, caller: LinkClient) -> Reconnector:
         """Keep ``caller`` connected to this address, with back-off, until ``hang_up`` is called."""
 
 
@@ -104,7 +104,7 @@ class TcpLink(StreamLink):
 
     def __init__(self, accept: Accept) -> None:
         self._accept = accept
-        self.has_heard = False
+        self.has_received = False
         self._receiver: Receiver | None = None
         self._is_busy = False
 
@@ -136,9 +136,9 @@ class TcpLink(StreamLink):
         self._receiver = self._accept(self)
 
     def dataReceived(self, data: bytes) -> None:  # noqa: D102 (Twisted's)
-        self.has_heard = True
+        self.has_received = True
         if self._receiver is not None:
-            self._receiver.received(data)
+            self._receiver.data_received(data)
 
     def connectionLost(self, reason: Failure = protocol.connectionDone) -> None:  # noqa: D102 (Twisted's)
         self.connected = 0
@@ -190,10 +190,10 @@ class TcpConnector:
 
     def __init__(self, reactor: Any = None, waits: Sequence[float] = (), says: bool = False) -> None:
         self._reactor = reactor
-        self._waits = waits
-        self._says = says
+        self._retry_delays_s = waits
+        self._logs_problems = says
 
-    def call(self, host: str, port: int, caller: Caller) -> Line:
+    def connect(self, host: str, port: int, caller: LinkClient) -> Reconnector:
         """Keep ``caller`` connected to this address, with back-off, until ``hang_up`` is called."""
         reactor = reactor_or_running(self._reactor)
 
@@ -201,12 +201,12 @@ class TcpConnector:
             caller.link_up(link)
             return caller
 
-        line = _TcpLine(accept, reactor, self._waits, f"{host}:{port}" if self._says else "")
-        line.connector = reactor.connectTCP(host, port, line, timeout=CALL_S)
+        line = _TcpReconnector(accept, reactor, self._retry_delays_s, f"{host}:{port}" if self._logs_problems else "")
+        line.connector = reactor.connectTCP(host, port, line, timeout=CONNECT_TIMEOUT_S)
         return line
 
 
-class _TcpLine(protocol.ReconnectingClientFactory):
+class _TcpReconnector(protocol.ReconnectingClientFactory):
     """Reconnect with Twisted's older factory; ``ClientService`` has no advantage here and takes 0.6 MiB more per node.
 
     ``problem`` says in one line why there is no link; it is empty while the link is open and before the first attempt
@@ -216,7 +216,7 @@ class _TcpLine(protocol.ReconnectingClientFactory):
 
     noisy = False
     initialDelay = FIRST_RETRY_S  # noqa: N815 (Twisted's)
-    maxDelay = LAST_RETRY_S  # noqa: N815 (Twisted's)
+    maxDelay = MAX_RETRY_S  # noqa: N815 (Twisted's)
     factor = RETRY_FACTOR
     jitter = 0.0
 
@@ -229,7 +229,7 @@ class _TcpLine(protocol.ReconnectingClientFactory):
         self._failures = 0
         self._logged_problem = ""
         self.delay = self.initialDelay
-        self._waits = waits
+        self._retry_delays_s = waits
         self._tries = 0
         self.connector: Any = None
         self._accept = accept
@@ -244,8 +244,8 @@ class _TcpLine(protocol.ReconnectingClientFactory):
         return self._link
 
     def retry(self, connector: Any = None) -> None:
-        if self._waits:
-            self.delay = self._waits[min(self._tries, len(self._waits) - 1)]
+        if self._retry_delays_s:
+            self.delay = self._retry_delays_s[min(self._tries, len(self._retry_delays_s) - 1)]
             self._tries += 1
         super().retry(connector)
 
@@ -256,11 +256,11 @@ class _TcpLine(protocol.ReconnectingClientFactory):
 
     def clientConnectionLost(self, connector: Any, unused_reason: Failure) -> None:  # noqa: N802 (Twisted's)
         link, self._link = self._link, None
-        if (link is not None and link.has_heard) or self.clock.seconds() - self._opened_at >= LAST_RETRY_S:
+        if (link is not None and link.has_received) or self.clock.seconds() - self._opened_at >= MAX_RETRY_S:
             self.delay, self._tries = self.initialDelay, 0
             self._failures, self._logged_problem = 0, ""
         elif self._closed is None:
-            self._on_problem(HUNG_UP)
+            self._on_problem(CLOSED_AT_ONCE)
         super().clientConnectionLost(connector, unused_reason)
         closed, self._closed = self._closed, None
         if closed is not None:
@@ -270,11 +270,11 @@ class _TcpLine(protocol.ReconnectingClientFactory):
         self.problem = problem
         self._failures += 1
         # A few failures are normal while the robot starts or restarts.
-        if self._address and self._failures >= NEWS and problem != self._logged_problem:
+        if self._address and self._failures >= MIN_LOGGED_FAILURES and problem != self._logged_problem:
             self._logged_problem = problem
             self.log.warn("{address}: {problem}", address=self._address, problem=problem)
 
-    def hang_up(self) -> Deferred[None]:
+    def disconnect(self) -> Deferred[None]:
         self.stopTrying()
         if self.connector.state == "disconnected":
             return succeed(None)
@@ -288,7 +288,7 @@ class MemoryLink:
     """One end of a pair in memory: data sent at one end arrives at the other ``delay`` seconds later, in order."""
 
     def __init__(self, clock: IReactorTime, delay: float) -> None:
-        self.is_busy = self.is_silent = False
+        self.is_busy = self.is_blocked = False
         self.other: MemoryLink | None = None
         self.receiver: Receiver | None = None
         self._clock = clock
@@ -296,7 +296,7 @@ class MemoryLink:
 
     def send(self, data: bytes) -> None:
         """Send bytes; does nothing on a closed link."""
-        if self.other is not None and not self.is_silent:
+        if self.other is not None and not self.is_blocked:
             self._clock.callLater(self._delay, self.other._deliver, data)
 
     def close(self) -> None:
@@ -308,7 +308,7 @@ class MemoryLink:
 
     def _deliver(self, data: bytes) -> None:
         if self.receiver is not None:
-            self.receiver.received(data)
+            self.receiver.data_received(data)
 
     def _drop(self) -> None:
         self.other = None
@@ -330,9 +330,9 @@ class MemoryConnector:
         self._accept = accept
         self._delay = delay
 
-    def call(self, host: str, port: int, caller: Caller) -> Line:
+    def connect(self, host: str, port: int, caller: LinkClient) -> Reconnector:
         """Keep ``caller`` connected, with back-off, until ``hang_up`` is called."""
-        return _MemoryLine(self, self._clock, caller)
+        return _MemoryReconnector(self, self._clock, caller)
 
     def cut(self) -> None:
         """Break every open link."""
@@ -340,15 +340,15 @@ class MemoryConnector:
         for link in links:
             link.close()
 
-    def silence(self) -> None:
+    def block_data(self) -> None:
         """Drop all data on open links and refuse new ones, as a lost radio connection does."""
         self.is_open = False
         for link in self.links:
             for end in (link, link.other):
                 if end is not None:
-                    end.is_silent = True
+                    end.is_blocked = True
 
-    def opened(self, caller: Receiver) -> MemoryLink | None:
+    def open_pair(self, caller: Receiver) -> MemoryLink | None:
         """Open a new pair and return the caller's end; None if refused."""
         if not self.is_open:
             return None
@@ -360,39 +360,39 @@ class MemoryConnector:
         return near
 
 
-class _MemoryLine:
+class _MemoryReconnector:
     """The counterpart of ``_TcpLine`` in memory; it stands between link and caller to notice when the link closes."""
 
-    def __init__(self, connector: MemoryConnector, clock: IReactorTime, caller: Caller) -> None:
+    def __init__(self, connector: MemoryConnector, clock: IReactorTime, caller: LinkClient) -> None:
         self._connector = connector
-        self._caller = caller
+        self._client = caller
         self._retry_s = FIRST_RETRY_S
         self._link: MemoryLink | None = None
         self._is_wanted = True
         self._pending = Timer(clock)
         self._pending.set(0.0, self._try_open)
 
-    def hang_up(self) -> Deferred[None]:
+    def disconnect(self) -> Deferred[None]:
         self._is_wanted = False
         self._pending.cancel()
         if self._link is not None:
             self._link.close()
         return succeed(None)
 
-    def received(self, data: bytes) -> None:
-        self._caller.received(data)
+    def data_received(self, data: bytes) -> None:
+        self._client.data_received(data)
 
     def link_down(self) -> None:
         self._link = None
         if self._is_wanted:
             self._pending.set(FIRST_RETRY_S, self._try_open)
-        self._caller.link_down()
+        self._client.link_down()
 
     def _try_open(self) -> None:
-        self._link = self._connector.opened(self)
+        self._link = self._connector.open_pair(self)
         if self._link is None:
             self._pending.set(self._retry_s, self._try_open)
-            self._retry_s = min(self._retry_s * RETRY_FACTOR, LAST_RETRY_S)
+            self._retry_s = min(self._retry_s * RETRY_FACTOR, MAX_RETRY_S)
             return
         self._retry_s = FIRST_RETRY_S
-        self._caller.link_up(self._link)
+        self._client.link_up(self._link)

@@ -10,7 +10,7 @@ from msgspec import Meta
 
 from drivers.driver import MAX_FPS
 from drivers.errors import UsageError
-from formats.convert import Invalid, Unit, convert_table
+from formats.convert import InvalidValue, Unit, convert_table
 
 T = TypeVar("T")
 Port = Annotated[int, Meta(ge=1, le=65535)]
@@ -39,10 +39,10 @@ def convert_options(kind: str, table: object, cls: type[T]) -> T:
     """Convert ``table`` to the options class ``cls``; raise ``UsageError`` that names the key and the remedy."""
     try:
         return convert_table(table, cls)
-    except Invalid as error:
-        raise fault_of(kind, error.key, error.problem, error.remedy) from None
+    except InvalidValue as error:
+        raise make_option_error(kind, error.key, error.problem, error.remedy) from None
 
 
-def fault_of(kind: str, key: str, problem: str, remedy: str) -> UsageError:
+def make_option_error(kind: str, key: str, problem: str, remedy: str) -> UsageError:
     """Return the error about one option."""
     return UsageError(f'driver "{kind}": option {key} {problem}; {remedy}')

@@ -27,15 +27,26 @@ from drivers.reading import Description
 if TYPE_CHECKING:
     from drivers.link import Connector
 
-ENTRY_POINTS = "swarm_node.drivers"
-NEEDED = ("description", "state", "connect", "disconnect", "enable", "disable", "act", "stop", "observe", "subscribe")
+ENTRY_POINT_GROUP = "swarm_node.drivers"
+REQUIRED_MEMBERS = (
+    "description",
+    "state",
+    "connect",
+    "disconnect",
+    "enable",
+    "disable",
+    "act",
+    "stop",
+    "observe",
+    "subscribe",
+)
 Factory = Callable[[Mapping[str, object], str, IReactorTime, "Connector | None"], Driver]
 Describe = Callable[[Mapping[str, object], str], Description]
 Parts = Sequence[tuple[str, Mapping[str, object]]]
 """Kind and options of each sensing part that is mounted on a robot."""
 
 
-def built_in_kinds() -> list[str]:
+def list_built_in_kinds() -> list[str]:
     """Return the built-in kinds: the packages of ``drivers`` that have a ``driver`` module; none is imported.
 
     Such a module has ``MANIFEST``, ``make_driver(options, name, clock, connector)`` and ``describe(options, name)``.
@@ -44,24 +55,24 @@ def built_in_kinds() -> list[str]:
     return [name for name in packages if find_spec(f"drivers.{name}.driver") is not None]
 
 
-def manifest_of(kind: str) -> Manifest:
+def load_manifest(kind: str) -> Manifest:
     """Return the manifest of a built-in kind; an empty one for any other."""
-    return cast(Manifest, _load_attribute(kind, "MANIFEST")) if kind in built_in_kinds() else Manifest()
+    return cast(Manifest, _load_attribute(kind, "MANIFEST")) if kind in list_built_in_kinds() else Manifest()
 
 
-def kinds() -> list[str]:
+def list_kinds() -> list[str]:
     """Return the kinds of robot that have drivers, including other distributions; none is imported."""
-    return sorted({*built_in_kinds(), *places()})
+    return sorted({*list_built_in_kinds(), *list_entry_points()})
 
 
-def places() -> dict[str, str]:
+def list_entry_points() -> dict[str, str]:
     """Return each kind that another distribution provides, and its ``module:name``; none is imported."""
     from importlib.metadata import entry_points  # expensive to import, and most nodes do not need it
 
-    return {point.name: point.value for point in entry_points(group=ENTRY_POINTS)}
+    return {point.name: point.value for point in entry_points(group=ENTRY_POINT_GROUP)}
 
 
-def maker(kind: str, place: str) -> Factory:
+def load_factory(kind: str, place: str) -> Factory:
     """Load the factory of drivers of ``kind`` from ``place`` (``module:name``); raise ``UsageError`` if that fails."""
     module, _, attribute = place.partition(":")
     try:
@@ -73,12 +84,12 @@ def maker(kind: str, place: str) -> Factory:
     return partial(_make_checked, kind, make)
 
 
-def description_of(make: Factory, options: Mapping[str, object], name: str) -> Description:
+def get_description(make: Factory, options: Mapping[str, object], name: str) -> Description:
     """Return the description of such a robot; this creates a temporary driver, which opens nothing."""
     return make(options, name, Clock(), None).description
 
 
-def driver_for(
+def create_driver(
     kind: str,
     options: Mapping[str, object],
     name: str,
@@ -94,14 +105,14 @@ def driver_for(
     main = cast(Factory, _load_attribute(kind, "make_driver"))(options, name, clock, connector)
     if not parts:
         return main
-    from drivers.joined import joined  # not needed for a robot without parts
+    from drivers.composite import combine_drivers  # not needed for a robot without parts
 
     part_drivers = []
     for number, (part, table) in enumerate(parts, 1):
         with _prefix_part_number(number):
             make_part = cast(Factory, _load_attribute(part, "make_driver"))
             part_drivers.append(make_part(table, f"{name}'s {part}", clock, connector))
-    return joined(main, part_drivers, name)
+    return combine_drivers(main, part_drivers, name)
 
 
 def describe(kind: str, options: Mapping[str, object], name: str = "robot", parts: Parts = ()) -> Description:
@@ -109,13 +120,13 @@ def describe(kind: str, options: Mapping[str, object], name: str = "robot", part
     main = cast(Describe, _load_attribute(kind, "describe"))(options, name)
     if not parts:
         return main
-    from drivers.joined import described
+    from drivers.composite import combine_descriptions
 
     descriptions = []
     for number, (part, table) in enumerate(parts, 1):
         with _prefix_part_number(number):
             descriptions.append(cast(Describe, _load_attribute(part, "describe"))(table, name))
-    return described(main, descriptions)
+    return combine_descriptions(main, descriptions)
 
 
 @contextmanager
@@ -128,14 +139,14 @@ def _prefix_part_number(number: int) -> Iterator[None]:
 
 
 def _load_attribute(kind: str, attribute: str) -> object:
-    if kind in built_in_kinds():
+    if kind in list_built_in_kinds():
         return getattr(import_module(f"drivers.{kind}.driver"), attribute)
-    place = kind if ":" in kind else places().get(kind)
+    place = kind if ":" in kind else list_entry_points().get(kind)
     if place is None:
         remedy = "for another driver write module:Class"
-        raise UsageError(f"no driver for robots of kind {kind!r}; known are {', '.join(kinds())}; {remedy}")
-    make = maker(kind, place)
-    return make if attribute == "make_driver" else partial(description_of, make)
+        raise UsageError(f"no driver for robots of kind {kind!r}; known are {', '.join(list_kinds())}; {remedy}")
+    make = load_factory(kind, place)
+    return make if attribute == "make_driver" else partial(get_description, make)
 
 
 def _make_checked(
@@ -143,7 +154,7 @@ def _make_checked(
 ) -> Driver:
     try:
         driver = make(options, name, clock, connector)
-        missing = [each for each in NEEDED if not hasattr(driver, each)]
+        missing = [each for each in REQUIRED_MEMBERS if not hasattr(driver, each)]
         if missing or not isinstance(driver.description, Description):
             raise TypeError(f"it is not a Driver: it lacks {', '.join(missing) or 'a Description'}")
     except DriverError:

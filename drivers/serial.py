@@ -19,18 +19,18 @@ from twisted.python.failure import Failure
 from drivers.errors import UsageError
 from drivers.link import (
     FIRST_RETRY_S,
-    LAST_RETRY_S,
+    MAX_RETRY_S,
     RETRY_FACTOR,
-    Caller,
-    Line,
+    LinkClient,
+    Reconnector,
     StreamLink,
     reactor_or_running,
 )
 from drivers.timer import Timer
 
-FLUSH_S = 1.0
+FLUSH_TIMEOUT_S = 1.0
 """Seconds that data sent before ``hang_up`` may take to be written."""
-BACKLOG = 4096
+MAX_BACKLOG_BYTES = 4096
 """Number of unsent bytes above which a link is busy."""
 PROBLEMS = {
     errno.ENOENT: "there is no such device; plug the robot in, or correct the option port",
@@ -49,7 +49,7 @@ Opener = Callable[[protocol.Protocol, str, int, Any], Any]
 """Opens a device at a baud rate on a reactor and attaches a protocol; raises ``OSError`` or ``ValueError``."""
 
 
-def problem_of(error: Exception) -> str:
+def describe_problem(error: Exception) -> str:
     """Return the reason why a device cannot be opened, and the remedy, in one line."""
     number = getattr(error, "errno", None)
     # pyserial wraps errors of the system into its own exceptions, some of them without the errno.
@@ -67,25 +67,25 @@ class SerialConnector:
         self._reactor = reactor
         self._opener = opener
 
-    def call(self, host: str, port: int, caller: Caller) -> Line:
+    def connect(self, host: str, port: int, caller: LinkClient) -> Reconnector:
         """Keep ``caller`` connected to the device ``host`` at ``port`` baud, with back-off, until ``hang_up``.
 
         Raises ``UsageError`` if pyserial is missing.
         """
         reactor = reactor_or_running(self._reactor)
-        return SerialLine(host, port, caller, reactor, _load_opener() if self._opener is None else self._opener)
+        return SerialReconnector(host, port, caller, reactor, _load_opener() if self._opener is None else self._opener)
 
 
-class SerialLine:
+class SerialReconnector:
     """Keeps a device open; ``problem`` says in one line why it is not, and is logged once."""
 
     log = Logger()
 
-    def __init__(self, device: str, baud: int, caller: Caller, reactor: Any, opener: Opener) -> None:
+    def __init__(self, device: str, baud: int, caller: LinkClient, reactor: Any, opener: Opener) -> None:
         self.problem = ""
         self._device = device
         self._baud = baud
-        self._caller = caller
+        self._client = caller
         self._reactor = reactor
         self._opener = opener
         self._link: _SerialLink | None = None
@@ -94,41 +94,41 @@ class SerialLine:
         self._pending = Timer(reactor)
         self._pending.set(0.0, self._try_open)
 
-    def hang_up(self) -> Deferred[None]:
+    def disconnect(self) -> Deferred[None]:
         """Write pending data, close the device, stop retrying; fires when the device is closed."""
         if self._link is None:
             self._pending.cancel()
             return succeed(None)
         if self._closed is None:
             self._closed = Deferred()
-            self._pending.set(FLUSH_S, self._link.close)
-            self._link.leave()
+            self._pending.set(FLUSH_TIMEOUT_S, self._link.close)
+            self._link.close_after_flush()
         return self._closed
 
-    def link_lost(self) -> None:
+    def on_link_lost(self) -> None:
         """Handle the close of the device; called by the link."""
         self._link = None
         closed, self._closed = self._closed, None
         self._pending.cancel()
         if closed is None:
             self._pending.set(FIRST_RETRY_S, self._try_open)
-        self._caller.link_down()
+        self._client.link_down()
         if closed is not None:
             closed.callback(None)
 
     def _try_open(self) -> None:
-        link = _SerialLink(self, self._caller)
+        link = _SerialLink(self, self._client)
         try:
             self._opener(link, self._device, self._baud, self._reactor)
         except (OSError, ValueError) as error:
-            self._log_problem(problem_of(error))
+            self._log_problem(describe_problem(error))
             self._pending.set(self._retry_s, self._try_open)
-            self._retry_s = min(self._retry_s * RETRY_FACTOR, LAST_RETRY_S)
+            self._retry_s = min(self._retry_s * RETRY_FACTOR, MAX_RETRY_S)
             return
         self._retry_s = FIRST_RETRY_S
         self.problem = ""
         self._link = link
-        self._caller.link_up(link)
+        self._client.link_up(link)
 
     def _log_problem(self, problem: str) -> None:
         if problem != self.problem:
@@ -137,14 +137,14 @@ class SerialLine:
 
 
 class _SerialLink(StreamLink):
-    def __init__(self, line: SerialLine, caller: Caller) -> None:
-        self._line = line
-        self._caller = caller
+    def __init__(self, line: SerialReconnector, caller: LinkClient) -> None:
+        self._reconnector = line
+        self._client = caller
 
     @property
     def is_busy(self) -> bool:
         transport: Any = self.transport
-        return transport is not None and len(transport.dataBuffer) + transport._tempDataLen > BACKLOG
+        return transport is not None and len(transport.dataBuffer) + transport._tempDataLen > MAX_BACKLOG_BYTES
 
     def close(self) -> None:
         transport: Any = self.transport
@@ -154,18 +154,18 @@ class _SerialLink(StreamLink):
             transport.stopWriting()
             transport.connectionLost(Failure(protocol.connectionDone.value))
 
-    def leave(self) -> None:
+    def close_after_flush(self) -> None:
         """Close after all pending data is written."""
         if self.transport is not None:
             self.transport.loseConnection()
 
     def dataReceived(self, data: bytes) -> None:
-        self._caller.received(data)
+        self._client.data_received(data)
 
     def connectionLost(self, reason: Failure = protocol.connectionDone) -> None:
         if self.connected:
             self.connected = 0
-            self._line.link_lost()
+            self._reconnector.on_link_lost()
 
 
 def _load_opener() -> Opener:

@@ -16,21 +16,21 @@ class Subscribers(Generic[T]):
     def __init__(self, robot: str, log: Logger) -> None:
         self._robot = robot
         self._log = log
-        self._all: list[Callable[[T], None]] = []
+        self._callbacks: list[Callable[[T], None]] = []
 
     def add(self, seen: Callable[[T], None]) -> Callable[[], None]:
         """Call ``seen`` with each new item; return a function that ends the subscription."""
-        self._all.append(seen)
+        self._callbacks.append(seen)
 
         def end() -> None:
-            if seen in self._all:
-                self._all.remove(seen)
+            if seen in self._callbacks:
+                self._callbacks.remove(seen)
 
         return end
 
-    def tell(self, newest: T) -> None:
+    def notify(self, newest: T) -> None:
         """Call the current subscribers; changes made during the calls take effect with the next item."""
-        for seen in list(self._all):
+        for seen in list(self._callbacks):
             try:
                 seen(newest)
             except Exception:

@@ -14,7 +14,7 @@ from peer import joined
 from twisted.internet import defer, stdio, task
 from twisted.protocols.basic import LineReceiver
 
-from middleware.entangled.control.word import printable
+from middleware.entangled.control.conversion import remove_control_characters
 from middleware.entangled.space.tuplespace import TupleSpace
 
 LINE_TTL_S = 60.0
@@ -47,7 +47,7 @@ class Keyboard(LineReceiver):
 async def _listen(space: TupleSpace, name: str) -> None:
     while True:
         _, _, speaker, text = await space.get(("line", name, str, str))
-        print(printable(f"{speaker}: {text}"), flush=True)
+        print(remove_control_characters(f"{speaker}: {text}"), flush=True)
 
 
 async def main(reactor: Any, port: int, known: str, name: str) -> None:
@@ -56,7 +56,7 @@ async def main(reactor: Any, port: int, known: str, name: str) -> None:
     space = TupleSpace(node, reactor, random.SystemRandom())
     await space.put(("here", name))
     here = sorted(other for _, other in await space.read_all(("here", str)))
-    print("here:", *map(printable, here), flush=True)
+    print("here:", *map(remove_control_characters, here), flush=True)
     ended: defer.Deferred[None] = defer.Deferred()
     stdio.StandardIO(Keyboard(space, name, ended))
     listening = defer.ensureDeferred(_listen(space, name))

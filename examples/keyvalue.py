@@ -9,16 +9,16 @@ import sys
 from peer import joined
 from twisted.internet import defer, task
 
-from middleware.entangled.record import hashed_key
+from middleware.entangled.record import hash_key
 
 
 async def main(reactor, port, known="", key="", value=""):
     """Store a value, read one, or only run a node."""
     node = await joined(reactor, int(port), known)
     if value:
-        print("stored on", await node.put(hashed_key(key), "value", value.encode()), "nodes", flush=True)
+        print("stored on", await node.put(hash_key(key), "value", value.encode()), "nodes", flush=True)
     elif key:
-        return print(*[record.value.decode() for record in await node.get(hashed_key(key))], flush=True)
+        return print(*[record.value.decode() for record in await node.get(hash_key(key))], flush=True)
     await defer.Deferred()
 
 

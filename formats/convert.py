@@ -16,12 +16,12 @@ from typing import Annotated, Any, Literal, TypeVar, get_args, get_origin, get_t
 from msgspec import Meta, MsgspecError, convert
 
 T = TypeVar("T")
-MAX_SHOWN = 60
+MAX_SHOWN_CHARS = 60
 FINITE = Meta(ge=-1.7e308, le=1.7e308)
 """Any number except NaN and the infinities."""
 
 
-class Invalid(Exception):
+class InvalidValue(Exception):
     """A value that is invalid for its field."""
 
     def __init__(self, key: str, problem: str, remedy: str) -> None:
@@ -32,7 +32,7 @@ class Invalid(Exception):
 
 
 @dataclass(frozen=True)
-class Then:
+class ConversionStep:
     """A step after the conversion: return the value to use, or raise ``ValueError``.
 
     ``raw`` is the type of the value before this step, if it differs from the field's.
@@ -61,40 +61,40 @@ def check_printable(value: Any) -> Any:
     return value
 
 
-LINE = Then(check_printable)
+PRINTABLE = ConversionStep(check_printable)
 
 
-def one_of(words: Sequence[str]) -> Then:
+def one_of(words: Sequence[str]) -> ConversionStep:
     """Allow one of ``words``."""
-    return Then(lambda word: word, raw=Literal[tuple(words)])
+    return ConversionStep(lambda word: word, raw=Literal[tuple(words)])
 
 
-def some_of(words: Sequence[str]) -> Then:
+def some_of(words: Sequence[str]) -> ConversionStep:
     """Allow a list of at least one of ``words``, sorted in the order of ``words``."""
     word: Any = Literal[tuple(words)]
     raw = Annotated[tuple[word, ...], Meta(min_length=1)]
-    return Then(lambda given: tuple(word for word in words if word in given), raw)
+    return ConversionStep(lambda given: tuple(word for word in words if word in given), raw)
 
 
-UNIQUE = Then(lambda items: tuple(dict.fromkeys(items)))
+UNIQUE = ConversionStep(lambda items: tuple(dict.fromkeys(items)))
 """Removes duplicates from a list."""
 
 
 def convert_table(table: object, cls: type[T]) -> T:
     """Convert a table to the dataclass ``cls``; raise ``Invalid``, with an empty key if it is not a table."""
     if not isinstance(table, Mapping):
-        raise Invalid("", f"must be a table, is {show_value(table)}", "write { key = value }")
+        raise InvalidValue("", f"must be a table, is {show_value(table)}", "write { key = value }")
     known = {field.name: field for field in fields(cls)}  # type: ignore[arg-type]
     for key in table:
         if key not in known:
-            raise Invalid(
-                str(key), "is unknown", f"the nearest is {nearest_of(str(key), known)}; known are {', '.join(known)}"
+            raise InvalidValue(
+                str(key), "is unknown", f"the nearest is {find_nearest(str(key), known)}; known are {', '.join(known)}"
             )
     hints = get_type_hints(cls, include_extras=True)
     values = {key: convert_value(value, hints[key], key, known[key].default) for key, value in table.items()}
     for key, field in known.items():
         if key not in values and field.default is MISSING and field.default_factory is MISSING:
-            raise Invalid(key, "is missing", _remedy_for(hints[key]))
+            raise InvalidValue(key, "is missing", _make_remedy(hints[key]))
     return cls(**values)
 
 
@@ -110,51 +110,51 @@ def convert_value(value: object, hint: Any, key: str = "", default: object = Non
     ``is_text``: the value is a command-line argument, in which commas separate the entries of a list.
     """
     extra = getattr(hint, "__metadata__", ())
-    raw = raw_of(hint)
+    raw = get_raw_type(hint)
     try:
-        if is_text and get_origin(_base_of(raw)) is tuple:
+        if is_text and get_origin(_get_base_type(raw)) is tuple:
             value = [word.strip() for word in str(value).split(",") if word.strip()]
         if is_text and raw is bool:
             value = {"true": True, "false": False}.get(str(value), value)
         result = convert(value, raw, strict=not is_text or raw is bool)
         for step in extra:
-            result = step.apply(result) if isinstance(step, Then) else result
+            result = step.apply(result) if isinstance(step, ConversionStep) else result
         return result
     except (MsgspecError, ValueError) as error:
         if any(isinstance(each, Secret) for each in extra):
-            raise Invalid(key, "is not allowed (its value is not shown)", _remedy_for(hint)) from None
-        place, wrong = _innermost(value, error)
+            raise InvalidValue(key, "is not allowed (its value is not shown)", _make_remedy(hint)) from None
+        place, wrong = _locate_error(value, error)
         problem = str(error)
         if isinstance(error, MsgspecError) or not problem:
             unknown = re.match(r"Object .* field `.*?`", problem)
             problem = f"has {unknown[0][7:]}" if unknown else f"is {show_value(wrong)}"
-        raise Invalid(key, f"{place} {problem}".strip(), _remedy_for(hint, default, wrong)) from None
+        raise InvalidValue(key, f"{place} {problem}".strip(), _make_remedy(hint, default, wrong)) from None
 
 
-def raw_of(hint: Any) -> Any:
+def get_raw_type(hint: Any) -> Any:
     """Return the type of a value before its steps."""
-    steps = [each for each in getattr(hint, "__metadata__", ()) if isinstance(each, Then)]
+    steps = [each for each in getattr(hint, "__metadata__", ()) if isinstance(each, ConversionStep)]
     return next((step.raw for step in steps if step.raw is not None), hint)
 
 
 def show_value(value: object) -> str:
     """Return ``value`` as JSON for an error, truncated to ``MAX_SHOWN`` characters."""
     text = json.dumps(value, default=str, ensure_ascii=False)
-    return text if len(text) <= MAX_SHOWN else text[: MAX_SHOWN - 3] + "..."
+    return text if len(text) <= MAX_SHOWN_CHARS else text[: MAX_SHOWN_CHARS - 3] + "..."
 
 
-def nearest_of(word: str, known: Iterable[str]) -> str:
+def find_nearest(word: str, known: Iterable[str]) -> str:
     """Return the known word that is most similar to ``word``."""
     from difflib import get_close_matches  # imported only for an error
 
     return get_close_matches(word[:64], list(known), n=1, cutoff=0.0)[0]
 
 
-def _base_of(hint: Any) -> Any:
+def _get_base_type(hint: Any) -> Any:
     return get_args(hint)[0] if hasattr(hint, "__metadata__") else hint
 
 
-def _innermost(value: object, error: Exception) -> tuple[str, object]:
+def _locate_error(value: object, error: Exception) -> tuple[str, object]:
     """Return the place and value of the entry in an error of ``msgspec``, from a path such as ``$[1].kind``."""
     path = re.search(r" - at `(?:key in `)?\$([^`]*)`", str(error))
     place = ""
@@ -166,16 +166,16 @@ def _innermost(value: object, error: Exception) -> tuple[str, object]:
     return place, value
 
 
-def _expected_by(hint: Any) -> str:
+def _describe_type(hint: Any) -> str:
     """Describe the values that a type allows, for errors."""
     extra = getattr(hint, "__metadata__", ())
     metas = [each for each in extra if isinstance(each, Meta)]
     for meta in metas:
         if meta.description:
             return meta.description
-    if raw_of(hint) is not hint:
-        return _expected_by(raw_of(hint))
-    base, unit = _base_of(hint), "".join(f" {each.name}" for each in extra if isinstance(each, Unit))
+    if get_raw_type(hint) is not hint:
+        return _describe_type(get_raw_type(hint))
+    base, unit = _get_base_type(hint), "".join(f" {each.name}" for each in extra if isinstance(each, Unit))
     if get_origin(base) is Literal:
         return f"one of {', '.join(map(json.dumps, get_args(base)))}"
     if get_origin(base) in (list, tuple):
@@ -183,7 +183,7 @@ def _expected_by(hint: Any) -> str:
             (f" of {meta.min_length or 0} to {meta.max_length} entries" for meta in metas if meta.max_length), ""
         )
         entry = get_args(base)[0]
-        return f"a list{most}" if entry is Any else f"a list{most}, each {_expected_by(entry)}"
+        return f"a list{most}" if entry is Any else f"a list{most}, each {_describe_type(entry)}"
     name = {bool: "true or false", int: "a whole number", float: "a number", str: "text"}.get(base, "a table")
     bounds = {"ge": "from", "gt": "above", "le": "to", "lt": "below", "pattern": "that matches"}
     limits = [
@@ -197,21 +197,21 @@ def _expected_by(hint: Any) -> str:
     return name + "".join([*limits, unit, *lengths])
 
 
-def _remedy_for(hint: Any, default: object = None, wrong: object = None) -> str:
-    words = _words_of(hint)
+def _make_remedy(hint: Any, default: object = None, wrong: object = None) -> str:
+    words = _list_words(hint)
     if words and isinstance(wrong, str):
-        return f'write {_expected_by(hint)}; the nearest is "{nearest_of(wrong, words)}"'
+        return f'write {_describe_type(hint)}; the nearest is "{find_nearest(wrong, words)}"'
     for meta in getattr(hint, "__metadata__", ()):
         if isinstance(meta, Meta) and meta.examples:
             default = meta.examples[0]
     # TOML writes strings, numbers and lists like JSON.
     has_example = isinstance(default, int | float | str | list | tuple) and default not in (True, False, "", ())
-    return f"write {_expected_by(hint)}{f', such as {json.dumps(default)}' if has_example else ''}"
+    return f"write {_describe_type(hint)}{f', such as {json.dumps(default)}' if has_example else ''}"
 
 
-def _words_of(hint: Any) -> list[str]:
+def _list_words(hint: Any) -> list[str]:
     """Return the words that a type allows, directly or as entries of a list."""
-    base = _base_of(raw_of(hint))
+    base = _get_base_type(get_raw_type(hint))
     if get_origin(base) is tuple:
-        base = _base_of(get_args(base)[0])
+        base = _get_base_type(get_args(base)[0])
     return [word for word in get_args(base) if isinstance(word, str)] if get_origin(base) is Literal else []

@@ -5,9 +5,9 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import NamedTuple
 
-MAX_HEAD = 8192
+MAX_HEAD_BYTES = 8192
 """The maximum number of bytes of a head."""
-_END = b"\r\n\r\n"
+_HEAD_END = b"\r\n\r\n"
 
 
 class Head(NamedTuple):
@@ -17,23 +17,23 @@ class Head(NamedTuple):
     fields: Mapping[bytes, bytes]
 
     @property
-    def said(self) -> str:
+    def summary(self) -> str:
         """The start of the first line, for error messages."""
         return self.first[:60].decode("ascii", "replace")
 
 
-def head(*lines: str) -> bytes:
+def encode_head(*lines: str) -> bytes:
     """Encode a head."""
-    return "\r\n".join(lines).encode() + _END
+    return "\r\n".join(lines).encode() + _HEAD_END
 
 
-def taken(buffer: bytearray) -> Head | None:
+def pop_head(buffer: bytearray) -> Head | None:
     """Remove the head from ``buffer`` and return it; None while it is incomplete."""
-    end = buffer.find(_END, 0, MAX_HEAD)
+    end = buffer.find(_HEAD_END, 0, MAX_HEAD_BYTES)
     if end < 0:
         return None
     first, *rest = bytes(buffer[:end]).split(b"\r\n")
-    del buffer[: end + len(_END)]
+    del buffer[: end + len(_HEAD_END)]
     fields: dict[bytes, bytes] = {}
     for line in rest:
         name, _, value = line.partition(b":")

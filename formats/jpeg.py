@@ -6,25 +6,25 @@ A few hundred bytes may declare an image of four thousand megapixels, or thousan
 
 from __future__ import annotations
 
-MAX_SIDE = 4096
+MAX_SIDE_PX = 4096
 """The maximum width and height in pixels."""
-MAX_DECODED = 2**25
+MAX_DECODED_PX = 2**25
 """The maximum number of pixels in all scans together: 16 megapixels in two, 1920 x 1080 in sixteen."""
 _START_OF_FRAME = frozenset((0xC0, 0xC1, 0xC2))
 """Baseline, extended and progressive with Huffman coding.  Cameras send no others, and their decoders are slower."""
 _OTHER_FRAMES = frozenset(range(0xC3, 0xD0)) - {0xC4, 0xC8, 0xCC}
 _START_OF_SCAN = b"\xff\xda"
-_BARE = frozenset((0x01, *range(0xD0, 0xD8)))
+_MARKERS_WITHOUT_LENGTH = frozenset((0x01, *range(0xD0, 0xD8)))
 
 
-def size_of(data: bytes) -> tuple[int, int] | None:
+def read_size(data: bytes) -> tuple[int, int] | None:
     """Return width and height in pixels of a complete JPEG; None if it is invalid, truncated or beyond the limits."""
     if not data.startswith(b"\xff\xd8") or not data.endswith(b"\xff\xd9"):
         return None
     offset = 2
     while offset + 9 <= len(data) and data[offset] == 0xFF:
         kind = data[offset + 1]
-        if kind == 0xFF or kind in _BARE:
+        if kind == 0xFF or kind in _MARKERS_WITHOUT_LENGTH:
             offset += 1 if kind == 0xFF else 2
             continue
         if kind in _START_OF_FRAME:
@@ -38,8 +38,8 @@ def size_of(data: bytes) -> tuple[int, int] | None:
 
 
 def _is_within_limits(width: int, height: int, data: bytes, start: int) -> bool:
-    if not (0 < width <= MAX_SIDE and 0 < height <= MAX_SIDE):
+    if not (0 < width <= MAX_SIDE_PX and 0 < height <= MAX_SIDE_PX):
         return False
     # Coded data does not contain these bytes. Bytes of other segments may, so the count is never too low.
     scans = data.count(_START_OF_SCAN, start)
-    return width * height * max(1, scans) <= MAX_DECODED
+    return width * height * max(1, scans) <= MAX_DECODED_PX

@@ -25,16 +25,16 @@ from wsproto.events import (
 )
 from wsproto.utilities import LocalProtocolError, RemoteProtocolError
 
-from formats.head import MAX_HEAD
+from formats.head import MAX_HEAD_BYTES
 
-NORMAL, BAD = 1000, 1002
+CLOSE_NORMAL, CLOSE_PROTOCOL_ERROR = 1000, 1002
 """Close codes."""
 MAX_FRAMES = 2048
 """The maximum number of frames in one read of at most 64 KiB; more are nearly empty frames, which cost more to receive
 than to send."""
 
 
-class End(ABC):
+class WebSocketEnd(ABC):
     """One end of a connection: the client if ``request`` is given.
 
     After a ``fault`` nothing more is received: close the stream.  A subclass checks the handshake of the other end.
@@ -48,12 +48,12 @@ class End(ABC):
         """The number of complete frames received.  If bytes arrive and it does not grow, the length of a frame may be
         corrupt."""
         self._request = request
-        self._longest = longest
+        self._max_message_bytes = longest
         self._takes_text = takes_text
         self._socket = WSConnection(ConnectionType.SERVER if request is None else ConnectionType.CLIENT)
         self._handshake_bytes = 0
-        self._left = MAX_FRAMES
-        self._part = bytearray()
+        self._frames_left = MAX_FRAMES
+        self._partial_message = bytearray()
         self._messages: list[bytes] = []
         self._reply: list[bytes] = []
 
@@ -61,11 +61,11 @@ class End(ABC):
         """Return the request of a client; a server sends nothing first."""
         return b"" if self._request is None else self._send(self._request)
 
-    def received(self, data: bytes) -> tuple[list[bytes], bytes]:
+    def receive_data(self, data: bytes) -> tuple[list[bytes], bytes]:
         """Process received bytes; return the messages that they complete, and the bytes to send back at once."""
         if self.fault or not data:
             return [], b""
-        self._left = MAX_FRAMES
+        self._frames_left = MAX_FRAMES
         self._handshake_bytes += 0 if self.is_open else len(data)
         try:
             self._socket.receive_data(data)
@@ -74,37 +74,37 @@ class End(ABC):
                     break
         # ValueError: the head has an unknown charset
         except (RemoteProtocolError, LocalProtocolError, ValueError) as error:
-            self._refuse(error)
-        if not (self.is_open or self.fault) and self._handshake_bytes >= MAX_HEAD:
-            self.fault = f"the handshake has no end within {MAX_HEAD} bytes; the other end is not a WebSocket"
+            self._reject_handshake(error)
+        if not (self.is_open or self.fault) and self._handshake_bytes >= MAX_HEAD_BYTES:
+            self.fault = f"the handshake has no end within {MAX_HEAD_BYTES} bytes; the other end is not a WebSocket"
         messages, self._messages = self._messages, []
         reply, self._reply = b"".join(self._reply), []
         return messages, reply
 
-    def framed(self, payload: bytes) -> bytes:
+    def encode_binary(self, payload: bytes) -> bytes:
         """Return a binary message as one frame, or nothing if the connection is closing."""
         return self._send(BytesMessage(payload))
 
-    def text(self, payload: bytes) -> bytes:
+    def encode_text(self, payload: bytes) -> bytes:
         """Return a UTF-8 text message as one frame, or nothing if the connection is closing."""
         return self._send(TextMessage(payload.decode()))
 
-    def ping(self) -> bytes:
+    def encode_ping(self) -> bytes:
         """Return a ping frame."""
         return self._send(Ping())
 
-    def closing(self, code: int = NORMAL) -> bytes:
+    def encode_close(self, code: int = CLOSE_NORMAL) -> bytes:
         """Return the frame that closes the connection, or nothing if it was sent before."""
         return self._send(CloseConnection(code))
 
     # -- for subclasses ---------------------------------------------------------------------------------------------
 
     @abstractmethod
-    def _answer(self, request: Request) -> AcceptConnection | RejectConnection:
+    def _make_response(self, request: Request) -> AcceptConnection | RejectConnection:
         """Return the server's response to a request."""
 
     @abstractmethod
-    def _fault_of(self, answer: AcceptConnection | RejectConnection | Exception) -> str:
+    def _find_error(self, answer: AcceptConnection | RejectConnection | Exception) -> str:
         """Return the fault in a server's response, or an empty text if frames may follow."""
 
     # -- private ----------------------------------------------------------------------------------------------------
@@ -117,11 +117,11 @@ class End(ABC):
 
     def _process_event(self, event: Event) -> bool:
         """Process an event; return False if it ends the connection."""
-        self._left -= 1
-        if self._left < 0:
+        self._frames_left -= 1
+        if self._frames_left < 0:
             self._fail(f"more than {MAX_FRAMES} frames at once")
         elif isinstance(event, Message):
-            self._join(event)
+            self._add_frame(event)
         elif isinstance(event, Ping | Pong):
             self.frames += 1
             if isinstance(event, Ping):
@@ -134,36 +134,36 @@ class End(ABC):
                 self.fault = "the other end closed the connection"
                 self._reply.append(self._send(event.response()))
         elif isinstance(event, Request):
-            answer = self._answer(event)
+            answer = self._make_response(event)
             self._reply.append(self._send(answer))
             self.is_open = isinstance(answer, AcceptConnection)
             self.fault = "" if self.is_open else "the request was rejected"
         elif isinstance(event, AcceptConnection | RejectConnection):
-            self.fault = self._fault_of(event)
+            self.fault = self._find_error(event)
             self.is_open = not self.fault
         return not self.fault
 
-    def _join(self, event: Message[Any]) -> None:
+    def _add_frame(self, event: Message[Any]) -> None:
         self.frames += event.frame_finished
-        self._part += event.data.encode() if isinstance(event.data, str) else event.data
+        self._partial_message += event.data.encode() if isinstance(event.data, str) else event.data
         if isinstance(event, TextMessage) and not self._takes_text:
             self._fail("a text message, but only binary ones are allowed")
-        elif len(self._part) > self._longest:
-            self._fail(f"a message of more than {self._longest} bytes")
+        elif len(self._partial_message) > self._max_message_bytes:
+            self._fail(f"a message of more than {self._max_message_bytes} bytes")
         elif event.message_finished:
-            self._messages.append(bytes(self._part))
-            self._part = bytearray()
+            self._messages.append(bytes(self._partial_message))
+            self._partial_message = bytearray()
 
-    def _fail(self, reason: str, code: int = BAD) -> None:
+    def _fail(self, reason: str, code: int = CLOSE_PROTOCOL_ERROR) -> None:
         self.fault = reason
-        self._reply.append(self.closing(code))
+        self._reply.append(self.encode_close(code))
 
-    def _refuse(self, error: Exception) -> None:
+    def _reject_handshake(self, error: Exception) -> None:
         """Close a connection that is not a WebSocket; a server sends an HTTP response."""
         if self.is_open:
             self._fail(str(error))
         elif self._request is not None:
-            self.fault = self._fault_of(error)
+            self.fault = self._find_error(error)
         else:
             self.fault = f"not a WebSocket handshake: {error}"
             hint = getattr(error, "event_hint", None) or RejectConnection()

@@ -18,44 +18,44 @@ from twisted.internet.defer import Deferred, maybeDeferred
 from twisted.internet.interfaces import IReactorTime
 from twisted.logger import Logger
 
-from middleware.consensus.bidding.group import Group, Heard
-from middleware.consensus.deployed import Deployed, is_deployed
-from middleware.consensus.strategy import place_of
+from middleware.consensus.bidding.group import Group, OnMembers
+from middleware.consensus.deployed_modules import DeployedModules, is_deployed
+from middleware.consensus.strategy import find_import_path
 from middleware.directory.directory import Directory, Matches, Page
-from middleware.directory.following import Following
 from middleware.directory.listing import Listing
-from middleware.directory.prefix import LONGEST
-from middleware.directory.presence import Device, Presence, devices_of
+from middleware.directory.prefix import MAX_LEASE_S
+from middleware.directory.presence import Device, Presence, parse_devices
+from middleware.directory.subscription import DeviceSubscription
 from middleware.entangled.background import Background
-from middleware.entangled.contact import Contact, unpacked
+from middleware.entangled.contact import Contact, parse_contact
 from middleware.entangled.data.store import Store
-from middleware.entangled.errors import EntangledError, NotRunning, Refused, WeatherError
+from middleware.entangled.errors import EntangledError, NotRunning, Refused, TransientError
 from middleware.entangled.identity import Identity
 from middleware.entangled.network.multicast import Multicast
 from middleware.entangled.network.network import Address, Network
 from middleware.entangled.node import EntangledNode
 from middleware.entangled.record import Record, Slot
 from middleware.entangled.replication.owner import Stored
-from middleware.entangled.replication.watch import Changed, Watch
+from middleware.entangled.replication.watch import OnChanged, Watch
 from middleware.entangled.streams import Streams
-from middleware.entangled.value import bounded
-from middleware.entangled.wire.door import OPEN, Door
+from middleware.entangled.value import check_size
+from middleware.entangled.wire.admission_check import OPEN_ADMISSION, AdmissionCheck
 from middleware.errors import UnknownStrategy
-from middleware.stop.halt import Halt
-from middleware.tasks.task import COUNCIL, MEMBER, ORDER, RESULT, TASKS, Result, Task, council_of, group_key
+from middleware.stop.stop_state import StopState
+from middleware.tasks.task import COUNCIL, MEMBER, ORDER, RESULT, TASKS, Result, Task, group_key, with_newest_council
 
 if TYPE_CHECKING:
     from middleware.admission.team import Team
-    from middleware.consensus.bidding.auctions import Bidding, Dissemination
-    from middleware.consensus.bidding.panel import Panel
-    from middleware.consensus.bidding.party import OnSummary
-    from middleware.consensus.guard import Guard
-    from middleware.consensus.lease.lessee import Lessee
-    from middleware.consensus.selection import Strategies
-    from middleware.consensus.verdict import Verdict
-    from middleware.consensus.view import View
-    from middleware.entangled.control.health import Gauge
-    from middleware.tasks.councils import Councils
+    from middleware.consensus.bidding.auction_service import AuctionService, Bidding
+    from middleware.consensus.bidding.participant import OnSummary
+    from middleware.consensus.bidding.reporters import Reporters
+    from middleware.consensus.decision_record import DecisionRecord
+    from middleware.consensus.guarded_strategy import GuardedStrategy
+    from middleware.consensus.lease.lease_client import LeaseClient
+    from middleware.consensus.report_view import ReportView
+    from middleware.consensus.strategy_registry import StrategyRegistry
+    from middleware.entangled.control.health import LinkMetrics
+    from middleware.tasks.council_manager import CouncilManager
 
 CAMERA = "camera"
 LEASE_VERBS = ("prepare", "propose", "release", "close", "cancel", "change", "install", "freed")
@@ -92,7 +92,7 @@ class SwarmNode(Service):
         rng: random.Random,
         wall: Callable[[], float],
         lease: float = 1.0,
-        door: Door = OPEN,
+        door: AdmissionCheck = OPEN_ADMISSION,
         lan: Multicast | None = None,
     ) -> None:
         self.clock = clock
@@ -101,18 +101,18 @@ class SwarmNode(Service):
         self.store = store
         self.entangled = EntangledNode(identity, team_key, network, store, clock, rng, lease, wall, door, lan)
         self.uuid = identity.node_id.hex()
-        self._door = door
+        self._admission = door
         self._chores = Background(clock)
         self.later = self._chores.later
         self.team: Team | None = None
-        self.deployed: Deployed = {}
+        self.deployed: DeployedModules = {}
         self.stop_deployed: Callable[[], None] = lambda: None
-        self.halt = Halt()
+        self.stop_state = StopState()
         self.directory = Directory(self.entangled, self._chores)
         self.presence = Presence(self._with_certified_name(device), self._announce, self._chores.later)
         self.streams = Streams(self.entangled.endpoint, clock)
         self.joined: Deferred[None] = Deferred()
-        self._known = list(known_nodes)
+        self._known_nodes = list(known_nodes)
         self._stop_calls: list[Callable[[], None]] = []
         self._network = network
         self._created_at = clock.seconds()
@@ -125,7 +125,7 @@ class SwarmNode(Service):
             expose(f"lease.{verb}", partial(self._answer_lease, f"lease.{verb}"), changes=True, idempotent=True)
         expose("bid.offer", self._answer_offer, changes=True, idempotent=True)
         expose("bid.announce", self._answer_announcement, changes=True, idempotent=True)
-        expose("bid.cry", self._take_cry, changes=True)
+        expose("bid.cry", self._answer_flood, changes=True)
         expose("device.message", self._answer_message, changes=True)
         expose("device.disconnect", self._answer_disconnect, changes=True)
 
@@ -143,9 +143,9 @@ class SwarmNode(Service):
         """Send goodbye and close everything except the store, which its opener closes."""
         self._leave(self.entangled.stop)
 
-    def vanish(self) -> None:
+    def stop_silently(self) -> None:
         """Stop without sending anything, as after a power failure."""
-        self._leave(self.entangled.vanish)
+        self._leave(self.entangled.stop_silently)
 
     def _leave(self, leave: Callable[[], None]) -> None:
         self._chores.stop()
@@ -159,9 +159,9 @@ class SwarmNode(Service):
         super().stopService()
 
     async def _join(self) -> None:
-        await self.entangled.join(self._known)
+        await self.entangled.join(self._known_nodes)
         others = await self._find_others()
-        depth = await self.directory.arrive()
+        depth = await self.directory.choose_initial_depth()
         if depth:  # the devices are in other parts of the directory now
             others = await self._find_others()
         previous = [d.joined for d in others if d.uuid == self.uuid]
@@ -180,9 +180,9 @@ class SwarmNode(Service):
         if now - self._reviewed_at >= REVIEW_INTERVAL_S:
             self._reviewed_at = now
             self.presence.change(
-                depth=self.directory.review(), name=self._with_certified_name(self.presence.device).name
+                depth=self.directory.update_depth(), name=self._with_certified_name(self.presence.device).name
             )
-        if self.directory.depth and now - self._figures_at < LONGEST:
+        if self.directory.depth and now - self._figures_at < MAX_LEASE_S:
             return
         self._figures_at = now
         dropped = sum(entangled.endpoint.counters.values())
@@ -210,7 +210,7 @@ class SwarmNode(Service):
         """Return the present devices (in a large team those around this one); retry until the directory answers."""
         while True:
             try:
-                return [device for device, _ in devices_of(await self.directory.around())]
+                return [device for device, _ in parse_devices(await self.directory.read_neighbourhood())]
             except NotRunning:
                 raise
             except EntangledError as error:
@@ -219,7 +219,7 @@ class SwarmNode(Service):
 
     def _with_certified_name(self, device: Device) -> Device:
         """Return ``device`` with the name in its certificate, if it has one."""
-        return replace(device, name=self._door.authority(self.entangled.identity.public).name or device.name)
+        return replace(device, name=self._admission.find_authority(self.entangled.identity.public).name or device.name)
 
     def _with_address(self, device: Device) -> Device:
         return replace(device, uuid=self.uuid, address=str(self._network.address), since=self.wall())
@@ -230,40 +230,40 @@ class SwarmNode(Service):
 
     # -- devices ----------------------------------------------------------------------------------------------------
 
-    def watch_devices(self, changed: Changed, keep: bool = False) -> Following:
+    def watch_devices(self, changed: OnChanged, keep: bool = False) -> DeviceSubscription:
         """Watch the devices of the team; ``devices_of`` reads the records, ``keep`` also stores them.
 
         In a large team each update takes a round of reads, and ``keep`` has no effect.
         """
-        return Following(self.directory, changed, keep)
+        return DeviceSubscription(self.directory, changed, keep)
 
     def list_devices(self) -> Deferred[Listing]:
         """Fire with all present devices; the list says whether it is complete.  Never fails."""
-        return Deferred.fromCoroutine(self.directory.listed())
+        return Deferred.fromCoroutine(self.directory.list_devices())
 
-    def some_devices(
+    def find_devices(
         self, count: int, matches: Matches = lambda device: True, after: bytes | None = None
     ) -> Deferred[Page]:
         """Fire with at most ``count`` devices; see ``Directory.some``.  Never fails."""
-        return Deferred.fromCoroutine(self.directory.some(count, matches, after))
+        return Deferred.fromCoroutine(self.directory.find_devices(count, matches, after))
 
-    def contact_of(self, record: Record) -> Contact | None:
+    def find_contact(self, record: Record) -> Contact | None:
         """Return the contact of the device that wrote ``record``; the observed address wins over the published one."""
-        pair = next(iter(devices_of([record])), None)
+        pair = next(iter(parse_devices([record])), None)
         if pair is None:
             return None
         host, _, port = pair[0].address.rpartition(":")
-        published = unpacked([record.owner, host, int(port)]) if port.isascii() and port.isdigit() else None
-        return published and (self.entangled.overlay.known(published.node_id) or published)
+        published = parse_contact([record.owner, host, int(port)]) if port.isascii() and port.isdigit() else None
+        return published and (self.entangled.overlay.find_known(published.node_id) or published)
 
-    def team_size(self) -> int:
+    def estimate_team_size(self) -> int:
         """Return the estimated number of nodes in the team, this one included."""
-        from middleware.consensus.bidding.scale import team_size
+        from middleware.consensus.bidding.path_choice import estimate_team_size
 
         overlay = self.entangled.overlay
-        return team_size(overlay.own_id, overlay.contacts(), overlay.is_large)
+        return estimate_team_size(overlay.own_id, overlay.contacts(), overlay.is_large)
 
-    def reached(self, uuids: Sequence[str]) -> list[Contact]:
+    def find_contacts(self, uuids: Sequence[str]) -> list[Contact]:
         """Return the contacts of the given devices that this node knows."""
         return [contact for contact in self.entangled.overlay.contacts() if contact.node_id.hex() in uuids]
 
@@ -280,55 +280,55 @@ class SwarmNode(Service):
     async def submit(self, task: Task) -> Task:
         """Publish ``task`` with its council, the nodes closest to its key now (rule 1); raise ``UnknownStrategy``."""
         if not is_deployed(task.strategy):  # only nodes with the deployed module can check it
-            place_of(task.strategy)
-        task = await self.councils.pinned(task)
-        await self.entangled.put(TASKS, task.task_id, task.packed(), "team")
+            find_import_path(task.strategy)
+        task = await self.council_manager.choose_council(task)
+        await self.entangled.put(TASKS, task.task_id, task.pack(), "team")
         return task
 
-    def watch_tasks(self, changed: Changed, keep: bool = False) -> Watch:
+    def watch_tasks(self, changed: OnChanged, keep: bool = False) -> Watch:
         """Watch the tasks of the team; ``keep`` also stores them."""
         return self.entangled.watch(TASKS, changed, keep)
 
-    def watch_group(self, task_id: str, changed: Changed, keep: bool = False) -> Watch:
+    def watch_group(self, task_id: str, changed: OnChanged, keep: bool = False) -> Watch:
         """Watch the reports and the result of one task; ``keep`` also stores them."""
         return self.entangled.watch(group_key(task_id), changed, keep)
 
-    def group(
-        self, task: Task, heard: Heard, ordered: Changed = lambda records: None, panel: Panel | None = None
+    def join_group(
+        self, task: Task, heard: OnMembers, ordered: OnChanged = lambda records: None, panel: Reporters | None = None
     ) -> Group:
         """Take part in a task, and bid for it if it has a council.
 
         In a large team only the reporters (``panel``) of a task with a council write records, except for tasks that
         are divided among devices, which need the records of all participants.
         """
-        from middleware.consensus.bidding.panel import panel_of
+        from middleware.consensus.bidding.reporters import make_reporters
 
-        panel = panel or panel_of(self.uuid, group_key(task.task_id))
-        enter = partial(self.bidding, task, task.generation) if task.council else None
-        view = self._view(task.strategy) if task.council else None
-        devices = self.team_size if task.council and not task.group else lambda: 1
+        panel = panel or make_reporters(self.uuid, group_key(task.task_id))
+        enter = partial(self.start_bidding, task, task.generation) if task.council else None
+        view = self._make_view(task.strategy) if task.council else None
+        devices = self.estimate_team_size if task.council and not task.group else lambda: 1
         callbacks = (heard, self._log_failures, ordered, enter, view)
         return Group(task, self.entangled, *callbacks, panel, devices, self.clock.seconds, self.later)
 
-    def bidding(self, task: Task, epoch: int, on_summary: OnSummary) -> Bidding:
+    def start_bidding(self, task: Task, epoch: int, on_summary: OnSummary) -> Bidding:
         """Bid for ``task`` in ``epoch``; call ``on_summary`` with the bids that the task's council announces."""
-        from middleware.consensus.bidding.auction import MAX_WAITING, Auction
+        from middleware.consensus.bidding.auction import MAX_WAITING_S, Auction
 
-        waiting = min(float(task.waiting_period), MAX_WAITING)
+        waiting = min(float(task.waiting_period), MAX_WAITING_S)
         auction = Auction(task.task_id, epoch, task.council, task.strategy, waiting, task.exclusive)
-        return self.dissemination.enter(auction, on_summary)
+        return self.auction_service.take_part(auction, on_summary)
 
-    def order(self, task_id: str, order: bytes) -> Deferred[Stored]:
+    def record_order(self, task_id: str, order: bytes) -> Deferred[Stored]:
         """Record an operator's order to a running task (``middleware.tasks.order``, packed)."""
         return self.entangled.put(group_key(task_id), ORDER, order, "team")
 
-    def conclude(self, task_id: str, result: Result) -> Deferred[Stored]:
+    def record_result(self, task_id: str, result: Result) -> Deferred[Stored]:
         """Record the result of a task; this node's role must allow orders."""
-        return self.entangled.put(group_key(task_id), RESULT, result.packed(), "team")
+        return self.entangled.put(group_key(task_id), RESULT, result.pack(), "team")
 
-    def justify(self, verdict: Verdict) -> None:
+    def publish_decision_record(self, verdict: DecisionRecord) -> None:
         """Publish a decision record of this node's agent; it outlives this node's lease."""
-        put = maybeDeferred(self.entangled.put, verdict.key, verdict.slot, verdict.packed(), "team")
+        put = maybeDeferred(self.entangled.put, verdict.key, verdict.slot, verdict.pack(), "team")
         self._log_failures(put)
 
     async def cancel(self, task: Task, result: Result) -> Stored:
@@ -336,132 +336,136 @@ class SwarmNode(Service):
 
         If the council is unreachable only the record is written; the acting agent stops when it receives that.
         """
-        written = self.conclude(task.task_id, result)
+        written = self.record_result(task.task_id, result)
         with suppress(EntangledError):
-            await self.councils.of(await self._with_present_council(task)).close()
+            await self.council_manager.make_proposer(await self._with_present_council(task)).close()
         return await written
 
-    def strategy(self, name: str) -> Guard:
+    def get_strategy(self, name: str) -> GuardedStrategy:
         """Return the strategy ``name`` in its guard, kept until this node stops; raise ``UnknownStrategy``."""
-        return self._strategies.named(name, self.deployed)
+        return self._strategies.get(name, self.deployed)
 
-    def _view(self, strategy: str) -> View:
+    def _make_view(self, strategy: str) -> ReportView:
         """Return the report fields that a strategy reads; only the costs if it does not exist."""
-        from middleware.consensus.view import View, view_of
+        from middleware.consensus.report_view import ReportView, make_view
 
         try:
-            return view_of(self.strategy(strategy))
+            return make_view(self.get_strategy(strategy))
         except UnknownStrategy:
-            return View()
+            return ReportView()
 
-    def lessee(self, task: Task, changed: Callable[[], None], floor: int) -> Lessee:
+    def make_lease_client(self, task: Task, changed: Callable[[], None], floor: int) -> LeaseClient:
         """Return this node's proposer for the lease on ``task``; it calls ``changed`` at each change of state.
 
         ``floor`` is the highest fencing token that the node's device has obeyed; new tokens are higher.
         """
-        return self.councils.lessee(task, changed, floor)
+        return self.council_manager.make_lease_client(task, changed, floor)
 
     async def _record_council(self, task: Task) -> None:
         """Record the present council of ``task``, unless it or a newer one is recorded already."""
-        from middleware.consensus.lease.charter import charter_of
+        from middleware.consensus.lease.charter import parse_charter
 
-        charter = charter_of(task.charter)
+        charter = parse_charter(task.charter)
         if charter is not None:
-            known = await self._with_present_council(task.with_council(replace(charter, links=())))
+            known = await self._with_present_council(task.with_council(replace(charter, changes=())))
             if known.configuration < task.configuration:
                 await self.entangled.put(group_key(task.task_id), COUNCIL, task.charter, "team")
 
     async def _with_present_council(self, task: Task) -> Task:
         """Return ``task`` with the newest council on record."""
-        return council_of(task, await self.entangled.get(group_key(task.task_id)))
+        return with_newest_council(task, await self.entangled.get(group_key(task.task_id)))
 
     @cached_property
-    def councils(self) -> Councils:
+    def council_manager(self) -> CouncilManager:
         """The councils of tasks: this node's acceptors, and its proposers."""
         # Imported on first use: a node without councils saves the memory.
-        from middleware.tasks.councils import Councils
+        from middleware.tasks.council_manager import CouncilManager
 
         def moved(task: Task) -> None:
             self._log_failures(Deferred.fromCoroutine(self._record_council(task)))
 
         def may_sit(public: bytes) -> bool:
-            return self._door.may(public, "lease.freed")
+            return self._admission.may_call(public, "lease.freed")
 
-        return Councils(self.entangled, self.store, self.clock, self.rng, self._created_at, moved, may_sit)
+        return CouncilManager(self.entangled, self.store, self.clock, self.rng, self._created_at, moved, may_sit)
 
     @cached_property
-    def gauge(self) -> Gauge:
+    def link_metrics(self) -> LinkMetrics:
         """The quality of the paths to this node's peers."""
         # Imported on first use.
-        from middleware.entangled.control.health import Gauge
+        from middleware.entangled.control.health import LinkMetrics
 
-        return Gauge(self.entangled, self.clock, self._chores)
+        return LinkMetrics(self.entangled, self.clock, self._chores)
 
     @cached_property
-    def _strategies(self) -> Strategies:
+    def _strategies(self) -> StrategyRegistry:
         """The strategies loaded on this node."""
         # Imported on first use: a node that neither decides nor carries bids saves the memory.
-        from middleware.consensus.selection import Strategies
+        from middleware.consensus.strategy_registry import StrategyRegistry
 
-        strategies = Strategies()
+        strategies = StrategyRegistry()
         self._stop_calls.append(strategies.stop)
         return strategies
 
     @cached_property
-    def dissemination(self) -> Dissemination:
+    def auction_service(self) -> AuctionService:
         """This node's part in flooding the bids for tasks."""
         # Imported on first use: a node that carries no bids saves the memory.
-        from middleware.consensus.bidding.auctions import Dissemination, Surroundings
+        from middleware.consensus.bidding.auction_service import AuctionService, Environment
 
         entangled = self.entangled
 
         def may_bid(key: bytes, public: bytes) -> bool:
             return entangled.replica.may_store(Slot(key, public, MEMBER))
 
-        around = Surroundings(
-            lambda: entangled.contact, entangled.overlay.contacts, self.team_size, self.strategy, may_bid
+        around = Environment(
+            lambda: entangled.contact, entangled.overlay.contacts, self.estimate_team_size, self.get_strategy, may_bid
         )
-        dissemination = Dissemination(entangled.identity, entangled.endpoint, around, self.clock, self.rng)
+        dissemination = AuctionService(entangled.identity, entangled.endpoint, around, self.clock, self.rng)
         self._stop_calls.append(dissemination.stop)
         return dissemination
 
     # -- requests of peers ---------------------------------------------------------------------------------------------
 
     def _answer_lease(self, method: str, peer: Contact, *arguments: Any) -> object:
-        return self.councils.desk.answer(method, peer, arguments)
+        return self.council_manager.lease_service.answer(method, peer, arguments)
 
     def _answer_offer(
         self, peer: Contact, auction: list[object], bids: list[object], age_ms: int, is_shared: bool
     ) -> object:
-        offer = partial(self.dissemination.answer_offer, peer, auction, bids, age_ms, is_shared)
+        offer = partial(self.auction_service.answer_offer, peer, auction, bids, age_ms, is_shared)
         learning = self._learn_bidders(peer, bids)
         return offer() if learning is None else learning.addCallback(lambda _: offer())
 
     def _answer_announcement(self, peer: Contact, auction: list[object], announcement: list[object]) -> None:
-        self.dissemination.answer_announcement(peer, auction, announcement)
+        self.auction_service.answer_announcement(peer, auction, announcement)
 
-    def _take_cry(self, peer: Contact, auction: list[object], bids: list[object]) -> None:
+    def _answer_flood(self, peer: Contact, auction: list[object], bids: list[object]) -> None:
         learning = self._learn_bidders(peer, bids)
         if learning is not None:
-            self._log_failures(learning.addCallback(lambda _: self.dissemination.take_cry(peer, auction, bids)))
+            self._log_failures(learning.addCallback(lambda _: self.auction_service.answer_flood(peer, auction, bids)))
             return
-        self.dissemination.take_cry(peer, auction, bids)
+        self.auction_service.answer_flood(peer, auction, bids)
 
     def _learn_bidders(self, peer: Contact, bids: list[object]) -> Deferred[None] | None:
         """Request missing certificates of bidders from ``peer``; return None if none is missing."""
-        from middleware.consensus.bidding.errand import MAX_BIDS
+        from middleware.consensus.bidding.outgoing_message import MAX_BIDS_PER_MESSAGE
 
         certificates = self.entangled.replica.certificates
-        owners = [each[0] for each in bids[:MAX_BIDS] if isinstance(each, list) and each and type(each[0]) is bytes]
-        if not certificates.lacking(peer, owners):
+        owners = [
+            each[0]
+            for each in bids[:MAX_BIDS_PER_MESSAGE]
+            if isinstance(each, list) and each and type(each[0]) is bytes
+        ]
+        if not certificates.find_missing(peer, owners):
             return None
-        return Deferred.fromCoroutine(certificates.learn(peer, owners))
+        return Deferred.fromCoroutine(certificates.fetch_missing(peer, owners))
 
     def _answer_message(self, peer: Contact, text: str) -> str:
         if not 0 < len(text) <= 200:
             raise Refused("a message is a text of 1 to 200 characters")
         self._on_message(text)
-        self.presence.say(self.wall(), f"operator: {text}")
+        self.presence.add_message(self.wall(), f"operator: {text}")
         return "delivered"
 
     def _answer_disconnect(self, peer: Contact, seconds: float) -> str:
@@ -476,13 +480,13 @@ class SwarmNode(Service):
     def _announce(self, value: bytes) -> None:
         def put() -> Deferred[Any]:
             device = self.presence.device
-            return self.directory.announce(device.name, bounded(value), device.depth)
+            return self.directory.announce(device.name, check_size(value), device.depth)
 
         self._log_failures(maybeDeferred(put))
 
     def _log_failures(self, work: Deferred[Any]) -> None:
         def ended(failure: Any) -> None:
-            if failure.check(WeatherError, NotRunning, Refused) is None:
+            if failure.check(TransientError, NotRunning, Refused) is None:
                 self._log.failure("cannot publish to the team", failure)
 
         work.addErrback(ended)

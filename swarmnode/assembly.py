@@ -10,30 +10,30 @@ from typing import TYPE_CHECKING
 from twisted.application.service import Service
 from twisted.logger import Logger
 
-from agents.registry import agent_named
+from agents.registry import load_agent
 from drivers.driver import MAX_FPS, Driver, Filming
 from drivers.errors import DriverError
 from drivers.option import Fps
-from drivers.registry import describe, driver_for
+from drivers.registry import create_driver, describe
 from formats.convert import convert_value
 from middleware.config.settings import Settings
-from middleware.config.tuning import Knob, answer_tuning
-from middleware.diagnostics.survey import answer_survey
+from middleware.config.tuning import TunableSetting, expose_tuning
+from middleware.diagnostics.node_diagnostics import expose_diagnostics
 from middleware.directory.presence import Device
 from middleware.entangled.data.store import Store
 from middleware.entangled.errors import EntangledError
 from middleware.entangled.identity import Identity
-from middleware.entangled.wire.door import OPEN, UNPROTECTED
+from middleware.entangled.wire.admission_check import OPEN_ADMISSION, OPEN_TEAM_WARNING
 from middleware.errors import BadSetting, SwarmError
 from middleware.node import SwarmNode
-from middleware.stop.halt import answer_halt
-from swarmnode.seams import Seams
+from middleware.stop.stop_state import expose_stops
+from swarmnode.dependencies import Dependencies
 from webnode.errors import WebError
 
 if TYPE_CHECKING:
     from middleware.admission.team import Team
 
-FAULTS = (SwarmError, EntangledError, DriverError, WebError)
+EXPECTED_ERRORS = (SwarmError, EntangledError, DriverError, WebError)
 """Errors that an operator can fix; they are shown in one line."""
 
 _log = Logger()
@@ -48,18 +48,18 @@ class Assembly:
     driver: Driver | None
 
 
-def identity_in(store: Store, rng: random.Random) -> Identity:
+def load_identity(store: Store, rng: random.Random) -> Identity:
     """Return the lasting identity in the store, and create it at the first start."""
-    seed = store.noted("identity")
+    seed = store.get_note("identity")
     if seed is None or len(seed) != 32:
         if store.origin != "new":
             _log.warn("the data store has lost the node's identity: the node has a new one now")
         seed = rng.randbytes(32)
-        store.note("identity", seed)
+        store.set_note("identity", seed)
     return Identity(seed)
 
 
-def checked_team(settings: Settings) -> None:
+def check_team(settings: Settings) -> None:
     """Raise ``BadSetting`` if the settings have no team, or two."""
     node = settings.node
     if not node.membership and not node.team_key:
@@ -71,17 +71,17 @@ def checked_team(settings: Settings) -> None:
         raise BadSetting(settings.origin, "[node] team_key", problem, "remove team_key, or the membership")
 
 
-def assembled(settings: Settings, seams: Seams) -> Assembly:
+def assemble_node(settings: Settings, seams: Dependencies) -> Assembly:
     """Connect one node, agent and driver as ``settings`` require (thesis, Algorithm 4.1).
 
     Raises ``SwarmError`` or ``DriverError`` if that is not possible.
     """
     if seams.membership is None:
-        checked_team(settings)
+        check_team(settings)
     _check_robot(settings)
     injector = None
     if settings.faults.allow:
-        from agents.catalogue import task_named
+        from agents.catalogue import create_task
         from middleware.faults.injector import FaultInjector  # imported on demand, to save memory
 
         injector = FaultInjector(seams.clock, seams.wall, seams.rng, seams.network, seams.process)
@@ -91,7 +91,7 @@ def assembled(settings: Settings, seams: Seams) -> Assembly:
     _expose_methods(node, settings, driver)
     if injector is not None:
         driver = None if driver is None else injector.wrap_driver(driver)
-        injector.expose(node, task_named)
+        injector.expose(node, create_task)
     if settings.deployment.allow:
         _enable_deployment(node, settings, seams)
     return Assembly(node, _make_agent(node, settings, driver, seams), driver)
@@ -127,21 +127,21 @@ def _make_device(settings: Settings) -> Device:
     )
 
 
-def _make_driver(settings: Settings, seams: Seams) -> Driver | None:
+def _make_driver(settings: Settings, seams: Dependencies) -> Driver | None:
     """Return the driver of the robot, not yet connected; None without a robot."""
     wanted = settings.driver
     if not wanted.kind:
         return None
-    return driver_for(wanted.kind, wanted.options, settings.node.name, seams.clock, seams.connector, wanted.parts)
+    return create_driver(wanted.kind, wanted.options, settings.node.name, seams.clock, seams.connector, wanted.parts)
 
 
-def _make_node(device: Device, settings: Settings, seams: Seams) -> SwarmNode:
+def _make_node(device: Device, settings: Settings, seams: Dependencies) -> SwarmNode:
     """Return the node of ``device``, a member of its team."""
     team = _load_team(seams)
-    known = [] if team is None else team.membership.known
+    known = [] if team is None else team.membership.known_nodes
     node = SwarmNode(
         device,
-        identity_in(seams.store, seams.rng) if team is None else team.identity,
+        load_identity(seams.store, seams.rng) if team is None else team.identity,
         settings.node.team_secret if team is None else team.secret,
         list(dict.fromkeys([*settings.node.known_nodes, *known])),
         seams.network(),
@@ -151,10 +151,10 @@ def _make_node(device: Device, settings: Settings, seams: Seams) -> SwarmNode:
         seams.wall,
         settings.node.presence_lease,
         lan=None if seams.lan is None else seams.lan(),
-        door=OPEN if team is None else team.door,
+        door=OPEN_ADMISSION if team is None else team.admission,
     )
     if team is None:
-        _log.warn("{name} is in an open team: {open}", name=device.name, open=UNPROTECTED)
+        _log.warn("{name} is in an open team: {open}", name=device.name, open=OPEN_TEAM_WARNING)
     else:
         team.attach(node.entangled, seams.clock)
         node.team = team
@@ -163,19 +163,19 @@ def _make_node(device: Device, settings: Settings, seams: Seams) -> SwarmNode:
 
 def _expose_methods(node: SwarmNode, settings: Settings, driver: Driver | None) -> None:
     """Expose diagnostics, changes of settings, and the emergency stop."""
-    answer_survey(node)
-    tuning = answer_tuning(node, settings, {} if driver is None else driver.description.capabilities)
+    expose_diagnostics(node)
+    tuning = expose_tuning(node, settings, {} if driver is None else driver.description.capabilities)
     filming: object = driver
     if isinstance(filming, Filming) and "camera" in node.presence.device.capabilities:
-        tuning.add(_make_camera_setting(filming))
-    node.halt = answer_halt(node.entangled, node.rng, node.later, node.presence.obey)
+        tuning.add(_make_camera_knob(filming))
+    node.stop_state = expose_stops(node.entangled, node.rng, node.later, node.presence.announce_stops)
 
 
-def _make_agent(node: SwarmNode, settings: Settings, driver: Driver | None, seams: Seams) -> Service | None:
+def _make_agent(node: SwarmNode, settings: Settings, driver: Driver | None, seams: Dependencies) -> Service | None:
     """Return the agent of the device; None if the settings have none."""
     if not settings.agent.module or driver is None:
         return None
-    agent = agent_named(settings.agent.module)(node, driver, seams.clock, seams.rng)
+    agent = load_agent(settings.agent.module)(node, driver, seams.clock, seams.rng)
     if settings.agent.name:
         place = f" on {settings.node.laptop}" if settings.node.laptop else ""
         _log.info(
@@ -184,7 +184,7 @@ def _make_agent(node: SwarmNode, settings: Settings, driver: Driver | None, seam
     return agent
 
 
-def _load_team(seams: Seams) -> Team | None:
+def _load_team(seams: Dependencies) -> Team | None:
     """Return the closed team of the node; None, without importing its modules, in an open team."""
     if seams.membership is None:
         return None
@@ -193,23 +193,23 @@ def _load_team(seams: Seams) -> Team | None:
     return Team(seams.membership, seams.store, seams.wall, seams.rng)
 
 
-def _make_camera_setting(driver: Filming) -> Knob:
+def _make_camera_knob(driver: Filming) -> TunableSetting:
     about, check = "Frame rate of the camera", partial(convert_value, hint=Fps)
     read = partial(getattr, driver, "camera_fps")
-    return Knob("camera_fps", about, read, driver.set_camera_fps, check, "per second", 0.0, MAX_FPS)
+    return TunableSetting("camera_fps", about, read, driver.set_camera_fps, check, "per second", 0.0, MAX_FPS)
 
 
-def _enable_deployment(node: SwarmNode, settings: Settings, seams: Seams) -> None:
+def _enable_deployment(node: SwarmNode, settings: Settings, seams: Dependencies) -> None:
     """Let the node run modules that its operators push; the modules for this are imported only if it is allowed."""
     from middleware.deployment.deployment import Author, Deployment
-    from middleware.deployment.process import ProcessChannel
-    from middleware.deployment.shelf import MemoryShelf
+    from middleware.deployment.module_store import MemoryModuleStore
+    from middleware.deployment.process_channel import ProcessChannel
 
     def author_of(public: bytes) -> Author:
         if node.team is None:
             return Author("", None)
-        member = node.team.door.member(public)
-        return Author("" if member is None else member.name, node.team.door.roles_of(public))
+        member = node.team.admission.find_member(public)
+        return Author("" if member is None else member.name, node.team.admission.roles_of(public))
 
     deployment = Deployment(
         node.entangled,
@@ -217,13 +217,13 @@ def _enable_deployment(node: SwarmNode, settings: Settings, seams: Seams) -> Non
         node.wall,
         node.later,
         settings.deployment,
-        MemoryShelf() if seams.shelf is None else seams.shelf,
+        MemoryModuleStore() if seams.shelf is None else seams.shelf,
         author_of,
         ProcessChannel if seams.spawn is None else seams.spawn,
         node.clock.seconds,
     )
     node.deployed, node.stop_deployed = deployment.modules, deployment.stop
-    node.later(0.0, deployment.open)  # after daemonization, because module processes end with their parent
+    node.later(0.0, deployment.load_stored)  # after daemonization, because module processes end with their parent
 
     def follow(_: None) -> None:
         if node.running:

@@ -8,14 +8,14 @@ from collections.abc import Sequence
 from importlib.util import find_spec
 
 from middleware.errors import MissingExtra
-from swarmnode.ballast import drop_tls
+from swarmnode.memory_savings import block_tls_import
 
-OURS = ("agents", "drivers", "formats", "middleware", "sim", "swarmnode", "webnode")
+OWN_PACKAGES = ("agents", "drivers", "formats", "middleware", "sim", "swarmnode", "webnode")
 # Verbs without an installed module are not listed.
-WORKS: dict[str, tuple[str, str]] = {
+VERB_MODULES: dict[str, tuple[str, str]] = {
     "demo": ("sim.demo.demonstration", "run a demo on this machine: three robots, a red target and the page"),
     "yard": ("sim.robots.server", "run the robot simulator alone"),
-    "trials": ("swarmnode.rehearsal", "repeat both experiments of the thesis"),
+    "trials": ("swarmnode.simulated_team", "repeat both experiments of the thesis"),
     "crowd": ("swarmnode.crowd", "simulate hundreds of agents and thousands of robots"),
     "chaos": ("swarmnode.faults", "inject faults into a team, and measure the takeover"),
     "driver": ("swarmnode.driver.command", "find and test a robot before it joins a team"),
@@ -37,7 +37,7 @@ WORKS: dict[str, tuple[str, str]] = {
     "web": ("swarmnode.web_code", "show the address of the page and the sign-in code"),
     "password": ("swarmnode.password", "hash a password for the settings of the page"),
 }
-GROUPS = {
+NODE_VERBS = {
     "dht": "get, put, find, watch or remove records of the distributed hash table",
     "keyword": "publish, search, watch or remove keywords",
     "tuple": "put, get or read tuples of the tuple space",
@@ -49,14 +49,14 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """Run the verb in ``arguments``; returns its exit code."""
     words = sys.argv[1:] if arguments is None else arguments
     verb = words[0] if words else ""
-    if verb in GROUPS:
+    if verb in NODE_VERBS:
         # Fast path for requests to a running node: needs only the standard library.
         from middleware.entangled.control.command import main as command
 
         return command(verb, words[1:])
-    works = {name: work for name, work in WORKS.items() if find_spec(work[0]) is not None}
+    works = {name: work for name, work in VERB_MODULES.items() if find_spec(work[0]) is not None}
     if verb not in works:
-        about = {**{name: purpose for name, (_, purpose) in works.items()}, **GROUPS}
+        about = {**{name: purpose for name, (_, purpose) in works.items()}, **NODE_VERBS}
         if verb not in ("", "--help", "-h"):
             sys.stderr.write(f"swarm: no verb {verb!r}; verbs: {', '.join(about)}; see swarm --help\n")
             return 2
@@ -64,11 +64,11 @@ def main(arguments: Sequence[str] | None = None) -> int:
         example = "swarm init lab --first vaio --page\n  swarm demo"
         sys.stdout.write(f"usage: swarm VERB [options]\n\n{lines}\nexamples:\n  {example}\n\nSee swarm VERB --help.\n")
         return 0
-    drop_tls()
+    block_tls_import()
     try:
         module = importlib.import_module(works[verb][0])
     except ModuleNotFoundError as error:
-        if (error.name or "").split(".")[0] in OURS:
+        if (error.name or "").split(".")[0] in OWN_PACKAGES:
             raise
         sys.stderr.write(f"swarm {verb}: {MissingExtra(f'swarm {verb}', 'all')}\n")
         return 2

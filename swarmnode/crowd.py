@@ -12,33 +12,33 @@ from typing import Any
 
 from twisted.internet.defer import Deferred
 
-from agents.catalogue import DEMO, task_named
+from agents.catalogue import DEMO_TASK, create_task
 from middleware.config.settings import Settings
 from middleware.entangled.network.network import Address
 from middleware.entangled.replication.watch import Watch
-from middleware.tasks.task import Task, outcome_of
+from middleware.tasks.task import Task, find_outcome
 from sim.robots.crowd.command import main as run_crowd
 from sim.robots.crowd.controller import Controller, wander
-from sim.robots.crowd.ground import Ground
-from sim.robots.crowd.search import Word
-from sim.robots.crowd.yard import CrowdYard
-from sim.team.world import World
-from swarmnode.rehearsal import LAN
-from swarmnode.seams import Seams
+from sim.robots.crowd.scene import CrowdScene
+from sim.robots.crowd.search import AgentStatus
+from sim.robots.crowd.simulator import CrowdSimulator
+from sim.team.simulation import Simulation
+from swarmnode.dependencies import Dependencies
 from swarmnode.service import NodeService
+from swarmnode.simulated_team import LAN
 
-DESK = "desk"
+TASK_NODE = "desk"
 """Name of the node without a robot, which assigns the task and is the bootstrap node of all others."""
 TEAM_KEY = "of a crowd that never leaves one process"
-JOINING = 0.1
+JOIN_INTERVAL_S = 0.1
 """Seconds between the starts of two nodes."""
-SETTLING = 2.0
+SETTLE_S = 2.0
 CAMERA_FPS = 5.0
 PORT = 7000
-TASK = "search"
+TASK_ID = "search"
 
 
-class CrowdTeam(World):
+class CrowdTeam(Simulation):
     """``agents`` nodes with the first robots of a crowd on ``ground``, and one node without a robot.
 
     Node, agent, driver and detection are the real ones; the team is open.  A seed reproduces a run exactly.
@@ -48,23 +48,23 @@ class CrowdTeam(World):
         self,
         seed: int,
         agents: int,
-        ground: Ground,
+        ground: CrowdScene,
         controller: Controller = wander,
         stopwatch: Callable[[], float] = lambda: 0.0,
         camera_fps: float = CAMERA_FPS,
     ) -> None:
         super().__init__(seed, LAN)
         yard_rng = random.Random(f"{seed}/yard")
-        self.yard = CrowdYard(self.clock, yard_rng, ground, agents, controller, stopwatch)
-        self.yard.start()
+        self.simulator = CrowdSimulator(self.clock, yard_rng, ground, agents, controller, stopwatch)
+        self.simulator.start()
         self.services: dict[str, NodeService] = {}
         self._fps = camera_fps
-        self._group: Watch | None = None
+        self._task_watch: Watch | None = None
         self._task: Task | None = None
-        for name in (DESK, *self.yard.names):
-            self._add(name)
-            self.clock.advance(JOINING)
-        self.clock.advance(SETTLING)
+        for name in (TASK_NODE, *self.simulator.names):
+            self._add_node(name)
+            self.clock.advance(JOIN_INTERVAL_S)
+        self.clock.advance(SETTLE_S)
 
     def address(self, place: int) -> Address:
         """Return the address of the node ``place``; each node has a separate machine."""
@@ -72,38 +72,38 @@ class CrowdTeam(World):
 
     def assign(self) -> None:
         """Assign the task of finding the red target."""
-        node = self.services[DESK].assembly.node
-        self._group = node.watch_group(TASK, lambda records: None, keep=True)
-        submitted = Deferred.fromCoroutine(node.submit(task_named(DEMO, TASK, self.clock.seconds())))
+        node = self.services[TASK_NODE].assembly.node
+        self._task_watch = node.watch_group(TASK_ID, lambda records: None, keep=True)
+        submitted = Deferred.fromCoroutine(node.submit(create_task(DEMO_TASK, TASK_ID, self.clock.seconds())))
         submitted.addCallback(self._store_task)
 
-    def words(self) -> Mapping[str, Word]:
+    def get_statuses(self) -> Mapping[str, AgentStatus]:
         """Return the report of each participating agent, by name."""
         every = {}
-        for name in self.yard.names:
+        for name in self.simulator.names:
             agent: Any = self.services[name].assembly.agent
             if agent.engagement is not None:
                 every[name] = agent.engagement.me
         named = {me.uuid: name for name, me in every.items()}
-        return {name: Word(me.cost, named.get(me.assigned, "")) for name, me in every.items()}
+        return {name: AgentStatus(me.cost, named.get(me.assigned, "")) for name, me in every.items()}
 
-    def done_by(self) -> str | None:
+    def find_finisher(self) -> str | None:
         """Return the name of the agent that ended the task, None while it is open."""
-        if self._group is None or self._task is None:
+        if self._task_watch is None or self._task is None:
             return None
-        outcome = outcome_of(self._task, self._group.records)
+        outcome = find_outcome(self._task, self._task_watch.records)
         return None if outcome is None else outcome.by
 
     def stop(self) -> None:
         """Stop all nodes at once, without leaving messages."""
         for service in self.services.values():
             service.vanish()
-        self.yard.stop()
+        self.simulator.stop()
 
     def _store_task(self, task: Task) -> None:
         self._task = task
 
-    def _add(self, name: str) -> None:
+    def _add_node(self, name: str) -> None:
         number = len(self.services)
         node: dict[str, Any] = {"name": name, "port": PORT, "team_key": TEAM_KEY}
         mapping: dict[str, Any] = {"node": node}
@@ -114,7 +114,9 @@ class CrowdTeam(World):
             mapping["agent"] = {"module": "search"}
             mapping["driver"] = {"kind": "sim", "options": {"robot": name, "camera_fps": self._fps}}
         network = partial(self.network, number)
-        seams = Seams(self.clock, network, self.store(number), rng, self.clock.seconds, self.yard.connector())
+        seams = Dependencies(
+            self.clock, network, self.store(number), rng, self.clock.seconds, self.simulator.connector()
+        )
         self.services[name] = NodeService(Settings.from_mapping(mapping, f"seed {self.seed}"), seams)
         self.services[name].startService()
 

@@ -12,32 +12,32 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, TextIO
 
-from middleware.consensus.deployed import KINDS, PREFIX
+from middleware.consensus.deployed_modules import KINDS, PREFIX
 from middleware.deployment.manifest import (
     DEPLOYMENTS,
-    MAX_SOURCE,
+    MAX_SOURCE_BYTES,
     MAX_VERSION,
-    NAME,
+    NAME_PATTERN,
     Manifest,
-    manifest_of,
-    newest,
-    pushed,
-    rolled_back,
+    find_newest,
+    make_next_manifest,
+    make_rollback,
+    parse_manifest,
     source_key,
 )
-from middleware.deployment.module import compiled
-from middleware.entangled.control.command import Ask, asked
-from middleware.entangled.control.word import printable
+from middleware.deployment.module_loader import compile_source
+from middleware.entangled.control.command import SendRequest, send_request
+from middleware.entangled.control.conversion import remove_control_characters
 from middleware.entangled.record import Record
 from middleware.errors import Undeployable
-from swarmnode.asker import Asker, Refusal
-from swarmnode.team.office import Answer, Desk, Wrong, run
+from swarmnode.control_client import ControlClient, Rejection
+from swarmnode.team.common import Answer, CommandContext, InvalidCommand, run_verb
 
-SOURCE = "source"
+SOURCE_SLOT = "source"
 """Name of the slot of a source under its key."""
 
 
-def parser() -> argparse.ArgumentParser:
+def make_parser() -> argparse.ArgumentParser:
     """Return the parser of the command line."""
     common = argparse.ArgumentParser(add_help=False)
     common.add_argument("--node", metavar="NAME", help="node on this machine, if several run")
@@ -67,99 +67,99 @@ def parser() -> argparse.ArgumentParser:
     return main_parser
 
 
-def main(words: Sequence[str] | None = None, out: TextIO | None = None, ask: Ask = asked) -> int:
+def main(words: Sequence[str] | None = None, out: TextIO | None = None, ask: SendRequest = send_request) -> int:
     """Run the command; returns 0, 1 if the node rejected the request, 2 if the command is wrong."""
     verbs = {"push": _push, "rollback": _rollback, "status": _status, "keys": _keys}
 
-    def work(options: argparse.Namespace, desk: Desk) -> Answer:
+    def work(options: argparse.Namespace, desk: CommandContext) -> Answer:
         answer, lines = verbs[options.verb](options, desk.ask)
-        return answer, [printable(line) for line in lines]
+        return answer, [remove_control_characters(line) for line in lines]
 
-    return run(parser(), words, Desk(out or sys.stdout, ask), work)
+    return run_verb(make_parser(), words, CommandContext(out or sys.stdout, ask), work)
 
 
-def _push(options: argparse.Namespace, ask: Ask) -> Answer:
+def _push(options: argparse.Namespace, ask: SendRequest) -> Answer:
     try:
         source = Path(options.file).read_bytes()
     except OSError as error:
-        raise Wrong(f"cannot read {options.file}: {error.strerror or error}") from error
-    if not re.fullmatch(NAME, options.name, re.ASCII):
-        raise Wrong(f"--name {options.name!r} does not match {NAME}")
-    if not 0 < len(source) <= MAX_SOURCE:
-        raise Wrong(f"{options.file} has {len(source)} bytes; a module has 1 to {MAX_SOURCE}")
+        raise InvalidCommand(f"cannot read {options.file}: {error.strerror or error}") from error
+    if not re.fullmatch(NAME_PATTERN, options.name, re.ASCII):
+        raise InvalidCommand(f"--name {options.name!r} does not match {NAME_PATTERN}")
+    if not 0 < len(source) <= MAX_SOURCE_BYTES:
+        raise InvalidCommand(f"{options.file} has {len(source)} bytes; a module has 1 to {MAX_SOURCE_BYTES}")
     try:
-        compiled(source, options.name)
+        compile_source(source, options.name)
     except Undeployable as error:
-        raise Wrong(f"{options.file}: {error.problem}") from error
-    asker = Asker(options.node, ask)
-    held = newest(each for each, _ in _manifests(asker) if each.name == options.name)
-    manifest = pushed(options.name, options.kind, source, held, options.version)
+        raise InvalidCommand(f"{options.file}: {error.problem}") from error
+    asker = ControlClient(options.node, ask)
+    held = find_newest(each for each, _ in _list_manifests(asker) if each.name == options.name)
+    manifest = make_next_manifest(options.name, options.kind, source, held, options.version)
     if held is not None and manifest.kind != held.kind:
-        raise Refusal(f"{held.name} is a {held.kind}; use another name for a {manifest.kind}")
+        raise Rejection(f"{held.name} is a {held.kind}; use another name for a {manifest.kind}")
     if held is not None and manifest.rank <= held.rank:
-        raise Refusal(f"version {manifest.version} is not higher than {held.rank[0]}, which was already pushed")
+        raise Rejection(f"version {manifest.version} is not higher than {held.rank[0]}, which was already pushed")
     if not 0 < manifest.version <= MAX_VERSION:
-        raise Refusal(f"--version {manifest.version} is not between 1 and {MAX_VERSION}")
+        raise Rejection(f"--version {manifest.version} is not between 1 and {MAX_VERSION}")
     # Store the source first: nodes request it as soon as they receive the manifest.
-    asker.put(source_key(manifest.digest), SOURCE, source)
+    asker.put(source_key(manifest.digest), SOURCE_SLOT, source)
     return _publish(asker, manifest, "pushed")
 
 
-def _rollback(options: argparse.Namespace, ask: Ask) -> Answer:
-    asker = Asker(options.node, ask)
-    manifests = [each for each, _ in _manifests(asker)]
-    held = newest(each for each in manifests if each.name == options.name)
+def _rollback(options: argparse.Namespace, ask: SendRequest) -> Answer:
+    asker = ControlClient(options.node, ask)
+    manifests = [each for each, _ in _list_manifests(asker)]
+    held = find_newest(each for each in manifests if each.name == options.name)
     if held is None:
         there = ", ".join(sorted({each.name for each in manifests})) or "none"
-        raise Refusal(f"no module {options.name!r} was pushed; pushed modules: {there}")
-    manifest = rolled_back(held)
+        raise Rejection(f"no module {options.name!r} was pushed; pushed modules: {there}")
+    manifest = make_rollback(held)
     if manifest is None:
-        raise Refusal(f"{held.name} has no version before {held.version}")
+        raise Rejection(f"{held.name} has no version before {held.version}")
     return _publish(asker, manifest, f"rolled back from version {held.version}:")
 
 
-def _status(options: argparse.Namespace, ask: Ask) -> Answer:
-    asker = Asker(options.node, ask)
-    devices = asker.devices()
+def _status(options: argparse.Namespace, ask: SendRequest) -> Answer:
+    asker = ControlClient(options.node, ask)
+    devices = asker.list_devices()
     names = {record.owner: device.name for device, record in devices}
     rows: list[dict[str, Any]] = []
     lines = []
-    pairs = _manifests(asker)
+    pairs = _list_manifests(asker)
     for name in sorted({manifest.name for manifest, _ in pairs}):
         manifest, record = max((p for p in pairs if p[0].name == name), key=lambda p: (p[0].rank, p[0].digest))
         runs = {device.name: device.deployed.get(name, "") for device, _ in devices}
         by = names.get(record.owner, record.owner.hex()[:8])
-        rows.append({**_as_json(manifest), "by": by, "operator": record.owner.hex(), "devices": runs})
-        lines.append(f"{name}  {manifest.kind}  {manifest.label}  pushed by {by}{_history(manifest)}")
+        rows.append({**_to_json(manifest), "by": by, "operator": record.owner.hex(), "devices": runs})
+        lines.append(f"{name}  {manifest.kind}  {manifest.label}  pushed by {by}{_format_history(manifest)}")
         width = max(map(len, runs), default=0)
         lines += [f"  {device:{width}}  {label or '-'}" for device, label in runs.items()]
     return rows, lines or ["no module was pushed"]
 
 
-def _keys(options: argparse.Namespace, ask: Ask) -> Answer:
-    keys = {device.name: record.owner.hex() for device, record in Asker(options.node, ask).devices()}
+def _keys(options: argparse.Namespace, ask: SendRequest) -> Answer:
+    keys = {device.name: record.owner.hex() for device, record in ControlClient(options.node, ask).list_devices()}
     width = max(map(len, keys), default=0)
     return keys, [f"{name:{width}}  {key}" for name, key in keys.items()]
 
 
-def _manifests(asker: Asker) -> list[tuple[Manifest, Record]]:
-    records = asker.records(DEPLOYMENTS)
-    return [(manifest, record) for record in records if (manifest := manifest_of(record)) is not None]
+def _list_manifests(asker: ControlClient) -> list[tuple[Manifest, Record]]:
+    records = asker.get_records(DEPLOYMENTS)
+    return [(manifest, record) for record in records if (manifest := parse_manifest(record)) is not None]
 
 
-def _publish(asker: Asker, manifest: Manifest, verb: str) -> Answer:
-    replicas = asker.put(DEPLOYMENTS, manifest.name, manifest.packed())
+def _publish(asker: ControlClient, manifest: Manifest, verb: str) -> Answer:
+    replicas = asker.put(DEPLOYMENTS, manifest.name, manifest.pack())
     line = f"{verb} {manifest.kind} {manifest.name} {manifest.label}; stored by {replicas} replicas"
-    return {**_as_json(manifest), "replicas": replicas}, [line]
+    return {**_to_json(manifest), "replicas": replicas}, [line]
 
 
-def _as_json(manifest: Manifest) -> dict[str, Any]:
+def _to_json(manifest: Manifest) -> dict[str, Any]:
     before = [edition.version for edition in manifest.before]
     about = {"name": manifest.name, "kind": manifest.kind, "version": manifest.version, "digest": manifest.digest}
     return {**about, "size": manifest.size, "before": before, "withdrawn": manifest.withdrawn}
 
 
-def _history(manifest: Manifest) -> str:
+def _format_history(manifest: Manifest) -> str:
     withdrawn = f", {manifest.withdrawn} was withdrawn" if manifest.withdrawn > manifest.version else ""
     before = f", previous version {manifest.before[0].version}" if manifest.before else ""
     return withdrawn + before

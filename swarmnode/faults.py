@@ -10,15 +10,26 @@ from pathlib import Path
 from typing import TextIO
 
 from middleware.directory.presence import Device
-from middleware.entangled.control.command import FAILED, WRONG, Ask, asked
-from middleware.entangled.control.place import NoControl
-from middleware.entangled.control.word import printable
+from middleware.entangled.control.command import EXIT_FAILED, EXIT_USAGE, SendRequest, send_request
+from middleware.entangled.control.conversion import remove_control_characters
+from middleware.entangled.control.socket_path import NoControl
 from middleware.errors import BadFault, BadSetting
-from middleware.faults.kinds import ASKED, ASSIGN, CAUSE, KINDS, MAX_S, MIN_S, USUAL_S, Fault, begins_in, parse_fault
-from middleware.faults.play import NobodyThere, play
-from middleware.faults.scenario import Scenario, Step, loaded
-from middleware.tasks.task import outcome_of, tasks_of
-from swarmnode.asker import Asker, Refusal
+from middleware.faults.kinds import (
+    ASSIGN_METHOD,
+    CAUSE_METHOD,
+    DEFAULT_S,
+    KINDS,
+    LIST_METHOD,
+    MAX_S,
+    MIN_S,
+    Fault,
+    parse_delay,
+    parse_fault,
+)
+from middleware.faults.scenario import Scenario, Step, load_scenario
+from middleware.faults.scenario_runner import DeviceNotPresent, run_scenario
+from middleware.tasks.task import find_outcome, parse_tasks
+from swarmnode.control_client import ControlClient, Rejection
 
 RUN, LIST = "run", "list"
 
@@ -26,54 +37,56 @@ RUN, LIST = "run", "list"
 class TeamStage:
     """A running team, accessed through the control socket of a node on this machine."""
 
-    def __init__(self, asker: Asker, seconds: Callable[[], float], wait: Callable[[float], None]) -> None:
+    def __init__(self, asker: ControlClient, seconds: Callable[[], float], wait: Callable[[float], None]) -> None:
         self.seconds = seconds
         self.wait = wait
-        self._asker = asker
+        self._client = asker
 
     def devices(self) -> list[Device]:
         """Return the present devices."""
-        return [device for device, _ in self._asker.devices()]
+        return [device for device, _ in self._client.list_devices()]
 
     def assign(self, task: str) -> str:
         """Publish a task through the first device that permits it."""
         refusals = []
         for device in self.devices():
             try:
-                return str(self._asker.call(device.address, ASSIGN, task))
-            except Refusal as error:
+                return str(self._client.call(device.address, ASSIGN_METHOD, task))
+            except Rejection as error:
                 refusals.append(f"{device.name}: {error}")
-        raise Refusal("no device publishes the task: " + ("; ".join(refusals) or "no device is present"))
+        raise Rejection("no device publishes the task: " + ("; ".join(refusals) or "no device is present"))
 
-    def cause(self, device: Device, fault: Fault) -> float:
+    def inject(self, device: Device, fault: Fault) -> float:
         """Order the fault at the device."""
         try:
-            return begins_in(self._asker.call(device.address, CAUSE, fault.kind, fault.seconds, fault.amount or None))
-        except Refusal as error:
-            raise Refusal(f"{device.name}: {_explain(error)}") from error
+            return parse_delay(
+                self._client.call(device.address, CAUSE_METHOD, fault.kind, fault.seconds, fault.amount or None)
+            )
+        except Rejection as error:
+            raise Rejection(f"{device.name}: {_explain(error)}") from error
 
     def is_over(self, task_id: str) -> bool:
         """Return whether the outcome of the task is recorded."""
-        task = tasks_of(self._asker.records("tasks", "fast")).get(task_id)
-        return task is not None and outcome_of(task, self._asker.records(f"task/{task_id}", "fast")) is not None
+        task = parse_tasks(self._client.get_records("tasks", "fast")).get(task_id)
+        return task is not None and find_outcome(task, self._client.get_records(f"task/{task_id}", "fast")) is not None
 
-    def suffers(self, device: Device) -> str:
+    def describe_faults(self, device: Device) -> str:
         """Describe the faults that the device supports, and the active ones."""
         try:
-            answer = self._asker.call(device.address, ASKED)
-        except Refusal as error:
+            answer = self._client.call(device.address, LIST_METHOD)
+        except Rejection as error:
             return _explain(error)
         active = "; ".join(f"{kind} for another {max(0.0, left):.0f} s" for kind, left, _ in answer["active"])
         return ", ".join(map(str, answer["kinds"])) + (f" (now: {active})" if active else "")
 
 
-def _explain(error: Refusal) -> str:
+def _explain(error: Rejection) -> str:
     # Replace the error for an unknown method by an explanation.
     is_unknown = "method" in str(error)
     return 'it does not allow faults; set "allow = true" in [faults] of its settings' if is_unknown else str(error)
 
 
-def parser() -> argparse.ArgumentParser:
+def make_parser() -> argparse.ArgumentParser:
     """Return the parser of the command line for one fault."""
     kinds = "\n".join(f"  {name:9}{kind.about}" for name, kind in KINDS.items())
     chaos = argparse.ArgumentParser(
@@ -87,14 +100,14 @@ def parser() -> argparse.ArgumentParser:
     chaos.add_argument("device", metavar="DEVICE", help='name of the device, "executing" or "any"')
     chaos.add_argument("kind", metavar="KIND", help="kind of fault")
     chaos.add_argument(
-        "--seconds", type=float, default=USUAL_S, help=f"duration, {MIN_S:g} to {MAX_S:g} s (default: {USUAL_S:g})"
+        "--seconds", type=float, default=DEFAULT_S, help=f"duration, {MIN_S:g} to {MAX_S:g} s (default: {DEFAULT_S:g})"
     )
     chaos.add_argument("--amount", type=float, help="amount of delay, loss, skew or battery")
-    _common(chaos)
+    _add_common_arguments(chaos)
     return chaos
 
 
-def scenario_parser() -> argparse.ArgumentParser:
+def make_scenario_parser() -> argparse.ArgumentParser:
     """Return the parser of the command line for a scenario."""
     run = argparse.ArgumentParser(
         prog="swarm chaos run",
@@ -103,11 +116,11 @@ def scenario_parser() -> argparse.ArgumentParser:
     )
     run.add_argument("file", metavar="FILE", type=Path, help="scenario, such as examples/scenarios/takeover.toml")
     run.add_argument("--rehearse", action="store_true", help="run it with a simulated team; a seed repeats a run")
-    _common(run)
+    _add_common_arguments(run)
     return run
 
 
-def _common(parser: argparse.ArgumentParser) -> None:
+def _add_common_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--seed", type=int, help='selects the devices for "any" (default: the seed of the scenario)')
     parser.add_argument("--node", metavar="NAME", help="node on this machine, if several run")
 
@@ -115,7 +128,7 @@ def _common(parser: argparse.ArgumentParser) -> None:
 def main(
     words: Sequence[str] | None = None,
     out: TextIO | None = None,
-    ask: Ask = asked,
+    ask: SendRequest = send_request,
     seconds: Callable[[], float] = time.monotonic,
     wait: Callable[[float], None] = time.sleep,
 ) -> int:
@@ -124,51 +137,51 @@ def main(
     arguments = list(sys.argv[1:] if words is None else words)
 
     def say(text: str) -> None:
-        out.write(printable(text) + "\n")
+        out.write(remove_control_characters(text) + "\n")
         out.flush()
 
     try:
         if arguments[:1] == [RUN]:
-            options = scenario_parser().parse_args(arguments[1:])
-            scenario = loaded(options.file)
+            options = make_scenario_parser().parse_args(arguments[1:])
+            scenario = load_scenario(options.file)
             if options.rehearse:
-                return _rehearse(scenario, options.seed, say)
+                return _run_simulated(scenario, options.seed, say)
         elif arguments[:1] == [LIST]:
             listing = argparse.ArgumentParser(
                 prog="swarm chaos list",
                 description="List the faults that each device supports, and the active ones.",
                 epilog="Example: swarm chaos list --node dog1",
             )
-            _common(listing)
-            stage = TeamStage(Asker(listing.parse_args(arguments[1:]).node, ask), seconds, wait)
+            _add_common_arguments(listing)
+            stage = TeamStage(ControlClient(listing.parse_args(arguments[1:]).node, ask), seconds, wait)
             for device in stage.devices():
-                say(f"{device.name:12}{stage.suffers(device)}")
+                say(f"{device.name:12}{stage.describe_faults(device)}")
             return 0
         else:
-            options = parser().parse_args(arguments)
+            options = make_parser().parse_args(arguments)
             fault = parse_fault(options.kind, options.seconds, options.amount)
             scenario = Scenario("", (Step(0.0, options.device, fault),))
-        stage = TeamStage(Asker(options.node, ask), seconds, wait)
-        losses = play(scenario, scenario.seed if options.seed is None else options.seed, stage, say)
+        stage = TeamStage(ControlClient(options.node, ask), seconds, wait)
+        losses = run_scenario(scenario, scenario.seed if options.seed is None else options.seed, stage, say)
     except (BadFault, BadSetting, NoControl) as problem:
-        sys.stderr.write(printable(f"swarm chaos: {problem}") + "\n")
-        return WRONG
-    except (Refusal, NobodyThere) as problem:
-        sys.stderr.write(printable(f"swarm chaos: {problem}") + "\n")
-        return FAILED
+        sys.stderr.write(remove_control_characters(f"swarm chaos: {problem}") + "\n")
+        return EXIT_USAGE
+    except (Rejection, DeviceNotPresent) as problem:
+        sys.stderr.write(remove_control_characters(f"swarm chaos: {problem}") + "\n")
+        return EXIT_FAILED
     except KeyboardInterrupt:
-        return FAILED
-    return 0 if all(loss.held for loss in losses) else FAILED
+        return EXIT_FAILED
+    return 0 if all(loss.is_within_target for loss in losses) else EXIT_FAILED
 
 
-def _rehearse(scenario: Scenario, seed: int | None, say: Callable[[str], None]) -> int:
-    from swarmnode.rehearsal import RehearsedStage  # imported on demand: it needs the simulator's libraries
+def _run_simulated(scenario: Scenario, seed: int | None, say: Callable[[str], None]) -> int:
+    from swarmnode.simulated_team import SimulatedStage  # imported on demand: it needs the simulator's libraries
 
     seed = scenario.seed if seed is None else seed
-    stage = RehearsedStage(seed)
+    stage = SimulatedStage(seed)
     try:
-        losses = play(scenario, seed, stage, say)
+        losses = run_scenario(scenario, seed, stage, say)
     finally:
         stage.stop()
     say(f"digest {stage.digest()}")
-    return 0 if all(loss.held for loss in losses) else FAILED
+    return 0 if all(loss.is_within_target for loss in losses) else EXIT_FAILED

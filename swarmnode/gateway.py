@@ -17,9 +17,9 @@ from twisted.internet.defer import Deferred, DeferredList, fail, maybeDeferred, 
 from twisted.internet.interfaces import IDelayedCall
 from twisted.logger import Logger
 
-from drivers.phone.driver import SIGHT, PhoneDriver
-from drivers.phone.option import FPS, MOST_SIDE
-from formats.jpeg import size_of
+from drivers.phone.driver import TARGET_KEYS, PhoneDriver
+from drivers.phone.option import MAX_SIDE_PX, TASK_FPS
+from formats.jpeg import read_size
 from middleware.admission.certificate import GATEWAY
 from middleware.config.settings import (
     IN_MEMORY,
@@ -34,42 +34,42 @@ from middleware.directory.presence import DONE, EXECUTING, IDLE, Device
 from middleware.entangled.data.memory import MemoryStore
 from middleware.entangled.identity import Identity
 from middleware.entangled.token_bucket import TokenBucket
-from middleware.frontend.view import TeamView
+from middleware.frontend.team_view import TeamView
 from middleware.node import SwarmNode
-from swarmnode.assembly import FAULTS, assembled
-from swarmnode.seams import Seams
-from webnode.board import Wanted
+from swarmnode.assembly import EXPECTED_ERRORS, assemble_node
+from swarmnode.dependencies import Dependencies
 from webnode.errors import Refusal
+from webnode.services import PictureReply
 
-MOST = 8
+MAX_PHONES = 8
 """Maximum number of phones at one web node; each takes the memory and CPU time of a node."""
-SILENCE_S = 1.0
+PICTURE_TIMEOUT_S = 1.0
 """Seconds of silence after which a phone is considered gone."""
-FIRST_S = 5.0
+FIRST_PICTURE_TIMEOUT_S = 5.0
 """Seconds until the first picture: the browser may have to ask the visitor for the camera."""
 IDLE_FPS = 5.0
 """Frame rate without a task: enough to be considered present, and it saves the phone's battery."""
-LOOKS, LOOKS_S = 20.0, 15.0
+PICTURE_BURST, PICTURES_PER_S = 20.0, 15.0
 """Rate limit of pictures: burst, and pictures per second."""
-JOINS, JOINS_S = 8.0, 1.0
-PLACE_S = 1.0
+JOIN_BURST, JOINS_PER_S = 8.0, 1.0
+POSITION_INTERVAL_S = 1.0
 """Minimum seconds between two published positions."""
-PLACE: Mapping[str, int] = {"lat": 5, "lon": 5, "accuracy": 0}
+POSITION_DECIMALS: Mapping[str, int] = {"lat": 5, "lon": 5, "accuracy": 0}
 """Published fields of the position and their decimals: about a metre."""
-PERSON = b"phone"
+HASH_PERSON = b"phone"
 
 
-def seed_of(team: bytes, secret: bytes) -> bytes:
+def derive_seed(team: bytes, secret: bytes) -> bytes:
     """Return the seed of a phone's identity in the team ``team``, derived from the phone's ``secret``."""
-    return hashlib.blake2s(secret, key=team, person=PERSON).digest()
+    return hashlib.blake2s(secret, key=team, person=HASH_PERSON).digest()
 
 
-def sides(jpeg: bytes) -> tuple[int, int]:
+def check_picture(jpeg: bytes) -> tuple[int, int]:
     """Return width and height of a picture in pixels; raises ``Refusal`` 400 for an unsupported picture."""
-    size = size_of(jpeg)
-    if size is None or max(size) > MOST_SIDE:
+    size = read_size(jpeg)
+    if size is None or max(size) > MAX_SIDE_PX:
         problem = "it is not a supported JPEG picture" if jpeg else "it is missing or empty"
-        raise Refusal("body", problem, f"send a complete JPEG of at most {MOST_SIDE} pixels a side")
+        raise Refusal("body", problem, f"send a complete JPEG of at most {MAX_SIDE_PX} pixels a side")
     return size
 
 
@@ -83,35 +83,41 @@ class Gateway:
     _log = Logger()
 
     def __init__(
-        self, settings: Settings, node: SwarmNode, seams: Callable[[], Seams], others: Callable[[], Sequence[Device]]
+        self,
+        settings: Settings,
+        node: SwarmNode,
+        seams: Callable[[], Dependencies],
+        others: Callable[[], Sequence[Device]],
     ) -> None:
         self._settings = settings
         self._node = node
-        self._seams = seams
-        self._others = others
+        self._make_dependencies = seams
+        self._list_devices = others
         self._phones: dict[str, _Phone] = {}
-        self._ending: dict[str, Deferred[Any]] = {}
+        self._stopping: dict[str, Deferred[Any]] = {}
         self._removed: dict[str, float] = {}
-        self._joins = TokenBucket(JOINS_S, JOINS)
+        self._joins = TokenBucket(JOINS_PER_S, JOIN_BURST)
 
     def join(self, secret: bytes, name: str, can: Mapping[str, Any]) -> Deferred[str]:
         """Start the node of a phone; fires with its uuid, fails with ``Refusal`` 409, 429 or 503."""
         closed = self._node.team
-        seed = seed_of(self._settings.node.team_secret if closed is None else closed.roll.operator, secret)
+        seed = derive_seed(
+            self._settings.node.team_secret if closed is None else closed.membership_list.operator, secret
+        )
         uuid = Identity(seed).node_id.hex()
         if uuid in self._phones:
-            self._phones[uuid].wait(FIRST_S)
+            self._phones[uuid].restart_timer(FIRST_PICTURE_TIMEOUT_S)
             return succeed(uuid)
         now = self._node.clock.seconds()
         removed_for = self._removed.get(uuid, now) - now
         if removed_for > 0.0:
             return fail(Refusal("phone", "an operator removed it", f"wait {removed_for:.0f} s", 409))
-        if len(self._phones) >= MOST:
+        if len(self._phones) >= MAX_PHONES:
             remedy = "wait until one leaves, or join at another web node"
-            return fail(Refusal("phone", f"this node already has {MOST} phones", remedy, 409))
+            return fail(Refusal("phone", f"this node already has {MAX_PHONES} phones", remedy, 409))
         team = self._node.team
-        if team is not None and GATEWAY not in team.door.me.roles:
-            remedy = f"ask the operator to run: swarm promote {team.door.me.name} --role {GATEWAY}"
+        if team is not None and GATEWAY not in team.admission.me.roles:
+            remedy = f"ask the operator to run: swarm promote {team.admission.me.name} --role {GATEWAY}"
             return fail(Refusal("phone", "this node may not admit guests to its team", remedy, 409))
         if not self._joins.take(now):
             return fail(Refusal("phone", "too many phones join at once", "try again in a few seconds", 429))
@@ -122,24 +128,24 @@ class Gateway:
                 if uuid not in self._phones:
                     self._phones[uuid] = self._start_phone(uuid, seed, self._unique_name(name, uuid), can)
                 joined.callback(uuid)
-            except FAULTS as error:
+            except EXPECTED_ERRORS as error:
                 joined.errback(Refusal("phone", f"its node cannot start: {error}", "try again in a moment", 503))
             return left
 
         # Wait until a former node of the same phone has stopped.
-        self._ending.get(uuid, succeed(None)).addCallback(enter)
+        self._stopping.get(uuid, succeed(None)).addCallback(enter)
         return joined
 
-    def look(self, uuid: str, jpeg: bytes, values: Mapping[str, float]) -> Wanted:
+    def receive_picture(self, uuid: str, jpeg: bytes, values: Mapping[str, float]) -> PictureReply:
         """Process a picture and readings of a phone; raises ``Refusal`` 400, 404 or 429."""
-        size = sides(jpeg)
+        size = check_picture(jpeg)
         phone = self._phones.get(uuid)
         if phone is None:
             raise Refusal("uuid", "this phone has not joined at this node", "join by POST /api/v1/phones", 404)
-        phone.wait(SILENCE_S)
+        phone.restart_timer(PICTURE_TIMEOUT_S)
         if not phone.bucket.take(self._node.clock.seconds()):
-            raise Refusal("phone", "it sends too many pictures", f"send at most {FPS:g} a second", 429)
-        return phone.look(jpeg, size, values)
+            raise Refusal("phone", "it sends too many pictures", f"send at most {TASK_FPS:g} a second", 429)
+        return phone.process_picture(jpeg, size, values)
 
     def leave(self, uuid: str) -> None:
         """Stop the node of a phone, if there is one."""
@@ -148,27 +154,27 @@ class Gateway:
             return
 
         def gone(_: object) -> None:
-            self._ending.pop(uuid, None)
+            self._stopping.pop(uuid, None)
 
-        ending = self._ending[uuid] = phone.stop()
+        ending = self._stopping[uuid] = phone.stop()
         ending.addBoth(gone)
 
     def close(self) -> Deferred[Any]:
         """Stop the nodes of all phones; fires when they have stopped."""
         for uuid in list(self._phones):
             self.leave(uuid)
-        waiting = [ending.addCallback(lambda _: None) for ending in self._ending.values()]
+        waiting = [ending.addCallback(lambda _: None) for ending in self._stopping.values()]
         return DeferredList(waiting, consumeErrors=True)
 
     def _start_phone(self, uuid: str, seed: bytes, name: str, can: Mapping[str, Any]) -> _Phone:
-        seams = self._seams()
-        seams.store.note("identity", seed)
+        seams = self._make_dependencies()
+        seams.store.set_note("identity", seed)
         if self._node.team is not None:
             from middleware.admission.membership import MemoryMembership
 
-            seams = replace(seams, membership=MemoryMembership(self._node.team.guest(seed, name)))
+            seams = replace(seams, membership=MemoryMembership(self._node.team.create_guest(seed, name)))
         settings = _make_settings(self._settings, self._node, name, can)
-        assembly = assembled(settings, seams)
+        assembly = assemble_node(settings, seams)
         assert isinstance(assembly.driver, PhoneDriver) and assembly.agent is not None
         phone = _Phone(assembly.node, assembly.agent, assembly.driver, partial(self._on_silence, uuid))
         assembly.node.on_disconnect(partial(self._on_removed, uuid))
@@ -177,7 +183,7 @@ class Gateway:
 
     def _unique_name(self, name: str, uuid: str) -> str:
         """Return ``name``, or a unique variant of it if another device has it."""
-        taken = {device.name for device in self._others() if device.uuid != uuid}
+        taken = {device.name for device in self._list_devices() if device.uuid != uuid}
         taken |= {phone.name for other, phone in self._phones.items() if other != uuid}
         return name if name not in taken else f"{name[:35]}-{uuid[:4]}"
 
@@ -197,19 +203,19 @@ class _Phone:
 
     def __init__(self, node: SwarmNode, agent: Service, driver: PhoneDriver, silent: Callable[[], None]) -> None:
         self.name = node.presence.device.name
-        self.bucket = TokenBucket(LOOKS_S, LOOKS)
+        self.bucket = TokenBucket(PICTURES_PER_S, PICTURE_BURST)
         self._node = node
         self._agent = agent
         self._driver = driver
-        self._silent = silent
+        self._on_silence = silent
         self._timer: IDelayedCall | None = None
-        self._placed_at = 0.0
+        self._position_sent_at = 0.0
 
     def start(self) -> None:
         """Open the port and join; raises one of ``FAULTS`` if that fails."""
         self._node.startService()
         self._agent.startService()
-        self.wait(FIRST_S)
+        self.restart_timer(FIRST_PICTURE_TIMEOUT_S)
 
     def stop(self) -> Deferred[Any]:
         """Release the lease, then leave the network."""
@@ -217,27 +223,33 @@ class _Phone:
             self._timer.cancel()
         return maybeDeferred(self._agent.stopService).addBoth(lambda _: self._node.stopService())
 
-    def wait(self, seconds: float) -> None:
+    def restart_timer(self, seconds: float) -> None:
         """Restart the timer for the next picture."""
         if self._timer is not None and self._timer.active():
             self._timer.reset(seconds)
         else:
-            self._timer = self._node.clock.callLater(seconds, self._silent)
+            self._timer = self._node.clock.callLater(seconds, self._on_silence)
 
-    def look(self, jpeg: bytes, size: tuple[int, int], values: Mapping[str, float]) -> Wanted:
+    def process_picture(self, jpeg: bytes, size: tuple[int, int], values: Mapping[str, float]) -> PictureReply:
         """Pass on a picture, and return the requested frame rate and the instruction for the visitor."""
-        self._driver.look(jpeg, *size, values)
+        self._driver.process_picture(jpeg, *size, values)
         now = self._node.clock.seconds()
-        place = {key: round(values[f"position.{key}"], n) for key, n in PLACE.items() if f"position.{key}" in values}
-        if place and now - self._placed_at >= PLACE_S:
-            self._placed_at = now
+        place = {
+            key: round(values[f"position.{key}"], n)
+            for key, n in POSITION_DECIMALS.items()
+            if f"position.{key}" in values
+        }
+        if place and now - self._position_sent_at >= POSITION_INTERVAL_S:
+            self._position_sent_at = now
             self._node.presence.change(position=place)
         device = self._node.presence.device
-        return Wanted(FPS if device.task else IDLE_FPS, self._instruction(device, SIGHT[0] in values))
+        return PictureReply(
+            TASK_FPS if device.task else IDLE_FPS, self._make_instruction(device, TARGET_KEYS[0] in values)
+        )
 
-    def _instruction(self, device: Device, is_seen: bool) -> str:
+    def _make_instruction(self, device: Device, is_seen: bool) -> str:
         """Return the instruction for the visitor."""
-        if self._node.halt.is_stopped:
+        if self._node.stop_state.is_stopped:
             return "The team is stopped. Wait."
         if device.status == EXECUTING:
             return (
@@ -275,13 +287,13 @@ def _make_settings(settings: Settings, node: SwarmNode, name: str, can: Mapping[
     )
 
 
-def gateway(settings: Settings, node: SwarmNode, seams: Seams, reactor: Any, view: TeamView) -> Gateway:
+def make_gateway(settings: Settings, node: SwarmNode, seams: Dependencies, reactor: Any, view: TeamView) -> Gateway:
     """Return the gateway of the web node with these ``seams``; each phone has a separate UDP port."""
     from middleware.entangled.network.udp import UdpNetwork
 
-    def of_phone() -> Seams:
+    def of_phone() -> Dependencies:
         store = MemoryStore(settings.node.store_rows, settings.node.store_bytes, epoch=seams.rng.randbytes(8))
         network = partial(UdpNetwork, reactor, settings.node.host, 0)
-        return Seams(reactor, network, store, seams.rng, seams.wall)
+        return Dependencies(reactor, network, store, seams.rng, seams.wall)
 
     return Gateway(settings, node, of_phone, lambda: view.devices)

@@ -14,32 +14,32 @@ from typing import TYPE_CHECKING, Any
 from twisted.application.service import MultiService
 from twisted.internet.defer import gatherResults, maybeDeferred
 
-from agents.catalogue import DEMO, TASKS
+from agents.catalogue import DEMO_TASK, TASKS
 from drivers.link import TcpConnector
-from drivers.sim.operator import YardOperator
+from drivers.sim.client import SimulatorClient
 from middleware.config.settings import IN_MEMORY, Settings
 from middleware.entangled.data.sqlite import read_records
 from middleware.frontend.client import TeamClient
 from middleware.node import SwarmNode
-from swarmnode.gateway import gateway
-from swarmnode.invitation import at_terminal, invited
-from swarmnode.seams import Seams
-from webnode.audit import Audit
-from webnode.board import Board, Phones
+from swarmnode.dependencies import Dependencies
+from swarmnode.gateway import make_gateway
+from swarmnode.page_access import announce_page, find_terminal
+from webnode.audit import AuditLog
+from webnode.diagnostics import Diagnostics
 from webnode.fallback import TeamFallbacks
 from webnode.faults import FaultControl
-from webnode.guard import LOCAL_ENDS
-from webnode.halting import TeamHalts
-from webnode.invite import TeamInvites
-from webnode.ledger import Glance, state_from
+from webnode.guard import LOCAL_SUFFIXES
+from webnode.invite import Invites
 from webnode.server import WebService
-from webnode.session import sessions
-from webnode.state import Departed
-from webnode.survey import TeamSurvey
-from webnode.team import TeamDesk
+from webnode.services import Phones, Services
+from webnode.session import make_sessions
+from webnode.state import DepartedDevices
+from webnode.state_builder import StateCache, build_state
+from webnode.stop_control import StopControl
+from webnode.team_control import TeamControl
 
 if TYPE_CHECKING:
-    from webnode.tls import TlsDoor
+    from webnode.tls import TlsPort
 
 
 class PageService(MultiService):
@@ -49,18 +49,18 @@ class PageService(MultiService):
     """
 
     def __init__(
-        self, web: WebService, operator: YardOperator | None, tell: Callable[[], None], phones: Phones
+        self, web: WebService, operator: SimulatorClient | None, tell: Callable[[], None], phones: Phones
     ) -> None:
         super().__init__()
         self._operator = operator
         self._phones = phones
-        self._tell = tell
+        self._announce = tell
         web.setServiceParent(self)
 
     def startService(self) -> None:
         """Open the ports, announce the page, and connect to the simulator."""
         super().startService()
-        self._tell()
+        self._announce()
         if self._operator is not None:
             self._operator.connect().addErrback(lambda _: None)
 
@@ -72,68 +72,68 @@ class PageService(MultiService):
         return gatherResults([left, maybeDeferred(super().stopService)])
 
 
-def page(
-    settings: Settings, seams: Seams, reactor: Any, node: SwarmNode, door: Callable[..., TlsDoor] | None
+def make_page_service(
+    settings: Settings, seams: Dependencies, reactor: Any, node: SwarmNode, door: Callable[..., TlsPort] | None
 ) -> PageService:
     """Return the page over the data store of ``node``; ``door`` creates its TLS port, if it has one."""
     address, wall, store = settings.web, seams.wall, settings.node.store
     operator = None
     if address.yard is not None:
-        operator = YardOperator(TcpConnector(), reactor, address.yard.host, address.yard.port)
+        operator = SimulatorClient(TcpConnector(), reactor, address.yard.host, address.yard.port)
     client = TeamClient(node)
-    desk = TeamDesk(client, TASKS, DEMO, operator)
-    tls = None if door is None else door(settings, node.store, reactor, wall, seams.rng, _machine_names)
+    desk = TeamControl(client, TASKS, DEMO_TASK, operator)
+    tls = None if door is None else door(settings, node.store, reactor, wall, seams.rng, _list_machine_names)
     team = TeamFallbacks(node, reactor.seconds)
-    phones = gateway(settings, node, seams, reactor, client.view)
+    phones = make_gateway(settings, node, seams, reactor, client.view)
 
     def urls() -> list[str]:
-        return web.urls(_machine_names())
+        return web.urls(_list_machine_names())
 
     authority, fingerprint = (b"", "") if tls is None else (tls.signer.pem, tls.signer.fingerprint)
-    board = Board(
+    board = Services(
         desk,
-        sessions(settings, node, reactor, seams.rng, team),
-        Audit(None if store == IN_MEMORY else Path(f"{store}.audit"), wall),
+        make_sessions(settings, node, reactor, seams.rng, team),
+        AuditLog(None if store == IN_MEMORY else Path(f"{store}.audit"), wall),
         fallbacks=team,
-        survey=TeamSurvey(node, client),
-        halts=TeamHalts(client),
+        survey=Diagnostics(node, client),
+        halts=StopControl(client),
         faults=FaultControl(node, reactor.seconds) if settings.faults.allow else None,
         phones=phones,
-        invites=TeamInvites(urls, authority, fingerprint, reactor, reactor.getThreadPool()),
+        invites=Invites(urls, authority, fingerprint, reactor, reactor.getThreadPool()),
     )
-    live = partial(state_from, client.read, Departed(), settings.node.name)
+    live = partial(build_state, client.read, DepartedDevices(), settings.node.name)
     # A separate memory of departed devices: the file is one commit behind the watched records.
-    on_file = partial(state_from, partial(read_records, Path(store)), Departed(), settings.node.name)
+    on_file = partial(build_state, partial(read_records, Path(store)), DepartedDevices(), settings.node.name)
     stored = live if store == IN_MEMORY else on_file
     web = WebService(
         reactor,
         address.host,
         address.port,
-        Glance(lambda: stored(wall()), reactor.seconds),
+        StateCache(lambda: stored(wall()), reactor.seconds),
         board,
         wall,
-        hosts_of(settings, socket.gethostname()),
+        list_host_names(settings, socket.gethostname()),
         [] if tls is None else [tls.open],
         live=lambda: live(wall()),
-        version=lambda: (client.version, tuple(node.halt.stops)),
+        version=lambda: (client.version, tuple(node.stop_state.stops)),
     )
 
     def tell() -> None:
         where = address.host, lambda: web.port
-        invited(settings.node.name, *where, board.sessions.code, web.secure_port, at_terminal())
-        team.serves(urls())
+        announce_page(settings.node.name, *where, board.sessions.code, web.secure_port, find_terminal())
+        team.publish(urls())
 
     return PageService(web, operator, tell, phones)
 
 
-def hosts_of(settings: Settings, machine: str) -> frozenset[str]:
+def list_host_names(settings: Settings, machine: str) -> frozenset[str]:
     """Return the host names by which a browser may open the page, in addition to addresses."""
     short = {machine.split(".")[0].lower(), settings.node.name.lower()}
-    local = {f"{name}{end}" for name in short for end in ("", *LOCAL_ENDS)}
+    local = {f"{name}{end}" for name in short for end in ("", *LOCAL_SUFFIXES)}
     return frozenset({machine.lower(), *local, *settings.web.names})
 
 
-def _machine_names() -> Sequence[str]:
+def _list_machine_names() -> Sequence[str]:
     """Return the names of this machine in the network: its address, and its mDNS name."""
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
         try:

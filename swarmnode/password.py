@@ -9,10 +9,10 @@ import sys
 from collections.abc import Callable, Sequence
 from typing import TextIO
 
-from webnode.password import LEAST, MOST, SALT, hashed
+from webnode.password import MAX_LENGTH, MIN_LENGTH, SALT_BYTES, hash_password
 
 
-def parser() -> argparse.ArgumentParser:
+def make_parser() -> argparse.ArgumentParser:
     """Return the parser of the command line."""
     about = "Ask for a password, and print its hash for the settings, as [web] password."
     return argparse.ArgumentParser(prog="swarm password", description=about, epilog="Example: swarm password")
@@ -26,12 +26,12 @@ def main(
 ) -> int:
     """Run the command; returns 0, or 1 if there is no valid password."""
     out = out or sys.stdout
-    parser().parse_args(words)
+    make_parser().parse_args(words)
     try:
         password = ask("Password: ")
         problem = ""
-        if not LEAST <= len(password) <= MOST:
-            problem = f"the password has {len(password)} characters; use {LEAST} to {MOST}"
+        if not MIN_LENGTH <= len(password) <= MAX_LENGTH:
+            problem = f"the password has {len(password)} characters; use {MIN_LENGTH} to {MAX_LENGTH}"
         elif password != password.strip() or not password.isprintable():
             problem = "the password begins or ends with a space, or has an unprintable character; use another one"
         elif ask("Repeat the password: ") != password:
@@ -41,5 +41,5 @@ def main(
     if problem:
         sys.stderr.write(f"swarm password: {problem}\n")
         return 1
-    out.write(f'password = "{hashed(password, salt(SALT))}"\n')
+    out.write(f'password = "{hash_password(password, salt(SALT_BYTES))}"\n')
     return 0

@@ -15,24 +15,24 @@ from twisted.python import usage
 
 from drivers.errors import DriverError
 from middleware.admission.errors import BadKeyFile
-from middleware.admission.keyfile import MAX_FILE, read_bytes
+from middleware.admission.keyfile import MAX_FILE_BYTES, read_bytes
 from middleware.config.settings import COMMAND_LINE, NodeSettings, Settings
 from middleware.entangled.clock import use_monotonic_time
 from middleware.entangled.errors import BadStore, PortInUse, TunnelPortInUse
 from middleware.entangled.network.network import Network
 from middleware.errors import BadSetting, MissingExtra, SwarmError, UnknownAgent
 from middleware.node import SwarmNode
-from swarmnode.assembly import FAULTS, assembled, checked_team
-from swarmnode.ballast import STARTED_S, drop_tls, warmed_up
-from swarmnode.ports import given_way
+from swarmnode.assembly import EXPECTED_ERRORS, assemble_node, check_team
+from swarmnode.environment import create_control_socket, make_dependencies, make_network_factory, resolve_hosts
+from swarmnode.memory_savings import STARTUP_S, block_tls_import, release_memory
+from swarmnode.ports import replace_busy_ports
 from swarmnode.service import NodeService
-from swarmnode.web import web_page, with_code
-from swarmnode.world import control_socket, real_network, real_seams, resolved
+from swarmnode.web import add_sign_in_code, make_web_page
 from webnode.errors import PortTaken
 
 use_monotonic_time()
 
-KEYS: Sequence[tuple[type[Exception], str]] = (
+ERROR_KEYS: Sequence[tuple[type[Exception], str]] = (
     (TunnelPortInUse, "[node] tunnel_port"),
     (PortInUse, "[node] port"),
     (BadStore, "[node] store"),
@@ -44,8 +44,8 @@ KEYS: Sequence[tuple[type[Exception], str]] = (
 )
 """Setting to name in the message of each error."""
 
-KEY_FILE = "team-key-file"
-TRIES = 5
+KEY_FILE_OPTION = "team-key-file"
+MAX_PORT_TRIES = 5
 """Number of ports to try if programs that start at the same moment compete for them."""
 
 
@@ -85,14 +85,16 @@ class Options(usage.Options):
         """Rejected, because all users of the computer can read command lines; use --team-key-file."""
         problem = "can be read by all users of this computer"
         remedy = "write a new secret to a file of mode 0600 and pass --team-key-file FILE; replace the one given here"
-        _refuse(BadSetting(COMMAND_LINE, "--team-key", problem, remedy))
+        _exit_with_error(BadSetting(COMMAND_LINE, "--team-key", problem, remedy))
 
     def postOptions(self) -> None:
         """Read the file and the flags; an error is printed in one line, with exit code 2."""
-        flags = {name.replace("-", "_"): value for name, value in self.items() if name not in ("config", KEY_FILE)}
+        flags = {
+            name.replace("-", "_"): value for name, value in self.items() if name not in ("config", KEY_FILE_OPTION)
+        }
         try:
-            if self[KEY_FILE] is not None:
-                flags["team_key"] = _read_team_key(self[KEY_FILE])
+            if self[KEY_FILE_OPTION] is not None:
+                flags["team_key"] = _read_team_key(self[KEY_FILE_OPTION])
             if self["config"]:
                 settings = Settings.load(self["config"])
             elif self["name"] is None:
@@ -101,15 +103,15 @@ class Options(usage.Options):
                 settings = Settings.from_mapping({"node": {"name": "unnamed"}}, COMMAND_LINE)
             self.settings = settings.with_flags(**flags)
         except (SwarmError, BadKeyFile) as error:
-            _refuse(error)
+            _exit_with_error(error)
         # This is the last moment before the reactor is imported.
         if not ("web" in self.settings.node.roles and self.settings.web.tls):
-            drop_tls()
+            block_tls_import()
 
 
 def _read_team_key(file: str) -> str:
     """Return the secret in a private file, or from standard input, without the newline at its end."""
-    content = sys.stdin.buffer.read(MAX_FILE + 1) if file == "-" else read_bytes(Path(file))
+    content = sys.stdin.buffer.read(MAX_FILE_BYTES + 1) if file == "-" else read_bytes(Path(file))
     try:
         return content.decode().rstrip("\r\n")
     except UnicodeDecodeError:
@@ -122,17 +124,17 @@ def makeService(options: Options) -> IService:
 
     settings = options.settings
     try:
-        settings = given_way(resolved(settings))
-        checked_team(settings)
-        seams = real_seams(settings, reactor)
-        fronts: list[Callable[[SwarmNode], IService]] = [partial(control_socket, settings, reactor)]
+        settings = replace_busy_ports(resolve_hosts(settings))
+        check_team(settings)
+        seams = make_dependencies(settings, reactor)
+        fronts: list[Callable[[SwarmNode], IService]] = [partial(create_control_socket, settings, reactor)]
         if "web" in settings.node.roles:
-            settings = with_code(settings, seams.rng)
-            fronts.append(partial(web_page, settings, seams, reactor))
-        reactor.callLater(STARTED_S, warmed_up)
+            settings = add_sign_in_code(settings, seams.rng)
+            fronts.append(partial(make_web_page, settings, seams, reactor))
+        reactor.callLater(STARTUP_S, release_memory)
         return CheckedService(settings, seams, fronts)
-    except FAULTS as error:
-        _refuse(told(error, settings.origin))
+    except EXPECTED_ERRORS as error:
+        _exit_with_error(format_error(error, settings.origin))
 
 
 class CheckedService(NodeService):
@@ -141,7 +143,7 @@ class CheckedService(NodeService):
     def startService(self) -> None:
         """Start; if the default port has been taken since it was checked, try the next ones."""
         try:
-            for left in reversed(range(TRIES)):
+            for left in reversed(range(MAX_PORT_TRIES)):
                 try:
                     super().startService()
                     return
@@ -149,25 +151,25 @@ class CheckedService(NodeService):
                     if not left or self.settings.is_given("node", "port"):
                         raise
                 self.vanish()
-                self.settings = given_way(self.settings)
-                self._seams = replace(self._seams, network=self._network(self.settings.node))
-                self.assembly = assembled(self.settings, self._seams)
-        except FAULTS as error:
-            _refuse(told(error, self.settings.origin))
+                self.settings = replace_busy_ports(self.settings)
+                self._dependencies = replace(self._dependencies, network=self._make_network(self.settings.node))
+                self.assembly = assemble_node(self.settings, self._dependencies)
+        except EXPECTED_ERRORS as error:
+            _exit_with_error(format_error(error, self.settings.origin))
 
-    def _network(self, node: NodeSettings) -> Callable[[], Network]:
-        return real_network(node, self._seams.clock, self._seams.rng)
+    def _make_network(self, node: NodeSettings) -> Callable[[], Network]:
+        return make_network_factory(node, self._dependencies.clock, self._dependencies.rng)
 
 
-def told(error: Exception, origin: str) -> str:
+def format_error(error: Exception, origin: str) -> str:
     """Return one line with file, key, problem and remedy."""
     if isinstance(error, BadSetting):
         return str(error)
-    key = next((key for kind, key in KEYS if isinstance(error, kind)), "")
+    key = next((key for kind, key in ERROR_KEYS if isinstance(error, kind)), "")
     return " ".join(": ".join(filter(None, (origin, key, str(error)))).split())
 
 
-def _refuse(problem: object) -> NoReturn:
+def _exit_with_error(problem: object) -> NoReturn:
     # twistd redirects sys.stderr to its log, which the user does not see.
     stream = sys.__stderr__ if isinstance(sys.stderr, LoggingFile) else sys.stderr
     if stream is not None:

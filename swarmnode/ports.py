@@ -10,7 +10,7 @@ from twisted.logger import Logger
 
 from middleware.config.settings import Settings
 
-NEXT = 8
+PORT_COUNT = 8
 """Number of ports to try: the default and the next ones, so a firewall can be opened for them; then any port."""
 
 IsFree = Callable[[socket.SocketKind, str, int], bool]
@@ -31,7 +31,7 @@ def is_free(kind: socket.SocketKind, host: str, port: int) -> bool:
     return True
 
 
-def given_way(settings: Settings, is_free: IsFree = is_free) -> Settings:
+def replace_busy_ports(settings: Settings, is_free: IsFree = is_free) -> Settings:
     """Replace each default port that is in use by a free one; ports that were set stay."""
     node, web = settings.node, settings.web
     if not settings.is_given("node", "port"):
@@ -47,11 +47,11 @@ def given_way(settings: Settings, is_free: IsFree = is_free) -> Settings:
 
 
 def _select_port(key: str, kind: socket.SocketKind, host: str, usual: int, is_free: IsFree) -> int:
-    for port in range(usual, usual + NEXT):
+    for port in range(usual, usual + PORT_COUNT):
         if is_free(kind, host, port):
             if port != usual:
                 _log.info("{key}: {usual} is in use; using {port}", key=key, usual=usual, port=port)
             return port
-    last = usual + NEXT - 1
+    last = usual + PORT_COUNT - 1
     _log.info("{key}: {usual} to {last} are in use; using any free port", key=key, usual=usual, last=last)
     return 0

@@ -14,48 +14,48 @@ from collections.abc import Mapping
 from contextlib import suppress
 from functools import partial
 
-from agents.pushed import BehaviourKind
-from middleware.consensus.deployed import BEHAVIOUR, STRATEGY
+from agents.behaviour_process import BehaviourKind
+from middleware.consensus.deployed_modules import BEHAVIOUR, STRATEGY
 from middleware.deployment.confinement import confine
-from middleware.deployment.frame import MAX_QUESTION, Channel, Splitter
-from middleware.deployment.host import Host, Kind, MemoryChannel, StrategyKind
+from middleware.deployment.module_channel import MAX_REQUEST_BYTES, Channel, FrameSplitter
+from middleware.deployment.module_host import MemoryChannel, ModuleHost, ModuleKind, StrategyKind
 
 READ_BYTES = 64 * 1024
-LIBRARIES = (
+ALLOWED_LIBRARIES = (
     *("abc", "base64", "bisect", "cmath", "collections", "collections.abc", "colorsys", "contextlib", "copy"),
     *("dataclasses", "datetime", "decimal", "enum", "fractions", "functools", "hashlib", "heapq", "itertools"),
     *("json", "math", "numbers", "operator", "random", "re", "statistics", "string", "struct", "textwrap", "time"),
     *("traceback", "types", "typing", "zlib", "cv2", "numpy"),
 )
-PREFIXES = ("agents.", "drivers.reading", "middleware.consensus.", "middleware.entangled.value", "numpy.")
+ALLOWED_PREFIXES = ("agents.", "drivers.reading", "middleware.consensus.", "middleware.entangled.value", "numpy.")
 """Further names that a module may import, by prefix."""
-LATER = {"numpy": ("numpy.fft", "numpy.random")}
+LAZY_IMPORTS = {"numpy": ("numpy.fft", "numpy.random")}
 """Modules that a library imports at first use, when imports are no longer possible."""
 _IMPORT = re.compile(rb"^[ \t]*(?:from[ \t]+([\w.]+)[ \t]+import|import[ \t]+([\w., \t]+))", re.MULTILINE)
 
 
-def kinds() -> Mapping[str, Kind]:
+def make_kinds() -> Mapping[str, ModuleKind]:
     """Return the handler of each kind of module."""
     return {STRATEGY: StrategyKind(), BEHAVIOUR: BehaviourKind()}
 
 
-def simulated() -> Channel:
+def make_memory_channel() -> Channel:
     """Return an in-memory channel, for simulated teams."""
-    return MemoryChannel(kinds())
+    return MemoryChannel(make_kinds())
 
 
-def wanted(source: bytes) -> list[str]:
+def find_allowed_imports(source: bytes) -> list[str]:
     """Return the allowed libraries that ``source`` imports; they are loaded before privileges are dropped."""
     named: set[str] = set()
     for one, several in _IMPORT.findall(source):
         words = [one] if one else [part.split()[0] for part in several.split(b",") if part.split()]
         named.update(word.decode("ascii", "replace") for word in words)
-    known = {name for name in named if name in LIBRARIES or name.startswith(PREFIXES)}
-    return sorted(known.union(*(LATER.get(name, ()) for name in known)))
+    known = {name for name in named if name in ALLOWED_LIBRARIES or name.startswith(ALLOWED_PREFIXES)}
+    return sorted(known.union(*(LAZY_IMPORTS.get(name, ()) for name in known)))
 
 
 def _prepare(parent: int, source: bytes) -> list[str]:
-    for name in wanted(source):
+    for name in find_allowed_imports(source):
         with suppress(Exception):  # the module's own import raises again
             importlib.import_module(name)
     os.environ.clear()
@@ -71,11 +71,11 @@ def main() -> None:
     os.close(null)
     with suppress(OSError):
         os.rmdir(os.getcwd())  # the folder is empty and not needed
-    host = Host(kinds(), partial(_prepare, int(sys.argv[1])))
-    questions = Splitter(MAX_QUESTION)
+    host = ModuleHost(make_kinds(), partial(_prepare, int(sys.argv[1])))
+    questions = FrameSplitter(MAX_REQUEST_BYTES)
     while data := os.read(0, READ_BYTES):
         for question in questions.feed(data):
-            rest = host.answer(question)
+            rest = host.answer_request(question)
             while rest:
                 rest = rest[os.write(out, rest) :]
 

@@ -11,11 +11,11 @@ from typing import Any, TextIO, get_type_hints
 
 import msgspec
 
-from formats.convert import raw_of
+from formats.convert import get_raw_type
 from middleware.config.settings import TABLES
 
 
-def json_schema() -> dict[str, Any]:
+def make_json_schema() -> dict[str, Any]:
     """Return the schema; settings with a further conversion step accept fewer values than it allows."""
     tables = {name: _make_struct(name, cls) for name, cls in TABLES.items()}
     optional: list[tuple[str, Any, Any]] = [
@@ -31,7 +31,7 @@ def _make_struct(name: str, cls: type[Any]) -> type[Any]:
     for each in fields(cls):
         default = each.default if each.default is not MISSING else None
         is_needed = each.default is MISSING is each.default_factory
-        known.append((each.name, raw_of(hints[each.name]), *(() if is_needed else (default,))))
+        known.append((each.name, get_raw_type(hints[each.name]), *(() if is_needed else (default,))))
     return msgspec.defstruct(name, known, forbid_unknown_fields=True)
 
 
@@ -43,5 +43,5 @@ def main(words: Sequence[str] | None = None, out: TextIO | None = None) -> int:
         epilog="Example: swarm schema > swarm-node.schema.json",
     )
     parser.parse_args(words)
-    (out or sys.stdout).write(json.dumps(json_schema(), indent=2) + "\n")
+    (out or sys.stdout).write(json.dumps(make_json_schema(), indent=2) + "\n")
     return 0

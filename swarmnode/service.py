@@ -12,10 +12,10 @@ from twisted.logger import Logger
 
 from middleware.config.settings import Settings
 from middleware.node import SwarmNode
-from swarmnode.assembly import FAULTS, assembled
-from swarmnode.seams import Seams
+from swarmnode.assembly import EXPECTED_ERRORS, assemble_node
+from swarmnode.dependencies import Dependencies
 
-COMING_BACK = 2.0
+REJOIN_RETRY_S = 2.0
 """Seconds between attempts to return to the network."""
 
 
@@ -28,14 +28,14 @@ class NodeService(Service):
     _log = Logger()
 
     def __init__(
-        self, settings: Settings, seams: Seams, fronts: Sequence[Callable[[SwarmNode], IService]] = ()
+        self, settings: Settings, seams: Dependencies, fronts: Sequence[Callable[[SwarmNode], IService]] = ()
     ) -> None:
         self.settings = settings
-        self.assembly = assembled(settings, seams)
-        self._seams = seams
+        self.assembly = assemble_node(settings, seams)
+        self._dependencies = seams
         self._fronts = fronts
         self._open_fronts: list[IService] = []
-        self._return_call: IDelayedCall | None = None
+        self._rejoin_call: IDelayedCall | None = None
 
     def startService(self) -> None:
         """Open the port and join; raises one of ``FAULTS`` if that fails."""
@@ -45,40 +45,40 @@ class NodeService(Service):
     def stopService(self) -> Deferred[None]:
         """Stop the robot, leave the network, and close the store."""
         super().stopService()
-        if self._return_call is not None and self._return_call.active():
-            self._return_call.cancel()
+        if self._rejoin_call is not None and self._rejoin_call.active():
+            self._rejoin_call.cancel()
         # The agent releases its lease while the node still runs, so another device continues at once.
         ended = self._stop_agent().addBoth(lambda _: self.assembly.node.stopService())
         down = gatherResults([ended, self._stop_fronts()])
-        return down.addBoth(lambda _: self._seams.store.close())
+        return down.addBoth(lambda _: self._dependencies.store.close())
 
     def vanish(self) -> None:
         """Stop immediately without sending anything, as in a power failure; the robot's link breaks as well."""
         # Stop the node first, so the agent cannot send anything, not even the release of its lease.
-        self.assembly.node.vanish()
+        self.assembly.node.stop_silently()
         self._stop_agent()
         self._stop_fronts()
 
-    def leave(self, seconds: float) -> None:
+    def leave_for(self, seconds: float) -> None:
         """Leave the network with the robot, and return after ``seconds``."""
-        if self._return_call is None and self.running:
+        if self._rejoin_call is None and self.running:
             self._log.info("{name} leaves the network for {s:g} s", name=self.settings.node.name, s=seconds)
             self.vanish()
-            self._return_call = self._seams.clock.callLater(seconds, self._rejoin)
+            self._rejoin_call = self._dependencies.clock.callLater(seconds, self._rejoin)
 
     def _rejoin(self) -> None:
-        self._return_call = None
+        self._rejoin_call = None
         try:
-            self.assembly = assembled(self.settings, self._seams)
+            self.assembly = assemble_node(self.settings, self._dependencies)
             self._start_parts()
-        except FAULTS as error:
+        except EXPECTED_ERRORS as error:
             self._log.warn("{name} cannot rejoin the network yet: {error}", name=self.settings.node.name, error=error)
             self.vanish()
-            self._return_call = self._seams.clock.callLater(COMING_BACK, self._rejoin)
+            self._rejoin_call = self._dependencies.clock.callLater(REJOIN_RETRY_S, self._rejoin)
 
     def _start_parts(self) -> None:
         node, agent = self.assembly.node, self.assembly.agent
-        node.on_disconnect(self.leave)
+        node.on_disconnect(self.leave_for)
         node.startService()
         if agent is not None:
             agent.startService()

@@ -15,16 +15,16 @@ from twisted.logger import globalLogBeginner
 
 from middleware.errors import SwarmError
 from sim.team.command import Environment, run
-from sim.team.scale.command import scale
+from sim.team.scale.command import run_scale
 
 WRONG = 2
-SPARING = 200_000, 20, 20
+GC_THRESHOLDS = 200_000, 20, 20
 """Garbage collection thresholds.  With Python's defaults of 700, 10, 10 a large team spends its time in collections
 that find nothing."""
 Verb = Callable[[Sequence[str], Environment], int]
 VERBS: Mapping[str, tuple[Verb, str]] = {
     "run": (run, "run a scenario with whole nodes, and print the verdict"),
-    "scale": (scale, "measure teams of many sizes, and plot the results"),
+    "scale": (run_scale, "measure teams of many sizes, and plot the results"),
 }
 
 
@@ -56,7 +56,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         read=lambda path: Path(path).read_text(encoding="ascii"),
         columns=shutil.get_terminal_size().columns if sys.stderr.isatty() else 0,
         is_stopped=lambda: bool(signals),
-        grown=_reduce_garbage_collection,
+        on_allocated=_reduce_garbage_collection,
     )
     # Without an observer Twisted buffers log events, which keep references to nodes that have ended.
     globalLogBeginner.beginLoggingTo([], discardBuffer=True, redirectStandardIO=False)
@@ -75,7 +75,7 @@ def _reduce_garbage_collection() -> None:
     """Collect garbage rarely, and never among current objects, because this process ends with them."""
     gc.collect()
     gc.freeze()
-    gc.set_threshold(*SPARING)
+    gc.set_threshold(*GC_THRESHOLDS)
 
 
 if __name__ == "__main__":

@@ -16,7 +16,7 @@ from middleware.entangled.network.url import Proxy, Url
 _log = Logger()
 
 
-def with_tunnels(
+def add_tunnels(
     settings: NodeSettings,
     udp: Callable[[], Network],
     reactor: Any,
@@ -28,21 +28,21 @@ def with_tunnels(
     if not (urls or settings.tunnel_port):
         return udp
     from middleware.entangled.network.joint import JointNetwork
-    from middleware.entangled.network.tcp import TcpCarrier
+    from middleware.entangled.network.tcp import TcpTransport
     from middleware.entangled.network.tunnel import TunnelNetwork
 
     host = settings.host if settings.tunnel_tls else "127.0.0.1"
     is_served, is_plain = settings.tunnel_port > 0, not settings.tunnel_tls
-    proxies = partial(proxy_for, environment)
+    proxies = partial(find_proxy, environment)
 
     def joint() -> Network:
-        carrier = TcpCarrier(reactor, host, settings.tunnel_port)
+        carrier = TcpTransport(reactor, host, settings.tunnel_port)
         return JointNetwork(udp(), TunnelNetwork(carrier, reactor, rng, urls, is_served, is_plain, proxies))
 
     return joint
 
 
-def proxy_for(environment: Mapping[str, str], url: Url) -> Proxy | None:
+def find_proxy(environment: Mapping[str, str], url: Url) -> Proxy | None:
     """Return the HTTP proxy for ``url`` by ``https_proxy`` and ``no_proxy``; None if there is none."""
     proxy = environment.get("https_proxy") or environment.get("HTTPS_PROXY") or ""
     excluded = environment.get("no_proxy") or environment.get("NO_PROXY") or ""
@@ -50,7 +50,7 @@ def proxy_for(environment: Mapping[str, str], url: Url) -> Proxy | None:
         if name and (name == "*" or url.host == name or url.host.endswith("." + name)):
             return None
     try:
-        return Proxy.of(proxy) if proxy and url.is_tls else None
+        return Proxy.parse(proxy) if proxy and url.is_tls else None
     except ValueError as error:
         _log.warn("https_proxy is ignored: {error}", error=error)
         return None

@@ -12,10 +12,10 @@ from twisted.application.service import IService
 from middleware.config.settings import Settings
 from middleware.errors import BadSetting, MissingExtra
 from middleware.node import SwarmNode
-from swarmnode.seams import Seams
+from swarmnode.dependencies import Dependencies
 
 
-def with_code(settings: Settings, rng: random.Random) -> Settings:
+def add_sign_in_code(settings: Settings, rng: random.Random) -> Settings:
     """Return ``settings`` with a sign-in code; drawn once, so the code stays the same when the node rejoins."""
     from webnode.password import draw_code
 
@@ -23,22 +23,22 @@ def with_code(settings: Settings, rng: random.Random) -> Settings:
     return settings if web.code or not web.sign_in else replace(settings, web=replace(web, code=draw_code(rng)))
 
 
-def web_page(settings: Settings, seams: Seams, reactor: Any, node: SwarmNode) -> IService:
+def make_web_page(settings: Settings, seams: Dependencies, reactor: Any, node: SwarmNode) -> IService:
     """Return the page over the node's data store; raises ``MissingExtra``, or ``BadSetting`` if TLS is unavailable."""
     try:
-        from swarmnode.page import page
+        from swarmnode.page import make_page_service
     except ModuleNotFoundError as error:
         raise MissingExtra("the web role", "web") from error
-    return page(settings, seams, reactor, node, _tls_factory(settings) if settings.web.tls else None)
+    return make_page_service(settings, seams, reactor, node, _load_tls_factory(settings) if settings.web.tls else None)
 
 
-def _tls_factory(settings: Settings) -> Callable[..., Any]:
+def _load_tls_factory(settings: Settings) -> Callable[..., Any]:
     """Return the factory of the page's TLS port; raises ``BadSetting`` if its libraries are missing."""
     try:
-        from webnode.tls import door
+        from webnode.tls import make_tls_port
     except ModuleNotFoundError as error:
         library = (error.name or "").split(".")[0]
         problem = f"is {settings.web.tls!r}, but the library {library} is not installed"
         remedy = "install it by: pip install 'swarm-node[tls]', or remove tls"
         raise BadSetting(settings.origin, "[web] tls", problem, remedy) from error
-    return door
+    return make_tls_port

@@ -9,12 +9,12 @@ from collections.abc import Callable, Sequence
 from dataclasses import asdict
 from typing import TextIO
 
-from middleware.entangled.control.place import NoControl
-from middleware.entangled.control.word import printable
-from swarmnode.invitation import Invitation, invitations
+from middleware.entangled.control.conversion import remove_control_characters
+from middleware.entangled.control.socket_path import NoControl
+from swarmnode.page_access import PageAccess, list_pages
 
 
-def parser() -> argparse.ArgumentParser:
+def make_parser() -> argparse.ArgumentParser:
     """Return the parser of the command line."""
     web = argparse.ArgumentParser(
         prog="swarm web",
@@ -29,15 +29,15 @@ def parser() -> argparse.ArgumentParser:
 def main(
     words: Sequence[str] | None = None,
     out: TextIO | None = None,
-    known: Callable[[], list[Invitation]] = invitations,
+    known: Callable[[], list[PageAccess]] = list_pages,
 ) -> int:
     """Run the command; returns 0, or 2 if there is no page."""
     out = out or sys.stdout
-    options = parser().parse_args(words)
+    options = make_parser().parse_args(words)
     try:
         here = known()
     except NoControl as problem:
-        sys.stderr.write(printable(f"swarm web: {problem}") + "\n")
+        sys.stderr.write(remove_control_characters(f"swarm web: {problem}") + "\n")
         return 2
     found = [each for each in here if options.node in (None, each.name)]
     if not found:
@@ -45,7 +45,7 @@ def main(
         remedy = f"nodes with a page: {names}" if here else "start a node with the role web"
         which = "no node" if options.node is None else f"no node {options.node!r}"
         sys.stderr.write(
-            printable(f"swarm web: {which} with a page runs on this machine; {remedy}; ")
+            remove_control_characters(f"swarm web: {which} with a page runs on this machine; {remedy}; ")
             + "see docs/explanation/access-and-robot-safety.md\n"
         )
         return 2
@@ -55,5 +55,5 @@ def main(
         else:
             code = f"code {each.code}, or open {each.link}" if each.code else "no sign-in: anyone may control the team"
             also = f" and {each.secure}" if each.secure else ""
-            out.write(printable(f"{each.name}: {each.url}{also}  {code}") + "\n")
+            out.write(remove_control_characters(f"{each.name}: {each.url}{also}  {code}") + "\n")
     return 0

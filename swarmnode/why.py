@@ -12,70 +12,70 @@ from collections.abc import Sequence
 from dataclasses import asdict
 from typing import TextIO
 
-from middleware.consensus.verdict import verdict_of, verdicts_text
-from middleware.diagnostics.explanation import as_text, explained
-from middleware.entangled.control.command import FAILED, WRONG, Ask, asked
-from middleware.entangled.control.place import NoControl
-from middleware.entangled.control.word import printable
-from middleware.tasks.task import Task, outcome_of, tasks_of
-from swarmnode.asker import Asker, Refusal
+from middleware.consensus.decision_record import decision_records_key_text, parse_decision_record
+from middleware.diagnostics.explanation import explain_decisions, format_explanation
+from middleware.entangled.control.command import EXIT_FAILED, EXIT_USAGE, SendRequest, send_request
+from middleware.entangled.control.conversion import remove_control_characters
+from middleware.entangled.control.socket_path import NoControl
+from middleware.tasks.task import Task, find_outcome, parse_tasks
+from swarmnode.control_client import ControlClient, Rejection
 
-LAST = "last"
-LISTED = 5
+LAST_TASK = "last"
+MAX_LISTED = 5
 
 
-def parser() -> argparse.ArgumentParser:
+def make_parser() -> argparse.ArgumentParser:
     """Return the parser of the command line."""
     why = argparse.ArgumentParser(
         prog="swarm why",
         description="Explain the choice of a device for a task.",
         epilog="Example: swarm why last",
     )
-    why.add_argument("task", metavar="TASK", help=f"beginning of a task's id, or {LAST!r} for the newest task")
+    why.add_argument("task", metavar="TASK", help=f"beginning of a task's id, or {LAST_TASK!r} for the newest task")
     why.add_argument("--node", metavar="NAME", help="node on this machine, if several run")
     why.add_argument("--json", action="store_true", help="print JSON, on one line")
     return why
 
 
-def main(words: Sequence[str] | None = None, out: TextIO | None = None, ask: Ask = asked) -> int:
+def main(words: Sequence[str] | None = None, out: TextIO | None = None, ask: SendRequest = send_request) -> int:
     """Run the command; returns 0, 1 if there is no decision or the node refused, 2 if no node can be asked."""
     out = out or sys.stdout
-    options = parser().parse_args(words)
+    options = make_parser().parse_args(words)
     try:
-        asker = Asker(options.node, ask)
-        task = chosen(options.task, list(tasks_of(asker.records("tasks")).values()))
-        outcome = outcome_of(task, asker.records(f"task/{task.task_id}"))
-        records = asker.records(verdicts_text(task.task_id))
-    except (Refusal, NoControl) as problem:
-        sys.stderr.write(printable(f"swarm why: {problem}") + "\n")
-        return FAILED if isinstance(problem, Refusal) else WRONG
-    verdicts = [verdict for each in records if (verdict := verdict_of(each)) is not None]
-    explanation = explained(verdict for verdict in verdicts if verdict.task == task.task_id)
+        asker = ControlClient(options.node, ask)
+        task = select_task(options.task, list(parse_tasks(asker.get_records("tasks")).values()))
+        outcome = find_outcome(task, asker.get_records(f"task/{task.task_id}"))
+        records = asker.get_records(decision_records_key_text(task.task_id))
+    except (Rejection, NoControl) as problem:
+        sys.stderr.write(remove_control_characters(f"swarm why: {problem}") + "\n")
+        return EXIT_FAILED if isinstance(problem, Rejection) else EXIT_USAGE
+    verdicts = [verdict for each in records if (verdict := parse_decision_record(each)) is not None]
+    explanation = explain_decisions(verdict for verdict in verdicts if verdict.task == task.task_id)
     if options.json:
         head_fields = {"task": task.task_id, "title": task.title, "strategy": task.strategy}
         ended = None if outcome is None else {"outcome": outcome.outcome, "by": outcome.by, "took": outcome.took}
         out.write(json.dumps({**head_fields, "outcome": ended, "epochs": asdict(explanation)["epochs"]}) + "\n")
-        return 0 if explanation.epochs else FAILED
+        return 0 if explanation.epochs else EXIT_FAILED
     ended_by = "" if outcome is None else f", {outcome.outcome.lower()} by {outcome.by}"
-    head = printable(f"task {task.task_id}: {task.title}{ended_by}")
-    out.write(f"{head}\n{as_text(explanation)}")
+    head = remove_control_characters(f"task {task.task_id}: {task.title}{ended_by}")
+    out.write(f"{head}\n{format_explanation(explanation)}")
     if not explanation.epochs:
         out.write("no decision yet\n")
-    return 0 if explanation.epochs else FAILED
+    return 0 if explanation.epochs else EXIT_FAILED
 
 
-def chosen(wanted: str, tasks: Sequence[Task]) -> Task:
+def select_task(wanted: str, tasks: Sequence[Task]) -> Task:
     """Return the task with the id prefix ``wanted``, or the newest for ``last``; raises ``Refusal`` with candidates."""
     newest = {task.task_id: task for task in tasks}
     known = sorted(tasks, key=lambda task: (-task.created, task.task_id))
     if not known:
-        raise Refusal("the team has no task; assign one on the page of its web node")
-    if wanted == LAST:
+        raise Rejection("the team has no task; assign one on the page of its web node")
+    if wanted == LAST_TASK:
         return known[0]
     matching = [task for task in known if task.task_id.startswith(wanted)] if wanted else []
     if len(matching) == 1 or (wanted in newest):
         return newest[wanted] if wanted in newest else matching[0]
-    near = ", ".join(task.task_id for task in (matching or known)[:LISTED])
+    near = ", ".join(task.task_id for task in (matching or known)[:MAX_LISTED])
     if matching:
-        raise Refusal(f"{len(matching)} tasks begin with {wanted!r}: {near}; give more of the id")
-    raise Refusal(f"no task begins with {wanted!r}; the newest are {near}")
+        raise Rejection(f"{len(matching)} tasks begin with {wanted!r}: {near}; give more of the id")
+    raise Rejection(f"no task begins with {wanted!r}; the newest are {near}")

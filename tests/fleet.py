@@ -7,10 +7,10 @@ from typing import TypeVar
 from twisted.internet.defer import Deferred
 from twisted.trial.unittest import SynchronousTestCase
 
-from middleware.entangled.network.switchboard import CALM, Switchboard, Weather
-from sim.team.world import JOINING, TEAM, Fleet, SwarmFleet, World
+from middleware.entangled.network.switchboard import PERFECT, LinkConditions, Switchboard
+from sim.team.simulation import JOIN_S, TEAM_KEY, EntangledTeam, Simulation, SwarmTeam
 
-__all__ = ["TEAM", "Fleet", "FleetCase", "SwarmFleet", "World"]
+__all__ = ["TEAM_KEY", "EntangledTeam", "FleetCase", "SwarmTeam", "Simulation"]
 
 T = TypeVar("T")
 
@@ -18,20 +18,20 @@ T = TypeVar("T")
 class FleetCase(SynchronousTestCase):
     """A test with simulated nodes; at its end no timers may be left."""
 
-    worlds: list[Fleet | SwarmFleet]
+    worlds: list[EntangledTeam | SwarmTeam]
 
     def setUp(self) -> None:
         self.worlds = []
 
-    def fleet(self, n: int, seed: int = 1, weather: Weather = CALM) -> Fleet:
+    def fleet(self, n: int, seed: int = 1, weather: LinkConditions = PERFECT) -> EntangledTeam:
         """Return a simulated team that is stopped at the end of the test."""
-        fleet = Fleet(n, seed, weather)
+        fleet = EntangledTeam(n, seed, weather)
         self.worlds.append(fleet)
         return fleet
 
-    def swarm(self, n: int, seed: int = 1, weather: Weather = CALM, pause: float = JOINING) -> SwarmFleet:
+    def swarm(self, n: int, seed: int = 1, weather: LinkConditions = PERFECT, pause: float = JOIN_S) -> SwarmTeam:
         """Return a simulated team of swarm nodes that is stopped at the end of the test."""
-        fleet = SwarmFleet(n, seed, weather, pause)
+        fleet = SwarmTeam(n, seed, weather, pause)
         self.worlds.append(fleet)
         return fleet
 
@@ -41,7 +41,7 @@ class FleetCase(SynchronousTestCase):
             weather_only = [call for call in world.clock.getDelayedCalls() if not _is_delivery(call)]
             self.assertEqual(weather_only, [], "a node left a timer behind")
 
-    def done(self, world: World, work: Deferred[T], within: float = 5.0) -> T:
+    def done(self, world: Simulation, work: Deferred[T], within: float = 5.0) -> T:
         """Return the result of ``work`` after ``within`` seconds of virtual time."""
         world.run(within)
         return self.successResultOf(work)

@@ -46,7 +46,7 @@ LAYERS: dict[str, Layer] = {
     "middleware.entangled.kademlia": Layer(
         "contacts, buckets, lookups, the roster of members", (*BASE, *_entangled("network", "wire"))
     ),
-    "middleware.entangled.reach": Layer(
+    "middleware.entangled.nat": Layer(
         "paths to nodes behind routers: introduction, hole punching, relays", (*BASE, *_entangled("network", "wire"))
     ),
     "middleware.entangled.data": Layer("the store: in memory and in SQLite", BASE),

@@ -13,13 +13,13 @@ from twisted.internet.task import Clock
 from twisted.trial.unittest import SynchronousTestCase
 
 from drivers.errors import UsageError
-from drivers.registry import built_in_kinds, describe
+from drivers.registry import describe, list_built_in_kinds
 from middleware.config.settings import Settings
-from sim.demo.cast import CASTS
 from sim.demo.configuration import DOGS
+from sim.demo.robots import ROBOT_SETS
 from sim.robots import scene
-from sim.robots.table import Robots, emulated_kinds
-from sim.robots.yard import Yard
+from sim.robots.emulated_robots import EmulatedRobots, emulated_kinds
+from sim.robots.simulator import RobotSimulator
 from tests.layers import TOP, write_table
 from tests.role_table import write_tables
 
@@ -103,7 +103,7 @@ class DocumentTests(SynchronousTestCase):
         """The table of robots in the README lists exactly the kinds of drivers, with a link to each kind's page."""
         table = part_of(ROOT / "README.md", "Robots")
         rows = re.findall(r"^\| `(\w+)` \|.*\[[\w-]+\.md\]\(docs/([\w./-]+)\) \|$", table, re.MULTILINE)
-        self.assertEqual(sorted(kind for kind, _ in rows), built_in_kinds())
+        self.assertEqual(sorted(kind for kind, _ in rows), list_built_in_kinds())
         for kind, page in rows:
             self.assertIn(f"`{kind}`", (ROOT / "docs" / page).read_text(encoding="utf-8"))
 
@@ -112,9 +112,9 @@ class DocumentTests(SynchronousTestCase):
         rows = re.findall(
             r"^\| `(\w+)`", part_of(ROOT / "docs" / "tutorials" / "demo.md", "Which robots"), re.MULTILINE
         )
-        self.assertEqual(sorted(rows), sorted(CASTS))
+        self.assertEqual(sorted(rows), sorted(ROBOT_SETS))
         makefile = (ROOT / "Makefile").read_text(encoding="utf-8")
-        self.assertIn(f"[ROBOT={'|'.join(sorted(CASTS))}]", makefile)
+        self.assertIn(f"[ROBOT={'|'.join(sorted(ROBOT_SETS))}]", makefile)
         (default,) = re.findall(r"^ROBOT +\?= (\w+)$", makefile, re.MULTILINE)
         self.assertIn(f"| `{default}` (default) |", part_of(ROOT / "docs" / "tutorials" / "demo.md", "Which robots"))
 
@@ -128,12 +128,19 @@ class DocumentTests(SynchronousTestCase):
                 table = tomllib.loads(block)
                 if not set(table) <= set(DOGS):
                     continue
-                Robots(clock, Random(1), Yard(clock, Random(1), scene.loaded("three-dogs")), table)
+                EmulatedRobots(
+                    clock, Random(1), RobotSimulator(clock, Random(1), scene.load_scene("three-dogs")), table
+                )
                 for robot in table.values():
                     played |= {robot["kind"], *(part["kind"] for part in robot.get("parts", []))}
             self.assertIn("create2" if page == "how-to/simulate-robots" else page.removeprefix("robots/"), played)
         with self.assertRaises(UsageError) as refused:
-            Robots(clock, Random(1), Yard(clock, Random(1), scene.loaded("three-dogs")), {"dog1": {"kind": "phone"}})
+            EmulatedRobots(
+                clock,
+                Random(1),
+                RobotSimulator(clock, Random(1), scene.load_scene("three-dogs")),
+                {"dog1": {"kind": "phone"}},
+            )
         self.assertTrue(str(refused.exception).endswith(f"it has {', '.join(emulated_kinds())}"), refused.exception)
 
     def test_thesis_is_complete(self) -> None:

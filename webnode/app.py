@@ -16,12 +16,12 @@ from twisted.internet.defer import Deferred
 from twisted.python.failure import Failure
 from werkzeug.exceptions import HTTPException
 
-from webnode.board import Board
 from webnode.dispatch import Dispatch
 from webnode.errors import Refusal
-from webnode.guard import HEADERS, MAX_BODY, LetsIn, headers, is_own_origin, refusal, token_of
-from webnode.route import API, Ask, Content, Route, checked, guarded
-from webnode.routes.table import TABLE
+from webnode.guard import HEADERS, MAX_BODY, IsAllowedOrigin, choose_token, find_refusal, is_own_origin, make_headers
+from webnode.route import API, Content, Route, RouteRequest, check_request, check_role
+from webnode.routes.registry import TABLE
+from webnode.services import Services
 from webnode.state import State
 
 MAX_ID = 64
@@ -43,7 +43,7 @@ def _call_directly(call: Callable[..., Any], *arguments: Any, limit_s: float | N
 
 def create_app(
     read: Callable[[], State],
-    board: Board,
+    board: Services,
     on_reactor: OnReactor = _call_directly,
     hosts: Collection[str] = (),
     wall: Callable[[], float] = lambda: 0.0,
@@ -59,8 +59,8 @@ def create_app(
     app.json.sort_keys = False  # type: ignore[attr-defined]
 
     # navigator.sendBeacon, which a phone uses when its page is closed, cannot set headers.
-    unmarked = {(str(route.method), _rule(route.path)) for route in TABLE if route.role == "phone"}
-    lets_in = partial(on_reactor, board.fallbacks.lets_in)
+    unmarked = {(str(route.method), _to_flask_rule(route.path)) for route in TABLE if route.role == "phone"}
+    lets_in = partial(on_reactor, board.fallbacks.is_allowed_origin)
     _add_checks(app, lets_in, hosts, lambda: (request.method, str(request.url_rule)) not in unmarked)
     _add_error_handlers(app)
     _serve_page(app, read)
@@ -69,25 +69,27 @@ def create_app(
     def serve(route: Route) -> None:
         def answer(**path: str) -> Response:
             now = wall()
-            who = on_reactor(board.sessions.visitor, _token(), now)
-            guarded(route.role, who)
-            given = checked(route, path, request.args, {} if route.method == "GET" else _body())
-            ask = Ask(given, who, board, read(), _idempotency_key(), request.remote_addr or "", now, TABLE)
+            who = on_reactor(board.sessions.authenticate, _read_token(), now)
+            check_role(route.role, who)
+            given = check_request(route, path, request.args, {} if route.method == "GET" else _read_body())
+            ask = RouteRequest(
+                given, who, board, read(), _read_idempotency_key(), request.remote_addr or "", now, TABLE
+            )
             result = on_reactor(dispatch.carry_out, route, ask, limit_s=route.limit_s)
             is_content = isinstance(result, Content)
             response = app.response_class(result.body, content_type=result.kind) if is_content else jsonify(result)
             response.status_code = route.status
             return response
 
-        app.add_url_rule(_rule(route.path), route.name, answer, methods=[route.method])
+        app.add_url_rule(_to_flask_rule(route.path), route.name, answer, methods=[route.method])
 
     for route in TABLE:
-        if route.answer is not None:
+        if route.handler is not None:
             serve(route)
     return app
 
 
-def _add_checks(app: Flask, lets_in: LetsIn, hosts: Collection[str], needs_mark: Callable[[], bool]) -> None:
+def _add_checks(app: Flask, lets_in: IsAllowedOrigin, hosts: Collection[str], needs_mark: Callable[[], bool]) -> None:
     """Check ``Host`` and ``Origin`` of each request, and set the security headers of each response."""
 
     @app.before_request
@@ -95,8 +97,8 @@ def _add_checks(app: Flask, lets_in: LetsIn, hosts: Collection[str], needs_mark:
         marked = not needs_mark() or request.headers.get("X-Swarm") == "1" or request.is_json
         host, origin = request.headers.get("Host", ""), request.headers.get("Origin")
         is_let_in = not is_own_origin(origin, host) and lets_in(origin or "")
-        g.headers = headers(host, origin, lambda _: is_let_in)
-        problem = refusal(request.method, host, origin, marked, hosts, lambda _: is_let_in)
+        g.headers = make_headers(host, origin, lambda _: is_let_in)
+        problem = find_refusal(request.method, host, origin, marked, hosts, lambda _: is_let_in)
         if problem is not None:
             raise problem
         # OPTIONS is the preflight request (CORS) for a page of another web node.
@@ -142,22 +144,22 @@ def _serve_page(app: Flask, read: Callable[[], State]) -> None:
         return response
 
 
-def _rule(path: str) -> str:
+def _to_flask_rule(path: str) -> str:
     return re.sub(r"\{(\w+)\}", r"<\1>", path)
 
 
-def _token() -> str:
-    return token_of(request.headers.get("Authorization", ""), request.args.get("ticket", ""))
+def _read_token() -> str:
+    return choose_token(request.headers.get("Authorization", ""), request.args.get("ticket", ""))
 
 
-def _idempotency_key() -> str:
+def _read_idempotency_key() -> str:
     value = request.headers.get("Idempotency-Key", "")
     if len(value) > MAX_ID or not value.isprintable():
         raise Refusal("Idempotency-Key", "invalid value", f"send at most {MAX_ID} printable characters")
     return value
 
 
-def _body() -> object:
+def _read_body() -> object:
     try:
         return request.get_json(force=True) if request.get_data() else {}
     except RecursionError:

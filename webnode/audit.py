@@ -10,19 +10,19 @@ from pathlib import Path
 
 from twisted.logger import Logger
 
-from webnode.field import Json
-from webnode.visitor import Visitor
+from webnode.auth import User
+from webnode.sanitize import Json
 
-AUDITED = 200
+MAX_LINES = 200
 """Number of newest lines kept in memory."""
-MOST = 1 << 20
+MAX_FILE_BYTES = 1 << 20
 """Size limit of the file in bytes; a full file is renamed to ``.1``, so there are at most two."""
-TAIL = 1 << 16
+TAIL_BYTES = 1 << 16
 QUIET_S, KNOWN = 60.0, 256
 """Seconds within which equal requests of a client without a session are one line, and the number of clients kept."""
 
 
-class Audit:
+class AuditLog:
     """The audit log in the file at ``path``, or only in memory if that is None; ``wall`` returns unix time in seconds.
 
     If the file cannot be written, the log says so once and the page continues to work.
@@ -30,16 +30,18 @@ class Audit:
 
     _log = Logger()
 
-    def __init__(self, path: Path | None = None, wall: Callable[[], float] = lambda: 0.0, most: int = MOST) -> None:
+    def __init__(
+        self, path: Path | None = None, wall: Callable[[], float] = lambda: 0.0, most: int = MAX_FILE_BYTES
+    ) -> None:
         self._path = path
         self._wall = wall
-        self._most = most
-        self._newest: deque[dict[str, Json]] = deque([] if path is None else _read_tail(path), maxlen=AUDITED)
+        self._max_bytes = most
+        self._newest: deque[dict[str, Json]] = deque([] if path is None else _read_tail(path), maxlen=MAX_LINES)
         self._counts: Counter[tuple[str, str]] = Counter()
         self._strangers: OrderedDict[tuple[str, str, str], list[float]] = OrderedDict()
         self._is_failing = False
 
-    def note(self, who: Visitor, source: str, route: str, target: str, outcome: str) -> None:
+    def write(self, who: User, source: str, route: str, target: str, outcome: str) -> None:
         """Write one line: ``route`` is method and path, ``target`` the path parameters, ``outcome`` the status."""
         self._counts[who.role, outcome[:3]] += 1
         now = self._wall()
@@ -54,7 +56,7 @@ class Audit:
         if self._path is None:
             return
         try:
-            _write(self._path, json.dumps(line) + "\n", self._most)
+            _append_line(self._path, json.dumps(line) + "\n", self._max_bytes)
         except OSError as error:
             if not self._is_failing:
                 self._log.warn("cannot write the audit log {path}: {error}", path=self._path, error=error)
@@ -62,11 +64,11 @@ class Audit:
         else:
             self._is_failing = False
 
-    def newest(self, count: int) -> list[dict[str, Json]]:
+    def list_newest(self, count: int) -> list[dict[str, Json]]:
         """Return the newest lines, newest first; at most ``AUDITED``."""
         return list(self._newest)[:count]
 
-    def counts(self) -> Mapping[tuple[str, str], int]:
+    def get_counts(self) -> Mapping[tuple[str, str], int]:
         """Return the number of changes since the start by role and status, suppressed repetitions included."""
         return self._counts
 
@@ -83,7 +85,7 @@ class Audit:
         return 0 if known is None else int(known[1])
 
 
-def _write(path: Path, line: str, most: int) -> None:
+def _append_line(path: Path, line: str, most: int) -> None:
     descriptor = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_APPEND, 0o600)
     with open(descriptor, "a", encoding="utf-8") as file:
         is_full = file.tell() + len(line) > most
@@ -91,19 +93,19 @@ def _write(path: Path, line: str, most: int) -> None:
             file.write(line)
     if is_full:
         os.replace(path, path.with_name(f"{path.name}.1"))
-        _write(path, line[:most], most)
+        _append_line(path, line[:most], most)
 
 
 def _read_tail(path: Path) -> list[dict[str, Json]]:
     """Return the newest lines of the file, newest first."""
     try:
         with path.open("rb") as file:
-            file.seek(max(0, path.stat().st_size - TAIL))
+            file.seek(max(0, path.stat().st_size - TAIL_BYTES))
             rows = file.read().splitlines()
     except OSError:
         return []
     found = []
-    for row in rows[-AUDITED:]:
+    for row in rows[-MAX_LINES:]:
         try:
             line = json.loads(row)
         except ValueError:

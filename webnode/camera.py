@@ -7,20 +7,20 @@ from collections.abc import Callable
 from twisted.internet.interfaces import IDelayedCall, IReactorTime
 from twisted.web.http import Request
 
-from formats.jpeg import size_of
+from formats.jpeg import read_size
 from webnode.errors import Refusal
-from webnode.resource import argument
+from webnode.resource import read_argument
 
 POLL_S = 5.0
 LINGER_S = 2.0
-MAX_FRAME = 1 << 20
+MAX_FRAME_BYTES = 1 << 20
 
 OnFrame = Callable[[int, bytes, float], None]
 """Called with the number of a picture, the picture as a JPEG, and the seconds since it was taken."""
-Question = tuple[Request, bytes, IDelayedCall]
+WaitingRequest = tuple[Request, bytes, IDelayedCall]
 
 
-class Camera:
+class CameraStream:
     """The newest picture of one device, and the requests that wait for the next one.
 
     ``watch`` opens the upstream and may raise ``Refusal``.  An upstream that is silent for ``POLL_S`` is reopened, as
@@ -36,18 +36,18 @@ class Camera:
         self._received_at = -POLL_S
         self._linger: IDelayedCall | None = None
         self._is_ended = False
-        self.waiting: list[Question] = []
+        self.waiting: list[WaitingRequest] = []
         self._stop_upstream = watch(self.on_frame)
 
     def wait(self, request: Request) -> None:
         """Answer ``request`` with the first picture that its viewer has not seen."""
-        viewer = argument(request, b"viewer")
+        viewer = read_argument(request, b"viewer")
         for entry in [entry for entry in self.waiting if viewer and entry[1] == viewer]:
             self._release(entry)
         if self._linger is not None:
             self._linger.cancel()
             self._linger = None
-        if self._newest is not None and argument(request, b"after") != str(self._newest[0]).encode():
+        if self._newest is not None and read_argument(request, b"after") != str(self._newest[0]).encode():
             self._send(request)
             self._start_linger()
             return
@@ -57,7 +57,7 @@ class Camera:
 
     def on_frame(self, seq: int, jpeg: bytes, age: float) -> None:
         """Take a picture that is ``age`` seconds old; drop it if it is late, too large or no JPEG."""
-        if self._is_ended or len(jpeg) > MAX_FRAME or size_of(jpeg) is None:
+        if self._is_ended or len(jpeg) > MAX_FRAME_BYTES or read_size(jpeg) is None:
             return
         now = self._clock.seconds()
         self._newest, self._received_at = (seq, jpeg, now - age), now
@@ -86,7 +86,7 @@ class Camera:
         request.write(jpeg)
         request.finish()
 
-    def _give_up(self, entry: Question) -> None:
+    def _give_up(self, entry: WaitingRequest) -> None:
         self._release(entry)
         if self._clock.seconds() - max(self._received_at, self._opened_at) < POLL_S:
             return
@@ -98,12 +98,12 @@ class Camera:
         except Refusal:
             self.close()
 
-    def _release(self, entry: Question) -> None:
+    def _release(self, entry: WaitingRequest) -> None:
         self._forget(entry)
         entry[0].setResponseCode(204)
         entry[0].finish()
 
-    def _forget(self, entry: Question) -> None:
+    def _forget(self, entry: WaitingRequest) -> None:
         if entry in self.waiting:
             self.waiting.remove(entry)
         if entry[2].active():

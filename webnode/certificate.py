@@ -27,23 +27,23 @@ from cryptography.hazmat.primitives.serialization import (
 )
 from cryptography.x509.oid import ExtendedKeyUsageOID, NameOID
 
-PERSON = b"swarm-page-tls"
-ORDER = 0xFFFFFFFF00000000FFFFFFFFFFFFFFFFBCE6FAADA7179E84F3B9CAC2FC632551
+HASH_PERSON = b"swarm-page-tls"
+CURVE_ORDER = 0xFFFFFFFF00000000FFFFFFFFFFFFFFFFBCE6FAADA7179E84F3B9CAC2FC632551
 """Order of the group of P-256; a private key is a number below it."""
 FROM, UNTIL = datetime(2025, 1, 1, tzinfo=UTC), datetime(2049, 12, 31, tzinfo=UTC)
 """Validity of the authority; constant, as the certificate is the same after each start, whatever the clock says."""
-LASTS = timedelta(days=365)
+VALIDITY = timedelta(days=365)
 """Validity of a node's certificate; phones reject certificates that are valid for more than 825 days."""
-EARLIER = timedelta(days=2)
+CLOCK_TOLERANCE = timedelta(days=2)
 """A node's certificate is valid from this long before its creation, to tolerate clock differences."""
-LEFT = timedelta(days=30)
+RENEWAL_MARGIN = timedelta(days=30)
 """A certificate with less remaining validity is replaced."""
 NETWORKS = (
     *("10.0.0.0/8", "172.16.0.0/12", "192.168.0.0/16", "100.64.0.0/10", "169.254.0.0/16", "127.0.0.0/8"),
     *("fc00::/7", "fe80::/10", "::1/128"),
 )
 DOMAINS = ("localhost", "local", "lan", "internal", "home.arpa")
-MOST = 32
+MAX_NAMES = 32
 """Maximum number of names in one certificate."""
 
 
@@ -69,11 +69,11 @@ class Authority(Credential):
         return bytes(self.certificate.fingerprint(SHA256())).hex(":").upper()
 
 
-def authority(secret: bytes, title: str) -> Authority:
+def make_authority(secret: bytes, title: str) -> Authority:
     """Return the authority of the node with the secret ``secret`` and the display name ``title``."""
-    key = _key(secret, b"authority")
+    key = _derive_key(secret, b"authority")
     # A phone lists authorities by name, so names of different nodes must differ.
-    mark = hashlib.blake2s(_point(key), digest_size=3).hexdigest()
+    mark = hashlib.blake2s(_encode_point(key), digest_size=3).hexdigest()
     name = x509.Name([x509.NameAttribute(NameOID.COMMON_NAME, f"Swarm {title} {mark}")])
     constraints = x509.NameConstraints(
         [
@@ -84,10 +84,10 @@ def authority(secret: bytes, title: str) -> Authority:
     )
     builder = (
         _start_builder(
-            name, name, key, int.from_bytes(hashlib.blake2b(_point(key), digest_size=15).digest()), FROM, UNTIL
+            name, name, key, int.from_bytes(hashlib.blake2b(_encode_point(key), digest_size=15).digest()), FROM, UNTIL
         )
         .add_extension(x509.BasicConstraints(ca=True, path_length=0), critical=True)
-        .add_extension(_usage(signs_certificates=True), critical=True)
+        .add_extension(_make_usage(signs_certificates=True), critical=True)
         .add_extension(constraints, critical=True)
     )
     return Authority(key, builder.sign(key, SHA256(), ecdsa_deterministic=True))
@@ -101,10 +101,12 @@ class Leaf(Credential):
         """Both in PEM; secret."""
         return bytes(self.key.private_bytes(Encoding.PEM, PrivateFormat.PKCS8, NoEncryption())) + self.pem
 
-    def flaw(self, signer: Authority, names: Collection[str], now: float) -> str:
+    def find_flaw(self, signer: Authority, names: Collection[str], now: float) -> str:
         """Return why the certificate cannot serve ``names`` at the unix time ``now``; empty if it can."""
         certificate, moment = self.certificate, _to_datetime(now)
-        if _point(self.key) != certificate.public_key().public_bytes(Encoding.X962, PublicFormat.UncompressedPoint):
+        if _encode_point(self.key) != certificate.public_key().public_bytes(
+            Encoding.X962, PublicFormat.UncompressedPoint
+        ):
             return "its key does not match"
         try:
             certificate.verify_directly_issued_by(signer.certificate)
@@ -112,9 +114,9 @@ class Leaf(Credential):
             return "another authority signed it"
         if moment < certificate.not_valid_before_utc:
             return "it is not valid yet"
-        if moment > certificate.not_valid_after_utc - LEFT:
+        if moment > certificate.not_valid_after_utc - RENEWAL_MARGIN:
             return "it expires soon"
-        missing = [name for name in nameable(names) if name not in self.names]
+        missing = [name for name in filter_names(names) if name not in self.names]
         return f"it lacks {', '.join(missing)}" if missing else ""
 
     @property
@@ -127,7 +129,7 @@ class Leaf(Credential):
         return [str(name.value) for name in found]
 
 
-def read(pem: bytes) -> Leaf:
+def parse_leaf(pem: bytes) -> Leaf:
     """Parse a leaf from its ``pem_with_key``; raises ``ValueError`` if that is invalid."""
     try:
         key = load_pem_private_key(pem, None)
@@ -141,29 +143,31 @@ def read(pem: bytes) -> Leaf:
     return Leaf(key, certificate)
 
 
-def leaf(signer: Authority, title: str, names: Collection[str], now: float, rng: random.Random) -> Leaf:
+def make_leaf(signer: Authority, title: str, names: Collection[str], now: float, rng: random.Random) -> Leaf:
     """Sign a certificate for the node called ``title``, for the ``names`` that the authority may sign."""
-    key = _key(rng.randbytes(32), b"leaf")
+    key = _derive_key(rng.randbytes(32), b"leaf")
     subject = x509.Name([x509.NameAttribute(NameOID.COMMON_NAME, title)])
-    since = min(max(_to_datetime(now) - EARLIER, FROM), UNTIL - LASTS)
+    since = min(max(_to_datetime(now) - CLOCK_TOLERANCE, FROM), UNTIL - VALIDITY)
     serial = int.from_bytes(rng.randbytes(15)) or 1
     builder = (
-        _start_builder(subject, signer.certificate.subject, key, serial, since, since + LASTS, signer)
+        _start_builder(subject, signer.certificate.subject, key, serial, since, since + VALIDITY, signer)
         .add_extension(x509.BasicConstraints(ca=False, path_length=None), critical=True)
-        .add_extension(_usage(signs_certificates=False), critical=True)
+        .add_extension(_make_usage(signs_certificates=False), critical=True)
         .add_extension(x509.ExtendedKeyUsage([ExtendedKeyUsageOID.SERVER_AUTH]), critical=False)
-        .add_extension(x509.SubjectAlternativeName([_general_name(name) for name in nameable(names)]), critical=False)
+        .add_extension(
+            x509.SubjectAlternativeName([_make_general_name(name) for name in filter_names(names)]), critical=False
+        )
     )
     return Leaf(key, builder.sign(signer.key, SHA256(), ecdsa_deterministic=True))
 
 
-def nameable(names: Collection[str]) -> list[str]:
+def filter_names(names: Collection[str]) -> list[str]:
     """Return the ``names`` for which the authority may sign, in canonical form; includes localhost."""
-    usual = (plain(name) for name in ("localhost", "127.0.0.1", "::1", *names))
-    return list(dict.fromkeys(name for name in usual if name))[:MOST]
+    usual = (normalize_name(name) for name in ("localhost", "127.0.0.1", "::1", *names))
+    return list(dict.fromkeys(name for name in usual if name))[:MAX_NAMES]
 
 
-def plain(name: str) -> str:
+def normalize_name(name: str) -> str:
     """Return the canonical form of an address or name; empty if the authority must not sign for it."""
     try:
         address = ipaddress.ip_address(name)
@@ -180,20 +184,20 @@ def plain(name: str) -> str:
     return str(address) if fits else ""
 
 
-def _general_name(name: str) -> x509.GeneralName:
+def _make_general_name(name: str) -> x509.GeneralName:
     try:
         return x509.IPAddress(ipaddress.ip_address(name))
     except ValueError:
         return x509.DNSName(name)
 
 
-def _key(secret: bytes, use: bytes) -> ec.EllipticCurvePrivateKey:
+def _derive_key(secret: bytes, use: bytes) -> ec.EllipticCurvePrivateKey:
     """Derive a private key from a secret; the hash of 64 bytes keeps the distribution of keys uniform."""
-    number = int.from_bytes(hashlib.blake2b(secret, digest_size=64, key=use, person=PERSON).digest())
-    return ec.derive_private_key(1 + number % (ORDER - 1), ec.SECP256R1())
+    number = int.from_bytes(hashlib.blake2b(secret, digest_size=64, key=use, person=HASH_PERSON).digest())
+    return ec.derive_private_key(1 + number % (CURVE_ORDER - 1), ec.SECP256R1())
 
 
-def _point(key: ec.EllipticCurvePrivateKey) -> bytes:
+def _encode_point(key: ec.EllipticCurvePrivateKey) -> bytes:
     return bytes(key.public_key().public_bytes(Encoding.X962, PublicFormat.UncompressedPoint))
 
 
@@ -225,7 +229,7 @@ def _start_builder(
     )
 
 
-def _usage(signs_certificates: bool) -> x509.KeyUsage:
+def _make_usage(signs_certificates: bool) -> x509.KeyUsage:
     return x509.KeyUsage(
         digital_signature=not signs_certificates,
         key_cert_sign=signs_certificates,

@@ -16,32 +16,32 @@ from twisted.web.http import HTTPChannel
 from twisted.web.server import Request as SiteRequest
 from twisted.web.server import Site
 
+from webnode.auth import User
 from webnode.errors import Refusal
 from webnode.guard import HEADERS, MAX_BODY
-from webnode.limits import AddressLimits, Kept
-from webnode.visitor import Visitor
+from webnode.limits import AddressLimits, CountedKind
 
-HEAD_S = 10.0
+HEADERS_LIMIT_S = 10.0
 """Deadline for a request's headers, after its first byte or after the connection was made."""
-KEEP_S = 15.0
+KEEP_ALIVE_S = 15.0
 """Time that an idle connection stays open for its next request."""
 GRACE_S, PACE = 2.0, 1000.0
 """Grace period of a request body, and the minimum rate afterwards in bytes per second."""
-STALL_S = 30.0
+STALL_LIMIT_S = 30.0
 """Time after which a response that the client does not read is aborted."""
-CLOSE_S = 2.0
+CLOSE_LIMIT_S = 2.0
 """Time for a refused client to read the reason."""
 STATUS = {400: "Bad Request", 408: "Request Timeout", 413: "Content Too Large", 503: "Service Unavailable"}
 
 TOO_LARGE = Refusal("body", "it is too large", "send at most 64 KiB", 413)
 UNREADABLE = Refusal("request", "it is not valid HTTP", "send HTTP/1.1, with at most 16 KiB of headers", 400)
-LATE_HEAD = Refusal("request", "headers not complete in time", f"send all headers within {HEAD_S:g} s", 408)
+LATE_HEAD = Refusal("request", "headers not complete in time", f"send all headers within {HEADERS_LIMIT_S:g} s", 408)
 LATE_BODY = Refusal("body", "it arrives too slowly", f"send at least {PACE:g} bytes a second", 408)
 TOO_MANY = Refusal("request", "too many incomplete requests from this address", "complete those first", 503)
 TOO_BUSY = Refusal("request", "too many open requests from this address", "close some, then try again", 503)
 
 
-def raw(refusal: Refusal) -> bytes:
+def make_raw_response(refusal: Refusal) -> bytes:
     """Return the complete HTTP response to a request that does not reach Flask."""
     body = json.dumps(refusal.fields).encode()
     lines = [f"HTTP/1.1 {refusal.status} {STATUS[refusal.status]}", "Content-Type: application/json"]
@@ -50,15 +50,15 @@ def raw(refusal: Refusal) -> bytes:
     return "\r\n".join(lines).encode() + body
 
 
-class CappedRequest(SiteRequest):
+class LimitedRequest(SiteRequest):
     """A request whose body is limited to ``guard.MAX_BODY``; a larger one is answered with 413 and disconnected.
 
     ``who`` is the authenticated client of a request to a native resource.
     """
 
-    who = Visitor()
-    _taken = 0
-    _is_cut = False
+    who = User()
+    _body_bytes = 0
+    _is_refused = False
 
     def gotLength(self, length: int | None) -> None:  # noqa: N802
         """Refuse a body whose Content-Length is too large."""
@@ -68,26 +68,26 @@ class CappedRequest(SiteRequest):
 
     def handleContentChunk(self, data: bytes) -> None:  # noqa: N802
         """Take a chunk of the body, or refuse the rest."""
-        self._taken += len(data)
-        if self._taken > MAX_BODY:
+        self._body_bytes += len(data)
+        if self._body_bytes > MAX_BODY:
             self._refuse()
-        if not self._is_cut:
+        if not self._is_refused:
             super().handleContentChunk(data)
 
     def requestReceived(self, command: bytes, path: bytes, version: bytes) -> None:  # noqa: N802
         """Process the request, unless its body was refused."""
-        if not self._is_cut:
+        if not self._is_refused:
             super().requestReceived(command, path, version)
 
     def _refuse(self) -> None:
-        if self._is_cut or self.channel is None:
+        if self._is_refused or self.channel is None:
             return
-        self._is_cut = True
+        self._is_refused = True
         channel: Any = self.channel
         if isinstance(channel, Channel):
             channel.refuse(TOO_LARGE)
         else:
-            channel.transport.write(raw(TOO_LARGE))
+            channel.transport.write(make_raw_response(TOO_LARGE))
             channel.transport.loseConnection()
 
 
@@ -100,7 +100,7 @@ class Channel(HTTPChannel):
     _phase = "idle"
     _deadline: IDelayedCall | None = None
     _stall_deadline: IDelayedCall | None = None
-    _counted: Kept | None = None
+    _counted_kind: CountedKind | None = None
     _open = False
     _is_over = False
     _received_bytes = 0
@@ -111,13 +111,13 @@ class Channel(HTTPChannel):
         super().connectionMade()
         self.limits = self.factory.limits
         self._address = str(getattr(self.getPeer(), "host", ""))
-        if not self.limits.may("open", self._address):
+        if not self.limits.can_open("open", self._address):
             self._is_over = True
             self.transport.abortConnection()
             return
         self.limits.count("open", self._address, 1)
         self._open = True
-        self._set_deadline(HEAD_S, self._close)
+        self._set_deadline(HEADERS_LIMIT_S, self._close)
 
     def dataReceived(self, data: bytes) -> None:  # noqa: N802
         """Take bytes and update the request's phase."""
@@ -144,7 +144,7 @@ class Channel(HTTPChannel):
         self._phase = "answer"
         self._cancel(self._deadline)
         self._deadline = None
-        if not self.limits.may("stream", self._address):
+        if not self.limits.can_open("stream", self._address):
             self.refuse(TOO_BUSY)
             return
         self._count("stream")
@@ -155,7 +155,7 @@ class Channel(HTTPChannel):
         self._count(None)
         self._phase = "idle"
         waits = bool(self._dataBuffer)
-        self._set_deadline(KEEP_S, self._close)
+        self._set_deadline(KEEP_ALIVE_S, self._close)
         if waits:
             self._start_request()
         super().requestDone(request)
@@ -165,7 +165,7 @@ class Channel(HTTPChannel):
         """Start the deadline for a client that does not read its response."""
         super().pauseProducing()
         if self._stall_deadline is None and not self._is_over:
-            self._stall_deadline = self.callLater(STALL_S, self._abort)
+            self._stall_deadline = self.callLater(STALL_LIMIT_S, self._abort)
 
     def resumeProducing(self) -> None:  # noqa: N802
         """End the deadline for the client to read."""
@@ -191,9 +191,9 @@ class Channel(HTTPChannel):
             return
         self._is_over = True
         self._count(None)
-        self.transport.write(raw(refusal))
+        self.transport.write(make_raw_response(refusal))
         self.loseConnection()
-        self._set_deadline(CLOSE_S, self._abort)
+        self._set_deadline(CLOSE_LIMIT_S, self._abort)
 
     def lineLengthExceeded(self, line: bytes) -> None:  # noqa: N802
         """Refuse a line that exceeds the limit for all headers."""
@@ -205,13 +205,13 @@ class Channel(HTTPChannel):
 
     def _start_request(self) -> None:
         self._phase, self._received_bytes = "head", 0
-        self._set_deadline(HEAD_S, lambda: self.refuse(LATE_HEAD))
+        self._set_deadline(HEADERS_LIMIT_S, lambda: self.refuse(LATE_HEAD))
 
     def _count_incomplete(self) -> None:
         """Count a request that is not complete; a request that arrives whole is not counted."""
-        if self._is_over or self._phase not in ("head", "body") or self._counted:
+        if self._is_over or self._phase not in ("head", "body") or self._counted_kind:
             return
-        if not self.limits.may("unfinished", self._address):
+        if not self.limits.can_open("unfinished", self._address):
             self.refuse(TOO_MANY)
             return
         self._count("unfinished")
@@ -222,13 +222,13 @@ class Channel(HTTPChannel):
         else:
             self._set_deadline(1.0, self._check_pace)
 
-    def _count(self, kind: Kept | None) -> None:
-        if self._counted != kind:
-            if self._counted:
-                self.limits.count(self._counted, self._address, -1)
+    def _count(self, kind: CountedKind | None) -> None:
+        if self._counted_kind != kind:
+            if self._counted_kind:
+                self.limits.count(self._counted_kind, self._address, -1)
             if kind:
                 self.limits.count(kind, self._address, 1)
-            self._counted = kind
+            self._counted_kind = kind
 
     def _set_deadline(self, seconds: float, late: Any) -> None:
         self._cancel(self._deadline)
@@ -244,14 +244,14 @@ class Channel(HTTPChannel):
     def _close(self) -> None:
         self._is_over = True
         self.loseConnection()
-        self._set_deadline(CLOSE_S, self._abort)
+        self._set_deadline(CLOSE_LIMIT_S, self._abort)
 
     def _abort(self) -> None:
         self._is_over = True
         self.transport.abortConnection()
 
 
-def limited(site: Site, limits: AddressLimits) -> None:
+def limit_connections(site: Site, limits: AddressLimits) -> None:
     """Apply ``limits`` and the deadlines of this module to the connections of ``site``."""
     held: Any = site
     held.protocol = Channel

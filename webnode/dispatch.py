@@ -9,9 +9,9 @@ from twisted.internet.defer import Deferred, maybeDeferred
 from twisted.python.failure import Failure
 
 from webnode.errors import Refusal
-from webnode.route import Ask, Route
+from webnode.route import Route, RouteRequest
 
-REMEMBERED = 256
+MAX_ANSWERS = 256
 """Number of answers kept for repeated requests."""
 
 
@@ -21,7 +21,7 @@ class Dispatch:
     def __init__(self) -> None:
         self._answers: OrderedDict[tuple[str, str, str], _Answer] = OrderedDict()
 
-    def carry_out(self, route: Route, ask: Ask) -> Deferred[Any]:
+    def carry_out(self, route: Route, ask: RouteRequest) -> Deferred[Any]:
         """Return the answer; a repeated id of the same session gets the first answer again."""
         # A route that a viewer may call changes nothing, whatever its method.
         if route.method == "GET" or route.role == "viewer":
@@ -29,28 +29,28 @@ class Dispatch:
         # Unauthenticated clients share one identity: a stored answer must not reach another client.
         if not ask.id or route.role == "anyone":
             return self._call_audited(route, ask)
-        key = ask.who.token_id, route.name, ask.id
+        key = ask.user.token_id, route.name, ask.id
         known = self._answers.get(key)
         if known is None:
             known = self._answers[key] = _Answer()
-            while len(self._answers) > REMEMBERED:
+            while len(self._answers) > MAX_ANSWERS:
                 self._answers.popitem(last=False)
             self._call_audited(route, ask).addBoth(known.set_outcome)
         return known.wait()
 
-    def _call(self, route: Route, ask: Ask) -> Deferred[Any]:
-        assert route.answer is not None
-        return maybeDeferred(route.answer, ask)
+    def _call(self, route: Route, ask: RouteRequest) -> Deferred[Any]:
+        assert route.handler is not None
+        return maybeDeferred(route.handler, ask)
 
-    def _call_audited(self, route: Route, ask: Ask) -> Deferred[Any]:
+    def _call_audited(self, route: Route, ask: RouteRequest) -> Deferred[Any]:
         def note(outcome: Any) -> Any:
             result = str(route.status)
             if isinstance(outcome, Failure):
                 refusal = outcome.value
                 result = f"{refusal.status} {refusal.problem}" if isinstance(refusal, Refusal) else "500"
-            named = {name for name in ask.given if f"{{{name}}}" in route.path}
-            target = " ".join(str(ask.given[name]) for name in sorted(named))
-            ask.board.audit.note(ask.who, ask.source, route.name, target, result)
+            named = {name for name in ask.values if f"{{{name}}}" in route.path}
+            target = " ".join(str(ask.values[name]) for name in sorted(named))
+            ask.services.audit.write(ask.user, ask.source, route.name, target, result)
             return outcome
 
         return self._call(route, ask).addBoth(note)

@@ -14,19 +14,19 @@ from math import inf
 from urllib.parse import urlsplit
 
 from middleware.admission.roles import GATEWAY
-from middleware.directory.presence import Device, devices_of
+from middleware.directory.presence import Device, parse_devices
 from middleware.entangled.record import Record
 from middleware.node import SwarmNode
 from webnode.guard import is_local_name
 
-REMEMBERED_S = 3600.0
+ORIGIN_KEPT_S = 3600.0
 """Seconds for which the origin of a web node that left is still accepted: its page may still run in a browser."""
 MAX_URL = 100
 MAX_URLS = 4
 MAX_GONE = 256
 """Maximum number of pages of departed web nodes that are kept, the newest."""
 PORTS = {"http": 80, "https": 443}
-ANY = ("0.0.0.0", "::", "")
+ANY_HOSTS = ("0.0.0.0", "::", "")
 
 
 @dataclass(frozen=True)
@@ -45,20 +45,20 @@ class Fallbacks:
     def __init__(self, *pages: Page) -> None:
         self.pages = list(pages)
 
-    def here(self) -> list[Page]:
+    def list_pages(self) -> list[Page]:
         """Return the pages that are served now."""
         return self.pages
 
-    def serves(self, urls: Iterable[str]) -> None:
+    def publish(self, urls: Iterable[str]) -> None:
         """Publish that this node also serves the page at ``urls``; call it when the port is open."""
         self.pages += [Page("here", url, url.startswith("https:"), True) for url in urls]
 
-    def lets_in(self, origin: str) -> bool:
+    def is_allowed_origin(self, origin: str) -> bool:
         """Return whether ``origin`` is, or recently was, the origin of a page of the team."""
         return origin in [page.url for page in self.pages]
 
 
-def origin_of(url: str) -> str:
+def get_origin(url: str) -> str:
     """Return the origin of the page at ``url`` as browsers name it; "" if the URL is not valid for a page of a team.
 
     ``localhost`` and all loopback addresses become 127.0.0.1.
@@ -87,19 +87,19 @@ def is_loopback(host: str) -> bool:
         return False
 
 
-def pages_of(devices: Iterable[Device], own: str = "") -> list[Page]:
+def find_pages(devices: Iterable[Device], own: str = "") -> list[Page]:
     """Return the pages that ``devices`` serve, in their order; ``own`` is the uuid of this node."""
     return [
         Page(device.uuid, url, url.startswith("https:"), device.uuid == own)
         for device in devices
         for url in device.pages[:MAX_URLS]
-        if origin_of(url)
+        if get_origin(url)
     ]
 
 
-def urls_at(host: str, port: int, names: Iterable[str], is_secure: bool = False) -> list[str]:
+def make_urls(host: str, port: int, names: Iterable[str], is_secure: bool = False) -> list[str]:
     """Return the URLs of a page at ``host`` and ``port``; ``names`` replace a wildcard host."""
-    hosts = [name for name in names if name] if host in ANY else [host]
+    hosts = [name for name in names if name] if host in ANY_HOSTS else [host]
     scheme = "https" if is_secure else "http"
     return [f"{scheme}://{f'[{name}]' if ':' in name else name}:{port}" for name in hosts][:MAX_URLS]
 
@@ -125,56 +125,60 @@ class TeamFallbacks(Fallbacks):
         self._clock = clock
         self._own = node.entangled.identity.public
         self._served: list[_Served] = []
-        self._watch = node.watch_devices(self._follow, keep=True)
+        self._watch = node.watch_devices(self._on_records, keep=True)
 
-    def serves(self, urls: Iterable[str]) -> None:
+    def publish(self, urls: Iterable[str]) -> None:
         """Publish that this node also serves the page at ``urls``; call it when the port is open."""
         pages = [*self._node.presence.device.pages, *urls]
         self._node.presence.change(pages=tuple(dict.fromkeys(pages))[:MAX_URLS])
-        self._follow(self._watch.records)
+        self._on_records(self._watch.records)
 
-    def here(self) -> list[Page]:
+    def list_pages(self) -> list[Page]:
         """Return the pages that gateways serve now, this node's pages first."""
         here = [each for each in self._served if each.end == inf]
-        may = {public for public in {each.public for each in here} if self.may_vouch(public) or public == self._own}
+        may = {
+            public for public in {each.public for each in here} if self.can_authenticate(public) or public == self._own
+        }
         return [each.page for each in here if each.public in may]
 
-    def may_vouch(self, public: bytes) -> bool:
+    def can_authenticate(self, public: bytes) -> bool:
         """Return whether the node with the key ``public`` may currently authenticate visitors."""
         if self._node.team is not None:
-            return GATEWAY in self._node.team.door.roles_of(public)
+            return GATEWAY in self._node.team.admission.roles_of(public)
         now = self._clock()
         return public == self._own or any(each.public == public and each.end > now for each in self._served)
 
-    def lets_in(self, origin: str) -> bool:
+    def is_allowed_origin(self, origin: str) -> bool:
         """Return whether ``origin`` belongs to a page of a gateway, now or within the last hour.
 
         A loopback origin is accepted if its scheme and port match, as its page comes from this machine.
         """
-        asked, now = origin_of(origin), self._clock()
+        asked, now = get_origin(origin), self._clock()
         if not asked:
             return False
         here = urlsplit(asked)
 
         def is_there(url: str) -> bool:
-            known = urlsplit(origin_of(url))
+            known = urlsplit(get_origin(url))
             is_port = (known.scheme, known.port) == (here.scheme, here.port)
             return is_port and (known.hostname == here.hostname or is_loopback(here.hostname or ""))
 
         found = {each.public for each in self._served if each.end > now and is_there(each.page.url)}
-        return any(public == self._own or self.may_vouch(public) for public in found)
+        return any(public == self._own or self.can_authenticate(public) for public in found)
 
-    def _follow(self, records: list[Record]) -> None:
-        devices = [(device, record.owner) for device, record in devices_of(records) if device.uuid != self._node.uuid]
+    def _on_records(self, records: list[Record]) -> None:
+        devices = [
+            (device, record.owner) for device, record in parse_devices(records) if device.uuid != self._node.uuid
+        ]
         own = self._node.presence.device
         here = [
             _Served(public, page)
             for device, public in [(Device(self._node.uuid, own.name, pages=own.pages), self._own), *devices]
-            for page in pages_of([device], self._node.uuid)
+            for page in find_pages([device], self._node.uuid)
         ]
         now, known = self._clock(), {(each.public, each.page.url) for each in here}
         gone = [
-            replace(each, end=min(each.end, now + REMEMBERED_S))
+            replace(each, end=min(each.end, now + ORIGIN_KEPT_S))
             for each in self._served
             if each.end > now and (each.public, each.page.url) not in known
         ]

@@ -9,31 +9,31 @@ from typing import Any
 from twisted.internet.defer import Deferred, fail
 from twisted.logger import Logger
 
-from middleware.directory.presence import devices_of
+from middleware.directory.presence import parse_devices
 from middleware.entangled.errors import EntangledError, NoAnswer
 from middleware.entangled.record import Record
 from middleware.errors import BadFault
-from middleware.faults.kinds import ASKED, CAUSE, KINDS, Fault, begins_in, parse_fault
-from middleware.faults.takeover import Takeover, acting
+from middleware.faults.kinds import CAUSE_METHOD, KINDS, LIST_METHOD, Fault, parse_delay, parse_fault
+from middleware.faults.takeover import Takeover, find_executing
 from middleware.node import SwarmNode
 from webnode.errors import Refusal
-from webnode.field import Json, text
+from webnode.sanitize import Json, clean_text
 
-PATIENCE_S = 1.5
+ANSWER_LIMIT_S = 1.5
 """Timeout of a device's reply in seconds; the browser waits for two."""
-TOLD_S = 60.0
+SHOWN_S = 60.0
 """Seconds for which a fault that has ended is still listed."""
-KEPT = 50
-REMEMBERED = 1000
+MAX_FAULTS = 50
+MAX_NAMES = 1000
 """Maximum number of devices known; beyond it, absent devices are forgotten."""
 
 
 @dataclass
-class _Caused:
+class _InjectedFault:
     n: int
     fault: Fault
     name: str
-    clock: Takeover
+    takeover: Takeover
 
 
 class FaultControl:
@@ -45,17 +45,17 @@ class FaultControl:
         self._node = node
         self._clock = clock
         self._kinds: dict[str, tuple[str, ...]] = {}
-        self._asked: set[str] = set()
+        self._queried: set[str] = set()
         self._names: dict[str, str] = {}
-        self._caused: list[_Caused] = []
+        self._injected: list[_InjectedFault] = []
         self._count = 0
-        self._watch = node.watch_devices(self._changed)
+        self._watch = node.watch_devices(self._on_records)
 
-    def kinds(self, uuid: str) -> Sequence[str]:
+    def get_kinds(self, uuid: str) -> Sequence[str]:
         """Return the fault kinds that the device allows; empty until it has reported them."""
         return self._kinds.get(uuid, ())
 
-    def cause(self, uuid: str, kind: str, seconds: float, amount: float | None) -> Deferred[None]:
+    def inject(self, uuid: str, kind: str, seconds: float, amount: float | None) -> Deferred[None]:
         """Inject a fault, by default with the usual ``amount``; fires when the device has accepted it.
 
         Fails with ``Refusal``: 400 for an invalid field, 409 and 504 for the device.  The takeover is timed from the
@@ -65,36 +65,38 @@ class FaultControl:
             fault = parse_fault(kind, seconds, amount)
         except BadFault as error:
             return fail(Refusal(error.field, error.problem, error.remedy))
-        record = next((each for device, each in devices_of(self._watch.records) if device.uuid == uuid), None)
-        contact = None if record is None else self._node.contact_of(record)
+        record = next((each for device, each in parse_devices(self._watch.records) if device.uuid == uuid), None)
+        contact = None if record is None else self._node.find_contact(record)
         if contact is None:
             return fail(Refusal("device", "it has left the network", "wait until it is back", 409))
         name = self._names.get(uuid, "it")
-        if kind not in self.kinds(uuid):
-            can = ", ".join(self.kinds(uuid))
+        if kind not in self.get_kinds(uuid):
+            can = ", ".join(self.get_kinds(uuid))
             remedy = f"choose one of {can}" if can else 'set "allow = true" below [faults] in its settings'
             return fail(Refusal("kind" if can else "device", f"{name} does not allow {kind}", remedy, 409))
-        task = acting(device for device, _ in devices_of(self._watch.records)).get(uuid, "")
+        task = find_executing(device for device, _ in parse_devices(self._watch.records)).get(uuid, "")
 
         def add_fault(answer: object) -> None:
-            now = self._clock() + begins_in(answer)
+            now = self._clock() + parse_delay(answer)
             self._count += 1
-            self._caused.insert(0, _Caused(self._count, fault, name, Takeover(uuid, task, now, now + fault.seconds)))
-            del self._caused[KEPT:]
+            self._injected.insert(
+                0, _InjectedFault(self._count, fault, name, Takeover(uuid, task, now, now + fault.seconds))
+            )
+            del self._injected[MAX_FAULTS:]
 
         def refused(failure: Any) -> None:
             failure.trap(EntangledError)
             if failure.check(NoAnswer):
                 raise Refusal("device", f"{name} does not answer", "wait until it is back", 504)
-            problem = text(failure.getErrorMessage(), "it refused")
+            problem = clean_text(failure.getErrorMessage(), "it refused")
             raise Refusal("device", f"{name}: {problem}", "check its settings", 409)
 
         asked = self._node.entangled.call(
-            contact, CAUSE, fault.kind, fault.seconds, amount, timeout=PATIENCE_S, changes=True
+            contact, CAUSE_METHOD, fault.kind, fault.seconds, amount, timeout=ANSWER_LIMIT_S, changes=True
         )
         return asked.addCallbacks(add_fault, refused)
 
-    def active(self) -> list[dict[str, Json]]:
+    def list_active(self) -> list[dict[str, Json]]:
         """Return the faults that are active or ended recently, newest first.
 
         ``n`` is the number of the fault; ``left_s`` and ``since_s`` are its remaining and elapsed seconds; ``task`` is
@@ -102,13 +104,13 @@ class FaultControl:
         ``to`` the name of that device, None and empty before; ``watched`` says whether the takeover is still measured.
         """
         now = self._clock()
-        self._caused = [each for each in self._caused if now < each.clock.until + TOLD_S]
-        return [self._row(each, now) for each in self._caused]
+        self._injected = [each for each in self._injected if now < each.takeover.until + SHOWN_S]
+        return [self._make_row(each, now) for each in self._injected]
 
     # -- inside -----------------------------------------------------------------------------------------------------
 
-    def _row(self, caused: _Caused, now: float) -> dict[str, Json]:
-        clock, fault = caused.clock, caused.fault
+    def _make_row(self, caused: _InjectedFault, now: float) -> dict[str, Json]:
+        clock, fault = caused.takeover, caused.fault
         return {
             "n": caused.n,
             "uuid": clock.lost,
@@ -123,24 +125,24 @@ class FaultControl:
             "watched": clock.is_open(now),
         }
 
-    def _changed(self, records: list[Record]) -> None:
-        devices = devices_of(records)
-        acts, now = acting(device for device, _ in devices), self._clock()
+    def _on_records(self, records: list[Record]) -> None:
+        devices = parse_devices(records)
+        acts, now = find_executing(device for device, _ in devices), self._clock()
         self._names.update({device.uuid: device.name for device, _ in devices})
-        for each in self._caused:
-            each.clock.look(acts, now)
+        for each in self._injected:
+            each.takeover.observe(acts, now)
         for device, record in devices:
-            if device.uuid not in self._asked:
-                self._asked.add(device.uuid)
-                self._learn(device.uuid, record)
+            if device.uuid not in self._queried:
+                self._queried.add(device.uuid)
+                self._query_kinds(device.uuid, record)
         # A device that returns may have other settings and is queried again; the previous reply holds until then.
-        self._asked &= {device.uuid for device, _ in devices}
-        if len(self._names) > REMEMBERED:
+        self._queried &= {device.uuid for device, _ in devices}
+        if len(self._names) > MAX_NAMES:
             self._names = {device.uuid: device.name for device, _ in devices}
             self._kinds = {uuid: self._kinds[uuid] for uuid in self._names.keys() & self._kinds.keys()}
 
-    def _learn(self, uuid: str, record: Record) -> None:
-        contact = self._node.contact_of(record)
+    def _query_kinds(self, uuid: str, record: Record) -> None:
+        contact = self._node.find_contact(record)
         if contact is None:
             return
 
@@ -152,9 +154,9 @@ class FaultControl:
         def handle_failure(failure: Any) -> None:
             failure.trap(EntangledError)
             if failure.check(NoAnswer):
-                self._asked.discard(uuid)  # ask again at the next change of any device
+                self._queried.discard(uuid)  # ask again at the next change of any device
             else:
                 self._kinds.pop(uuid, None)
 
-        asked = self._node.entangled.call(contact, ASKED).addCallbacks(store_kinds, handle_failure)
+        asked = self._node.entangled.call(contact, LIST_METHOD).addCallbacks(store_kinds, handle_failure)
         asked.addErrback(lambda failure: self._log.failure("cannot read which faults a device allows", failure))

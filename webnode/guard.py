@@ -14,7 +14,7 @@ from collections.abc import Callable, Collection
 from webnode.errors import Refusal
 
 MAX_BODY = 64 * 1024
-LOCAL_ENDS = (".localhost", ".local", ".lan", ".internal", ".home.arpa")
+LOCAL_SUFFIXES = (".localhost", ".local", ".lan", ".internal", ".home.arpa")
 HEADERS = {
     # A page that has lost its node connects to other web nodes of the team, whose addresses this node may not know.
     "Content-Security-Policy": (
@@ -26,7 +26,7 @@ HEADERS = {
     "Cross-Origin-Opener-Policy": "same-origin",
     "Cross-Origin-Resource-Policy": "same-origin",
 }
-SHARED = {
+SHARED_HEADERS = {
     "Vary": "Origin",
     "Cross-Origin-Resource-Policy": "cross-origin",
     "Access-Control-Allow-Methods": "GET, POST, PUT, DELETE",
@@ -36,14 +36,14 @@ SHARED = {
 }
 """CORS headers that allow requests from the page of another web node."""
 
-LetsIn = Callable[[str], bool]
+IsAllowedOrigin = Callable[[str], bool]
 
 
 def is_local_name(host: str) -> bool:
     """Return whether a ``Host`` header can name a machine of the local network: an address or a local name."""
-    name = _hostname_of(host)
+    name = _get_hostname(host)
     is_plain = bool(name) and all(c.isalnum() or c in "-_" for c in name)
-    return is_plain or name.endswith(LOCAL_ENDS) or _is_address(name)
+    return is_plain or name.endswith(LOCAL_SUFFIXES) or _is_address(name)
 
 
 def is_own_host(host: str, names: Collection[str] = ()) -> bool:
@@ -52,11 +52,11 @@ def is_own_host(host: str, names: Collection[str] = ()) -> bool:
     Other local names are not accepted: any machine of a LAN can register a name such as evil.local and then let it
     resolve to this machine's address (DNS rebinding).
     """
-    name = _hostname_of(host)
+    name = _get_hostname(host)
     return name == "localhost" or name.endswith(".localhost") or _is_address(name) or name in names
 
 
-def _hostname_of(host: str) -> str:
+def _get_hostname(host: str) -> str:
     name = host.rsplit("]", 1)[0].lstrip("[") if host.startswith("[") else host.rsplit(":", 1)[0]
     return name.rstrip(".").lower()
 
@@ -74,8 +74,8 @@ def is_own_origin(origin: str | None, host: str) -> bool:
     return origin is None or origin.split("://", 1)[-1].lower() == host.lower()
 
 
-def refusal(
-    method: str, host: str, origin: str | None, is_marked: bool, names: Collection[str], lets_in: LetsIn
+def find_refusal(
+    method: str, host: str, origin: str | None, is_marked: bool, names: Collection[str], lets_in: IsAllowedOrigin
 ) -> Refusal | None:
     """Return why a request is rejected, or None.
 
@@ -95,14 +95,14 @@ def refusal(
     return None
 
 
-def headers(host: str, origin: str | None, lets_in: LetsIn) -> dict[str, str]:
+def make_headers(host: str, origin: str | None, lets_in: IsAllowedOrigin) -> dict[str, str]:
     """Return the security headers of a response to ``origin``."""
     if origin is None or is_own_origin(origin, host) or not lets_in(origin):
         return HEADERS
-    return {**HEADERS, **SHARED, "Access-Control-Allow-Origin": origin}
+    return {**HEADERS, **SHARED_HEADERS, "Access-Control-Allow-Origin": origin}
 
 
-def token_of(authorization: str, ticket: str) -> str:
+def choose_token(authorization: str, ticket: str) -> str:
     """Return the token of the Authorization header, else the ticket of the query, else an empty text."""
     kind, _, token = authorization.partition(" ")
     return token.strip() if kind.lower() == "bearer" and token.strip() else ticket

@@ -16,7 +16,7 @@ MARGIN = 4
 """Width of the quiet zone around a QR code, in modules."""
 
 
-def code(text: str) -> str:
+def make_qr_code(text: str) -> str:
     """Return a QR code of ``text`` as SVG; empty for an empty text or without the library segno."""
     try:
         import segno
@@ -31,7 +31,7 @@ def code(text: str) -> str:
     return drawing.getvalue().decode()
 
 
-def best_first(urls: Iterable[str]) -> list[str]:
+def sort_by_reach(urls: Iterable[str]) -> list[str]:
     """Sort ``urls`` for an invitation: URLs that other machines can reach first, then those over TLS."""
 
     def rank(url: str) -> tuple[bool, bool]:
@@ -40,7 +40,7 @@ def best_first(urls: Iterable[str]) -> list[str]:
     return sorted(dict.fromkeys(urls), key=rank)
 
 
-class TeamInvites:
+class Invites:
     """The URLs of this node's page, evaluated at each call of ``urls``; ``authority`` is empty without TLS."""
 
     def __init__(
@@ -54,8 +54,8 @@ class TeamInvites:
 
     def urls(self) -> list[str]:
         """Return the URLs at which this node serves the page, the most reachable first."""
-        return best_first(self._urls())
+        return sort_by_reach(self._urls())
 
-    def drawn(self, text: str) -> Deferred[str]:
+    def draw_qr_code(self, text: str) -> Deferred[str]:
         """Draw a QR code on a worker thread, as it takes a small device a tenth of a second."""
-        return deferToThreadPool(self._reactor, self._pool, code, text)
+        return deferToThreadPool(self._reactor, self._pool, make_qr_code, text)

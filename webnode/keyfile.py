@@ -7,35 +7,35 @@ import stat
 from contextlib import suppress
 from pathlib import Path
 
-MOST = 64 * 1024
+MAX_FILE_BYTES = 64 * 1024
 
 
-class Unsafe(Exception):
+class UnsafeFile(Exception):
     """The file exists and must not be used; the message says why."""
 
 
-def kept(path: Path) -> bytes | None:
+def read_key_file(path: Path) -> bytes | None:
     """Read the file, None if it does not exist; raises ``Unsafe`` if other users could have read or written it."""
     try:
         descriptor = os.open(path, os.O_RDONLY | os.O_NOFOLLOW | os.O_NONBLOCK)
     except FileNotFoundError:
         return None
     except OSError as error:
-        raise Unsafe(f"it cannot be read ({error.strerror})") from error
+        raise UnsafeFile(f"it cannot be read ({error.strerror})") from error
     try:
         about = os.fstat(descriptor)
         if not stat.S_ISREG(about.st_mode):
-            raise Unsafe("it is not a regular file")
+            raise UnsafeFile("it is not a regular file")
         if about.st_uid not in (os.geteuid(), 0):
-            raise Unsafe("it belongs to another user")
+            raise UnsafeFile("it belongs to another user")
         if about.st_mode & 0o077:
-            raise Unsafe(f"other users can read or write it (mode {stat.S_IMODE(about.st_mode):o})")
-        return os.read(descriptor, MOST)
+            raise UnsafeFile(f"other users can read or write it (mode {stat.S_IMODE(about.st_mode):o})")
+        return os.read(descriptor, MAX_FILE_BYTES)
     finally:
         os.close(descriptor)
 
 
-def keep(path: Path, content: bytes) -> None:
+def write_key_file(path: Path, content: bytes) -> None:
     """Write ``content`` atomically, readable by the node's user only; raises ``OSError``."""
     fresh = path.with_name(f"{path.name}.new")
     with suppress(FileNotFoundError):

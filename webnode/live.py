@@ -20,32 +20,32 @@ from twisted.web.resource import Resource
 from twisted.web.server import NOT_DONE_YET
 from zope.interface import implementer
 
-from webnode.board import Board
-from webnode.camera import Camera, OnFrame
+from webnode.camera import CameraStream, OnFrame
 from webnode.errors import Refusal
-from webnode.guard import token_of
-from webnode.journal import Journal, dumped
-from webnode.resource import JsonResource, answer, argument
+from webnode.guard import choose_token
+from webnode.journal import Journal, encode_json
+from webnode.resource import JsonResource, read_argument, write_refusal
+from webnode.services import Services
 from webnode.state import State
 
 BEAT_S = 0.2
-PACE_S = 0.1
-SPARED = 4
+CHANGES_INTERVAL_S = 0.1
+READ_PAUSE_FACTOR = 4
 """For a large team, pause between two readings of the state as a multiple of the time that one takes."""
 CHECK_S = 1.0
 """Interval in seconds at which the sessions of open streams are checked."""
-LEAD_S = 3600.0
+RENEWAL_LEAD_S = 3600.0
 """Seconds before the end of a session at which the page is asked to renew it."""
 IDLE_S = 1.0
 """Interval of reading the state without any stream, for the chronicle and to expire departed devices."""
 MAX_VIEWERS = 256
 MAX_WAITING = 256
-ENTRIES = 100
+MAX_NEW_ENTRIES = 100
 """Number of chronicle entries sent to a new page."""
-SENT_AHEAD, SYSTEM_AHEAD = 4096, 16384
+SEND_BUFFER_BYTES, KERNEL_BUFFER_BYTES = 4096, 16384
 """Send buffer limits in bytes for a slow client, here and in the kernel: buffered data would be seconds old."""
 
-Watch = Callable[[str, OnFrame], Callable[[], None]]
+StreamCamera = Callable[[str, OnFrame], Callable[[], None]]
 """Streams the camera of a device until the returned function is called; raises ``Refusal`` if it has none."""
 
 
@@ -61,11 +61,11 @@ class Viewer:
         self.ticket = ticket
         self.is_renewing = False
         self.is_whole = is_whole
-        self.heard = heard
-        self.entry = 0
+        self.last_change = heard
+        self.last_entry = 0
         self.paused = False
         self.skipped = 0
-        self.seen: dict[str, str] = {}
+        self.sent_latest: dict[str, str] = {}
 
     def pauseProducing(self) -> None:
         """Pause: the client reads too slowly."""
@@ -79,7 +79,7 @@ class Viewer:
         """Stop writing; the connection has ended."""
         self.paused = True
 
-    def narrow(self) -> None:
+    def shrink_buffers(self) -> None:
         """Shrink the send buffers of the connection."""
         transport: Any = getattr(self.request.channel, "transport", None)
         if isinstance(transport, ProtocolWrapper):
@@ -87,11 +87,11 @@ class Viewer:
             transport = transport.transport
         handle = transport.getHandle() if hasattr(transport, "getHandle") else None
         if isinstance(handle, socket.socket):
-            transport.bufferSize = SENT_AHEAD
-            handle.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, SYSTEM_AHEAD)
+            transport.bufferSize = SEND_BUFFER_BYTES
+            handle.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, KERNEL_BUFFER_BYTES)
 
 
-class Events(JsonResource):
+class EventStreams(JsonResource):
     """``/events?since=ID&whole=1``: the state, then changes, at most ten per second; a ``beat`` five times a second.
 
     Events are ``state`` (``state.state_of``; ``resync`` is true if it replaces missed changes), ``change``
@@ -112,7 +112,7 @@ class Events(JsonResource):
         read: Callable[[], State],
         clock: IReactorTime,
         wall: Callable[[], float],
-        board: Board,
+        board: Services,
         version: Callable[[], object] | None = None,
     ) -> None:
         super().__init__()
@@ -120,19 +120,19 @@ class Events(JsonResource):
         self._clock = clock
         self._wall = wall
         self._board = board
-        self._newest: dict[str, Callable[[], Any]] = {
-            "yard": lambda: board.desk.yard(),
-            "pages": lambda: [asdict(page) for page in board.fallbacks.here()],
+        self._latest_sources: dict[str, Callable[[], Any]] = {
+            "yard": lambda: board.control.get_map(),
+            "pages": lambda: [asdict(page) for page in board.fallbacks.list_pages()],
         }
         self._version = version
         self._checked_at = 0.0
-        self._known: object = None
+        self._known_version: object = None
         self._read_at = -IDLE_S
-        self._took = 0.0
+        self._read_duration_s = 0.0
         self._journal = Journal(f"{int(1000 * wall()):x}")
-        self._whole = (0, "")
+        self._encoded = (0, "")
         self._viewers: list[Viewer] = []
-        self._turn: IDelayedCall | None = None
+        self._timer: IDelayedCall | None = None
         self._beat_at = 0.0
         self._failing: dict[str, bool] = {}
         self._is_open = False
@@ -142,7 +142,7 @@ class Events(JsonResource):
         """The number of open streams."""
         return len(self._viewers)
 
-    def open(self) -> None:
+    def start(self) -> None:
         """Start to read the state for the chronicle, also without any stream."""
         self._is_open = True
         self._schedule(IDLE_S)
@@ -150,23 +150,27 @@ class Events(JsonResource):
     def render_GET(self, request: Request) -> int | bytes:
         """Open a stream."""
         if len(self._viewers) >= MAX_VIEWERS:
-            return answer(request, Refusal("events", "too many open pages", "close one and try again", 503))
+            return write_refusal(request, Refusal("events", "too many open pages", "close one and try again", 503))
         request.setHeader("Content-Type", "text/event-stream; charset=utf-8")
         request.setHeader("Cache-Control", "no-store")
         request.setHeader("X-Accel-Buffering", "no")
-        since = request.getHeader("last-event-id") or argument(request, b"since").decode("ascii", "replace")
-        is_whole = argument(request, b"whole") in (b"1", b"true")
-        viewer = Viewer(request, is_whole, self._journal.number(since), shown(request))
+        since = request.getHeader("last-event-id") or read_argument(request, b"since").decode("ascii", "replace")
+        is_whole = read_argument(request, b"whole") in (b"1", b"true")
+        viewer = Viewer(request, is_whole, self._journal.parse_event_id(since), read_token(request))
         self._viewers.append(viewer)
         request.notifyFinish().addBoth(lambda _: self._close(viewer))
-        viewer.narrow()
+        viewer.shrink_buffers()
         request.registerProducer(viewer, True)
         self._read_state()
-        text = ["retry: 1000\n\n", self._backlog(viewer, bool(since)), self._latest_events(viewer, self._news())]
-        request.write("".join([*text, self._beat(viewer)]).encode())
+        text = [
+            "retry: 1000\n\n",
+            self._make_backlog(viewer, bool(since)),
+            self._make_latest_events(viewer, self._encode_latest()),
+        ]
+        request.write("".join([*text, self._make_beat(viewer)]).encode())
         if len(self._viewers) == 1:
             self._beat_at = self._clock.seconds() + BEAT_S
-            self._schedule(PACE_S)
+            self._schedule(CHANGES_INTERVAL_S)
         return NOT_DONE_YET
 
     def close(self) -> None:
@@ -177,45 +181,45 @@ class Events(JsonResource):
         self._schedule(None)
 
     def _schedule(self, seconds: float | None) -> None:
-        if self._turn is not None and self._turn.active():
-            self._turn.cancel()
-        self._turn = None if seconds is None else self._clock.callLater(seconds, self._tick)
+        if self._timer is not None and self._timer.active():
+            self._timer.cancel()
+        self._timer = None if seconds is None else self._clock.callLater(seconds, self._tick)
 
     def _tick(self) -> None:
-        self._schedule(PACE_S if self._viewers else IDLE_S)
+        self._schedule(CHANGES_INTERVAL_S if self._viewers else IDLE_S)
         self._read_state()
         if not self._viewers:
             return
-        news, is_beat = self._news(), self._clock.seconds() >= self._beat_at
+        news, is_beat = self._encode_latest(), self._clock.seconds() >= self._beat_at
         if is_beat:
-            self._beat_at = self._clock.seconds() + BEAT_S - PACE_S / 2
+            self._beat_at = self._clock.seconds() + BEAT_S - CHANGES_INTERVAL_S / 2
         is_checked = self._clock.seconds() >= self._checked_at
         if is_checked:
             self._checked_at = self._clock.seconds() + CHECK_S
         for viewer in list(self._viewers):
-            if is_checked and not self._may_stay(viewer):
+            if is_checked and not self._check_session(viewer):
                 continue
             if viewer.paused:
-                viewer.skipped += viewer.heard < self._journal.n
+                viewer.skipped += viewer.last_change < self._journal.n
                 continue
             text = (
-                self._backlog(viewer, True)
-                + self._latest_events(viewer, news)
-                + (self._beat(viewer) if is_beat else "")
+                self._make_backlog(viewer, True)
+                + self._make_latest_events(viewer, news)
+                + (self._make_beat(viewer) if is_beat else "")
             )
             if text:
                 viewer.request.write(text.encode())
 
-    def _may_stay(self, viewer: Viewer) -> bool:
+    def _check_session(self, viewer: Viewer) -> bool:
         """End the stream of an expired session; announce the expiry of one that can be renewed."""
         now = self._wall()
-        who = self._board.sessions.visitor(viewer.ticket, now)
+        who = self._board.sessions.authenticate(viewer.ticket, now)
         if who.role == "anyone":
             self._end(viewer)
             return False
-        if not viewer.is_renewing and not viewer.paused and who.until - now < LEAD_S and who.until < who.limit:
+        if not viewer.is_renewing and not viewer.paused and who.until - now < RENEWAL_LEAD_S and who.until < who.limit:
             viewer.is_renewing = True
-            viewer.request.write(_event("ticket", dumped({"until": who.until})).encode())
+            viewer.request.write(_format_event("ticket", encode_json({"until": who.until})).encode())
         return True
 
     def _end(self, viewer: Viewer) -> None:
@@ -225,56 +229,60 @@ class Events(JsonResource):
     def _read_state(self) -> None:
         """Read the state, if it may have changed."""
         now = self._clock.seconds()
-        if now - self._read_at < SPARED * self._took:
+        if now - self._read_at < READ_PAUSE_FACTOR * self._read_duration_s:
             return
         version = None if self._version is None else self._version()
-        if version is not None and version == self._known and now - self._read_at < IDLE_S:
+        if version is not None and version == self._known_version and now - self._read_at < IDLE_S:
             return
-        self._known, self._read_at = version, now
-        with_state = self._call_logged("state", lambda: self._journal.take(self._read()))
+        self._known_version, self._read_at = version, now
+        with_state = self._call_logged("state", lambda: self._journal.add_state(self._read()))
         if with_state:
-            self._board.chronicle.saw(self._journal.state, self._wall())
-        self._took = self._clock.seconds() - now
+            self._board.event_log.record_state(self._journal.state, self._wall())
+        self._read_duration_s = self._clock.seconds() - now
 
-    def _backlog(self, viewer: Viewer, is_again: bool) -> str:
+    def _make_backlog(self, viewer: Viewer, is_again: bool) -> str:
         """Return the missed changes or the whole state, whichever is smaller, and the missed chronicle entries."""
         journal, text = self._journal, []
-        missed = None if viewer.is_whole else journal.since(viewer.heard)
+        missed = None if viewer.is_whole else journal.list_since(viewer.last_change)
         if (
             missed is not None
             and len(missed) > 1
-            and sum(len(each.words) for each in missed) > len(self._encoded_state())
+            and sum(len(each.encoded) for each in missed) > len(self._encoded_state())
         ):
             missed = None
         if missed is not None:
-            text = [f"id: {journal.id(each.n)}\nevent: change\ndata: {each.words}\n\n" for each in missed]
-        elif viewer.heard < journal.n:
+            text = [f"id: {journal.make_event_id(each.n)}\nevent: change\ndata: {each.encoded}\n\n" for each in missed]
+        elif viewer.last_change < journal.n:
             start = "true," if is_again and not viewer.is_whole else "false,"
-            text = [f'id: {journal.id(journal.n)}\nevent: state\ndata: {{"resync":{start}{self._encoded_state()}\n\n']
-        viewer.heard = journal.n
-        entries = self._board.chronicle.since(viewer.entry)[-ENTRIES:]
+            text = [
+                f'id: {journal.make_event_id(journal.n)}\nevent: state\ndata: {{"resync":{start}{self._encoded_state()}\n\n'
+            ]
+        viewer.last_change = journal.n
+        entries = self._board.event_log.list_since(viewer.last_entry)[-MAX_NEW_ENTRIES:]
         if entries:
-            viewer.entry = entries[-1].n
-            text.append(_event("event", dumped([asdict(entry) for entry in entries])))
+            viewer.last_entry = entries[-1].n
+            text.append(_format_event("event", encode_json([asdict(entry) for entry in entries])))
         return "".join(text)
 
     def _encoded_state(self) -> str:
         """Return the whole state as JSON without its first brace, encoded once for all viewers."""
-        if self._whole[0] != self._journal.n:
-            self._whole = (self._journal.n, dumped(self._journal.state)[1:])
-        return self._whole[1]
+        if self._encoded[0] != self._journal.n:
+            self._encoded = (self._journal.n, encode_json(self._journal.state)[1:])
+        return self._encoded[1]
 
-    def _latest_events(self, viewer: Viewer, news: Mapping[str, str]) -> str:
+    def _make_latest_events(self, viewer: Viewer, news: Mapping[str, str]) -> str:
         """Return the events of which only the newest counts, if the viewer has not received them yet."""
-        fresh = {event: text for event, text in news.items() if viewer.seen.get(event) != text}
-        viewer.seen |= fresh
-        return "".join(_event(event, text) for event, text in fresh.items())
+        fresh = {event: text for event, text in news.items() if viewer.sent_latest.get(event) != text}
+        viewer.sent_latest |= fresh
+        return "".join(_format_event(event, text) for event, text in fresh.items())
 
-    def _beat(self, viewer: Viewer) -> str:
-        return _event("beat", dumped({"now": round(self._wall(), 3), "skipped": viewer.skipped}))
+    def _make_beat(self, viewer: Viewer) -> str:
+        return _format_event("beat", encode_json({"now": round(self._wall(), 3), "skipped": viewer.skipped}))
 
-    def _news(self) -> dict[str, str]:
-        encoded = {event: self._call_logged(event, partial(_encode, source)) for event, source in self._newest.items()}
+    def _encode_latest(self) -> dict[str, str]:
+        encoded = {
+            event: self._call_logged(event, partial(_encode, source)) for event, source in self._latest_sources.items()
+        }
         return {event: text for event, text in encoded.items() if text is not None}
 
     def _call_logged(self, event: str, produce: Callable[[], Any]) -> Any:
@@ -297,31 +305,31 @@ class Events(JsonResource):
 
 
 def _encode(source: Callable[[], Any]) -> str:
-    return dumped(source())
+    return encode_json(source())
 
 
-def _event(event: str, text: str) -> str:
+def _format_event(event: str, text: str) -> str:
     return f"event: {event}\ndata: {text}\n\n"
 
 
-def shown(request: Request) -> str:
+def read_token(request: Request) -> str:
     """Return the token or ticket of a request."""
     tickets: list[bytes] = (request.args or {}).get(b"ticket", [b""])
-    return token_of(request.getHeader("authorization") or "", tickets[0].decode("ascii", "replace"))
+    return choose_token(request.getHeader("authorization") or "", tickets[0].decode("ascii", "replace"))
 
 
-class Shots(JsonResource):
+class CameraImages(JsonResource):
     """``/shot/<device>?after=N&viewer=V``: the newest picture whose number is not N, as soon as there is one.
 
     The response has the number in ``X-Seq``, to be used as the next ``after``; it is 204 after five seconds without a
     new picture.  A second request of the same viewer ends its first with 204, so one picture is in flight per viewer.
     """
 
-    def __init__(self, watch: Watch, clock: IReactorTime) -> None:
+    def __init__(self, watch: StreamCamera, clock: IReactorTime) -> None:
         super().__init__()
         self._watch = watch
         self._clock = clock
-        self._cameras: dict[str, Camera] = {}
+        self._cameras: dict[str, CameraStream] = {}
 
     @property
     def watched(self) -> list[str]:
@@ -330,19 +338,21 @@ class Shots(JsonResource):
 
     def getChild(self, path: bytes, request: Request) -> Resource:
         """Return the resource of one device's camera."""
-        return _Shot(self, path.decode("ascii", "replace"))
+        return _CameraImage(self, path.decode("ascii", "replace"))
 
-    def ask(self, uuid: str, request: Request) -> int | bytes:
+    def serve(self, uuid: str, request: Request) -> int | bytes:
         """Answer at once if the newest picture is new to the viewer, else with the next one."""
         camera = self._cameras.get(uuid)
         if camera is None:
             try:
-                camera = Camera(self._clock, lambda seen: self._watch(uuid, seen), lambda: self._end(uuid))
+                camera = CameraStream(self._clock, lambda seen: self._watch(uuid, seen), lambda: self._end(uuid))
             except Refusal as refusal:
-                return answer(request, refusal)
+                return write_refusal(request, refusal)
             self._cameras[uuid] = camera
         if len(camera.waiting) >= MAX_WAITING:
-            return answer(request, Refusal("shot", "too many viewers of this camera", "close one and try again", 503))
+            return write_refusal(
+                request, Refusal("shot", "too many viewers of this camera", "close one and try again", 503)
+            )
         camera.wait(request)
         return NOT_DONE_YET
 
@@ -355,13 +365,13 @@ class Shots(JsonResource):
         self._cameras.pop(uuid, None)
 
 
-class _Shot(JsonResource):
+class _CameraImage(JsonResource):
     isLeaf = True
 
-    def __init__(self, shots: Shots, uuid: str) -> None:
+    def __init__(self, shots: CameraImages, uuid: str) -> None:
         super().__init__()
-        self._shots = shots
+        self._images = shots
         self._uuid = uuid
 
     def render_GET(self, request: Request) -> int | bytes:
-        return self._shots.ask(self._uuid, request)
+        return self._images.serve(self._uuid, request)

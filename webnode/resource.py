@@ -18,23 +18,25 @@ class JsonResource(Resource):
 
     def getChild(self, path: bytes, request: Request) -> Resource:
         """Refuse a path below this resource."""
-        return Refused(Refusal(path_of(request), "not found", "see docs/reference/http-api.md for the routes", 404))
+        return RefusedResource(
+            Refusal(get_path(request), "not found", "see docs/reference/http-api.md for the routes", 404)
+        )
 
     def render(self, request: Request) -> int | bytes:
         """Answer a request with one of ``methods``."""
         is_there = self.isLeaf or hasattr(self, "render_GET") or request.method not in (b"GET", b"HEAD")
         if not is_there or (self.isLeaf and getattr(request, "postpath", None)):
-            refusal = Refusal(path_of(request), "not found", "see docs/reference/http-api.md for the routes", 404)
-            return answer(request, refusal)
+            refusal = Refusal(get_path(request), "not found", "see docs/reference/http-api.md for the routes", 404)
+            return write_refusal(request, refusal)
         if request.method not in self.methods:
             request.setHeader("Allow", b", ".join(self.methods).decode())
             allowed = " or ".join(method.decode() for method in self.methods)
-            return answer(request, Refusal(path_of(request), "method not allowed", f"use {allowed}", 405))
+            return write_refusal(request, Refusal(get_path(request), "method not allowed", f"use {allowed}", 405))
         told: int | bytes = super().render(request)
         return told
 
 
-class Refused(Resource):
+class RefusedResource(Resource):
     """A resource that answers every request with the same refusal."""
 
     isLeaf = True
@@ -45,10 +47,10 @@ class Refused(Resource):
 
     def render(self, request: Request) -> bytes:
         """Answer with the refusal."""
-        return answer(request, self._refusal)
+        return write_refusal(request, self._refusal)
 
 
-def answer(request: Request, refusal: Refusal) -> bytes:
+def write_refusal(request: Request, refusal: Refusal) -> bytes:
     """Set status and type of a refusal, and return its JSON body."""
     request.setResponseCode(refusal.status)
     request.setHeader("Content-Type", "application/json")
@@ -56,13 +58,13 @@ def answer(request: Request, refusal: Refusal) -> bytes:
     return json.dumps(refusal.fields).encode()
 
 
-def argument(request: Request, name: bytes) -> bytes:
+def read_argument(request: Request, name: bytes) -> bytes:
     """Return the first value of a query parameter, cut to 40 bytes; empty if it is missing."""
     values: list[bytes] = (request.args or {}).get(name, [b""])
     return values[0][:40]
 
 
-def path_of(request: Request) -> str:
+def get_path(request: Request) -> str:
     """Return the requested path for messages: cut, and without its query, which may contain a ticket."""
     path: bytes = request.path or b""
     return path.decode("ascii", "replace")[:100]

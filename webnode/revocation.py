@@ -12,15 +12,15 @@ from typing import Any
 import msgpack
 
 from middleware.entangled.errors import EntangledError
-from middleware.entangled.record import Record, hashed_key
-from middleware.entangled.value import LARGEST, bounded, is_number, mapping_of
+from middleware.entangled.record import Record, hash_key
+from middleware.entangled.value import MAX_NUMBER, check_size, is_number, parse_mapping
 from middleware.node import SwarmNode
 
-REVOKED = hashed_key("signed-out")
+REVOKED_KEY = hash_key("signed-out")
 SLOT = "signed-out"
-MOST = 60
+MAX_PUBLISHED = 60
 """Maximum number of sessions in one record, the newest; the record has to fit into a datagram."""
-REMEMBERED = 4096
+MAX_KNOWN = 4096
 ID_BYTES = 8
 
 
@@ -30,13 +30,13 @@ class Revocations:
     def __init__(self) -> None:
         self._known: dict[str, float] = {}
 
-    def has(self, token_id: str) -> bool:
+    def is_revoked(self, token_id: str) -> bool:
         """Return whether the session is revoked."""
         return token_id in self._known
 
-    def add(self, token_id: str, until: float) -> None:
+    def revoke(self, token_id: str, until: float) -> None:
         """Revoke a session; it and all tokens derived from it expire at ``until``, in unix seconds."""
-        self._known = _newest({**self._known, token_id: until}, REMEMBERED)
+        self._known = _select_newest({**self._known, token_id: until}, MAX_KNOWN)
 
 
 class TeamRevocations(Revocations):
@@ -46,31 +46,33 @@ class TeamRevocations(Revocations):
         super().__init__()
         self._node = node
         self._own: dict[str, float] = {}
-        self._watch = node.entangled.watch(REVOKED, self._on_records, keep=True)
+        self._watch = node.entangled.watch(REVOKED_KEY, self._on_records, keep=True)
 
-    def add(self, token_id: str, until: float) -> None:
+    def revoke(self, token_id: str, until: float) -> None:
         """Revoke a session here, and publish that to the other web nodes."""
-        self._learn({token_id: until})
+        self._add_known({token_id: until})
         own = {each: end for each, end in self._own.items() if end > self._node.wall()}
-        self._own = _newest({**own, token_id: until}, MOST)
-        ends = {bytes.fromhex(each): int(min(end, LARGEST)) for each, end in self._own.items()}
-        self._node.entangled.put(REVOKED, SLOT, bounded(bytes(msgpack.packb(ends))), "team").addErrback(_ignore_failure)
+        self._own = _select_newest({**own, token_id: until}, MAX_PUBLISHED)
+        ends = {bytes.fromhex(each): int(min(end, MAX_NUMBER)) for each, end in self._own.items()}
+        self._node.entangled.put(REVOKED_KEY, SLOT, check_size(bytes(msgpack.packb(ends))), "team").addErrback(
+            _ignore_failure
+        )
 
     def _on_records(self, records: list[Record]) -> None:
         for record in records:
-            self._learn(revoked_in(record))
+            self._add_known(read_revocations(record))
 
-    def _learn(self, ends: Mapping[str, float]) -> None:
+    def _add_known(self, ends: Mapping[str, float]) -> None:
         # A revocation stays valid when its publisher leaves.  The table is replaced, never modified, as other threads
         # read it.
         now = self._node.wall()
         known = {each: end for each, end in self._known.items() if end > now}
-        self._known = _newest({**known, **{each: end for each, end in ends.items() if end > now}}, REMEMBERED)
+        self._known = _select_newest({**known, **{each: end for each, end in ends.items() if end > now}}, MAX_KNOWN)
 
 
-def revoked_in(record: Record) -> Mapping[str, float]:
+def read_revocations(record: Record) -> Mapping[str, float]:
     """Return the sessions that a record revokes, by id with their time of expiry; empty if it is invalid."""
-    content: dict[Any, Any] | None = mapping_of(record) if record.name == SLOT else None
+    content: dict[Any, Any] | None = parse_mapping(record) if record.name == SLOT else None
     return {
         each.hex(): float(end)
         for each, end in (content or {}).items()
@@ -78,7 +80,7 @@ def revoked_in(record: Record) -> Mapping[str, float]:
     }
 
 
-def _newest(ends: Mapping[str, float], most: int) -> dict[str, float]:
+def _select_newest(ends: Mapping[str, float], most: int) -> dict[str, float]:
     return dict(list(ends.items())[-most:])
 
 

@@ -12,18 +12,18 @@ from typing import Annotated, Any, Literal
 
 from msgspec import Meta
 
-from formats.convert import Invalid, Secret, Unit, convert_value, nearest_of
-from webnode.board import Board
+from formats.convert import InvalidValue, Secret, Unit, convert_value, find_nearest
+from webnode.auth import Role, User
 from webnode.errors import Refusal
-from webnode.field import MAX_ENTRIES, MAX_TEXT, text
+from webnode.sanitize import MAX_ENTRIES, MAX_TEXT, clean_text
+from webnode.services import Services
 from webnode.state import GONE, State
-from webnode.visitor import Role, Visitor
 
 API = "/api/v1"
 MAX_NUMBER = 1e9
 REQUIRED: Any = object()
 """The default of a field that has to be given."""
-ALLOWED: Mapping[Role, tuple[Role, ...]] = {
+ALLOWED_ROLES: Mapping[Role, tuple[Role, ...]] = {
     "anyone": ("anyone", "viewer", "operator", "phone"),
     "viewer": ("viewer", "operator", "phone"),
     "operator": ("operator",),
@@ -32,9 +32,9 @@ ALLOWED: Mapping[Role, tuple[Role, ...]] = {
 """For each role that a route requires, the roles that satisfy it."""
 
 Kind = Literal["text", "number", "whole", "flag", "choice", "table", "list"]
-Answer = Callable[["Ask"], Any]
+Handler = Callable[["RouteRequest"], Any]
 """Called on the reactor's thread; returns JSON or ``Content``, or a Deferred of it, and raises ``Refusal``."""
-Native = Callable[[Board, Any], Any]
+Native = Callable[[Services, Any], Any]
 """Makes the Twisted resource of a route from the board and the reactor, once, when the service is created."""
 
 
@@ -48,34 +48,34 @@ class Field:
 
     name: str
     kind: Kind
-    about: str
+    description: str
     where: Literal["path", "query", "body"] = "body"
-    least: float | None = None
-    most: float | None = None
+    minimum: float | None = None
+    maximum: float | None = None
     choices: tuple[str, ...] = ()
     default: Any = REQUIRED
     unit: str = ""
 
 
-DEVICE = Field("uuid", "text", "the device", "path", most=64)
+DEVICE = Field("uuid", "text", "the device", "path", maximum=64)
 
 
 @dataclass(frozen=True)
-class Ask:
+class RouteRequest:
     """A checked request for a route.
 
     ``id`` is the client's ``Idempotency-Key`` or empty: repeated requests with one id are carried out once.  ``source``
     is the client's address, ``now`` unix seconds, ``table`` all routes.
     """
 
-    given: Mapping[str, Any]
-    who: Visitor
-    board: Board
+    values: Mapping[str, Any]
+    user: User
+    services: Services
     state: State
     id: str = ""
     source: str = ""
     now: float = 0.0
-    table: tuple[Route, ...] = ()
+    routes: tuple[Route, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -96,15 +96,15 @@ class Route:
 
     method: Literal["GET", "POST", "PUT", "DELETE"]
     path: str
-    about: str
+    description: str
     role: Role
-    answer: Answer | None
+    handler: Handler | None
     fields: tuple[Field, ...] = ()
-    gives: str = ""
+    response: str = ""
     status: int = 200
     native: Native | None = None
     limit_s: float | None = None
-    takes: str = ""
+    body_type: str = ""
 
     @property
     def name(self) -> str:
@@ -112,9 +112,9 @@ class Route:
         return f"{self.method} {self.path}"
 
 
-def guarded(role: Role, who: Visitor) -> None:
+def check_role(role: Role, who: User) -> None:
     """Check that ``who`` has the role ``role``; raises ``Refusal`` otherwise."""
-    if who.role in ALLOWED[role]:
+    if who.role in ALLOWED_ROLES[role]:
         return
     if who.role == "anyone":
         remedy = f"sign in at POST {API}/session, and send 'Authorization: Bearer TOKEN' or ?ticket=TICKET"
@@ -122,7 +122,7 @@ def guarded(role: Role, who: Visitor) -> None:
     raise Refusal("Authorization", f"a {who.role} may not do this", f"sign in as {role}", 403)
 
 
-def checked(route: Route, path: Mapping[str, str], query: Mapping[str, str], body: object) -> dict[str, Any]:
+def check_request(route: Route, path: Mapping[str, str], query: Mapping[str, str], body: object) -> dict[str, Any]:
     """Return the values by field name; raises ``Refusal`` with the field, the problem and the remedy."""
     if not isinstance(body, Mapping):
         raise Refusal("body", "it is not a JSON object", 'send something like {"name": "value"}')
@@ -130,23 +130,23 @@ def checked(route: Route, path: Mapping[str, str], query: Mapping[str, str], bod
     known = {field.name for field in route.fields if field.where == "body"}
     for name in body:
         if name not in known:
-            raise Refusal(text(name, "body", 64), "unknown field", _nearest(name, known))
+            raise Refusal(clean_text(name, "body", 64), "unknown field", _suggest_field(name, known))
     given: dict[str, Any] = dict(path)
     for field in route.fields:
         place = places[field.where]
         if field.name in place:
             value = place[field.name]
-            given[field.name] = _value(field, value if field.where == "body" else _read(field, value))
+            given[field.name] = _convert_field(field, value if field.where == "body" else _convert_text(field, value))
         elif field.default is REQUIRED:
-            raise Refusal(field.name, "it is missing", f"give {field.about}")
+            raise Refusal(field.name, "it is missing", f"give {field.description}")
         else:
             given[field.name] = field.default
     return given
 
 
-def device(ask: Ask) -> State:
+def find_device(ask: RouteRequest) -> State:
     """Return the device of the path's ``uuid``; raises ``Refusal`` 404 if it is unknown, 409 if it has left."""
-    found = [each for each in ask.state["devices"] if each["uuid"] == ask.given["uuid"]]
+    found = [each for each in ask.state["devices"] if each["uuid"] == ask.values["uuid"]]
     if not found:
         raise Refusal("device", "unknown device", f"choose one of {API}/devices", 404)
     if found[0]["status"] == GONE:
@@ -154,12 +154,12 @@ def device(ask: Ask) -> State:
     return dict(found[0])
 
 
-def _nearest(name: object, known: Collection[str]) -> str:
-    near = f"the nearest is {nearest_of(str(name), known)}" if known else "this route takes no fields"
+def _suggest_field(name: object, known: Collection[str]) -> str:
+    near = f"the nearest is {find_nearest(str(name), known)}" if known else "this route takes no fields"
     return f"leave it out; {near}"
 
 
-def _read(field: Field, word: str) -> object:
+def _convert_text(field: Field, word: str) -> object:
     """Convert the text of a path or query field; an invalid text stays as it is and fails the check."""
     if field.kind in ("number", "whole"):
         try:
@@ -169,13 +169,13 @@ def _read(field: Field, word: str) -> object:
     return {"true": True, "false": False}.get(word, word) if field.kind == "flag" else word
 
 
-def hint_of(field: Field) -> Any:
+def make_type_hint(field: Field) -> Any:
     """Return the type of a field with its bounds, for conversion and documentation."""
-    least, most = field.least, field.most
+    least, most = field.minimum, field.maximum
     match field.kind:
         case "text":  # may be a password, so errors must not repeat it
             return Annotated[
-                str, Meta(min_length=int(1 if least is None else least), max_length=_longest(field)), Secret()
+                str, Meta(min_length=int(1 if least is None else least), max_length=_get_max_length(field)), Secret()
             ]
         case "number" | "whole":
             low, high = -MAX_NUMBER if least is None else least, MAX_NUMBER if most is None else most
@@ -189,16 +189,20 @@ def hint_of(field: Field) -> Any:
     return {"flag": bool, "table": dict[str, Any]}[field.kind]
 
 
-def _longest(field: Field) -> int:
-    return MAX_TEXT if field.most is None else int(field.most)
+def _get_max_length(field: Field) -> int:
+    return MAX_TEXT if field.maximum is None else int(field.maximum)
 
 
-def _value(field: Field, value: object) -> Any:
-    hint = hint_of(field)
+def _convert_field(field: Field, value: object) -> Any:
+    hint = make_type_hint(field)
     if field.kind == "whole" and isinstance(value, float) and value.is_integer():
         value = int(value)
     try:
         converted = convert_value(value, hint, field.name)
-        return convert_value(text(converted, limit=_longest(field)), hint) if field.kind == "text" else converted
-    except Invalid as error:
+        return (
+            convert_value(clean_text(converted, limit=_get_max_length(field)), hint)
+            if field.kind == "text"
+            else converted
+        )
+    except InvalidValue as error:
         raise Refusal(field.name, f"it {error.problem}", error.remedy) from None

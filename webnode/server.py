@@ -30,27 +30,27 @@ from twisted.web.server import Site
 from twisted.web.wsgi import WSGIResource
 
 from webnode.app import OnReactor, create_app
-from webnode.board import Board
-from webnode.channel import CappedRequest, limited
+from webnode.auth import Role
+from webnode.channel import LimitedRequest, limit_connections
 from webnode.errors import PortTaken, Refusal
-from webnode.fallback import urls_at
-from webnode.guard import headers, refusal
-from webnode.live import Events, Shots, shown
-from webnode.resource import JsonResource, Refused
-from webnode.route import guarded
-from webnode.routes.table import TABLE
+from webnode.fallback import make_urls
+from webnode.guard import find_refusal, make_headers
+from webnode.live import CameraImages, EventStreams, read_token
+from webnode.resource import JsonResource, RefusedResource
+from webnode.route import check_role
+from webnode.routes.registry import TABLE
+from webnode.services import Services
 from webnode.state import State
-from webnode.visitor import Role
 
 WORKERS = 4
-LIMIT_S = 2.0
+CALL_LIMIT_S = 2.0
 STATIC = Path(__file__).parent / "static"
 
-Door = Callable[[Site], IListeningPort]
+OpenPort = Callable[[Site], IListeningPort]
 """Opens a port for a site; raises ``PortTaken``."""
 
 
-def caller(reactor: Any, usual_s: float = LIMIT_S) -> OnReactor:
+def make_caller(reactor: Any, usual_s: float = CALL_LIMIT_S) -> OnReactor:
     """Return the function with which Flask's workers call code on the reactor's thread.
 
     It waits at most ``limit_s`` (default ``usual_s``) for the result, also of a Deferred.  After that it raises a
@@ -71,7 +71,7 @@ def caller(reactor: Any, usual_s: float = LIMIT_S) -> OnReactor:
     return on_reactor
 
 
-class Files(JsonResource):
+class StaticFiles(JsonResource):
     """``/static``: the files of the page, read and compressed once, revalidated by ETag.
 
     ``files.json`` lists all paths, for the service worker.
@@ -81,12 +81,12 @@ class Files(JsonResource):
         super().__init__()
         paths = [path for path in sorted(folder.iterdir()) if path.is_file()]
         for path in paths:
-            self.putChild(path.name.encode(), _File(path.name, sent(path)))
+            self.putChild(path.name.encode(), _StaticFile(path.name, read_static(path)))
         listed = json.dumps([f"/static/{path.name}" for path in paths]).encode()
-        self.putChild(b"files.json", _File("files.json", listed))
+        self.putChild(b"files.json", _StaticFile("files.json", listed))
 
 
-class _File(JsonResource):
+class _StaticFile(JsonResource):
     isLeaf = True
     methods = (b"GET", b"HEAD")
 
@@ -94,13 +94,13 @@ class _File(JsonResource):
         super().__init__()
         # mtime=0 makes the compressed bytes, and so the tag, equal at every node.
         packed = gzip.compress(content, 9, mtime=0)
-        self._forms = {"": content, "gzip": packed} if len(packed) < len(content) else {"": content}
+        self._encodings = {"": content, "gzip": packed} if len(packed) < len(content) else {"": content}
         self._tag = hashlib.blake2s(content, digest_size=8).hexdigest()
         kind = mimetypes.guess_type(name)[0] or "application/octet-stream"
         self._kind = kind + ("; charset=utf-8" if kind.startswith("text/") else "")
 
     def render_GET(self, request: Request) -> bytes:
-        form = "gzip" if "gzip" in self._forms and _takes_gzip(request.getHeader("accept-encoding") or "") else ""
+        form = "gzip" if "gzip" in self._encodings and _accepts_gzip(request.getHeader("accept-encoding") or "") else ""
         request.setHeader("Content-Type", self._kind)
         request.setHeader("Cache-Control", "no-cache")
         request.setHeader("Vary", "Accept-Encoding")
@@ -108,16 +108,16 @@ class _File(JsonResource):
             return b""
         if form:
             request.setHeader("Content-Encoding", form)
-        return self._forms[form]
+        return self._encodings[form]
 
 
-def sent(path: Path) -> bytes:
+def read_static(path: Path) -> bytes:
     """Return the content to send; comment lines of scripts become empty lines, which keeps line numbers."""
     content = path.read_bytes()
     return re.sub(rb"^ *//.*$", b"", content, flags=re.MULTILINE) if path.suffix == ".js" else content
 
 
-def _takes_gzip(accepted: str) -> bool:
+def _accepts_gzip(accepted: str) -> bool:
     """Return whether an ``Accept-Encoding`` header accepts gzip with a weight above zero."""
     for entry in accepted.split(","):
         name, _, weight = entry.replace(" ", "").partition(";q=")
@@ -136,14 +136,14 @@ class Root(Resource):
         self,
         flask: IResource,
         native: dict[str, Resource],
-        board: Board,
+        board: Services,
         wall: Callable[[], float],
         hosts: Collection[str] = (),
     ) -> None:
         super().__init__()
         self._flask = flask
         self._native = [
-            (tuple(path.strip("/").encode().split(b"/")), resource, _role_of(path))
+            (tuple(path.strip("/").encode().split(b"/")), resource, _get_role(path))
             for path, resource in sorted(native.items(), key=lambda item: -item[0].count("/"))
         ]
         self._board = board
@@ -155,33 +155,33 @@ class Root(Resource):
         assert request.prepath is not None and request.postpath is not None
         asked = (path, *request.postpath)
         for pattern, resource, role in self._native:
-            if _matches(asked, pattern):
+            if _is_match(asked, pattern):
                 for _ in pattern[1:]:
                     request.prepath.append(request.postpath.pop(0))
-                return self._guarded(resource, role, request)
+                return self._check_role(resource, role, request)
         request.prepath.pop()
         request.postpath.insert(0, path)
         return self._flask
 
-    def _guarded(self, resource: Resource, role: Role, request: SiteRequest) -> IResource:
+    def _check_role(self, resource: Resource, role: Role, request: SiteRequest) -> IResource:
         host, origin = request.getHeader("host") or "", request.getHeader("origin")
-        lets_in = self._board.fallbacks.lets_in
-        for name, value in headers(host, origin, lets_in).items():
+        lets_in = self._board.fallbacks.is_allowed_origin
+        for name, value in make_headers(host, origin, lets_in).items():
             request.setHeader(name, value)
         method = (request.method or b"").decode("ascii", "replace")
         # navigator.sendBeacon, which a phone uses when its page is closed, cannot set headers.
         is_marked = role == "phone" or request.getHeader("x-swarm") == "1" or method == "GET"
-        problem = refusal(method, host, origin, is_marked, self._hosts, lets_in)
+        problem = find_refusal(method, host, origin, is_marked, self._hosts, lets_in)
         if problem is not None:
-            return Refused(problem)
+            return RefusedResource(problem)
         if method == "OPTIONS":
             return _Preflight()
         try:
-            who = self._board.sessions.visitor(shown(request), self._wall())
-            guarded(role, who)
+            who = self._board.sessions.authenticate(read_token(request), self._wall())
+            check_role(role, who)
         except Refusal as no:
-            return Refused(no)
-        if isinstance(request, CappedRequest):
+            return RefusedResource(no)
+        if isinstance(request, LimitedRequest):
             request.who = who
         return resource
 
@@ -196,20 +196,20 @@ class _Preflight(Resource):
         return b""
 
 
-def _matches(asked: Sequence[bytes], pattern: Sequence[bytes]) -> bool:
+def _is_match(asked: Sequence[bytes], pattern: Sequence[bytes]) -> bool:
     return len(asked) >= len(pattern) and all(
         segment == wanted or (wanted.startswith(b"{") and segment != b"")
         for segment, wanted in zip(asked, pattern, strict=False)
     )
 
 
-def _role_of(path: str) -> Role:
+def _get_role(path: str) -> Role:
     """Return the role for the native route at ``path`` or below it; "operator" for a path without a route."""
-    roles = [route.role for route in TABLE if route.answer is None and f"{route.path}/".startswith(f"{path}/")]
+    roles = [route.role for route in TABLE if route.handler is None and f"{route.path}/".startswith(f"{path}/")]
     return roles[0] if roles else "operator"
 
 
-def listening(reactor: Any, host: str, port: int, factory: Any, setting: str) -> IListeningPort:
+def open_port(reactor: Any, host: str, port: int, factory: Any, setting: str) -> IListeningPort:
     """Open a TCP port for ``factory``; raises ``PortTaken``, with a remedy for ``setting``."""
     try:
         opened: IListeningPort = reactor.listenTCP(port, factory, interface=host)
@@ -251,60 +251,62 @@ class WebService(Service):
         host: str,
         port: int,
         read: Callable[[], State],
-        board: Board,
+        board: Services,
         wall: Callable[[], float],
         hosts: Collection[str] = (),
-        doors: Sequence[Door] = (),
+        doors: Sequence[OpenPort] = (),
         live: Callable[[], State] | None = None,
         version: Callable[[], object] | None = None,
     ) -> None:
         self._reactor = reactor
         self._host = host
-        self._wanted = port
-        self._doors = doors
+        self._configured_port = port
+        self._port_openers = doors
         self._pool = ThreadPool(1, WORKERS, "web")
-        flask = WSGIResource(reactor, self._pool, create_app(read, board, caller(reactor), hosts, wall))
-        self._events = Events(live or read, reactor, wall, board, version)
-        self._shots = Shots(board.desk.watch, reactor)
-        native: dict[str, Resource] = {"/events": self._events, "/shot": self._shots, "/static": Files()}
+        flask = WSGIResource(reactor, self._pool, create_app(read, board, make_caller(reactor), hosts, wall))
+        self._events = EventStreams(live or read, reactor, wall, board, version)
+        self._camera_images = CameraImages(board.control.stream_camera, reactor)
+        native: dict[str, Resource] = {"/events": self._events, "/shot": self._camera_images, "/static": StaticFiles()}
         native.update({route.path: route.native(board, reactor) for route in TABLE if route.native is not None})
         root = Root(flask, native, board, wall, hosts)
-        self.site = QuietSite(root, requestFactory=CappedRequest, timeout=30)
+        self.site = QuietSite(root, requestFactory=LimitedRequest, timeout=30)
         self.site.displayTracebacks = False
-        limited(self.site, board.limits)
+        limit_connections(self.site, board.limits)
         self._listening: IListeningPort | None = None
-        self._open: list[IListeningPort] = []
+        self._secure_ports: list[IListeningPort] = []
 
     @property
     def port(self) -> int:
         """The port of the page; the configured one before the service starts."""
         return (
-            self._wanted if self._listening is None else int(getattr(self._listening.getHost(), "port", self._wanted))
+            self._configured_port
+            if self._listening is None
+            else int(getattr(self._listening.getHost(), "port", self._configured_port))
         )
 
     @property
     def secure_port(self) -> int:
         """The first of the further ports; 0 if there is none or the service has not started."""
-        return next((int(getattr(door.getHost(), "port", 0)) for door in self._open), 0)
+        return next((int(getattr(door.getHost(), "port", 0)) for door in self._secure_ports), 0)
 
     def urls(self, names: Collection[str]) -> list[str]:
         """Return the URLs of the page; ``names`` are this machine's, for a page at all addresses."""
-        doors = urls_at(self._host, self.secure_port, names, is_secure=True) if self.secure_port else []
-        return [*urls_at(self._host, self.port, names), *doors]
+        doors = make_urls(self._host, self.secure_port, names, is_secure=True) if self.secure_port else []
+        return [*make_urls(self._host, self.port, names), *doors]
 
     def startService(self) -> None:
         """Open the ports, then start the workers."""
-        self._listening = listening(self._reactor, self._host, self._wanted, self.site, "port")
+        self._listening = open_port(self._reactor, self._host, self._configured_port, self.site, "port")
         try:
-            for door in self._doors:
-                self._open.append(door(self.site))
+            for door in self._port_openers:
+                self._secure_ports.append(door(self.site))
         except PortTaken:
-            for port in (self._listening, *self._open):
+            for port in (self._listening, *self._secure_ports):
                 port.stopListening()
-            self._listening, self._open = None, []
+            self._listening, self._secure_ports = None, []
             raise
         self._pool.start()
-        self._events.open()
+        self._events.start()
         super().startService()
 
     def stopService(self) -> Deferred[None] | None:
@@ -312,10 +314,12 @@ class WebService(Service):
         super().stopService()
         if self._listening is None:
             return None
-        closed: list[Deferred[Any]] = [maybeDeferred(port.stopListening) for port in (self._listening, *self._open)]
-        self._listening, self._open = None, []
+        closed: list[Deferred[Any]] = [
+            maybeDeferred(port.stopListening) for port in (self._listening, *self._secure_ports)
+        ]
+        self._listening, self._secure_ports = None, []
         self._events.close()
-        self._shots.close()
+        self._camera_images.close()
         # Runs on another thread, as a worker may be waiting for the reactor.
         closed.append(deferToThreadPool(self._reactor, self._reactor.getThreadPool(), self._pool.stop))
         return gatherResults(closed).addCallback(lambda _: None)

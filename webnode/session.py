@@ -16,29 +16,29 @@ from twisted.internet.threads import deferToThreadPool
 from middleware.config.settings import Settings
 from middleware.errors import BadSetting
 from middleware.node import SwarmNode
-from webnode.delay import SOURCES, Delays, network_of
+from webnode.auth import OpenSessions, Role, Sessions, Token, User
 from webnode.errors import Refusal
 from webnode.fallback import TeamFallbacks, is_loopback
-from webnode.password import draw_code, is_password, read
+from webnode.password import draw_code, parse_hash, verify_password
 from webnode.revocation import Revocations, TeamRevocations
+from webnode.sign_in_delay import MAX_SOURCES, SignInDelays, get_network
 from webnode.token import MAX_PARENTS, MAX_VOUCHERS, SESSION_BYTES, Claim, TokenKey
-from webnode.visitor import OpenSessions, Role, Sessions, Token, Visitor
 
-SIGNED_S = 12 * 3600.0
+SESSION_S = 12 * 3600.0
 """Validity of a session in seconds, unless the page renews it."""
-MAX_SIGNED_S = 30 * 86400.0
+MAX_SESSION_S = 30 * 86400.0
 """Maximum duration of a session in seconds, with renewals."""
-PASS_S = 600.0
+PEER_TOKEN_S = 600.0
 """Validity in seconds of a token for another web node, at which the page renews it."""
 FREE_EVERYWHERE, LONGEST_EVERYWHERE_S, FORGOTTEN_EVERYWHERE_S = 100, 60.0, 3600.0
 """Failed attempts of all addresses together: 100 are free, then one per minute is allowed, until an hour passes without
 any.  The pause is short, as it delays every address that has not signed in before."""
-EVERYWHERE = "everywhere"
-AT_ONCE, WAITING = 2, 1
+ALL_SOURCES = "everywhere"
+MAX_CHECKS, MAX_WAITING_CHECKS = 2, 1
 """Number of passwords checked at the same time, and of those waiting: each occupies one of the page's four workers, and
 guesses must not occupy all."""
 
-NOBODY = Visitor()
+ANONYMOUS = User()
 NO_GATEWAY = Refusal(
     "node",
     "it has no role gateway in its team, so it cannot sign anyone in",
@@ -68,147 +68,157 @@ class SignedSessions:
         rng: random.Random,
         check: Check,
         revoked: Revocations | None = None,
-        signed_s: float = SIGNED_S,
+        signed_s: float = SESSION_S,
     ) -> None:
         self.code = code
         self.key = key
-        self._may_vouch = may_vouch
+        self._can_authenticate = may_vouch
         self._password = password
         self._rng = rng
         self._check = check
-        self._attempts = Attempts()
-        self._revoked = Revocations() if revoked is None else revoked
-        self.signed_s = signed_s
-        self._gate = DeferredSemaphore(AT_ONCE)
+        self._attempts = SignInAttempts()
+        self._revocations = Revocations() if revoked is None else revoked
+        self.session_s = signed_s
+        self._gate = DeferredSemaphore(MAX_CHECKS)
 
     def sign_in(self, proof: str, source: str, now: float) -> Deferred[Token]:
         """Sign in with a code, a password or an invitation; fails with ``Refusal`` 401, 403, 429 or 503."""
-        if not self._may_vouch(self.key.public):
+        if not self._can_authenticate(self.key.public):
             return fail(NO_GATEWAY)
         # A signature cannot be guessed, so invitations need no rate limit.
-        invited = self.visitor(proof.strip(), now)
+        invited = self.authenticate(proof.strip(), now)
         if invited.role != "anyone" and not invited.is_ticket:
             return succeed(self._begin(invited.name, invited.role, now, invited.until, invited))
-        wait = self._attempts.wait(source, now)
+        wait = self._attempts.get_wait(source, now)
         if wait > 0.0:
             return fail(Refusal("code", "too many wrong attempts", f"wait {math.ceil(wait)} s", 429))
-        self._attempts.tried(source, now)
-        if hmac.compare_digest(_normalized(proof), _normalized(self.code)):
-            return succeed(self._operator(source, now))
+        self._attempts.count_attempt(source, now)
+        if hmac.compare_digest(_normalize_code(proof), _normalize_code(self.code)):
+            return succeed(self._begin_operator(source, now))
         if not self._password:
-            return fail(_wrong_code())
-        if len(self._gate.waiting) >= WAITING:
+            return fail(_make_wrong_code())
+        if len(self._gate.waiting) >= MAX_WAITING_CHECKS:
             return fail(Refusal("code", "too many sign-ins at once", "try again in a few seconds", 503))
 
         def finish(is_right: bool) -> Token:
             if not is_right:
-                raise _wrong_code()
-            return self._operator(source, now)
+                raise _make_wrong_code()
+            return self._begin_operator(source, now)
 
         return self._gate.run(self._check, self._password, proof).addCallback(finish)
 
-    def visitor(self, token: str, now: float) -> Visitor:
+    def authenticate(self, token: str, now: float) -> User:
         """Return the visitor of a token or ticket."""
-        claim = self.key.claim(token)
-        if claim is None or now >= claim.until or any(self._revoked.has(each) for each in (claim.id, *claim.parents)):
-            return NOBODY
-        if not all(self._may_vouch(public) for public in (self.key.public, *claim.vouchers)):
-            return NOBODY
+        claim = self.key.read_claim(token)
+        if (
+            claim is None
+            or now >= claim.until
+            or any(self._revocations.is_revoked(each) for each in (claim.id, *claim.parents))
+        ):
+            return ANONYMOUS
+        if not all(self._can_authenticate(public) for public in (self.key.public, *claim.vouchers)):
+            return ANONYMOUS
         limit = max(claim.until, claim.limit)
-        who = Visitor(claim.name, claim.role, claim.id, claim.until, limit, claim.is_ticket)
+        who = User(claim.name, claim.role, claim.id, claim.until, limit, claim.is_ticket)
         return replace(who, parents=claim.parents, vouchers=claim.vouchers)
 
-    def token(self, who: Visitor, name: str, role: Role, now: float, seconds: float) -> Token:
+    def issue_guest_token(self, who: User, name: str, role: Role, now: float, seconds: float) -> Token:
         """Return a token for a guest of ``who``, valid no longer than ``who`` can stay."""
         end = min(now + seconds, who.limit)
-        claim = Claim(self._fresh_id(), name, role, int(end), limit=int(end), vouchers=self._vouchers_of(who))
-        return self._signed(claim)
+        claim = Claim(self._draw_id(), name, role, int(end), limit=int(end), vouchers=self._list_vouchers(who))
+        return self._sign(claim)
 
-    def derived(self, who: Visitor, name: str, role: Role, now: float, seconds: float) -> Token:
+    def issue_derived_token(self, who: User, name: str, role: Role, now: float, seconds: float) -> Token:
         """Return a token for ``who`` under another name, which ends with the session."""
-        token = Claim(self._fresh_id(), name, role, int(min(now + seconds, who.limit)), vouchers=self._vouchers_of(who))
-        return self._signed(replace(token, limit=token.until, parents=_lineage(who)))
+        token = Claim(
+            self._draw_id(), name, role, int(min(now + seconds, who.limit)), vouchers=self._list_vouchers(who)
+        )
+        return self._sign(replace(token, limit=token.until, parents=_list_session_ids(who)))
 
-    def renewed(self, who: Visitor, now: float) -> Token:
+    def renew_token(self, who: User, now: float) -> Token:
         """Return another token for the same session; revoking one ends both."""
         _require_session(who)
-        return self._session(who, now + self.signed_s, who.limit)
+        return self._make_session_token(who, now + self.session_s, who.limit)
 
-    def passes(self, who: Visitor, nodes: Iterable[str], now: float) -> dict[str, Token]:
+    def issue_peer_tokens(self, who: User, nodes: Iterable[str], now: float) -> dict[str, Token]:
         """Return tokens for the same session at other web nodes, by uuid, each valid only there and for ``PASS_S``."""
         _require_session(who)
-        until = min(now + PASS_S, who.limit)
-        return {node: self._session(who, until, who.limit, bytes.fromhex(node)) for node in dict.fromkeys(nodes)}
+        until = min(now + PEER_TOKEN_S, who.limit)
+        return {
+            node: self._make_session_token(who, until, who.limit, bytes.fromhex(node)) for node in dict.fromkeys(nodes)
+        }
 
     def revoke(self, token_id: str, until: float = math.inf) -> None:
         """Revoke a session at all web nodes of the team."""
-        self._revoked.add(token_id, until)
+        self._revocations.revoke(token_id, until)
 
-    def _operator(self, source: str, now: float) -> Token:
-        self._attempts.held(source, now)
-        return self._begin("operator", "operator", now, now + MAX_SIGNED_S)
+    def _begin_operator(self, source: str, now: float) -> Token:
+        self._attempts.record_success(source, now)
+        return self._begin("operator", "operator", now, now + MAX_SESSION_S)
 
-    def _begin(self, name: str, role: Role, now: float, limit: float, invited: Visitor = NOBODY) -> Token:
+    def _begin(self, name: str, role: Role, now: float, limit: float, invited: User = ANONYMOUS) -> Token:
         """Start a session, which ends with the invitation that it was made from."""
-        who = Visitor(name, role, self._fresh_id(), parents=_lineage(invited), vouchers=invited.vouchers)
-        return self._session(who, now + self.signed_s, limit)
+        who = User(name, role, self._draw_id(), parents=_list_session_ids(invited), vouchers=invited.vouchers)
+        return self._make_session_token(who, now + self.session_s, limit)
 
-    def _session(self, who: Visitor, until: float, limit: float, audience: bytes = b"") -> Token:
+    def _make_session_token(self, who: User, until: float, limit: float, audience: bytes = b"") -> Token:
         claim = Claim(who.token_id, who.name, who.role, int(min(until, limit)), limit=int(limit))
-        return self._signed(replace(claim, parents=who.parents, vouchers=self._vouchers_of(who)), audience)
+        return self._sign(replace(claim, parents=who.parents, vouchers=self._list_vouchers(who)), audience)
 
-    def _signed(self, claim: Claim, audience: bytes = b"") -> Token:
-        text, ticket = (self.key.token(each, audience) for each in (claim, claim.ticket))
+    def _sign(self, claim: Claim, audience: bytes = b"") -> Token:
+        text, ticket = (self.key.sign_token(each, audience) for each in (claim, claim.ticket))
         return Token(text, ticket, claim.role, float(claim.until))
 
-    def _vouchers_of(self, who: Visitor) -> tuple[bytes, ...]:
+    def _list_vouchers(self, who: User) -> tuple[bytes, ...]:
         """Return the other web nodes that vouch for ``who``; raises ``Refusal`` if there are too many."""
         others = tuple(each for each in who.vouchers if each != self.key.public)
         if len(others) > MAX_VOUCHERS:
             raise Refusal("Authorization", "the session used too many web nodes", "sign in here", 401)
         return others
 
-    def _fresh_id(self) -> str:
+    def _draw_id(self) -> str:
         return self._rng.randbytes(SESSION_BYTES).hex()
 
 
-class Attempts:
+class SignInAttempts:
     """Limits attempts to sign in with a code or password, per address and for all addresses together.
 
     The common limit does not apply to this machine and to networks from which a visitor has signed in before.
     """
 
     def __init__(self) -> None:
-        self._here = Delays()
-        self._everywhere = Delays(FREE_EVERYWHERE, LONGEST_EVERYWHERE_S, FORGOTTEN_EVERYWHERE_S)
+        self._by_source = SignInDelays()
+        self._overall = SignInDelays(FREE_EVERYWHERE, LONGEST_EVERYWHERE_S, FORGOTTEN_EVERYWHERE_S)
         self._known: OrderedDict[str, None] = OrderedDict()
 
-    def wait(self, source: str, now: float) -> float:
+    def get_wait(self, source: str, now: float) -> float:
         """Return the seconds until ``source`` may try again; 0 if it may now."""
-        wait = self._here.wait(source, now)
-        return wait if self._is_known(source) else max(wait, self._everywhere.wait(EVERYWHERE, now))
+        wait = self._by_source.get_wait(source, now)
+        return wait if self._is_known(source) else max(wait, self._overall.get_wait(ALL_SOURCES, now))
 
-    def tried(self, source: str, now: float) -> None:
+    def count_attempt(self, source: str, now: float) -> None:
         """Count an attempt."""
-        self._here.tried(source, now)
+        self._by_source.count_attempt(source, now)
         if not self._is_known(source):
-            self._everywhere.tried(EVERYWHERE, now)
+            self._overall.count_attempt(ALL_SOURCES, now)
 
-    def held(self, source: str, now: float) -> None:
+    def record_success(self, source: str, now: float) -> None:
         """Record that the last attempt of ``source`` succeeded."""
-        self._here.held(source)
+        self._by_source.forget(source)
         if not self._is_known(source):
-            self._everywhere.undo(EVERYWHERE)
-        self._known[network_of(source)] = None
-        self._known.move_to_end(network_of(source))
-        if len(self._known) > SOURCES:
+            self._overall.uncount_attempt(ALL_SOURCES)
+        self._known[get_network(source)] = None
+        self._known.move_to_end(get_network(source))
+        if len(self._known) > MAX_SOURCES:
             self._known.popitem(last=False)
 
     def _is_known(self, source: str) -> bool:
-        return network_of(source) in self._known or is_loopback(source)
+        return get_network(source) in self._known or is_loopback(source)
 
 
-def sessions(settings: Settings, node: SwarmNode, reactor: Any, rng: random.Random, team: TeamFallbacks) -> Sessions:
+def make_sessions(
+    settings: Settings, node: SwarmNode, reactor: Any, rng: random.Random, team: TeamFallbacks
+) -> Sessions:
     """Return the sessions for these settings; raises ``BadSetting`` if they would admit every client of the network."""
     web, origin = settings.web, settings.origin
     key = TokenKey(node.entangled.identity)
@@ -216,37 +226,37 @@ def sessions(settings: Settings, node: SwarmNode, reactor: Any, rng: random.Rand
         if not is_loopback(web.host):
             problem = f"is false, and {web.host} serves more than this machine"
             raise BadSetting(origin, "[web] sign_in", problem, "set host = '127.0.0.1', or leave sign_in out")
-        return OpenSessions(lambda: team.may_vouch(key.public))
+        return OpenSessions(lambda: team.can_authenticate(key.public))
     if web.password:
         try:
-            read(web.password)
+            parse_hash(web.password)
         except ValueError as error:
             raise BadSetting(
                 origin, "[web] password", f"is not a valid hash ({error})", "create one with: swarm password"
             ) from error
 
     def check(text: str, password: str) -> Deferred[Any]:
-        return deferToThreadPool(reactor, reactor.getThreadPool(), is_password, text, password)
+        return deferToThreadPool(reactor, reactor.getThreadPool(), verify_password, text, password)
 
     code = web.code or draw_code(rng)
-    return SignedSessions(key, team.may_vouch, code, web.password, rng, check, TeamRevocations(node))
+    return SignedSessions(key, team.can_authenticate, code, web.password, rng, check, TeamRevocations(node))
 
 
-def _wrong_code() -> Refusal:
+def _make_wrong_code() -> Refusal:
     return Refusal("code", "wrong code", "see the node's output at its start, or run: swarm web", 401)
 
 
-def _normalized(code: str) -> bytes:
+def _normalize_code(code: str) -> bytes:
     """Normalize a code: capitals, spaces and hyphens do not matter."""
     return "".join(c for c in code.lower() if not c.isspace() and c != "-").encode()
 
 
-def _lineage(who: Visitor) -> tuple[str, ...]:
+def _list_session_ids(who: User) -> tuple[str, ...]:
     """Return the ids of the sessions with which everything started by ``who`` ends."""
     return tuple(each for each in (who.token_id, *who.parents) if each)[:MAX_PARENTS]
 
 
-def _require_session(who: Visitor) -> None:
+def _require_session(who: User) -> None:
     if who.role == "anyone" or who.is_ticket:
         problem = "a ticket is not enough" if who.is_ticket else "not signed in"
         raise Refusal("Authorization", problem, "send the token, as 'Bearer TOKEN', or sign in", 401)

@@ -11,7 +11,7 @@ import math
 from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
-from webnode.field import count, distance, number, properties, text, texts
+from webnode.sanitize import clean_count, clean_distance, clean_number, clean_properties, clean_text, clean_texts
 
 State = dict[str, Any]
 Fields = Mapping[str, Any]
@@ -20,13 +20,13 @@ DEVICE_STATUSES = ("IDLE", "ASSIGNED", "SEARCHING", "WAITING", "EXECUTING", "DON
 TASK_STATUSES = ("OPEN", "ASSIGNED", "EXECUTING", "COMPLETED", "FAILED", "CANCELLED")
 UNKNOWN = "UNKNOWN"
 GONE = "GONE"
-REMEMBERED_S = 60.0
-MESSAGES = 5
-FARTHEST = 1e6
+DEPARTED_SHOWN_S = 60.0
+MAX_MESSAGES = 5
+MAX_DISTANCE_M = 1e6
 """Maximum distance of a device from the origin of its frame, in metres."""
 
 
-def state_of(
+def format_state(
     devices: Iterable[Fields],
     tasks: Iterable[Fields],
     groups: Mapping[str, Sequence[Fields]],
@@ -38,11 +38,11 @@ def state_of(
 
     ``departed`` are the devices that left recently (``Departed.of``); ``node`` is the name of the serving node.
     """
-    present = [view for view in map(device_view, devices) if view["uuid"]]
+    present = [view for view in map(make_device_view, devices) if view["uuid"]]
     known = {view["uuid"] for view in present}
     gone = [view for view in departed if view["uuid"] not in known]
     shown = sorted([*present, *gone], key=lambda view: (view["joined"], view["uuid"]))
-    listed = [view for view in map(task_view, tasks) if view["id"]]
+    listed = [view for view in map(make_task_view, tasks) if view["id"]]
     listed.sort(key=lambda view: (-view["created"], view["id"]))
     titles = {view["id"]: view["title"] for view in listed}
     for view in shown:
@@ -52,72 +52,74 @@ def state_of(
     order = {view["id"]: place for place, view in enumerate(listed)}
     keys = sorted((key for key in groups if groups[key]), key=lambda key: (order.get(key, len(order)), key))
     return {
-        "node": text(node),
+        "node": clean_text(node),
         "devices": shown,
         "tasks": listed,
-        "groups": [group_view(key, titles.get(key, key), groups[key], names) for key in keys],
+        "groups": [make_group_view(key, titles.get(key, key), groups[key], names) for key in keys],
     }
 
 
-def device_view(fields: Fields) -> State:
+def make_device_view(fields: Fields) -> State:
     """Return one device as the page shows it; missing and invalid fields become empty."""
     network, deployed = fields.get("network"), fields.get("deployed")
     deployed = deployed if isinstance(deployed, Mapping) else {}
     return {
-        "uuid": text(fields.get("uuid"), limit=64),
-        "name": text(fields.get("name"), "unnamed", 64),
-        "kind": text(fields.get("kind"), limit=64),
-        "description": text(fields.get("description")),
-        "capabilities": properties(fields.get("capabilities")),
-        "address": text(fields.get("address"), limit=64),
-        "roles": texts(fields.get("roles")),
-        "joined": count(fields.get("joined")),
-        "since": number(fields.get("since")),
-        "task": text(fields.get("task"), limit=64),
-        "status": _status(fields.get("status"), DEVICE_STATUSES),
-        "messages": _messages(fields.get("messages")),
-        "network": {text(key): number(value) for key, value in network.items()} if isinstance(network, Mapping) else {},
-        "deployed": {text(key): text(value, limit=200) for key, value in deployed.items()},
-        "position": _position(fields.get("position")),
-        "laptop": text(fields.get("laptop"), limit=64),
-        "agent": text(fields.get("agent"), limit=64),
-        "stops": texts(fields.get("stops")),
-        "obeys": text(fields.get("obeys"), limit=64),
+        "uuid": clean_text(fields.get("uuid"), limit=64),
+        "name": clean_text(fields.get("name"), "unnamed", 64),
+        "kind": clean_text(fields.get("kind"), limit=64),
+        "description": clean_text(fields.get("description")),
+        "capabilities": clean_properties(fields.get("capabilities")),
+        "address": clean_text(fields.get("address"), limit=64),
+        "roles": clean_texts(fields.get("roles")),
+        "joined": clean_count(fields.get("joined")),
+        "since": clean_number(fields.get("since")),
+        "task": clean_text(fields.get("task"), limit=64),
+        "status": _read_status(fields.get("status"), DEVICE_STATUSES),
+        "messages": _read_messages(fields.get("messages")),
+        "network": {clean_text(key): clean_number(value) for key, value in network.items()}
+        if isinstance(network, Mapping)
+        else {},
+        "deployed": {clean_text(key): clean_text(value, limit=200) for key, value in deployed.items()},
+        "position": _read_position(fields.get("position")),
+        "laptop": clean_text(fields.get("laptop"), limit=64),
+        "agent": clean_text(fields.get("agent"), limit=64),
+        "stops": clean_texts(fields.get("stops")),
+        "obeys": clean_text(fields.get("obeys"), limit=64),
         "gone": None,
     }
 
 
-def task_view(fields: Fields) -> State:
+def make_task_view(fields: Fields) -> State:
     """Return one task as the page shows it."""
     note, result, why = fields.get("note"), fields.get("result"), fields.get("why")
     return {
-        "id": text(fields.get("id"), limit=64),
-        "kind": text(fields.get("kind"), limit=64),
-        "title": text(fields.get("title")) or text(fields.get("kind")) or "untitled",
-        "requirements": properties(fields.get("requirements")),
-        "waiting_period": number(fields.get("waiting_period")),
-        "strategy": text(fields.get("strategy")),
-        "group": text(fields.get("group"), limit=64),
-        "created": number(fields.get("created")),
-        "council": texts(fields.get("council")),
+        "id": clean_text(fields.get("id"), limit=64),
+        "kind": clean_text(fields.get("kind"), limit=64),
+        "title": clean_text(fields.get("title")) or clean_text(fields.get("kind")) or "untitled",
+        "requirements": clean_properties(fields.get("requirements")),
+        "waiting_period": clean_number(fields.get("waiting_period")),
+        "strategy": clean_text(fields.get("strategy")),
+        "group": clean_text(fields.get("group"), limit=64),
+        "created": clean_number(fields.get("created")),
+        "council": clean_texts(fields.get("council")),
         "paused": fields.get("paused") is True,
-        "priority": count(fields.get("priority")),
-        "deadline": number(fields.get("deadline")),
-        "status": _status(fields.get("status"), TASK_STATUSES),
-        "note": "\n".join(texts(note.split("\n"))) if isinstance(note, str) else "",
-        "result": _result(result) if isinstance(result, Mapping) else None,
-        "why": [_ruling_view(epoch) for epoch in why.get("epochs", ())] if isinstance(why, Mapping) else [],
+        "priority": clean_count(fields.get("priority")),
+        "deadline": clean_number(fields.get("deadline")),
+        "status": _read_status(fields.get("status"), TASK_STATUSES),
+        "note": "\n".join(clean_texts(note.split("\n"))) if isinstance(note, str) else "",
+        "result": _make_result(result) if isinstance(result, Mapping) else None,
+        "why": [_make_decision_view(epoch) for epoch in why.get("epochs", ())] if isinstance(why, Mapping) else [],
     }
 
 
-def group_view(task: str, title: str, members: Sequence[Fields], known: Mapping[str, str] | None = None) -> State:
+def make_group_view(task: str, title: str, members: Sequence[Fields], known: Mapping[str, str] | None = None) -> State:
     """Return the consensus point of one group: the winner that each agent computed, and whether they agree.
 
     The point is the agent named most often (of equals, the lowest uuid).  ``differ`` lists the members that named
     another agent, ``undecided`` the members without a choice yet.  ``known`` names devices without a report (uuid to
     name).  ``share`` is the cost (metres) relative to the largest.
     """
-    views = [_member_view(member) for member in members]
+    views = [_make_member_view(member) for member in members]
     views.sort(key=lambda view: (view["name"], view["uuid"]))
     names = {**(known or {}), **{view["uuid"]: view["name"] for view in views}}
     farthest = max((view["cost"] for view in views if view["cost"] is not None), default=0.0)
@@ -130,7 +132,7 @@ def group_view(task: str, title: str, members: Sequence[Fields], known: Mapping[
     for view in views:
         view["choice"] = names.get(view["assigned"], view["assigned"][:8])
     return {
-        "task": text(task, limit=64),
+        "task": clean_text(task, limit=64),
         "title": title,
         "members": views,
         "scale": farthest,
@@ -143,20 +145,20 @@ def group_view(task: str, title: str, members: Sequence[Fields], known: Mapping[
     }
 
 
-class Departed:
+class DepartedDevices:
     """Keeps devices that left for some time, so that the page shows them as gone."""
 
-    def __init__(self, remembered_s: float = REMEMBERED_S) -> None:
+    def __init__(self, remembered_s: float = DEPARTED_SHOWN_S) -> None:
         self._remembered_s = remembered_s
         self._last: dict[str, State] = {}
         self._gone: dict[str, State] = {}
 
-    def of(self, devices: Iterable[Fields], now: float) -> list[State]:
+    def update(self, devices: Iterable[Fields], now: float) -> list[State]:
         """Return the devices that left recently; ``gone`` is the unix time at which this was seen.
 
         Safe to call from several threads: each call replaces the stored tables and modifies nothing in place.
         """
-        present = {view["uuid"]: view for view in map(device_view, devices) if view["uuid"]}
+        present = {view["uuid"]: view for view in map(make_device_view, devices) if view["uuid"]}
         left = {uuid: {**view, "status": GONE, "gone": now} for uuid, view in self._last.items() if uuid not in present}
         gone = {**left, **self._gone}
         gone = {u: v for u, v in gone.items() if u not in present and now - v["gone"] < self._remembered_s}
@@ -164,28 +166,28 @@ class Departed:
         return [dict(view) for view in gone.values()]
 
 
-def _member_view(fields: Fields) -> State:
+def _make_member_view(fields: Fields) -> State:
     return {
-        "uuid": text(fields.get("uuid"), limit=64),
-        "name": text(fields.get("name"), "unnamed", 64),
-        "status": _status(fields.get("status"), DEVICE_STATUSES),
-        "cost": distance(fields.get("cost")),
-        "assigned": text(fields.get("assigned"), limit=64),
-        "token": count(fields.get("token")),
-        "why": text(fields.get("why"), limit=600),
-        "state": text(fields.get("state"), limit=32),
-        "epoch": count(fields.get("epoch")),
+        "uuid": clean_text(fields.get("uuid"), limit=64),
+        "name": clean_text(fields.get("name"), "unnamed", 64),
+        "status": _read_status(fields.get("status"), DEVICE_STATUSES),
+        "cost": clean_distance(fields.get("cost")),
+        "assigned": clean_text(fields.get("assigned"), limit=64),
+        "token": clean_count(fields.get("token")),
+        "why": clean_text(fields.get("why"), limit=600),
+        "state": clean_text(fields.get("state"), limit=32),
+        "epoch": clean_count(fields.get("epoch")),
         "available": fields.get("available") is not False,
-        "progress": distance(fields.get("progress")),
-        "post": None if fields.get("post") is None else round(math.degrees(number(fields.get("post")))),
+        "progress": clean_distance(fields.get("progress")),
+        "post": None if fields.get("post") is None else round(math.degrees(clean_number(fields.get("post")))),
     }
 
 
-def _result(fields: Fields) -> State:
-    return {"by": text(fields.get("by")), "took": number(fields.get("took"))}
+def _make_result(fields: Fields) -> State:
+    return {"by": clean_text(fields.get("by")), "took": clean_number(fields.get("took"))}
 
 
-def _ruling_view(fields: Fields) -> State:
+def _make_decision_view(fields: Fields) -> State:
     """Return one epoch of an ``Explanation``, with a row per device that reported or differs."""
     standby, winner = list(fields["standby"]), fields["winner"]
     differ = {each["name"]: each["what"] for each in fields["differ"]}
@@ -193,47 +195,47 @@ def _ruling_view(fields: Fields) -> State:
     for report in fields["reports"]:
         name = report["name"]
         note = "goes" if report["agent"] == winner else "stands by" if name in standby else ""
-        words = "; ".join(filter(None, (note, text(report["more"], limit=64))))
-        rows[name] = {"name": text(name, limit=64), "cost": number(report["cost"]), "note": words}
+        words = "; ".join(filter(None, (note, clean_text(report["more"], limit=64))))
+        rows[name] = {"name": clean_text(name, limit=64), "cost": clean_number(report["cost"]), "note": words}
     for name in (*fields["silent"], *differ):
-        rows.setdefault(name, {"name": text(name, limit=64), "cost": None, "note": ""})
+        rows.setdefault(name, {"name": clean_text(name, limit=64), "cost": None, "note": ""})
     for name, what in differ.items():
-        rows[name]["note"] = f"differs: {text(what, limit=200)}"
+        rows[name]["note"] = f"differs: {clean_text(what, limit=200)}"
     return {
-        "epoch": count(fields["epoch"]),
-        "chosen": text(fields["chosen"], limit=64),
+        "epoch": clean_count(fields["epoch"]),
+        "chosen": clean_text(fields["chosen"], limit=64),
         "agree": len(fields["agree"]),
-        "of": count(fields["of"]),
-        "differ": texts(list(differ)),
-        "rule": text(f"{fields['rule']} {fields['version']}".strip(), limit=100),
-        "hysteresis": text(fields["hysteresis"], limit=200),
-        "agreed": text(fields["agreed"], limit=64),
-        "digest": text(fields["digest"], limit=64),
-        "token": count(fields["token"]),
-        "reported": count(fields["reported"]),
+        "of": clean_count(fields["of"]),
+        "differ": clean_texts(list(differ)),
+        "rule": clean_text(f"{fields['rule']} {fields['version']}".strip(), limit=100),
+        "hysteresis": clean_text(fields["hysteresis"], limit=200),
+        "agreed": clean_text(fields["agreed"], limit=64),
+        "digest": clean_text(fields["digest"], limit=64),
+        "token": clean_count(fields["token"]),
+        "reported": clean_count(fields["reported"]),
         "rows": list(rows.values()),
     }
 
 
-def _position(value: object) -> State | None:
+def _read_position(value: object) -> State | None:
     """Return the position of a device in metres on its map, or in degrees on the globe; None if it reports neither."""
     reported = value if isinstance(value, Mapping) else {}
     x, y, heading, lat, lon, accuracy = (
-        number(reported.get(key), math.nan) for key in ("x", "y", "heading", "lat", "lon", "accuracy")
+        clean_number(reported.get(key), math.nan) for key in ("x", "y", "heading", "lat", "lon", "accuracy")
     )
-    if abs(x) <= FARTHEST and abs(y) <= FARTHEST:
+    if abs(x) <= MAX_DISTANCE_M and abs(y) <= MAX_DISTANCE_M:
         return {"x": x, "y": y, "heading": None if math.isnan(heading) else heading}
     if abs(lat) <= 90.0 and abs(lon) <= 180.0:
         return {"lat": lat, "lon": lon, "accuracy": accuracy if accuracy >= 0.0 else None}
     return None
 
 
-def _status(value: object, allowed: Sequence[str]) -> str:
+def _read_status(value: object, allowed: Sequence[str]) -> str:
     return value if isinstance(value, str) and value in allowed else UNKNOWN
 
 
-def _messages(value: object) -> list[list[float | str]]:
+def _read_messages(value: object) -> list[list[float | str]]:
     if not isinstance(value, list | tuple):
         return []
     pairs = [entry for entry in value if isinstance(entry, list | tuple) and len(entry) == 2]
-    return [[number(moment), text(words)] for moment, words in pairs[-MESSAGES:]]
+    return [[clean_number(moment), clean_text(words)] for moment, words in pairs[-MAX_MESSAGES:]]

@@ -22,18 +22,18 @@ from zope.interface import implementer
 
 from middleware.config.settings import IN_MEMORY, Settings
 from middleware.entangled.data.store import Store
-from webnode.certificate import Authority, Leaf, authority, leaf, nameable, plain, read
-from webnode.keyfile import Unsafe, keep, kept
-from webnode.server import listening
+from webnode.certificate import Authority, Leaf, filter_names, make_authority, make_leaf, normalize_name, parse_leaf
+from webnode.keyfile import UnsafeFile, read_key_file, write_key_file
+from webnode.server import open_port
 
-LEAF = ".tls"
+FILE_SUFFIX = ".tls"
 """Suffix of the file with the certificate and its key, next to the node's store."""
-AUTHORITY = "page/authority"
+SEED_NOTE = "page/authority"
 """Key of the note in the node's store with the seed of its authority."""
 SEED_BYTES = 32
-LOOK_S = 60.0
+CHECK_S = 60.0
 """Minimum interval in seconds between two checks of the certificate, made when a client connects."""
-MOST_REACHED = 8
+MAX_REACHED = 8
 
 Names = Callable[[], Collection[str]]
 """Returns the current addresses and names of this machine in the network."""
@@ -42,7 +42,7 @@ _log = Logger()
 
 
 @implementer(IOpenSSLServerConnectionCreator)
-class Certified:
+class CertificateProvider:
     """The certificate for connections: from the file, or a new one.
 
     With ``path`` None it is not stored.  ``wall`` returns unix time, ``names`` the names of this machine.
@@ -73,20 +73,20 @@ class Certified:
         """The addresses and names in the certificate."""
         return self._leaf.names
 
-    def reached(self, host: str) -> None:
+    def add_reached(self, host: str) -> None:
         """Add an address of this machine, to which a client has connected, to the certificate."""
-        for name in nameable([host]):
+        for name in filter_names([host]):
             if name not in self._leaf.names:
-                self._reached = [*self._reached, name][-MOST_REACHED:]
+                self._reached = [*self._reached, name][-MAX_REACHED:]
                 self._checked_at = 0.0
 
     def serverConnectionForTLS(self, protocol: object) -> Connection:  # noqa: N802
         """Return the TLS state of the next connection."""
         now = self._wall()
         # Check again also if the clock was set back.
-        if not 0.0 <= now - self._checked_at < LOOK_S:
+        if not 0.0 <= now - self._checked_at < CHECK_S:
             self._checked_at = now
-            flaw = self._leaf.flaw(self._signer, self._required_names(), now)
+            flaw = self._leaf.find_flaw(self._signer, self._required_names(), now)
             if flaw:
                 self._leaf, self._options = self._create(flaw), None
         if self._options is None:
@@ -105,12 +105,12 @@ class Certified:
         if self._path is None:
             return None
         try:
-            pem = kept(self._path)
+            pem = read_key_file(self._path)
             if pem is None:
                 return None
-            stored = read(pem)
-            flaw = stored.flaw(self._signer, self._required_names(), self._wall())
-        except (Unsafe, ValueError) as error:
+            stored = parse_leaf(pem)
+            flaw = stored.find_flaw(self._signer, self._required_names(), self._wall())
+        except (UnsafeFile, ValueError) as error:
             flaw = str(error)
         if not flaw:
             return stored
@@ -119,15 +119,15 @@ class Certified:
 
     def _create(self, why: str) -> Leaf:
         """Create a certificate and store it in the file."""
-        created = leaf(self._signer, self._title, self._required_names(), self._wall(), self._rng)
+        created = make_leaf(self._signer, self._title, self._required_names(), self._wall(), self._rng)
         _log.info("new certificate for {names}: {why}", names=", ".join(created.names), why=why)
-        excluded = [name for name in self._required_names() if name and not plain(name)]
+        excluded = [name for name in self._required_names() if name and not normalize_name(name)]
         if excluded:
             warning = "{names}: not local names, so not in the certificate; open the page by another name"
             _log.warn(warning, names=", ".join(excluded))
         if self._path is not None:
             try:
-                keep(self._path, created.pem_with_key)
+                write_key_file(self._path, created.pem_with_key)
             except OSError as error:
                 _log.warn(
                     "cannot store the certificate in {path} ({error}): the next start creates another",
@@ -137,56 +137,56 @@ class Certified:
         return created
 
 
-class _Connection(BufferingTLSTransport):
+class _TlsProtocol(BufferingTLSTransport):
     factory: Any
 
     def makeConnection(self, transport: Any) -> None:  # noqa: N802
         # The address that the client dialled has to be in the certificate.
-        self.factory.certified.reached(str(getattr(transport.getHost(), "host", "")))
+        self.factory.provider.add_reached(str(getattr(transport.getHost(), "host", "")))
         super().makeConnection(transport)
 
 
-class _Connections(TLSMemoryBIOFactory):
-    protocol = _Connection
+class _TlsFactory(TLSMemoryBIOFactory):
+    protocol = _TlsProtocol
     noisy = False
 
-    def __init__(self, certified: Certified, site: Site, clock: Any) -> None:
+    def __init__(self, certified: CertificateProvider, site: Site, clock: Any) -> None:
         super().__init__(certified, False, site, clock)
-        self.certified = certified
+        self.provider = certified
 
 
-class TlsDoor:
+class TlsPort:
     """The TLS port; ``signer`` is the authority that a visitor's browser should trust."""
 
-    def __init__(self, reactor: Any, host: str, port: int, signer: Authority, certified: Certified) -> None:
+    def __init__(self, reactor: Any, host: str, port: int, signer: Authority, certified: CertificateProvider) -> None:
         self.signer = signer
         self._reactor = reactor
         self._host = host
         self._port = port
-        self._certified = certified
+        self._provider = certified
 
     def open(self, site: Site) -> IListeningPort:
         """Open the port for ``site``; raises ``PortTaken``."""
-        connections = _Connections(self._certified, site, self._reactor)
-        return listening(self._reactor, self._host, self._port, connections, "tls_port")
+        connections = _TlsFactory(self._provider, site, self._reactor)
+        return open_port(self._reactor, self._host, self._port, connections, "tls_port")
 
 
-def door(
+def make_tls_port(
     settings: Settings, store: Store, reactor: Any, wall: Callable[[], float], rng: random.Random, names: Names
-) -> TlsDoor:
+) -> TlsPort:
     """Return the TLS port of the page for the node with this ``store``."""
     web, node = settings.web, settings.node
-    signer = authority(_seed(store, rng), node.name)
-    path = None if node.store == IN_MEMORY else Path(f"{node.store}{LEAF}")
-    certified = Certified(signer, node.name, path, names, wall, rng)
+    signer = make_authority(_load_seed(store, rng), node.name)
+    path = None if node.store == IN_MEMORY else Path(f"{node.store}{FILE_SUFFIX}")
+    certified = CertificateProvider(signer, node.name, path, names, wall, rng)
     _log.info("phones that trust the authority {fingerprint} trust this node's page", fingerprint=signer.fingerprint)
-    return TlsDoor(reactor, web.host, web.tls_port, signer, certified)
+    return TlsPort(reactor, web.host, web.tls_port, signer, certified)
 
 
-def _seed(store: Store, rng: random.Random) -> bytes:
+def _load_seed(store: Store, rng: random.Random) -> bytes:
     """Return the seed of this node's authority, drawn at the first start."""
-    seed = store.noted(AUTHORITY)
+    seed = store.get_note(SEED_NOTE)
     if seed is None or len(seed) != SEED_BYTES:
         seed = rng.randbytes(SEED_BYTES)
-        store.note(AUTHORITY, seed)
+        store.set_note(SEED_NOTE, seed)
     return seed

@@ -15,8 +15,8 @@ from itsdangerous import BadData, Signer
 from itsdangerous.encoding import base64_decode, base64_encode
 from itsdangerous.signer import SigningAlgorithm
 
-from middleware.entangled.identity import Identity, verified
-from webnode.visitor import Role
+from middleware.entangled.identity import Identity, is_signature_valid
+from webnode.auth import Role
 
 ROLES: tuple[Role, ...] = ("viewer", "operator", "phone")
 VERSION = 3
@@ -26,10 +26,10 @@ MAX_VOUCHERS = 3
 """Maximum number of other web nodes through which a session may have come."""
 MAX_PARENTS = 3
 MAX_TEXT = 700
-REMEMBERED = 512
+MAX_CACHED = 512
 """Number of verified tokens cached; a verification takes 80 us, and streams are checked every second."""
-MAX_MOMENT = 2**40
-DOMAIN = b"swarm-page-1 "
+MAX_TIME_S = 2**40
+SIGNATURE_DOMAIN = b"swarm-page-1 "
 
 
 @dataclass(frozen=True)
@@ -65,11 +65,11 @@ class Ed25519(SigningAlgorithm):
     def get_signature(self, key: bytes, value: bytes) -> bytes:
         """Return the signature of ``value``; ``key`` is the public key of the identity."""
         assert self._identity is not None and key == self._identity.public
-        return self._identity.sign(DOMAIN + value)
+        return self._identity.sign(SIGNATURE_DOMAIN + value)
 
     def verify_signature(self, key: bytes, value: bytes, sig: bytes) -> bool:
         """Return whether the owner of the public key ``key`` signed ``value``."""
-        return verified(key, DOMAIN + value, sig)
+        return is_signature_valid(key, SIGNATURE_DOMAIN + value, sig)
 
 
 class TokenKey:
@@ -78,19 +78,19 @@ class TokenKey:
     def __init__(self, identity: Identity) -> None:
         self.public = identity.public
         self.node_id = identity.node_id
-        self._signer = _signer(identity.public, Ed25519(identity))
-        self._read = lru_cache(REMEMBERED)(self._verify)
+        self._signer = _make_signer(identity.public, Ed25519(identity))
+        self._read = lru_cache(MAX_CACHED)(self._verify)
 
-    def token(self, claim: Claim, audience: bytes = b"") -> str:
+    def sign_token(self, claim: Claim, audience: bytes = b"") -> str:
         """Return the token of ``claim`` for the node with the id ``audience``, by default for this one.
 
         It consists of letters, digits, ``-``, ``_`` and ``.``.  A token for this node does not name it.
         """
         is_own = audience in (b"", self.node_id)
-        value = base64_encode(packed(claim, b"" if is_own else audience))
+        value = base64_encode(encode_claim(claim, b"" if is_own else audience))
         return self._signer.sign(value if is_own else base64_encode(self.public) + b"." + value).decode()
 
-    def claim(self, text: str) -> Claim | None:
+    def read_claim(self, text: str) -> Claim | None:
         """Return the content of a token for this node, with its signer among the vouchers; None if it is invalid.
 
         The caller checks the expiry and whether the vouchers may vouch.
@@ -104,18 +104,18 @@ class TokenKey:
             public = self.public if is_own else base64_decode(issuer)
             if len(public) != len(self.public):
                 return None
-            _signer(public, Ed25519()).unsign(text)
-            return unpacked(base64_decode(value), public, b"" if is_own else self.node_id)
+            _make_signer(public, Ed25519()).unsign(text)
+            return decode_claim(base64_decode(value), public, b"" if is_own else self.node_id)
         except (BadData, ValueError, TypeError):
             return None
 
 
-def _signer(public: bytes, algorithm: Ed25519) -> Signer:
+def _make_signer(public: bytes, algorithm: Ed25519) -> Signer:
     # No key derivation: the algorithm is asymmetric, and the key names the signer.
     return Signer(public, key_derivation="none", algorithm=algorithm)
 
 
-def packed(claim: Claim, audience: bytes = b"") -> bytes:
+def encode_claim(claim: Claim, audience: bytes = b"") -> bytes:
     """Encode a claim."""
     flags = ROLES.index(claim.role) << 1 | claim.is_ticket
     vouchers = list(claim.vouchers)
@@ -124,7 +124,7 @@ def packed(claim: Claim, audience: bytes = b"") -> bytes:
     return bytes(msgpack.packb([*fields, parents, vouchers, audience]))
 
 
-def unpacked(data: bytes, issuer: bytes, audience: bytes) -> Claim:
+def decode_claim(data: bytes, issuer: bytes, audience: bytes) -> Claim:
     """Decode the claim in ``data``, signed by ``issuer``; raises ``ValueError`` if it is not valid for ``audience``."""
     fields = msgpack.unpackb(data)
     version, flags, until, limit, session, name, parents, vouchers, meant = fields
@@ -132,7 +132,7 @@ def unpacked(data: bytes, issuer: bytes, audience: bytes) -> Claim:
         version == VERSION
         and type(flags) is int
         and 0 <= flags < 2 * len(ROLES)
-        and all(type(each) is int and 0 <= each < MAX_MOMENT for each in (until, limit))
+        and all(type(each) is int and 0 <= each < MAX_TIME_S for each in (until, limit))
         and isinstance(name, str)
         and isinstance(parents, list)
         and isinstance(vouchers, list)

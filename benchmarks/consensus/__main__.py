@@ -16,23 +16,23 @@ from pathlib import Path
 from statistics import fmean, median
 from typing import Any
 
-from benchmarks.consensus.decider import DECIDERS, FEWER, MEETINGS, TALKED, Owners
+from benchmarks.consensus.cbba_run import ROUND_S, run_cbba
+from benchmarks.consensus.decider import DECIDERS, EXCHANGING, LIMITED_OPTIMUM, MEETINGS, Owners
 from benchmarks.consensus.mission import Mission
-from benchmarks.consensus.oracle import least_star, least_way, travelled
-from benchmarks.consensus.outcome import ALL, gathered, outcome
-from benchmarks.consensus.plot import drawn
-from benchmarks.consensus.talk import ROUND_S, talked
+from benchmarks.consensus.oracle import measure_routes, search_routes, solve_assignment
+from benchmarks.consensus.outcome import MAX_FULL_BIDDERS, make_collected_outcome, make_outcome
+from benchmarks.consensus.plot import draw_svg
 from middleware.consensus.strategies import hungarian
-from middleware.consensus.strategies.sequential import ways_of
+from middleware.consensus.strategies.sequential import plan_routes
 
 SIZES = (3, 10, 30, 100, 300, 1000)
-QUICK = (3, 10, 30, 100)
+QUICK_SIZES = (3, 10, 30, 100)
 SEEDS, QUICK_SEEDS = 10, 2
-DEAREST = 3000
+MAX_AGENTS = 3000
 """Maximum number of agents in all missions of one size together: the cost of a mission grows with their square."""
-FAILED = 10
-PATHS = ((3, 3), (3, 6), (10, 10), (10, 20), (50, 50), (50, 100))
-WAY_S, QUICK_WAY_S = 0.08, 0.01
+FAILED_PERCENT = 10
+ROUTE_SIZES = ((3, 3), (3, 6), (10, 10), (10, 20), (50, 50), (50, 100))
+ROUTE_SEARCH_S, QUICK_ROUTE_SEARCH_S = 0.08, 0.01
 """Seconds of the search for the shortest routes, for each task."""
 
 
@@ -45,12 +45,12 @@ def main() -> int:
     )
     parser.add_argument(
         "--seeds", type=int, default=0,
-        help=f"missions of each size, at most {DEAREST} agents in total (default {SEEDS}, quick {QUICK_SEEDS})",
+        help=f"missions of each size, at most {MAX_AGENTS} agents in total (default {SEEDS}, quick {QUICK_SEEDS})",
     )  # fmt: skip
     parser.add_argument("--out", type=Path, help="write everything as JSON")
     parser.add_argument("--plot", type=Path, help="draw the costs as SVG")
     wanted = parser.parse_args()
-    sizes = [int(n) for n in wanted.sizes.split(",")] if wanted.sizes else list(QUICK if wanted.quick else SIZES)
+    sizes = [int(n) for n in wanted.sizes.split(",")] if wanted.sizes else list(QUICK_SIZES if wanted.quick else SIZES)
     seeds = wanted.seeds or (QUICK_SEEDS if wanted.quick else SEEDS)
     gc.disable()  # otherwise the garbage collector scans a thousand agents in one process, without finding garbage
     began = time.monotonic()
@@ -58,11 +58,11 @@ def main() -> int:
           f" {'kB':>6s} {'rounds':>6s} {'agree s':>7s} {'CPU ms':>8s}")  # fmt: skip
     rows = []
     for size in sizes:
-        for row in judged(size, range(1, 1 + max(1, min(seeds, DEAREST // size)))):
+        for row in measure_size(size, range(1, 1 + max(1, min(seeds, MAX_AGENTS // size)))):
             rows.append(row)
-            print(line(row), flush=True)
-    ways = paths(1 if wanted.quick else 5, QUICK_WAY_S if wanted.quick else WAY_S)
-    found = targets(rows, ways, range(1, 1 + seeds))
+            print(format_row(row), flush=True)
+    ways = compare_routes(1 if wanted.quick else 5, QUICK_ROUTE_SEARCH_S if wanted.quick else ROUTE_SEARCH_S)
+    found = check_targets(rows, ways, range(1, 1 + seeds))
     print(f"\nRoutes through several tasks, sequential, relative to the best known ({ways['by']}), and the maximum:")
     for key, ratio in ways["ratios"].items():
         print(f"    {key:12s} {ratio:.3f} {ways['worst'][key]:.3f}")
@@ -74,42 +74,44 @@ def main() -> int:
     if wanted.out:
         wanted.out.write_text(json.dumps({"rows": rows, "ways": ways, "targets": found}, indent=1), encoding="utf-8")
     if wanted.plot:
-        wanted.plot.write_text(drawn(rows), encoding="utf-8")
+        wanted.plot.write_text(draw_svg(rows), encoding="utf-8")
     return int(not all(target["is_met"] for target in found))
 
 
-def judged(size: int, seeds: range) -> list[dict[str, Any]]:
+def measure_size(size: int, seeds: range) -> list[dict[str, Any]]:
     """Return a row for every strategy on the missions of one size."""
-    found = [tried(size, seed) for seed in seeds]
-    return [summed_up(size, name, [one[name] for one in found]) for name in DECIDERS]
+    found = [run_mission(size, seed) for seed in seeds]
+    return [summarize(size, name, [one[name] for one in found]) for name in DECIDERS]
 
 
-def tried(size: int, seed: int) -> dict[str, dict[str, Any]]:
+def run_mission(size: int, seed: int) -> dict[str, dict[str, Any]]:
     """Return the results of each strategy on one mission."""
-    calm, after = Mission(size, size, seed), Mission(size, size, seed, FAILED)
-    (least, by), (least_after, _) = least_star(calm), least_star(after)
-    talk, alive = talked(calm), set(after.alive)
+    calm, after = Mission(size, size, seed), Mission(size, size, seed, FAILED_PERCENT)
+    (least, by), (least_after, _) = solve_assignment(calm), solve_assignment(after)
+    talk, alive = run_cbba(calm), set(after.alive)
     found = {}
     for name in DECIDERS:
-        now, then = outcome(name, calm, talk), outcome(name, after)
+        now, then = make_outcome(name, calm, talk), make_outcome(name, after)
         kept = [task for task, agent in now.owners.items() if agent in alive]
-        is_greedy = name == "cbba" and size <= ALL  # otherwise CBBA did not use every bid
+        is_greedy = name == "cbba" and size <= MAX_FULL_BIDDERS  # otherwise CBBA did not use every bid
         found[name] = {
-            "ratio": cost(calm, now.owners) / least,
-            "ratio_failed": cost(after, then.owners) / least_after,
+            "ratio": compute_cost(calm, now.owners) / least,
+            "ratio_failed": compute_cost(after, then.owners) / least_after,
             "moved": sum(then.owners.get(task) != now.owners[task] for task in kept) / max(1, len(kept)),
             "messages": now.messages,
             "kB": now.kB,
             "rounds": now.rounds,
             "cpu_ms": now.cpu_ms,
             "by": by,
-            "two_owners": sum(len(o) > 1 for o in talk.owners.values()) if name in TALKED else 0,
-            "unlike_greedy": len(gathered(name, calm).owners.items() ^ now.owners.items()) if is_greedy else 0,
+            "two_owners": sum(len(o) > 1 for o in talk.owners.values()) if name in EXCHANGING else 0,
+            "unlike_greedy": len(make_collected_outcome(name, calm).owners.items() ^ now.owners.items())
+            if is_greedy
+            else 0,
         }
     return found
 
 
-def summed_up(size: int, name: str, found: list[dict[str, Any]]) -> dict[str, Any]:
+def summarize(size: int, name: str, found: list[dict[str, Any]]) -> dict[str, Any]:
     """Summarise one strategy on the missions of one size: means, and the median of the processor time."""
     means = ("ratio", "ratio_failed", "moved", "messages", "kB", "rounds")
     row: dict[str, Any] = {"agents": size, "missions": len(found), "strategy": name, "by": found[0]["by"]}
@@ -117,32 +119,32 @@ def summed_up(size: int, name: str, found: list[dict[str, Any]]) -> dict[str, An
     row |= {key: sum(one[key] for one in found) for key in ("two_owners", "unlike_greedy")}
     row["cpu_ms"] = median(one["cpu_ms"] for one in found)
     # The agents of CBBA compute in parallel, also while messages are in transit.
-    row["agree_s"] = row["rounds"] * ROUND_S + (0.0 if name in TALKED else row["cpu_ms"] / 1000.0)
+    row["agree_s"] = row["rounds"] * ROUND_S + (0.0 if name in EXCHANGING else row["cpu_ms"] / 1000.0)
     return row
 
 
-def cost(mission: Mission, owners: Owners) -> float:
+def compute_cost(mission: Mission, owners: Owners) -> float:
     """Return the sum of all routes; a task without an agent costs as much as the longest route."""
     longest = max(max(row.values()) for row in mission.costs.values())
-    return float(sum(mission.costs[owners[t]][t] if t in owners else longest for t in mission.places))
+    return float(sum(mission.costs[owners[t]][t] if t in owners else longest for t in mission.task_positions))
 
 
-def paths(seeds: int, seconds: float) -> dict[str, Any]:
+def compare_routes(seeds: int, seconds: float) -> dict[str, Any]:
     """Compare the routes of the sequential auction with the shortest known after ``seconds`` per task."""
     ratios, worst, by = {}, {}, ""
-    for agents, tasks in PATHS:
+    for agents, tasks in ROUTE_SIZES:
         found = []
         for seed in range(1, seeds + 1):
             mission = Mission(agents, tasks, seed, spare=1)
-            ways = ways_of(mission.reports(mission.alive, tasks), mission.items) or {}
-            best, by = least_way(mission, ways, seconds * tasks)
-            found.append(travelled(mission, ways) / best)
+            ways = plan_routes(mission.make_reports(mission.alive, tasks), mission.items) or {}
+            best, by = search_routes(mission, ways, seconds * tasks)
+            found.append(measure_routes(mission, ways) / best)
         ratios[f"{agents} x {tasks}"] = fmean(found)
         worst[f"{agents} x {tasks}"] = max(found)
     return {"ratios": ratios, "worst": worst, "by": by}
 
 
-def targets(rows: list[dict[str, Any]], ways: dict[str, Any], seeds: range) -> list[dict[str, Any]]:
+def check_targets(rows: list[dict[str, Any]], ways: dict[str, Any], seeds: range) -> list[dict[str, Any]]:
     """Return the targets, and whether they are met."""
     hundred = {row["strategy"]: row for row in rows if row["agents"] == 100}
     found = []
@@ -152,7 +154,7 @@ def targets(rows: list[dict[str, Any]], ways: dict[str, Any], seeds: range) -> l
 
     if hundred:
         demand("cost of group_optimal, 100 x 100", hundred["group_optimal"]["ratio"], 1.0)
-        demand("  with 20 bids of each", hundred[FEWER]["ratio"], 1.01)
+        demand("  with 20 bids of each", hundred[LIMITED_OPTIMUM]["ratio"], 1.01)
         demand("cost of cbba + exchange, 100 x 100", hundred["cbba + exchange"]["ratio"], 1.05)
         demand("  by meetings of two", hundred[MEETINGS]["ratio"], 1.05)
         demand("messages of an agent, cbba, 100 x 100, four neighbours", hundred["cbba"]["messages"], 70.0)
@@ -162,11 +164,11 @@ def targets(rows: list[dict[str, Any]], ways: dict[str, Any], seeds: range) -> l
     demand("tasks with two owners, cbba, all sizes", float(sum(row["two_owners"] for row in rows)), 0.0)
     demand("ways of sequential, mean of six sets", fmean(ways["ratios"].values()), 1.15)
     for size, most in ((100, 10.0), (300, 300.0)):
-        demand(f"Hungarian without a library, {size} x {size}, ms", solving(size, seeds), most)
+        demand(f"Hungarian without a library, {size} x {size}, ms", measure_solver_ms(size, seeds), most)
     return found
 
 
-def solving(size: int, seeds: range) -> float:
+def measure_solver_ms(size: int, seeds: range) -> float:
     """Return the milliseconds of processor time of one exact assignment, the median of several."""
     took = []
     for seed in seeds:
@@ -174,12 +176,12 @@ def solving(size: int, seeds: range) -> float:
         costs = [list(row.values()) for row in mission.costs.values()]
         for _ in range(5 if size <= 100 else 1):
             began = time.process_time()
-            hungarian.assigned(costs)
+            hungarian.solve(costs)
             took.append((time.process_time() - began) * 1000.0)
     return median(took)
 
 
-def line(row: dict[str, Any]) -> str:
+def format_row(row: dict[str, Any]) -> str:
     """Return one row of the table."""
     assert math.isfinite(row["ratio"])
     return (

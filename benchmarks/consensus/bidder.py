@@ -41,14 +41,14 @@ class Bidder:
         self._known: dict[str, dict[str, Statement]] = {task: {} for task in self._tasks}
         self._rival: dict[str, Statement | None] = dict.fromkeys(self._tasks)
         self._sent_statements: dict[str, Statement | None] = dict.fromkeys(self._tasks)
-        self._out: dict[tuple[str, str], Statement] = {}
+        self._outgoing: dict[tuple[str, str], Statement] = {}
         self._received_statements: dict[str, dict[tuple[str, str], int]] = {}
         self._touched: set[str] = set()
         self._disowned: set[str] = set()
         self._count = 0
         self._rebuild_bundle()
 
-    def winner(self, task: str) -> Statement | None:
+    def find_winner(self, task: str) -> Statement | None:
         """Return the highest valid bid for a task in this agent's view, or None."""
         own = self._known[task].get(self.agent)
         rival = self._rival[task]
@@ -56,7 +56,7 @@ class Bidder:
             return rival
         return own if rival is None or _beats(own.bid, self.agent, rival) else rival
 
-    def hear(self, neighbour: str, statements: Sequence[Statement]) -> list[Statement]:
+    def receive(self, neighbour: str, statements: Sequence[Statement]) -> list[Statement]:
         """Process a neighbour's statements; return newer statements that the neighbour should have."""
         corrections = []
         is_moved = False
@@ -78,7 +78,7 @@ class Bidder:
                 continue
             bids[agent] = said
             if known is not None and known.bid > 0.0:
-                self._out[task, agent] = said  # it replaces the forwarded statement
+                self._outgoing[task, agent] = said  # it replaces the forwarded statement
             is_moved |= self._update_rival(said)
         if is_moved:
             self._rebuild_bundle()
@@ -90,11 +90,11 @@ class Bidder:
         A call every few message times instead of every time gives fewer and larger messages with the same content.
         """
         for task in sorted(self._touched):
-            best = self.winner(task)
+            best = self.find_winner(task)
             if best is not None and best != self._sent_statements[task]:
-                self._out[task, best.agent] = self._sent_statements[task] = best
-        news = sorted(self._out.items())
-        self._out.clear()
+                self._outgoing[task, best.agent] = self._sent_statements[task] = best
+        news = sorted(self._outgoing.items())
+        self._outgoing.clear()
         self._touched.clear()
         found = {}
         for neighbour in self.neighbours:
@@ -107,7 +107,7 @@ class Bidder:
     @property
     def is_quiet(self) -> bool:
         """Whether there is nothing to send."""
-        return not self._out and not self._touched
+        return not self._outgoing and not self._touched
 
     def _adopt_previous_run(self, said: Statement) -> bool:
         """Number new statements above the statements of a previous run of this agent, which others remember."""
@@ -162,13 +162,13 @@ class Bidder:
             if own is None or own.bid != bid:
                 self._count += 1
                 stated = Statement(task, self.agent, self._count, bid)
-                self._known[task][self.agent] = self._out[task, self.agent] = stated
+                self._known[task][self.agent] = self._outgoing[task, self.agent] = stated
                 self._touched.add(task)
         self._disowned.clear()
         self.bundle = tuple(bids)
 
 
-def is_over(rounds: int, quiet: int, tasks: int, members: int) -> bool:
+def is_final(rounds: int, quiet: int, tasks: int, members: int) -> bool:
     """Return whether the result is final after ``rounds`` synchronous rounds, the last ``quiet`` without changes.
 
     Silence is no proof, because distant agents may still change their bids. The bound is the number of tasks times the

@@ -5,9 +5,9 @@ from __future__ import annotations
 from collections.abc import Callable
 
 from benchmarks.consensus.mission import Mission
-from middleware.consensus.item import Sharing, capacities, exact
-from middleware.consensus.strategies.cbba import Cbba, greedy
-from middleware.consensus.strategies.group_optimal import BIDS, GroupOptimal
+from middleware.consensus.assignment import MultiTaskStrategy, find_capacities, to_millionths
+from middleware.consensus.strategies.cbba import Cbba, assign_greedily
+from middleware.consensus.strategies.group_optimal import FIRST_PASS_BIDS, GroupOptimal
 from middleware.consensus.strategies.nearest import Nearest
 from middleware.consensus.strategies.sequential import Sequential
 from middleware.consensus.strategy import Consensus, Report
@@ -16,14 +16,14 @@ Owners = dict[str, str]
 Decider = Callable[[Mission, list[Report]], Owners]
 
 
-def in_order(mission: Mission, reports: list[Report]) -> Owners:
+def decide_in_order(mission: Mission, reports: list[Report]) -> Owners:
     """The rule of the thesis: one task after the other; an agent with a full bundle does not bid."""
-    left = capacities(reports)
+    left = find_capacities(reports)
     owners: Owners = {}
     bids: dict[str, list[Report]] = {}
     for report in reports:
         bids.setdefault(report.task, []).append(report)
-    for task in mission.places:
+    for task in mission.task_positions:
         free = [r for r in bids.get(task, ()) if left[r.agent] > 0]
         chosen = Nearest().find(free).assigned_agent
         if chosen is not None:
@@ -32,15 +32,15 @@ def in_order(mission: Mission, reports: list[Report]) -> Owners:
     return owners
 
 
-def bundled(mission: Mission, reports: list[Report]) -> Owners:
+def decide_greedily(mission: Mission, reports: list[Report]) -> Owners:
     """CBBA without exchange, which ends at the greedy assignment."""
     costs: dict[str, dict[str, float]] = {}
     for report in reports:
-        costs.setdefault(report.agent, {})[report.task] = exact(report.cost)
-    return greedy(costs, capacities(reports))
+        costs.setdefault(report.agent, {})[report.task] = to_millionths(report.cost)
+    return assign_greedily(costs, find_capacities(reports))
 
 
-def shared(strategy: Sharing) -> Decider:
+def make_decider(strategy: MultiTaskStrategy) -> Decider:
     """Return the function of a strategy for several tasks."""
 
     def decide(mission: Mission, reports: list[Report]) -> Owners:
@@ -50,7 +50,7 @@ def shared(strategy: Sharing) -> Decider:
     return decide
 
 
-def with_all_bids() -> GroupOptimal:
+def make_exact_optimum() -> GroupOptimal:
     """The optimum over all bids, instead of 20 of each agent."""
     strategy = GroupOptimal()
     strategy.bids = 10**6
@@ -58,16 +58,16 @@ def with_all_bids() -> GroupOptimal:
 
 
 MEETINGS = "cbba, then meetings"
-TALKED = ("cbba", MEETINGS)
-FEWER = f"group_optimal, {BIDS} bids"
+EXCHANGING = ("cbba", MEETINGS)
+LIMITED_OPTIMUM = f"group_optimal, {FIRST_PASS_BIDS} bids"
 DECIDERS: dict[str, Decider] = {
-    "nearest, in order": in_order,
-    "cbba": bundled,
-    MEETINGS: bundled,
-    "cbba + exchange": shared(Cbba()),
-    "sequential": shared(Sequential()),
-    FEWER: shared(GroupOptimal()),
-    "group_optimal": shared(with_all_bids()),
+    "nearest, in order": decide_in_order,
+    "cbba": decide_greedily,
+    MEETINGS: decide_greedily,
+    "cbba + exchange": make_decider(Cbba()),
+    "sequential": make_decider(Sequential()),
+    LIMITED_OPTIMUM: make_decider(GroupOptimal()),
+    "group_optimal": make_decider(make_exact_optimum()),
 }
-NAMED = {FEWER: BIDS}
+BIDS_BY_NAME = {LIMITED_OPTIMUM: FIRST_PASS_BIDS}
 """Bids of each agent, if the number does not depend on the team."""

@@ -8,11 +8,11 @@ from collections.abc import Collection
 from dataclasses import dataclass
 from functools import cached_property
 
-from middleware.consensus.item import Item, exact
+from middleware.consensus.assignment import Item, to_millionths
 from middleware.consensus.strategy import Report
 
-SIDE = 1000.0
-Place = tuple[float, float]
+SIDE_M = 1000.0
+Position = tuple[float, float]
 
 
 @dataclass(frozen=True)
@@ -31,44 +31,50 @@ class Mission:
         return math.ceil(self.tasks / max(1, len(self.alive))) + self.spare
 
     @cached_property
-    def starts(self) -> dict[str, Place]:
+    def agent_positions(self) -> dict[str, Position]:
         """The position of each agent."""
         rng = random.Random(f"agents/{self.agents}/{self.tasks}/{self.seed}")
-        return {f"a{n:04d}": (rng.uniform(0, SIDE), rng.uniform(0, SIDE)) for n in range(self.agents)}
+        return {f"a{n:04d}": (rng.uniform(0, SIDE_M), rng.uniform(0, SIDE_M)) for n in range(self.agents)}
 
     @cached_property
-    def places(self) -> dict[str, Place]:
+    def task_positions(self) -> dict[str, Position]:
         """The position of each task."""
         rng = random.Random(f"tasks/{self.agents}/{self.tasks}/{self.seed}")
-        return {f"t{n:04d}": (rng.uniform(0, SIDE), rng.uniform(0, SIDE)) for n in range(self.tasks)}
+        return {f"t{n:04d}": (rng.uniform(0, SIDE_M), rng.uniform(0, SIDE_M)) for n in range(self.tasks)}
 
     @cached_property
     def alive(self) -> list[str]:
         """The agents that do not fail."""
         rng = random.Random(f"failed/{self.agents}/{self.seed}")
         gone = set(rng.sample(range(self.agents), self.agents * self.failed // 100))
-        return [agent for number, agent in enumerate(sorted(self.starts)) if number not in gone]
+        return [agent for number, agent in enumerate(sorted(self.agent_positions)) if number not in gone]
 
     @cached_property
     def items(self) -> list[Item]:
         """The tasks as input of the strategies."""
-        return [Item(task, place) for task, place in self.places.items()]
+        return [Item(task, place) for task, place in self.task_positions.items()]
 
     @cached_property
     def costs(self) -> dict[str, dict[str, int]]:
         """The distance from each agent to each task, in whole micrometres."""
-        return {a: {t: exact(math.dist(s, p)) for t, p in self.places.items()} for a, s in self.starts.items()}
+        return {
+            a: {t: to_millionths(math.dist(s, p)) for t, p in self.task_positions.items()}
+            for a, s in self.agent_positions.items()
+        }
 
     @cached_property
-    def near(self) -> dict[str, list[tuple[float, str]]]:
+    def nearest_tasks(self) -> dict[str, list[tuple[float, str]]]:
         """For each agent the distance to each task in metres, and the task, the nearest first."""
-        return {a: sorted((math.dist(s, p), t) for t, p in self.places.items()) for a, s in self.starts.items()}
+        return {
+            a: sorted((math.dist(s, p), t) for t, p in self.task_positions.items())
+            for a, s in self.agent_positions.items()
+        }
 
-    def reports(self, agents: list[str], bids: int, also: Collection[str] = ()) -> list[Report]:
+    def make_reports(self, agents: list[str], bids: int, also: Collection[str] = ()) -> list[Report]:
         """Return the bids of some agents, each for its ``bids`` nearest tasks and for the tasks ``also``."""
         found = []
         for agent in agents:
-            start, ways = self.starts[agent], self.near[agent]
+            start, ways = self.agent_positions[agent], self.nearest_tasks[agent]
             ways = ways[:bids] + [(way, task) for way, task in ways[bids:] if task in also]
             found += [Report(agent, way, task=t, value=start, capacity=self.capacity) for way, t in ways]
         return found

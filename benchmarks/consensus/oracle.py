@@ -8,38 +8,40 @@ from typing import Any
 
 from benchmarks.consensus.mission import Mission
 from middleware.consensus.strategies import hungarian
-from middleware.consensus.strategies.sequential import insertion, length
+from middleware.consensus.strategies.sequential import compute_length, find_insertion
 
-STEPS_S = 60_000
+STEPS_PER_S = 60_000
 """Steps of the own search for short routes per second that OR-Tools would get."""
 
 
-def least_star(mission: Mission) -> tuple[float, str]:
+def solve_assignment(mission: Mission) -> tuple[float, str]:
     """Return the exact least sum of distances if each task is a separate trip, and the solver's name."""
     columns = [agent for agent in mission.alive for _ in range(mission.capacity)]
-    costs = [[mission.costs[agent][task] for agent in columns] for task in mission.places]
+    costs = [[mission.costs[agent][task] for agent in columns] for task in mission.task_positions]
     try:
         import numpy
         from scipy.optimize import linear_sum_assignment
     except ImportError:
-        chosen_columns = hungarian.solved(costs)[0]
+        chosen_columns = hungarian.find_optimum(costs)[0]
         return float(sum(row[column] for row, column in zip(costs, chosen_columns, strict=True))), "own Hungarian"
     table: Any = numpy.array(costs, dtype=float)
     rows, chosen = linear_sum_assignment(table)
     return float(table[rows, chosen].sum()), "SciPy"
 
 
-def least_way(mission: Mission, ways: dict[str, list[str]], seconds: float) -> tuple[float, str]:
+def search_routes(mission: Mission, ways: dict[str, list[str]], seconds: float) -> tuple[float, str]:
     """Return the shortest known sum of routes through all tasks, and the solver's name, starting from ``ways``."""
     try:
-        return min(travelled(mission, ways), _solve_with_ortools(mission, seconds)), "OR-Tools"
+        return min(measure_routes(mission, ways), _solve_with_ortools(mission, seconds)), "OR-Tools"
     except ImportError:
-        return _anneal(mission, ways, round(STEPS_S * seconds)), "own search"
+        return _anneal(mission, ways, round(STEPS_PER_S * seconds)), "own search"
 
 
-def travelled(mission: Mission, ways: dict[str, list[str]]) -> float:
+def measure_routes(mission: Mission, ways: dict[str, list[str]]) -> float:
     """Return the sum of the routes through all tasks, in metres."""
-    return sum(length(mission.starts[a], [mission.places[t] for t in way]) for a, way in ways.items())
+    return sum(
+        compute_length(mission.agent_positions[a], [mission.task_positions[t] for t in way]) for a, way in ways.items()
+    )
 
 
 def _anneal(mission: Mission, ways: dict[str, list[str]], steps: int) -> float:
@@ -47,11 +49,11 @@ def _anneal(mission: Mission, ways: dict[str, list[str]], steps: int) -> float:
     rng = random.Random(mission.seed)
     now = {agent: list(ways.get(agent, ())) for agent in mission.alive}
     agents = list(now)
-    best = cost = travelled(mission, now)
-    heat = cost / max(1, len(mission.places)) * 0.3
+    best = cost = measure_routes(mission, now)
+    heat = cost / max(1, len(mission.task_positions)) * 0.3
 
     def long(agent: str, way: list[str]) -> float:
-        return length(mission.starts[agent], [mission.places[t] for t in way])
+        return compute_length(mission.agent_positions[agent], [mission.task_positions[t] for t in way])
 
     owner = {task: agent for agent, way in now.items() for task in way}
     tasks = sorted(owner)
@@ -66,7 +68,9 @@ def _anneal(mission: Mission, ways: dict[str, list[str]], steps: int) -> float:
         if len(target) >= mission.capacity:
             continue
         spared = long(here, now[here]) - long(here, rest)
-        more, where = insertion(mission.starts[there], [mission.places[t] for t in target], mission.places[task])
+        more, where = find_insertion(
+            mission.agent_positions[there], [mission.task_positions[t] for t in target], mission.task_positions[task]
+        )
         if more - spared <= 0.0 or rng.random() < math.exp((spared - more) / warmth):
             now[here] = rest
             now[there] = [*target[:where], task, *target[where:]]
@@ -79,8 +83,8 @@ def _anneal(mission: Mission, ways: dict[str, list[str]], steps: int) -> float:
 def _solve_with_ortools(mission: Mission, seconds: float) -> float:
     from ortools.constraint_solver import pywrapcp, routing_enums_pb2
 
-    agents, tasks = mission.alive, list(mission.places)
-    points = [mission.starts[a] for a in agents] + [mission.places[t] for t in tasks]
+    agents, tasks = mission.alive, list(mission.task_positions)
+    points = [mission.agent_positions[a] for a in agents] + [mission.task_positions[t] for t in tasks]
     end = len(points)  # a place without cost: routes are open at their end
     far = [[round(1000.0 * math.dist(p, q)) for q in points] + [0] for p in points] + [[0] * (end + 1)]
     index = pywrapcp.RoutingIndexManager(end + 1, len(agents), list(range(len(agents))), [end] * len(agents))

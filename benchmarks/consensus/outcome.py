@@ -5,12 +5,12 @@ from __future__ import annotations
 import time
 from dataclasses import dataclass, replace
 
-from benchmarks.consensus.decider import DECIDERS, MEETINGS, NAMED, TALKED, Owners
+from benchmarks.consensus.cbba_run import CbbaRun, run_meetings
+from benchmarks.consensus.decider import BIDS_BY_NAME, DECIDERS, EXCHANGING, MEETINGS, Owners
 from benchmarks.consensus.mission import Mission
-from benchmarks.consensus.talk import Talked, after_meetings
 
-ALL = 100
-FEW = 40
+MAX_FULL_BIDDERS = 100
+FEW_BIDS = 40
 """Bids of each agent in missions of more than ``ALL`` agents, because all bids would be a million."""
 BID_KB = 0.012
 """An encoded bid: its task, its cost, and its share of the message overhead."""
@@ -28,12 +28,12 @@ class Outcome:
     cpu_ms: float
 
 
-def outcome(name: str, mission: Mission, talk: Talked | None = None) -> Outcome:
+def make_outcome(name: str, mission: Mission, talk: CbbaRun | None = None) -> Outcome:
     """Return the result of a strategy; strategies without collection use ``talk``, if given."""
-    found = gathered(name, mission) if talk is None or name not in TALKED else among_themselves(talk)
+    found = make_collected_outcome(name, mission) if talk is None or name not in EXCHANGING else make_cbba_outcome(talk)
     if name != MEETINGS:
         return found
-    owners, messages = after_meetings(mission, found.owners)
+    owners, messages = run_meetings(mission, found.owners)
     return replace(
         found,
         owners=owners,
@@ -43,26 +43,26 @@ def outcome(name: str, mission: Mission, talk: Talked | None = None) -> Outcome:
     )
 
 
-def among_themselves(talk: Talked) -> Outcome:
+def make_cbba_outcome(talk: CbbaRun) -> Outcome:
     """Return the agreement between the agents; if two agents claim a task, the first one owns it."""
     owners = {task: agents[0] for task, agents in talk.owners.items()}
-    return Outcome(owners, talk.messages, talk.octets / 1000.0, talk.rounds, talk.cpu_s * 1000.0)
+    return Outcome(owners, talk.messages, talk.message_bytes / 1000.0, talk.rounds, talk.cpu_s * 1000.0)
 
 
-def gathered(name: str, mission: Mission) -> Outcome:
+def make_collected_outcome(name: str, mission: Mission) -> Outcome:
     """Return the result with bids collected at one node: each agent sends one message per round, and gets one.
 
     Agents bid for tasks without a bid in another round, and everything is decided again.
     """
-    most = NAMED.get(name, mission.tasks if mission.agents <= ALL else FEW)
+    most = BIDS_BY_NAME.get(name, mission.tasks if mission.agents <= MAX_FULL_BIDDERS else FEW_BIDS)
     took, times, holes = 0.0, 0, set[str]()
     while True:
         times += 1
-        reports = mission.reports(mission.alive, most, holes)
+        reports = mission.make_reports(mission.alive, most, holes)
         began = time.process_time()
         owners = DECIDERS[name](mission, reports)
         took += (time.process_time() - began) * 1000.0
-        more = set(mission.places) - set(owners)
+        more = set(mission.task_positions) - set(owners)
         if more <= holes:
             each = len(reports) / len(mission.alive)
             return Outcome(owners, 2.0 * times, BID_KB * each, 2.0 * times, took)

@@ -13,7 +13,7 @@ CALM, AFTER, GRID = "#2563a8", "#d08a2e", "#dddddd"
 END, BOLD = ' text-anchor="end"', ' font-weight="bold"'
 
 
-def drawn(rows: Sequence[dict[str, Any]]) -> str:
+def draw_svg(rows: Sequence[dict[str, Any]]) -> str:
     """Return the picture: the excess of each strategy over the optimum, before and after failures of agents."""
     parts: list[str] = []
     y = 16

@@ -12,44 +12,44 @@ import tempfile
 from collections.abc import Sequence
 from pathlib import Path
 
-from benchmarks.dht.contestant import ENTRIES, Entry, chosen
-from benchmarks.dht.course import Course, Plan, Result
-from benchmarks.dht.loss import LEAST, lost
-from benchmarks.dht.plot import drawn
-from benchmarks.dht.report import table
-from benchmarks.dht.space import space
+from benchmarks.dht.library import LIBRARIES, Library, select_libraries
+from benchmarks.dht.loss import MIN_NODES, measure_losses
+from benchmarks.dht.optional_features import measure_long_values, measure_watches
+from benchmarks.dht.plot import draw_svg
+from benchmarks.dht.report import format_table
+from benchmarks.dht.space import measure_space
 from benchmarks.dht.team import Team
-from benchmarks.dht.verbs import long_values, watches
-from benchmarks.remote import Lost
+from benchmarks.dht.workload import Plan, Result, Workload
+from benchmarks.remote import OrderFailed
 
 PARTS = ("steady", "killed", "silent")
 KEYS = 200
-ENDED = 130
+EXIT_INTERRUPTED = 130
 
 
-async def run(course: Course, part: str) -> None:
+async def run_part(course: Workload, part: str) -> None:
     """Run one part of the comparison with a separate team."""
     if part != "steady":
-        await lost(course, is_silent=part == "silent")
-    elif await course.steady():
-        for verb in (watches, long_values, space):
+        await measure_losses(course, is_silent=part == "silent")
+    elif await course.run_healthy():
+        for verb in (measure_watches, measure_long_values, measure_space):
             await verb(course)
 
 
-async def measured(entry: Entry, size: int, plan: Plan, parts: Sequence[str], result: Result) -> None:
+async def measure_library(entry: Library, size: int, plan: Plan, parts: Sequence[str], result: Result) -> None:
     """Measure one library at one size; ``result`` has the figures obtained, also after an error."""
     task = asyncio.current_task()
     assert task is not None
     asyncio.get_running_loop().add_signal_handler(signal.SIGTERM, task.cancel)
     for part in parts:
-        if part != "steady" and size < LEAST:
+        if part != "steady" and size < MIN_NODES:
             continue
         figures = result if part == "steady" else result.setdefault(part, {})
         with tempfile.TemporaryDirectory() as folder:
             try:
                 async with Team(entry, size, folder) as team:
-                    await run(Course(team, plan, figures), part)
-            except Lost as error:
+                    await run_part(Workload(team, plan, figures), part)
+            except OrderFailed as error:
                 figures.setdefault("trouble", {})["team"] = str(error)
 
 
@@ -60,13 +60,13 @@ def main(arguments: Sequence[str]) -> int:
     parser.add_argument("--seconds", type=float, default=5.0, help="duration of each load (default 5)")
     parser.add_argument(
         "--peers",
-        default=",".join(ENTRIES),
+        default=",".join(LIBRARIES),
         help="libraries, comma-separated (default %(default)s); opendht selects both of its variants",
     )
     parser.add_argument(
         "--parts",
         default=",".join(PARTS),
-        help=f"parts, comma-separated (default %(default)s); failures need {LEAST} nodes",
+        help=f"parts, comma-separated (default %(default)s); failures need {MIN_NODES} nodes",
     )
     parser.add_argument("--seed", type=int, default=1, help="seed of the choice of nodes (default 1)")
     parser.add_argument("--profile", default="", help="prefix of files for profiles of two nodes under load")
@@ -74,7 +74,7 @@ def main(arguments: Sequence[str]) -> int:
     parser.add_argument("--plot", help="draw the main figures to this file, as SVG")
     given = parser.parse_args(arguments)
     try:
-        entries = chosen(given.peers)
+        entries = select_libraries(given.peers)
         sizes = [int(size) for size in given.nodes.split(",")]
     except ValueError as error:
         parser.error(str(error))
@@ -93,18 +93,18 @@ def main(arguments: Sequence[str]) -> int:
             for entry in [entry for entry in entries if entry.is_installed]:
                 sys.stderr.write(f"{entry.name}, {size} nodes\n")
                 result = results.setdefault(str(size), {}).setdefault(entry.name, {})
-                asyncio.run(measured(entry, size, plan, parts, result))
+                asyncio.run(measure_library(entry, size, plan, parts, result))
     except (KeyboardInterrupt, asyncio.CancelledError):
         sys.stderr.write("ended early; what was measured until now:\n")
-        ended = ENDED
-    sys.stdout.write(table(results))
+        ended = EXIT_INTERRUPTED
+    sys.stdout.write(format_table(results))
     if given.out:
         about = {"python": platform.python_version(), "machine": platform.machine(), **vars(plan)}
-        behind = {e.name: {"behind": e.behind, "promise": e.promise, "largest": e.largest} for e in entries}
+        behind = {e.name: {"behind": e.storage, "promise": e.guarantee, "largest": e.largest} for e in entries}
         text = json.dumps({"about": about, "behind": behind, "results": results}, indent=1)
         Path(given.out).write_text(text + "\n", encoding="utf-8")
     if given.plot:
-        Path(given.plot).write_text(drawn(results), encoding="utf-8")
+        Path(given.plot).write_text(draw_svg(results), encoding="utf-8")
     return ended
 
 

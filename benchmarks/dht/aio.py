@@ -6,7 +6,7 @@ import asyncio
 from collections.abc import Callable, Coroutine
 from typing import Any
 
-from benchmarks.dht.contestant import Done, Got, Prevent
+from benchmarks.dht.library import Cancel, OnDone, OnValue
 
 
 class AsyncioPeer:
@@ -25,15 +25,15 @@ class AsyncioPeer:
 
         asyncio.run(forever())
 
-    def soon(self, call: Callable[..., object], *arguments: object) -> None:
+    def call_soon(self, call: Callable[..., object], *arguments: object) -> None:
         """Schedule a call in the loop from any thread."""
         self._loop.call_soon_threadsafe(call, *arguments)
 
-    def later(self, seconds: float, call: Callable[..., object], *arguments: object) -> Prevent:
+    def call_later(self, seconds: float, call: Callable[..., object], *arguments: object) -> Cancel:
         """Schedule a call after ``seconds``."""
         return self._loop.call_later(seconds, call, *arguments).cancel
 
-    def fork(self, work: Coroutine[Any, Any, Any], done: Callable[[Any], object]) -> None:
+    def run_in_thread(self, work: Coroutine[Any, Any, Any], done: Callable[[Any], object]) -> None:
         """Run ``work`` and call ``done`` with its result, or None after an error."""
         task = self._loop.create_task(work)
         self._tasks.add(task)
@@ -44,18 +44,18 @@ class AsyncioPeer:
 
         task.add_done_callback(ended)
 
-    def holds(self, keys: list[str]) -> list[bool | None]:
+    def list_held(self, keys: list[str]) -> list[bool | None]:
         """Return None for unknown, unless the library can tell."""
         return [None] * len(keys)
 
-    def watch(self, key: str, heard: Got, done: Callable[[], None]) -> None:
+    def watch(self, key: str, heard: OnValue, done: Callable[[], None]) -> None:
         """Raise ``NotImplementedError``, unless the library has watches."""
         raise NotImplementedError("this library has no watches")
 
-    def space(self, verb: str, fields: list[object], limit_s: float, done: Done) -> None:
+    def run_space_operation(self, verb: str, fields: list[object], limit_s: float, done: OnDone) -> None:
         """Raise ``NotImplementedError``: none of these libraries has a tuple space."""
         raise NotImplementedError("this library has no tuple space")
 
-    def lose(self, share: float) -> None:
+    def drop_datagrams(self, share: float) -> None:
         """Raise ``NotImplementedError``: their sockets are not accessible."""
         raise NotImplementedError("the sockets of this library are not accessible")

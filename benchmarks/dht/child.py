@@ -16,22 +16,22 @@ import time
 from collections.abc import Callable
 from typing import Any, TextIO
 
-from benchmarks.dht.contestant import ENTRIES, Contestant
+from benchmarks.dht.library import LIBRARIES, LibraryNode
 from benchmarks.dht.load import Load
 
 Order = dict[str, Any]
-AGAIN_S = 0.01
-TRY_S = 2.0
+RETRY_S = 0.01
+TRY_LIMIT_S = 2.0
 
 
-class Child:
+class OrderExecutor:
     """Execute orders on ``node``, and answer each on ``out`` by its id."""
 
-    def __init__(self, node: Contestant, out: TextIO) -> None:
+    def __init__(self, node: LibraryNode, out: TextIO) -> None:
         self._node = node
         self._out = out
         self._lock = threading.Lock()
-        self._heard: dict[str, list[float]] = {}
+        self._notified: dict[str, list[float]] = {}
         self._profile: Any = None
 
     def begin(self) -> None:
@@ -41,7 +41,7 @@ class Child:
 
     def _read(self) -> None:
         for line in sys.stdin:
-            self._node.soon(self._execute, json.loads(line))
+            self._node.call_soon(self._execute, json.loads(line))
         # The parent has exited, perhaps without a message.
         os._exit(0)
 
@@ -70,13 +70,13 @@ class Child:
             if wanted is None:
                 self._answer(order, join_ms=ms())
             else:
-                self._start_timing("get", wanted[0], bytes.fromhex(wanted[1]), TRY_S, read)
+                self._start_timing("get", wanted[0], bytes.fromhex(wanted[1]), TRY_LIMIT_S, read)
 
         def read(is_good: bool, _: float) -> None:
             if is_good or time.monotonic() - began > order["limit_s"]:
                 self._answer(order, join_ms=ms() if is_good else None)
             else:
-                self._node.later(AGAIN_S, joined)
+                self._node.call_later(RETRY_S, joined)
 
         self._node.start(order["port"], order["known"], joined)
 
@@ -94,7 +94,7 @@ class Child:
 
     def _do_load(self, order: Order) -> None:
         """Keep operations in flight: each item ``once``, or all of them repeatedly for ``seconds``."""
-        Load(self._start_timing, self._node.later, order, lambda **fields: self._answer(order, **fields)).fill()
+        Load(self._start_timing, self._node.call_later, order, lambda **fields: self._answer(order, **fields)).fill()
 
     def _do_space(self, order: Order) -> None:
         """Execute one operation on the tuple space; ``moments`` are its start and end."""
@@ -104,12 +104,12 @@ class Child:
             ended = time.monotonic()
             self._answer(order, good=is_good, ms=(ended - began) * 1000, moments=[began, ended])
 
-        self._node.space(order["verb"], order["fields"], order["limit_s"], done)
+        self._node.run_space_operation(order["verb"], order["fields"], order["limit_s"], done)
 
     def _do_watch(self, order: Order) -> None:
         """Record the time at which each value of a key arrives."""
         value = bytes.fromhex(order["value"])
-        moments = self._heard.setdefault(order["key"], [])
+        moments = self._notified.setdefault(order["key"], [])
 
         def heard(came: bytes | None) -> None:
             if came == value:
@@ -118,13 +118,13 @@ class Child:
         self._node.watch(order["key"], heard, lambda: self._answer(order))
 
     def _do_heard(self, order: Order) -> None:
-        self._answer(order, moments=self._heard.get(order["key"], []))
+        self._answer(order, moments=self._notified.get(order["key"], []))
 
     def _do_holds(self, order: Order) -> None:
-        self._answer(order, holds=self._node.holds(order["keys"]))
+        self._answer(order, holds=self._node.list_held(order["keys"]))
 
     def _do_lose(self, order: Order) -> None:
-        self._node.lose(order["share"])
+        self._node.drop_datagrams(order["share"])
         self._answer(order)
 
     def _do_profile(self, order: Order) -> None:
@@ -152,7 +152,7 @@ class Child:
                 in_time()
                 done(result == value if kind == "get" else bool(result), (time.monotonic() - began) * 1000)
 
-        in_time = self._node.later(limit_s, finish, None)
+        in_time = self._node.call_later(limit_s, finish, None)
         (self._node.get if kind == "get" else self._node.put)(key, value, finish)
 
 
@@ -162,8 +162,8 @@ def main(name: str, folder: str) -> None:
     # Only orders use the real stdout; output of libraries goes to stderr.
     out = os.fdopen(os.dup(1), "w")
     os.dup2(2, 1)
-    node = ENTRIES[name].made(folder)
-    node.run(Child(node, out).begin)
+    node = LIBRARIES[name].make_node(folder)
+    node.run(OrderExecutor(node, out).begin)
 
 
 if __name__ == "__main__":

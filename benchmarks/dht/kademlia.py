@@ -8,7 +8,7 @@ from kademlia.network import Server
 from kademlia.utils import digest
 
 from benchmarks.dht.aio import AsyncioPeer
-from benchmarks.dht.contestant import HOST, Done, Got
+from benchmarks.dht.library import HOST, OnDone, OnValue
 
 
 class KademliaPeer(AsyncioPeer):
@@ -23,16 +23,16 @@ class KademliaPeer(AsyncioPeer):
             if known:
                 await self._server.bootstrap([(HOST, known)])
 
-        self.fork(up(), lambda _: done())
+        self.run_in_thread(up(), lambda _: done())
 
-    def put(self, key: str, value: bytes, done: Done) -> None:
+    def put(self, key: str, value: bytes, done: OnDone) -> None:
         """Store; the library waits for every replica."""
-        self.fork(self._server.set(key, value), lambda ok: done(bool(ok)))
+        self.run_in_thread(self._server.set(key, value), lambda ok: done(bool(ok)))
 
-    def get(self, key: str, value: bytes, done: Got) -> None:
+    def get(self, key: str, value: bytes, done: OnValue) -> None:
         """Read; from the own store if it has the key."""
-        self.fork(self._server.get(key), done)
+        self.run_in_thread(self._server.get(key), done)
 
-    def holds(self, keys: list[str]) -> list[bool | None]:
+    def list_held(self, keys: list[str]) -> list[bool | None]:
         """Look into the store."""
         return [self._server.storage.get(digest(key)) is not None for key in keys]

@@ -14,7 +14,7 @@ from typing import Any
 import libtorrent
 
 from benchmarks.dht.aio import AsyncioPeer
-from benchmarks.dht.contestant import HOST, Done, Got
+from benchmarks.dht.library import HOST, OnDone, OnValue
 
 
 class LibtorrentPeer(AsyncioPeer):
@@ -36,8 +36,8 @@ class LibtorrentPeer(AsyncioPeer):
         }
         if limits == "free":
             self._settings["dht_upload_rate_limit"] = 1 << 30
-        self._puts: dict[bytes, list[Done]] = {}
-        self._gets: dict[bytes, list[Got]] = {}
+        self._puts: dict[bytes, list[OnDone]] = {}
+        self._gets: dict[bytes, list[OnValue]] = {}
         self._joined: Callable[[], None] | None = None
 
     def start(self, port: int, known: int, done: Callable[[], None]) -> None:
@@ -49,20 +49,20 @@ class LibtorrentPeer(AsyncioPeer):
         self._session = libtorrent.session(self._settings)
         threading.Thread(target=self._poll_alerts, daemon=True).start()
         if not known:
-            self.later(1.0, self._report_joined)
+            self.call_later(1.0, self._report_joined)
 
-    def put(self, key: str, value: bytes, done: Done) -> None:
+    def put(self, key: str, value: bytes, done: OnDone) -> None:
         """Store."""
         self._puts.setdefault(_target(value), []).append(done)
         self._session.dht_put_immutable_item(value)
 
-    def get(self, key: str, value: bytes, done: Got) -> None:
+    def get(self, key: str, value: bytes, done: OnValue) -> None:
         """Read; always from the network."""
         target = _target(value)
         self._gets.setdefault(target, []).append(done)
         self._session.dht_get_immutable_item(libtorrent.sha1_hash(target))
 
-    def holds(self, keys: list[str]) -> list[bool | None]:
+    def list_held(self, keys: list[str]) -> list[bool | None]:
         """Return False for all keys: reads never come from the own store."""
         return [False] * len(keys)
 
@@ -76,11 +76,11 @@ class LibtorrentPeer(AsyncioPeer):
             if self._session.wait_for_alert(1000):
                 for alert in self._session.pop_alerts():
                     if isinstance(alert, libtorrent.dht_put_alert):
-                        self.soon(self._handle_put, alert.target.to_bytes(), alert.num_success > 0)
+                        self.call_soon(self._handle_put, alert.target.to_bytes(), alert.num_success > 0)
                     elif isinstance(alert, libtorrent.dht_immutable_item_alert):
-                        self.soon(self._handle_item, alert.target.to_bytes(), alert.item)
+                        self.call_soon(self._handle_item, alert.target.to_bytes(), alert.item)
                     elif isinstance(alert, libtorrent.dht_bootstrap_alert):
-                        self.soon(self._report_joined)
+                        self.call_soon(self._report_joined)
 
     def _handle_put(self, target: bytes, is_stored: bool) -> None:
         for done in self._puts.pop(target, []):

@@ -6,7 +6,7 @@ import time
 from collections.abc import Callable
 from typing import Any
 
-BREATH = 64
+MAX_BATCH = 64
 """Operations started in one turn; answers from the own store are immediate, and the loop must run in between."""
 
 
@@ -24,8 +24,8 @@ class Load:
         order: dict[str, Any],
         answer: Callable[..., None],
     ) -> None:
-        self._timed = timed
-        self._later = later
+        self._start_timed = timed
+        self._call_later = later
         self._answer = answer
         self._kind: str = order["kind"]
         self._items = [(key, bytes.fromhex(value)) for key, value in order["items"]]
@@ -38,7 +38,7 @@ class Load:
         self._open = 0
         self._filling = False
         self._ended = False
-        self._took: list[tuple[str, bool, float]] = []
+        self._results: list[tuple[str, bool, float]] = []
         later(order["seconds"] + 0.05, self._end)
 
     def fill(self) -> None:
@@ -47,36 +47,38 @@ class Load:
             return
         self._filling = True
         begun = 0
-        while self._open < self._in_flight and self._is_more() and begun < BREATH:
+        while self._open < self._in_flight and self._has_more() and begun < MAX_BATCH:
             key, value = self._items[self._next % len(self._items)]
             self._next += 1
             self._open += 1
             begun += 1
-            self._timed(self._kind, key, value, self._limit_s, lambda good, ms, key=key: self._done(key, good, ms))
+            self._start_timed(
+                self._kind, key, value, self._limit_s, lambda good, ms, key=key: self._on_done(key, good, ms)
+            )
         self._filling = False
-        if begun == BREATH:
-            self._later(0, self.fill)
+        if begun == MAX_BATCH:
+            self._call_later(0, self.fill)
         elif not self._open:
             self._end()
 
-    def _is_more(self) -> bool:
+    def _has_more(self) -> bool:
         return time.monotonic() < self._ends_at and not (self._once and self._next >= len(self._items))
 
-    def _done(self, key: str, is_good: bool, ms: float) -> None:
+    def _on_done(self, key: str, is_good: bool, ms: float) -> None:
         self._open -= 1
         if not self._ended:
-            self._took.append((key, is_good, ms))
+            self._results.append((key, is_good, ms))
             self.fill()
 
     def _end(self) -> None:
         if self._ended:
             return
         self._ended = True
-        good = [(key, ms) for key, is_good, ms in self._took if is_good]
+        good = [(key, ms) for key, is_good, ms in self._results if is_good]
         self._answer(
             seconds=time.monotonic() - self._began,
             good=len(good),
-            tried=len(self._took),
+            tried=len(self._results),
             unfinished=self._open,
             ms=sorted(round(ms, 3) for _, ms in good),
             done=[key for key, _ in good] if self._once else [],

@@ -8,7 +8,7 @@ from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
 
-from benchmarks.measure import TICKS, maps_mib, udp_count
+from benchmarks.measure import TICKS_PER_S, read_maps_mib, read_udp_counter
 
 
 def percentile(values: list[float], percent: float) -> float | None:
@@ -17,7 +17,7 @@ def percentile(values: list[float], percent: float) -> float | None:
     return ordered[min(len(ordered) - 1, round(percent / 100 * (len(ordered) - 1)))] if ordered else None
 
 
-def cpu_s(pids: Iterable[int]) -> float:
+def read_cpu_s(pids: Iterable[int]) -> float:
     """Return the processor seconds of the threads of these processes; ended threads do not count."""
     total = 0
     for pid in pids:
@@ -29,16 +29,16 @@ def cpu_s(pids: Iterable[int]) -> float:
     return total / 1e9
 
 
-def memory_mib(pid: int) -> tuple[float, float]:
+def read_memory_mib(pid: int) -> tuple[float, float]:
     """Return the resident memory of a process, and its private part (RSS, USS)."""
-    mib = maps_mib(pid)
+    mib = read_maps_mib(pid)
     return mib["Rss"], mib["Private_Clean"] + mib["Private_Dirty"]
 
 
-def busy_s() -> float:
+def read_busy_s() -> float:
     """Return the busy seconds of all processors together."""
     fields = [int(field) for field in Path("/proc/stat").read_text().splitlines()[0].split()[1:9]]
-    return (sum(fields) - fields[3] - fields[4]) / TICKS
+    return (sum(fields) - fields[3] - fields[4]) / TICKS_PER_S
 
 
 @dataclass
@@ -49,11 +49,11 @@ class Cost:
     cpu_s: float = 0.0
     datagrams: float = 0.0
     dropped: float = 0.0
-    foreign: float = 0.0
+    foreign_share: float = 0.0
 
-    def per(self, operations: int, idle: Cost) -> dict[str, float]:
+    def per_operation(self, operations: int, idle: Cost) -> dict[str, float]:
         """Return the cost of one operation, without the consumption of an idle network in that time."""
-        noise = {"dropped": self.dropped, "foreign": self.foreign}
+        noise = {"dropped": self.dropped, "foreign": self.foreign_share}
         if not operations:
             return noise
         share = self.seconds / idle.seconds
@@ -69,14 +69,16 @@ class Meter:
 
     def __init__(self, pids: list[int]) -> None:
         self._pids = pids
-        self._start = self._now()
+        self._start = self._read_counters()
 
     def read(self) -> Cost:
         """Return the cost since the creation."""
-        seconds, cpu, own, sent, dropped, busy = (b - a for a, b in zip(self._start, self._now(), strict=True))
+        seconds, cpu, own, sent, dropped, busy = (
+            b - a for a, b in zip(self._start, self._read_counters(), strict=True)
+        )
         foreign = (busy - cpu - own) / seconds / (os.cpu_count() or 1)
         return Cost(seconds, cpu, sent, dropped, max(0.0, foreign))
 
-    def _now(self) -> tuple[float, ...]:
-        sent, dropped = udp_count("OutDatagrams"), udp_count("RcvbufErrors")
-        return time.monotonic(), cpu_s(self._pids), time.process_time(), float(sent), float(dropped), busy_s()
+    def _read_counters(self) -> tuple[float, ...]:
+        sent, dropped = read_udp_counter("OutDatagrams"), read_udp_counter("RcvbufErrors")
+        return time.monotonic(), read_cpu_s(self._pids), time.process_time(), float(sent), float(dropped), read_busy_s()

@@ -8,9 +8,9 @@ from typing import Any
 import opendht
 
 from benchmarks.dht.aio import AsyncioPeer
-from benchmarks.dht.contestant import HOST, Done, Got
+from benchmarks.dht.library import HOST, OnDone, OnValue
 
-LISTENS_AFTER_S = 0.5
+JOIN_DELAY_S = 0.5
 """The binding does not report when the replicas have registered a listen."""
 
 
@@ -32,11 +32,11 @@ class OpenDhtPeer(AsyncioPeer):
             self._node.bootstrap(HOST, str(known))
         done()
 
-    def put(self, key: str, value: bytes, done: Done) -> None:
+    def put(self, key: str, value: bytes, done: OnDone) -> None:
         """Store."""
-        self._node.put(opendht.InfoHash.get(key), opendht.Value(value), lambda ok, nodes: self.soon(done, ok))
+        self._node.put(opendht.InfoHash.get(key), opendht.Value(value), lambda ok, nodes: self.call_soon(done, ok))
 
-    def get(self, key: str, value: bytes, done: Got) -> None:
+    def get(self, key: str, value: bytes, done: OnValue) -> None:
         """Read the first value that arrives, and end the search."""
         is_open = True
 
@@ -44,7 +44,7 @@ class OpenDhtPeer(AsyncioPeer):
             nonlocal is_open
             if is_open:
                 is_open = False
-                self.soon(done, result)
+                self.call_soon(done, result)
 
         def found(value: Any) -> bool:
             finish(bytes(value.data))
@@ -52,18 +52,18 @@ class OpenDhtPeer(AsyncioPeer):
 
         self._node.get(opendht.InfoHash.get(key), found, lambda ok, nodes: finish(None))
 
-    def watch(self, key: str, heard: Got, done: Callable[[], None]) -> None:
+    def watch(self, key: str, heard: OnValue, done: Callable[[], None]) -> None:
         """Listen."""
 
         def came(value: Any, is_expired: bool) -> bool:
             if not is_expired:
-                self.soon(heard, bytes(value.data))
+                self.call_soon(heard, bytes(value.data))
             return True
 
         self._kept.append((came, self._node.listen(opendht.InfoHash.get(key), came)))
-        self.later(LISTENS_AFTER_S, done)
+        self.call_later(JOIN_DELAY_S, done)
 
-    def holds(self, keys: list[str]) -> list[bool | None]:
+    def list_held(self, keys: list[str]) -> list[bool | None]:
         """Read the log of the store; the binding holds Python's lock meanwhile, so never under load."""
         log = self._node.getStorageLog()
         return [str(opendht.InfoHash.get(key)) in log for key in keys]

@@ -5,10 +5,10 @@ from __future__ import annotations
 from collections.abc import Mapping
 from html import escape
 
-from benchmarks.dht.contestant import ENTRIES
-from benchmarks.dht.figure import ROWS, Result
+from benchmarks.dht.library import LIBRARIES
+from benchmarks.dht.rows import ROWS, Result
 
-SHOWN = (
+SHOWN_ROWS = (
     "join, first old key read, ms",
     "put p50, ms",
     "get p50, ms",
@@ -26,7 +26,7 @@ WIDTH, NAME, BAR, HIGH, GAP = 760, 150, 490, 18, 14
 OWN, OTHER = "#2563a8", "#9aa3ad"
 
 
-def drawn(results: Mapping[str, Mapping[str, Result]]) -> str:
+def draw_svg(results: Mapping[str, Mapping[str, Result]]) -> str:
     """Return the picture: a block for each figure and size; each block has a separate scale."""
     reads = dict(ROWS)
     parts: list[str] = []
@@ -36,7 +36,7 @@ def drawn(results: Mapping[str, Mapping[str, Result]]) -> str:
         parts.append(f'<text x="{x:.1f}" y="{y + 4}"{more}>{escape(words)}</text>')
 
     for size, row in results.items():
-        for label in SHOWN:
+        for label in SHOWN_ROWS:
             values = {name: value for name in row if (value := reads[label](row[name])) is not None}
             if not values:
                 continue
@@ -51,9 +51,9 @@ def drawn(results: Mapping[str, Mapping[str, Result]]) -> str:
                 parts.append(f'<rect x="{NAME}" y="{y - 7}" width="{long:.1f}" height="{HIGH - 4}" fill="{colour}"/>')
                 text(NAME + long + 6, f"{value:,.2f}" if value < 100 else f"{value:,.0f}")
             y += HIGH
-    for name in [name for name in ENTRIES if any(name in row for row in results.values())]:
+    for name in [name for name in LIBRARIES if any(name in row for row in results.values())]:
         y += HIGH
-        text(8, f"{name}: {ENTRIES[name].behind}; a finished put means: {ENTRIES[name].promise}")
+        text(8, f"{name}: {LIBRARIES[name].storage}; a finished put means: {LIBRARIES[name].guarantee}")
     body = "\n".join(parts)
     return (
         f'<svg xmlns="http://www.w3.org/2000/svg" width="{WIDTH}" height="{y + 16}" font-family="sans-serif"'

@@ -11,21 +11,21 @@ from typing import Any
 from twisted.internet import reactor as _reactor
 from twisted.internet.defer import Deferred, maybeDeferred
 
-from benchmarks.dht.contestant import HOST, Done, Got, Prevent
+from benchmarks.dht.library import HOST, Cancel, OnDone, OnValue
 from middleware.entangled.clock import use_monotonic_time
 from middleware.entangled.data.memory import MemoryStore
 from middleware.entangled.data.sqlite import SqliteStore
-from middleware.entangled.data.store import Durable, Store
+from middleware.entangled.data.store import Durability, Store
 from middleware.entangled.identity import Identity
 from middleware.entangled.network.network import Address
 from middleware.entangled.network.udp import UdpNetwork
 from middleware.entangled.node import EntangledNode
-from middleware.entangled.record import Record, hashed_key
+from middleware.entangled.record import Record, hash_key
 from middleware.entangled.space.tuplespace import TupleSpace
 
 TEAM_KEY = b"the key of a team that only runs"
 NAME = "bench"
-STANDS_AFTER_S = 0.2
+JOIN_DELAY_S = 0.2
 """A watch does not report when its replicas have registered it."""
 reactor: Any = _reactor
 
@@ -33,11 +33,11 @@ reactor: Any = _reactor
 class LossyUdp(UdpNetwork):
     """Real UDP that drops the share ``share`` of the sent datagrams."""
 
-    share = 0.0
+    loss_share = 0.0
 
     def send(self, datagram: bytes, to: Address) -> None:
         """Send or drop a datagram."""
-        if not self.share or random.random() >= self.share:
+        if not self.loss_share or random.random() >= self.loss_share:
             super().send(datagram, to)
 
 
@@ -47,7 +47,7 @@ class SwarmPeer:
     def __init__(self, folder: str, store: str = "memory") -> None:
         use_monotonic_time()
         self._folder = folder if store != "memory" else ""
-        self._durable: Durable = "crash" if store == "crash" else "power"
+        self._durable: Durability = "crash" if store == "crash" else "power"
         self._rng = random.SystemRandom()
         self._space: Any = None
 
@@ -56,11 +56,11 @@ class SwarmPeer:
         reactor.callWhenRunning(begin)
         reactor.run(installSignalHandlers=False)
 
-    def soon(self, call: Callable[..., object], *arguments: object) -> None:
+    def call_soon(self, call: Callable[..., object], *arguments: object) -> None:
         """Schedule a call in the reactor from any thread."""
         reactor.callFromThread(call, *arguments)
 
-    def later(self, seconds: float, call: Callable[..., object], *arguments: object) -> Prevent:
+    def call_later(self, seconds: float, call: Callable[..., object], *arguments: object) -> Cancel:
         """Schedule a call after ``seconds``."""
         timer = reactor.callLater(seconds, call, *arguments)
         return lambda: timer.cancel() if timer.active() else None
@@ -77,29 +77,29 @@ class SwarmPeer:
         self._node.start()
         self._node.join([Address(HOST, known)] if known else []).addCallback(lambda _: done())
 
-    def put(self, key: str, value: bytes, done: Done) -> None:
+    def put(self, key: str, value: bytes, done: OnDone) -> None:
         """Store; call ``done`` when a majority of the replicas has it."""
-        _report_result(maybeDeferred(self._node.put, hashed_key(key), NAME, value), lambda held: done(held is not None))
+        _report_result(maybeDeferred(self._node.put, hash_key(key), NAME, value), lambda held: done(held is not None))
 
-    def get(self, key: str, value: bytes, done: Got) -> None:
+    def get(self, key: str, value: bytes, done: OnValue) -> None:
         """Read; the first answer counts, as with the other libraries."""
-        _report_result(self._node.get(hashed_key(key), "fast"), lambda found: done(found[0].value if found else None))
+        _report_result(self._node.get(hash_key(key), "fast"), lambda found: done(found[0].value if found else None))
 
-    def holds(self, keys: list[str]) -> list[bool | None]:
+    def list_held(self, keys: list[str]) -> list[bool | None]:
         """Look into the store."""
-        return [bool(self._node.store.get(hashed_key(key))) for key in keys]
+        return [bool(self._node.store.get(hash_key(key))) for key in keys]
 
-    def watch(self, key: str, heard: Got, done: Callable[[], None]) -> None:
+    def watch(self, key: str, heard: OnValue, done: Callable[[], None]) -> None:
         """Watch."""
 
         def changed(records: list[Record]) -> None:
             for record in records:
                 heard(record.value)
 
-        self._node.watch(hashed_key(key), changed)
-        self.later(STANDS_AFTER_S, done)
+        self._node.watch(hash_key(key), changed)
+        self.call_later(JOIN_DELAY_S, done)
 
-    def space(self, verb: str, fields: list[object], limit_s: float, done: Done) -> None:
+    def run_space_operation(self, verb: str, fields: list[object], limit_s: float, done: OnDone) -> None:
         """Execute ``verb`` in the tuple space; "open" makes this node a member of it."""
         if self._space is None:
             self._space = TupleSpace(self._node, reactor, self._rng, NAME)
@@ -112,9 +112,9 @@ class SwarmPeer:
             template = tuple(int if field is None else field for field in fields)
             _report_result(getattr(self._space, verb)(template, **waiting), lambda found: done(found is not None))
 
-    def lose(self, share: float) -> None:
+    def drop_datagrams(self, share: float) -> None:
         """Drop datagrams."""
-        self._network.share = share
+        self._network.loss_share = share
 
 
 def _report_result(outcome: Deferred[Any], tell: Callable[[Any], object]) -> None:

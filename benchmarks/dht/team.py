@@ -7,34 +7,34 @@ import sys
 from pathlib import Path
 from typing import Any
 
-from benchmarks.dht.contestant import HOST, Entry
-from benchmarks.remote import Remote
-from sim.demo.port import BOTH, free
+from benchmarks.dht.library import HOST, Library
+from benchmarks.remote import RemoteProcess
+from sim.demo.free_ports import TCP_AND_UDP, find_free_ports
 
 ROOT = Path(__file__).resolve().parents[2]
 SPAWNED_AT_ONCE = 4
-SPAWN_S = 30.0
-ORDER_S = 30.0
-MAX_LINE = 1 << 24
+SPAWN_LIMIT_S = 30.0
+ORDER_LIMIT_S = 30.0
+MAX_LINE_BYTES = 1 << 24
 
 
-class Node(Remote):
+class Node(RemoteProcess):
     """The process of one node."""
 
     def __init__(self, port: int, process: asyncio.subprocess.Process, errors: Path) -> None:
         super().__init__(f"the node on port {port}", process, errors)
         self.port = port
 
-    async def order(self, do: str, patience_s: float = ORDER_S, /, **fields: Any) -> dict[str, Any]:
+    async def run_order(self, do: str, patience_s: float = ORDER_LIMIT_S, /, **fields: Any) -> dict[str, Any]:
         """Execute an order; raises ``Lost``."""
-        return await super().order(do, patience_s, **fields)
+        return await super().run_order(do, patience_s, **fields)
 
 
 class Team:
     """The nodes of one contestant; ``async with`` spawns the processes and ends them, orders start the nodes."""
 
-    def __init__(self, entry: Entry, size: int, folder: str) -> None:
-        self.entry = entry
+    def __init__(self, entry: Library, size: int, folder: str) -> None:
+        self.library = entry
         self.nodes: list[Node] = []
         self._size = size
         self._folder = Path(folder)
@@ -46,11 +46,13 @@ class Team:
 
     async def __aenter__(self) -> Team:
         try:
-            ports = free(BOTH, HOST, self._size)  # some of the compared libraries use UDP, some also TCP
+            ports = find_free_ports(
+                TCP_AND_UDP, HOST, self._size
+            )  # some of the compared libraries use UDP, some also TCP
             for first in range(0, self._size, SPAWNED_AT_ONCE):
                 spawned = [await self._spawn(port) for port in ports[first : first + SPAWNED_AT_ONCE]]
                 for node in spawned:
-                    await node.up(SPAWN_S)
+                    await node.wait_ready(SPAWN_LIMIT_S)
         except BaseException:
             await self._end()
             raise
@@ -60,16 +62,16 @@ class Team:
         await self._end()
 
     async def _spawn(self, port: int) -> Node:
-        command = [sys.executable, "-m", "benchmarks.dht.child", self.entry.name, str(self._folder)]
+        command = [sys.executable, "-m", "benchmarks.dht.child", self.library.name, str(self._folder)]
         pipe, said = asyncio.subprocess.PIPE, self._folder / f"{port}.errors"
         with said.open("wb") as errors:
             # In a separate session, so that signals from the terminal reach only the parent.
             process = await asyncio.create_subprocess_exec(
-                *command, stdin=pipe, stdout=pipe, stderr=errors, cwd=ROOT, limit=MAX_LINE, start_new_session=True
+                *command, stdin=pipe, stdout=pipe, stderr=errors, cwd=ROOT, limit=MAX_LINE_BYTES, start_new_session=True
             )
         node = Node(port, process, said)
         self.nodes.append(node)
         return node
 
     async def _end(self) -> None:
-        await asyncio.gather(*(node.ended() for node in self.nodes))
+        await asyncio.gather(*(node.kill() for node in self.nodes))

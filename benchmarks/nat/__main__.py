@@ -18,12 +18,12 @@ from collections.abc import Sequence
 from dataclasses import asdict
 from pathlib import Path
 
-from benchmarks.nat.outcome import PLAIN, Outcome, promises
-from benchmarks.nat.report import drawn, table, written
-from sim.demo.stage import say
-from sim.demo.trials import whole
+from benchmarks.nat.outcome import PLAIN, Outcome, check_requirements
+from benchmarks.nat.report import draw_svg, format_table, update_document
+from sim.demo.preparation import print_line
+from sim.demo.trials import parse_count
 from sim.namespaces.internet import Internet
-from sim.namespaces.room import refusal
+from sim.namespaces.namespace import find_unavailable_reason
 
 DOCUMENT = Path("docs/internals/nat.md")
 PICTURE = "images/nat.svg"
@@ -32,16 +32,16 @@ PICTURE = "images/nat.svg"
 async def run(count: int, lossy: int, seed: int) -> list[Outcome]:
     """Run the whole matrix; clean up on SIGTERM, too."""
     from benchmarks.nat.hosts import Hosts
-    from benchmarks.nat.matrix import Matrix, sites
+    from benchmarks.nat.matrix import Matrix, list_sites
 
     task = asyncio.current_task()
     assert task is not None
     for number in (signal.SIGTERM, signal.SIGINT):
         asyncio.get_running_loop().add_signal_handler(number, task.cancel)
-    with tempfile.TemporaryDirectory(prefix="nat-") as folder, Internet(sites(), seed) as net:
-        say(f"{len(net.hosts)} hosts on {len(net.sites)} sites")
+    with tempfile.TemporaryDirectory(prefix="nat-") as folder, Internet(list_sites(), seed) as net:
+        print_line(f"{len(net.hosts)} hosts on {len(net.sites)} sites")
         async with Hosts(net, net.hosts, Path(folder)) as fleet:
-            matrix = Matrix(net, fleet, seed, say)
+            matrix = Matrix(net, fleet, seed, print_line)
             await matrix.run(count, lossy)
             return matrix.outcomes
 
@@ -49,13 +49,13 @@ async def run(count: int, lossy: int, seed: int) -> list[Outcome]:
 def main(arguments: Sequence[str] = tuple(sys.argv[1:])) -> int:
     """Run the command line."""
     parser = argparse.ArgumentParser(prog="python -m benchmarks.nat", description="Connect real nodes behind NATs.")
-    parser.add_argument("--count", type=whole, default=5, help="rounds of every pair (%(default)s)")
-    parser.add_argument("--lossy", type=whole, default=4, help="rounds with 30 %% loss (%(default)s)")
+    parser.add_argument("--count", type=parse_count, default=5, help="rounds of every pair (%(default)s)")
+    parser.add_argument("--lossy", type=parse_count, default=4, help="rounds with 30 %% loss (%(default)s)")
     parser.add_argument("--seed", type=int, default=1, help="seed of losses and keys (%(default)s)")
     parser.add_argument("--out", type=Path, default=Path("build"), help="folder for the JSON and the picture")
     parser.add_argument("--docs", action="store_true", help=f"also write table and picture to {DOCUMENT}")
     given = parser.parse_args(list(arguments))
-    why = refusal()
+    why = find_unavailable_reason()
     if why:
         sys.stderr.write(f"!!!\n!!! live-nat CANNOT RUN HERE: {why}\n!!!\n")
         return 2
@@ -69,15 +69,15 @@ def main(arguments: Sequence[str] = tuple(sys.argv[1:])) -> int:
     except asyncio.CancelledError:
         sys.stderr.write("live-nat: ended before its time; all it had made is gone\n")
         return 130
-    kept = promises(outcomes)
+    kept = check_requirements(outcomes)
     file = given.out / "live-nat"
     trials = {"promises": [asdict(one) for one in kept], "trials": [asdict(one) for one in outcomes]}
     file.with_suffix(".json").write_text(json.dumps(trials, indent=1) + "\n", encoding="utf-8")
-    picture = drawn([one for one in outcomes if one.part == PLAIN], "Seconds until the first answer")
+    picture = draw_svg([one for one in outcomes if one.part == PLAIN], "Seconds until the first answer")
     file.with_suffix(".svg").write_text(picture, encoding="utf-8")
-    say(f"\n{table(outcomes)}\n{file}.json, .svg; {time.monotonic() - began:.0f} s")
+    print_line(f"\n{format_table(outcomes)}\n{file}.json, .svg; {time.monotonic() - began:.0f} s")
     if given.docs:
-        DOCUMENT.write_text(written(DOCUMENT.read_text(encoding="utf-8"), outcomes), encoding="utf-8")
+        DOCUMENT.write_text(update_document(DOCUMENT.read_text(encoding="utf-8"), outcomes), encoding="utf-8")
         (DOCUMENT.parent / PICTURE).write_text(picture, encoding="utf-8")
     return 0 if all(one.is_kept for one in kept) else 1
 

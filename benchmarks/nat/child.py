@@ -23,23 +23,23 @@ from middleware.entangled.contact import Contact
 from middleware.entangled.errors import EntangledError
 from middleware.entangled.identity import Identity
 from middleware.entangled.node import EntangledNode
-from swarmnode.world import real_seams
+from swarmnode.environment import make_dependencies
 
 Order = dict[str, Any]
 reactor: Any = _reactor
-CALL = "matrix.hello"
-AGAIN_S = 0.25
+CALL_METHOD = "matrix.hello"
+RETRY_S = 0.25
 """Seconds between two calls to a peer that has not answered yet."""
 IN_FLIGHT = 8
 
 
-class Sight:
+class PeerObservation:
     """The observations of one node about one peer."""
 
     def __init__(self) -> None:
         self.contact: Contact | None = None
         """The contact that the node calls."""
-        self.proved: Contact | None = None
+        self.confirmed: Contact | None = None
         """The contact that answered, or connected."""
         self.known_at = self.answered_at = -1.0
         self.path = ""
@@ -50,11 +50,11 @@ class Member:
     """A node of a trial, with hooks that record its requests."""
 
     def __init__(self, settings: Settings, seed: bytes) -> None:
-        seams = real_seams(settings, reactor)
+        seams = make_dependencies(settings, reactor)
         identity, network = Identity(seed), seams.network()
         self.node = EntangledNode(identity, settings.node.team_secret, network, seams.store, reactor, seams.rng)
-        self.sights: dict[bytes, Sight] = {}
-        self.sought: dict[bytes, float] = {}
+        self.observations: dict[bytes, PeerObservation] = {}
+        self.wanted_peers: dict[bytes, float] = {}
         """Peers that are called as soon as they are known, with the maximum duration in seconds."""
         self._network = network
         endpoint = self.node.endpoint
@@ -62,11 +62,11 @@ class Member:
         # The time at which a node learns of a peer is visible only in its own requests, so they are intercepted.
         endpoint.ask = self._ask_and_record  # type: ignore[method-assign]
         endpoint.on_contact.add(self._on_contact)
-        self.node.rpc(CALL)(lambda peer: True)
+        self.node.rpc(CALL_METHOD)(lambda peer: True)
 
-    def sight(self, public: bytes) -> Sight:
+    def get_observation(self, public: bytes) -> PeerObservation:
         """Return the observations about the peer with that key."""
-        return self.sights.setdefault(public, Sight())
+        return self.observations.setdefault(public, PeerObservation())
 
     def start(self) -> int:
         """Open the port and return it."""
@@ -97,30 +97,30 @@ class Member:
             if reactor.seconds() - began > limit_s:
                 over(-1.0)
                 return
-            sight = self.sight(public)
-            contact = sight.proved or sight.contact
+            sight = self.get_observation(public)
+            contact = sight.confirmed or sight.contact
             if contact is not None and state["in flight"] < IN_FLIGHT:
                 state["in flight"] += 1
-                asked: Deferred[Any] = self.node.call(contact, CALL)
+                asked: Deferred[Any] = self.node.call(contact, CALL_METHOD)
                 asked.addCallbacks(answered, failed)
-            reactor.callLater(AGAIN_S, again)
+            reactor.callLater(RETRY_S, again)
 
         again()
 
-    def path(self, public: bytes) -> str:
+    def get_path(self, public: bytes) -> str:
         """Return the present path to a peer."""
-        proved = self.sight(public).proved
-        return "" if proved is None else path(proved)
+        proved = self.get_observation(public).confirmed
+        return "" if proved is None else find_path_kind(proved)
 
     def _ask_and_record(self, contact: Contact, method: str, *arguments: object, **options: Any) -> Deferred[Any]:
-        sight = self.sight(contact.public)
+        sight = self.get_observation(contact.public)
         self._record_contact(contact, sight)
         asked = self._ask(contact, method, *arguments, **options)
 
         def answered(answer: object) -> object:
             if sight.answered_at < 0:
                 sight.answered_at = reactor.seconds()
-                sight.path = self.path(contact.public)
+                sight.path = self.get_path(contact.public)
                 for waiting in sight.waiting:
                     waiting()
             return answer
@@ -128,20 +128,20 @@ class Member:
         return asked.addCallback(answered)
 
     def _on_contact(self, contact: Contact) -> None:
-        sight = self.sight(contact.public)
-        sight.proved = contact
+        sight = self.get_observation(contact.public)
+        sight.confirmed = contact
         self._record_contact(contact, sight)
 
-    def _record_contact(self, contact: Contact, sight: Sight) -> None:
+    def _record_contact(self, contact: Contact, sight: PeerObservation) -> None:
         sight.contact = contact
         if sight.known_at < 0:
             sight.known_at = reactor.seconds()
-            if contact.public in self.sought:
+            if contact.public in self.wanted_peers:
                 # Simulate an application that calls each discovered peer; its call follows the node's own request.
-                reactor.callLater(0.0, self.call, contact.public, lambda _: None, self.sought[contact.public])
+                reactor.callLater(0.0, self.call, contact.public, lambda _: None, self.wanted_peers[contact.public])
 
 
-def path(contact: Contact) -> str:
+def find_path_kind(contact: Contact) -> str:
     """Return the kind of path from the address of a contact."""
     host = contact.address.host
     if host.startswith("~wss"):
@@ -149,7 +149,7 @@ def path(contact: Contact) -> str:
     return "relayed" if host.startswith("~") else "direct"
 
 
-class Computer:
+class OrderExecutor:
     """Execute orders and answer each by its id."""
 
     def __init__(self) -> None:
@@ -186,7 +186,7 @@ class Computer:
         """Start a node; answer when it has joined (the first of a team at once), or at the time limit."""
         settings = Settings.from_mapping({"node": order["node"]}, "trial")
         member = self._members[order["trial"]] = Member(settings, bytes.fromhex(order["seed"]))
-        member.sought = {bytes.fromhex(public): order["limit_s"] for public in order["sought"]}
+        member.wanted_peers = {bytes.fromhex(public): order["limit_s"] for public in order["sought"]}
         port, began = member.start(), reactor.seconds()
         late = reactor.callLater(order["limit_s"], self._answer, order, port=port, joined_s=None)
 
@@ -201,7 +201,7 @@ class Computer:
         """Wait until a peer has answered; return the time since the node learnt of it."""
         member = self._members[order["trial"]]
         public = bytes.fromhex(order["peer"])
-        sight = member.sight(public)
+        sight = member.get_observation(public)
 
         def tell() -> None:
             if not timer.active():
@@ -223,20 +223,20 @@ class Computer:
         member, public = self._members[order["trial"]], bytes.fromhex(order["peer"])
 
         def done(seconds: float) -> None:
-            self._answer(order, took_s=None if seconds < 0 else seconds, path=member.path(public))
+            self._answer(order, took_s=None if seconds < 0 else seconds, path=member.get_path(public))
 
         member.call(public, done, order["limit_s"])
 
     def _do_path(self, order: Order) -> None:
         """Return the present path to a peer."""
-        self._answer(order, path=self._members[order["trial"]].path(bytes.fromhex(order["peer"])))
+        self._answer(order, path=self._members[order["trial"]].get_path(bytes.fromhex(order["peer"])))
 
     def _do_stop(self, order: Order) -> None:
         """Stop nodes without notifying their peers."""
         for trial in order["trials"]:
             member = self._members.pop(trial, None)
             if member is not None:
-                member.node.vanish()
+                member.node.stop_silently()
         self._answer(order)
 
 
@@ -244,7 +244,7 @@ def main() -> None:
     """Execute orders until the input ends."""
     logging.disable(logging.CRITICAL)
     use_monotonic_time()
-    reactor.callWhenRunning(Computer().begin)
+    reactor.callWhenRunning(OrderExecutor().begin)
     reactor.run(installSignalHandlers=False)
 
 

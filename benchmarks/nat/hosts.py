@@ -8,25 +8,25 @@ from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
-from benchmarks.remote import Lost, Remote, Unable
+from benchmarks.remote import OrderFailed, OrderImpossible, RemoteProcess
 from sim.namespaces.internet import ROOT, Internet
-from sim.namespaces.room import environment
+from sim.namespaces.namespace import make_environment
 
-SPAWN_S = 60.0
+SPAWN_LIMIT_S = 60.0
 MARGIN_S = 10.0
 """Seconds after an order's time limit until it counts as lost."""
-MAX_LINE = 1 << 20
+MAX_LINE_BYTES = 1 << 20
 
 
-class Computer(Remote):
+class HostProcess(RemoteProcess):
     """The child process of one host, with orders that may take some time."""
 
-    async def order(self, do: str, limit_s: float = 0.0, /, **fields: Any) -> dict[str, Any]:
+    async def run_order(self, do: str, limit_s: float = 0.0, /, **fields: Any) -> dict[str, Any]:
         """Execute an order that may take ``limit_s``; raises ``Lost``."""
         try:
-            return await super().order(do, limit_s + MARGIN_S, limit_s=limit_s, **fields)
-        except Unable as error:
-            raise Lost(f"{self.name} could not {do}: {error}") from None
+            return await super().run_order(do, limit_s + MARGIN_S, limit_s=limit_s, **fields)
+        except OrderImpossible as error:
+            raise OrderFailed(f"{self.name} could not {do}: {error}") from None
 
 
 class Hosts:
@@ -36,16 +36,16 @@ class Hosts:
         self.net = net
         self._hosts = list(hosts)
         self._folder = folder
-        self._computers: dict[str, Computer] = {}
+        self._processes_by_host: dict[str, HostProcess] = {}
 
-    def __getitem__(self, host: str) -> Computer:
-        return self._computers[host]
+    def __getitem__(self, host: str) -> HostProcess:
+        return self._processes_by_host[host]
 
     async def __aenter__(self) -> Hosts:
         try:
             for host in self._hosts:
-                self._computers[host] = await self._spawn(host)
-            await asyncio.gather(*(computer.up(SPAWN_S) for computer in self._computers.values()))
+                self._processes_by_host[host] = await self._spawn(host)
+            await asyncio.gather(*(computer.wait_ready(SPAWN_LIMIT_S) for computer in self._processes_by_host.values()))
         except BaseException:
             await self._end()
             raise
@@ -54,16 +54,16 @@ class Hosts:
     async def __aexit__(self, *trouble: object) -> None:
         await self._end()
 
-    async def _spawn(self, host: str) -> Computer:
+    async def _spawn(self, host: str) -> HostProcess:
         said, pipe = self._folder / f"{host}.errors", asyncio.subprocess.PIPE
         command = self.net.command(host, [sys.executable, "-m", "benchmarks.nat.child"])
         with said.open("wb") as errors:
             # In a separate session, so that signals from the terminal reach only the parent.
             process = await asyncio.create_subprocess_exec(
-                *command, stdin=pipe, stdout=pipe, stderr=errors, cwd=ROOT, env=environment(), limit=MAX_LINE,
+                *command, stdin=pipe, stdout=pipe, stderr=errors, cwd=ROOT, env=make_environment(), limit=MAX_LINE_BYTES,
                 start_new_session=True,
             )  # fmt: skip
-        return Computer(host, process, said)
+        return HostProcess(host, process, said)
 
     async def _end(self) -> None:
-        await asyncio.gather(*(computer.ended() for computer in self._computers.values()))
+        await asyncio.gather(*(computer.kill() for computer in self._processes_by_host.values()))

@@ -9,9 +9,9 @@ from dataclasses import dataclass, field
 from functools import partial
 
 from sim.demo.trials import percentile
-from sim.namespaces.kind import Kind
+from sim.namespaces.nat import NatKind
 
-MATRIX = (Kind.NONE, Kind.FULL, Kind.ADDR, Kind.PORT, Kind.SYM, Kind.NOUDP)
+MATRIX = (NatKind.NONE, NatKind.FULL, NatKind.ADDR, NatKind.PORT, NatKind.SYM, NatKind.NOUDP)
 PLAIN, ALONE, LOSS, HOME, LEAKY, FORGOTTEN, RENUMBERED, MOVED, IDLE = (
     "plain",
     "bootstrap cut off",
@@ -56,7 +56,7 @@ class Outcome:
 
 
 @dataclass(frozen=True)
-class Promise:
+class Requirement:
     """A requirement, its measured result, and whether the result meets it."""
 
     what: str
@@ -64,16 +64,16 @@ class Promise:
     is_kept: bool
 
 
-def is_punchable(a: Kind, b: Kind) -> bool:
+def is_punchable(a: NatKind, b: NatKind) -> bool:
     """Return whether datagrams sent at the same time from both sides can open a path (hole punching).
 
     They cannot if a filter by port meets a NAT that uses another port for each peer.
     """
-    closed = {Kind.PORT, Kind.SYM}
-    return Kind.NOUDP not in (a, b) and not (Kind.SYM in (a, b) and {a, b} <= closed)
+    closed = {NatKind.PORT, NatKind.SYM}
+    return NatKind.NOUDP not in (a, b) and not (NatKind.SYM in (a, b) and {a, b} <= closed)
 
 
-def cell(outcomes: Sequence[Outcome]) -> str:
+def format_cell(outcomes: Sequence[Outcome]) -> str:
     """Return the table cell of a pair: the path, the median and the maximum of the seconds."""
     if not outcomes:
         return ""
@@ -86,20 +86,20 @@ def cell(outcomes: Sequence[Outcome]) -> str:
     return words if len(there) == len(outcomes) else f"{words}, {len(outcomes) - len(there)} of {len(outcomes)} fail"
 
 
-def promises(outcomes: Iterable[Outcome]) -> list[Promise]:
+def check_requirements(outcomes: Iterable[Outcome]) -> list[Requirement]:
     """Return the requirements of a run in the order of the parts, without the parts that were not run."""
     every = list(outcomes)
     plain = [one for one in every if one.part == PLAIN]
-    open_ones = [one for one in plain if is_punchable(Kind(one.a), Kind(one.b))]
-    closed = [one for one in plain if not is_punchable(Kind(one.a), Kind(one.b))]
-    wanted: list[Promise] = []
+    open_ones = [one for one in plain if is_punchable(NatKind(one.a), NatKind(one.b))]
+    closed = [one for one in plain if not is_punchable(NatKind(one.a), NatKind(one.b))]
+    wanted: list[Requirement] = []
 
     def want(what: str, some: Sequence[Outcome], kept: Callable[[Outcome], bool], share: float = 1.0) -> None:
         if some:
             held = [one for one in some if kept(one)]
             times = [one.seconds for one in some]
-            seen = f"{len(held)} of {len(some)}; p50 {_s(percentile(times, 0.5))}, worst {_s(max(times))}"
-            wanted.append(Promise(what, seen, len(held) >= share * len(some)))
+            seen = f"{len(held)} of {len(some)}; p50 {_format_seconds(percentile(times, 0.5))}, worst {_format_seconds(max(times))}"
+            wanted.append(Requirement(what, seen, len(held) >= share * len(some)))
 
     want(
         "pairs that hole punching can connect are direct",
@@ -108,25 +108,27 @@ def promises(outcomes: Iterable[Outcome]) -> list[Promise]:
     )
     if open_ones:
         p95 = percentile([one.seconds for one in open_ones], 0.95)
-        wanted.append(Promise(f"their 95th percentile is at most {DIRECT_S:g} s", _s(p95), p95 <= DIRECT_S))
+        wanted.append(
+            Requirement(f"their 95th percentile is at most {DIRECT_S:g} s", _format_seconds(p95), p95 <= DIRECT_S)
+        )
     want(f"all other pairs connect within {RELAYED_S:g} s", closed, partial(_is_within, RELAYED_S))
-    tunnelled = [one for one in closed if Kind.NOUDP.value in one.pair]
+    tunnelled = [one for one in closed if NatKind.NOUDP.value in one.pair]
     if tunnelled:
         times = [max(one.joined_s, default=math.inf) if len(one.joined_s) == 2 else math.inf for one in tunnelled]
-        seen = f"{sum(took <= JOIN_S for took in times)} of {len(times)}; worst {_s(max(times))}"
-        wanted.append(Promise(f"nodes without UDP join within {JOIN_S:g} s", seen, max(times) <= JOIN_S))
-    for part, (limit, words) in _WANTED.items():
+        seen = f"{sum(took <= JOIN_S for took in times)} of {len(times)}; worst {_format_seconds(max(times))}"
+        wanted.append(Requirement(f"nodes without UDP join within {JOIN_S:g} s", seen, max(times) <= JOIN_S))
+    for part, (limit, words) in _LIMITS_BY_PART.items():
         some = [one for one in every if one.part == part]
         want(f"{words} within {limit:g} s", some, partial(_is_within, limit))
     lossy = [one for one in every if one.part == LOSS]
-    with_udp = [one for one in lossy if Kind.NOUDP.value not in one.pair]
-    without = [one for one in lossy if Kind.NOUDP.value in one.pair]
+    with_udp = [one for one in lossy if NatKind.NOUDP.value not in one.pair]
+    without = [one for one in lossy if NatKind.NOUDP.value in one.pair]
     for some, of in ((lossy, "of all pairs"), (with_udp, "of pairs with UDP"), (without, "of pairs without UDP")):
         want(f"30 % lost on both lines: within {LOSS_S:g} s 95 % {of}", some, partial(_is_within, LOSS_S), 0.95)
     return wanted
 
 
-_WANTED = {
+_LIMITS_BY_PART = {
     ALONE: (DIRECT_S, "direct pairs continue without the bootstrap node: an answer"),
     HOME: (DIRECT_S, "two hosts behind one router"),
     LEAKY: (LEAKY_S, "a router without a firewall, and one side late:"),
@@ -141,5 +143,5 @@ def _is_within(limit: float, outcome: Outcome) -> bool:
     return outcome.seconds <= limit
 
 
-def _s(seconds: float) -> str:
+def _format_seconds(seconds: float) -> str:
     return "never" if seconds == math.inf else f"{seconds:.2f} s"

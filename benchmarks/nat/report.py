@@ -7,9 +7,19 @@ import statistics
 from collections.abc import Sequence
 from html import escape
 
-from benchmarks.nat.outcome import ALONE, FORGOTTEN, LOSS, MATRIX, PLAIN, RENUMBERED, Outcome, cell, promises
+from benchmarks.nat.outcome import (
+    ALONE,
+    FORGOTTEN,
+    LOSS,
+    MATRIX,
+    PLAIN,
+    RENUMBERED,
+    Outcome,
+    check_requirements,
+    format_cell,
+)
 
-WHOLE = (PLAIN, LOSS, FORGOTTEN, RENUMBERED)
+MATRIX_PARTS = (PLAIN, LOSS, FORGOTTEN, RENUMBERED)
 """The parts that run every pair."""
 BEGIN, END = "<!-- measured -->", "<!-- /measured -->"
 LEFT, TOP, WIDE, HIGH = 150, 46, 112, 52
@@ -17,35 +27,37 @@ COLOURS = {"direct": "#cfe8d5", "relayed": "#fbe7b2", "tunnel": "#cfdcf2", "": "
 INK, FAINT = "#1d2733", "#5b6672"
 
 
-def rows(outcomes: Sequence[Outcome], part: str) -> list[list[str]]:
+def make_matrix_rows(outcomes: Sequence[Outcome], part: str) -> list[list[str]]:
     """Return the matrix of one part: a row for each kind, with a cell for each pair; the lower half is empty."""
     some = [one for one in outcomes if one.part == part]
     found = [[part, *(kind.value for kind in MATRIX)]]
     for number, a in enumerate(MATRIX):
         pairs = [
-            cell([one for one in some if {one.a, one.b} == {a.value, b.value}]) if place >= number else ""
+            format_cell([one for one in some if {one.a, one.b} == {a.value, b.value}]) if place >= number else ""
             for place, b in enumerate(MATRIX)
         ]
         found.append([a.value, *pairs])
     return found
 
 
-def others(outcomes: Sequence[Outcome]) -> list[list[str]]:
+def make_other_rows(outcomes: Sequence[Outcome]) -> list[list[str]]:
     """Return the special cases: a row for each pair of each other part."""
     found: list[list[str]] = []
-    for part in dict.fromkeys(one.part for one in outcomes if one.part not in (*WHOLE, ALONE)):
+    for part in dict.fromkeys(one.part for one in outcomes if one.part not in (*MATRIX_PARTS, ALONE)):
         some = [one for one in outcomes if one.part == part]
         for a, b, note in dict.fromkeys((one.a, one.b, one.note) for one in some):
             these = [one for one in some if (one.a, one.b, one.note) == (a, b, note)]
-            found.append([part, f"{a} x {b}" + (f", {note}" if note else ""), cell(these)])
+            found.append([part, f"{a} x {b}" + (f", {note}" if note else ""), format_cell(these)])
     return found
 
 
-def table(outcomes: Sequence[Outcome]) -> str:
+def format_table(outcomes: Sequence[Outcome]) -> str:
     """Return the complete report for a terminal."""
-    parts = [_align(rows(outcomes, part)) for part in _measured_parts(outcomes)]
-    parts += [_align(others(outcomes))]
-    parts += ["\n".join(f"{'met    ' if p.is_kept else 'NOT MET'}  {p.what}: {p.seen}" for p in promises(outcomes))]
+    parts = [_align(make_matrix_rows(outcomes, part)) for part in _measured_parts(outcomes)]
+    parts += [_align(make_other_rows(outcomes))]
+    parts += [
+        "\n".join(f"{'met    ' if p.is_kept else 'NOT MET'}  {p.what}: {p.seen}" for p in check_requirements(outcomes))
+    ]
     troubles = dict.fromkeys(f"{one.part} {one.a} x {one.b}: {one.trouble}" for one in outcomes if one.trouble)
     parts += ["\n".join(list(troubles)[:12])]
     later = [one for one in outcomes if one.later and one.later != one.path and one.seconds < math.inf]
@@ -54,7 +66,7 @@ def table(outcomes: Sequence[Outcome]) -> str:
     return "\n\n".join(part for part in parts if part)
 
 
-def written(document: str, outcomes: Sequence[Outcome]) -> str:
+def update_document(document: str, outcomes: Sequence[Outcome]) -> str:
     """Return ``document`` with the results between its two marks; raises ``ValueError`` without the marks."""
     before, begin, rest = document.partition(BEGIN)
     _, end, after = rest.partition(END)
@@ -62,16 +74,16 @@ def written(document: str, outcomes: Sequence[Outcome]) -> str:
         raise ValueError(f"the document has no marks {BEGIN} and {END}")
     lines = [BEGIN, ""]
     for part in _measured_parts(outcomes):
-        head, *body = rows(outcomes, part)
+        head, *body = make_matrix_rows(outcomes, part)
         lines += [*_format_markdown(head, body), ""]
-    kept = [[p.what, p.seen, "met" if p.is_kept else "**not met**"] for p in promises(outcomes)]
+    kept = [[p.what, p.seen, "met" if p.is_kept else "**not met**"] for p in check_requirements(outcomes)]
     lines += _format_markdown(["requirement", "result", ""], kept)
-    lines += ["", *_format_markdown(["case", "pair", "result"], others(outcomes)), "", END]
+    lines += ["", *_format_markdown(["case", "pair", "result"], make_other_rows(outcomes)), "", END]
     return before + "\n".join(lines) + after
 
 
 def _measured_parts(outcomes: Sequence[Outcome]) -> list[str]:
-    return [part for part in WHOLE if any(one.part == part for one in outcomes)]
+    return [part for part in MATRIX_PARTS if any(one.part == part for one in outcomes)]
 
 
 def _format_markdown(head: list[str], body: list[list[str]]) -> list[str]:
@@ -89,14 +101,14 @@ def _align(lines: list[list[str]]) -> str:
     return "\n".join("  ".join(f"{c:<{w}}" for c, w in zip(line, widths, strict=True)).rstrip() for line in lines)
 
 
-def drawn(outcomes: Sequence[Outcome], title: str) -> str:
+def draw_svg(outcomes: Sequence[Outcome], title: str) -> str:
     """Return the matrix as an SVG: a square for each pair with the path and the median of the seconds."""
     width, height = LEFT + WIDE * len(MATRIX) + 16, TOP + HIGH * len(MATRIX) + 60
     parts = [f'<text x="12" y="22" font-size="15" font-weight="bold">{escape(title)}</text>']
     for number, kind in enumerate(MATRIX):
         x, y = LEFT + number * WIDE + WIDE / 2, TOP + number * HIGH + HIGH / 2
-        parts.append(f'<text x="{x:g}" y="{TOP - 6}" text-anchor="middle">{escape(kind.meaning)}</text>')
-        parts.append(f'<text x="{LEFT - 10}" y="{y + 4:g}" text-anchor="end">{escape(kind.meaning)}</text>')
+        parts.append(f'<text x="{x:g}" y="{TOP - 6}" text-anchor="middle">{escape(kind.description)}</text>')
+        parts.append(f'<text x="{LEFT - 10}" y="{y + 4:g}" text-anchor="end">{escape(kind.description)}</text>')
     for row, a in enumerate(MATRIX):
         for column, b in enumerate(MATRIX[row:], start=row):
             some = [one for one in outcomes if {one.a, one.b} == {a.value, b.value}]

@@ -30,9 +30,9 @@ class Cause(Enum):
     TRIPLE_KILL = "triple kill"
 
 
-VIRTUAL = frozenset({Cause.LOST_LINK})
+VIRTUAL_ONLY = frozenset({Cause.LOST_LINK})
 """Causes in virtual time only; with processes the demonstration has it (``--lose link``)."""
-SAYS = {
+DESCRIPTIONS = {
     Cause.CRASH: "its node dies (SIGKILL)",
     Cause.FREEZE: "its node stands still (SIGSTOP) for two leases and more, and goes on",
     Cause.LOST_RADIO: "nothing passes between it and the others",
@@ -62,20 +62,20 @@ class Trial:
     zombies: int
 
     @property
-    def held(self) -> bool:
+    def has_passed(self) -> bool:
         """Whether another robot completed the task, and no two robots acted at once."""
-        return self.done and self.by not in ("", self.lost) and self.takeover is not None and not self.bad
+        return self.done and self.by not in ("", self.lost) and self.takeover is not None and not self.violation_count
 
     @property
-    def bad(self) -> int:
+    def violation_count(self) -> int:
         """Samples in which a robot moved without permission."""
         return self.overlaps + self.zombies
 
 
-LOOK_S = 0.01
+POLL_S = 0.01
 
 
-class Judge:
+class TakeoverObserver:
     """Observer of a trial in which ``lost`` failed at ``began``; ``rng`` draws the duration of a freeze.
 
     The trial ends ``limit`` seconds after the failure, or ``after`` seconds after its end was observed.
@@ -95,14 +95,14 @@ class Judge:
         """Return whether the observation is complete; never while the failed node is frozen."""
         return now >= self._end and self._thaw_at is None
 
-    def thaws(self, now: float) -> bool:
+    def take_thaw(self, now: float) -> bool:
         """Return whether the failed node has to continue now; true once."""
         if self._thaw_at is None or now < self._thaw_at:
             return False
         self._thaw_at = None
         return True
 
-    def look(self, now: float, moving: Collection[str], result: Result | None) -> None:
+    def record(self, now: float, moving: Collection[str], result: Result | None) -> None:
         """Record the moving robots, and the result of the task if it is known."""
         self._overlaps += len(moving) > 1
         if self.takeover is not None:
@@ -113,7 +113,7 @@ class Judge:
             self._end = now + self._after if self.result is None else self._end
             self.result = result
 
-    def verdict(self) -> Trial:
+    def make_trial(self) -> Trial:
         """Return the result of the trial."""
         by, done = ("", False) if self.result is None else (self.result.by, self.result.outcome == COMPLETED)
         cause = self._cause.value

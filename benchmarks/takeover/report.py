@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from html import escape
 
-from benchmarks.takeover.cause import SAYS, Cause, Trial
+from benchmarks.takeover.cause import DESCRIPTIONS, Cause, Trial
 from sim.demo.trials import percentile
 
 TARGETS = {cause.value: (1.5, 2.0) for cause in Cause} | {Cause.POLITE_LEAVE.value: (0.2, 0.5)}
@@ -14,7 +14,7 @@ BIN_S, MOST_S = 0.1, 4.0
 WIDE, HIGH, LEFT = 12, 60, 150
 
 
-def table(trials: Sequence[Trial]) -> str:
+def format_table(trials: Sequence[Trial]) -> str:
     """Return one line per cause: held trials, seconds to take over, and samples with two moving robots or a zombie."""
     lines = [
         f"{'':16}{'trials':>7}{'held':>6}{'p50 s':>8}{'p95 s':>8}{'p99 s':>8}{'max s':>8}"
@@ -29,14 +29,14 @@ def table(trials: Sequence[Trial]) -> str:
         cells = "".join(f"{value:8.2f}" for value in shares) or f"{'-':>8}" * 4
         p50, p99 = TARGETS[cause.value]
         reached = bool(shares) and shares[0] <= p50 and shares[2] <= p99
-        held = sum(trial.held for trial in some)
+        held = sum(trial.has_passed for trial in some)
         bad = f"{sum(t.overlaps for t in some):>5}{sum(t.zombies for t in some):>8}"
         verdict = f"p50 {p50:g}, p99 {p99:g}: {'yes' if reached else 'no'}"
         lines.append(f"{cause.value:16}{len(some):>7}{held:>6}{cells}{bad}  {verdict}")
     return "\n".join(lines)
 
 
-def drawn(trials: Sequence[Trial]) -> str:
+def draw_svg(trials: Sequence[Trial]) -> str:
     """Return a histogram for each cause, in one SVG: tenths of a second to the right, trials upwards."""
     bins = round(MOST_S / BIN_S)
     parts, y = [], 10
@@ -48,7 +48,7 @@ def drawn(trials: Sequence[Trial]) -> str:
         for seconds in times:
             counts[min(bins, int(seconds / BIN_S))] += 1
         parts.append(f'<text x="8" y="{y + 14}" font-weight="bold">{escape(cause.value)}</text>')
-        parts.append(f'<text x="{LEFT}" y="{y + 14}">{escape(SAYS[cause])}</text>')
+        parts.append(f'<text x="{LEFT}" y="{y + 14}">{escape(DESCRIPTIONS[cause])}</text>')
         y += HIGH + 22
         for place, count in enumerate(counts):
             high = HIGH * count / max(counts)

@@ -14,12 +14,12 @@ from dataclasses import dataclass
 from drivers.errors import BadFrame
 
 T4, T2 = "T4", "T2"
-MAX_LINE = 4096
+MAX_LINE_BYTES = 4096
 MAX_COUNT = 256
-MAX_MODEL = 32
+MAX_MODEL_BYTES = 32
 MODEL_START = b"ERS-"
 PID_JOINTS = 18
-COMMAND = 5
+COMMAND_BYTES = 5
 """Bytes of each walk and head command: a letter and a float."""
 
 
@@ -37,12 +37,12 @@ class WorldState:
     duties: tuple[float, ...]
 
 
-def command(letter: str, value: float) -> bytes:
+def encode_command(letter: str, value: float) -> bytes:
     """Return a walk command (``f s r`` and the digits) or a head command (``t p r``) with a value from -1 to 1."""
     return struct.pack("<cf", letter.encode("ascii"), value)
 
 
-class Short(Exception):
+class IncompletePacket(Exception):
     """A packet is incomplete: it has at least ``need`` bytes."""
 
     def __init__(self, need: int) -> None:
@@ -50,7 +50,7 @@ class Short(Exception):
         self.need = need
 
 
-def string(text: str) -> bytes:
+def encode_string(text: str) -> bytes:
     """Encode a string as the dog does: its length, its bytes and a NUL."""
     data = text.encode("latin-1")
     return struct.pack("<I", len(data)) + data + b"\0"
@@ -63,50 +63,50 @@ class Cursor:
         self.at = 0
         self._data = data
 
-    def take(self, size: int) -> bytes:
+    def read(self, size: int) -> bytes:
         """Read ``size`` bytes."""
         piece = self._data[self.at : self.at + size]
         if len(piece) < size:
-            raise Short(self.at + size)
+            raise IncompletePacket(self.at + size)
         self.at += size
         return piece
 
-    def words(self, count: int) -> tuple[int, ...]:
+    def read_words(self, count: int) -> tuple[int, ...]:
         """Read ``count`` unsigned numbers."""
-        return struct.unpack(f"<{count}I", self.take(4 * count))
+        return struct.unpack(f"<{count}I", self.read(4 * count))
 
-    def floats(self, count: int) -> tuple[float, ...]:
+    def read_floats(self, count: int) -> tuple[float, ...]:
         """Read ``count`` floats."""
-        return struct.unpack(f"<{count}f", self.take(4 * count))
+        return struct.unpack(f"<{count}f", self.read(4 * count))
 
-    def count(self) -> int:
+    def read_count(self) -> int:
         """Read the number of values that follow."""
-        (count,) = self.words(1)
+        (count,) = self.read_words(1)
         if count > MAX_COUNT:
             raise BadFrame(f"a count of {count} values exceeds the maximum of {MAX_COUNT}")
         return count
 
-    def row(self) -> tuple[float, ...]:
+    def read_row(self) -> tuple[float, ...]:
         """Read a count and that many floats."""
-        return self.floats(self.count())
+        return self.read_floats(self.read_count())
 
-    def until_nul(self) -> str:
+    def read_name(self) -> str:
         """Read a short name that ends with a NUL."""
-        end = self._data.find(b"\0", self.at, self.at + MAX_MODEL)
+        end = self._data.find(b"\0", self.at, self.at + MAX_MODEL_BYTES)
         if end < 0:
-            if len(self._data) - self.at >= MAX_MODEL:
+            if len(self._data) - self.at >= MAX_MODEL_BYTES:
                 raise BadFrame("name without terminating NUL")
-            raise Short(len(self._data) + 1)
+            raise IncompletePacket(len(self._data) + 1)
         text = self._data[self.at : end]
         self.at = end + 1
         return text.decode("latin-1")
 
-    def string(self, limit: int) -> str:
+    def read_string(self, limit: int) -> str:
         """Read a string of at most ``limit`` bytes, in the encoding of ``string``."""
-        (length,) = self.words(1)
+        (length,) = self.read_words(1)
         if length > limit:
             raise BadFrame(f"string of {length} bytes exceeds the maximum of {limit}")
-        data = self.take(length + 1)
+        data = self.read(length + 1)
         if data[-1]:
             raise BadFrame("string without terminating NUL")
         return data[:-1].decode("latin-1")
@@ -121,9 +121,9 @@ class CommandReader:
     def read(self, data: bytes) -> Iterator[tuple[str, float]]:
         """Yield letter and value of each command that ``data`` completes."""
         self._rest += data
-        while len(self._rest) >= COMMAND:
-            letter, value = struct.unpack("<cf", self._rest[:COMMAND])
-            del self._rest[:COMMAND]
+        while len(self._rest) >= COMMAND_BYTES:
+            letter, value = struct.unpack("<cf", self._rest[:COMMAND_BYTES])
+            del self._rest[:COMMAND_BYTES]
             yield letter.decode("latin-1"), value
 
 
@@ -137,17 +137,17 @@ class LineReader:
     def read(self, data: bytes) -> Iterator[str]:
         """Yield the lines that ``data`` completes, without their line ends."""
         *lines, self._rest = (self._rest + data).split(b"\n")
-        if len(self._rest) > MAX_LINE:
+        if len(self._rest) > MAX_LINE_BYTES:
             self._rest = b""
             self.bad_lines += 1
         for line in lines:
-            if len(line) > MAX_LINE:
+            if len(line) > MAX_LINE_BYTES:
                 self.bad_lines += 1
                 continue
             yield line.removesuffix(b"\r").decode("latin-1")
 
 
-def encoded(state: WorldState) -> bytes:
+def encode_state(state: WorldState) -> bytes:
     """Encode ``state`` in its dialect; T2 contains joints only, which are the first of the outputs."""
     if state.dialect == T2:
         rows = (state.outputs[: len(state.duties)], state.sensors, state.buttons)
@@ -156,7 +156,7 @@ def encoded(state: WorldState) -> bytes:
     return head + b"".join(_encode_row(row) for row in (state.outputs, state.sensors, state.buttons, state.duties))
 
 
-def encoded_gains(t: int, pids: Sequence[tuple[float, float, float]]) -> bytes:
+def encode_gains(t: int, pids: Sequence[tuple[float, float, float]]) -> bytes:
     """Encode the packet of port 10032: the gains P, I and D of each joint at ``t`` ms."""
     return struct.pack("<II", t, len(pids)) + _encode_floats([value for row in pids for value in row])
 
@@ -186,7 +186,7 @@ class StateReader:
             cursor = Cursor(bytes(self._rest))
             try:
                 state = _read_state(cursor, self._rest.startswith(MODEL_START))
-            except Short as short:
+            except IncompletePacket as short:
                 self._need = short.need
                 continue
             del self._rest[: cursor.at]
@@ -196,11 +196,15 @@ class StateReader:
 
 def _read_state(cursor: Cursor, has_model: bool) -> WorldState:
     if has_model:
-        model = cursor.until_nul()
-        t, frame = cursor.words(2)
-        return WorldState(T4, model, t, frame, cursor.row(), cursor.row(), cursor.row(), cursor.row())
-    (t,) = cursor.words(1)
-    joints = cursor.count()
+        model = cursor.read_name()
+        t, frame = cursor.read_words(2)
+        return WorldState(
+            T4, model, t, frame, cursor.read_row(), cursor.read_row(), cursor.read_row(), cursor.read_row()
+        )
+    (t,) = cursor.read_words(1)
+    joints = cursor.read_count()
     if joints != PID_JOINTS:
         raise BadFrame(f"neither dialect: no model, and {joints} joints")
-    return WorldState(T2, "", t, 0, cursor.floats(joints), cursor.row(), cursor.row(), cursor.floats(joints))
+    return WorldState(
+        T2, "", t, 0, cursor.read_floats(joints), cursor.read_row(), cursor.read_row(), cursor.read_floats(joints)
+    )

@@ -9,15 +9,15 @@ from functools import partial
 from twisted.internet.defer import Deferred, fail, gatherResults, succeed
 from twisted.internet.interfaces import IReactorTime
 
-from drivers.aibo import menu, sense
-from drivers.aibo.codec import LineReader, StateReader, WorldState, command
-from drivers.aibo.link import WAITS, Camera, Datagrams, Port, UdpDatagrams
+from drivers.aibo import menu, sensors
+from drivers.aibo.codec import LineReader, StateReader, WorldState, encode_command
+from drivers.aibo.link import RETRY_DELAYS_S, Camera, DatagramConnector, Port, UdpConnector
 from drivers.aibo.menu import Hello, Load, MenuReader, select
-from drivers.aibo.option import SOUNDS, Options, checked, described
+from drivers.aibo.option import SOUNDS, Options, make_description, parse_options
 from drivers.aibo.picture import Picture
-from drivers.base import ENGAGED, BaseDriver, heard_at
-from drivers.deadman.keeper import kept
-from drivers.deadman.switch import DeadMan, LastWord
+from drivers.base import ENGAGED, BaseDriver, correct_last_data_time
+from drivers.deadman.supervisor import create_switch
+from drivers.deadman.switch import DeadManSwitch, HaltCommand
 from drivers.driver import Permit
 from drivers.errors import BadFrame, LinkLost, NotEnabled, Unsupported
 from drivers.link import Connector, TcpConnector
@@ -27,17 +27,17 @@ from drivers.timer import Timer
 
 MANIFEST = Manifest(example={"host": "192.168.0.51"})
 
-AGAIN_S = 0.5
+WALK_REPEAT_S = 0.5
 """Interval in seconds at which a walk command is repeated; the dog stops 3 s after the last one."""
-WATCH_S = 0.125
-ASK_S = 1.0
+CHECK_INTERVAL_S = 0.125
+SERVER_RESTART_S = 1.0
 """Seconds without an answer after which a port's server is started again through main control."""
-STARTED_S = 3.0
+MAIN_CONTROL_TIMEOUT_S = 3.0
 """Seconds to wait for main control before connecting to the other ports anyway."""
-PATIENCE_S = 5.0
-NEEDED = ("estop", "state", "walk")
+NO_ANSWER_S = 5.0
+REQUIRED_SERVERS = ("estop", "state", "walk")
 """Servers without which the dog cannot be driven safely."""
-ANY_SOUND = re.compile(r"[A-Za-z0-9_-]{1,32}(\.[A-Za-z0-9]{1,4})?")
+SOUND_NAME = re.compile(r"[A-Za-z0-9_-]{1,32}(\.[A-Za-z0-9]{1,4})?")
 
 
 class AiboDriver(BaseDriver):
@@ -55,11 +55,11 @@ class AiboDriver(BaseDriver):
         name: str,
         connector: Connector,
         clock: IReactorTime,
-        datagrams: Datagrams | None = None,
-        dead_man: DeadMan | None = None,
+        datagrams: DatagramConnector | None = None,
+        dead_man: DeadManSwitch | None = None,
     ) -> None:
-        self._options = options if isinstance(options, Options) else checked(options)
-        super().__init__(described(self._options), name, clock, dead_man)
+        self._options = options if isinstance(options, Options) else parse_options(options)
+        super().__init__(make_description(self._options), name, clock, dead_man)
         self._connector = connector
         self._fps = self._options.wanted_fps
         self._ports = {
@@ -73,17 +73,17 @@ class AiboDriver(BaseDriver):
         over = datagrams if self._options.camera_transport == "udp" else None
         self._camera = Camera(connector, clock, address, self._on_picture, over)
         self._menu, self._lines, self._states = MenuReader(), LineReader(), StateReader()
-        self._hellos = 0
-        self._main_at: float | None = None
+        self._hello_count = 0
+        self._main_opened_at: float | None = None
         self._is_engaged = True
         self._walk = (0.0, 0.0, 0.0)
-        self._odometry = sense.Odometry()
-        self._heard_at = self._watch_at = 0.0
+        self._odometry = sensors.Odometry()
+        self._last_data_at = self._next_check_at = 0.0
         self._frame: Frame | None = None
-        self._started: set[str] = set()
+        self._started_servers: set[str] = set()
         self._logged_keys: set[str] = set()
-        self._asked_at: dict[str, float] = {}
-        self._repeat_timer, self._watch_timer = Timer(clock), Timer(clock)
+        self._restarted_at: dict[str, float] = {}
+        self._repeat_timer, self._check_timer = Timer(clock), Timer(clock)
 
     @property
     def camera_fps(self) -> float:
@@ -95,10 +95,10 @@ class AiboDriver(BaseDriver):
         self._fps = fps
         if fps > 0:
             self._send_lines(self._start_lines(["camera"])[:-1])
-            if self._hellos >= 2:
+            if self._hello_count >= 2:
                 self._camera.open()
         else:
-            self._send_lines(menu.stopped(["camera"]))
+            self._send_lines(menu.make_stop_commands(["camera"]))
             self._camera.close()
 
     def invoke(self, name: str, **arguments: float | str) -> Deferred[Mapping[str, Value]]:
@@ -109,7 +109,7 @@ class AiboDriver(BaseDriver):
             if name == "play":
                 return succeed(self._play_sound(arguments))
             if name in SOUNDS and not arguments:
-                self._get_open_port("walk").send(command(SOUNDS[name], 0.0))
+                self._get_open_port("walk").send(encode_command(SOUNDS[name], 0.0))
                 return succeed({})
         except (Unsupported, LinkLost, NotEnabled) as error:
             return fail(error)
@@ -127,14 +127,14 @@ class AiboDriver(BaseDriver):
 
     def _open(self) -> None:
         self._ports["main"].open()
-        self._watch_at = self._clock.seconds()
-        self._on_watch()
+        self._next_check_at = self._clock.seconds()
+        self._check_links()
 
     def _close(self) -> Deferred[None]:
         self._repeat_timer.cancel()
-        self._watch_timer.cancel()
+        self._check_timer.cancel()
         self._ports["estop"].send(b"stop\n")
-        self._send_lines(menu.stopped(sorted(self._started)))
+        self._send_lines(menu.make_stop_commands(sorted(self._started_servers)))
         closing = [port.close() for port in self._ports.values()] + [self._camera.close()]
         return gatherResults(closing).addCallback(lambda _: None)
 
@@ -162,25 +162,25 @@ class AiboDriver(BaseDriver):
     def _halt(self) -> None:
         self._send_walk(0.0, 0.0, 0.0)
 
-    def _last_word(self) -> LastWord | None:
+    def _make_halt_command(self) -> HaltCommand | None:
         link = self._ports["walk"].link
-        return None if link is None else LastWord(_walk_command(0.0, 0.0, 0.0), link)
+        return None if link is None else HaltCommand(_encode_walk(0.0, 0.0, 0.0), link)
 
     def _send_walk(self, f: float, s: float, r: float) -> None:
         self._repeat_timer.cancel()
         self._walk = (f, s, r)
-        self._ports["walk"].send(_walk_command(f, s, r))
+        self._ports["walk"].send(_encode_walk(f, s, r))
         if any(self._walk):
-            self._repeat_timer.set(AGAIN_S, self._on_again)
+            self._repeat_timer.set(WALK_REPEAT_S, self._on_repeat)
 
-    def _on_again(self) -> None:
-        if self._may_move:
+    def _on_repeat(self) -> None:
+        if self._is_motion_permitted:
             self._send_walk(*self._walk)
         else:
             self.stop()
 
     def _start_lines(self, services: list[str]) -> list[str]:
-        return menu.started(services, self._options.camera_transport, self._fps, self._options.camera_width)
+        return menu.make_start_commands(services, self._options.camera_transport, self._fps, self._options.camera_width)
 
     def _send_lines(self, lines: list[str]) -> None:
         if lines:
@@ -190,11 +190,11 @@ class AiboDriver(BaseDriver):
         done: dict[str, Value] = {}
         commands = b""
         for key, value in arguments.items():
-            if key not in _HEAD or isinstance(value, (bool, str)) or not -10.0 < value < 10.0:
+            if key not in _HEAD_AXES or isinstance(value, (bool, str)) or not -10.0 < value < 10.0:
                 raise Unsupported(f"look takes pan, tilt and nod in radians, not {key} = {value!r}")
-            letter, (low, high) = _HEAD[key]
+            letter, (low, high) = _HEAD_AXES[key]
             angle = min(max(float(value), low), high)
-            commands += command(letter, angle / high if angle > 0 else -angle / low if angle < 0 else 0.0)
+            commands += encode_command(letter, angle / high if angle > 0 else -angle / low if angle < 0 else 0.0)
             done[f"ptz.{key}"] = angle
         port = self._get_open_port("head")
         if self._is_engaged:
@@ -204,10 +204,10 @@ class AiboDriver(BaseDriver):
 
     def _play_sound(self, arguments: Mapping[str, float | str]) -> dict[str, Value]:
         name = arguments.get("sound")
-        if len(arguments) != 1 or not isinstance(name, str) or not ANY_SOUND.fullmatch(name):
+        if len(arguments) != 1 or not isinstance(name, str) or not SOUND_NAME.fullmatch(name):
             raise Unsupported('play takes the name of a sound file on the stick, as in sound = "mew.wav"')
         self._get_open_port("main")
-        self._send_lines(menu.sound(name))
+        self._send_lines(menu.make_sound_commands(name))
         return {}
 
     def _get_open_port(self, service: str) -> Port:
@@ -231,15 +231,15 @@ class AiboDriver(BaseDriver):
 
     def _on_main_up(self) -> None:
         self._counts["bad_frames"] += self._menu.bad_lines
-        self._menu, self._hellos, self._main_at = MenuReader(), 0, self._clock.seconds()
+        self._menu, self._hello_count, self._main_opened_at = MenuReader(), 0, self._clock.seconds()
         services = [service for service in menu.SERVERS if service != "camera" or self._fps > 0]
-        self._send_lines(menu.greeting() + self._start_lines(services))
+        self._send_lines(menu.make_greeting() + self._start_lines(services))
 
     def _on_main(self, data: bytes) -> None:
         for message in self._menu.read(data):
             if isinstance(message, Hello):
-                self._hellos += 1
-                if self._hellos == 2:
+                self._hello_count += 1
+                if self._hello_count == 2:
                     self._open_ports()
             elif isinstance(message, Load):
                 self._on_load(message.port)
@@ -247,13 +247,13 @@ class AiboDriver(BaseDriver):
     def _on_load(self, number: int) -> None:
         for service, port in self._all_ports().items():
             if port.number == number:
-                self._started.add(service)
+                self._started_servers.add(service)
                 if port.opened_at is not None:
                     port.open()
 
     def _open_ports(self) -> None:
         """Connect to all servers, which run by now or never will; retry the waiting ones at once."""
-        self._main_at = None
+        self._main_opened_at = None
         for service, port in self._ports.items():
             if service != "main":
                 port.open()
@@ -283,26 +283,26 @@ class AiboDriver(BaseDriver):
 
     def _on_state_up(self) -> None:
         self._states = StateReader()
-        self._heard_at = self._clock.seconds()
-        self._odometry.forget()
+        self._last_data_at = self._clock.seconds()
+        self._odometry.restart_interval()
         self._frame = None
         self._check_up()
 
     def _on_state(self, data: bytes) -> None:
         try:
             for state in self._states.read(data):
-                self._on_world(state)
+                self._on_world_state(state)
         except BadFrame as error:
             # Packets have no start marker; only a new link starts with a packet.
             self._counts["bad_frames"] += 1
             self._log_once("state", f"port {self._ports['state'].number} sent an invalid world state: {error}")
             self._ports["state"].drop()
 
-    def _on_world(self, state: WorldState) -> None:
+    def _on_world_state(self, state: WorldState) -> None:
         values: dict[str, Value] = {}
-        if sense.is_known(state):
+        if sensors.is_known(state):
             try:
-                values = sense.values(state)
+                values = sensors.convert_state(state)
             except BadFrame as error:
                 self._counts["bad_frames"] += 1
                 self._log_once("sense", f"a world state was dropped: {error}")
@@ -310,7 +310,7 @@ class AiboDriver(BaseDriver):
         else:
             self._log_once("model", f"the sensors of its model {state.model!r} are unknown; they are not reported")
         self._counts["frames"] += 1
-        self._heard_at = self._clock.seconds()
+        self._last_data_at = self._clock.seconds()
         self._logged_keys -= {"silence", "state"}
         forward, backward, aside, turn = self._options.speed
         f, s, r = (0.0, 0.0, 0.0) if self._is_engaged else self._walk
@@ -319,18 +319,18 @@ class AiboDriver(BaseDriver):
         values.update(zip(("base.vx", "base.vy", "base.wz"), motion, strict=True))
         values |= {"base.moving": any(motion), ENGAGED: self._is_engaged, "mode": state.dialect}
         if self._is_up:
-            self._observed({**values, **self._odometry.values()}, self._odometry.t, frame=self._frame)
+            self._observed({**values, **self._odometry.read_pose()}, self._odometry.t, frame=self._frame)
 
     def _on_picture(self, picture: Picture) -> None:
         self._counts["pictures"] += 1
         size = (picture.width, picture.height)
-        t = self._odometry.moment(picture.t)
+        t = self._odometry.convert_time(picture.t)
         self._frame = Frame(picture.number, *size, picture.data, t, picture.encoding)
 
     def _check_up(self) -> None:
-        if self._is_up or self._is_closed or not all(self._ports[service].is_up for service in NEEDED):
+        if self._is_up or self._is_closed or not all(self._ports[service].is_up for service in REQUIRED_SERVERS):
             return
-        self._heard_at = self._clock.seconds()
+        self._last_data_at = self._clock.seconds()
         self._halt()
         if not self._wants_motors:
             self._power(False)
@@ -339,20 +339,24 @@ class AiboDriver(BaseDriver):
         self._up()
 
     def _on_lost(self, service: str) -> None:
-        if service in NEEDED and self._is_up:
+        if service in REQUIRED_SERVERS and self._is_up:
             self._halt()
             self._down()
 
-    def _on_watch(self) -> None:
+    def _check_links(self) -> None:
         now = self._clock.seconds()
-        self._heard_at = heard_at(self._heard_at, self._watch_at, now)
-        self._watch_at = now + WATCH_S
-        self._watch_timer.set(WATCH_S, self._on_watch)
-        if self._main_at is not None and now - self._main_at > STARTED_S and self._ports["main"].is_up:
+        self._last_data_at = correct_last_data_time(self._last_data_at, self._next_check_at, now)
+        self._next_check_at = now + CHECK_INTERVAL_S
+        self._check_timer.set(CHECK_INTERVAL_S, self._check_links)
+        if (
+            self._main_opened_at is not None
+            and now - self._main_opened_at > MAIN_CONTROL_TIMEOUT_S
+            and self._ports["main"].is_up
+        ):
             self._log_once("main", "main control does not answer; connecting to the other ports anyway")
             self._open_ports()
-        if self._ports["state"].is_up and now - self._heard_at > self.STALE_S:
-            self._heard_at = now
+        if self._ports["state"].is_up and now - self._last_data_at > self.STALE_S:
+            self._last_data_at = now
             self._log_once("silence", f"no world state for {self.STALE_S:g} s; reconnecting")
             self._ports["state"].drop()
             # After a power cycle the dog has to be asked to start its servers again.
@@ -364,7 +368,7 @@ class AiboDriver(BaseDriver):
                 continue
             if service != "main":
                 self._restart_server(service, port.opened_at)
-            if now - port.opened_at > PATIENCE_S:
+            if now - port.opened_at > NO_ANSWER_S:
                 where = f"{self._options.host}:{port.number}"
                 why = "is it on, and does no other client hold the port (the dog takes one)?"
                 self._log_once(service, f"its {service} server at {where} does not answer; {why}")
@@ -372,8 +376,8 @@ class AiboDriver(BaseDriver):
     def _restart_server(self, service: str, since: float) -> None:
         """Start a server that is silent through main control: a server of Tekkotsu 5 ends with its client."""
         now = self._clock.seconds()
-        if now - max(since, self._asked_at.get(service, 0.0)) > ASK_S:
-            self._asked_at[service] = now
+        if now - max(since, self._restarted_at.get(service, 0.0)) > SERVER_RESTART_S:
+            self._restarted_at[service] = now
             self._send_lines([select(name) for name in menu.SERVERS[service]])
 
     def _log_once(self, what: str, problem: str) -> None:
@@ -382,11 +386,11 @@ class AiboDriver(BaseDriver):
             self.log.warn("{robot}: {problem}", robot=self._name, problem=problem)
 
 
-def _walk_command(f: float, s: float, r: float) -> bytes:
-    return command("f", f) + command("s", s) + command("r", r)
+def _encode_walk(f: float, s: float, r: float) -> bytes:
+    return encode_command("f", f) + encode_command("s", s) + encode_command("r", r)
 
 
-_HEAD = {"pan": ("p", sense.PAN), "tilt": ("t", sense.TILT), "nod": ("r", sense.NOD)}
+_HEAD_AXES = {"pan": ("p", sensors.PAN), "tilt": ("t", sensors.TILT), "nod": ("r", sensors.NOD)}
 """The letter and the range of each axis."""
 
 
@@ -395,15 +399,15 @@ def make_driver(
 ) -> AiboDriver:
     """Return a driver of the dog at the host in ``options``."""
     return AiboDriver(
-        checked(options),
+        parse_options(options),
         name,
-        TcpConnector(waits=WAITS) if connector is None else connector,
+        TcpConnector(waits=RETRY_DELAYS_S) if connector is None else connector,
         clock,
-        UdpDatagrams(clock),
-        kept(name) if connector is None else None,
+        UdpConnector(clock),
+        create_switch(name) if connector is None else None,
     )
 
 
 def describe(options: Mapping[str, object], name: str) -> Description:
     """Return the description of that dog."""
-    return described(checked(options))
+    return make_description(parse_options(options))

@@ -9,17 +9,17 @@ from twisted.internet.defer import Deferred, succeed
 from twisted.internet.interfaces import IReactorTime
 from twisted.internet.protocol import DatagramProtocol
 
-from drivers.aibo.picture import REQUEST, Closing, Message, Picture, PictureReader, decoded
+from drivers.aibo.picture import REQUEST, Closing, Message, Picture, PictureReader, decode_message
 from drivers.errors import BadFrame
-from drivers.link import Connector, Line, Link
+from drivers.link import Connector, Link, Reconnector
 from drivers.timer import Timer
 
-WAITS = (0.5, 1.0, 2.0, 5.0)
+RETRY_DELAYS_S = (0.5, 1.0, 2.0, 5.0)
 """Delays before reconnecting, as in the dog's own clients: a port that was just closed does not accept at once."""
 FLUSH_S = 1.0
-ASK_S = 0.5
+REQUEST_INTERVAL_S = 0.5
 """Interval at which datagrams are requested until the first arrives, and again after they stop."""
-SILENT_S = 2.0
+SILENCE_S = 2.0
 
 
 class Port:
@@ -41,7 +41,7 @@ class Port:
         self._on_up = on_up
         self._on_down = on_down
         self._on_bytes = on_bytes
-        self._line: Line | None = None
+        self._reconnector: Reconnector | None = None
         self._link: Link | None = None
 
     @property
@@ -63,11 +63,11 @@ class Port:
         """Connect now, and keep connecting; an open link stays open."""
         if self._link is not None:
             return
-        if self._line is not None:
-            self._line.hang_up()
+        if self._reconnector is not None:
+            self._reconnector.disconnect()
         else:
             self.opened_at = self._clock.seconds()
-        self._line = self._connector.call(*self._address, self)
+        self._reconnector = self._connector.connect(*self._address, self)
 
     def send(self, data: bytes) -> None:
         """Send bytes; does nothing without a link."""
@@ -81,11 +81,11 @@ class Port:
 
     def close(self) -> Deferred[None]:
         """Close for good after pending data is written, but wait at most ``FLUSH_S`` for a dead link."""
-        line, self._line = self._line, None
+        line, self._reconnector = self._reconnector, None
         if line is None:
             return succeed(None)
         link, self.opened_at = self._link, None
-        closed = line.hang_up()
+        closed = line.disconnect()
         if link is not None and not closed.called:
             timer = Timer(self._clock)
             timer.set(FLUSH_S, link.close)
@@ -100,23 +100,23 @@ class Port:
     def link_down(self) -> None:
         """Drop the link; called by the link."""
         self._link = None
-        self.opened_at = None if self._line is None else self._clock.seconds()
+        self.opened_at = None if self._reconnector is None else self._clock.seconds()
         self._on_down()
 
-    def received(self, data: bytes) -> None:
+    def data_received(self, data: bytes) -> None:
         """Take bytes; called by the link."""
-        if self._line is not None:
+        if self._reconnector is not None:
             self._on_bytes(data)
 
 
-class Datagrams(Protocol):
+class DatagramConnector(Protocol):
     """Opens links for datagrams."""
 
     def open(self, host: str, port: int, received: Callable[[bytes], None]) -> Link:
         """Return a link to ``host``; datagrams from it are passed to ``received``."""
 
 
-class UdpDatagrams:
+class UdpConnector:
     """Opens UDP links on ``reactor``, from a port that the system chooses."""
 
     def __init__(self, reactor: Any) -> None:
@@ -135,14 +135,14 @@ class _UdpLink(DatagramProtocol):
 
     def __init__(self, host: str, port: int, received: Callable[[bytes], None]) -> None:
         self._address = (host, port)
-        self._received = received
+        self._on_datagram = received
 
     def startProtocol(self) -> None:
         transport: Any = self.transport
         transport.connect(*self._address)
 
     def datagramReceived(self, datagram: bytes, addr: object) -> None:
-        self._received(datagram)
+        self._on_datagram(datagram)
 
     def connectionRefused(self) -> None:
         """Ignore the error: the server does not listen yet, and the request is sent again."""
@@ -166,24 +166,24 @@ class Camera:
         clock: IReactorTime,
         address: tuple[str, int],
         seen: Callable[[Picture], None],
-        datagrams: Datagrams | None = None,
+        datagrams: DatagramConnector | None = None,
     ) -> None:
         self.bad_frames = 0
         self.bytes = 0
         self.port = Port(connector, clock, address, self._on_up, lambda: None, self._on_bytes)
         self._clock = clock
         self._address = address
-        self._seen = seen
+        self._on_picture = seen
         self._datagrams = datagrams
         self._reader = PictureReader()
         self._link: Link | None = None
-        self._ask_timer = Timer(clock)
-        self._heard_at = -SILENT_S
+        self._request_timer = Timer(clock)
+        self._last_data_at = -SILENCE_S
 
     @property
     def is_silent(self) -> bool:
         """Whether datagrams were requested and none has arrived for ``SILENT_S``."""
-        return self._link is not None and self._clock.seconds() - self._heard_at >= SILENT_S
+        return self._link is not None and self._clock.seconds() - self._last_data_at >= SILENCE_S
 
     def open(self) -> None:
         """Start receiving pictures; does nothing if already started."""
@@ -191,11 +191,11 @@ class Camera:
             self.port.open()
         elif self._link is None:
             self._link = self._datagrams.open(*self._address, self._on_datagram)
-            self._keep_asking()
+            self._request_pictures()
 
     def close(self) -> Deferred[None]:
         """Stop receiving pictures; the camera can be opened again."""
-        self._ask_timer.cancel()
+        self._request_timer.cancel()
         link, self._link = self._link, None
         if link is not None:
             link.close()
@@ -216,9 +216,9 @@ class Camera:
         if self._link is None:
             return
         self.bytes += len(data)
-        self._heard_at = self._clock.seconds()
+        self._last_data_at = self._clock.seconds()
         try:
-            message = decoded(data)
+            message = decode_message(data)
         except BadFrame:
             self.bad_frames += 1
             return
@@ -226,12 +226,12 @@ class Camera:
 
     def _on_message(self, message: Message) -> None:
         if isinstance(message, Picture):
-            self._seen(message)
+            self._on_picture(message)
         elif isinstance(message, Closing):
-            self._heard_at = -SILENT_S
+            self._last_data_at = -SILENCE_S
             self.port.drop()
 
-    def _keep_asking(self) -> None:
-        self._ask_timer.set(ASK_S, self._keep_asking)
+    def _request_pictures(self) -> None:
+        self._request_timer.set(REQUEST_INTERVAL_S, self._request_pictures)
         if self._link is not None and self.is_silent:
             self._link.send(REQUEST)

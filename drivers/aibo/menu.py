@@ -15,8 +15,8 @@ from dataclasses import dataclass
 from drivers.aibo.codec import LineReader
 from drivers.errors import BadFrame
 
-MAX_LINES = 256
-MAX_MESSAGE = 4096
+MAX_COUNT = 256
+MAX_MESSAGE_LINES = 4096
 """Most lines of one message, more than any real menu has."""
 HELLO = "!hello"
 EMPTY_SLOT = "----------"
@@ -34,8 +34,8 @@ PICTURE_MS = 1000.0 / 30.0
 class Item:
     """One entry of a menu: the number of its subitems, whether it is highlighted, its name and its description."""
 
-    items: int
-    is_lit: bool
+    item_count: int
+    is_highlighted: bool
     title: str
     description: str = ""
 
@@ -87,13 +87,13 @@ class Stack:
 
 
 @dataclass(frozen=True)
-class Word:
+class OneWordMessage:
     """A message of one word: ``push`` and ``pop`` when a menu opens or closes, ``goodbye`` at the end."""
 
     word: str
 
 
-Message = Refresh | Status | Load | Close | Hello | Stack | Word
+Message = Refresh | Status | Load | Close | Hello | Stack | OneWordMessage
 _Lines = Generator[None, str, Message]
 
 
@@ -107,52 +107,55 @@ def unselect(name: str) -> str:
     return select("#" + name)
 
 
-def setting(key: str, value: object) -> str:
+def format_setting(key: str, value: object) -> str:
     """Return the command that changes the dog's configuration."""
     return f"!set {key}={value}"
 
 
-def greeting() -> list[str]:
+def make_greeting() -> list[str]:
     """Return the first commands: ask for the number of clients and the open menu."""
     return [HELLO, "!dump_stack", "!refresh"]
 
 
-def started(services: Iterable[str], transport: str, fps: float, width: int = 104) -> list[str]:
+def make_start_commands(services: Iterable[str], transport: str, fps: float, width: int = 104) -> list[str]:
     """Return commands that set up and start ``services``; the answer to the last one confirms all of them.
 
     Each server is started under all its names; ``width`` is the width of the pictures in pixels.
     """
-    lines = [setting("main.worldState_interval", 0), setting("vision.rawcam.transport", transport.upper())]
-    lines += [setting("vision.rawcam.encoding", "color"), setting("vision.rawcam.compression", "jpeg")]
-    lines += sized(width) + paced(fps)
+    lines = [
+        format_setting("main.worldState_interval", 0),
+        format_setting("vision.rawcam.transport", transport.upper()),
+    ]
+    lines += [format_setting("vision.rawcam.encoding", "color"), format_setting("vision.rawcam.compression", "jpeg")]
+    lines += make_size_commands(width) + make_rate_commands(fps)
     lines += [select(name) for service in services for name in SERVERS[service]]
     return [*lines, HELLO]
 
 
-def sized(width: int) -> list[str]:
+def make_size_commands(width: int) -> list[str]:
     """Return commands for the width of the pictures in pixels; each camera layer is half as wide as the one above."""
     skip = {208: 1, 104: 2}[width]
     names = (f"vision.rawcam{mark}{channel}_skip" for mark in "._" for channel in ("y", "uv"))
-    return [setting(name, skip + name.endswith("uv_skip")) for name in names]
+    return [format_setting(name, skip + name.endswith("uv_skip")) for name in names]
 
 
-def paced(fps: float) -> list[str]:
+def make_rate_commands(fps: float) -> list[str]:
     """Return commands for the frame rate; the dog waits after each picture, so half of its duration is subtracted."""
     wait_ms = 0 if fps <= 0 or fps >= 29 else round(1000.0 / fps - PICTURE_MS / 2.0)
-    return [setting("vision.rawcam.interval", wait_ms), setting("vision.rawcam_interval", wait_ms)]
+    return [format_setting("vision.rawcam.interval", wait_ms), format_setting("vision.rawcam_interval", wait_ms)]
 
 
-def stopped(services: Iterable[str]) -> list[str]:
+def make_stop_commands(services: Iterable[str]) -> list[str]:
     """Return commands that stop ``services``."""
     return [unselect(name) for service in services for name in SERVERS[service]]
 
 
-def sound(name: str) -> list[str]:
+def make_sound_commands(name: str) -> list[str]:
     """Return commands that play a sound from the memory stick by its file name."""
     return [select("Play Sound"), select(name.upper())]
 
 
-def encoded(message: Message, has_four_fields: bool = False) -> bytes:
+def encode_message(message: Message, has_four_fields: bool = False) -> bytes:
     """Encode ``message`` as the dog does."""
     return "".join(line + "\n" for line in _format_lines(message, has_four_fields)).encode("latin-1")
 
@@ -162,7 +165,7 @@ def _format_lines(message: Message, has_four_fields: bool) -> Iterator[str]:
         case Refresh(title, items):
             yield from ("refresh", title, str(len(items)))
             for item in items:
-                yield from (str(item.items), str(int(item.is_lit)), item.title)
+                yield from (str(item.item_count), str(int(item.is_highlighted)), item.title)
                 if not has_four_fields:
                     yield str(item.description.count("\n"))
                 yield item.description
@@ -176,7 +179,7 @@ def _format_lines(message: Message, has_four_fields: bool) -> Iterator[str]:
             yield from ("hello", str(count))
         case Stack(titles):
             yield from ("stack_dump", str(len(titles)), *titles)
-        case Word(word):
+        case OneWordMessage(word):
             yield word
 
 
@@ -212,8 +215,8 @@ class MenuReader:
                 next(self._parser)
             else:
                 self._line_count += 1
-                if self._line_count > MAX_MESSAGE:
-                    raise BadFrame(f"message of more than {MAX_MESSAGE} lines")
+                if self._line_count > MAX_MESSAGE_LINES:
+                    raise BadFrame(f"message of more than {MAX_MESSAGE_LINES} lines")
                 self._parser.send(line)
         except StopIteration as stop:
             done: Message = stop.value
@@ -225,7 +228,7 @@ def _parse_message(word: str) -> _Lines:
     """Take the lines after ``word`` one by one, and return the message."""
     match word:
         case "push" | "pop" | "goodbye":
-            return Word(word)
+            return OneWordMessage(word)
         case "refresh":
             return (yield from _parse_refresh())
         case "status":
@@ -265,7 +268,7 @@ def _parse_text(more: int) -> Generator[None, str, str]:
     return "\n".join(lines)
 
 
-def _parse_count(line: str, limit: int = MAX_LINES) -> int:
+def _parse_count(line: str, limit: int = MAX_COUNT) -> int:
     if not (line.isascii() and line.isdecimal()) or len(line) > 10 or int(line) > limit:
         raise BadFrame(f"not a count up to {limit}: {line!r}")
     return int(line)

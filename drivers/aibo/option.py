@@ -9,14 +9,14 @@ from typing import Annotated, Literal
 
 from msgspec import Meta
 
-from drivers.aibo.sense import MODEL, NOD, PAN, TILT
-from drivers.option import Fps, Host, Port, convert_options, fault_of
+from drivers.aibo.sensors import MODEL, NOD, PAN, TILT
+from drivers.option import Fps, Host, Port, convert_options, make_option_error
 from drivers.reading import Description
-from formats.convert import Then
+from formats.convert import ConversionStep
 
 PORTS: dict[str, int] = {"main": 10020, "estop": 10053, "state": 10031, "walk": 10050, "head": 10052, "camera": 10011}
 """Servers that the driver connects to, with Tekkotsu's port numbers."""
-FORWARD, BACKWARD, ASIDE, TURN = 0.160, 0.156, 0.103, 2.03
+MAX_FORWARD_MPS, MAX_BACKWARD_MPS, MAX_STRAFE_MPS, MAX_TURN_RADPS = 0.160, 0.156, 0.103, 2.03
 """Top speeds of the stock walk, in m/s and rad/s."""
 SOUNDS = {"howl": "5", "yap": "6", "whimper": "7", "growl": "8", "bark": "9"}
 """Sounds of the walk server, and the letters of their commands."""
@@ -26,7 +26,7 @@ HEIGHTS = {104: 80, 208: 160}
 """Width of a camera picture to its height, in pixels."""
 
 
-def _all_ports(given: Mapping[str, int]) -> dict[str, int]:
+def _complete_ports(given: Mapping[str, int]) -> dict[str, int]:
     unknown = [name for name in given if name not in PORTS]
     if unknown:
         raise ValueError(f"has no {unknown[0]!r}")
@@ -45,11 +45,11 @@ class Options:
     speed: Annotated[
         tuple[Speed, Speed, Speed, Speed],
         Meta(description="forward, backward, aside (m/s) and turn (rad/s), each above 0 and at most 10"),
-    ] = (FORWARD, BACKWARD, ASIDE, TURN)
+    ] = (MAX_FORWARD_MPS, MAX_BACKWARD_MPS, MAX_STRAFE_MPS, MAX_TURN_RADPS)
     ports: Annotated[
         Mapping[str, int],
         Meta(description=f"a table of ports, such as {{walk = 10050}}; its keys are {', '.join(PORTS)}"),
-        Then(_all_ports, raw=dict[str, Port]),
+        ConversionStep(_complete_ports, raw=dict[str, Port]),
     ] = field(default_factory=lambda: dict(PORTS))
 
     @property
@@ -58,16 +58,16 @@ class Options:
         return self.camera_fps if self.camera else 0.0
 
 
-def checked(table: Mapping[str, object]) -> Options:
+def parse_options(table: Mapping[str, object]) -> Options:
     """Convert and check ``table``; raise ``UsageError`` that names the key and the remedy."""
     options = convert_options("aibo", table, Options)
     if options.camera_transport == "udp" and not _is_address(options.host):
         problem = f'is {options.host!r}, which camera_transport = "udp" does not allow'
-        raise fault_of("aibo", "host", problem, 'write a numeric address, such as "192.168.0.51"')
+        raise make_option_error("aibo", "host", problem, 'write a numeric address, such as "192.168.0.51"')
     return options
 
 
-def described(options: Options) -> Description:
+def make_description(options: Options) -> Description:
     """Return the description of an ERS-7."""
     forward, backward, aside, turn = options.speed
     capabilities: dict[str, Mapping[str, float | str]] = {
@@ -76,7 +76,9 @@ def described(options: Options) -> Description:
         "ranger": {"max": 1.5},
         "imu": {},
         "joints": {"count": 18.0, "read_only": 1.0},
-        "ptz": {f"{name}_{end}": value for name, ends in _HEAD.items() for end, value in zip(_ENDS, ends, strict=True)},
+        "ptz": {
+            f"{name}_{end}": value for name, ends in _HEAD_AXES.items() for end, value in zip(_ENDS, ends, strict=True)
+        },
         "buttons": {},
         "power": {},
         "sound": {},
@@ -98,7 +100,7 @@ def described(options: Options) -> Description:
     )
 
 
-_HEAD = {"pan": PAN, "tilt": TILT, "nod": NOD}
+_HEAD_AXES = {"pan": PAN, "tilt": TILT, "nod": NOD}
 _ENDS = ("min", "max")
 
 

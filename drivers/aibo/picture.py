@@ -11,16 +11,16 @@ import struct
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
-from drivers.aibo.codec import Cursor, Short, string
+from drivers.aibo.codec import Cursor, IncompletePacket, encode_string
 from drivers.errors import BadFrame
-from formats.jpeg import size_of
+from formats.jpeg import read_size
 
 REQUEST = b"connection request"
 COLOUR, SINGLE = 0, 1
-MAX_SIDE = 1024
-MAX_JPEG = 512 * 1024
-MAX_TEXT = 64 * 1024
-BLANK = 0x80
+MAX_SIDE_PX = 1024
+MAX_JPEG_BYTES = 512 * 1024
+MAX_TEXT_BYTES = 64 * 1024
+BLANK_VALUE = 0x80
 
 
 @dataclass(frozen=True)
@@ -60,30 +60,34 @@ class Block:
 
 
 Message = Picture | Closing | Posture
-START = string("TekkotsuImage")
-CLOSING = string("CloseConnection")
+HEADER_START = encode_string("TekkotsuImage")
+CLOSING = encode_string("CloseConnection")
 POSTURE = b"#POS"
 
 
-def header(encoding: int, compression: int, width: int, height: int, t: int, number: int) -> bytes:
+def encode_header(encoding: int, compression: int, width: int, height: int, t: int, number: int) -> bytes:
     """Encode the header of a packet."""
-    return START + struct.pack("<6I", encoding, compression, width, height, t, number)
+    return HEADER_START + struct.pack("<6I", encoding, compression, width, height, t, number)
 
 
-def block(one: Block, size: int | None = None) -> bytes:
+def encode_block(one: Block, size: int | None = None) -> bytes:
     """Encode one block; ``size`` replaces the length of its JPEG, to create invalid packets."""
-    head = string("FbkImage") + struct.pack("<4I", one.width, one.height, one.layer, one.channel) + string(one.form)
+    head = (
+        encode_string("FbkImage")
+        + struct.pack("<4I", one.width, one.height, one.layer, one.channel)
+        + encode_string(one.form)
+    )
     if one.form.startswith("JPEG"):
         head += struct.pack("<I", len(one.data) if size is None else size)
     return head + one.data
 
 
-def decoded(data: bytes) -> Message:
+def decode_message(data: bytes) -> Message:
     """Decode the message in one datagram; raise ``BadFrame`` if it is invalid."""
     cursor = Cursor(data)
     try:
         message = _read_message(cursor)
-    except Short as short:
+    except IncompletePacket as short:
         raise BadFrame(f"packet is cut off: {len(data)} of at least {short.need} bytes") from short
     if cursor.at != len(data):
         raise BadFrame(f"{len(data) - cursor.at} extra bytes after the packet")
@@ -106,27 +110,27 @@ class PictureReader:
             try:
                 _check_start(self._rest)
                 message = _read_message(cursor)
-            except Short as short:
+            except IncompletePacket as short:
                 self._need = short.need
                 continue
             except BadFrame:
                 self.bad_frames += 1
-                self._skip()
+                self._skip_to_header()
                 continue
             del self._rest[: cursor.at]
             self._need = 8
             yield message
 
-    def _skip(self) -> None:
-        at = self._rest.find(START, 1)
+    def _skip_to_header(self) -> None:
+        at = self._rest.find(HEADER_START, 1)
         # The last bytes may be the start of a header that is not complete yet.
-        del self._rest[: at if at > 0 else max(1, len(self._rest) - len(START) + 1)]
-        self._need = 8 if at > 0 else len(START)
+        del self._rest[: at if at > 0 else max(1, len(self._rest) - len(HEADER_START) + 1)]
+        self._need = 8 if at > 0 else len(HEADER_START)
 
 
 def _check_start(data: bytearray) -> None:
     """Reject invalid data early: its first bytes, read as a length, could make the reader wait for long."""
-    for start in (START, CLOSING):
+    for start in (HEADER_START, CLOSING):
         if start.startswith(data[: len(start)]):
             return
     if not POSTURE.startswith(data[4 : 4 + len(POSTURE)]):
@@ -134,15 +138,15 @@ def _check_start(data: bytearray) -> None:
 
 
 def _read_message(cursor: Cursor) -> Message:
-    kind = cursor.string(MAX_TEXT)
+    kind = cursor.read_string(MAX_TEXT_BYTES)
     if kind == "CloseConnection":
         return Closing()
     if kind.startswith("#POS"):
         return Posture(kind)
     if kind != "TekkotsuImage":
         raise BadFrame(f"unknown camera packet {kind!r}")
-    encoding, _, width, height, t, number = cursor.words(6)
-    if encoding not in (COLOUR, SINGLE) or not (0 < width <= MAX_SIDE and 0 < height <= MAX_SIDE):
+    encoding, _, width, height, t, number = cursor.read_words(6)
+    if encoding not in (COLOUR, SINGLE) or not (0 < width <= MAX_SIDE_PX and 0 < height <= MAX_SIDE_PX):
         raise BadFrame(f"unsupported picture: {width} x {height} pixels, encoding {encoding}")
     first = _read_block(cursor)
     is_whole = first.form == "JPEGColor" or encoding == SINGLE
@@ -151,21 +155,21 @@ def _read_message(cursor: Cursor) -> Message:
 
 
 def _read_block(cursor: Cursor) -> Block:
-    if cursor.string(32) != "FbkImage":
+    if cursor.read_string(32) != "FbkImage":
         raise BadFrame("not the start of a block of channels")
-    width, height, layer, channel = cursor.words(4)
-    form = cursor.string(32)
+    width, height, layer, channel = cursor.read_words(4)
+    form = cursor.read_string(32)
     if form in ("JPEGColor", "JPEGGrayscale"):
-        (size,) = cursor.words(1)
-        if size > MAX_JPEG:
-            raise BadFrame(f"JPEG of {size} bytes exceeds the maximum of {MAX_JPEG}")
-        data = cursor.take(size)
-        if size_of(data) is None:
+        (size,) = cursor.read_words(1)
+        if size > MAX_JPEG_BYTES:
+            raise BadFrame(f"JPEG of {size} bytes exceeds the maximum of {MAX_JPEG_BYTES}")
+        data = cursor.read(size)
+        if read_size(data) is None:
             raise BadFrame("JPEG is cut off, or too large to decode")
     elif form == "RawImage":
-        if not (0 < width <= MAX_SIDE and 0 < height <= MAX_SIDE):
+        if not (0 < width <= MAX_SIDE_PX and 0 < height <= MAX_SIDE_PX):
             raise BadFrame(f"unsupported channel size: {width} x {height} pixels")
-        data = cursor.take(width * height)
+        data = cursor.read(width * height)
     elif form == "blank":
         data = b""
     else:
@@ -186,7 +190,7 @@ def _join_blocks(blocks: Sequence[Block], width: int, height: int) -> tuple[str,
 def _scale_up(one: Block, width: int, height: int) -> bytes:
     """Scale a channel to full size by repeating pixels."""
     if one.form == "blank":
-        return bytes([BLANK]) * (width * height)
+        return bytes([BLANK_VALUE]) * (width * height)
     if (one.width, one.height) == (width, height):
         return one.data
     columns = [x * one.width // width for x in range(width)]

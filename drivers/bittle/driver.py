@@ -16,12 +16,12 @@ from twisted.python.failure import Failure
 
 from drivers.base import ENGAGED, LinkedDriver
 from drivers.bittle import codec
-from drivers.bittle.dialogue import Dialogue
-from drivers.bittle.gait import REST, STAND, Velocity, chosen
-from drivers.bittle.link import HttpConnector, HttpLine
-from drivers.bittle.option import JOINT_LIMITS, JOINT_NAMES, Options, checked, described
-from drivers.deadman.keeper import kept
-from drivers.deadman.switch import DeadMan, LastWord
+from drivers.bittle.gait import REST, STAND, Velocity, select_gait
+from drivers.bittle.link import HttpConnector, HttpLink
+from drivers.bittle.option import JOINT_LIMITS, JOINT_NAMES, Options, make_description, parse_options
+from drivers.bittle.request_table import RequestTable
+from drivers.deadman.supervisor import create_switch
+from drivers.deadman.switch import DeadManSwitch, HaltCommand
 from drivers.driver import Permit
 from drivers.errors import BadFrame, DriverError, LinkLost, NotEnabled, Unsupported
 from drivers.link import Connector, Link, TcpConnector
@@ -31,19 +31,19 @@ from drivers.serial import SerialConnector
 
 MANIFEST = Manifest("serial", "serial", "on a cable", {"port": "/dev/ttyUSB0"}, is_on_cable=True)
 
-GREET_S = 1.0
+VERSION_TIMEOUT_S = 1.0
 """Seconds to wait for the robot's version before asking again: it may be booting."""
 POLL_S, HTTP_POLL_S = 0.05, 0.2
-POLL_PATIENCE_S = 1.0
-GAIT_S = 1.0
+POLL_TIMEOUT_S = 1.0
+GAIT_RETRY_S = 1.0
 """Seconds after which an unanswered gait command is repeated."""
-REST_S = 2.0
+REST_RETRY_S = 2.0
 """Seconds after which an unanswered command to lie down is repeated."""
-SKILL_S = 15.0
+SKILL_TIMEOUT_S = 15.0
 """Longest duration of a behaviour; the longest known ones take about eight seconds."""
-MISSES = 3
+MAX_MISSED_POLLS = 3
 """Missing answers after which old values are dropped; if all polls fail, the driver greets the robot again."""
-SLOW_EVERY = 20
+BATTERY_POLL_PERIOD = 20
 """One poll in this many asks for the battery."""
 EMPTY_V, FULL_V = 6.8, 8.4
 """Voltages of two lithium cells."""
@@ -64,17 +64,17 @@ class BittleDriver(LinkedDriver):
         name: str,
         connector: Connector,
         clock: IReactorTime,
-        dead_man: DeadMan | None = None,
+        dead_man: DeadManSwitch | None = None,
     ) -> None:
         place = (options.host, options.http_port) if options.host else (options.port, int(options.baud))
-        super().__init__(described(options), name, clock, connector, place, dead_man)
+        super().__init__(make_description(options), name, clock, connector, place, dead_man)
         self.STALE_S = 2.0 if options.host else 1.0
         self._options = options
         self._gaits = dict(options.gaits)
-        self._moving_commands = {codec.skill(name) for name, velocity in options.gaits if velocity != REST}
-        self._dialogue = Dialogue(clock, self._send)
+        self._moving_commands = {codec.encode_skill(name) for name, velocity in options.gaits if velocity != REST}
+        self._requests = RequestTable(clock, self._send)
         self._board = ""
-        self._greet_s = GREET_S
+        self._version_timeout_s = VERSION_TIMEOUT_S
         self._requested_gait = ""
         self._is_gait_certain = True
         self._velocity = REST
@@ -97,18 +97,18 @@ class BittleDriver(LinkedDriver):
         if self._running_skill:
             return fail(NotEnabled(f"{self._name} is busy with {self._running_skill}; wait until it is done"))
         try:
-            command = self._joint_command(arguments) if name == "joint" else codec.skill(name)
+            command = self._make_joint_command(arguments) if name == "joint" else codec.encode_skill(name)
             if name != "joint" and arguments:
                 raise Unsupported(f"{name} takes no arguments")
         except Unsupported as error:
             return fail(error)
         # The skill replaces any gait.
-        self._rest()
+        self._clear_motion()
         self._update_odometry()
         self._velocity, self._requested_gait, self._running_skill = REST, "", name
         # The robot answers no poll while the skill runs.
-        self.STALE_S += SKILL_S
-        return self._dialogue.ask(command, SKILL_S).addBoth(self._on_skill_done, name)
+        self.STALE_S += SKILL_TIMEOUT_S
+        return self._requests.request(command, SKILL_TIMEOUT_S).addBoth(self._on_skill_done, name)
 
     def act(self, action: Action, permit: Permit) -> Action:
         """As for every driver; raises ``NotEnabled`` while a skill runs, because the robot would act only after it."""
@@ -120,41 +120,41 @@ class BittleDriver(LinkedDriver):
 
     def _open(self) -> None:
         super()._open()
-        if isinstance(self._line, HttpLine):
-            self._line.may_leave = self._may_leave
+        if isinstance(self._reconnector, HttpLink):
+            self._reconnector.should_send = self._should_send
 
     def _close(self) -> Deferred[None]:
         self._send(codec.REST)
-        self._dialogue.end(LinkLost(f"{self._name}: disconnected"))
+        self._requests.fail_all(LinkLost(f"{self._name}: disconnected"))
         return super()._close()
 
     def _power(self, on: bool) -> None:
         if on:
-            self._ask_gait(STAND, REST)
+            self._request_gait(STAND, REST)
         else:
             self._lie_down()
 
     def _drive(self, motion: Action, permit: Permit) -> Action:
-        name, velocity = chosen(motion.get("base.vx", 0.0), motion.get("base.wz", 0.0), self._gaits)
+        name, velocity = select_gait(motion.get("base.vx", 0.0), motion.get("base.wz", 0.0), self._gaits)
         if name != self._requested_gait or not self._is_gait_certain:
-            self._ask_gait(name, velocity)
+            self._request_gait(name, velocity)
         return {key: getattr(velocity, key.removeprefix("base.")) for key in motion}
 
     def _halt(self) -> None:
         # With its servos off the dog would stand up.
         if self._wants_motors is True:
-            self._ask_gait(STAND, REST)
+            self._request_gait(STAND, REST)
 
-    def _last_word(self) -> LastWord | None:
-        halt = codec.skill(STAND)
-        if self._link is None or not isinstance(self._line, HttpLine):
-            return None if self._link is None else LastWord(halt, self._link)
-        return LastWord(self._line.asked_of(halt), self._link, self._line.address)
+    def _make_halt_command(self) -> HaltCommand | None:
+        halt = codec.encode_skill(STAND)
+        if self._link is None or not isinstance(self._reconnector, HttpLink):
+            return None if self._link is None else HaltCommand(halt, self._link)
+        return HaltCommand(self._reconnector.encode_command_request(halt), self._link, self._reconnector.address)
 
-    def _ask_gait(self, name: str, velocity: Velocity) -> None:
+    def _request_gait(self, name: str, velocity: Velocity) -> None:
         self._requested_gait, self._is_gait_certain = name, True
-        patience = GAIT_S + (SKILL_S if self._running_skill else 0.0)
-        self._dialogue.ask(codec.skill(name), patience).addCallbacks(
+        patience = GAIT_RETRY_S + (SKILL_TIMEOUT_S if self._running_skill else 0.0)
+        self._requests.request(codec.encode_skill(name), patience).addCallbacks(
             lambda _: self._on_gait(name, velocity), lambda failure: self._on_no_gait(name, velocity, failure)
         )
 
@@ -169,14 +169,14 @@ class BittleDriver(LinkedDriver):
             self._counts["refused"] += 1
             self.log.error("{robot}: {error}; remove it from the option gaits", robot=self._name, error=failure.value)
         elif self._is_up and self._requested_gait == name and not self._is_closed:
-            if velocity == REST or self._may_move:
-                self._ask_gait(name, velocity)
+            if velocity == REST or self._is_motion_permitted:
+                self._request_gait(name, velocity)
             else:
                 self.stop()
 
     def _lie_down(self) -> None:
         self._requested_gait = ""
-        self._dialogue.ask(codec.REST, REST_S).addCallbacks(self._on_lying, self._on_not_lying)
+        self._requests.request(codec.REST, REST_RETRY_S).addCallbacks(self._on_lying, self._on_not_lying)
 
     def _on_lying(self, _lines: list[str]) -> None:
         self._is_lying = True
@@ -188,7 +188,7 @@ class BittleDriver(LinkedDriver):
         if self._is_up and not self._is_closed and not self._requested_gait and not self._running_skill:
             self._lie_down()
 
-    def _joint_command(self, arguments: Mapping[str, float | str]) -> bytes:
+    def _make_joint_command(self, arguments: Mapping[str, float | str]) -> bytes:
         numbers = {name: joint for joint, name in JOINT_NAMES.items()}
         wanted: list[float] = []
         for name, angle in arguments.items():
@@ -200,36 +200,36 @@ class BittleDriver(LinkedDriver):
             wanted += [numbers[name], min(max(math.degrees(angle), low), high)]
         if not wanted:
             raise Unsupported("joint needs an angle, as in joint(head_pan=0.5)")
-        return codec.text("i", *wanted)
+        return codec.encode_text_command("i", *wanted)
 
     def _on_skill_done(self, result: list[str] | Failure, name: str) -> Mapping[str, Value] | Failure:
         self._running_skill = ""
-        self.STALE_S -= SKILL_S
+        self.STALE_S -= SKILL_TIMEOUT_S
         return result if isinstance(result, Failure) else {"skill.done": name}
 
-    def _may_leave(self, command: bytes) -> bool:
-        return self._may_move or command not in self._moving_commands
+    def _should_send(self, command: bytes) -> bool:
+        return self._is_motion_permitted or command not in self._moving_commands
 
     # -- from the robot ---------------------------------------------------------------------------------------------
 
     def link_up(self, link: Link) -> None:
         """Ask for the version; called by the link."""
         self._link = link
-        self._greet_s = GREET_S
+        self._version_timeout_s = VERSION_TIMEOUT_S
         self._reader = codec.LineReader()
-        self._greet()
+        self._request_version()
 
     def link_down(self) -> None:
         """Reset the motion here; the dog continues until it is reachable again; called by the link."""
         self._link = None
         self._on_lost(LinkLost(f"the link to {self._name} was lost"))
 
-    def _heard(self, line: str) -> None:
+    def _on_message(self, line: str) -> None:
         if codec.is_banner(line) and self._is_up:
             self._on_lost(LinkLost(f"{self._name} restarted"))
-            self._greet()
+            self._request_version()
         else:
-            self._dialogue.heard(line)
+            self._requests.process_line(line)
 
     def _on_lost(self, error: Exception) -> None:
         self._timer.cancel()
@@ -238,19 +238,21 @@ class BittleDriver(LinkedDriver):
         self._update_odometry()
         self._velocity = REST
         self._is_lying = True
-        self._dialogue.end(error)
+        self._requests.fail_all(error)
         if is_up or self._link is None:
             self._down()
 
-    def _greet(self) -> None:
+    def _request_version(self) -> None:
         self._timer.cancel()
-        self._dialogue.ask(codec.VERSION, self._greet_s).addCallbacks(self._on_greeted, self._on_no_greeting)
+        self._requests.request(codec.VERSION, self._version_timeout_s).addCallbacks(
+            self._on_version, self._on_no_version
+        )
 
-    def _on_greeted(self, lines: list[str]) -> None:
-        board = codec.board_of(lines)
+    def _on_version(self, lines: list[str]) -> None:
+        board = codec.parse_board(lines)
         self._board = self._options.board if self._options.board != "auto" else board or "biboard"
         if board and board != self._board:
-            self._name_problem(f"this robot has a {board}, the option board says {self._board}; correct the option")
+            self._set_problem(f"this robot has a {board}, the option board says {self._board}; correct the option")
         else:
             self._problem = ""
         self._values = {"mode": {"mode": self._board}}
@@ -260,17 +262,17 @@ class BittleDriver(LinkedDriver):
         self._up()
         self._schedule_poll()
 
-    def _on_no_greeting(self, failure: Failure) -> None:
+    def _on_no_version(self, failure: Failure) -> None:
         if self._link is None or self._is_closed:
             return
-        self._name_problem(
+        self._set_problem(
             f"it does not report its version; is it switched on, and {self._options.baud} baud right?"
             if self._options.port
             else "it does not report its version; is it switched on, and its web server part of the firmware?"
         )
-        self._greet_s = min(self._greet_s * 1.5, 5.0)
+        self._version_timeout_s = min(self._version_timeout_s * 1.5, 5.0)
         if not failure.check(LinkLost):
-            self._greet()
+            self._request_version()
 
     def _schedule_poll(self) -> None:
         self._timer.set(HTTP_POLL_S if self._options.host else POLL_S, self._send_poll)
@@ -279,21 +281,23 @@ class BittleDriver(LinkedDriver):
         if self._running_skill:
             self._schedule_poll()
             return
-        polls = self._polls()
+        polls = self._list_polls()
         self._poll_count += 1
-        is_slow = self._poll_count % SLOW_EVERY == 0 and self._board != "nyboard"
+        is_slow = self._poll_count % BATTERY_POLL_PERIOD == 0 and self._board != "nyboard"
         key = "power" if is_slow else list(polls)[self._poll_count % len(polls)]
-        command, read = (codec.VOLTAGE, _power) if is_slow else polls[key]
-        answered = self._dialogue.ask(command, POLL_PATIENCE_S)
+        command, read = (codec.VOLTAGE, _read_power) if is_slow else polls[key]
+        answered = self._requests.request(command, POLL_TIMEOUT_S)
         answered.addCallback(self._on_answer, key, read).addErrback(self._on_no_answer, key)
 
-    def _polls(self) -> dict[str, tuple[bytes, Callable[[list[str]], dict[str, Value]]]]:
+    def _list_polls(self) -> dict[str, tuple[bytes, Callable[[list[str]], dict[str, Value]]]]:
         polls: dict[str, tuple[bytes, Callable[[list[str]], dict[str, Value]]]] = {
-            "imu": (codec.ATTITUDE_OLD, _imu_old) if self._board == "nyboard" else (codec.ATTITUDE, _imu),
-            "joint": (codec.JOINT_ANGLES, _joints),
+            "imu": (codec.NYBOARD_ATTITUDE, _read_nyboard_imu)
+            if self._board == "nyboard"
+            else (codec.ATTITUDE, _read_imu),
+            "joint": (codec.JOINT_ANGLES, _read_joints),
         }
         if self._options.ultrasonic is not None:
-            polls["range"] = (codec.ultrasonic(*self._options.ultrasonic), _range)
+            polls["range"] = (codec.encode_ultrasonic(*self._options.ultrasonic), _read_range)
         return polls
 
     def _on_answer(self, lines: list[str], key: str, read: Callable[[list[str]], dict[str, Value]]) -> None:
@@ -315,13 +319,13 @@ class BittleDriver(LinkedDriver):
         self._missed_polls[key] = self._missed_polls.get(key, 0) + 1
         # It may have restarted and lie down: the next action sends its gait again.
         self._is_gait_certain = False
-        if self._missed_polls[key] >= MISSES:
+        if self._missed_polls[key] >= MAX_MISSED_POLLS:
             self._values.pop(key, None)
-        polls = self._polls()
-        if all(self._missed_polls.get(one, 0) >= MISSES for one in polls):
-            self._name_problem("it answers nothing; is it switched on, and in range?")
+        polls = self._list_polls()
+        if all(self._missed_polls.get(one, 0) >= MAX_MISSED_POLLS for one in polls):
+            self._set_problem("it answers nothing; is it switched on, and in range?")
             self._on_lost(LinkLost(f"{self._name} does not answer"))
-            self._greet()
+            self._request_version()
         else:
             self._schedule_poll()
 
@@ -348,25 +352,25 @@ class BittleDriver(LinkedDriver):
         self._pose = (x, y, math.remainder(yaw + self._velocity.wz * span, math.tau))
 
 
-def _imu(lines: list[str]) -> dict[str, Value]:
-    return {f"imu.{key}": angle for key, angle in codec.attitude(lines).items()}
+def _read_imu(lines: list[str]) -> dict[str, Value]:
+    return {f"imu.{key}": angle for key, angle in codec.parse_attitude(lines).items()}
 
 
-def _imu_old(lines: list[str]) -> dict[str, Value]:
-    return {f"imu.{key}": angle for key, angle in codec.attitude_old(lines).items()}
+def _read_nyboard_imu(lines: list[str]) -> dict[str, Value]:
+    return {f"imu.{key}": angle for key, angle in codec.parse_nyboard_attitude(lines).items()}
 
 
-def _joints(lines: list[str]) -> dict[str, Value]:
-    angles = codec.joints(lines)
+def _read_joints(lines: list[str]) -> dict[str, Value]:
+    angles = codec.parse_joints(lines)
     return {f"joint.{JOINT_NAMES[joint]}.pos": angle for joint, angle in angles.items() if joint in JOINT_NAMES}
 
 
-def _range(lines: list[str]) -> dict[str, Value]:
-    return {"range.front": codec.distance(lines)}
+def _read_range(lines: list[str]) -> dict[str, Value]:
+    return {"range.front": codec.parse_distance(lines)}
 
 
-def _power(lines: list[str]) -> dict[str, Value]:
-    volts = codec.volts(lines)
+def _read_power(lines: list[str]) -> dict[str, Value]:
+    volts = codec.parse_voltage(lines)
     return {"power.volts": volts, "power.level": min(max((volts - EMPTY_V) / (FULL_V - EMPTY_V), 0.0), 1.0)}
 
 
@@ -374,8 +378,8 @@ def make_driver(
     options: Mapping[str, object], name: str, clock: IReactorTime, connector: Connector | None
 ) -> BittleDriver:
     """Return a driver of the dog at the serial device or the address in ``options``."""
-    checked_options = checked(options)
-    dead_man = kept(name) if connector is None else None
+    checked_options = parse_options(options)
+    dead_man = create_switch(name) if connector is None else None
     if checked_options.host:
         over = TcpConnector() if connector is None else connector
         return BittleDriver(checked_options, name, HttpConnector(over, clock, checked_options.board), clock, dead_man)
@@ -384,4 +388,4 @@ def make_driver(
 
 def describe(options: Mapping[str, object], name: str) -> Description:
     """Return the description of that dog."""
-    return described(checked(options))
+    return make_description(parse_options(options))

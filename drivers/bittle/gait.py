@@ -7,7 +7,7 @@ from collections.abc import Mapping
 from typing import NamedTuple
 
 STAND = "up"
-LEAST_SPEED, LEAST_TURN = 0.02, 0.1
+MIN_SPEED_MPS, MIN_TURN_RADPS = 0.02, 0.1
 """Requested speeds below these, in m/s and rad/s, mean standing."""
 
 
@@ -31,15 +31,19 @@ GAITS: Mapping[str, Velocity] = {
 """Approximate velocity of each skill on a smooth floor; measured values of a robot go into its options."""
 
 
-def chosen(vx: float, wz: float, gaits: Mapping[str, Velocity]) -> tuple[str, Velocity]:
+def select_gait(vx: float, wz: float, gaits: Mapping[str, Velocity]) -> tuple[str, Velocity]:
     """Return the skill nearest to the requested velocity, and its real velocity.
 
     A slow request still selects a moving gait.  A gait that moves in an unrequested direction is never selected;
     if no other fits, the robot stands.
     """
-    vx = 0.0 if abs(vx) < LEAST_SPEED else vx
-    wz = 0.0 if abs(wz) < LEAST_TURN else wz
-    fitting = {name: one for name, one in gaits.items() if one != REST and _fits(one.vx, vx) and _fits(one.wz, wz)}
+    vx = 0.0 if abs(vx) < MIN_SPEED_MPS else vx
+    wz = 0.0 if abs(wz) < MIN_TURN_RADPS else wz
+    fitting = {
+        name: one
+        for name, one in gaits.items()
+        if one != REST and _is_compatible(one.vx, vx) and _is_compatible(one.wz, wz)
+    }
     if not fitting:
         return STAND, REST
     speed = max(abs(one.vx) for one in gaits.values()) or 1.0
@@ -48,5 +52,5 @@ def chosen(vx: float, wz: float, gaits: Mapping[str, Velocity]) -> tuple[str, Ve
     return name, gaits[name]
 
 
-def _fits(real: float, requested: float) -> bool:
+def _is_compatible(real: float, requested: float) -> bool:
     return real == 0.0 or real * requested > 0.0

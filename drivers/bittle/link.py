@@ -11,18 +11,18 @@ from twisted.logger import Logger
 
 from drivers.bittle import codec
 from drivers.errors import BadFrame
-from drivers.link import Caller, Connector, Line, Link
+from drivers.link import Connector, Link, LinkClient, Reconnector
 from drivers.timer import Timer
 
-ANSWER_S = 3.0
+REQUEST_TIMEOUT_S = 3.0
 """Seconds after which an unanswered request has failed."""
-STATUS_S = 0.05
+STATUS_POLL_S = 0.05
 """Interval at which a BiBoard's task is polled, for at most ``TASK_S``."""
-TASK_S = 16.0
-MISSES = 3
+TASK_TIMEOUT_S = 16.0
+MAX_FAILURES = 3
 """Consecutive failures after which the link counts as lost."""
 RETRY_S = 1.0
-MAX_WAITING = 8
+MAX_QUEUED = 8
 
 
 class HttpConnector:
@@ -33,12 +33,12 @@ class HttpConnector:
         self._clock = clock
         self._board = board
 
-    def call(self, host: str, port: int, caller: Caller) -> Line:
+    def connect(self, host: str, port: int, caller: LinkClient) -> Reconnector:
         """Keep ``caller`` connected to the robot at this address until ``hang_up``."""
-        return HttpLine(self._connector, self._clock, self._board, host, port, caller)
+        return HttpLink(self._connector, self._clock, self._board, host, port, caller)
 
 
-class HttpLine:
+class HttpLink:
     """A persistent connection and its one link; ``problem`` says why the robot cannot be reached.
 
     ``may_leave`` is called when a queued command can be sent; if it returns False, the command is dropped.
@@ -47,40 +47,40 @@ class HttpLine:
     log = Logger()
 
     def __init__(
-        self, connector: Connector, clock: IReactorTime, board: str, host: str, port: int, caller: Caller
+        self, connector: Connector, clock: IReactorTime, board: str, host: str, port: int, caller: LinkClient
     ) -> None:
         self.problem = ""
-        self.may_leave: Callable[[bytes], bool] = lambda _: True
+        self.should_send: Callable[[bytes], bool] = lambda _: True
         self._connector = connector
         self.clock = clock
         self._board = board
         self._host = host
         self._port = port
         self._peer: tuple[str, int] | None = None
-        self._caller = caller
+        self._client = caller
         self._queue: deque[bytes] = deque()
         self._request: _Request | None = None
         self._is_up = False
         self._is_wanted = True
-        self._misses = 0
+        self._failure_count = 0
         self._closed: Deferred[None] | None = None
         self._timer = Timer(clock)
         self._timer.set(0.0, self._open)
 
     # -- Line -------------------------------------------------------------------------------------------------------
 
-    def hang_up(self) -> Deferred[None]:
+    def disconnect(self) -> Deferred[None]:
         """Send only the last queued command, which makes the robot lie down; fires when its request has ended."""
         self._is_wanted = False
         if self._is_up:
             self._is_up = False
-            self._caller.link_down()
+            self._client.link_down()
         last = self._queue.pop() if self._queue else None
         self._queue.clear()
         self._timer.cancel()
         if last is not None:
-            self._drop()
-            self._request = _Request(self, codec.command_path(self._board, last), lambda _: None)
+            self._drop_request()
+            self._request = _Request(self, codec.format_command_path(self._board, last), lambda _: None)
         if self._request is None:
             return succeed(None)
         self._closed = self._closed or Deferred()
@@ -102,7 +102,7 @@ class HttpLine:
         """Send one command; does nothing on a closed link."""
         if not self._is_up:
             return
-        if len(self._queue) >= MAX_WAITING:
+        if len(self._queue) >= MAX_QUEUED:
             self._queue.popleft()
         self._queue.append(data)
         if self._request is None and not self._timer.is_set:
@@ -114,9 +114,9 @@ class HttpLine:
 
     def _open(self) -> None:
         self._is_up = True
-        self._misses = 0
+        self._failure_count = 0
         link: Link = self
-        self._caller.link_up(link)
+        self._client.link_up(link)
 
     def _lose(self, problem: str) -> None:
         if not self._is_up:
@@ -126,21 +126,21 @@ class HttpLine:
         self.problem = problem
         self._is_up = False
         self._queue.clear()
-        self._drop()
+        self._drop_request()
         self._timer.cancel()
-        self._caller.link_down()
+        self._client.link_down()
         if self._is_wanted:
             self._timer.set(RETRY_S, self._open)
 
     def _send_next(self) -> None:
-        while self._queue and not self.may_leave(self._queue[0]):
+        while self._queue and not self.should_send(self._queue[0]):
             self._queue.popleft()
         if not self._queue or not self._is_up:
             return
         command = self._queue.popleft()
-        path = codec.command_path(self._board, command)
+        path = codec.format_command_path(self._board, command)
         if self._board == "nyboard":
-            end = self.clock.seconds() + TASK_S
+            end = self.clock.seconds() + TASK_TIMEOUT_S
             self._request = _Request(self, path, lambda body: self._on_text(body, command, end), command)
         else:
             self._request = _Request(self, path, lambda body: self._on_task(body, command), command)
@@ -151,29 +151,31 @@ class HttpLine:
         # Output that follows the dongle's response stays in the dongle until the next request, even an empty one.
         is_done = _has_end(body, command)
         if not is_done and self.clock.seconds() < end and not self._queue:
-            self._timer.set(STATUS_S, self._request_more, command, end)
+            self._timer.set(STATUS_POLL_S, self._request_more, command, end)
         self._deliver(body + b"\n")
 
     def _request_more(self, command: bytes, end: float) -> None:
         if self._queue:
             self._send_next()
         else:
-            path = codec.command_path(self._board, b"")
+            path = codec.format_command_path(self._board, b"")
             self._request = _Request(self, path, lambda body: self._on_text(body, command, end))
 
     def _on_task(self, body: bytes, command: bytes) -> None:
-        task = codec.task_of(body)
+        task = codec.parse_task_id(body)
         if not self._is_wanted:
             return
-        self._ask_status(task, command, self.clock.seconds() + TASK_S)
+        self._request_status(task, command, self.clock.seconds() + TASK_TIMEOUT_S)
 
-    def _ask_status(self, task: str, command: bytes, end: float) -> None:
-        self._request = _Request(self, codec.status_path(task), lambda body: self._on_status(body, task, command, end))
+    def _request_status(self, task: str, command: bytes, end: float) -> None:
+        self._request = _Request(
+            self, codec.format_status_path(task), lambda body: self._on_status(body, task, command, end)
+        )
 
     def _on_status(self, body: bytes, task: str, command: bytes, end: float) -> None:
-        result = codec.result_of(body)
+        result = codec.parse_task_result(body)
         if result is None and self.clock.seconds() < end:
-            self._timer.set(STATUS_S, self._ask_status, task, command, end)
+            self._timer.set(STATUS_POLL_S, self._request_status, task, command, end)
             return
         lines = (result or b"") + b"\n"
         # On a cable the token ends the answer; here the status of the task does.
@@ -182,49 +184,49 @@ class HttpLine:
         self._deliver(lines)
 
     def _deliver(self, lines: bytes) -> None:
-        self._misses = 0
+        self._failure_count = 0
         self.problem = ""
-        self._caller.received(lines)
+        self._client.data_received(lines)
         if self._request is None and not self._timer.is_set:
             self._send_next()
 
-    def failed(self, problem: str) -> None:
+    def on_request_failed(self, problem: str) -> None:
         """Handle a failed request."""
         self._end_request()
-        self._misses += 1
-        if self._misses >= MISSES:
+        self._failure_count += 1
+        if self._failure_count >= MAX_FAILURES:
             self._lose(problem)
         else:
             self._send_next()
 
-    def passed_over(self) -> None:
+    def on_command_dropped(self) -> None:
         """Handle a request with a command that ``may_leave`` dropped."""
         self._end_request()
         self._send_next()
 
-    def fetched(self, body: bytes, take: Callable[[bytes], None]) -> None:
+    def on_response(self, body: bytes, take: Callable[[bytes], None]) -> None:
         """Handle the body of a request's response."""
         self._end_request()
         try:
             take(body)
         except BadFrame as error:
-            self.failed(str(error))
+            self.on_request_failed(str(error))
 
-    def call(self, request: _Request) -> Line:
+    def open_connection(self, request: _Request) -> Reconnector:
         """Open a connection for a request."""
-        return self._connector.call(self._host, self._port, request)
+        return self._connector.connect(self._host, self._port, request)
 
-    def met(self, link: Link) -> None:
+    def store_peer(self, link: Link) -> None:
         """Store the peer's address of a request's connection."""
         self._peer = getattr(link, "peer", None) or self._peer
 
-    def asked_of(self, command: bytes) -> bytes:
+    def encode_command_request(self, command: bytes) -> bytes:
         """Return the bytes of the request that makes the robot perform ``command``."""
-        return self.asked(codec.command_path(self._board, command))
+        return self.encode_request(codec.format_command_path(self._board, command))
 
-    def asked(self, path: str) -> bytes:
+    def encode_request(self, path: str) -> bytes:
         """Return the bytes of a request for ``path``."""
-        return codec.request(self._host, path)
+        return codec.encode_request(self._host, path)
 
     def _end_request(self) -> None:
         self._request = None
@@ -232,7 +234,7 @@ class HttpLine:
         if closed is not None:
             closed.callback(None)
 
-    def _drop(self) -> None:
+    def _drop_request(self) -> None:
         request, self._request = self._request, None
         if request is not None:
             request.drop()
@@ -245,31 +247,31 @@ def _has_end(lines: bytes, command: bytes) -> bool:
 class _Request:
     """One request over its own connection; ``command`` is the command that it carries, if any."""
 
-    def __init__(self, line: HttpLine, path: str, take: Callable[[bytes], None], command: bytes = b"") -> None:
-        self._line = line
+    def __init__(self, line: HttpLink, path: str, take: Callable[[bytes], None], command: bytes = b"") -> None:
+        self._http_link = line
         self._path = path
         self._on_body = take
         self._command = command
         self._reader = codec.ResponseReader()
         self._is_over = self._is_sent = False
         self._timer = Timer(line.clock)
-        self._timer.set(ANSWER_S, self._on_late)
-        self._call = line.call(self)
+        self._timer.set(REQUEST_TIMEOUT_S, self._on_timeout)
+        self._reconnector = line.open_connection(self)
 
     def link_up(self, link: Link) -> None:
         if self._is_sent:
             # The first connection was lost, and the robot may already have performed the command.
             self._fail("the robot closes without an answer; is its web server part of the firmware?")
             return
-        if self._command and not self._line.may_leave(self._command):
+        if self._command and not self._http_link.should_send(self._command):
             self.drop()
-            self._line.passed_over()
+            self._http_link.on_command_dropped()
             return
         self._is_sent = True
-        self._line.met(link)
-        link.send(self._line.asked(self._path))
+        self._http_link.store_peer(link)
+        link.send(self._http_link.encode_request(self._path))
 
-    def received(self, data: bytes) -> None:
+    def data_received(self, data: bytes) -> None:
         if self._is_over:
             return
         try:
@@ -284,7 +286,7 @@ class _Request:
         if self._is_over:
             return
         try:
-            body = self._reader.ended()
+            body = self._reader.finish()
         except BadFrame as error:
             self._fail(str(error))
             return
@@ -293,16 +295,16 @@ class _Request:
     def drop(self) -> None:
         self._is_over = True
         self._timer.cancel()
-        self._call.hang_up()
+        self._reconnector.disconnect()
 
-    def _on_late(self) -> None:
+    def _on_timeout(self) -> None:
         self._fail("the robot does not answer; is it switched on, in this network, and the option host right?")
 
     def _finish(self, body: bytes) -> None:
         self.drop()
-        self._line.fetched(body, self._on_body)
+        self._http_link.on_response(body, self._on_body)
 
     def _fail(self, problem: str) -> None:
         if not self._is_over:
             self.drop()
-            self._line.failed(problem)
+            self._http_link.on_request_failed(problem)

@@ -11,9 +11,9 @@ from msgspec import Meta
 from drivers.bittle.codec import NAME
 from drivers.bittle.gait import GAITS, Velocity
 from drivers.errors import UsageError
-from drivers.option import Port, convert_options, fault_of
+from drivers.option import Port, convert_options, make_option_error
 from drivers.reading import Description
-from formats.convert import Then
+from formats.convert import ConversionStep
 
 Baud = Literal[57600, 115200]
 Board = Literal["auto", "biboard", "nyboard"]
@@ -45,13 +45,13 @@ JOINT_LIMITS = {
 """Degrees."""
 
 
-def _gaits_of(table: Mapping[str, tuple[float, float]]) -> tuple[tuple[str, Velocity], ...]:
+def _parse_gaits(table: Mapping[str, tuple[float, float]]) -> tuple[tuple[str, Velocity], ...]:
     if not all(NAME.fullmatch(name) for name in table) or not any(vx for vx, _ in table.values()):
         raise ValueError
     return tuple((name, Velocity(*pair)) for name, pair in table.items())
 
 
-_GAITS = "skills with m/s ahead and rad/s to the left, some of which move, such as {wkF = [0.08, 0.0]}"
+_GAITS_DESCRIPTION = "skills with m/s ahead and rad/s to the left, some of which move, such as {wkF = [0.08, 0.0]}"
 
 
 @dataclass(frozen=True)
@@ -69,22 +69,24 @@ class Options:
     ] = None
     gaits: Annotated[
         tuple[tuple[str, Velocity], ...],
-        Meta(description=_GAITS),
-        Then(_gaits_of, raw=dict[str, tuple[Speed, Speed]]),
+        Meta(description=_GAITS_DESCRIPTION),
+        ConversionStep(_parse_gaits, raw=dict[str, tuple[Speed, Speed]]),
     ] = tuple(GAITS.items())
 
 
-def checked(table: Mapping[str, object]) -> Options:
+def parse_options(table: Mapping[str, object]) -> Options:
     """Convert and check ``table``; raise ``UsageError`` that names the key and the remedy."""
     options = convert_options("bittle", table, Options)
     if bool(options.port) == bool(options.host):
         raise UsageError('driver "bittle": write one of the options port = "/dev/ttyUSB0" and host = "192.168.1.40"')
     if options.host and options.board == "auto":
-        raise fault_of("bittle", "board", "is auto, which is not possible with host", 'write "biboard" or "nyboard"')
+        raise make_option_error(
+            "bittle", "board", "is auto, which is not possible with host", 'write "biboard" or "nyboard"'
+        )
     return options
 
 
-def described(options: Options) -> Description:
+def make_description(options: Options) -> Description:
     """Return the description of a Bittle."""
     speeds = [one.vx for _, one in options.gaits] + [0.0]
     turns = [one.wz for _, one in options.gaits] + [0.0]

@@ -12,12 +12,12 @@ from collections.abc import Callable, Mapping
 
 from drivers.errors import BadFrame
 
-MOST_BYTES = 1024 * 1024
+MAX_PICTURE_BYTES = 1024 * 1024
 """Largest picture in bytes."""
-MOST_HEAD = 8192
+MAX_HEADER_BYTES = 8192
 """Largest header in bytes, of the stream or of one picture."""
-TOO_LARGE = f"a picture has more than {MOST_BYTES} bytes; set a smaller size in the camera"
-KIND = "multipart/x-mixed-replace"
+TOO_LARGE_ERROR = f"a picture has more than {MAX_PICTURE_BYTES} bytes; set a smaller size in the camera"
+CONTENT_TYPE = "multipart/x-mixed-replace"
 BOUNDARY = "frame"
 
 _REMEDIES = {
@@ -28,9 +28,9 @@ _REMEDIES = {
 }
 
 
-def request(host: str, path: str, login: str = "") -> bytes:
+def encode_request(host: str, path: str, login: str = "") -> bytes:
     """Return the request to ``host`` for the stream at ``path``; ``login`` is ``NAME:PASSWORD``, or empty."""
-    lines = [f"GET {path} HTTP/1.1", f"Host: {host}", f"Accept: {KIND}", "Connection: close"]
+    lines = [f"GET {path} HTTP/1.1", f"Host: {host}", f"Accept: {CONTENT_TYPE}", "Connection: close"]
     if login:
         lines.append("Authorization: Basic " + base64.b64encode(login.encode()).decode())
     return "\r\n".join([*lines, "", ""]).encode()
@@ -51,7 +51,7 @@ class StreamReader:
         self._chunks: _Chunks | None = None
         self._delimiter = b""
         self._length = 0
-        self._fields = 0
+        self._field_bytes = 0
         self._search_start = 0
 
     def read(self, data: bytes) -> list[bytes]:
@@ -64,15 +64,15 @@ class StreamReader:
         return found
 
     def _read_head(self) -> bool:
-        end = _blank_line(self._rest)
-        if end < 0 or end > MOST_HEAD:
-            if len(self._rest) > MOST_HEAD:
-                raise BadFrame(f"its answer begins with more than {MOST_HEAD} bytes of fields; is it a camera?")
+        end = _find_blank_line(self._rest)
+        if end < 0 or end > MAX_HEADER_BYTES:
+            if len(self._rest) > MAX_HEADER_BYTES:
+                raise BadFrame(f"its answer begins with more than {MAX_HEADER_BYTES} bytes of fields; is it a camera?")
             return False
         first, *lines = bytes(self._rest[:end]).decode("latin-1").splitlines()
-        fields = _fields(lines)
+        fields = _parse_fields(lines)
         _check_status(first, fields)
-        self._delimiter = _delimiter(fields.get("content-type", ""))
+        self._delimiter = _parse_delimiter(fields.get("content-type", ""))
         rest = bytes(self._rest[end:])
         if fields.get("transfer-encoding", "").lower() == "chunked":
             self._chunks = _Chunks()
@@ -98,28 +98,28 @@ class StreamReader:
         is_one = end >= 0 and not self._rest[after:end].strip()
         del self._rest[: end + 1 if is_one else after]
         if is_one:
-            self._length = self._fields = 0
+            self._length = self._field_bytes = 0
             self._parse_step = self._read_fields
         return True
 
     def _read_fields(self) -> bool:
-        end = self._rest.find(b"\n", 0, MOST_HEAD)
-        if self._fields + (end if end >= 0 else len(self._rest)) > MOST_HEAD:
-            raise BadFrame(f"a picture begins with more than {MOST_HEAD} bytes of fields")
+        end = self._rest.find(b"\n", 0, MAX_HEADER_BYTES)
+        if self._field_bytes + (end if end >= 0 else len(self._rest)) > MAX_HEADER_BYTES:
+            raise BadFrame(f"a picture begins with more than {MAX_HEADER_BYTES} bytes of fields")
         if end < 0:
             return False
         line = bytes(self._rest[:end]).strip()
         del self._rest[: end + 1]
-        self._fields += end + 1
+        self._field_bytes += end + 1
         name, _, value = line.partition(b":")
         if name.strip().lower() == b"content-length" and value.strip().isdigit():
             # Twelve digits are enough to exceed the limit.
             self._length = int(value.strip()[:12])
-            if self._length > MOST_BYTES:
-                raise BadFrame(TOO_LARGE)
+            if self._length > MAX_PICTURE_BYTES:
+                raise BadFrame(TOO_LARGE_ERROR)
         if not line:
             self._search_start = 0
-            self._parse_step = self._read_sized if self._length else self._read_open
+            self._parse_step = self._read_sized if self._length else self._read_until_boundary
         return True
 
     def _read_sized(self) -> bool:
@@ -130,18 +130,18 @@ class StreamReader:
         self._parse_step = self._skip_boundary
         return True
 
-    def _read_open(self) -> bool:
+    def _read_until_boundary(self) -> bool:
         at = self._rest.find(self._delimiter, self._search_start)
         if at < 0:
             # The last bytes may be a line end and the start of the boundary; they do not count.
-            if len(self._rest) - len(self._delimiter) - 4 > MOST_BYTES:
-                raise BadFrame(TOO_LARGE)
+            if len(self._rest) - len(self._delimiter) - 4 > MAX_PICTURE_BYTES:
+                raise BadFrame(TOO_LARGE_ERROR)
             self._search_start = max(0, len(self._rest) - len(self._delimiter) + 1)
             return False
         # A line end precedes the boundary, and the boundary may have more dashes than announced.
         picture = bytes(self._rest[:at]).rstrip(b"-").removesuffix(b"\n").removesuffix(b"\r")
-        if len(picture) > MOST_BYTES:
-            raise BadFrame(TOO_LARGE)
+        if len(picture) > MAX_PICTURE_BYTES:
+            raise BadFrame(TOO_LARGE_ERROR)
         self._pictures.append(picture)
         del self._rest[:at]
         self._parse_step = self._skip_boundary
@@ -174,14 +174,16 @@ class _Chunks:
                 break
             size = line.partition(b";")[0].strip()
             if not 0 < len(size) <= 8 or size.strip(b"0123456789abcdefABCDEF"):
-                raise BadFrame(f"a chunk has the size {_printable(size)}; is it a camera?")
+                raise BadFrame(f"a chunk has the size {_make_printable(size)}; is it a camera?")
             self._left = int(size, 16)
             self.is_over = self._left == 0
             data = after
         return bytes(found)
 
 
-def answer(kind: str = f"{KIND}; boundary={BOUNDARY}", status: str = "200 OK", is_chunked: bool = False) -> bytes:
+def encode_answer_header(
+    kind: str = f"{CONTENT_TYPE}; boundary={BOUNDARY}", status: str = "200 OK", is_chunked: bool = False
+) -> bytes:
     """Return the header of a camera's answer."""
     lines = [f"HTTP/1.1 {status}", f"Content-Type: {kind}", "Cache-Control: no-store", "Connection: close"]
     if is_chunked:
@@ -189,29 +191,29 @@ def answer(kind: str = f"{KIND}; boundary={BOUNDARY}", status: str = "200 OK", i
     return "\r\n".join([*lines, "", ""]).encode()
 
 
-def part(jpeg: bytes, has_length: bool = True) -> bytes:
+def encode_part(jpeg: bytes, has_length: bool = True) -> bytes:
     """Return one picture with its boundary."""
     length = f"Content-Length: {len(jpeg)}\r\n" if has_length else ""
     return f"--{BOUNDARY}\r\nContent-Type: image/jpeg\r\n{length}\r\n".encode() + jpeg + b"\r\n"
 
 
-def chunk(data: bytes) -> bytes:
+def encode_chunk(data: bytes) -> bytes:
     """Return ``data`` as one chunk."""
     return b"%x\r\n%b\r\n" % (len(data), data)
 
 
-def method_of(data: bytes) -> str | None:
+def parse_method(data: bytes) -> str | None:
     """Return the method of the request ``data``; None while the request is incomplete."""
-    return None if _blank_line(data) < 0 else data.split(b" ", 1)[0].decode("latin-1")
+    return None if _find_blank_line(data) < 0 else data.split(b" ", 1)[0].decode("latin-1")
 
 
-def _blank_line(data: bytes | bytearray) -> int:
+def _find_blank_line(data: bytes | bytearray) -> int:
     """Return the offset after the first blank line; -1 without one."""
     ends = [at + len(end) for end in (b"\r\n\r\n", b"\n\n") if (at := data.find(end)) >= 0]
     return min(ends, default=-1)
 
 
-def _fields(lines: list[str]) -> dict[str, str]:
+def _parse_fields(lines: list[str]) -> dict[str, str]:
     pairs = (line.partition(":") for line in lines)
     return {name.strip().lower(): value.strip() for name, _, value in pairs}
 
@@ -219,20 +221,22 @@ def _fields(lines: list[str]) -> dict[str, str]:
 def _check_status(line: str, fields: Mapping[str, str]) -> None:
     words = line.split(None, 2)
     if len(words) < 2 or not words[0].startswith("HTTP/") or not (words[1].isdecimal() and len(words[1]) == 3):
-        raise BadFrame(f"it does not speak HTTP, it sends {_printable(line)}; correct the port of url")
+        raise BadFrame(f"it does not speak HTTP, it sends {_make_printable(line)}; correct the port of url")
     status = int(words[1])
     if status == 200:
         return
     elsewhere = fields.get("location", "")
-    remedy = f"write url = {_printable(elsewhere)}" if elsewhere else _REMEDIES.get(status, "look at it in a browser")
-    raise BadFrame(f"it answers {_printable(' '.join(words[1:]))}; {remedy}")
+    remedy = (
+        f"write url = {_make_printable(elsewhere)}" if elsewhere else _REMEDIES.get(status, "look at it in a browser")
+    )
+    raise BadFrame(f"it answers {_make_printable(' '.join(words[1:]))}; {remedy}")
 
 
-def _delimiter(kind: str) -> bytes:
+def _parse_delimiter(kind: str) -> bytes:
     name, *parameters = kind.split(";")
-    if name.strip().lower() != KIND:
+    if name.strip().lower() != CONTENT_TYPE:
         raise BadFrame(
-            f"it sends {_printable(name) or 'no content type'} instead of a stream ({KIND}); correct the path of url"
+            f"it sends {_make_printable(name) or 'no content type'} instead of a stream ({CONTENT_TYPE}); correct the path of url"
         )
     for parameter in parameters:
         key, _, value = parameter.partition("=")
@@ -244,7 +248,7 @@ def _delimiter(kind: str) -> bytes:
     raise BadFrame("its stream names no boundary; is it a camera?")
 
 
-def _printable(text: str | bytes) -> str:
+def _make_printable(text: str | bytes) -> str:
     """Return received text without control characters, for the log."""
     plain = text.decode("latin-1") if isinstance(text, bytes) else text
     return "".join(char if " " <= char <= "~" else "?" for char in plain.strip()[:60])

@@ -11,10 +11,10 @@ from twisted.internet.defer import Deferred
 from twisted.internet.interfaces import IReactorTime
 
 from drivers.base import SensingDriver
-from drivers.camera.option import Options, checked, described, place_of
-from drivers.camera.shots import CaptureShots, FolderShots, Shot
-from drivers.camera.stream import StreamFilm
-from drivers.camera.thread import ClockFilm, Film, ThreadFilm
+from drivers.camera.mjpeg import MjpegStream
+from drivers.camera.option import Options, make_description, parse_options, parse_url
+from drivers.camera.picture_stream import PictureStream, ThreadedStream, TimedStream
+from drivers.camera.source import CaptureSource, FolderSource, JpegPicture
 from drivers.link import Connector, TcpConnector
 from drivers.option import Manifest
 from drivers.reading import Description, Frame
@@ -26,11 +26,13 @@ MANIFEST = Manifest("cv2", "vision", "except for a folder of JPEGs or a url")
 class CameraDriver(SensingDriver):
     """One camera; ``film`` delivers its pictures."""
 
-    def __init__(self, options: Options | Mapping[str, object], film: Film, clock: IReactorTime, name: str) -> None:
-        self._options = options if isinstance(options, Options) else checked(options)
-        super().__init__(described(self._options), name, clock)
+    def __init__(
+        self, options: Options | Mapping[str, object], film: PictureStream, clock: IReactorTime, name: str
+    ) -> None:
+        self._options = options if isinstance(options, Options) else parse_options(options)
+        super().__init__(make_description(self._options), name, clock)
         self.STALE_S = max(0.5, 3.0 / self._options.fps)
-        self._film = film
+        self._stream = film
         self._fps = self._options.fps
         self._started_at = 0.0
         self._problem = ""
@@ -45,7 +47,7 @@ class CameraDriver(SensingDriver):
     def set_camera_fps(self, fps: float) -> None:
         """Set the frame rate in pictures per second; at 0 no pictures are taken, and the device stays ready."""
         previous, self._fps = self._fps, fps
-        self._film.set_fps(fps)
+        self._stream.set_fps(fps)
         self.STALE_S = max(0.5, 3.0 / fps) if fps > 0 else 0.5
         if fps > 0:
             self._idle_timer.cancel()
@@ -59,11 +61,11 @@ class CameraDriver(SensingDriver):
 
     def diagnostics(self) -> dict[str, float]:
         """As for every driver; ``dropped`` is the number of pictures replaced by newer ones."""
-        return {**super().diagnostics(), "dropped": float(getattr(self._film, "dropped", 0))}
+        return {**super().diagnostics(), "dropped": float(getattr(self._stream, "dropped", 0))}
 
     # -- called by the film -----------------------------------------------------------------------------------------
 
-    def shown(self, shot: Shot) -> None:
+    def shown(self, shot: JpegPicture) -> None:
         """Publish a picture."""
         self._problem = ""
         self._counts["frames"] += 1
@@ -94,11 +96,11 @@ class CameraDriver(SensingDriver):
 
     def _open(self) -> None:
         self._started_at = self._clock.seconds()
-        self._film.start(self, self._fps)
+        self._stream.start(self, self._fps)
 
     def _close(self) -> Deferred[None]:
         self._idle_timer.cancel()
-        return self._film.stop()
+        return self._stream.stop()
 
     def _report_idle(self) -> None:
         """Observe without a new picture, so that the link does not become stale while no pictures are requested."""
@@ -108,21 +110,21 @@ class CameraDriver(SensingDriver):
 
 def make_driver(options: Mapping[str, object], name: str, clock: IReactorTime, connector: Any) -> CameraDriver:
     """Return a driver of a camera or a substitute; only a camera on the network uses ``connector``."""
-    wanted = checked(options)
-    return CameraDriver(wanted, film_of(wanted, clock, connector), clock, name)
+    wanted = parse_options(options)
+    return CameraDriver(wanted, make_picture_stream(wanted, clock, connector), clock, name)
 
 
 def describe(options: Mapping[str, object], name: str) -> Description:
     """Return the description of that camera."""
-    return described(checked(options))
+    return make_description(parse_options(options))
 
 
-def film_of(options: Options, clock: Any, connector: Connector | None = None) -> Film:
+def make_picture_stream(options: Options, clock: Any, connector: Connector | None = None) -> PictureStream:
     """Return the source of pictures; for a camera of this machine ``clock`` must be a reactor."""
     if options.url:
         size = options.width, options.height
-        return StreamFilm(place_of(options.url), size, TcpConnector() if connector is None else connector, clock)
+        return MjpegStream(parse_url(options.url), size, TcpConnector() if connector is None else connector, clock)
     if isinstance(options.source, str) and not options.is_device and os.path.isdir(options.source):
-        return ClockFilm(FolderShots(options.source), clock)
-    shots = CaptureShots(options, lambda: import_module("cv2"))
-    return ThreadFilm(shots, clock.callFromThread) if options.is_device else ClockFilm(shots, clock)
+        return TimedStream(FolderSource(options.source), clock)
+    shots = CaptureSource(options, lambda: import_module("cv2"))
+    return ThreadedStream(shots, clock.callFromThread) if options.is_device else TimedStream(shots, clock)

@@ -13,16 +13,16 @@ from drivers.driver import MAX_FPS
 from drivers.errors import UsageError
 from drivers.option import convert_options
 from drivers.reading import Description
-from formats.convert import LINE, Unit
+from formats.convert import PRINTABLE, Unit
 
-LEAST_SIDE, MOST_SIDE = 16, 1920
+MIN_SIDE_PX, MAX_SIDE_PX = 16, 1920
 """Smallest and largest side of a picture, in pixels."""
-Side = Annotated[int, Meta(ge=LEAST_SIDE, le=MOST_SIDE), Unit("pixels")]
-DEVICE = "/dev/video"
+Side = Annotated[int, Meta(ge=MIN_SIDE_PX, le=MAX_SIDE_PX), Unit("pixels")]
+DEVICE_PREFIX = "/dev/video"
 
 
 @dataclass(frozen=True)
-class Place:
+class StreamAddress:
     """Address of the pictures of a camera on the network; ``login`` is ``NAME:PASSWORD``, or empty."""
 
     host: str
@@ -49,7 +49,7 @@ class Options:
     source: Annotated[
         Annotated[int, Meta(ge=0, le=63)] | Annotated[str, Meta(min_length=1)],
         Meta(description='a number from 0 to 63 ("/dev/video0" is 0), a video file, or a folder of JPEGs'),
-        LINE,
+        PRINTABLE,
     ] = 0
     url: str = ""
     width: Side = 320
@@ -63,19 +63,19 @@ class Options:
     @property
     def is_device(self) -> bool:
         """Whether the source is a camera of this machine."""
-        return not self.url and (isinstance(self.source, int) or self.source.startswith(DEVICE))
+        return not self.url and (isinstance(self.source, int) or self.source.startswith(DEVICE_PREFIX))
 
 
-def checked(table: Mapping[str, object]) -> Options:
+def parse_options(table: Mapping[str, object]) -> Options:
     """Convert and check ``table``; raise ``UsageError`` that names the key and the remedy."""
     if "url" in table and "source" in table:
         raise UsageError('driver "camera": options source and url exclude each other; leave one out')
     if "url" in table:
-        place_of(table["url"])
+        parse_url(table["url"])
     return convert_options("camera", table, Options)
 
 
-def place_of(url: object) -> Place:
+def parse_url(url: object) -> StreamAddress:
     """Parse ``url``; raise ``UsageError`` with the remedy if it is invalid."""
     # The error does not contain the url, which may include a password.
     fault = UsageError('driver "camera": option url must be as in url = "http://192.168.1.30:81/stream"')
@@ -92,10 +92,10 @@ def place_of(url: object) -> Place:
         raise fault
     login = f"{unquote(parts.username or '')}:{unquote(parts.password or '')}" if "@" in parts.netloc else ""
     path = (parts.path or "/") + (f"?{parts.query}" if parts.query else "")
-    return Place(parts.hostname, port or 80, path, login)
+    return StreamAddress(parts.hostname, port or 80, path, login)
 
 
-def described(options: Options) -> Description:
+def make_description(options: Options) -> Description:
     """Return the description of the camera; it has no motor, so it has no actions."""
     camera = {"width": options.width, "height": options.height, "fps": options.fps, "fov_h_deg": options.lens}
     camera["ahead"] = options.ahead

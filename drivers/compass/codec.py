@@ -16,7 +16,7 @@ from dataclasses import dataclass
 
 from drivers.errors import BadFrame
 
-MOST_LINE = 120
+MAX_LINE_BYTES = 120
 """Longest sentence in bytes; the standard allows 82."""
 RANKS = {"HDM": 1, "HDG": 2, "HDT": 3}
 """The sentences that contain a heading; if a compass sends several, the highest rank is used."""
@@ -53,7 +53,7 @@ class SentenceReader:
         for line in filter(None, lines):
             is_first, self._is_first = self._is_first, False
             try:
-                heading = self._heading(line)
+                heading = self._parse_line(line)
             except BadFrame:
                 # The first line of a stream is usually the end of a sentence.
                 self.bad_frames += not is_first
@@ -61,35 +61,35 @@ class SentenceReader:
             self.sentences += 1
             if heading is not None:
                 found.append(heading)
-        if len(self._rest) > MOST_LINE:
+        if len(self._rest) > MAX_LINE_BYTES:
             self.bad_frames += 1
             self._rest = b""
         return found
 
-    def _heading(self, line: bytes) -> Heading | None:
+    def _parse_line(self, line: bytes) -> Heading | None:
         body, star, _ = line.partition(b"*")
         if self._has_checksums and not star:
             raise BadFrame("sentence without checksum")
-        heading = heading_in(line)
+        heading = parse_heading(line)
         self._has_checksums = self._has_checksums or bool(star)
         return heading
 
 
-def heading_in(line: bytes) -> Heading | None:
+def parse_heading(line: bytes) -> Heading | None:
     """Parse one sentence; return None for another kind; raise ``BadFrame`` if it is invalid or has no heading."""
     body, star, checksum = line.strip().partition(b"*")
-    if len(line) > MOST_LINE or not body.startswith((b"$", b"!")) or not body.isascii():
+    if len(line) > MAX_LINE_BYTES or not body.startswith((b"$", b"!")) or not body.isascii():
         raise BadFrame("not an NMEA 0183 sentence")
-    if star and (len(checksum) != 2 or checksum.upper() != _checksum(body[1:])):
+    if star and (len(checksum) != 2 or checksum.upper() != _compute_checksum(body[1:])):
         raise BadFrame("wrong checksum")
     address, *fields = (field.strip() for field in body[1:].decode().split(","))
     kind = address[2:]
     if len(address) != 5 or kind not in RANKS:
         return None
     fields += [""] * 5
-    degrees = _degrees(fields[0])
+    degrees = _parse_degrees(fields[0])
     if kind == "HDG":
-        deviation, variation = _eastward(*fields[1:3]), _eastward(*fields[3:5])
+        deviation, variation = _parse_angle(*fields[1:3]), _parse_angle(*fields[3:5])
         degrees += (deviation or 0.0) + (variation or 0.0)
         return Heading(degrees % 360.0, variation is not None, RANKS[kind])
     if fields[1] not in ("", kind[2]):
@@ -97,34 +97,34 @@ def heading_in(line: bytes) -> Heading | None:
     return Heading(degrees % 360.0, kind == "HDT", RANKS[kind])
 
 
-def sentence(address: str, *fields: str) -> bytes:
+def encode_sentence(address: str, *fields: str) -> bytes:
     """Return a sentence with its checksum and line end."""
     body = ",".join((address, *fields)).encode()
-    return b"$" + body + b"*" + _checksum(body) + b"\r\n"
+    return b"$" + body + b"*" + _compute_checksum(body) + b"\r\n"
 
 
-def eastward(degrees: float) -> tuple[str, str]:
+def format_angle(degrees: float) -> tuple[str, str]:
     """Return the two fields of an angle that is positive to the east."""
     return f"{abs(degrees):.1f}", "E" if degrees >= 0 else "W"
 
 
-def _degrees(field: str) -> float:
+def _parse_degrees(field: str) -> float:
     if not _DEGREES.fullmatch(field) or float(field) > 360.0:
         raise BadFrame(f"not an angle in degrees: {field!r}")
     return float(field)
 
 
-def _eastward(field: str, side: str) -> float | None:
+def _parse_angle(field: str, side: str) -> float | None:
     """Return the angle of two fields, positive to the east; None if they are empty."""
     if not field and not side:
         return None
-    degrees = _degrees(field)
+    degrees = _parse_degrees(field)
     if degrees > 180.0 or side not in ("E", "W"):
         raise BadFrame(f"not an angle east or west: {field!r}, {side!r}")
     return degrees if side == "E" else -degrees
 
 
-def _checksum(body: bytes) -> bytes:
+def _compute_checksum(body: bytes) -> bytes:
     total = 0
     for byte in body:
         total ^= byte

@@ -12,7 +12,7 @@ from twisted.internet.interfaces import IReactorTime
 
 from drivers.base import LinkedDriver, SensingDriver
 from drivers.compass.codec import Heading, SentenceReader
-from drivers.compass.option import Options, checked, described
+from drivers.compass.option import Options, make_description, parse_options
 from drivers.link import Connector, Link, TcpConnector
 from drivers.option import Manifest
 from drivers.reading import Description
@@ -20,9 +20,9 @@ from drivers.reading import Description
 MANIFEST = Manifest("serial", "serial", "on a cable", {"device": "/dev/ttyUSB1"})
 
 HEADING = "compass.heading"
-SILENCE_S, LAST_SILENCE_S = 3.0, 24.0
+SILENCE_S, MAX_SILENCE_S = 3.0, 24.0
 """Seconds without a heading after which the link is reopened, at first and at most; the time doubles each time."""
-BELIEVED_S = 3.0
+RANK_HOLD_S = 3.0
 """Seconds for which sentences of a lower rank are ignored after one of the best rank."""
 
 
@@ -30,19 +30,19 @@ class CompassDriver(SensingDriver, LinkedDriver):
     """One compass."""
 
     def __init__(self, options: Options, name: str, connector: Connector, clock: IReactorTime) -> None:
-        super().__init__(described(options), name, clock, connector, options.place)
+        super().__init__(make_description(options), name, clock, connector, options.endpoint)
         self.STALE_S = max(0.5, 3.0 / options.rate)
         self._options = options
         self._reader: SentenceReader = SentenceReader()
-        self._best = 0
+        self._best_rank = 0
         self._best_at = -math.inf
         self._bytes_at_start = 0
-        self._heard_at = 0.0
+        self._last_data_at = 0.0
         self._silence_s = max(SILENCE_S, 3.0 / options.rate)
 
     def _open(self) -> None:
-        self._heard_at = self._clock.seconds()
-        self._timer.set(self._silence_s, self._watch)
+        self._last_data_at = self._clock.seconds()
+        self._timer.set(self._silence_s, self._check_silence)
         super()._open()
 
     # -- from the compass -------------------------------------------------------------------------------------------
@@ -52,7 +52,7 @@ class CompassDriver(SensingDriver, LinkedDriver):
         self._link = link
         self._reader = SentenceReader()
         self._bytes_at_start = self._counts["bytes"]
-        self._heard_at = self._clock.seconds()
+        self._last_data_at = self._clock.seconds()
 
     def link_down(self) -> None:
         """Handle the loss of the link; called by the link."""
@@ -60,12 +60,12 @@ class CompassDriver(SensingDriver, LinkedDriver):
         if self._is_up:
             self._down()
 
-    def _heard(self, heading: Heading) -> None:
+    def _on_message(self, heading: Heading) -> None:
         now = self._clock.seconds()
-        if heading.rank < self._best and now - self._best_at <= BELIEVED_S:
+        if heading.rank < self._best_rank and now - self._best_at <= RANK_HOLD_S:
             return
-        self._best, self._best_at = heading.rank, now
-        self._heard_at = now
+        self._best_rank, self._best_at = heading.rank, now
+        self._last_data_at = now
         self._silence_s = max(SILENCE_S, 3.0 / self._options.rate)
         self._problem = ""
         self._counts["frames"] += 1
@@ -80,20 +80,20 @@ class CompassDriver(SensingDriver, LinkedDriver):
         true = heading.degrees + (0.0 if heading.is_true else options.variation_deg)
         return math.remainder(math.radians(options.x_axis_deg - true - options.mounted_deg), math.tau)
 
-    def _watch(self) -> None:
-        silent = self._clock.seconds() - self._heard_at
+    def _check_silence(self) -> None:
+        silent = self._clock.seconds() - self._last_data_at
         if silent < self._silence_s:
-            self._timer.set(self._silence_s - silent, self._watch)
+            self._timer.set(self._silence_s - silent, self._check_silence)
             return
-        self._silence_s = min(2.0 * self._silence_s, max(LAST_SILENCE_S, self._silence_s))
-        self._heard_at = self._clock.seconds()
-        self._timer.set(self._silence_s, self._watch)
-        self._name_problem(self._describe_silence())
+        self._silence_s = min(2.0 * self._silence_s, max(MAX_SILENCE_S, self._silence_s))
+        self._last_data_at = self._clock.seconds()
+        self._timer.set(self._silence_s, self._check_silence)
+        self._set_problem(self._describe_silence())
         if self._link is not None:
             self._link.close()
 
     def _describe_silence(self) -> str:
-        place, scale = self._options.place
+        place, scale = self._options.endpoint
         if self._link is None:
             is_cable = bool(self._options.device)
             return (
@@ -114,7 +114,7 @@ def make_driver(
     options: Mapping[str, object], name: str, clock: IReactorTime, connector: Connector | None
 ) -> CompassDriver:
     """Return a driver of the compass that ``options`` name."""
-    wanted = checked(options)
+    wanted = parse_options(options)
     if connector is None and wanted.device:
         from drivers.serial import SerialConnector  # not needed for a compass on the network
 
@@ -124,4 +124,4 @@ def make_driver(
 
 def describe(options: Mapping[str, object], name: str) -> Description:
     """Return the description of that compass."""
-    return described(checked(options))
+    return make_description(parse_options(options))

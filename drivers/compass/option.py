@@ -11,9 +11,9 @@ from msgspec import Meta
 from drivers.errors import UsageError
 from drivers.option import Port, convert_options
 from drivers.reading import Description
-from formats.convert import LINE, Unit
+from formats.convert import PRINTABLE, Unit
 
-PORT = 10110
+NMEA_PORT = 10110
 """The TCP port that is registered for NMEA 0183."""
 Baud = Literal[4800, 9600, 19200, 38400, 57600, 115200]
 
@@ -27,9 +27,9 @@ class Options:
     degrees clockwise from north.  ``rate`` is the number of headings per second that it sends.
     """
 
-    host: Annotated[str, Meta(min_length=1, examples=["192.168.1.31"]), LINE] = ""
-    port: Port = PORT
-    device: Annotated[str, Meta(min_length=1, examples=["/dev/ttyUSB1"]), LINE] = ""
+    host: Annotated[str, Meta(min_length=1, examples=["192.168.1.31"]), PRINTABLE] = ""
+    port: Port = NMEA_PORT
+    device: Annotated[str, Meta(min_length=1, examples=["/dev/ttyUSB1"]), PRINTABLE] = ""
     baud: Baud = 4800
     mounted_deg: Annotated[float, Meta(ge=-360, le=360), Unit("degrees to the left")] = 0.0
     variation_deg: Annotated[float, Meta(ge=-180, le=180), Unit("degrees to the east")] = 0.0
@@ -37,12 +37,12 @@ class Options:
     rate: Annotated[float, Meta(ge=0.5, le=100), Unit("headings a second")] = 10.0
 
     @property
-    def place(self) -> tuple[str, int]:
+    def endpoint(self) -> tuple[str, int]:
         """The arguments of the connector: host and port, or device and baud rate."""
         return (self.device, self.baud) if self.device else (self.host, self.port)
 
 
-def checked(table: Mapping[str, object]) -> Options:
+def parse_options(table: Mapping[str, object]) -> Options:
     """Convert and check ``table``; raise ``UsageError`` that names the key and the remedy."""
     options = convert_options("compass", table, Options)
     if bool(options.host) == bool(options.device):
@@ -50,6 +50,6 @@ def checked(table: Mapping[str, object]) -> Options:
     return options
 
 
-def described(options: Options) -> Description:
+def make_description(options: Options) -> Description:
     """Return the description of the compass; it has no motor, so it has no actions."""
     return Description("compass", "a compass (NMEA 0183)", {"compass": {}}, {}, 0.05, {"compass": options.rate})

@@ -13,13 +13,13 @@ from collections.abc import Mapping
 from twisted.internet.defer import Deferred, fail, succeed
 from twisted.internet.interfaces import IReactorTime
 
-from drivers.base import LinkedDriver, heard_at
+from drivers.base import LinkedDriver, correct_last_data_time
 from drivers.create2 import codec
-from drivers.create2.odometry import WHEEL_BASE, Odometry
-from drivers.create2.option import SKILLS, Options, checked, described
-from drivers.create2.sense import ARMED, IDS, event_of, mode_of, seen
-from drivers.deadman.keeper import kept
-from drivers.deadman.switch import DeadMan, LastWord
+from drivers.create2.odometry import WHEEL_BASE_MM, Odometry
+from drivers.create2.option import SKILLS, Options, make_description, parse_options
+from drivers.create2.sensors import DRIVING_MODES, PACKET_IDS, convert_frame, describe_safety_event, get_mode
+from drivers.deadman.supervisor import create_switch
+from drivers.deadman.switch import DeadManSwitch, HaltCommand
 from drivers.driver import Permit
 from drivers.errors import LinkLost, NoReply, NotEnabled, Unsupported, UsageError
 from drivers.link import Connector, Link
@@ -30,12 +30,12 @@ from drivers.timer import Timer
 
 MANIFEST = Manifest("serial", "serial", example={"port": "/dev/ttyUSB0"}, is_on_cable=True)
 
-SETTLE_S = 0.05
+START_DELAY_S = 0.05
 """Seconds to wait after ``START`` before the next command."""
 SILENCE_S = 0.5
 """Seconds without a frame after which the robot is started again: it was switched off, or rebooted."""
-LAST_SILENCE_S = 4.0
-DOCK_S = 120.0
+MAX_SILENCE_S = 4.0
+DOCK_TIMEOUT_S = 120.0
 """Seconds within which the robot must find its home base."""
 
 
@@ -53,17 +53,17 @@ class Create2Driver(LinkedDriver):
         name: str,
         connector: Connector,
         clock: IReactorTime,
-        dead_man: DeadMan | None = None,
+        dead_man: DeadManSwitch | None = None,
     ) -> None:
-        super().__init__(described(options), name, clock, connector, (options.port, options.baud), dead_man)
+        super().__init__(make_description(options), name, clock, connector, (options.port, options.baud), dead_man)
         self._options = options
-        self._reader: codec.StreamReader = codec.StreamReader(IDS)
+        self._reader: codec.StreamReader = codec.StreamReader(PACKET_IDS)
         self._odometry = Odometry()
         self._silence_s = SILENCE_S
-        self._heard_at = self._watch_at = 0.0
+        self._last_data_at = self._next_check_at = 0.0
         self._bytes_at_start = 0
         self._mode = ""
-        self._event = ""
+        self._safety_event = ""
         self._docking: Deferred[Mapping[str, Value]] | None = None
         self._dock_timer = Timer(clock)
         self._counts |= {"safety_events": 0, "jumps": 0}
@@ -84,45 +84,45 @@ class Create2Driver(LinkedDriver):
     def _close(self) -> Deferred[None]:
         self._end_docking(LinkLost(f"{self._name}: disconnected"))
         # Without STOP the robot stays awake and drains its battery.
-        self._send(codec.drive_direct(0, 0) + codec.pause(False) + bytes((codec.START, codec.STOP)))
+        self._send(codec.encode_drive_direct(0, 0) + codec.encode_pause(False) + bytes((codec.START, codec.STOP)))
         return super()._close()
 
     def _power(self, on: bool) -> None:
         self._end_docking(NotEnabled("enable() or disable() ended the search for the dock"))
         if on:
-            self._event = ""
+            self._safety_event = ""
             self._send(bytes((codec.SAFE if self._options.mode == "safe" else codec.FULL,)))
         else:
-            self._send(codec.drive_direct(0, 0) + bytes((codec.START,)))
+            self._send(codec.encode_drive_direct(0, 0) + bytes((codec.START,)))
 
     def _drive(self, motion: Action, permit: Permit) -> Action:
-        ahead, turn = motion["base.vx"] * 1000.0, motion["base.wz"] * WHEEL_BASE / 2.0
+        ahead, turn = motion["base.vx"] * 1000.0, motion["base.wz"] * WHEEL_BASE_MM / 2.0
         right, left = ahead + turn, ahead - turn
-        share = min(1.0, codec.TOP_SPEED / max(abs(right), abs(left), 1.0))
+        share = min(1.0, codec.MAX_WHEEL_SPEED_MMPS / max(abs(right), abs(left), 1.0))
         right, left = round(right * share), round(left * share)
-        self._send(codec.drive_direct(right, left))
-        return {"base.vx": (right + left) / 2000.0, "base.wz": (right - left) / WHEEL_BASE}
+        self._send(codec.encode_drive_direct(right, left))
+        return {"base.vx": (right + left) / 2000.0, "base.wz": (right - left) / WHEEL_BASE_MM}
 
     def _halt(self) -> None:
         if not self._end_docking(NotEnabled("stop() ended the search for the dock")):
-            self._send(codec.drive_direct(0, 0))
+            self._send(codec.encode_drive_direct(0, 0))
 
-    def _last_word(self) -> LastWord | None:
-        return None if self._link is None else LastWord(codec.drive_direct(0, 0), self._link)
+    def _make_halt_command(self) -> HaltCommand | None:
+        return None if self._link is None else HaltCommand(codec.encode_drive_direct(0, 0), self._link)
 
     def _dock(self, arguments: Mapping[str, float | str]) -> Deferred[Mapping[str, Value]]:
         if arguments:
             raise Unsupported("dock takes no arguments")
         if self._docking is not None:
             raise UsageError("it is already seeking its dock")
-        if self._wants_motors is not True or self._mode not in ARMED:
+        if self._wants_motors is not True or self._mode not in DRIVING_MODES:
             raise NotEnabled(f"{self._name}'s motors are off; call enable() first")
         self.stop()
         # The robot drives itself in passive mode; this change of mode is not a safety event.
         self._wants_motors = False
         self._docking = Deferred(self._on_docking_cancelled)
-        late = NoReply(f"{self._name} did not find its dock within {DOCK_S:g} s")
-        self._dock_timer.set(DOCK_S, self._end_docking, late)
+        late = NoReply(f"{self._name} did not find its dock within {DOCK_TIMEOUT_S:g} s")
+        self._dock_timer.set(DOCK_TIMEOUT_S, self._end_docking, late)
         self._send(bytes((codec.DOCK,)))
         return self._docking
 
@@ -142,7 +142,7 @@ class Create2Driver(LinkedDriver):
             return False
         self._dock_timer.cancel()
         # The robot ignores wheel commands while it docks: switch to safe mode, stop, and return to passive mode.
-        self._send(bytes((codec.SAFE,)) + codec.drive_direct(0, 0) + bytes((codec.START,)))
+        self._send(bytes((codec.SAFE,)) + codec.encode_drive_direct(0, 0) + bytes((codec.START,)))
         if error is not None:
             docking.errback(error)
         return True
@@ -154,10 +154,10 @@ class Create2Driver(LinkedDriver):
         hz, seconds = arguments.get("hz", 440.0), arguments.get("s", 0.5)
         if not _is_between(hz, 49.0, 12544.0) or not _is_between(seconds, 1 / 64, 3.98):
             raise Unsupported("beep needs hz from 49 to 12544 and s from 0.016 to 3.98")
-        if self._mode not in ARMED:
+        if self._mode not in DRIVING_MODES:
             raise NotEnabled(f"{self._name} beeps in safe or full mode only; call enable() first")
         note = min(127, round(69 + 12 * math.log2(float(hz) / 440.0)))
-        self._send(codec.song(0, [(note, round(float(seconds) * 64))]) + codec.play(0))
+        self._send(codec.encode_song(0, [(note, round(float(seconds) * 64))]) + codec.encode_play(0))
         return succeed({"beep.hz": 440.0 * 2.0 ** ((note - 69) / 12)})
 
     # -- from the robot ---------------------------------------------------------------------------------------------
@@ -175,28 +175,28 @@ class Create2Driver(LinkedDriver):
         self._end_docking(LinkLost(f"the link to {self._name} was lost"))
         self._down()
 
-    def _heard(self, frame: Mapping[str, int]) -> None:
+    def _on_message(self, frame: Mapping[str, int]) -> None:
         self._counts["frames"] += 1
-        mode, before = mode_of(frame), self._mode
-        if mode in ARMED and not self._is_up:
+        mode, before = get_mode(frame), self._mode
+        if mode in DRIVING_MODES and not self._is_up:
             return  # sent before the robot processed START, which selects passive mode
         now = self._clock.seconds()
-        self._heard_at = now
+        self._last_data_at = now
         self._silence_s = SILENCE_S
         self._problem = ""
         self._mode = mode
         if not self._is_up:
             self._up()
-        self._odometry.count(frame["left_encoder"], frame["right_encoder"], now)
+        self._odometry.update(frame["left_encoder"], frame["right_encoder"], now)
         self._counts["jumps"] = self._odometry.jumps
-        values = seen(frame)
-        if before in ARMED and mode not in ARMED and self._wants_motors:
-            self._on_safety_event(event_of(values))
+        values = convert_frame(frame)
+        if before in DRIVING_MODES and mode not in DRIVING_MODES and self._wants_motors:
+            self._on_safety_event(describe_safety_event(values))
         odometry = self._odometry
         values |= {"odom.x": odometry.x, "odom.y": odometry.y, "odom.yaw": odometry.yaw}
         values |= {"base.vx": odometry.vx, "base.vy": 0.0, "base.wz": odometry.wz}
         values["base.moving"] = bool(odometry.vx or odometry.wz)
-        values["safety.event"] = self._event
+        values["safety.event"] = self._safety_event
         values["skill.running"] = "" if self._docking is None else "dock"
         if self._docking is not None and values["dock.on"]:
             self._on_docked()
@@ -204,7 +204,7 @@ class Create2Driver(LinkedDriver):
         self._observed(values, now)
 
     def _on_safety_event(self, event: str) -> None:
-        self._event = event
+        self._safety_event = event
         self._counts["safety_events"] += 1
         self.stop()
         self._wants_motors = False
@@ -213,31 +213,31 @@ class Create2Driver(LinkedDriver):
     def _start(self) -> None:
         # A robot with an incomplete command takes the first of these bytes as the missing data.
         self._send(bytes((codec.START,)) * 5)
-        self._reader = codec.StreamReader(IDS)
-        self._odometry.forget()
+        self._reader = codec.StreamReader(PACKET_IDS)
+        self._odometry.discard_counts()
         self._mode = ""
         self._bytes_at_start = self._counts["bytes"]
-        self._timer.set(SETTLE_S, self._start_stream)
+        self._timer.set(START_DELAY_S, self._start_stream)
 
     def _start_stream(self) -> None:
-        self._send(codec.stream(IDS))
-        self._heard_at = self._clock.seconds()
-        self._schedule_watch(self._silence_s)
+        self._send(codec.encode_stream(PACKET_IDS))
+        self._last_data_at = self._clock.seconds()
+        self._schedule_check(self._silence_s)
 
-    def _schedule_watch(self, seconds: float) -> None:
-        self._watch_at = self._clock.seconds() + seconds
-        self._timer.set(seconds, self._watch)
+    def _schedule_check(self, seconds: float) -> None:
+        self._next_check_at = self._clock.seconds() + seconds
+        self._timer.set(seconds, self._check_silence)
 
-    def _watch(self) -> None:
+    def _check_silence(self) -> None:
         now = self._clock.seconds()
-        self._heard_at = heard_at(self._heard_at, self._watch_at, now)
-        silent = now - self._heard_at
+        self._last_data_at = correct_last_data_time(self._last_data_at, self._next_check_at, now)
+        silent = now - self._last_data_at
         if silent < self._silence_s:
-            self._schedule_watch(self._silence_s - silent)
+            self._schedule_check(self._silence_s - silent)
             return
-        self._silence_s = min(2.0 * self._silence_s, LAST_SILENCE_S)
+        self._silence_s = min(2.0 * self._silence_s, MAX_SILENCE_S)
         has_noise = self._counts["bytes"] > self._bytes_at_start and not self._is_up
-        self._name_problem(
+        self._set_problem(
             f"it sends, but no frames; is {self._options.baud} baud right, and is it a Create 2?"
             if has_noise
             else "it sends nothing; is it switched on, and the cable in?"
@@ -257,10 +257,10 @@ def make_driver(
 ) -> Create2Driver:
     """Return a driver of the robot on the serial device in ``options``."""
     if connector is not None:
-        return Create2Driver(checked(options), name, connector, clock)
-    return Create2Driver(checked(options), name, SerialConnector(), clock, kept(name))
+        return Create2Driver(parse_options(options), name, connector, clock)
+    return Create2Driver(parse_options(options), name, SerialConnector(), clock, create_switch(name))
 
 
 def describe(options: Mapping[str, object], name: str) -> Description:
     """Return the description of that robot."""
-    return described(checked(options))
+    return make_description(parse_options(options))

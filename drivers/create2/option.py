@@ -29,12 +29,12 @@ class Options:
     max_turn: Annotated[float, Meta(gt=0, le=4.25)] = 4.25
 
 
-def checked(table: Mapping[str, object]) -> Options:
+def parse_options(table: Mapping[str, object]) -> Options:
     """Convert and check ``table``; raise ``UsageError`` that names the key and the remedy."""
     return convert_options("create2", table, Options)
 
 
-def described(options: Options) -> Description:
+def make_description(options: Options) -> Description:
     """Return the description of a Create 2."""
     return Description(
         kind="create2",

@@ -17,9 +17,9 @@ import select
 import time
 from struct import Struct
 
-HEAD = Struct("<cdI")
+HEADER = Struct("<cdI")
 """Header of each message of the node: kind, time, and number of bytes that follow."""
-GUARD, CALL, UNTIL, REST, LEAVE = b"g", b"c", b"u", b"r", b"l"
+SET_LINK, SET_SERVER, ARM, DISARM, LINK_LOST = b"g", b"c", b"u", b"r", b"l"
 """Kinds of messages.
 
 ``GUARD`` carries a descriptor and the bytes that halt; ``CALL`` host, port and a request, separated by NUL.
@@ -28,13 +28,13 @@ HALTED = b"."
 """Sent to the node after each halt."""
 GRACE_S = 0.05
 """Seconds after the end of a motion within which a running node reports rest; after that it counts as frozen."""
-AGAIN_S, TIMES = 0.1, 3
+HALT_REPEAT_S, HALT_COUNT = 0.1, 3
 """Interval and number of repetitions of a halt: one written into the middle of a partly written command is lost."""
 ANSWER_S = 0.25
 """Seconds to wait for a server's answer."""
 TICK_S = 0.05
 """Longest wait while a motion is in force: waits do not progress while the machine is suspended."""
-FDS = Struct("<i")
+FD_STRUCT = Struct("<i")
 
 
 def now() -> float:
@@ -42,21 +42,21 @@ def now() -> float:
     return time.clock_gettime(getattr(time, "CLOCK_BOOTTIME", time.CLOCK_MONOTONIC))
 
 
-class Open:
+class SharedLink:
     """An open connection to the robot, a socket or a serial device, which the node uses as well."""
 
     def __init__(self, descriptor: int) -> None:
         self._descriptor = descriptor
-        self._left = b""
+        self._unsent = b""
 
-    def say(self, halt: bytes) -> bool:
+    def send(self, halt: bytes) -> bool:
         """Write without blocking, bytes left over from the last call first; return False, as nothing confirms it."""
-        data = self._left + halt
+        data = self._unsent + halt
         try:
             poll = select.poll()
             poll.register(self._descriptor, select.POLLOUT)
             if poll.poll(0):
-                self._left = data[os.write(self._descriptor, data) :]
+                self._unsent = data[os.write(self._descriptor, data) :]
         except OSError:
             pass  # the link is dead
         return False
@@ -66,14 +66,14 @@ class Open:
         os.close(self._descriptor)
 
 
-class Server:
+class CommandServer:
     """A robot that takes each command over a new connection."""
 
     def __init__(self, host: str, port: int) -> None:
         self._family = _socket.AF_INET6 if ":" in host else _socket.AF_INET
         self._address = (host, port)
 
-    def say(self, request: bytes) -> bool:
+    def send(self, request: bytes) -> bool:
         """Send the request and wait up to ``ANSWER_S``; return whether it was answered."""
         connection = _socket.socket(self._family, _socket.SOCK_STREAM)
         try:
@@ -90,95 +90,95 @@ class Server:
         """Do nothing: no connection is open."""
 
 
-class Watch:
+class HaltTimer:
     """One robot: its connection, its halt command, and the end of the motion in force."""
 
     def __init__(self) -> None:
         self.halts = 0
-        self._target: Open | Server | None = None
+        self._target: SharedLink | CommandServer | None = None
         self._halt = b""
-        self._end: float | None = None
-        self._times = 0
-        self._again_at = 0.0
+        self._motion_ends_at: float | None = None
+        self._halts_left = 0
+        self._next_halt_at = 0.0
 
-    def guard(self, target: Open | Server, halt: bytes) -> None:
+    def set_halt_command(self, target: SharedLink | CommandServer, halt: bytes) -> None:
         """Set the connection and the halt command; a motion in force stays in force."""
         self._close()
         self._target, self._halt = target, halt
 
-    def until(self, moment: float) -> None:
+    def arm(self, moment: float) -> None:
         """Set the end of the motion in force."""
-        self._end, self._times = moment, 0
+        self._motion_ends_at, self._halts_left = moment, 0
 
-    def rest(self) -> None:
+    def disarm(self) -> None:
         """Clear the motion in force."""
-        self._end, self._times = None, 0
+        self._motion_ends_at, self._halts_left = None, 0
 
-    def leave(self) -> None:
+    def on_link_lost(self) -> None:
         """Clear the motion and close the connection."""
-        self.rest()
+        self.disarm()
         self._close()
 
-    def end(self, moment: float) -> None:
+    def on_node_end(self, moment: float) -> None:
         """Handle the end of the node: halt now if a motion is in force."""
-        if self._end is not None:
-            self._end = moment - GRACE_S
+        if self._motion_ends_at is not None:
+            self._motion_ends_at = moment - GRACE_S
 
-    def wait(self, moment: float) -> float | None:
+    def get_timeout(self, moment: float) -> float | None:
         """Return the seconds until ``turn`` is due; None if nothing is in force."""
-        if self._times:
-            return max(0.0, self._again_at - moment)
-        return None if self._end is None else max(0.0, self._end + GRACE_S - moment)
+        if self._halts_left:
+            return max(0.0, self._next_halt_at - moment)
+        return None if self._motion_ends_at is None else max(0.0, self._motion_ends_at + GRACE_S - moment)
 
-    def turn(self, moment: float) -> None:
+    def send_due_halts(self, moment: float) -> None:
         """Send the halts that are due."""
-        if self._end is not None and moment >= self._end + GRACE_S:
-            self._end = None
+        if self._motion_ends_at is not None and moment >= self._motion_ends_at + GRACE_S:
+            self._motion_ends_at = None
             if self._target is not None:
                 self.halts += 1
-                self._times, self._again_at = TIMES, moment
-        if self._times and moment >= self._again_at and self._target is not None:
-            self._times -= 1
-            self._again_at = moment + AGAIN_S
-            if self._target.say(self._halt):
-                self._times = 0
+                self._halts_left, self._next_halt_at = HALT_COUNT, moment
+        if self._halts_left and moment >= self._next_halt_at and self._target is not None:
+            self._halts_left -= 1
+            self._next_halt_at = moment + HALT_REPEAT_S
+            if self._target.send(self._halt):
+                self._halts_left = 0
 
     def _close(self) -> None:
         target, self._target = self._target, None
-        self._times = 0
+        self._halts_left = 0
         if target is not None:
             target.close()
 
 
-class Ear:
+class MessageParser:
     """Parses messages of the node, cut at any byte, and applies them to ``watch``."""
 
-    def __init__(self, watch: Watch) -> None:
-        self._watch = watch
+    def __init__(self, watch: HaltTimer) -> None:
+        self._halt_timer = watch
         self._rest = b""
         self._descriptors: list[int] = []
 
-    def heard(self, data: bytes, descriptors: list[int]) -> None:
+    def feed(self, data: bytes, descriptors: list[int]) -> None:
         """Take bytes, and the descriptors that arrived with them."""
         self._descriptors += descriptors
         self._rest += data
-        while len(self._rest) >= HEAD.size:
-            kind, moment, size = HEAD.unpack_from(self._rest)
-            if len(self._rest) < HEAD.size + size:
+        while len(self._rest) >= HEADER.size:
+            kind, moment, size = HEADER.unpack_from(self._rest)
+            if len(self._rest) < HEADER.size + size:
                 return
-            content = self._rest[HEAD.size : HEAD.size + size]
-            self._rest = self._rest[HEAD.size + size :]
-            if kind == GUARD:
-                self._watch.guard(Open(self._descriptors.pop(0)), content)
-            elif kind == CALL:
+            content = self._rest[HEADER.size : HEADER.size + size]
+            self._rest = self._rest[HEADER.size + size :]
+            if kind == SET_LINK:
+                self._halt_timer.set_halt_command(SharedLink(self._descriptors.pop(0)), content)
+            elif kind == SET_SERVER:
                 host, port, request = content.split(b"\0", 2)
-                self._watch.guard(Server(host.decode("ascii"), int(port)), request)
-            elif kind == UNTIL:
-                self._watch.until(moment)
-            elif kind == REST:
-                self._watch.rest()
-            elif kind == LEAVE:
-                self._watch.leave()
+                self._halt_timer.set_halt_command(CommandServer(host.decode("ascii"), int(port)), request)
+            elif kind == ARM:
+                self._halt_timer.arm(moment)
+            elif kind == DISARM:
+                self._halt_timer.disarm()
+            elif kind == LINK_LOST:
+                self._halt_timer.on_link_lost()
 
 
 def main() -> None:
@@ -190,26 +190,26 @@ def main() -> None:
     node.setblocking(False)
     poll = select.poll()
     poll.register(0, select.POLLIN)
-    watch = Watch()
-    ear = Ear(watch)
+    watch = HaltTimer()
+    ear = MessageParser(watch)
     is_open = True
     while True:
         halts_before = watch.halts
-        wait = watch.wait(now())
+        wait = watch.get_timeout(now())
         if not is_open:
             if wait is None:
                 return
             time.sleep(wait)
         elif poll.poll(None if wait is None else 1000.0 * min(wait, TICK_S) + 1.0):
-            is_open = listened(node, ear)
+            is_open = read_messages(node, ear)
             if not is_open:
-                watch.end(now())
-        watch.turn(now())
+                watch.on_node_end(now())
+        watch.send_due_halts(now())
         if watch.halts > halts_before and is_open:
-            tell(node)
+            report_halt(node)
 
 
-def tell(node: _socket.socket) -> None:
+def report_halt(node: _socket.socket) -> None:
     """Report a halt to the node; a frozen node reads it later."""
     try:
         node.send(HALTED)
@@ -217,11 +217,11 @@ def tell(node: _socket.socket) -> None:
         return  # the node is gone; the next read reports it
 
 
-def listened(node: _socket.socket, ear: Ear) -> bool:
+def read_messages(node: _socket.socket, ear: MessageParser) -> bool:
     """Read all pending messages, so that newer ones count before time does; return whether the node still runs."""
     while True:
         try:
-            data, extras, _, _ = node.recvmsg(65536, _socket.CMSG_SPACE(4 * FDS.size))
+            data, extras, _, _ = node.recvmsg(65536, _socket.CMSG_SPACE(4 * FD_STRUCT.size))
         except BlockingIOError:
             return True
         except OSError:
@@ -230,11 +230,11 @@ def listened(node: _socket.socket, ear: Ear) -> bool:
             fd
             for level, kind, some in extras
             if (level, kind) == (_socket.SOL_SOCKET, _socket.SCM_RIGHTS)
-            for (fd,) in FDS.iter_unpack(some[: len(some) // FDS.size * FDS.size])
+            for (fd,) in FD_STRUCT.iter_unpack(some[: len(some) // FD_STRUCT.size * FD_STRUCT.size])
         ]
         if not data:
             return False
-        ear.heard(data, descriptors)
+        ear.feed(data, descriptors)
 
 
 if __name__ == "__main__":

@@ -15,35 +15,35 @@ from drivers.link import Link
 
 
 @dataclass(frozen=True)
-class LastWord:
+class HaltCommand:
     """The bytes that halt a robot, as one complete command, and their destination.
 
     The destination is the open ``link``, or, if each command uses a new connection, the numeric ``address`` and port of
     a server.
     """
 
-    halt: bytes
+    data: bytes
     link: Link
     address: tuple[str, int] | None = None
 
 
-class DeadMan(Protocol):
+class DeadManSwitch(Protocol):
     """A switch for one robot; no method blocks."""
 
     @property
     def halts(self) -> int:
         """The number of times that it has halted the robot."""
 
-    def guard(self, word: LastWord) -> None:
+    def set_halt_command(self, word: HaltCommand) -> None:
         """Set the halt command; call this when a link opens or the command changes."""
 
-    def until(self, seconds: float) -> None:
+    def arm(self, seconds: float) -> None:
         """Announce, before a motion is commanded, that it is in force for ``seconds`` from now."""
 
-    def rest(self) -> None:
+    def disarm(self) -> None:
         """Announce that a halt was sent: nothing is in force once it has left this process."""
 
-    def leave(self) -> None:
+    def on_link_lost(self) -> None:
         """Announce that the link is lost."""
 
     def close(self) -> Deferred[None]:
@@ -51,37 +51,37 @@ class DeadMan(Protocol):
 
 
 @dataclass
-class MemoryDeadMan:
+class MemoryDeadManSwitch:
     """A switch that only records its calls; ``seconds`` is None while nothing is in force."""
 
     halts: int = 0
-    word: LastWord | None = None
+    command: HaltCommand | None = None
     seconds: float | None = None
     is_closed: bool = False
-    told: list[str] = field(default_factory=list)
+    calls: list[str] = field(default_factory=list)
 
-    def guard(self, word: LastWord) -> None:
+    def set_halt_command(self, word: HaltCommand) -> None:
         """Record the halt command."""
-        self.word = word
-        self.told.append("guard")
+        self.command = word
+        self.calls.append("guard")
 
-    def until(self, seconds: float) -> None:
+    def arm(self, seconds: float) -> None:
         """Record the duration."""
         self.seconds = seconds
-        self.told.append("until")
+        self.calls.append("until")
 
-    def rest(self) -> None:
+    def disarm(self) -> None:
         """Record that nothing is in force."""
         self.seconds = None
-        self.told.append("rest")
+        self.calls.append("rest")
 
-    def leave(self) -> None:
+    def on_link_lost(self) -> None:
         """Record that there is no link."""
-        self.word = None
-        self.told.append("leave")
+        self.command = None
+        self.calls.append("leave")
 
     def close(self) -> Deferred[None]:
         """Record the end."""
         self.is_closed = True
-        self.told.append("close")
+        self.calls.append("close")
         return succeed(None)

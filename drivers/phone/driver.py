@@ -11,12 +11,12 @@ from twisted.internet.interfaces import IReactorTime
 
 from drivers.base import SensingDriver
 from drivers.option import Manifest
-from drivers.phone.option import Options, checked, described
+from drivers.phone.option import Options, make_description, parse_options
 from drivers.reading import Description, Frame, Value
 
 MANIFEST = Manifest()
 
-SIGHT = ("target.bearing", "target.distance")
+TARGET_KEYS = ("target.bearing", "target.distance")
 """Position of the red target in the page's detection: radians, left positive, and metres; NaN if it is not seen."""
 
 
@@ -26,11 +26,11 @@ class PhoneDriver(SensingDriver):
     STALE_S = 0.5
 
     def __init__(self, options: Options | Mapping[str, object], clock: IReactorTime) -> None:
-        options = options if isinstance(options, Options) else checked(options)
-        super().__init__(described(options), "the phone", clock)
+        options = options if isinstance(options, Options) else parse_options(options)
+        super().__init__(make_description(options), "the phone", clock)
         self._started_at = 0.0
 
-    def look(self, jpeg: bytes, width: int, height: int, values: Mapping[str, float]) -> None:
+    def process_picture(self, jpeg: bytes, width: int, height: int, values: Mapping[str, float]) -> None:
         """Take one picture with its measurements; dropped before ``connect`` and after the end."""
         if self.state in ("idle", "closed"):
             return
@@ -39,7 +39,7 @@ class PhoneDriver(SensingDriver):
         self._counts["frames"] += 1
         self._counts["bytes"] += len(jpeg)
         t = self._clock.seconds() - self._started_at
-        sensed: dict[str, Value] = {**dict.fromkeys(SIGHT, math.nan), **values}
+        sensed: dict[str, Value] = {**dict.fromkeys(TARGET_KEYS, math.nan), **values}
         self._observed(sensed, t, frame=Frame(self._counts["frames"], width, height, jpeg, t))
 
     def _open(self) -> None:
@@ -56,4 +56,4 @@ def make_driver(options: Mapping[str, object], name: str, clock: IReactorTime, c
 
 def describe(options: Mapping[str, object], name: str) -> Description:
     """Return the description of that phone."""
-    return described(checked(options))
+    return make_description(parse_options(options))

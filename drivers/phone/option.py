@@ -12,12 +12,12 @@ from drivers.option import convert_options
 from drivers.reading import Description
 from formats.convert import Unit
 
-LENS_DEG = 65.0
+FIELD_OF_VIEW_DEG = 65.0
 """Field of view across the longer side of the picture.  No browser reports it; phones have 60 to 75 degrees."""
-LEAST_SIDE, MOST_SIDE = 16, 640
+MIN_SIDE_PX, MAX_SIDE_PX = 16, 640
 """Smallest and largest side of a picture, in pixels."""
-Side = Annotated[int, Meta(ge=LEAST_SIDE, le=MOST_SIDE), Unit("pixels")]
-FPS = 10.0
+Side = Annotated[int, Meta(ge=MIN_SIDE_PX, le=MAX_SIDE_PX), Unit("pixels")]
+TASK_FPS = 10.0
 """Pictures per second that are requested from a phone with a task."""
 
 
@@ -31,18 +31,18 @@ class Options:
     position: bool = False
 
 
-def checked(table: Mapping[str, object]) -> Options:
+def parse_options(table: Mapping[str, object]) -> Options:
     """Convert and check ``table``; raise ``UsageError`` that names the key and the remedy."""
     return convert_options("phone", table, Options)
 
 
-def described(options: Options) -> Description:
+def make_description(options: Options) -> Description:
     """Return the description of the phone; it has no motor, so it has no actions."""
     lens = "fov_h_deg" if options.width >= options.height else "fov_v_deg"
-    camera = {"width": options.width, "height": options.height, "fps": FPS, lens: LENS_DEG}
+    camera = {"width": options.width, "height": options.height, "fps": TASK_FPS, lens: FIELD_OF_VIEW_DEG}
     capabilities: dict[str, Mapping[str, float | str]] = {"camera": camera}
     if options.orientation:
         capabilities["orientation"] = {}
     if options.position:
         capabilities["position"] = {}
-    return Description("phone", "a phone's browser", capabilities, {}, 0.08, {"camera": FPS})
+    return Description("phone", "a phone's browser", capabilities, {}, 0.08, {"camera": TASK_FPS})

@@ -11,7 +11,7 @@ from twisted.internet.task import LoopingCall
 
 from drivers.pyro.robot import PyroRobot
 
-SHORT_WAYS = (
+DELEGATED_METHODS = (
     *("move", "translate", "rotate", "motors", "stop", "update"),
     *("getDevice", "startDevice", "removeDevice", "hasA", "requires"),
 )
@@ -37,7 +37,7 @@ class Brain:
         """Delegate to the robot: ``self.move(0.5, 0.0)`` is ``self.robot.move(0.5, 0.0)``."""
         if name == "robot":
             raise AttributeError("this brain has no engine and therefore no robot")
-        if name not in SHORT_WAYS:
+        if name not in DELEGATED_METHODS:
             raise AttributeError(f"a brain has no {name}")
         return getattr(self.robot, name)
 
@@ -89,7 +89,7 @@ class Engine:
         loop = self._loop = LoopingCall(self._step)
         loop.clock = self._clock
         done: Deferred[Any] = loop.start(brain.pauseTime)
-        return done.addBoth(self._ended)
+        return done.addBoth(self._on_end)
 
     def stop(self) -> None:
         """End the brain."""
@@ -107,7 +107,7 @@ class Engine:
         brain.step()
         brain.stepCount += 1
 
-    def _ended(self, result: Any) -> Any:
+    def _on_end(self, result: Any) -> Any:
         self.robot.stop()
         brain, self.brain = self.brain, None
         if brain is not None:

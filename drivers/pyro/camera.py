@@ -8,7 +8,7 @@ from typing import Any
 from drivers.errors import BadFrame, UsageError
 from drivers.pyro.device import Device
 from drivers.reading import Frame, Value
-from formats.jpeg import size_of
+from formats.jpeg import read_size
 
 Blob = tuple[int, int, int, int, int]
 """Left, top, right and bottom in pixels from the upper left corner, and the area; all 0 for none."""
@@ -62,7 +62,7 @@ class Camera(Device):
         whole = [int(value) for value in arguments]
         return self._match(*whole) if name == "match" else self._blobify(*whole)
 
-    def see(self, frame: Frame | None) -> None:
+    def process_frame(self, frame: Frame | None) -> None:
         """Take a picture if it is new, and run the filters on it."""
         if frame is None or frame.seq == self._seq:
             return
@@ -129,7 +129,7 @@ def _decode_picture(data: bytes) -> Any:
         import numpy as np
     except ImportError as error:
         raise UsageError("pictures need OpenCV: pip install 'swarm-node[vision]'") from error
-    picture = None if size_of(data) is None else cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR)
+    picture = None if read_size(data) is None else cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR)
     if picture is None:
         raise BadFrame(f"{len(data)} bytes are not a picture")
     return np.ascontiguousarray(picture[:, :, ::-1])

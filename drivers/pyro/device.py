@@ -16,7 +16,7 @@ DIRECTIONS: Mapping[str, float] = {
 """Direction of a ranger by its name, in degrees; other names have ``NAME_deg`` in the capability."""
 UNITS = ("ROBOTS", "METERS", "CM", "MM", "SCALED", "RAW")
 ALIASES = {"M": "METERS", "ROBOT": "ROBOTS"}
-ARC = math.radians(20.0)
+DEFAULT_ARC_RAD = math.radians(20.0)
 GROUPS: Mapping[str, tuple[float, float]] = {
     "front": (-22.5, 22.5),
     "front-left": (22.5, 67.5),
@@ -60,7 +60,7 @@ class SensorValue:
         self.rawValue = most if math.isnan(metres) else min(metres, most)
         self.pos = pos
         self.geometry = geometry
-        self._most = most
+        self._max_metres = most
         self._radius = radius
         self._unit = unit
 
@@ -71,10 +71,10 @@ class SensorValue:
 
     def distance(self, unit: str | None = None) -> float:
         """Return the distance in ``unit``: ``ROBOTS`` (diameters), ``METERS``, ``CM``, ``MM``, ``SCALED``, ``RAW``."""
-        name = unit_named(unit or self._unit)
+        name = parse_unit(unit or self._unit)
         if name == "ROBOTS":
             return self.rawValue / (2.0 * self._radius)
-        return self.rawValue * {"CM": 100.0, "MM": 1000.0, "SCALED": 1.0 / self._most}.get(name, 1.0)
+        return self.rawValue * {"CM": 100.0, "MM": 1000.0, "SCALED": 1.0 / self._max_metres}.get(name, 1.0)
 
     def angle(self, unit: str = "degrees") -> float | None:
         """Return the direction of the sensor, left positive; None if it is unknown."""
@@ -93,7 +93,7 @@ class SensorValue:
         return x + self.rawValue * math.cos(theta), y + self.rawValue * math.sin(theta), z
 
 
-def unit_named(name: str) -> str:
+def parse_unit(name: str) -> str:
     """Return the unit of this name; raise ``AttributeError`` that lists the known units."""
     upper = name.upper()
     found = ALIASES.get(upper, upper)
@@ -127,7 +127,7 @@ class Device:
         return 0
 
 
-class Rows(Device):
+class SensorArray(Device):
     """A device of several sensors; ``places`` maps a key of an observation to the position of the sensor."""
 
     units = "ROBOTS"
@@ -147,7 +147,7 @@ class Rows(Device):
 
     def setUnits(self, name: str) -> None:
         """Set the unit of ``value``."""
-        self.units = unit_named(name)
+        self.units = parse_unit(name)
 
     def getSensorValue(self, pos: int) -> SensorValue:
         """Return the reading of the sensor at ``pos``, from the left."""
@@ -229,7 +229,7 @@ class Rows(Device):
         return [one for one in self if (angle := one.angle(units)) is not None and low <= angle <= high]
 
 
-class Bumper(Rows):
+class Bumper(SensorArray):
     """The bumpers; ``value`` is 1 for a pressed bumper."""
 
     def getSensorValue(self, pos: int) -> SensorValue:
@@ -244,12 +244,12 @@ class Battery(Device):
     @property
     def level(self) -> float | None:
         """The charge."""
-        return _number(self.values.get("power.level"))
+        return _to_number(self.values.get("power.level"))
 
     @property
     def volts(self) -> float | None:
         """The voltage."""
-        return _number(self.values.get("power.volts"))
+        return _to_number(self.values.get("power.volts"))
 
 
 class Pose(NamedTuple):
@@ -301,25 +301,27 @@ class Ptz(Device):
     @property
     def pose(self) -> Pose:
         """The pose that the robot reports."""
-        pose = {axis: self._share(joint, float(self.values.get(f"ptz.{joint}", 0.0))) for axis, joint in AXES.items()}
+        pose = {
+            axis: self._to_share(joint, float(self.values.get(f"ptz.{joint}", 0.0))) for axis, joint in AXES.items()
+        }
         return Pose(pose["pan"], pose["tilt"], 0.0, pose["roll"])
 
     def _turn(self, **shares: float) -> None:
-        self._look({AXES[axis]: self._radians(AXES[axis], share) for axis, share in shares.items()})
+        self._look({AXES[axis]: self._to_radians(AXES[axis], share) for axis, share in shares.items()})
 
-    def _radians(self, joint: str, share: float) -> float:
+    def _to_radians(self, joint: str, share: float) -> float:
         share = max(-1.0, min(1.0, share))
-        return share * self._limit(joint, "max") if share > 0.0 else -share * self._limit(joint, "min")
+        return share * self._get_limit(joint, "max") if share > 0.0 else -share * self._get_limit(joint, "min")
 
-    def _share(self, joint: str, radians: float) -> float:
-        limit = self._limit(joint, "max") if radians > 0.0 else -self._limit(joint, "min")
+    def _to_share(self, joint: str, radians: float) -> float:
+        limit = self._get_limit(joint, "max") if radians > 0.0 else -self._get_limit(joint, "min")
         return max(-1.0, min(1.0, radians / limit)) if limit else 0.0
 
-    def _limit(self, joint: str, end: str) -> float:
+    def _get_limit(self, joint: str, end: str) -> float:
         return float(self._limits.get(f"{joint}_{end}", 0.0))
 
 
-def ranger_of(description: Description, values: Mapping[str, Value]) -> Rows | None:
+def make_ranger(description: Description, values: Mapping[str, Value]) -> SensorArray | None:
     """Return the range sensors of a robot; None without any.
 
     They are named ``laser`` if there are more than four, ``ir`` on a dog with a near and a far one, else ``sonar``.
@@ -333,23 +335,27 @@ def ranger_of(description: Description, values: Mapping[str, Value]) -> Rows | N
     angles = {name: capability.get(f"{name}_deg", DIRECTIONS.get(name, math.nan)) for name in names}
     known = {name: math.radians(float(angle)) for name, angle in angles.items() if angle == angle}
     names.sort(key=lambda name: (-known.get(name, -math.inf), list(values).index(f"range.{name}")))
-    places = {f"range.{name}": _on_hull(known.get(name), description.radius) for name in names}
-    return Rows(kind, places, float(most), description.radius)
+    places = {f"range.{name}": _make_geometry(known.get(name), description.radius) for name in names}
+    return SensorArray(kind, places, float(most), description.radius)
 
 
-def bumper_of(description: Description, values: Mapping[str, Value]) -> Bumper | None:
+def make_bumper(description: Description, values: Mapping[str, Value]) -> Bumper | None:
     """Return the bumpers of a robot; None without any."""
     names = [key.removeprefix("bump.") for key in values if key.startswith("bump.")]
     if not names:
         return None
     angles = {name: math.radians(DIRECTIONS[name]) for name in names if name in DIRECTIONS}
     names.sort(key=lambda name: -angles.get(name, -math.inf))
-    places = {f"bump.{name}": _on_hull(angles.get(name), description.radius) for name in names}
+    places = {f"bump.{name}": _make_geometry(angles.get(name), description.radius) for name in names}
     return Bumper("bumper", places, 1.0, description.radius)
 
 
-def _on_hull(theta: float | None, radius: float) -> Geometry | None:
-    return None if theta is None else Geometry(radius * math.cos(theta), radius * math.sin(theta), 0.0, theta, ARC)
+def _make_geometry(theta: float | None, radius: float) -> Geometry | None:
+    return (
+        None
+        if theta is None
+        else Geometry(radius * math.cos(theta), radius * math.sin(theta), 0.0, theta, DEFAULT_ARC_RAD)
+    )
 
 
 def _is_within(angle: float | None, low: float, high: float) -> bool:
@@ -358,5 +364,5 @@ def _is_within(angle: float | None, low: float, high: float) -> bool:
     return low <= angle <= high or low <= angle + 360.0 <= high
 
 
-def _number(value: Value | None) -> float | None:
+def _to_number(value: Value | None) -> float | None:
     return float(value) if isinstance(value, int | float) and not isinstance(value, bool) else None

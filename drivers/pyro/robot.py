@@ -21,7 +21,7 @@ from twisted.logger import Logger
 from drivers.driver import Driver, Permit
 from drivers.errors import NotEnabled, Unsupported, UsageError
 from drivers.pyro.camera import Camera
-from drivers.pyro.device import Battery, Device, Ptz, Rows, bumper_of, ranger_of
+from drivers.pyro.device import Battery, Device, Ptz, SensorArray, make_bumper, make_ranger
 from drivers.reading import Observation, Value
 
 TOKEN = 1
@@ -38,12 +38,12 @@ FEATURES = {
 RANGERS = ("ir", "sonar", "laser")
 LEGS = {"left front": "LFr", "right front": "RFr", "left back": "LBk", "right back": "RBk"}
 JOINTS = {"rotator": "rotor", "rotor": "rotor", "elevator": "elvtr", "knee": "knee"}
-PLACES = {"head tilt": "NECK:tilt", "head pan": "NECK:pan", "head nod": "NECK:nod", "head roll": "NECK:nod"}
-TAILS = {"tail tilt": "TAIL:tilt", "tail pan": "TAIL:pan", "mouth": "MOUTH"}
-Call = Callable[[Callable[[], Any]], Any]
+HEAD_JOINTS = {"head tilt": "NECK:tilt", "head pan": "NECK:pan", "head nod": "NECK:nod", "head roll": "NECK:nod"}
+TAIL_JOINTS = {"tail tilt": "TAIL:tilt", "tail pan": "TAIL:pan", "mouth": "MOUTH"}
+RunFunction = Callable[[Callable[[], Any]], Any]
 
 
-def here(call: Callable[[], Any]) -> Any:
+def run_directly(call: Callable[[], Any]) -> Any:
     """Call ``call`` on the reactor's thread, without waiting for asynchronous results."""
     return call()
 
@@ -57,7 +57,7 @@ class PyroRobot:
 
     log = Logger()
 
-    def __init__(self, driver: Driver, clock: IReactorTime, call: Call = here) -> None:
+    def __init__(self, driver: Driver, clock: IReactorTime, call: RunFunction = run_directly) -> None:
         self.driver = driver
         self.type = driver.description.kind
         self.radius = driver.description.radius
@@ -171,10 +171,10 @@ class PyroRobot:
                 if device.active:
                     device.update(values, seen.t_host)
                     if isinstance(device, Camera):
-                        device.see(seen.frame)
+                        device.process_frame(seen.frame)
 
     def _update_pose(self) -> None:
-        x, y, yaw = self._pose = self._odometry()
+        x, y, yaw = self._pose = self._read_odometry()
         x0, y0, yaw0 = self._origin
         x1, y1, yaw1 = self._pose_at_origin
         turn = yaw1 - yaw0
@@ -183,7 +183,7 @@ class PyroRobot:
         self.thr = (yaw + turn) % math.tau
         self.th = math.degrees(self.thr)
 
-    def _odometry(self) -> tuple[float, float, float]:
+    def _read_odometry(self) -> tuple[float, float, float]:
         x, y, yaw = (float(self._values.get(f"odom.{axis}", 0.0)) for axis in ("x", "y", "yaw"))
         return x, y, yaw
 
@@ -214,17 +214,17 @@ class PyroRobot:
 
     def getDevice(self, kind: str, index: int = 0) -> Device:
         """Return the device of this type."""
-        return self._devices_of(kind)[index]
+        return self._find_devices(kind)[index]
 
     def startDevice(self, name: str, **_options: object) -> Device:
         """Update a device again; a number after its type is ignored (``camera0``)."""
-        device = self._devices_of(name.rstrip("0123456789"))[0]
+        device = self._find_devices(name.rstrip("0123456789"))[0]
         device.active, device.state = 1, "started"
         return device
 
     def removeDevice(self, kind: str, index: int | None = None) -> None:
         """Stop updating a device; its last values stay."""
-        for device in self._devices_of(kind.rstrip("0123456789"))[slice(index, None if index is None else index + 1)]:
+        for device in self._find_devices(kind.rstrip("0123456789"))[slice(index, None if index is None else index + 1)]:
             device.active, device.state = 0, "stopped"
 
     @property
@@ -250,36 +250,37 @@ class PyroRobot:
 
     def setRangeSensor(self, kind: str, index: int = 0) -> None:
         """Make this device ``robot.range``."""
-        self._range = self._devices_of(kind)[index]
+        self._range = self._find_devices(kind)[index]
 
     @property
-    def range(self) -> Rows:
+    def range(self) -> SensorArray:
         """The range sensor, with readings from the left: ``robot.range["front"]``, ``robot.range[0]``."""
-        if not isinstance(self._range, Rows):
-            raise AttributeError(f"this robot ({self.type}) has no range sensor; it has {self._device_names()}")
+        if not isinstance(self._range, SensorArray):
+            raise AttributeError(f"this robot ({self.type}) has no range sensor; it has {self._format_device_names()}")
         return self._range
 
     def __getattr__(self, name: str) -> list[Any]:
         """Return the started devices of a type: ``robot.camera[0]``; ``AttributeError`` lists the known types."""
         if name.startswith("_") or name not in self._devices:
             raise AttributeError(
-                f"this robot has no {name}" + ("" if name.startswith("_") else f"; it has {self._device_names()}")
+                f"this robot has no {name}"
+                + ("" if name.startswith("_") else f"; it has {self._format_device_names()}")
             )
         return list(self._devices[name])
 
-    def _devices_of(self, kind: str) -> list[Device]:
+    def _find_devices(self, kind: str) -> list[Device]:
         if kind == "range" and self._range is not None:
             return [self._range]
         if kind not in self._devices:
-            raise AttributeError(f"this robot ({self.type}) has no {kind}; it has {self._device_names()}")
+            raise AttributeError(f"this robot ({self.type}) has no {kind}; it has {self._format_device_names()}")
         return self._devices[kind]
 
-    def _device_names(self) -> str:
+    def _format_device_names(self) -> str:
         return ", ".join(sorted(self._devices)) or "nothing before it is connected"
 
     def _create_devices(self, seen: Observation) -> None:
         description = self.driver.description
-        found: list[Device | None] = [ranger_of(description, seen.values), bumper_of(description, seen.values)]
+        found: list[Device | None] = [make_ranger(description, seen.values), make_bumper(description, seen.values)]
         if "power" in description.capabilities:
             found.append(Battery("battery"))
         if "odometry" in description.capabilities:
@@ -299,7 +300,9 @@ class PyroRobot:
         known = [key[6:-4] for key in self._values if key.startswith("joint.") and key.endswith(".pos")]
         words = name.replace(" leg ", " ")
         side, _, joint = words.rpartition(" ")
-        found = {**PLACES, **TAILS}.get(name) or (f"{LEGS[side]}:{JOINTS.get(joint, joint)}" if side in LEGS else name)
+        found = {**HEAD_JOINTS, **TAIL_JOINTS}.get(name) or (
+            f"{LEGS[side]}:{JOINTS.get(joint, joint)}" if side in LEGS else name
+        )
         if found not in known:
             raise AttributeError(f"unknown joint {name!r}; known are {', '.join(known) or 'none'}")
         effort = self._values.get(f"joint.{found}.effort", 0.0)

@@ -15,22 +15,22 @@ from typing import Any
 
 from drivers.errors import BadFrame
 from drivers.reading import Value
-from formats.jpeg import size_of
+from formats.jpeg import read_size
 
-FAR_M, FAST, PULL = 1e6, 100.0, 1000.0
+MAX_DISTANCE_M, MAX_SPEED, MAX_ACCELERATION_MPS2 = 1e6, 100.0, 1000.0
 """Largest plausible readings: metres, m/s or rad/s, and m/s2."""
-MOST_READINGS = 20_000
+MAX_READINGS = 20_000
 """Most readings in a scan."""
-MOST_VALUES = 2**16
+MAX_VALUES = 2**16
 """Most values in a message; a scan with its intensities has 40,000."""
-MOST_DIGITS = 400
+MAX_NUMBER_CHARS = 400
 """Most characters of a number; the largest float in full has 309."""
 CHARGING = 1
 """``power_supply_status`` of sensor_msgs/BatteryState."""
 
 
 @dataclass(frozen=True)
-class Published:
+class TopicMessage:
     """A message on a subscribed topic."""
 
     topic: str
@@ -38,7 +38,7 @@ class Published:
 
 
 @dataclass(frozen=True)
-class Answered:
+class ServiceResponse:
     """The answer of a service to call ``id``; after a failure ``values`` has the reason as ``error``."""
 
     id: str
@@ -54,35 +54,35 @@ class Status:
     text: str
 
 
-Message = Published | Answered | Status
+Message = TopicMessage | ServiceResponse | Status
 
 
 # -- to the robot -----------------------------------------------------------------------------------------------------
 
 
-def encoded(op: str, **fields: object) -> bytes:
+def encode_operation(op: str, **fields: object) -> bytes:
     """Encode one operation; the order of the fields is kept."""
     return json.dumps({"op": op, **fields}, separators=(",", ":"), allow_nan=False).encode()
 
 
-def twist(vx: float, vy: float, wz: float) -> dict[str, Any]:
+def make_twist(vx: float, vy: float, wz: float) -> dict[str, Any]:
     """Return a geometry_msgs/Twist."""
     return {"linear": {"x": vx, "y": vy, "z": 0.0}, "angular": {"x": 0.0, "y": 0.0, "z": wz}}
 
 
-def twist_stamped(vx: float, vy: float, wz: float) -> dict[str, Any]:
+def make_twist_stamped(vx: float, vy: float, wz: float) -> dict[str, Any]:
     """Return a geometry_msgs/TwistStamped of ROS 2; its stamp is 0, which bases treat as "now", as clocks differ."""
-    return {"header": {"stamp": {"sec": 0, "nanosec": 0}, "frame_id": "base_link"}, "twist": twist(vx, vy, wz)}
+    return {"header": {"stamp": {"sec": 0, "nanosec": 0}, "frame_id": "base_link"}, "twist": make_twist(vx, vy, wz)}
 
 
 # -- from the robot ---------------------------------------------------------------------------------------------------
 
 
-def decoded(data: bytes) -> Message:
+def decode_message(data: bytes) -> Message:
     """Decode one message; raise ``BadFrame`` if it is invalid."""
     # Count before decoding: the objects take up to a hundred times the memory of their text.
-    if sum(map(data.count, (b",", b"[", b"{"))) >= MOST_VALUES:
-        raise BadFrame(f"{len(data)} bytes of JSON have more than {MOST_VALUES} values")
+    if sum(map(data.count, (b",", b"[", b"{"))) >= MAX_VALUES:
+        raise BadFrame(f"{len(data)} bytes of JSON have more than {MAX_VALUES} values")
     try:
         operation = _DECODER.decode(str(data, "utf-8"))
     except (ValueError, RecursionError) as error:
@@ -91,35 +91,35 @@ def decoded(data: bytes) -> Message:
         raise BadFrame("the JSON value is not an operation")
     match operation:
         case {"op": "publish", "topic": str(topic), "msg": dict(message)}:
-            return Published(topic, message)
+            return TopicMessage(topic, message)
         case {"op": "service_response", "id": str(number), **rest}:
             values = rest.get("values")
             is_done = rest.get("result") is not False
             if isinstance(values, dict):
-                return Answered(number, values, is_done)
-            return Answered(number, {"error": brief(values or "no reason given", 200)}, is_done)
+                return ServiceResponse(number, values, is_done)
+            return ServiceResponse(number, {"error": shorten(values or "no reason given", 200)}, is_done)
         case {"op": "status", "level": str(level), **rest}:
-            return Status(level, brief(rest.get("msg", ""), 300))
-    raise BadFrame(f"operation {brief(operation.get('op'), 40)!r} is unknown or has wrong fields")
+            return Status(level, shorten(rest.get("msg", ""), 300))
+    raise BadFrame(f"operation {shorten(operation.get('op'), 40)!r} is unknown or has wrong fields")
 
 
-def brief(value: object, most: int) -> str:
+def shorten(value: object, most: int) -> str:
     """Return the start of a scalar as text, or the type of a list or object, which may be large and deeply nested."""
     is_plain = value is None or isinstance(value, (str, int, float))
     return str(value)[:most] if is_plain else f"a {type(value).__name__}"
 
 
-def odometry(message: Mapping[str, Any]) -> dict[str, Value]:
+def convert_odometry(message: Mapping[str, Any]) -> dict[str, Value]:
     """Convert nav_msgs/Odometry: the pose, and the speed in the robot's frame; raise ``BadFrame`` if invalid."""
-    pose = _at(message, "pose", "pose")
-    speed = _at(message, "twist", "twist")
-    position, linear = _at(pose, "position"), _at(speed, "linear")
-    vx, vy = _number(linear, "x", FAST), _number(linear, "y", FAST)
-    wz = _number(_at(speed, "angular"), "z", FAST)
+    pose = _get_nested(message, "pose", "pose")
+    speed = _get_nested(message, "twist", "twist")
+    position, linear = _get_nested(pose, "position"), _get_nested(speed, "linear")
+    vx, vy = _read_number(linear, "x", MAX_SPEED), _read_number(linear, "y", MAX_SPEED)
+    wz = _read_number(_get_nested(speed, "angular"), "z", MAX_SPEED)
     return {
-        "odom.x": _number(position, "x", FAR_M),
-        "odom.y": _number(position, "y", FAR_M),
-        "odom.yaw": angles(_at(pose, "orientation"))[2],
+        "odom.x": _read_number(position, "x", MAX_DISTANCE_M),
+        "odom.y": _read_number(position, "y", MAX_DISTANCE_M),
+        "odom.yaw": convert_quaternion(_get_nested(pose, "orientation"))[2],
         "base.vx": vx,
         "base.vy": vy,
         "base.wz": wz,
@@ -127,17 +127,19 @@ def odometry(message: Mapping[str, Any]) -> dict[str, Value]:
     }
 
 
-def scan(message: Mapping[str, Any], sectors: Mapping[str, tuple[float, float]], turn: float = 0.0) -> dict[str, Value]:
+def convert_scan(
+    message: Mapping[str, Any], sectors: Mapping[str, tuple[float, float]], turn: float = 0.0
+) -> dict[str, Value]:
     """Convert sensor_msgs/LaserScan to the nearest distance in each sector (centre and full width in rad), in metres.
 
     ``turn`` is the rotation of the scanner on the robot.  Readings below ``range_min`` (0.0 is a common value for "no
     echo"), above ``range_max`` and null count as no echo; a sector without any echo is NaN.  Raises ``BadFrame``.
     """
-    first, step = _number(message, "angle_min", 10.0), _number(message, "angle_increment", 10.0)
-    low, high = _number(message, "range_min", FAR_M), _number(message, "range_max", FAR_M)
+    first, step = _read_number(message, "angle_min", 10.0), _read_number(message, "angle_increment", 10.0)
+    low, high = _read_number(message, "range_min", MAX_DISTANCE_M), _read_number(message, "range_max", MAX_DISTANCE_M)
     readings = message.get("ranges")
-    if not isinstance(readings, Sequence) or isinstance(readings, str) or not 1 <= len(readings) <= MOST_READINGS:
-        raise BadFrame(f"a scan must have 1 to {MOST_READINGS} ranges")
+    if not isinstance(readings, Sequence) or isinstance(readings, str) or not 1 <= len(readings) <= MAX_READINGS:
+        raise BadFrame(f"a scan must have 1 to {MAX_READINGS} ranges")
     if step == 0.0 or not 0.0 <= low < high:
         raise BadFrame(f"invalid scan: range {low:g} to {high:g} m, angle increment {step:g} rad")
     nearest = dict.fromkeys(sectors, math.nan)
@@ -153,18 +155,20 @@ def scan(message: Mapping[str, Any], sectors: Mapping[str, tuple[float, float]],
     return {f"range.{name}": distance for name, distance in nearest.items()}
 
 
-def imu(message: Mapping[str, Any]) -> dict[str, Value]:
+def convert_imu(message: Mapping[str, Any]) -> dict[str, Value]:
     """Convert sensor_msgs/Imu: proper acceleration, and the attitude if it is known; raise ``BadFrame`` if invalid."""
-    acceleration = _at(message, "linear_acceleration")
-    values: dict[str, Value] = {f"imu.a{axis}": _number(acceleration, axis, PULL) for axis in "xyz"}
+    acceleration = _get_nested(message, "linear_acceleration")
+    values: dict[str, Value] = {
+        f"imu.a{axis}": _read_number(acceleration, axis, MAX_ACCELERATION_MPS2) for axis in "xyz"
+    }
     covariance = message.get("orientation_covariance")
     if not (isinstance(covariance, list) and covariance and covariance[0] == -1):
-        roll, pitch, yaw = angles(_at(message, "orientation"))
+        roll, pitch, yaw = convert_quaternion(_get_nested(message, "orientation"))
         values |= {"imu.roll": roll, "imu.pitch": pitch, "imu.yaw": yaw}
     return values
 
 
-def battery(message: Mapping[str, Any], full: float = 1.0) -> dict[str, Value]:
+def convert_battery(message: Mapping[str, Any], full: float = 1.0) -> dict[str, Value]:
     """Convert the known values of sensor_msgs/BatteryState; ``full`` is the percentage of a full battery, 1 or 100.
 
     Raises ``BadFrame`` if no value is known or the level is out of range.
@@ -172,9 +176,9 @@ def battery(message: Mapping[str, Any], full: float = 1.0) -> dict[str, Value]:
     values: dict[str, Value] = {}
     for key, name, most in (("power.volts", "voltage", 1000.0), ("power.amps", "current", 1000.0)):
         if _is_number(message.get(name)):
-            values[key] = _number(message, name, most)
+            values[key] = _read_number(message, name, most)
     if _is_number(message.get("percentage")):
-        level = _number(message, "percentage", 1e6) / full
+        level = _read_number(message, "percentage", 1e6) / full
         if not 0.0 <= level <= 1.01:
             raise BadFrame(f"the battery level {level:g} is not from 0 to 1; set battery_full to its value when full")
         values["power.level"] = min(level, 1.0)
@@ -184,20 +188,20 @@ def battery(message: Mapping[str, Any], full: float = 1.0) -> dict[str, Value]:
     return values
 
 
-def picture(message: Mapping[str, Any]) -> tuple[bytes, int, int]:
+def decode_picture(message: Mapping[str, Any]) -> tuple[bytes, int, int]:
     """Convert sensor_msgs/CompressedImage to a complete JPEG, its width and height; raise ``BadFrame`` if invalid."""
     text = message.get("data")
     try:
         data = base64.b64decode(text, validate=True) if isinstance(text, str) else b""
     except ValueError as error:
         raise BadFrame("a picture is not base64") from error
-    size = size_of(data)
+    size = read_size(data)
     if size is None:
-        raise BadFrame(f"a picture is not a complete JPEG; its format is {brief(message.get('format'), 40)!r}")
+        raise BadFrame(f"a picture is not a complete JPEG; its format is {shorten(message.get('format'), 40)!r}")
     return data, *size
 
 
-def stamp(message: Mapping[str, Any]) -> float | None:
+def read_stamp(message: Mapping[str, Any]) -> float | None:
     """Return the message's time in seconds on the robot's clock; None without a stamp."""
     header = message.get("header")
     at = header.get("stamp") if isinstance(header, dict) else None
@@ -209,9 +213,9 @@ def stamp(message: Mapping[str, Any]) -> float | None:
     return seconds + nanos / 1e9
 
 
-def angles(quaternion: Mapping[str, Any]) -> tuple[float, float, float]:
+def convert_quaternion(quaternion: Mapping[str, Any]) -> tuple[float, float, float]:
     """Return roll, pitch and yaw in rad; raise ``BadFrame`` if the quaternion is not a rotation."""
-    x, y, z, w = (_number(quaternion, axis, 2.0) for axis in "xyzw")
+    x, y, z, w = (_read_number(quaternion, axis, 2.0) for axis in "xyzw")
     if not 0.9 < x * x + y * y + z * z + w * w < 1.1:
         raise BadFrame("an orientation is not a rotation")
     roll = math.atan2(2 * (w * x + y * z), 1 - 2 * (x * x + y * y))
@@ -228,7 +232,7 @@ def _parse_float(text: str) -> float:
 
 
 def _check_length(text: str) -> str:
-    if len(text) > MOST_DIGITS:
+    if len(text) > MAX_NUMBER_CHARS:
         raise ValueError(f"a number of {len(text)} characters")
     return text
 
@@ -236,7 +240,7 @@ def _check_length(text: str) -> str:
 _DECODER = json.JSONDecoder(parse_int=_parse_int, parse_float=_parse_float)
 
 
-def _at(message: Mapping[str, Any], *path: str) -> Mapping[str, Any]:
+def _get_nested(message: Mapping[str, Any], *path: str) -> Mapping[str, Any]:
     found: Any = message
     for name in path:
         found = found.get(name) if isinstance(found, dict) else None
@@ -245,10 +249,10 @@ def _at(message: Mapping[str, Any], *path: str) -> Mapping[str, Any]:
     return found
 
 
-def _number(message: Mapping[str, Any], name: str, most: float) -> float:
+def _read_number(message: Mapping[str, Any], name: str, most: float) -> float:
     value: Any = message.get(name)
     if not _is_number(value) or not -most <= value <= most:
-        raise BadFrame(f"{name} is {brief(value, 40)}")
+        raise BadFrame(f"{name} is {shorten(value, 40)}")
     return float(value)
 
 

@@ -12,27 +12,27 @@ from twisted.internet.interfaces import IReactorTime
 from twisted.python.failure import Failure
 
 from drivers.base import ENGAGED, BaseDriver
-from drivers.deadman.keeper import kept
-from drivers.deadman.switch import DeadMan, LastWord
+from drivers.deadman.supervisor import create_switch
+from drivers.deadman.switch import DeadManSwitch, HaltCommand
 from drivers.driver import Permit
 from drivers.errors import BadFrame, LinkLost, NoReply, RobotError
 from drivers.link import Connector, TcpConnector
 from drivers.option import Manifest
 from drivers.reading import Action, Description, Frame, Value
 from drivers.rosbridge import codec
-from drivers.rosbridge.codec import Answered, Published, Status, decoded, encoded
+from drivers.rosbridge.codec import ServiceResponse, Status, TopicMessage, decode_message, encode_operation
 from drivers.rosbridge.link import Bridge
-from drivers.rosbridge.option import RATES, SECTORS, TYPES, Options, checked, described
+from drivers.rosbridge.option import RATES_HZ, ROS_TYPES, SECTORS, Options, make_description, parse_options
 from drivers.timer import Timer
 
 MANIFEST = Manifest()
 
 REPEAT_S = 0.1
 """Interval in seconds at which a velocity is repeated: most bases stop by themselves without one."""
-ASK_S = 1.0
+TYPE_TIMEOUT_S = 1.0
 """Seconds to wait for the type of the velocity topic."""
-CALL_S = 5.0
-SOURCE_S = 2.0
+SERVICE_TIMEOUT_S = 5.0
+MESSAGE_TTL_S = 2.0
 """Seconds for which the last message of a topic is valid; then its keys are omitted."""
 TYPE_SERVICE = "/rosapi/topic_type"
 
@@ -53,10 +53,10 @@ class RosbridgeDriver(BaseDriver):
         connector: Connector,
         clock: IReactorTime,
         name: str = "the ROS robot",
-        dead_man: DeadMan | None = None,
+        dead_man: DeadManSwitch | None = None,
     ) -> None:
-        self._options = options if isinstance(options, Options) else checked(options)
-        super().__init__(described(self._options), name, clock, dead_man)
+        self._options = options if isinstance(options, Options) else parse_options(options)
+        super().__init__(make_description(self._options), name, clock, dead_man)
         self._bridge = Bridge(self, connector, clock, self._options.host, self._options.port, self._options.path)
         self._sources = {topic: source for source, topic in self._options.topics.items()}
         self._sectors = {name: (math.radians(middle), math.radians(width)) for name, (middle, width) in SECTORS.items()}
@@ -70,7 +70,7 @@ class RosbridgeDriver(BaseDriver):
         self._repeat_timer, self._type_timer = Timer(clock), Timer(clock)
         self._calls: dict[str, tuple[Deferred[Mapping[str, Any]], Any]] = {}
         self._call_count = 0
-        self._warned: set[str] = set()
+        self._logged_warnings: set[str] = set()
 
     @property
     def camera_fps(self) -> float:
@@ -93,7 +93,7 @@ class RosbridgeDriver(BaseDriver):
         def scalars(values: Mapping[str, Any]) -> Mapping[str, Value]:
             return {key: value for key, value in values.items() if isinstance(value, (bool, int, float, str))}
 
-        return self._call(self._options.services[name], **arguments).addCallback(scalars)
+        return self._call_service(self._options.services[name], **arguments).addCallback(scalars)
 
     def diagnostics(self) -> dict[str, float]:
         """As for every driver; ``age.SOURCE`` is the age of a topic's last message in s, ``faults`` is the link's."""
@@ -109,17 +109,17 @@ class RosbridgeDriver(BaseDriver):
     def _close(self) -> Deferred[None]:
         self._stop_repeating()
         self._fail_calls(LinkLost(f"{self._name}: disconnected"))
-        return self._bridge.hang_up()
+        return self._bridge.disconnect()
 
     def _power(self, on: bool) -> None:
         def switched(values: Mapping[str, Any]) -> None:
             if values.get("success") is True:
                 self._has_motors = on
             else:
-                self._warn_once(f"{self._options.motor_service} refused: {codec.brief(values.get('message'), 200)}")
+                self._warn_once(f"{self._options.motor_service} refused: {codec.shorten(values.get('message'), 200)}")
 
         if self._options.motor_service:
-            self._call(self._options.motor_service, data=on).addCallbacks(switched, self._on_call_failed)
+            self._call_service(self._options.motor_service, data=on).addCallbacks(switched, self._on_call_failed)
         else:
             self._has_motors = on
 
@@ -135,7 +135,7 @@ class RosbridgeDriver(BaseDriver):
         self._send_velocity()
 
     def _on_repeat(self) -> None:
-        if not self._may_move:
+        if not self._is_motion_permitted:
             self.stop()
             return
         self._repeat_timer.set(REPEAT_S, self._on_repeat)
@@ -146,44 +146,46 @@ class RosbridgeDriver(BaseDriver):
         self._velocity = (0.0, 0.0, 0.0)
         self._repeat_timer.cancel()
 
-    def _last_word(self) -> LastWord | None:
+    def _make_halt_command(self) -> HaltCommand | None:
         link = self._bridge.link
-        return None if link is None else LastWord(self._bridge.framed(self._velocity_message(0.0, 0.0, 0.0)), link)
+        return (
+            None if link is None else HaltCommand(self._bridge.encode_frame(self._encode_velocity(0.0, 0.0, 0.0)), link)
+        )
 
     def _send_velocity(self) -> None:
-        self._bridge.send(self._velocity_message(*self._velocity))
+        self._bridge.send(self._encode_velocity(*self._velocity))
 
-    def _velocity_message(self, vx: float, vy: float, wz: float) -> bytes:
-        message = (codec.twist_stamped if self._is_stamped else codec.twist)(vx, vy, wz)
-        return encoded("publish", topic=self._options.velocity_topic, msg=message)
+    def _encode_velocity(self, vx: float, vy: float, wz: float) -> bytes:
+        message = (codec.make_twist_stamped if self._is_stamped else codec.make_twist)(vx, vy, wz)
+        return encode_operation("publish", topic=self._options.velocity_topic, msg=message)
 
     def _subscribe(self, source: str, topic: str) -> None:
-        rate = self._options.camera_fps if source == "image" else RATES[source]
+        rate = self._options.camera_fps if source == "image" else RATES_HZ[source]
         if rate <= 0:
-            self._bridge.send(encoded("unsubscribe", id=source, topic=topic))
+            self._bridge.send(encode_operation("unsubscribe", id=source, topic=topic))
             return
         self._bridge.send(
-            encoded(
+            encode_operation(
                 "subscribe",
                 id=source,
                 topic=topic,
-                type=self._options.type_of(TYPES[source]),
+                type=self._options.convert_type_name(ROS_TYPES[source]),
                 throttle_rate=round(1000 / rate),
                 queue_length=1,
             )
         )
 
-    def _call(self, service: str, **arguments: object) -> Deferred[Mapping[str, Any]]:
+    def _call_service(self, service: str, **arguments: object) -> Deferred[Mapping[str, Any]]:
         self._call_count += 1
         number = f"call:{self._call_count}"
         answered: Deferred[Mapping[str, Any]] = Deferred()
 
         def late() -> None:
             del self._calls[number]
-            answered.errback(NoReply(f"{service} did not answer within {CALL_S:g} s"))
+            answered.errback(NoReply(f"{service} did not answer within {SERVICE_TIMEOUT_S:g} s"))
 
-        self._calls[number] = (answered, self._clock.callLater(CALL_S, late))
-        self._bridge.send(encoded("call_service", id=number, service=service, args=arguments))
+        self._calls[number] = (answered, self._clock.callLater(SERVICE_TIMEOUT_S, late))
+        self._bridge.send(encode_operation("call_service", id=number, service=service, args=arguments))
         return answered
 
     # -- from the robot ---------------------------------------------------------------------------------------------
@@ -206,21 +208,21 @@ class RosbridgeDriver(BaseDriver):
         self._fail_calls(LinkLost(f"the link to {self._name} was lost"))
         self._down()
 
-    def bridge_said(self, payload: bytes) -> None:
+    def bridge_received(self, payload: bytes) -> None:
         """Process one message; called by the bridge."""
         self._counts["frames"] += 1
         try:
-            self._on_message(decoded(payload))
+            self._on_message(decode_message(payload))
         except BadFrame as error:
             self._counts["bad_frames"] += 1
             self.log.debug("{robot}: {error}", robot=self._name, error=error)
 
     def _on_message(self, message: codec.Message) -> None:
         match message:
-            case Published(topic, content):
+            case TopicMessage(topic, content):
                 if topic in self._sources:
                     self._on_published(self._sources[topic], content)
-            case Answered(number, values, is_done):
+            case ServiceResponse(number, values, is_done):
                 self._on_answer(number, values, is_done)
             case Status(level, text):
                 self._counts["refused"] += level == "error"
@@ -231,19 +233,19 @@ class RosbridgeDriver(BaseDriver):
         values: dict[str, Value] = {}
         match source:
             case "odometry":
-                values = codec.odometry(content)
+                values = codec.convert_odometry(content)
             case "scan":
-                values = codec.scan(content, self._sectors, math.radians(self._options.scan_turn))
+                values = codec.convert_scan(content, self._sectors, math.radians(self._options.scan_turn))
             case "imu":
-                values = codec.imu(content)
+                values = codec.convert_imu(content)
             case "battery":
-                values = codec.battery(content, self._options.battery_full)
-        stamp = codec.stamp(content)
+                values = codec.convert_battery(content, self._options.battery_full)
+        stamp = codec.read_stamp(content)
         # Topics arrive slightly out of order; a large step back means that the clock was set.
         if stamp is not None and (stamp > self._t_robot or self._t_robot - stamp > 1.0):
             self._t_robot = stamp
         if source == "image":
-            data, width, height = codec.picture(content)
+            data, width, height = codec.decode_picture(content)
             self._counts["pictures"] += 1
             self._frame = Frame(self._counts["pictures"], width, height, data, self._t_robot)
         now = self._clock.seconds()
@@ -252,7 +254,7 @@ class RosbridgeDriver(BaseDriver):
             return  # not ready: it cannot be driven before the type is known
         seen: dict[str, Value] = {ENGAGED: not self._has_motors}
         for at, some in self._source_values.values():
-            if now - at <= SOURCE_S:
+            if now - at <= MESSAGE_TTL_S:
                 seen.update(some)
         self._observed(seen, self._t_robot, frame=self._frame)
 
@@ -264,18 +266,18 @@ class RosbridgeDriver(BaseDriver):
         if is_done:
             answered.callback(values)
         else:
-            answered.errback(RobotError(codec.brief(values.get("error", values), 300)))
+            answered.errback(RobotError(codec.shorten(values.get("error", values), 300)))
 
     # -- type of the velocity topic ---------------------------------------------------------------------------------
 
     def _request_type(self) -> None:
-        call = self._call(TYPE_SERVICE, topic=self._options.velocity_topic)
+        call = self._call_service(TYPE_SERVICE, topic=self._options.velocity_topic)
         call.addCallbacks(self._on_type, lambda _: None)
         if self._options.velocity_type == "auto":
-            self._type_timer.set(ASK_S, self._on_no_type)
+            self._type_timer.set(TYPE_TIMEOUT_S, self._on_no_type)
 
     def _on_type(self, values: Mapping[str, Any]) -> None:
-        topic, found = self._options.velocity_topic, codec.brief(values.get("type", ""), 100)
+        topic, found = self._options.velocity_topic, codec.shorten(values.get("type", ""), 100)
         known = {"Twist": False, "TwistStamped": True}.get(found.rpartition("/")[2])
         if self._is_stamped is not None:
             if known is not None and known is not self._is_stamped:
@@ -288,7 +290,7 @@ class RosbridgeDriver(BaseDriver):
         # The topic has no subscriber yet, or another type; the base may still be starting.
         state = f"is {found}" if found else "has no subscriber"
         self._warn_once(f"{topic} {state}; is velocity_topic right? retrying")
-        self._type_timer.set(ASK_S, self._request_type)
+        self._type_timer.set(TYPE_TIMEOUT_S, self._request_type)
 
     def _on_no_type(self) -> None:
         default = "TwistStamped" if self._was_stamped else "Twist"
@@ -309,10 +311,10 @@ class RosbridgeDriver(BaseDriver):
 
     def _advertise(self, is_stamped: bool) -> None:
         self._is_stamped = self._was_stamped = is_stamped
-        name = self._options.type_of("geometry_msgs/TwistStamped" if is_stamped else "geometry_msgs/Twist")
-        self._bridge.send(encoded("advertise", topic=self._options.velocity_topic, type=name))
+        name = self._options.convert_type_name("geometry_msgs/TwistStamped" if is_stamped else "geometry_msgs/Twist")
+        self._bridge.send(encode_operation("advertise", topic=self._options.velocity_topic, type=name))
         if self._is_up:
-            self._guard()
+            self._update_halt_command()
 
     def _fail_calls(self, error: Exception) -> None:
         self._type_timer.cancel()
@@ -326,8 +328,8 @@ class RosbridgeDriver(BaseDriver):
             self._warn_once(f"{self._options.motor_service}: {failure.getErrorMessage()[:200]}")
 
     def _warn_once(self, text: str) -> None:
-        if text not in self._warned and len(self._warned) < 100:
-            self._warned.add(text)
+        if text not in self._logged_warnings and len(self._logged_warnings) < 100:
+            self._logged_warnings.add(text)
             self.log.warn("{robot}: {text}", robot=self._name, text=text)
 
 
@@ -336,10 +338,10 @@ def make_driver(
 ) -> RosbridgeDriver:
     """Return a driver of the robot behind the rosbridge in ``options``."""
     if connector is not None:
-        return RosbridgeDriver(checked(options), connector, clock, name)
-    return RosbridgeDriver(checked(options), TcpConnector(says=True), clock, name, dead_man=kept(name))
+        return RosbridgeDriver(parse_options(options), connector, clock, name)
+    return RosbridgeDriver(parse_options(options), TcpConnector(says=True), clock, name, dead_man=create_switch(name))
 
 
 def describe(options: Mapping[str, object], name: str) -> Description:
     """Return the description of that robot."""
-    return described(checked(options))
+    return make_description(parse_options(options))

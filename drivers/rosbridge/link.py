@@ -8,19 +8,19 @@ from twisted.internet.defer import Deferred, succeed
 from twisted.internet.interfaces import IReactorTime
 from twisted.logger import Logger
 
-from drivers.base import heard_at
-from drivers.link import Connector, Line, Link
+from drivers.base import correct_last_data_time
+from drivers.link import Connector, Link, Reconnector
 from drivers.rosbridge.websocket import WebSocket
 from drivers.timer import Timer
 
 PING_S = 1.0
-SILENCE_S = 3.0
+ANSWER_TIMEOUT_S = 3.0
 """Seconds without an answer to a ping after which rosbridge counts as gone, although its link is open."""
-FIRST_HOLD_S, LAST_HOLD_S = 0.5, 5.0
+MIN_RETRY_S, MAX_RETRY_S = 0.5, 5.0
 """First and longest delay before a new attempt at a server that is not rosbridge."""
 
 
-class Owner(Protocol):
+class BridgeOwner(Protocol):
     """Receives the messages and the state of a ``Bridge``."""
 
     def bridge_up(self) -> None:
@@ -29,7 +29,7 @@ class Owner(Protocol):
     def bridge_down(self) -> None:
         """Handle the loss of rosbridge; the bridge reconnects."""
 
-    def bridge_said(self, payload: bytes) -> None:
+    def bridge_received(self, payload: bytes) -> None:
         """Process one message."""
 
 
@@ -39,7 +39,7 @@ class Bridge:
     log = Logger()
 
     def __init__(
-        self, owner: Owner, connector: Connector, clock: IReactorTime, host: str, port: int, path: str
+        self, owner: BridgeOwner, connector: Connector, clock: IReactorTime, host: str, port: int, path: str
     ) -> None:
         self.bytes = 0
         self.faults = 0
@@ -47,14 +47,14 @@ class Bridge:
         self._connector = connector
         self._clock = clock
         self._host, self._port, self._path = host, port, path
-        self._line: Line | None = None
+        self._reconnector: Reconnector | None = None
         self._link: Link | None = None
         self._socket = self._make_socket()
         self._is_up = False
-        self._heard_at = self._ping_at = 0.0
-        self._hold_s = FIRST_HOLD_S
-        self._is_held = False
-        self._hold_until = 0.0
+        self._last_frame_at = self._next_ping_at = 0.0
+        self._retry_s = MIN_RETRY_S
+        self._ignores_data = False
+        self._retry_at = 0.0
         self._timer = Timer(clock)
         self._logged_reason = ""
 
@@ -68,34 +68,34 @@ class Bridge:
         """The link while rosbridge answers, else None."""
         return self._link if self._is_up else None
 
-    def framed(self, payload: bytes) -> bytes:
+    def encode_frame(self, payload: bytes) -> bytes:
         """Return one message as a WebSocket frame."""
-        return self._socket.text(payload)
+        return self._socket.encode_text(payload)
 
     def open(self) -> None:
         """Connect, and reconnect after each loss."""
-        self._line = self._connector.call(self._host, self._port, self)
+        self._reconnector = self._connector.connect(self._host, self._port, self)
 
-    def hang_up(self) -> Deferred[None]:
+    def disconnect(self) -> Deferred[None]:
         """Close the WebSocket and stop reconnecting."""
         if self._is_up and self._link is not None:
-            self._link.send(self._socket.closing())
-        self._is_up, self._is_held = False, True
+            self._link.send(self._socket.encode_close())
+        self._is_up, self._ignores_data = False, True
         self._timer.cancel()
-        return succeed(None) if self._line is None else self._line.hang_up()
+        return succeed(None) if self._reconnector is None else self._reconnector.disconnect()
 
     def send(self, payload: bytes) -> None:
         """Send one message; does nothing without a rosbridge."""
         if self._is_up and self._link is not None:
-            self._link.send(self._socket.text(payload))
+            self._link.send(self._socket.encode_text(payload))
 
     # -- called by the link -----------------------------------------------------------------------------------------
 
     def link_up(self, link: Link) -> None:
         """Start the handshake, after a delay if the server was not a rosbridge before."""
         self._link = link
-        self._is_held = True
-        wait = self._hold_until - self._clock.seconds()
+        self._ignores_data = True
+        wait = self._retry_at - self._clock.seconds()
         if wait > 0:
             self._timer.set(wait, self._start_handshake, link)
         else:
@@ -107,16 +107,16 @@ class Bridge:
         self._timer.cancel()
         self._on_down()
 
-    def received(self, data: bytes) -> None:
+    def data_received(self, data: bytes) -> None:
         """Take bytes."""
         self.bytes += len(data)
         socket, link, frames = self._socket, self._link, self._socket.frames
-        if self._is_held:
+        if self._ignores_data:
             return  # after a fault or hang_up; the link closes soon
-        messages, reply = socket.received(data)
+        messages, reply = socket.receive_data(data)
         if socket.frames > frames or (socket.is_open and not self._is_up):
             # Only complete frames count: bytes may belong to a frame with a corrupt length.
-            self._heard_at = self._clock.seconds()
+            self._last_frame_at = self._clock.seconds()
         if reply and link is not None and not link.is_busy:
             link.send(reply)  # dropped if busy, or replies to a peer that does not read would accumulate
         if socket.is_open and not self._is_up and not socket.fault:
@@ -124,32 +124,32 @@ class Bridge:
         for message in messages:
             if not self._is_up:
                 return  # the owner closed the bridge
-            self._hold_s, self._logged_reason = FIRST_HOLD_S, ""
-            self._owner.bridge_said(message)
-        if socket.fault and not self._is_held:
+            self._retry_s, self._logged_reason = MIN_RETRY_S, ""
+            self._owner.bridge_received(message)
+        if socket.fault and not self._ignores_data:
             self._on_fault(socket.fault)
 
     def _make_socket(self) -> WebSocket:
         return WebSocket(f"{self._host}:{self._port}", self._path)
 
     def _start_handshake(self, link: Link) -> None:
-        self._is_held = False
+        self._ignores_data = False
         self._socket = self._make_socket()
-        self._heard_at = self._clock.seconds()
+        self._last_frame_at = self._clock.seconds()
         link.send(self._socket.opening())
         self._schedule_ping()
 
     def _schedule_ping(self) -> None:
-        self._ping_at = self._clock.seconds() + PING_S
+        self._next_ping_at = self._clock.seconds() + PING_S
         self._timer.set(PING_S, self._on_time)
 
     def _on_time(self) -> None:
-        self._heard_at = heard_at(self._heard_at, self._ping_at, self._clock.seconds())
-        if self._clock.seconds() - self._heard_at > SILENCE_S:
-            self._on_fault(f"no complete frame for {SILENCE_S:g} s")
+        self._last_frame_at = correct_last_data_time(self._last_frame_at, self._next_ping_at, self._clock.seconds())
+        if self._clock.seconds() - self._last_frame_at > ANSWER_TIMEOUT_S:
+            self._on_fault(f"no complete frame for {ANSWER_TIMEOUT_S:g} s")
             return
         if self._is_up and self._link is not None:
-            self._link.send(self._socket.ping())
+            self._link.send(self._socket.encode_ping())
         self._schedule_ping()
 
     def _on_fault(self, reason: str) -> None:
@@ -158,13 +158,13 @@ class Bridge:
         if reason != self._logged_reason:
             self.log.warn("rosbridge at {host}:{port}: {reason}", host=self._host, port=self._port, reason=reason)
         self._logged_reason = reason
-        self._is_held = True
+        self._ignores_data = True
         self._timer.cancel()
         self._on_down()
         if self._link is not None:
-            self._timer.set(self._hold_s, self._link.close)
-            self._hold_until = self._clock.seconds() + self._hold_s
-            self._hold_s = min(2 * self._hold_s, LAST_HOLD_S)
+            self._timer.set(self._retry_s, self._link.close)
+            self._retry_at = self._clock.seconds() + self._retry_s
+            self._retry_s = min(2 * self._retry_s, MAX_RETRY_S)
 
     def _on_up(self) -> None:
         self._is_up = True

@@ -11,7 +11,7 @@ from msgspec import Meta
 from drivers.errors import UsageError
 from drivers.option import Fps, Port, convert_options
 from drivers.reading import Description
-from formats.convert import LINE, Then, Unit
+from formats.convert import PRINTABLE, ConversionStep, Unit
 
 DEFAULT_PORT = 9090
 VelocityType = Literal["auto", "twist", "twist_stamped"]
@@ -29,7 +29,7 @@ SECTORS: Mapping[str, tuple[float, float]] = {
     "front_right": (-45.0, 40.0),
 }
 """Centre and full width of each sector in degrees, left positive."""
-TYPES = {
+ROS_TYPES = {
     "odometry": "nav_msgs/Odometry",
     "scan": "sensor_msgs/LaserScan",
     "imu": "sensor_msgs/Imu",
@@ -37,7 +37,7 @@ TYPES = {
     "image": "sensor_msgs/CompressedImage",
 }
 """Sources of observations, and the types of their topics in ROS 1; ROS 2 adds ``/msg/``."""
-RATES = {"odometry": 20.0, "scan": 10.0, "imu": 20.0, "battery": 1.0}
+RATES_HZ = {"odometry": 20.0, "scan": 10.0, "imu": 20.0, "battery": 1.0}
 """Highest requested rate of each source in Hz."""
 
 
@@ -64,11 +64,11 @@ class Options:
     ``services`` maps skills to services without arguments (std_srvs/Trigger).
     """
 
-    host: Annotated[str, Meta(min_length=1, max_length=253), LINE] = "127.0.0.1"
+    host: Annotated[str, Meta(min_length=1, max_length=253), PRINTABLE] = "127.0.0.1"
     port: Port = DEFAULT_PORT
     path: Annotated[str, Meta(max_length=200, pattern=r"^/[!-~]*$(?!\n)")] = "/"
     ros: Literal[1, 2] = 2
-    model: Annotated[str, Meta(min_length=1, max_length=60), LINE] = "ROS robot"
+    model: Annotated[str, Meta(min_length=1, max_length=60), PRINTABLE] = "ROS robot"
     velocity_topic: Topic = "/cmd_vel"
     velocity_type: VelocityType = "auto"
     odometry_topic: AnyTopic = "/odom"
@@ -86,25 +86,27 @@ class Options:
     max_range: Annotated[float, Meta(ge=0.1, le=200), Unit("metres")] = 3.5
     radius: Annotated[float, Meta(ge=0.01, le=5), Unit("metres")] = 0.11
     scan_turn: Annotated[float, Meta(ge=-360, le=360), Unit("degrees to the left")] = 0.0
-    battery_full: Annotated[float, Meta(description="1 or 100, what a full battery reports"), Then(_check_full)] = 1.0
+    battery_full: Annotated[
+        float, Meta(description="1 or 100, what a full battery reports"), ConversionStep(_check_full)
+    ] = 1.0
     motor_service: AnyTopic = ""
     services: Annotated[
         Mapping[str, str],
         Meta(description='a table of skills to services, such as {dock = "/dock"}'),
-        Then(_check_skills, raw=dict[str, Topic]),
+        ConversionStep(_check_skills, raw=dict[str, Topic]),
     ] = field(default_factory=dict)
 
     @property
     def topics(self) -> dict[str, str]:
         """Sources of observations, and their topics; includes the image at rate 0."""
-        return {name: topic for name in TYPES if (topic := str(getattr(self, f"{name}_topic")))}
+        return {name: topic for name in ROS_TYPES if (topic := str(getattr(self, f"{name}_topic")))}
 
-    def type_of(self, name: str) -> str:
+    def convert_type_name(self, name: str) -> str:
         """Return the name of a ROS 1 type in the robot's version of ROS."""
         return name if self.ros == 1 else name.replace("/", "/msg/")
 
 
-def checked(table: Mapping[str, object]) -> Options:
+def parse_options(table: Mapping[str, object]) -> Options:
     """Convert and check ``table``; raise ``UsageError`` that names the key and the remedy."""
     options = convert_options("rosbridge", table, Options)
     if not any(topic for name, topic in options.topics.items() if name in ("odometry", "scan", "imu")):
@@ -112,12 +114,12 @@ def checked(table: Mapping[str, object]) -> Options:
     return options
 
 
-def described(options: Options) -> Description:
+def make_description(options: Options) -> Description:
     """Return the description of the robot according to its options."""
     capabilities: dict[str, Mapping[str, float | str]] = {"base2d": {}}
     topics = options.topics
     named = {"odometry": "odometry", "scan": "ranger", "imu": "imu", "battery": "power"}
-    rates = {"state": max(RATES[name] for name in topics if name in RATES)}
+    rates = {"state": max(RATES_HZ[name] for name in topics if name in RATES_HZ)}
     for name, capability in named.items():
         if name in topics:
             capabilities[capability] = {"max": options.max_range} if name == "scan" else {}

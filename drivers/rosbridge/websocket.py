@@ -4,22 +4,22 @@ from __future__ import annotations
 
 from wsproto.events import AcceptConnection, RejectConnection, Request
 
-from formats.websocket import End
+from formats.websocket import WebSocketEnd
 
-MAX_MESSAGE = 4 * 1024 * 1024
+MAX_MESSAGE_BYTES = 4 * 1024 * 1024
 """Largest message in bytes: fits a compressed picture of 2 megapixels in base64."""
 
 
-class WebSocket(End):
+class WebSocket(WebSocketEnd):
     """One end of a connection to rosbridge, the client if ``host`` is given; its messages are JSON."""
 
     def __init__(self, host: str = "", path: str = "/") -> None:
-        super().__init__(MAX_MESSAGE, Request(host, path) if host else None)
+        super().__init__(MAX_MESSAGE_BYTES, Request(host, path) if host else None)
 
-    def _answer(self, request: Request) -> AcceptConnection | RejectConnection:
+    def _make_response(self, request: Request) -> AcceptConnection | RejectConnection:
         return AcceptConnection()
 
-    def _fault_of(self, answer: AcceptConnection | RejectConnection | Exception) -> str:
+    def _find_error(self, answer: AcceptConnection | RejectConnection | Exception) -> str:
         if isinstance(answer, Exception):
             return f"no rosbridge answers there ({answer.__context__ or answer}); check host, port and path"
         if isinstance(answer, RejectConnection):

@@ -18,8 +18,8 @@ from formats.convert import FINITE
 
 VERSION = 2
 MARKER = b"\xa9Y"
-HEADER = len(MARKER) + 4
-MAX_PAYLOAD = 256 * 1024
+HEADER_BYTES = len(MARKER) + 4
+MAX_PAYLOAD_BYTES = 256 * 1024
 MAX_ENTRIES = Meta(max_length=64)
 Count = Annotated[int, Meta(ge=0, le=2**63 - 1)]
 Number = Annotated[float, FINITE]
@@ -39,7 +39,7 @@ class Hello(_Message, tag="hello", frozen=True):
     camera_fps: Number
 
 
-class Overlook(_Message, tag="overlook", frozen=True):
+class SubscribeWorld(_Message, tag="overlook", frozen=True):
     """From the operator: request the state of the world, ``rate`` times per second."""
 
     version: Count
@@ -71,11 +71,11 @@ class Halt(_Message, tag="halt", frozen=True):
     """From a driver: stop now; never refused."""
 
 
-class Alive(_Message, tag="alive", frozen=True):
+class KeepAlive(_Message, tag="alive", frozen=True):
     """From either client: keep-alive; the simulator releases the robot after some seconds without data."""
 
 
-class Order(_Message, tag="order", frozen=True):
+class WorldCommand(_Message, tag="order", frozen=True):
     """From the operator: ``verb`` with ``arguments``; answered by a ``Done`` of the same ``number``."""
 
     number: Count
@@ -102,13 +102,13 @@ class Picture(_Message, tag="picture", frozen=True):
     data: bytes
 
 
-class Truth(_Message, tag="truth", frozen=True):
+class WorldSnapshot(_Message, tag="truth", frozen=True):
     """From the simulator to the operator: the state of the whole world."""
 
     snapshot: Mapping[str, Any]
 
 
-class Done(_Message, tag="done", frozen=True):
+class CommandResult(_Message, tag="done", frozen=True):
     """From the simulator: the order was carried out, or ``problem`` says why not."""
 
     number: Count
@@ -147,26 +147,39 @@ class _Snapshot(TypedDict):
     collisions: Count
 
 
-Message = Hello | Overlook | Motors | Drive | Halt | Alive | Order | Sensors | Picture | Truth | Done | Refused
+Message = (
+    Hello
+    | SubscribeWorld
+    | Motors
+    | Drive
+    | Halt
+    | KeepAlive
+    | WorldCommand
+    | Sensors
+    | Picture
+    | WorldSnapshot
+    | CommandResult
+    | Refused
+)
 _ENCODER = msgpack.Encoder(enc_hook=float)
 """Encodes NumPy's numbers as floats."""
 _DECODER: msgpack.Decoder[Message] = msgpack.Decoder(Message)
 
 
-def encoded(message: Message) -> bytes:
+def encode_message(message: Message) -> bytes:
     """Return the frame of ``message``."""
     payload = _ENCODER.encode(message)
-    if len(payload) > MAX_PAYLOAD:
+    if len(payload) > MAX_PAYLOAD_BYTES:
         kind = type(message).__name__
-        raise ValueError(f"a {kind} message of {len(payload)} bytes exceeds the limit of {MAX_PAYLOAD}")
+        raise ValueError(f"a {kind} message of {len(payload)} bytes exceeds the limit of {MAX_PAYLOAD_BYTES}")
     return MARKER + len(payload).to_bytes(4, "big") + payload
 
 
-def decoded(payload: bytes) -> Message:
+def decode_message(payload: bytes) -> Message:
     """Decode the ``payload`` of one frame; raise ``BadFrame`` for any invalid bytes."""
     try:
         message = _DECODER.decode(payload)
-        if isinstance(message, Truth):
+        if isinstance(message, WorldSnapshot):
             convert(message.snapshot, _Snapshot)
     except (MsgspecError, ValueError, RecursionError) as error:
         raise BadFrame(f"{len(payload)} bytes are not a valid message: {error}") from error
@@ -186,7 +199,7 @@ class FrameReader:
         self._rest += data
         while (payload := self._next_payload()) is not None:
             try:
-                message = decoded(payload)
+                message = decode_message(payload)
             except BadFrame:
                 self.bad_frames += 1
                 continue
@@ -198,17 +211,17 @@ class FrameReader:
         while True:
             if not rest.startswith(MARKER[: len(rest)]):
                 self._skip_to_marker()
-            if len(rest) < HEADER:
+            if len(rest) < HEADER_BYTES:
                 return None
-            length = int.from_bytes(rest[len(MARKER) : HEADER], "big")
-            if length <= MAX_PAYLOAD:
+            length = int.from_bytes(rest[len(MARKER) : HEADER_BYTES], "big")
+            if length <= MAX_PAYLOAD_BYTES:
                 break
             del rest[0]
             self._skip_to_marker()
-        if len(rest) < HEADER + length:
+        if len(rest) < HEADER_BYTES + length:
             return None
-        payload = bytes(rest[HEADER : HEADER + length])
-        del rest[: HEADER + length]
+        payload = bytes(rest[HEADER_BYTES : HEADER_BYTES + length])
+        del rest[: HEADER_BYTES + length]
         return payload
 
     def _skip_to_marker(self) -> None:

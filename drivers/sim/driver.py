@@ -15,23 +15,23 @@ from drivers.option import Manifest
 from drivers.reading import Action, Description, Frame
 from drivers.sim.codec import (
     VERSION,
-    Alive,
     Drive,
     FrameReader,
     Halt,
     Hello,
+    KeepAlive,
     Message,
     Motors,
     Picture,
     Refused,
     Sensors,
-    encoded,
+    encode_message,
 )
-from drivers.sim.option import Options, checked, described
+from drivers.sim.option import Options, make_description, parse_options
 
 MANIFEST = Manifest()
 
-ALIVE_S = 0.5
+KEEP_ALIVE_S = 0.5
 
 
 class SimDriver(LinkedDriver):
@@ -42,9 +42,9 @@ class SimDriver(LinkedDriver):
     """
 
     def __init__(self, options: Options | Mapping[str, object], connector: Connector, clock: IReactorTime) -> None:
-        self._options = options if isinstance(options, Options) else checked(options)
+        self._options = options if isinstance(options, Options) else parse_options(options)
         place = (self._options.host, self._options.port)
-        super().__init__(described(self._options), self._options.robot, clock, connector, place)
+        super().__init__(make_description(self._options), self._options.robot, clock, connector, place)
         self._has_problem = False
         self._frame: Frame | None = None
 
@@ -90,7 +90,7 @@ class SimDriver(LinkedDriver):
         self._timer.cancel()
         self._down()
 
-    def _heard(self, message: Message) -> None:
+    def _on_message(self, message: Message) -> None:
         self._counts["frames"] += 1
         match message:
             case Sensors():
@@ -115,26 +115,24 @@ class SimDriver(LinkedDriver):
         self._has_problem = True
 
     def _send_message(self, message: Message) -> None:
-        self._send(encoded(message))
+        self._send(encode_message(message))
 
     def _keep_alive(self) -> None:
-        self._send_message(Alive())
-        self._timer.set(ALIVE_S, self._keep_alive)
+        self._send_message(KeepAlive())
+        self._timer.set(KEEP_ALIVE_S, self._keep_alive)
 
 
 def make_driver(
     options: Mapping[str, object], name: str, clock: IReactorTime, connector: Connector | None
 ) -> SimDriver:
     """Return a driver of the dog that ``options`` or else the device's ``name`` selects."""
-    return SimDriver(
-        _checked_options(options, name), TcpConnector(says=True) if connector is None else connector, clock
-    )
+    return SimDriver(_parse_options(options, name), TcpConnector(says=True) if connector is None else connector, clock)
 
 
 def describe(options: Mapping[str, object], name: str) -> Description:
     """Return the description of that dog."""
-    return described(_checked_options(options, name))
+    return make_description(_parse_options(options, name))
 
 
-def _checked_options(options: Mapping[str, object], name: str) -> Options:
-    return checked({"robot": name, **options})
+def _parse_options(options: Mapping[str, object], name: str) -> Options:
+    return parse_options({"robot": name, **options})

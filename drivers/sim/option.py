@@ -30,12 +30,12 @@ class Options:
         return self.camera_fps if self.camera else 0.0
 
 
-def checked(table: Mapping[str, object]) -> Options:
+def parse_options(table: Mapping[str, object]) -> Options:
     """Convert and check ``table``; raise ``UsageError`` that names the key and the remedy."""
     return convert_options("sim", table, Options)
 
 
-def described(options: Options) -> Description:
+def make_description(options: Options) -> Description:
     """Return the description of a simulated dog: an ERS-7 with Tekkotsu's walking speeds and sensor ranges."""
     capabilities: dict[str, Mapping[str, float | str]] = {
         "base2d": {},

@@ -21,10 +21,10 @@ class Rover(BaseDriver):
         self._connector = connector or TcpConnector()
 
     def _open(self):
-        self._line = self._connector.call(*self._address, self)
+        self._reconnector = self._connector.connect(*self._address, self)
 
     def _close(self):
-        return self._line.hang_up()
+        return self._reconnector.disconnect()
 
     def _power(self, on):
         self._link.send(b"M %d\n" % on)

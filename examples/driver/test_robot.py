@@ -6,10 +6,10 @@ from emulator import Emulator
 from robot import Rover
 from twisted.trial.unittest import SynchronousTestCase
 
-from drivers.conformance import Conformance, MemoryBench
+from drivers.conformance import Conformance, MemoryRig
 
 
 class RoverTests(Conformance, SynchronousTestCase):
     """The template conforms."""
 
-    bench = partial(MemoryBench, Rover, Emulator, {"host": "rover"})
+    bench = partial(MemoryRig, Rover, Emulator, {"host": "rover"})

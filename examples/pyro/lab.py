@@ -15,13 +15,13 @@ from drivers.driver import Driver
 from drivers.errors import UsageError
 from drivers.pyro.brain import Brain, Engine
 from drivers.pyro.robot import PyroRobot
-from drivers.registry import driver_for, kinds
+from drivers.registry import create_driver, list_kinds
 from sim.robots.camera import Camera
 from sim.robots.emulator.aibo_dog import AiboEmulator
-from sim.robots.emulator.dog import DogBody
-from sim.robots.scene import loaded
+from sim.robots.emulator.dog import SimulatedDog
+from sim.robots.scene import load_scene
 from sim.robots.sensor import Sensors
-from sim.robots.world import SUBSTEP, World
+from sim.robots.world import SUBSTEP_S, World
 
 STEPS = 2
 
@@ -30,21 +30,21 @@ class Pen:
     """A world with a red target and an emulated AIBO, its first dog; ``seed`` determines their positions."""
 
     def __init__(self, clock: IReactorTime, seed: int = 1) -> None:
-        self.world = World(random.Random(seed), loaded("three-dogs"))
+        self.world = World(random.Random(seed), load_scene("three-dogs"))
         self.world.scatter(seed)
         self.world.place_target_at_random()
         self.dog = self.world.dogs["dog1"]
-        self._senses = Sensors(random.Random(seed + 1), self.world, self.dog)
+        self._sensors = Sensors(random.Random(seed + 1), self.world, self.dog)
         camera = Camera(random.Random(seed + 2), self.world)
         self._clock = clock
-        body = DogBody(self.world, self.dog, self._senses, camera)
+        body = SimulatedDog(self.world, self.dog, self._sensors, camera)
         self._emulator = AiboEmulator(clock, body, random.Random(seed + 3))
         self._loop = LoopingCall.withCount(self._on_tick)
         self._loop.clock = clock
 
     def start(self) -> None:
         """Start the dog and simulated time."""
-        self._loop.start(STEPS * SUBSTEP)
+        self._loop.start(STEPS * SUBSTEP_S)
         self._emulator.start()
 
     def stop(self) -> None:
@@ -54,18 +54,18 @@ class Pen:
 
     def driver(self) -> Driver:
         """Return a driver of the dog, connected in memory."""
-        return driver_for("aibo", {"host": "pen"}, "pen", self._clock, self._emulator.connector())
+        return create_driver("aibo", {"host": "pen"}, "pen", self._clock, self._emulator.connector())
 
     def _on_tick(self, count: int) -> None:
         for _ in range(min(count, 100) * STEPS):
             self.world.step()
-            self._senses.sample()
+            self._sensors.sample()
 
 
 def main(init: Callable[[Engine], Brain], about: str) -> None:
     """Run a brain from the command line, until it quits, ``--seconds`` pass, or Ctrl-C; then stop the robot."""
     parser = argparse.ArgumentParser(description=about)
-    parser.add_argument("--kind", default="aibo", choices=kinds(), help="the kind of robot (default %(default)s)")
+    parser.add_argument("--kind", default="aibo", choices=list_kinds(), help="the kind of robot (default %(default)s)")
     parser.add_argument("--host", help="its address; without options an emulated AIBO runs in this process")
     parser.add_argument(
         "--option", action="append", default=[], metavar="KEY=VALUE", help="an option of its driver; repeatable"
@@ -86,7 +86,7 @@ def main(init: Callable[[Engine], Brain], about: str) -> None:
         options[key] = int(value) if value.isdigit() else value
     if options or args.kind != "aibo":
         try:
-            driver = driver_for(args.kind, options, "lab", reactor)
+            driver = create_driver(args.kind, options, "lab", reactor)
         except UsageError as error:
             parser.error(str(error))
     else:

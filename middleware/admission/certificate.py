@@ -24,19 +24,28 @@ from typing import Any
 
 import msgpack
 
-from middleware.admission.statement import YEAR, Grant, Invite, moment, named, opened, sized, unpacked
+from middleware.admission.statement import (
+    DEFAULT_LIFE_S,
+    Grant,
+    Invite,
+    check_bytes,
+    check_name,
+    check_number,
+    open_statement,
+    unpack_fields,
+)
 from middleware.entangled.errors import Forged, Malformed
-from middleware.entangled.identity import Identity, verified
+from middleware.entangled.identity import Identity, is_signature_valid
 
-ROOM = 640
+MAX_CERTIFICATE_BYTES = 640
 """Maximum size of a pass in bytes."""
-SKEW = 300
+MAX_CLOCK_SKEW_S = 300
 """Maximum clock difference within a team, in seconds."""
 BOOTSTRAP = "bootstrap"
 GATEWAY = "gateway"
-ADMISSION = 9
+ADMISSION_KIND = 9
 """Entry kind of admissions on the membership list, next to the kinds of statements."""
-GUEST_LIFE = 86_400
+GUEST_LIFE_S = 86_400
 """Maximum validity of a guest pass, in seconds."""
 _GUEST = b"swarm-guest-1 "
 _JOIN = b"swarm-join-1 "
@@ -63,7 +72,7 @@ class Member:
     not_after: int
     invitation: bytes = b""
     admitter: bytes = b""
-    voucher: Member | None = None
+    gateway: Member | None = None
     uses: int = 0
     since: int = 0
     life: int = 0
@@ -72,10 +81,10 @@ class Member:
     @property
     def is_renewable(self) -> bool:
         """Whether bootstrap nodes may renew the certificate; guest passes and shorter certificates expire."""
-        return self.life >= YEAR and self.voucher is None
+        return self.life >= DEFAULT_LIFE_S and self.gateway is None
 
     @property
-    def unrenewed(self) -> Member:
+    def before_renewal(self) -> Member:
         """The member with the dates of its certificate before any renewal.
 
         The renewal of a member that joined by a code does not contain the first end date: the certificate then counts
@@ -86,29 +95,29 @@ class Member:
         end = self.since if self.invitation else self.since + self.life
         return replace(self, not_before=self.since, not_after=end, renewer=b"")
 
-    def trouble(self, now: float) -> str:
+    def check_dates(self, now: float) -> str:
         """Return ``early`` or ``expired``, or an empty string if the pass is valid at ``now`` (wall clock)."""
-        if now < self.not_before - SKEW:
+        if now < self.not_before - MAX_CLOCK_SKEW_S:
             return "early"
         return "expired" if now >= self.not_after else ""
 
 
-def pass_of(grant: bytes) -> bytes:
+def wrap_grant(grant: bytes) -> bytes:
     """Return the pass of a member with a certificate from the operator."""
     return bytes(msgpack.packb([0, grant]))
 
 
-def proof(invitation: Identity, public: bytes, wish: str) -> bytes:
+def sign_join(invitation: Identity, public: bytes, wish: str) -> bytes:
     """Sign the newcomer's key ``public`` and the name that it asks for with the invitation's key."""
     return invitation.sign(_join_content(public, wish))
 
 
-def is_proof(invitation: bytes, public: bytes, wish: str, signature: bytes) -> bool:
+def is_join_signature(invitation: bytes, public: bytes, wish: str, signature: bytes) -> bool:
     """Return whether the invitation's key signed ``public`` and ``wish``."""
-    return verified(invitation, _join_content(public, wish), signature)
+    return is_signature_valid(invitation, _join_content(public, wish), signature)
 
 
-def chained(
+def issue_certificate(
     bootstrap: Identity,
     grant: bytes,
     invite: tuple[bytes, Invite],
@@ -127,7 +136,7 @@ def chained(
     return bytes(msgpack.packb([1, packed, wish, signature, name, now, end, admission, grant]))
 
 
-def renewed(bootstrap: Identity, grant: bytes, member: Member, shown: bytes, now: int) -> bytes:
+def renew_certificate(bootstrap: Identity, grant: bytes, member: Member, shown: bytes, now: int) -> bytes:
     """Renew the pass ``shown`` of ``member`` from ``now`` on, with its original validity.
 
     ``grant`` is the grant of ``bootstrap``.  Raises ``Malformed`` for the pass of a guest.
@@ -139,7 +148,7 @@ def renewed(bootstrap: Identity, grant: bytes, member: Member, shown: bytes, now
 
 def _extract_signed_content(member: Member, shown: bytes) -> list[Any]:
     """Return the operator-signed content of the pass of ``member``."""
-    kind, *rest = unpacked(shown)
+    kind, *rest = unpack_fields(shown)
     if kind == 0:
         return [rest[0]]
     if kind == 1:
@@ -150,49 +159,51 @@ def _extract_signed_content(member: Member, shown: bytes) -> list[Any]:
     raise Malformed("the pass of a guest cannot be renewed")
 
 
-def grant_of(operator: bytes, shown: bytes) -> tuple[Grant, bytes] | None:
+def extract_grant(operator: bytes, shown: bytes) -> tuple[Grant, bytes] | None:
     """Return the operator's grant in a renewed pass, parsed and packed; None if the member joined by a code."""
-    content = unpacked(shown)[1]
+    content = unpack_fields(shown)[1]
     return (_parse_grant(operator, content[0]), content[0]) if len(content) == 1 else None
 
 
-def entries_of(public: bytes, shown: bytes) -> list[bytes]:
+def extract_entries(public: bytes, shown: bytes) -> list[bytes]:
     """Return the entries for the membership list that a valid pass of ``public`` contains; none for a guest."""
-    kind, *rest = unpacked(shown)
+    kind, *rest = unpack_fields(shown)
     if kind == 0:
         return [bytes(rest[0])]
     grants = [bytes(rest[0][0])] if kind == 3 and len(rest[0]) == 1 else []
-    return [*grants, bytes(msgpack.packb([ADMISSION, public, shown]))] if kind in (1, 3) else []
+    return [*grants, bytes(msgpack.packb([ADMISSION_KIND, public, shown]))] if kind in (1, 3) else []
 
 
-def guest_pass(gateway: Identity, own: bytes, public: bytes, name: str, now: int, life: int = GUEST_LIFE) -> bytes:
+def issue_guest_certificate(
+    gateway: Identity, own: bytes, public: bytes, name: str, now: int, life: int = GUEST_LIFE_S
+) -> bytes:
     """Return a guest pass signed by ``gateway``, with the gateway's own pass ``own``.
 
     Raises ``Malformed`` if ``own`` is too long to be embedded; the operator then has to issue a grant (swarm promote).
     """
-    end = now + min(life, GUEST_LIFE)
+    end = now + min(life, GUEST_LIFE_S)
     signature = gateway.sign(_guest_content(public, name, now, end))
     shown = bytes(msgpack.packb([2, name, now, end, signature, gateway.public, own]))
-    if len(shown) > ROOM:
+    if len(shown) > MAX_CERTIFICATE_BYTES:
         raise Malformed("the pass of this gateway is too long to embed in a guest's pass; run swarm promote for it")
     return shown
 
 
-def member_of(operator: bytes, public: bytes, shown: bytes) -> Member:
+def verify_certificate(operator: bytes, public: bytes, shown: bytes) -> Member:
     """Verify a pass of ``public`` against the ``operator``'s key; raises ``Malformed`` or ``Forged``.
 
     The caller checks dates and revocations.
     """
-    if len(shown) > ROOM:
-        raise Malformed(f"the pass has {len(shown)} bytes, more than {ROOM}")
-    fields = unpacked(shown)
+    if len(shown) > MAX_CERTIFICATE_BYTES:
+        raise Malformed(f"the pass has {len(shown)} bytes, more than {MAX_CERTIFICATE_BYTES}")
+    fields = unpack_fields(shown)
     try:
         kind, *rest = fields
         if kind == 0:
             [packed_grant] = rest
-            return member_by(_parse_own_grant(operator, public, packed_grant))
+            return make_member(_parse_own_grant(operator, public, packed_grant))
         if kind == 1:
-            return _verify_chain(operator, public, rest)
+            return _verify_admission(operator, public, rest)
         if kind == 2:
             return _verify_guest(operator, public, rest)
         if kind == 3:
@@ -202,7 +213,7 @@ def member_of(operator: bytes, public: bytes, shown: bytes) -> Member:
     raise Malformed("the pass is of an unknown kind")
 
 
-def member_by(grant: Grant) -> Member:
+def make_member(grant: Grant) -> Member:
     """Return the member described by the operator's ``grant``."""
     begin, end = grant.not_before, grant.not_after
     return Member(grant.public, grant.name, grant.roles, begin, end, since=begin, life=grant.life)
@@ -213,18 +224,18 @@ def _verify_renewal(operator: bytes, public: bytes, fields: list[Any]) -> Member
     if not isinstance(content, list):
         raise Malformed("the renewal has no operator-signed content")
     member = (
-        member_by(_parse_own_grant(operator, public, content[0]))
+        make_member(_parse_own_grant(operator, public, content[0]))
         if len(content) == 1
         else _verify_invited(operator, public, content)
     )
     if not member.is_renewable:
         raise Forged("the operator did not issue this certificate as renewable")
     grant = _parse_grant(operator, packed_grant)
-    if BOOTSTRAP not in grant.roles or grant.life < YEAR:
+    if BOOTSTRAP not in grant.roles or grant.life < DEFAULT_LIFE_S:
         raise Forged("the renewal is signed by a node that may not renew")
-    moment(begin, max(0, max(member.since, grant.not_before) - SKEW))
-    moment(end, begin + 1, begin + member.life)
-    if not verified(grant.public, _renewal_content(public, content, begin, end), sized(signature, 64)):
+    check_number(begin, max(0, max(member.since, grant.not_before) - MAX_CLOCK_SKEW_S))
+    check_number(end, begin + 1, begin + member.life)
+    if not is_signature_valid(grant.public, _renewal_content(public, content, begin, end), check_bytes(signature, 64)):
         raise Forged("the renewal's signature is not valid")
     return replace(member, not_before=begin, not_after=end, renewer=grant.public)
 
@@ -233,37 +244,37 @@ def _verify_invited(operator: bytes, public: bytes, content: list[Any]) -> Membe
     """Return the member that joined by a code, without dates."""
     packed, wish, signature, name, admitter = content
     invite = _verify_invitation(operator, public, packed, wish, signature, name)
-    since = max(0, invite.not_before - SKEW)
-    origin = invite.public, sized(admitter, 32)
+    since = max(0, invite.not_before - MAX_CLOCK_SKEW_S)
+    origin = invite.public, check_bytes(admitter, 32)
     return Member(public, name, invite.roles, 0, 0, *origin, uses=invite.uses, since=since, life=invite.life)
 
 
 def _verify_invitation(operator: bytes, public: bytes, packed: Any, wish: Any, signature: Any, name: Any) -> Invite:
     """Return the invitation: its key signed ``public`` and ``wish``, and with this wish it allows ``name``."""
-    invite = opened(operator, packed)
+    invite = open_statement(operator, packed)
     if not isinstance(invite, Invite):
         raise Malformed("the pass does not begin with an invitation")
     if wish != "":
-        named(wish)
-    if not is_proof(invite.public, public, wish, sized(signature, 64)):
+        check_name(wish)
+    if not is_join_signature(invite.public, public, wish, check_bytes(signature, 64)):
         raise Forged("the invitation's signature does not cover this key")
-    if not invite.allows(named(name), wish):
+    if not invite.allows(check_name(name), wish):
         raise Forged("the invitation does not allow this name")
     return invite
 
 
-def _verify_chain(operator: bytes, public: bytes, fields: list[Any]) -> Member:
+def _verify_admission(operator: bytes, public: bytes, fields: list[Any]) -> Member:
     packed, wish, signature, name, begin, end, admission, packed_grant = fields
     invite = _verify_invitation(operator, public, packed, wish, signature, name)
-    moment(begin, max(0, invite.not_before - SKEW), invite.not_after)
-    moment(end, begin + 1, begin + invite.life)
+    check_number(begin, max(0, invite.not_before - MAX_CLOCK_SKEW_S), invite.not_after)
+    check_number(end, begin + 1, begin + invite.life)
     grant = _parse_grant(operator, packed_grant)
     # A renewed bootstrap node outlives its grant; the grant stays valid for its roles until it is revoked.
-    is_over = begin >= grant.not_after and grant.life < YEAR
-    if BOOTSTRAP not in grant.roles or begin < grant.not_before - SKEW or is_over:
+    is_over = begin >= grant.not_after and grant.life < DEFAULT_LIFE_S
+    if BOOTSTRAP not in grant.roles or begin < grant.not_before - MAX_CLOCK_SKEW_S or is_over:
         raise Forged("the node that admitted this key was not a bootstrap node at that time")
     content = _admission_content(invite.public, public, name, begin, end)
-    if not verified(grant.public, content, sized(admission, 64)):
+    if not is_signature_valid(grant.public, content, check_bytes(admission, 64)):
         raise Forged("the bootstrap node's signature is not valid")
     origin = invite.public, grant.public
     return Member(public, name, invite.roles, begin, end, *origin, uses=invite.uses, since=begin, life=invite.life)
@@ -273,14 +284,16 @@ def _verify_guest(operator: bytes, public: bytes, fields: list[Any]) -> Member:
     name, begin, end, signature, gateway, own = fields
     if not isinstance(own, bytes):
         raise Malformed("the guest's pass does not contain a gateway's pass")
-    voucher = member_of(operator, sized(gateway, 32), own)
-    moment(begin)
-    moment(end, begin + 1, begin + GUEST_LIFE)
-    if voucher.voucher is not None:
+    voucher = verify_certificate(operator, check_bytes(gateway, 32), own)
+    check_number(begin)
+    check_number(end, begin + 1, begin + GUEST_LIFE_S)
+    if voucher.gateway is not None:
         raise Forged("a guest cannot vouch for another guest")
-    if not verified(voucher.public, _guest_content(public, named(name), begin, end), sized(signature, 64)):
+    if not is_signature_valid(
+        voucher.public, _guest_content(public, check_name(name), begin, end), check_bytes(signature, 64)
+    ):
         raise Forged("the gateway's signature is not valid")
-    return Member(public, name, ("device",), begin, end, voucher=voucher)
+    return Member(public, name, ("device",), begin, end, gateway=voucher)
 
 
 def _guest_content(public: bytes, name: str, begin: int, end: int) -> bytes:
@@ -288,7 +301,7 @@ def _guest_content(public: bytes, name: str, begin: int, end: int) -> bytes:
 
 
 def _parse_grant(operator: bytes, packed_grant: Any) -> Grant:
-    grant = opened(operator, packed_grant)
+    grant = open_statement(operator, packed_grant)
     if not isinstance(grant, Grant):
         raise Malformed("the pass does not contain a grant")
     return grant

@@ -28,40 +28,40 @@ from nacl import bindings
 from nacl.exceptions import CryptoError
 
 from middleware.admission.errors import BadCode
-from middleware.admission.statement import MAX_TERMS, named, sized
+from middleware.admission.statement import MAX_TERMS_BYTES, check_bytes, check_name
 from middleware.entangled.errors import Forged, Malformed
 from middleware.entangled.identity import Identity
 
-LETTERS = "0123456789ABCDEFGHJKMNPQRSTVWXYZ"
-ALIKE = str.maketrans("OIL", "011", " -\t\r\n")
-LENGTH, GROUP = 20, 5
-_SECRET_LETTERS, _MARK_LETTERS = 15, 4
-_SECRET_BITS, _MARK_BITS = 5 * _SECRET_LETTERS, 5 * _MARK_LETTERS
+ALPHABET = "0123456789ABCDEFGHJKMNPQRSTVWXYZ"
+NORMALIZATION = str.maketrans("OIL", "011", " -\t\r\n")
+CODE_LENGTH, GROUP_LENGTH = 20, 5
+_SECRET_LETTERS, _FINGERPRINT_LETTERS = 15, 4
+_SECRET_BITS, _FINGERPRINT_BITS = 5 * _SECRET_LETTERS, 5 * _FINGERPRINT_LETTERS
 _POLYNOMIAL = 0b100101
 """x^5 + x^2 + 1, a primitive polynomial: the powers of x are all non-zero elements of the field."""
 MAX_SETTINGS = 16
 _NONCE_BYTES = 24
-_ABOUT = b"swarm-terms-1"
+_ASSOCIATED_DATA = b"swarm-terms-1"
 
 
 @dataclass(frozen=True)
-class Code:
+class JoinCode:
     """A join code: its ``secret`` (75 bits) and the ``mark`` of the operator (20 bits)."""
 
     secret: int = field(repr=False)
-    mark: int
+    fingerprint: int
 
     @property
     def text(self) -> str:
         """The code in four groups of five characters."""
-        letters = _encode(self.secret, _SECRET_LETTERS) + _encode(self.mark, _MARK_LETTERS)
-        letters += LETTERS[_compute_check([LETTERS.index(letter) for letter in letters])]
-        return "-".join(letters[start : start + GROUP] for start in range(0, LENGTH, GROUP))
+        letters = _encode(self.secret, _SECRET_LETTERS) + _encode(self.fingerprint, _FINGERPRINT_LETTERS)
+        letters += ALPHABET[_compute_check([ALPHABET.index(letter) for letter in letters])]
+        return "-".join(letters[start : start + GROUP_LENGTH] for start in range(0, CODE_LENGTH, GROUP_LENGTH))
 
     @property
     def key(self) -> Identity:
         """The key pair of the invitation, derived from the code."""
-        content = self.secret.to_bytes(10) + self.mark.to_bytes(3)
+        content = self.secret.to_bytes(10) + self.fingerprint.to_bytes(3)
         return Identity(hashlib.blake2s(content, person=b"code").digest())
 
     @property
@@ -70,36 +70,36 @@ class Code:
 
         Deriving them from the invitation's public key takes a search over all 2**75 secrets.
         """
-        content = self.secret.to_bytes(10) + self.mark.to_bytes(3)
+        content = self.secret.to_bytes(10) + self.fingerprint.to_bytes(3)
         return hashlib.blake2s(content, person=b"terms").digest()
 
-    def fits(self, operator: bytes) -> bool:
+    def matches_operator(self, operator: bytes) -> bool:
         """Return whether the code can belong to the operator with that public key."""
-        return mark_of(operator) == self.mark
+        return compute_fingerprint(operator) == self.fingerprint
 
 
-def mark_of(operator: bytes) -> int:
+def compute_fingerprint(operator: bytes) -> int:
     """Return the 20 bits of an operator's public key that each of its codes contains."""
-    return int.from_bytes(hashlib.blake2s(operator, digest_size=4, person=b"mark").digest()) >> (32 - _MARK_BITS)
+    return int.from_bytes(hashlib.blake2s(operator, digest_size=4, person=b"mark").digest()) >> (32 - _FINGERPRINT_BITS)
 
 
-def drawn(operator: bytes, rng: random.Random) -> Code:
+def draw_code(operator: bytes, rng: random.Random) -> JoinCode:
     """Draw a new code for the operator with that public key."""
-    return Code(rng.getrandbits(_SECRET_BITS), mark_of(operator))
+    return JoinCode(rng.getrandbits(_SECRET_BITS), compute_fingerprint(operator))
 
 
-def read(text: str) -> Code:
+def parse_code(text: str) -> JoinCode:
     """Parse a typed code, with or without separators, in upper or lower case; raises ``BadCode``."""
-    letters = text.upper().translate(ALIKE)
-    wrong = next((letter for letter in letters if letter not in LETTERS), "")
+    letters = text.upper().translate(NORMALIZATION)
+    wrong = next((letter for letter in letters if letter not in ALPHABET), "")
     if wrong:
         raise BadCode(f"the code contains {wrong!r}; a code has only digits and letters without U; check it")
-    if len(letters) != LENGTH:
-        raise BadCode(f"a code has {LENGTH} characters, this one has {len(letters)}; check it")
-    places = [LETTERS.index(letter) for letter in letters]
+    if len(letters) != CODE_LENGTH:
+        raise BadCode(f"a code has {CODE_LENGTH} characters, this one has {len(letters)}; check it")
+    places = [ALPHABET.index(letter) for letter in letters]
     if _compute_check(places[:-1]) != places[-1]:
         raise BadCode("the code is mistyped: its check character does not match; check it")
-    return Code(_decode(places[:_SECRET_LETTERS]), _decode(places[_SECRET_LETTERS:-1]))
+    return JoinCode(_decode(places[:_SECRET_LETTERS]), _decode(places[_SECRET_LETTERS:-1]))
 
 
 @dataclass(frozen=True)
@@ -111,21 +111,23 @@ class TermsContent:
     settings: Mapping[str, str | int | float | bool] = field(default_factory=dict)
 
 
-def seal_terms(code: Code, content: TermsContent, rng: random.Random) -> bytes:
+def seal_terms(code: JoinCode, content: TermsContent, rng: random.Random) -> bytes:
     """Encrypt ``content`` for the holder of ``code``; raises ``ValueError`` if it is too long."""
     body = msgpack.packb([content.operator, content.team, dict(content.settings)])
     nonce = rng.randbytes(_NONCE_BYTES)
-    sealed: bytes = nonce + bindings.crypto_aead_xchacha20poly1305_ietf_encrypt(body, _ABOUT, nonce, code.terms_key)
-    if len(sealed) > MAX_TERMS or len(content.settings) > MAX_SETTINGS:
-        raise ValueError(f"the settings for newcomers take {len(sealed)} bytes, at most {MAX_TERMS}; share fewer")
+    sealed: bytes = nonce + bindings.crypto_aead_xchacha20poly1305_ietf_encrypt(
+        body, _ASSOCIATED_DATA, nonce, code.terms_key
+    )
+    if len(sealed) > MAX_TERMS_BYTES or len(content.settings) > MAX_SETTINGS:
+        raise ValueError(f"the settings for newcomers take {len(sealed)} bytes, at most {MAX_TERMS_BYTES}; share fewer")
     return sealed
 
 
-def open_terms(code: Code, sealed: bytes) -> TermsContent:
+def open_terms(code: JoinCode, sealed: bytes) -> TermsContent:
     """Decrypt the terms of ``code``; raises ``Forged`` or ``Malformed``."""
     try:
         body = bindings.crypto_aead_xchacha20poly1305_ietf_decrypt(
-            sealed[_NONCE_BYTES:], _ABOUT, sealed[:_NONCE_BYTES], code.terms_key
+            sealed[_NONCE_BYTES:], _ASSOCIATED_DATA, sealed[:_NONCE_BYTES], code.terms_key
         )
     except (CryptoError, ValueError) as error:
         raise Forged("the code does not decrypt these terms") from error
@@ -133,18 +135,18 @@ def open_terms(code: Code, sealed: bytes) -> TermsContent:
         operator, team, settings = msgpack.unpackb(body, max_map_len=MAX_SETTINGS, max_ext_len=0, max_array_len=3)
         if not all(isinstance(k, str) and isinstance(v, str | int | float | bool) for k, v in settings.items()):
             raise Malformed("the terms contain settings of invalid types")
-        content = TermsContent(sized(operator, 32), named(team), settings)
+        content = TermsContent(check_bytes(operator, 32), check_name(team), settings)
     except Malformed:
         raise
     except Exception as error:  # untrusted bytes
         raise Malformed("the terms have invalid fields") from error
-    if not code.fits(content.operator):
+    if not code.matches_operator(content.operator):
         raise Forged("the terms are from another operator than the code names")
     return content
 
 
 def _encode(number: int, count: int) -> str:
-    return "".join(LETTERS[number >> 5 * place & 31] for place in reversed(range(count)))
+    return "".join(ALPHABET[number >> 5 * place & 31] for place in reversed(range(count)))
 
 
 def _decode(places: list[int]) -> int:

@@ -15,7 +15,7 @@ from __future__ import annotations
 from middleware.entangled.errors import LocalError, Refused
 
 _ASK = "ask the operator for another one (swarm invite)"
-WHY = {
+REFUSAL_TEXTS = {
     "unknown": f"the team does not know this code: it is of another team, was withdrawn, or expired long ago; {_ASK}",
     "used": f"this code was used as often as it may be; {_ASK}",
     "expired": f"this code has expired; {_ASK}, and check the clock of this machine",
@@ -44,4 +44,4 @@ class NotWelcome(Refused):
     code = "unknown"
 
     def __init__(self, code: str) -> None:
-        super().__init__(WHY.get(code, WHY["unknown"]), code)
+        super().__init__(REFUSAL_TEXTS.get(code, REFUSAL_TEXTS["unknown"]), code)

@@ -12,21 +12,21 @@ from collections.abc import Callable, Iterable, Iterator
 from twisted.logger import Logger
 from twisted.python.failure import Failure
 
-from middleware.admission.roll import DIGEST, Roll, digest_of
+from middleware.admission.membership_list import DIGEST_BYTES, MembershipList, compute_digest
 from middleware.admission.statement import Entry
 from middleware.entangled.background import Background
 from middleware.entangled.contact import Contact
 from middleware.entangled.errors import EntangledError, Full, RemoteError
 from middleware.entangled.wire.endpoint import Endpoint
 
-SPREAD = 8
+FANOUT = 8
 """Number of members that a node sends a new entry to.  More means fewer hops and more traffic."""
-COMPARED = 5.0
+COMPARE_INTERVAL_S = 5.0
 """Seconds between two comparisons.  Less catches up sooner after a partition."""
-NEWS = 8
+MAX_PUSHED_ENTRIES = 8
 """Maximum number of entries that are pushed at once."""
-PAGE = 32
-PAGE_BYTES = 65_536 + 16_384
+MAX_PAGE_ENTRIES = 32
+MAX_PAGE_BYTES = 65_536 + 16_384
 
 
 class Gossip:
@@ -39,7 +39,7 @@ class Gossip:
 
     def __init__(
         self,
-        roll: Roll,
+        roll: MembershipList,
         endpoint: Endpoint,
         contacts: Callable[[], list[Contact]],
         rng: random.Random,
@@ -47,13 +47,13 @@ class Gossip:
         wall: Callable[[], float],
         on_new: Callable[[Entry], None],
     ) -> None:
-        self._roll = roll
+        self._membership_list = roll
         self._endpoint = endpoint
         self._contacts = contacts
         self._rng = rng
         self._chores = chores
         self._wall = wall
-        self._on_new = on_new
+        self._on_new_entry = on_new
         self._is_full = False
         endpoint.expose("roll.tell", self._answer_tell, changes=True, idempotent=True)
         endpoint.expose("roll.compare", self._answer_compare)
@@ -61,17 +61,17 @@ class Gossip:
 
     def start(self) -> None:
         """Start the periodic comparison."""
-        self._chores.every(COMPARED, self._compare_with_one)
+        self._chores.every(COMPARE_INTERVAL_S, self._compare_with_one)
 
     def add(self, packed: bytes) -> Entry | None:
         """Add an entry that originates at this node, and push it; raises as ``Roll.add`` does."""
-        entry = self._roll.add(packed, self._wall())
+        entry = self._membership_list.add(packed, self._wall())
         if entry is not None:
-            self._on_new(entry)
+            self._on_new_entry(entry)
             self._push([packed], ())
         return entry
 
-    def met(self, contact: Contact) -> None:
+    def compare_with(self, contact: Contact) -> None:
         """Compare lists with a contact that is new or has returned."""
         self._chores.fork(self._compare(contact))
 
@@ -82,10 +82,10 @@ class Gossip:
         fresh: list[bytes] = []
         try:
             for packed in entries:
-                entry = self._roll.add(packed, self._wall())
+                entry = self._membership_list.add(packed, self._wall())
                 if entry is not None and isinstance(packed, bytes):
                     fresh.append(packed)
-                    self._on_new(entry)
+                    self._on_new_entry(entry)
         except RemoteError as error:
             self._log.warn("a member sent an entry that is not valid in this team: {error}", error=error)
         except Full as error:
@@ -94,47 +94,52 @@ class Gossip:
             self._is_full = True
         finally:
             # Many new entries at once occur at a newcomer only; otherwise the others catch up by comparison.
-            if len(fresh) <= NEWS:
+            if len(fresh) <= MAX_PUSHED_ENTRIES:
                 self._push(fresh, but)
 
     def _push(self, packed: list[bytes], but: tuple[bytes, ...]) -> None:
         others = [contact for contact in self._contacts() if contact.public not in but]
         for page in _split_pages(packed):
-            for contact in self._rng.sample(others, min(SPREAD, len(others))):
+            for contact in self._rng.sample(others, min(FANOUT, len(others))):
                 self._endpoint.ask(contact, "roll.tell", page, changes=True).addErrback(self._log_unexpected)
 
     def _compare_with_one(self) -> None:
-        self._roll.expire(self._wall())
+        self._membership_list.expire(self._wall())
         others = self._contacts()
         if others:
             self._chores.fork(self._compare(self._rng.choice(others)))
 
     async def _compare(self, contact: Contact) -> None:
-        answer = await self._endpoint.ask(contact, "roll.compare", self._roll.digest)
+        answer = await self._endpoint.ask(contact, "roll.compare", self._membership_list.digest)
         if not isinstance(answer, list):
             return
-        theirs = {each for each in answer if isinstance(each, bytes) and len(each) == DIGEST}
-        mine = set(self._roll.digests)
+        theirs = {each for each in answer if isinstance(each, bytes) and len(each) == DIGEST_BYTES}
+        mine = set(self._membership_list.digests)
         wanted = sorted(theirs - mine)
         while wanted:
-            found = await self._endpoint.ask(contact, "roll.fetch", wanted[:PAGE])
-            received = {digest_of(e) for e in found if isinstance(e, bytes)} if isinstance(found, list) else set()
+            found = await self._endpoint.ask(contact, "roll.fetch", wanted[:MAX_PAGE_ENTRIES])
+            received = {compute_digest(e) for e in found if isinstance(e, bytes)} if isinstance(found, list) else set()
             if not received.intersection(wanted):
                 break
             self._add_received(found, (contact.public,))
             wanted = [each for each in wanted if each not in received]
-        for page in _split_pages(self._roll.packed(sorted(mine - theirs))):
+        for page in _split_pages(self._membership_list.list_packed(sorted(mine - theirs))):
             await self._endpoint.ask(contact, "roll.tell", page, changes=True)
 
     def _answer_tell(self, peer: Contact, entries: list[object]) -> None:
-        self._add_received(entries[: PAGE * 2], (peer.public,))
+        self._add_received(entries[: MAX_PAGE_ENTRIES * 2], (peer.public,))
 
     def _answer_compare(self, peer: Contact, digest: bytes) -> list[bytes] | None:
-        self._roll.expire(self._wall())
-        return None if digest == self._roll.digest else self._roll.digests
+        self._membership_list.expire(self._wall())
+        return None if digest == self._membership_list.digest else self._membership_list.digests
 
     def _answer_fetch(self, peer: Contact, wanted: list[object]) -> list[bytes]:
-        return next(_split_pages(self._roll.packed(each for each in wanted[:PAGE] if isinstance(each, bytes))), [])
+        return next(
+            _split_pages(
+                self._membership_list.list_packed(each for each in wanted[:MAX_PAGE_ENTRIES] if isinstance(each, bytes))
+            ),
+            [],
+        )
 
     def _log_unexpected(self, failure: Failure) -> None:
         if failure.check(EntangledError) is None:
@@ -145,7 +150,7 @@ def _split_pages(packed: Iterable[bytes]) -> Iterator[list[bytes]]:
     page: list[bytes] = []
     size = 0
     for each in packed:
-        if page and (len(page) == PAGE or size + len(each) > PAGE_BYTES):
+        if page and (len(page) == MAX_PAGE_ENTRIES or size + len(each) > MAX_PAGE_BYTES):
             yield page
             page, size = [], 0
         page.append(each)

@@ -12,8 +12,8 @@ from typing import Any
 
 from middleware.admission.errors import BadKeyFile
 
-MODE = 0o600
-MAX_FILE = 2**20
+FILE_MODE = 0o600
+MAX_FILE_BYTES = 2**20
 
 
 def read(path: Path) -> dict[str, Any]:
@@ -23,7 +23,7 @@ def read(path: Path) -> dict[str, Any]:
         found = json.loads(content)
     except (ValueError, RecursionError):
         found = None
-    if not isinstance(found, dict) or len(content) > MAX_FILE:
+    if not isinstance(found, dict) or len(content) > MAX_FILE_BYTES:
         raise BadKeyFile(f"{path} is damaged; restore it from a backup, or have it created again")
     return found
 
@@ -41,7 +41,7 @@ def read_bytes(path: Path) -> bytes:
                     f"{path} holds secrets, and other users can read or change it (mode {mode:04o}); "
                     f"run chmod 600 {path}, and replace the key if another user may have read it"
                 )
-            return file.read(MAX_FILE + 1)
+            return file.read(MAX_FILE_BYTES + 1)
     except OSError as error:
         raise BadKeyFile(f"{path} cannot be read: {error.strerror or error}; check the path") from error
 
@@ -57,7 +57,7 @@ def write(path: Path, content: Mapping[str, Any], is_new: bool = False) -> None:
     try:
         with suppress(FileNotFoundError):
             fresh.unlink()
-        with open(os.open(fresh, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_NOFOLLOW, MODE), "w") as file:
+        with open(os.open(fresh, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_NOFOLLOW, FILE_MODE), "w") as file:
             json.dump(content, file, indent=1)
             file.write("\n")
             file.flush()

@@ -12,16 +12,16 @@ from pathlib import Path
 from typing import Any
 
 from middleware.admission import keyfile
-from middleware.admission.certificate import Member, member_of
+from middleware.admission.certificate import Member, verify_certificate
 from middleware.admission.errors import BadKeyFile
-from middleware.admission.roll import MAX_SECRETS
-from middleware.admission.statement import SECRET_BYTES, moment, named, sized
+from middleware.admission.membership_list import MAX_SECRETS
+from middleware.admission.statement import SECRET_BYTES, check_bytes, check_name, check_number
 from middleware.entangled.errors import RemoteError
 from middleware.entangled.identity import Identity
 from middleware.entangled.network.network import Address
 
 KIND = "swarm-node membership 1"
-MAX_KNOWN = 64
+MAX_KNOWN_NODES = 64
 
 
 @dataclass(frozen=True)
@@ -36,9 +36,9 @@ class Membership:
     team: str
     seed: bytes = field(repr=False)
     operator: bytes
-    shown: bytes
+    certificate: bytes
     secrets: tuple[tuple[int, bytes, int], ...] = field(repr=False)
-    known: tuple[Address, ...] = ()
+    known_nodes: tuple[Address, ...] = ()
     settings: Mapping[str, str | int | float | bool] = field(default_factory=dict)
 
     @property
@@ -50,7 +50,7 @@ class Membership:
     def member(self) -> Member:
         """The member described by the pass; raises ``BadKeyFile`` if the pass is not of this team."""
         try:
-            return member_of(self.operator, self.identity.public, self.shown)
+            return verify_certificate(self.operator, self.identity.public, self.certificate)
         except RemoteError as error:
             raise BadKeyFile(f"the certificate in the membership is not of this team: {error}; join again") from error
 
@@ -59,7 +59,7 @@ class Membership:
         secrets = [each for each in self.secrets if each[0] != number] + [(number, secret, until)]
         return replace(self, secrets=tuple(sorted(secrets, key=lambda each: -each[0])[:MAX_SECRETS]))
 
-    def accepted(self, now: float) -> list[tuple[int, bytes, int]]:
+    def list_accepted_secrets(self, now: float) -> list[tuple[int, bytes, int]]:
         """Return the secrets accepted at ``now`` (wall clock), newest first; the newest is always accepted."""
         found: list[tuple[int, bytes, int]] = []
         for each in self.secrets:
@@ -67,36 +67,41 @@ class Membership:
                 found.append(each)
         return found
 
-    def packed(self) -> dict[str, Any]:
+    def to_json(self) -> dict[str, Any]:
         """Return the content of the file."""
         return {
             "kind": KIND,
             "team": self.team,
             "operator": self.operator.hex(),
             "seed": self.seed.hex(),
-            "pass": self.shown.hex(),
+            "pass": self.certificate.hex(),
             "secrets": [[number, secret.hex(), until] for number, secret, until in self.secrets],
-            "known_nodes": [[address.host, address.port] for address in self.known],
+            "known_nodes": [[address.host, address.port] for address in self.known_nodes],
             "settings": dict(self.settings),
         }
 
 
-def unpacked(found: Mapping[str, Any]) -> Membership:
+def parse_membership(found: Mapping[str, Any]) -> Membership:
     """Parse the content of a membership file; raises ``BadKeyFile``."""
     try:
         if found["kind"] != KIND:
             raise ValueError("another kind of file")
         secrets = [
-            (moment(number, 1), sized(bytes.fromhex(secret), SECRET_BYTES), moment(until))
+            (check_number(number, 1), check_bytes(bytes.fromhex(secret), SECRET_BYTES), check_number(until))
             for number, secret, until in found["secrets"][:MAX_SECRETS]
         ]
         if not secrets:
             raise ValueError("no secret of the team")
-        known = [Address(str(host), moment(port, 1, 65535)) for host, port in found["known_nodes"][:MAX_KNOWN]]
-        operator, seed = sized(bytes.fromhex(found["operator"]), 32), sized(bytes.fromhex(found["seed"]), 32)
+        known = [
+            Address(str(host), check_number(port, 1, 65535)) for host, port in found["known_nodes"][:MAX_KNOWN_NODES]
+        ]
+        operator, seed = (
+            check_bytes(bytes.fromhex(found["operator"]), 32),
+            check_bytes(bytes.fromhex(found["seed"]), 32),
+        )
         shown = bytes.fromhex(found["pass"])
         membership = Membership(
-            named(found["team"]), seed, operator, shown, tuple(secrets), tuple(known), dict(found["settings"])
+            check_name(found["team"]), seed, operator, shown, tuple(secrets), tuple(known), dict(found["settings"])
         )
     except (KeyError, ValueError, TypeError, RemoteError) as error:
         raise BadKeyFile(f"not a valid membership ({error}); join again, or restore it from a backup") from error
@@ -111,15 +116,15 @@ class MembershipFile:
     def __init__(self, path: Path) -> None:
         self.path = path
         try:
-            self.membership = unpacked(keyfile.read(path))
+            self.membership = parse_membership(keyfile.read(path))
         except BadKeyFile as error:
             text = str(error)
             raise error if str(path) in text else BadKeyFile(f"{path}: {text}") from error
 
-    def keep(self, membership: Membership) -> None:
+    def save(self, membership: Membership) -> None:
         """Write ``membership`` to the file; raises ``BadKeyFile``."""
         if membership != self.membership:
-            keyfile.write(self.path, membership.packed())
+            keyfile.write(self.path, membership.to_json())
             self.membership = membership
 
 
@@ -129,14 +134,14 @@ class MemoryMembership:
     def __init__(self, membership: Membership) -> None:
         self.membership = membership
 
-    def keep(self, membership: Membership) -> None:
+    def save(self, membership: Membership) -> None:
         """Store ``membership``."""
         self.membership = membership
 
 
-def made(path: Path, membership: Membership) -> None:
+def create_membership_file(path: Path, membership: Membership) -> None:
     """Create the file of a new member; raises ``BadKeyFile``, also if it exists."""
-    keyfile.write(path, membership.packed(), is_new=True)
+    keyfile.write(path, membership.to_json(), is_new=True)
 
 
-Kept = MembershipFile | MemoryMembership
+MembershipStore = MembershipFile | MemoryMembership

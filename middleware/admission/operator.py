@@ -12,39 +12,39 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from middleware.admission import code, keyfile
-from middleware.admission.certificate import pass_of
+from middleware.admission.certificate import wrap_grant
 from middleware.admission.code import TermsContent, seal_terms
 from middleware.admission.errors import BadKeyFile
 from middleware.admission.membership import Membership
 from middleware.admission.statement import (
+    DEFAULT_LIFE_S,
     MAX_KEPT,
-    MAX_LIFE,
+    MAX_LIFE_S,
     SECRET_BYTES,
-    YEAR,
     Grant,
     Invite,
-    Revoke,
+    Revocation,
     Terms,
+    check_bytes,
+    check_name,
     member_id,
-    named,
     renewal_id,
-    sealed_secret,
-    signed,
-    sized,
+    seal_secret,
+    sign_statement,
 )
 from middleware.entangled.errors import RemoteError
 from middleware.entangled.identity import Identity
 
 KIND = "swarm-node operator 1"
-FIRST_SECRET = 1
-FIRST = ("device", "operator", "gateway", "bootstrap")
+FIRST_SECRET_NUMBER = 1
+FIRST_NODE_ROLES = ("device", "operator", "gateway", "bootstrap")
 """Roles of the first node of a team: all."""
 
 
 class Invitation(NamedTuple):
     """A code and the two statements that activate it; publish ``terms`` before ``invite``."""
 
-    code: code.Code
+    code: code.JoinCode
     invite: bytes
     terms: bytes
 
@@ -70,9 +70,9 @@ class Operator:
         """The operator's public key, which identifies the team."""
         return self.identity.public
 
-    def grant(self, public: bytes, name: str, roles: Sequence[str], now: float, life: float = YEAR) -> bytes:
+    def grant(self, public: bytes, name: str, roles: Sequence[str], now: float, life: float = DEFAULT_LIFE_S) -> bytes:
         """Sign a certificate for ``public``, valid for ``life`` seconds."""
-        return signed(self.identity, Grant(public, name, tuple(roles), int(now), int(now + life)))
+        return sign_statement(self.identity, Grant(public, name, tuple(roles), int(now), int(now + life)))
 
     def invite(
         self,
@@ -82,18 +82,18 @@ class Operator:
         now: float,
         expires: float,
         rng: random.Random,
-        life: float = YEAR,
+        life: float = DEFAULT_LIFE_S,
     ) -> Invitation:
         """Create a code that admits ``uses`` newcomers within ``expires`` seconds, each for ``life`` seconds.
 
         Raises ``ValueError`` for values that an invitation cannot have.
         """
-        drawn = code.drawn(self.public, rng)
+        drawn = code.draw_code(self.public, rng)
         end = int(now + expires)
         invite = Invite(drawn.key.public, name, tuple(roles), uses, int(now), end, int(life))
         sealed = seal_terms(drawn, TermsContent(self.public, self.team, self.settings), rng)
         terms = Terms(drawn.key.public, sealed, int(now), end)
-        return Invitation(drawn, signed(self.identity, invite), signed(self.identity, terms))
+        return Invitation(drawn, sign_statement(self.identity, invite), sign_statement(self.identity, terms))
 
     def revoke(
         self,
@@ -112,32 +112,34 @@ class Operator:
         ids = (*(member_id(each) for each in kept), *(renewal_id(*each) for each in renewals))
         if len(ids) > MAX_KEPT:
             raise ValueError(f"a revocation keeps at most {MAX_KEPT} members and renewals, not {len(ids)}")
-        return signed(self.identity, Revoke(public, name, int(now), int(now) + MAX_LIFE, ids))
+        return sign_statement(self.identity, Revocation(public, name, int(now), int(now) + MAX_LIFE_S, ids))
 
-    def rotate(self, number: int, members: Iterable[bytes], now: float, grace: float, rng: random.Random) -> bytes:
+    def rotate_secret(
+        self, number: int, members: Iterable[bytes], now: float, grace: float, rng: random.Random
+    ) -> bytes:
         """Draw a new team secret for ``members``; the previous one is accepted for ``grace`` seconds."""
-        secret = sealed_secret(rng.randbytes(SECRET_BYTES), number, members, int(now), int(grace), rng)
-        return signed(self.identity, secret)
+        secret = seal_secret(rng.randbytes(SECRET_BYTES), number, members, int(now), int(grace), rng)
+        return sign_statement(self.identity, secret)
 
-    def founded(
+    def create_membership(
         self, name: str, roles: Sequence[str], now: float, rng: random.Random, secret: bytes | None = None
     ) -> Membership:
         """Return a membership without a code: for the first node, or with the team's ``secret`` for another one."""
         seed = rng.randbytes(32)
         grant = self.grant(Identity(seed).public, name, roles, now)
         first = rng.randbytes(SECRET_BYTES) if secret is None else secret
-        return Membership(self.team, seed, self.public, pass_of(grant), ((FIRST_SECRET, first, 0),))
+        return Membership(self.team, seed, self.public, wrap_grant(grant), ((FIRST_SECRET_NUMBER, first, 0),))
 
 
-def drawn(team: str, rng: random.Random) -> Operator:
+def create_operator(team: str, rng: random.Random) -> Operator:
     """Create the operator of a new team; raises ``BadKeyFile`` if ``team`` is not a valid name."""
     try:
-        return Operator(named(team), rng.randbytes(32))
+        return Operator(check_name(team), rng.randbytes(32))
     except RemoteError as error:
         raise BadKeyFile("a team's name has 1 to 40 letters, digits, _ or -") from error
 
 
-def load(path: Path) -> Operator:
+def load_operator(path: Path) -> Operator:
     """Load the operator's key from ``path``; raises ``BadKeyFile``."""
     found: dict[str, Any] = keyfile.read(path)
     try:
@@ -146,12 +148,12 @@ def load(path: Path) -> Operator:
         settings = found.get("settings", {})
         if not isinstance(settings, dict):
             raise ValueError("the settings are not a mapping")
-        return Operator(named(found["team"]), sized(bytes.fromhex(found["seed"]), 32), settings)
+        return Operator(check_name(found["team"]), check_bytes(bytes.fromhex(found["seed"]), 32), settings)
     except (KeyError, ValueError, TypeError, RemoteError) as error:
         raise BadKeyFile(f"{path} is not an operator's key ({error}); name the file that swarm init made") from error
 
 
-def made(path: Path, operator: Operator) -> None:
+def create_operator_file(path: Path, operator: Operator) -> None:
     """Create the file of a new operator; raises ``BadKeyFile``, also if it exists."""
     content = {"kind": KIND, "team": operator.team, "seed": operator.seed.hex(), "settings": dict(operator.settings)}
     keyfile.write(path, content, is_new=True)

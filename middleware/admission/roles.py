@@ -12,8 +12,8 @@ from collections.abc import Collection, Mapping
 from typing import NamedTuple
 
 from middleware.directory.prefix import is_place
-from middleware.entangled.identity import node_id
-from middleware.entangled.record import Slot, hashed_key
+from middleware.entangled.identity import derive_node_id
+from middleware.entangled.record import Slot, hash_key
 
 DEVICE, OPERATOR, VIEWER, GATEWAY, BOOTSTRAP = "device", "operator", "viewer", "gateway", "bootstrap"
 ROLES = (DEVICE, OPERATOR, VIEWER, GATEWAY, BOOTSTRAP)
@@ -92,7 +92,7 @@ OTHER_METHODS = WORKING
 """Roles that may call a method that is not listed in ``METHODS``."""
 
 PRESENCE, TASKS, HALT, DEPLOYMENTS, SIGNED_OUT = "devices", "tasks", "halt", "deployments", "signed-out"
-MEMBER, RESULT, ORDER, VERDICT, SOURCE = "member", "result", "order", "verdict", "source"
+MEMBER, RESULT, ORDER, DECISION_RECORD, SOURCE = "member", "result", "order", "verdict", "source"
 COUNCIL, ENDED = "council", "done"
 OTHER = "other"
 
@@ -112,12 +112,12 @@ class Namespace(NamedTuple):
     by: str
     text: str
     example: tuple[str, str]
-    lasts: bool = False
+    is_lasting: bool = False
 
     def slot(self, owner: bytes) -> Slot:
         """Return the slot of ``owner`` with the example's key and name."""
         key, name = self.example
-        return Slot(hashed_key(key), owner, name)
+        return Slot(hash_key(key), owner, name)
 
 
 NAMESPACES: Mapping[str, Namespace] = {
@@ -125,7 +125,7 @@ NAMESPACES: Mapping[str, Namespace] = {
         ALL, BY_KEY, "the presence of a device, at its own places of the directory", (PRESENCE, "dog1")
     ),
     TASKS: Namespace(ORDERING, BY_KEY, "the tasks of the team", (TASKS, "task7")),
-    HALT: Namespace(ORDERING, BY_KEY, "the emergency stop and its release", (HALT, "halt"), lasts=True),
+    HALT: Namespace(ORDERING, BY_KEY, "the emergency stop and its release", (HALT, "halt"), is_lasting=True),
     DEPLOYMENTS: Namespace(PUSHING, BY_KEY, "the modules that are pushed to the team", (DEPLOYMENTS, "follow")),
     SIGNED_OUT: Namespace(
         frozenset({GATEWAY}), BY_KEY, "the sessions of the page that ended", (SIGNED_OUT, SIGNED_OUT)
@@ -140,18 +140,20 @@ NAMESPACES: Mapping[str, Namespace] = {
         ACTING, BY_NAME, "the result of a task, signed by the council that granted the lease", ("task/task7", ENDED)
     ),
     ORDER: Namespace(ORDERING, BY_NAME, "an operator's order for a running task", ("task/task7", ORDER)),
-    VERDICT: Namespace(ACTING, BY_NAME, "the decision record of an agent", ("task/task7/why", f"{VERDICT}/1")),
+    DECISION_RECORD: Namespace(
+        ACTING, BY_NAME, "the decision record of an agent", ("task/task7/why", f"{DECISION_RECORD}/1")
+    ),
     OTHER: Namespace(WRITING, REST, "tuples, and other records of programs in the DHT", ("group/7", "anything")),
 }
 """Each kind of record with the roles that may write it.  Nodes neither store nor return nor accept a record whose
 owner's current certificate does not permit it."""
 
 KINDS: Mapping[str, frozenset[str]] = {kind: namespace.roles for kind, namespace in NAMESPACES.items()}
-_BY_KEY = {hashed_key(kind): kind for kind, namespace in NAMESPACES.items() if namespace.by == BY_KEY}
+_BY_KEY = {hash_key(kind): kind for kind, namespace in NAMESPACES.items() if namespace.by == BY_KEY}
 _BY_NAME = frozenset(kind for kind, namespace in NAMESPACES.items() if namespace.by == BY_NAME)
 
 
-def kind_of(slot: Slot) -> str:
+def classify_slot(slot: Slot) -> str:
     """Return the kind of the records in ``slot``: by its key, otherwise by its name up to a ``/``.
 
     In a large team each device has an own place in the directory (``prefix``).
@@ -159,7 +161,7 @@ def kind_of(slot: Slot) -> str:
     kind = _BY_KEY.get(slot.key)
     if kind is None:
         name = slot.name.partition("/")[0]
-        kind = name if name in _BY_NAME else PRESENCE if is_place(slot.key, node_id(slot.owner)) else OTHER
+        kind = name if name in _BY_NAME else PRESENCE if is_place(slot.key, derive_node_id(slot.owner)) else OTHER
     return kind
 
 
@@ -173,11 +175,11 @@ def may_store(roles: Collection[str], slot: Slot, name: str = "") -> bool:
 
     A member with a certificate may publish its presence only under the certificate's ``name``.
     """
-    kind = kind_of(slot)
+    kind = classify_slot(slot)
     is_named = kind != PRESENCE or not name or slot.name == name
     return is_named and not KINDS[kind].isdisjoint(roles)
 
 
-def lasts(slot: Slot) -> bool:
+def is_lasting(slot: Slot) -> bool:
     """Return whether records in ``slot`` stay when their owner is revoked."""
-    return NAMESPACES[kind_of(slot)].lasts
+    return NAMESPACES[classify_slot(slot)].is_lasting

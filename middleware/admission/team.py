@@ -11,31 +11,31 @@ import msgpack
 from twisted.internet.interfaces import IReactorTime
 from twisted.logger import Logger
 
-from middleware.admission import knock
-from middleware.admission.certificate import Member, entries_of, guest_pass
-from middleware.admission.doorkeeper import Doorkeeper, begun
-from middleware.admission.errors import WHY, BadKeyFile
-from middleware.admission.gossip import COMPARED, Gossip
-from middleware.admission.knock import Welcome
-from middleware.admission.membership import Kept, Membership
-from middleware.admission.reception import Reception
+from middleware.admission import join_codec
+from middleware.admission.certificate import Member, extract_entries, issue_guest_certificate
+from middleware.admission.closed_admission import ClosedAdmission, start_incarnation
+from middleware.admission.errors import REFUSAL_TEXTS, BadKeyFile
+from middleware.admission.gossip import COMPARE_INTERVAL_S, Gossip
+from middleware.admission.join_codec import JoinReply
+from middleware.admission.membership import Membership, MembershipStore
+from middleware.admission.membership_list import MAX_ENTRIES, Admission, MembershipList, Renewal, invitation_id
 from middleware.admission.renewal import Renewer
-from middleware.admission.roll import MAX_ENTRIES, Admission, Renewal, Roll, invitation_id
-from middleware.admission.statement import Entry, Grant, Invite, Revoke, Secret
+from middleware.admission.server import AdmissionServer
+from middleware.admission.statement import Entry, Grant, Invite, Revocation, Secret
 from middleware.entangled.background import Background
 from middleware.entangled.contact import Contact
 from middleware.entangled.data.store import Store
 from middleware.entangled.errors import EntangledError, Full, Refused, RemoteError
-from middleware.entangled.identity import Identity, node_id
+from middleware.entangled.identity import Identity, derive_node_id
 from middleware.entangled.node import EntangledNode
-from middleware.entangled.wire.door import REVOKED, meaning
+from middleware.entangled.wire.admission_check import REVOKED, explain
 
 if TYPE_CHECKING:
-    from middleware.admission.uses import Uses
+    from middleware.admission.use_counters import UseCounters
 
-ROLL = "admission/roll"
+LIST_NOTE = "admission/roll"
 """Name of the stored note with the membership list."""
-GUESTS, NO_GUESTS = "admission/guests", bytes(msgpack.packb([]))
+GUESTS_NOTE, EMPTY_GUESTS = "admission/guests", bytes(msgpack.packb([]))
 """Name of the stored note with passes of record owners that are not on the membership list."""
 MAX_GUESTS = 256
 """Maximum number of owners whose passes are stored; other passes are requested again from members."""
@@ -49,24 +49,26 @@ class Team:
 
     _log = Logger()
 
-    def __init__(self, kept: Kept, store: Store, wall: Callable[[], float], rng: random.Random) -> None:
-        self._kept = kept
+    def __init__(self, kept: MembershipStore, store: Store, wall: Callable[[], float], rng: random.Random) -> None:
+        self._membership_store = kept
         self._store = store
         self._wall = wall
         self._rng = rng
         self.identity = kept.membership.identity
-        self.roll = Roll(kept.membership.operator)
+        self.membership_list = MembershipList(kept.membership.operator)
         self._load_list()
-        self.door = Doorkeeper(self.roll, lambda: self.membership, wall, begun(store, wall(), rng))
-        self._load_guest_passes()
+        self.admission = ClosedAdmission(
+            self.membership_list, lambda: self.membership, wall, start_incarnation(store, wall(), rng)
+        )
+        self._load_guest_certificates()
         self._node: EntangledNode | None = None
-        self._uses: Uses | None = None
-        self._accepted = [secret for _, secret, _ in self.membership.accepted(wall())]
+        self._use_counters: UseCounters | None = None
+        self._accepted_secrets = [secret for _, secret, _ in self.membership.list_accepted_secrets(wall())]
 
     @property
     def membership(self) -> Membership:
         """This node's current membership."""
-        return self._kept.membership
+        return self._membership_store.membership
 
     @property
     def secret(self) -> bytes:
@@ -79,142 +81,154 @@ class Team:
         self._chores = Background(clock)
         endpoint = node.endpoint
         self._gossip = Gossip(
-            self.roll, endpoint, node.overlay.contacts, self._rng, self._chores, self._wall, self._on_new
+            self.membership_list,
+            endpoint,
+            node.overlay.contacts,
+            self._rng,
+            self._chores,
+            self._wall,
+            self._on_new_entry,
         )
-        self.door.list_entry = self._gossip.add
-        self._renewer = Renewer(self.roll, self.identity, self.door.certificate, self._gossip.add, self._rng)
-        reception = Reception(
-            self.roll,
+        self.admission.publish_entry = self._gossip.add
+        self._renewer = Renewer(
+            self.membership_list, self.identity, self.admission.find_certificate, self._gossip.add, self._rng
+        )
+        reception = AdmissionServer(
+            self.membership_list,
             self.identity,
-            lambda invite: self.uses.take(invite),
+            lambda invite: self.use_counters.take(invite),
             self._gossip.add,
-            self._build_welcome,
-            endpoint.post,
+            self._build_reply,
+            endpoint.send_datagram,
             clock.seconds,
             self._wall,
             self._rng,
-            lambda who, source, code: endpoint.rebuffs.met(who, str(source), "code", code, WHY[code], clock.seconds()),
+            lambda who, source, code: endpoint.rejections.record(
+                who, str(source), "code", code, REFUSAL_TEXTS[code], clock.seconds()
+            ),
         )
-        endpoint.route(knock.KNOCK, reception.on_knock)
+        endpoint.route(join_codec.JOIN_REQUEST, reception.on_request)
         endpoint.expose("roll.secret", self._answer_secret)
-        node.overlay.on_newcomer.add(self._gossip.met)
-        if len(self._accepted) > 1:
-            endpoint.rekey(*self._accepted)
+        node.overlay.on_new_contact.add(self._gossip.compare_with)
+        if len(self._accepted_secrets) > 1:
+            endpoint.replace_secrets(*self._accepted_secrets)
 
     def start(self) -> None:
         """Start gossip, expiry and renewal."""
         self._evict_former_members()
-        self._log.info("member {name} of the closed team {team}", name=self.door.me.name, team=self.membership.team)
-        trouble = self.door.me.trouble(self._wall())
+        self._log.info(
+            "member {name} of the closed team {team}", name=self.admission.me.name, team=self.membership.team
+        )
+        trouble = self.admission.me.check_dates(self._wall())
         if trouble:
             # Whether the clock is right is unknown at this point, so the message has both causes.
-            self._log.warn("the certificate of this node is not valid by its clock: {why}", why=meaning(trouble))
+            self._log.warn("the certificate of this node is not valid by its clock: {why}", why=explain(trouble))
         self._gossip.start()
-        self._chores.every(COMPARED, self._run_periodic)
+        self._chores.every(COMPARE_INTERVAL_S, self._run_periodic)
 
     def stop(self) -> None:
         """Cancel pending work."""
         if self._node is not None:
             self._chores.stop()
-        if self._uses is not None:
-            self._uses.stop()
+        if self._use_counters is not None:
+            self._use_counters.stop()
 
     # -- operations of an operator ----------------------------------------------------------------------------------
 
     @property
-    def uses(self) -> Uses:
+    def use_counters(self) -> UseCounters:
         """The use counters of invitations, created on first use."""
-        if self._uses is None:
+        if self._use_counters is None:
             assert self._node is not None
             # Imported here: without join requests the node saves 1 MiB for the tuple space.
-            from middleware.admission.uses import Uses
+            from middleware.admission.use_counters import UseCounters
 
-            self._uses = Uses(self._node, self._clock, self._rng)
-        return self._uses
+            self._use_counters = UseCounters(self._node, self._clock, self._rng)
+        return self._use_counters
 
-    async def tell(self, packed: bytes) -> str:
+    async def publish(self, packed: bytes) -> str:
         """Publish a statement of the operator; returns its kind.
 
         An invitation can be used when this is done.  Raises ``Refused`` for a statement that is not of this team.
         """
-        check = Roll(self.roll.operator)
+        check = MembershipList(self.membership_list.operator)
         try:
             entry = check.add(packed, self._wall())
         except RemoteError as error:
             raise Refused(f"{error}; sign with the key of the team {self.membership.team}") from error
         if entry is None:
             raise Refused("the statement has already expired; check the clock of this machine")
-        if isinstance(entry, Invite) and self.roll.invited(invitation_id(entry.public)) is None:
-            await self.uses.issue(entry)
+        if isinstance(entry, Invite) and self.membership_list.find_invitation(invitation_id(entry.public)) is None:
+            await self.use_counters.issue(entry)
         self._gossip.add(packed)
         return entry.slot[0]
 
-    def members(self) -> list[Member]:
+    def list_members(self) -> list[Member]:
         """Return the current members that this node knows, by name."""
-        return self.roll.members(self._wall())
+        return self.membership_list.list_members(self._wall())
 
-    def guest(self, seed: bytes, name: str) -> Membership:
+    def create_guest(self, seed: bytes, name: str) -> Membership:
         """Return the membership of a guest of this node; raises ``Malformed`` if this node's pass is too long."""
         own, now = self.membership, int(self._wall())
-        shown = guest_pass(self.identity, self.door.shown, Identity(seed).public, name, now)
-        return replace(own, seed=seed, shown=shown, known=())
+        shown = issue_guest_certificate(self.identity, self.admission.own_pass, Identity(seed).public, name, now)
+        return replace(own, seed=seed, certificate=shown, known_nodes=())
 
     # -- implementation ---------------------------------------------------------------------------------------------
 
     def _load_list(self) -> None:
         """Load the stored membership list, and add the entries in this node's pass."""
         try:
-            noted = msgpack.unpackb(self._store.noted(ROLL) or b"\x90", max_array_len=MAX_ENTRIES)
+            noted = msgpack.unpackb(self._store.get_note(LIST_NOTE) or b"\x90", max_array_len=MAX_ENTRIES)
         except Exception:  # damaged file
             noted = []
-        shown, public = self.membership.shown, self.identity.public
-        for packed in [*(noted if isinstance(noted, list) else []), *entries_of(public, shown)]:
+        shown, public = self.membership.certificate, self.identity.public
+        for packed in [*(noted if isinstance(noted, list) else []), *extract_entries(public, shown)]:
             try:
-                self.roll.add(packed, self._wall())
+                self.membership_list.add(packed, self._wall())
             except (RemoteError, Full):
                 continue
 
-    def _load_guest_passes(self) -> None:
+    def _load_guest_certificates(self) -> None:
         """Load the stored passes of guests whose records this node holds."""
         try:
-            noted = msgpack.unpackb(self._store.noted(GUESTS) or NO_GUESTS, max_array_len=MAX_GUESTS)
+            noted = msgpack.unpackb(self._store.get_note(GUESTS_NOTE) or EMPTY_GUESTS, max_array_len=MAX_GUESTS)
             for owner, shown in noted:
-                self.door.learn(owner, shown)
+                self.admission.add_certificate(owner, shown)
         except Exception:  # damaged file
             self._log.warn("the stored passes of guests are damaged; other members will send them again")
 
-    def _on_new(self, entry: Entry) -> None:
-        self._store.note(ROLL, msgpack.packb(self.roll.packed()))
-        if isinstance(entry, Revoke):
+    def _on_new_entry(self, entry: Entry) -> None:
+        self._store.set_note(LIST_NOTE, msgpack.packb(self.membership_list.list_packed()))
+        if isinstance(entry, Revocation):
             self._log.info("revoked: {name}", name=entry.name)
-            self._store_pass()
+            self._store_certificate()
             self._evict_former_members()
             self._evict_revoked(entry.public)
         elif isinstance(entry, Secret):
-            found = entry.opened(self.identity)
+            found = entry.decrypt(self.identity)
             if found is not None:
                 self._adopt_secret(entry, found)
         elif isinstance(entry, Grant):
-            self._store_pass()
+            self._store_certificate()
             self._evict_former_members()
         elif isinstance(entry, Admission):
             self._log.info("{name} is a member now", name=entry.member.name)
         elif isinstance(entry, Renewal):
-            self._store_pass()
+            self._store_certificate()
             self._log.info("the certificate of {name} was renewed", name=entry.member.name)
 
     def _run_periodic(self) -> None:
         self._evict_former_members()
         self._apply_secrets()
-        if self._renewer.is_time(self._wall()):
+        if self._renewer.is_scan_due(self._wall()):
             self._chores.fork(self._renew_due())
-        newest = next(iter(self.roll.secrets()), None)
+        newest = next(iter(self.membership_list.list_secrets()), None)
         if newest is not None and newest.number > self.membership.secrets[0][0]:
             self._chores.fork(self._request_secret(newest))
 
     async def _renew_due(self) -> None:
         """Renew some of the members that are due and present."""
-        due = [each for each in self._renewer.find_due(self._wall()) if self._may_be_reachable(each)]
+        due = [each for each in self._renewer.find_due_members(self._wall()) if self._may_be_reachable(each)]
         for member in self._renewer.pick(due):
             if await self._is_reachable(member):
                 self._renewer.renew(member, self._wall())
@@ -224,15 +238,15 @@ class Team:
         assert self._node is not None
         is_me = member.public == self.identity.public
         overlay = self._node.overlay
-        return is_me or overlay.is_large or overlay.contact(node_id(member.public)) is not None
+        return is_me or overlay.is_large or overlay.find_contact(derive_node_id(member.public)) is not None
 
     async def _is_reachable(self, member: Member) -> bool:
         """Return whether ``member`` is this node, or replies."""
         assert self._node is not None
         if member.public == self.identity.public:
             return True
-        overlay, place = self._node.overlay, node_id(member.public)
-        contact = overlay.contact(place)
+        overlay, place = self._node.overlay, derive_node_id(member.public)
+        contact = overlay.find_contact(place)
         if contact is None:
             found = await overlay.lookup(place)
             contact = next((each for each in found if each.public == member.public), None)
@@ -244,30 +258,30 @@ class Team:
             return False
         return True
 
-    def _store_pass(self) -> None:
+    def _store_certificate(self) -> None:
         """Store the current pass for the next start."""
-        self._store_membership(replace(self.membership, shown=self.door.shown))
+        self._store_membership(replace(self.membership, certificate=self.admission.own_pass))
 
     def _evict_former_members(self) -> None:
         if self._node is not None:
-            for public, refusal in self.door.swept():
+            for public, refusal in self.admission.remove_former_members():
                 self._node.evict(public, refusal)
-            self._node.review()
-            self._store_guest_passes(self._node)
+            self._node.recheck()
+            self._store_guest_certificates(self._node)
 
-    def _store_guest_passes(self, node: EntangledNode) -> None:
+    def _store_guest_certificates(self, node: EntangledNode) -> None:
         """Store the passes of record owners that are not on the membership list, for the next start."""
-        owners = [owner for owner in node.store.owners() if self.door.is_off_roll(owner)][-MAX_GUESTS:]
-        noted = msgpack.packb([[owner, self.door.certificate(owner)] for owner in owners])
-        if noted != (self._store.noted(GUESTS) or NO_GUESTS):
-            self._store.note(GUESTS, noted)
+        owners = [owner for owner in node.store.owners() if self.admission.is_unlisted(owner)][-MAX_GUESTS:]
+        noted = msgpack.packb([[owner, self.admission.find_certificate(owner)] for owner in owners])
+        if noted != (self._store.get_note(GUESTS_NOTE) or EMPTY_GUESTS):
+            self._store.set_note(GUESTS_NOTE, noted)
 
     def _evict_revoked(self, public: bytes) -> None:
         """Evict revoked members, including those that are offline."""
         if self._node is None:
             return
-        for each in (public, *self.roll.void):
-            if self._node.overlay.known(node_id(each)) is not None:
+        for each in (public, *self.membership_list.invalidated):
+            if self._node.overlay.find_known(derive_node_id(each)) is not None:
                 self._node.evict(each, REVOKED)
 
     def _adopt_secret(self, entry: Secret, secret: bytes) -> None:
@@ -276,10 +290,10 @@ class Team:
         self._apply_secrets()
 
     def _apply_secrets(self) -> None:
-        accepted = [secret for _, secret, _ in self.membership.accepted(self._wall())]
-        if accepted != self._accepted and self._node is not None:
-            self._accepted = accepted
-            self._node.endpoint.rekey(*accepted)
+        accepted = [secret for _, secret, _ in self.membership.list_accepted_secrets(self._wall())]
+        if accepted != self._accepted_secrets and self._node is not None:
+            self._accepted_secrets = accepted
+            self._node.endpoint.replace_secrets(*accepted)
 
     async def _request_secret(self, entry: Secret) -> None:
         """Request a secret from another member, because it was encrypted before this node joined."""
@@ -287,26 +301,26 @@ class Team:
         others = self._node.overlay.contacts()
         if others:
             found = await self._node.endpoint.ask(self._rng.choice(others), "roll.secret", entry.number)
-            if isinstance(found, bytes) and entry.is_it(found):
+            if isinstance(found, bytes) and entry.matches(found):
                 self._adopt_secret(entry, found)
 
     def _answer_secret(self, peer: Contact, number: int) -> bytes | None:
         """Return the secret to a current member or guest; None to others."""
-        if not self.door.roles_of(peer.public):
+        if not self.admission.roles_of(peer.public):
             return None
         return next((secret for known, secret, _ in self.membership.secrets if known == number), None)
 
-    def _build_welcome(self, shown: bytes) -> Welcome:
+    def _build_reply(self, shown: bytes) -> JoinReply:
         membership = self.membership
         assert self._node is not None
         contacts = [contact for contact in self._node.overlay.contacts() if not contact.address.host.startswith("~")]
-        picked = self._rng.sample(contacts, min(len(contacts), knock.MAX_CONTACTS))
-        secrets = tuple(membership.accepted(self._wall()))
-        return Welcome(shown, secrets, tuple(picked))
+        picked = self._rng.sample(contacts, min(len(contacts), join_codec.MAX_CONTACTS))
+        secrets = tuple(membership.list_accepted_secrets(self._wall()))
+        return JoinReply(shown, secrets, tuple(picked))
 
     def _store_membership(self, membership: Membership) -> None:
         try:
-            self._kept.keep(membership)
+            self._membership_store.save(membership)
         except BadKeyFile as error:
             self._log.error("the changed membership could not be stored for the next start: {error}", error=error)
-            self._kept.membership = membership
+            self._membership_store.membership = membership

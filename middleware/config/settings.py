@@ -15,9 +15,9 @@ from typing import Annotated, Any, Literal
 
 from msgspec import Meta
 
-from formats.convert import Invalid, Secret, Unit, convert_field, convert_table, nearest_of, some_of
+from formats.convert import InvalidValue, Secret, Unit, convert_field, convert_table, find_nearest, some_of
 from middleware.config import types as setting
-from middleware.entangled.data.store import MAX_BYTES, MAX_ROWS, Durable
+from middleware.entangled.data.store import MAX_BYTES, MAX_ROWS, Durability
 from middleware.entangled.network.url import Url
 from middleware.errors import BadSetting
 
@@ -34,13 +34,13 @@ class NodeSettings:
     name: setting.Name
     """Name of the device; 1 to 40 letters, digits, ``_`` or ``-``.  Required."""
 
-    kind: setting.Word = "generic"
+    kind: setting.ShortText = "generic"
     """Kind of device, for display and for matching; at most 40 characters."""
 
-    description: setting.Sentence = ""
+    description: setting.LongText = ""
     """One line about the device, shown on the page; at most 200 characters."""
 
-    laptop: setting.Word = ""
+    laptop: setting.ShortText = ""
     """Name of the computer that the node runs on, such as ``dog1_laptop``, shown on the page; at most 40 characters.
     One node and its computer belong to one device (thesis, Table 5.1)."""
 
@@ -71,7 +71,7 @@ class NodeSettings:
     """Maximum total size of the stored records, in bytes.  More holds more large values; less saves memory and disk.
     Expired records and old tombstones are dropped first; then writes are refused, with figures."""
 
-    durable: Durable = "power"
+    durable: Durability = "power"
     """Durability of a write before it is acknowledged: it survives the loss of ``power``, or only a ``crash`` of the
     node.  ``crash`` does not wait for the disk; a power failure can lose the last writes, but not damage the file."""
 
@@ -112,7 +112,7 @@ class NodeSettings:
     @property
     def tunnel_urls(self) -> tuple[Url, ...]:
         """``tunnels`` with ``auto`` replaced by the URLs of the known nodes."""
-        urls = [Url.of(text) for text in self.tunnels if text != "auto"]
+        urls = [Url.parse(text) for text in self.tunnels if text != "auto"]
         if "auto" in self.tunnels:
             urls += [Url("wss", known.host, 443) for known in self.known_nodes if not _is_loopback(known.host)]
         return tuple(dict.fromkeys(urls))
@@ -130,7 +130,7 @@ class AgentSettings:
     module: setting.Module = ""
     """Agent module, by name or dotted path; empty: no agent."""
 
-    name: setting.Word = ""
+    name: setting.ShortText = ""
     """Name of the agent, such as ``dog1_agent``, shown on the page and in the log; at most 40 characters."""
 
 
@@ -261,9 +261,9 @@ class Settings:
             if name in TABLES:
                 continue
             if isinstance(value, Mapping):
-                remedy = f"the nearest table is [{nearest_of(name, TABLES)}]"
+                remedy = f"the nearest table is [{find_nearest(name, TABLES)}]"
                 raise BadSetting(origin, f"[{name}]", "is not a table of a node's settings", remedy)
-            key = nearest_of(name, [key for _, key in _keys()])
+            key = find_nearest(name, [key for _, key in _keys()])
             tables = " or ".join(f"[{table}]" for table, known in _keys() if known == key)
             remedy = f"write it below {tables}" if key == name else f"the nearest setting is {key}, below {tables}"
             raise BadSetting(origin, name, "is outside of any table", remedy)
@@ -271,7 +271,7 @@ class Settings:
         for name, kind in TABLES.items():
             try:
                 tables_by_name[name] = convert_table(mapping.get(name, {}), kind)
-            except Invalid as error:
+            except InvalidValue as error:
                 raise BadSetting(origin, f"[{name}] {error.key}".strip(), error.problem, error.remedy) from None
         node, folder = tables_by_name["node"], os.path.dirname(origin)
         if node.store != IN_MEMORY:
@@ -294,13 +294,13 @@ class Settings:
         for flag, value in flags.items():
             shown = "--" + flag.replace("_", "-")
             if flag not in known:
-                remedy = "the nearest is --" + nearest_of(flag, known).replace("_", "-")
+                remedy = "the nearest is --" + find_nearest(flag, known).replace("_", "-")
                 raise BadSetting(COMMAND_LINE, shown, "is not a setting", remedy)
             if value is not None:
                 table, key = known[flag]
                 try:
                     new = convert_field(value, TABLES[table], key, is_text=isinstance(value, str))
-                except Invalid as error:
+                except InvalidValue as error:
                     raise BadSetting(COMMAND_LINE, shown, error.problem, error.remedy) from None
                 changed.setdefault(table, {})[key] = new
         given = self.given | {(table, key) for table, keys in changed.items() for key in keys}

@@ -10,8 +10,8 @@ from typing import Annotated, Any
 
 from msgspec import Meta, Struct
 
-from formats.convert import FINITE, LINE, UNIQUE, Secret, Then, show_value
-from middleware.entangled.network.network import EVERYWHERE, Address
+from formats.convert import FINITE, PRINTABLE, UNIQUE, ConversionStep, Secret, show_value
+from middleware.entangled.network.network import ANY_HOST, Address
 from middleware.entangled.network.url import Url
 
 _POSITIONS = ({"x", "y", "heading"}, {"lat", "lon", "accuracy"})
@@ -22,10 +22,10 @@ def _read_host(text: str) -> str:
 
 
 def _read_reachable_host(text: str) -> str:
-    address = None if text == EVERYWHERE else ip_address(text)
+    address = None if text == ANY_HOST else ip_address(text)
     if address is not None and address.is_unspecified:
         raise ValueError(f"is {show_value(text)}, which other nodes cannot reach")
-    return EVERYWHERE if address is None else str(address)
+    return ANY_HOST if address is None else str(address)
 
 
 def _read_address(text: str) -> Address:
@@ -41,7 +41,7 @@ def _read_address(text: str) -> Address:
 def _check_tunnels(urls: tuple[str, ...]) -> tuple[str, ...]:
     for url in urls:
         if url != "auto":
-            Url.of(url)
+            Url.parse(url)
     return urls
 
 
@@ -67,10 +67,10 @@ class Part(Struct, forbid_unknown_fields=True):
 
 
 # Patterns end with $(?!\n): $ alone also matches before a final newline, and JSON Schema does not have \Z.
-Word = Annotated[str, Meta(max_length=40), LINE]
-Sentence = Annotated[str, Meta(max_length=200), LINE]
-File = Annotated[str, Meta(min_length=1, max_length=4000), LINE]
-MaybeFile = Annotated[str, Meta(max_length=4000), LINE]
+ShortText = Annotated[str, Meta(max_length=40), PRINTABLE]
+LongText = Annotated[str, Meta(max_length=200), PRINTABLE]
+File = Annotated[str, Meta(min_length=1, max_length=4000), PRINTABLE]
+MaybeFile = Annotated[str, Meta(max_length=4000), PRINTABLE]
 Name = Annotated[str, Meta(pattern=r"^[A-Za-z0-9_-]{1,40}$(?!\n)", examples=["dog1"])]
 Module = Annotated[
     str, Meta(pattern=r"^([A-Za-z_][A-Za-z0-9_]*([.:][A-Za-z_][A-Za-z0-9_]*)*)?$(?!\n)", examples=["search"])
@@ -79,22 +79,22 @@ Port = Annotated[int, Meta(ge=0, le=65535, description="a number from 0 to 65535
 Host = Annotated[
     str,
     Meta(description="a numeric address of this machine (`ip -brief address` lists them)", examples=["0.0.0.0"]),
-    Then(_read_host, raw=str),
+    ConversionStep(_read_host, raw=str),
 ]
 ReachableHost = Annotated[
     str,
     Meta(description='a numeric address of this machine that other nodes can reach, or "*"', examples=["192.168.1.10"]),
-    Then(_read_reachable_host, raw=str),
+    ConversionStep(_read_reachable_host, raw=str),
 ]
 MaybeAddress = Annotated[
     Address | None,
     Meta(description='"host:port" or empty', examples=["10.0.0.7:7000"]),
-    Then(lambda text: _read_address(text) if text else None, raw=str),
+    ConversionStep(lambda text: _read_address(text) if text else None, raw=str),
 ]
 Addresses = Annotated[
     tuple[Address, ...],
     Meta(description='a list of "host:port"', examples=[["10.0.0.7:7000"]]),
-    Then(lambda texts: tuple(map(_read_address, texts)), raw=tuple[str, ...]),
+    ConversionStep(lambda texts: tuple(map(_read_address, texts)), raw=tuple[str, ...]),
     UNIQUE,
 ]
 Tunnels = Annotated[
@@ -104,24 +104,24 @@ Tunnels = Annotated[
         description='a list of at most 8 URLs "wss://host:port/path" or "auto"',
         examples=[["wss://node.example:443"]],
     ),
-    Then(_check_tunnels),
+    ConversionStep(_check_tunnels),
     UNIQUE,
 ]
 Capabilities = Annotated[
     Mapping[str, Mapping[str, float | str]],
     Meta(description="a table of finite numbers and text for each capability, such as camera = { width = 208 }"),
-    Then(_check_capabilities, raw=dict[str, dict[str, Any]]),
+    ConversionStep(_check_capabilities, raw=dict[str, dict[str, Any]]),
 ]
 Position = Annotated[
     Mapping[str, float],
     Meta(description="{ x = 0.0, y = 0.0, heading = 0.0 } or { lat = 0.0, lon = 0.0, accuracy = 0.0 }"),
-    Then(_check_position, raw=dict[str, Annotated[float, FINITE]]),
+    ConversionStep(_check_position, raw=dict[str, Annotated[float, FINITE]]),
 ]
-Options = Annotated[Mapping[str, object], Then(dict, raw=dict[str, Any])]
+Options = Annotated[Mapping[str, object], ConversionStep(dict, raw=dict[str, Any])]
 Parts = Annotated[
     tuple[tuple[str, Mapping[str, object]], ...],
     Meta(description='at most 8 tables, such as { kind = "camera", options = {} }'),
-    Then(
+    ConversionStep(
         lambda parts: tuple((part.kind, part.options) for part in parts),
         Annotated[tuple[Part, ...], Meta(max_length=8)],
     ),

@@ -16,13 +16,13 @@ from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 from typing import Any
 
-from middleware.consensus.item import Item
-from middleware.consensus.strategy import READABLE, Consensus, ConsensusAlgorithm, Report, reads_of, refusal
+from middleware.consensus.assignment import Item
+from middleware.consensus.strategy import READABLE, Consensus, ConsensusAlgorithm, Report, find_read_fields, refusal
 
-Make = Callable[[], ConsensusAlgorithm]
-TEAMS = 40
+Factory = Callable[[], ConsensusAlgorithm]
+TEAM_COUNT = 40
 """Number of random teams for each rule; the same teams in every run."""
-HOSTILE = (
+INVALID_CHANGES = (
     {"cost": math.nan},
     {"cost": math.inf},
     {"cost": -math.inf},
@@ -49,7 +49,7 @@ HOSTILE = (
     {"choice": "x" * 10_000},
 )
 """Changes that make a report invalid; each such report would win if it were valid."""
-_BARE = Report("", 0.0)
+_DEFAULT_REPORT = Report("", 0.0)
 
 
 class Breach(AssertionError):
@@ -65,7 +65,7 @@ class Salted(str):
         return hash((Salted.salt, str(self)))
 
 
-def team(rng: random.Random, most: int = 9) -> list[Report]:
+def make_team(rng: random.Random, most: int = 9) -> list[Report]:
     """Create the reports of a random team, with ties and with every field that a strategy may read."""
     costs = [0.0, 1.0, 1.0, 2.5, rng.uniform(0.0, 50.0), rng.uniform(0.0, 1e6)]
     return [
@@ -82,158 +82,158 @@ def team(rng: random.Random, most: int = 9) -> list[Report]:
     ]
 
 
-def check_name(make: Make) -> None:
+def check_name(make: Factory) -> None:
     """The strategy has a name and a version."""
     strategy = make()
     for label in ("name", "version"):
         text = getattr(strategy, label, None)
-        _demand(isinstance(text, str) and (label == "version" or bool(text)), f"{label} is {text!r}")
+        _require(isinstance(text, str) and (label == "version" or bool(text)), f"{label} is {text!r}")
 
 
-def check_purity(make: Make) -> None:
+def check_purity(make: Factory) -> None:
     """The decision depends on the reports alone, not on earlier calls, and ``find`` does not change the reports."""
     old = make()
-    for rng, contacts in _teams():
+    for rng, contacts in _make_teams():
         before = list(contacts)
         first = old.find(contacts)
-        _demand(contacts == before, "find modifies its arguments", contacts)
-        old.find(team(rng))
-        _demand(old.find(contacts) == first, "a second call of find gives another result", contacts)
-        _demand(make().find(contacts) == first, "a second instance gives another result", contacts)
+        _require(contacts == before, "find modifies its arguments", contacts)
+        old.find(make_team(rng))
+        _require(old.find(contacts) == first, "a second call of find gives another result", contacts)
+        _require(make().find(contacts) == first, "a second instance gives another result", contacts)
 
 
-def check_order(make: Make) -> None:
+def check_order(make: Factory) -> None:
     """Neither the order of the reports nor their repetition affects the decision."""
     strategy = make()
-    for rng, contacts in _teams():
+    for rng, contacts in _make_teams():
         mixed = [*contacts, *contacts[: len(contacts) // 2]]
         rng.shuffle(mixed)
-        _demand(
+        _require(
             strategy.find(mixed) == strategy.find(contacts),
             "the order or repetition of the reports affects the result",
             contacts,
         )
 
 
-def check_merge(make: Make) -> None:
+def check_merge(make: Factory) -> None:
     """``merge`` is a join, and a summary leads to the same decision as all reports."""
     strategy = make()
-    for rng, contacts in _teams():
+    for rng, contacts in _make_teams():
         costlier = [replace(r, cost=r.cost + 1.0) for r in contacts[:2]]
         a, b, c = (rng.sample(contacts, rng.randint(0, len(contacts))) for _ in range(3))
         b = [*b, *costlier]
         ab, bc = strategy.merge(a, b), strategy.merge(b, c)
-        _demand(ab == strategy.merge(b, a), "merge is not commutative", contacts)
-        _demand(strategy.merge(ab, c) == strategy.merge(a, bc), "merge is not associative", contacts)
-        _demand(strategy.merge(ab, ab) == ab == strategy.merge(ab, ()), "merge is not idempotent", contacts)
-        _demand(
+        _require(ab == strategy.merge(b, a), "merge is not commutative", contacts)
+        _require(strategy.merge(ab, c) == strategy.merge(a, bc), "merge is not associative", contacts)
+        _require(strategy.merge(ab, ab) == ab == strategy.merge(ab, ()), "merge is not idempotent", contacts)
+        _require(
             strategy.find(ab) == strategy.find([*a, *b]),
             "find of a merged summary gives another result than find of all reports",
             contacts,
         )
-        _demand({*ab} <= {*a, *b}, "merge returns reports that were not given", contacts)
+        _require({*ab} <= {*a, *b}, "merge returns reports that were not given", contacts)
 
 
-def check_ties(make: Make) -> None:
+def check_ties(make: Factory) -> None:
     """Among equal reports exactly one agent wins, the same at every node."""
     strategy = make()
-    for rng, contacts in _teams():
+    for rng, contacts in _make_teams():
         equals = [replace(contacts[0], agent=r.agent) for r in contacts]
         found = strategy.find(equals)
-        _demand(found.assigned_agent is not None, "no agent is assigned among equal reports", equals)
+        _require(found.assigned_agent is not None, "no agent is assigned among equal reports", equals)
         rng.shuffle(equals)
-        _demand(strategy.find(equals) == found, "the order of equal reports affects the result", equals)
+        _require(strategy.find(equals) == found, "the order of equal reports affects the result", equals)
 
 
-def check_winners(make: Make) -> None:
+def check_winners(make: Factory) -> None:
     """Only reporting agents are named, none twice; a single agent is assigned, and without reports none is."""
     strategy = make()
-    _demand(strategy.find([]).assigned_agent is None, "an agent is assigned without any report")
-    for _, contacts in _teams():
+    _require(strategy.find([]).assigned_agent is None, "an agent is assigned without any report")
+    for _, contacts in _make_teams():
         found = strategy.find(contacts)
         names = [name for name in (found.assigned_agent, *found.standby) if name is not None]
-        _demand(isinstance(found, Consensus), "find does not return a Consensus", contacts)
-        _demand(
+        _require(isinstance(found, Consensus), "find does not return a Consensus", contacts)
+        _require(
             {*names, *found.assigned} <= {r.agent for r in contacts}, "it names an agent that did not report", contacts
         )
-        _demand(len(set(names)) == len(names), "it names an agent twice", contacts)
+        _require(len(set(names)) == len(names), "it names an agent twice", contacts)
         alone = contacts[0]
-        _demand(strategy.find([alone]).assigned_agent == alone.agent, "the only agent is not assigned", [alone])
+        _require(strategy.find([alone]).assigned_agent == alone.agent, "the only agent is not assigned", [alone])
 
 
-def check_hostile(make: Make) -> None:
+def check_hostile(make: Factory) -> None:
     """Invalid, infinite, negative and stale reports neither win nor affect the decision nor raise an exception."""
     strategy = make()
-    for rng, contacts in _teams():
+    for rng, contacts in _make_teams():
         found = strategy.find(contacts)
-        for change in HOSTILE:
+        for change in INVALID_CHANGES:
             changes: dict[str, Any] = {"agent": "aaa", "cost": 0.0, **change}
             with_it = [*contacts, replace(contacts[0], **changes)]
             rng.shuffle(with_it)
-            _demand(
+            _require(
                 strategy.find(with_it) == found, f"an invalid report with {str(change):.60} affects the result", with_it
             )
-            _demand(
+            _require(
                 strategy.find([with_it[0]] if refusal(with_it[0]) else []).assigned_agent is None,
                 "an invalid report wins",
             )
             strategy.merge(with_it, with_it)
 
 
-def check_improves(make: Make) -> None:
+def check_improves(make: Factory) -> None:
     """Only an offer that is better by more than the hysteresis takes over, so that the task does not oscillate."""
     strategy = make()
-    for rng, contacts in _teams():
-        a, b = contacts[0], replace(team(rng)[0], agent="other")
+    for rng, contacts in _make_teams():
+        a, b = contacts[0], replace(make_team(rng)[0], agent="other")
         for share in (0.0, 0.1, 0.5):
             both = [strategy.improves(a, b, share), strategy.improves(b, a, share)]
-            _demand(all(isinstance(yes, bool) for yes in both), "improves does not return a bool")
-            _demand(both != [True, True], "improves is true in both directions", [a, b])
-        _demand(not strategy.improves(a, replace(a, agent="other"), 0.0), "improves is true for an equal report", [a])
+            _require(all(isinstance(yes, bool) for yes in both), "improves does not return a bool")
+            _require(both != [True, True], "improves is true in both directions", [a, b])
+        _require(not strategy.improves(a, replace(a, agent="other"), 0.0), "improves is true for an equal report", [a])
         wins = [strategy.improves(a, b, share) for share in (0.0, 0.1, 0.3, 0.9)]
-        _demand(wins == sorted(wins, reverse=True), "improves becomes true with more hysteresis", [a, b])
-        for change in HOSTILE:
+        _require(wins == sorted(wins, reverse=True), "improves becomes true with more hysteresis", [a, b])
+        for change in INVALID_CHANGES:
             changes: dict[str, Any] = {"agent": "other", "cost": 0.0, **change}
-            _demand(
+            _require(
                 not strategy.improves(a, replace(a, **changes), 0.1),
                 f"an invalid report with {str(change):.60} takes over",
                 [a],
             )
 
 
-def check_hashing(make: Make) -> None:
+def check_hashing(make: Factory) -> None:
     """The hash seed of the process (``PYTHONHASHSEED``) does not affect the decision."""
-    for _, contacts in _teams():
+    for _, contacts in _make_teams():
         found = []
         for Salted.salt in (0, 1, 2):
             salted = [replace(r, agent=Salted(r.agent), choice=Salted(r.choice), task=Salted(r.task)) for r in contacts]
             found.append(make().find(salted))
-        _demand(found[0] == found[1] == found[2], "the hash values of names affect the result", contacts)
+        _require(found[0] == found[1] == found[2], "the hash values of names affect the result", contacts)
 
 
-def check_many(make: Make) -> None:
+def check_many(make: Factory) -> None:
     """The rules also hold with 300 agents."""
     rng = random.Random("many")
-    one = team(rng)[0]
+    one = make_team(rng)[0]
     contacts = [replace(one, agent=f"agent-{number:03d}", cost=1000.0 * (1 + number)) for number in range(300)]
     strategy = make()
     found = strategy.find(contacts)
-    _demand(found.assigned_agent in {r.agent for r in contacts}, "no agent is assigned among 300")
+    _require(found.assigned_agent in {r.agent for r in contacts}, "no agent is assigned among 300")
     rng.shuffle(contacts)
-    _demand(strategy.find(contacts) == found, "among 300 agents the order of the reports affects the result")
-    other = {r.agent: f"agent-{299 - number:03d}" for number, r in enumerate(sorted(contacts, key=_agent_of))}
+    _require(strategy.find(contacts) == found, "among 300 agents the order of the reports affects the result")
+    other = {r.agent: f"agent-{299 - number:03d}" for number, r in enumerate(sorted(contacts, key=_get_agent))}
     renamed = strategy.find([replace(r, agent=other[r.agent]) for r in contacts])
-    _demand(
+    _require(
         renamed.assigned_agent == other[str(found.assigned_agent)], "the winner depends on the numbers of the agents"
     )
 
 
-def check_group(make: Make) -> None:
+def check_group(make: Factory) -> None:
     """Several tasks at once: one decision each, no agent beyond its capacity, independent of the order."""
     strategy: Any = make()
     if not hasattr(strategy, "find_group"):
         return
-    for rng, contacts in _teams():
+    for rng, contacts in _make_teams():
         items = [Item(f"task-{number}", (rng.uniform(-9.0, 9.0), rng.uniform(-9.0, 9.0))) for number in range(5)]
         capacity_of = {r.agent: rng.randint(1, 2) for r in contacts}
         bids = [
@@ -242,43 +242,47 @@ def check_group(make: Make) -> None:
             for item in items
         ]
         found = strategy.find_group(bids, items)
-        _demand(
+        _require(
             [f.task for f in found] == [item.task for item in items],
             "find_group does not return one decision for each task",
             bids,
         )
         assigned = [f.assigned_agent for f in found if f.assigned_agent is not None]
-        _demand(
+        _require(
             all(assigned.count(agent) <= capacity_of[agent] for agent in assigned),
             "an agent has more tasks than its capacity",
             bids,
         )
-        _demand(
+        _require(
             len(assigned) == min(len(items), sum(capacity_of.values())),
             "a task has no agent although one has capacity left",
             bids,
         )
         mixed, turned = [*bids, *bids[:3]], items[::-1]
         rng.shuffle(mixed)
-        _demand(strategy.find_group(mixed, turned) == found, "the order of the bids or tasks affects the result", bids)
-        hostile: list[Any] = [replace(bids[0], **change) for change in HOSTILE if "agent" not in change]
-        _demand(strategy.find_group([*bids, *hostile], items) == found, "an invalid bid affects the result", bids)
+        _require(strategy.find_group(mixed, turned) == found, "the order of the bids or tasks affects the result", bids)
+        hostile: list[Any] = [replace(bids[0], **change) for change in INVALID_CHANGES if "agent" not in change]
+        _require(strategy.find_group([*bids, *hostile], items) == found, "an invalid bid affects the result", bids)
 
 
-def check_reads(make: Make) -> None:
+def check_reads(make: Factory) -> None:
     """A field that ``reads`` does not name is hidden in a running team, and must not affect the decision."""
     strategy = make()
-    hidden: dict[str, Any] = {name: getattr(_BARE, name) for name in READABLE if name not in reads_of(strategy)}
-    for _, contacts in _teams():
+    hidden: dict[str, Any] = {
+        name: getattr(_DEFAULT_REPORT, name) for name in READABLE if name not in find_read_fields(strategy)
+    }
+    for _, contacts in _make_teams():
         with_all_fields = strategy.find(contacts)
         with_visible_fields = strategy.find([replace(report, **hidden) for report in contacts])
         same = [(f.assigned_agent, f.standby, f.value, f.choice) for f in (with_all_fields, with_visible_fields)]
-        _demand(
-            same[0] == same[1], f"it reads more fields than {', '.join(reads_of(strategy)) or 'the cost'}", contacts
+        _require(
+            same[0] == same[1],
+            f"it reads more fields than {', '.join(find_read_fields(strategy)) or 'the cost'}",
+            contacts,
         )
 
 
-CHECKS: dict[str, Callable[[Make], None]] = {
+CHECKS: dict[str, Callable[[Factory], None]] = {
     "name": check_name,
     "purity": check_purity,
     "order": check_order,
@@ -294,7 +298,7 @@ CHECKS: dict[str, Callable[[Make], None]] = {
 }
 
 
-def broken(make: Make) -> dict[str, str]:
+def broken(make: Factory) -> dict[str, str]:
     """Return the rules that a strategy breaks, with the reason; an exception breaks the rule."""
     found = {}
     for name, check in CHECKS.items():
@@ -311,7 +315,7 @@ class Conformance:
     make: Any
 
 
-def _test_of(check: Callable[[Make], None]) -> Callable[[Conformance], None]:
+def _make_test(check: Callable[[Factory], None]) -> Callable[[Conformance], None]:
     def test(self: Conformance) -> None:
         check(type(self).make)
 
@@ -320,20 +324,20 @@ def _test_of(check: Callable[[Make], None]) -> Callable[[Conformance], None]:
 
 
 for _name, _check in CHECKS.items():
-    setattr(Conformance, f"test_{_name}", _test_of(_check))
+    setattr(Conformance, f"test_{_name}", _make_test(_check))
 
 
-def _agent_of(report: Report) -> str:
+def _get_agent(report: Report) -> str:
     return report.agent
 
 
-def _teams() -> Iterator[tuple[random.Random, list[Report]]]:
-    for number in range(TEAMS):
+def _make_teams() -> Iterator[tuple[random.Random, list[Report]]]:
+    for number in range(TEAM_COUNT):
         rng = random.Random(f"conformance/{number}")
-        yield rng, team(rng)
+        yield rng, make_team(rng)
 
 
-def _demand(is_so: bool, otherwise: str, contacts: Sequence[Report] = ()) -> None:
+def _require(is_so: bool, otherwise: str, contacts: Sequence[Report] = ()) -> None:
     if not is_so:
         examples = "; ".join(f"{r.agent!s:.40}: {r.cost!r:.20}" for r in contacts[:6])
         raise Breach(f"{otherwise}{', e.g. ' + examples if examples else ''}")

@@ -13,7 +13,7 @@ from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field
 from typing import Protocol
 
-from middleware.consensus.deployed import STRATEGY, Deployed, is_deployed, maker_of
+from middleware.consensus.deployed_modules import STRATEGY, DeployedModules, find_factory, is_deployed
 from middleware.errors import UnknownStrategy
 
 BUILT_IN = {
@@ -28,7 +28,7 @@ BUILT_IN = {
     "sequential": "middleware.consensus.strategies.sequential:Sequential",
     "weighted_vote": "middleware.consensus.strategies.weighted_vote:WeightedVote",
 }
-ENTRY_POINTS = "swarm_node.strategies"
+ENTRY_POINT_GROUP = "swarm_node.strategies"
 MAX_NUMBER = 1e9
 """Upper bound of costs, weights and coordinates; such numbers add up without loss of precision."""
 MAX_WHOLE = 2**53
@@ -36,7 +36,7 @@ MAX_NAME = 200
 READABLE = ("battery", "load", "value", "choice", "weight", "electorate")
 """The fields of ``Report`` that a strategy may read besides the cost.  A strategy without ``reads`` gets all of them.
 """
-SHOWN = 40
+MAX_SHOWN_CHARACTERS = 40
 LABELS = ("cost", "weight", "electorate", "load", "age", "valid_for")
 
 
@@ -111,7 +111,7 @@ class ConsensusAlgorithm(Protocol):
     every node, for example by uuid.  ``middleware.consensus.conformance`` tests an implementation against all rules.
 
     A strategy may also have an attribute ``reads``, the names out of ``READABLE`` of the fields that it uses besides
-    the cost, and a method ``find_group`` to decide several tasks at once (``middleware.consensus.item``).
+    the cost, and a method ``find_group`` to decide several tasks at once (``middleware.consensus.assignment``).
     """
 
     name: str
@@ -164,12 +164,12 @@ def refusal(report: Report) -> str:
     return ""
 
 
-def cost_of(report: Report) -> float:
+def get_cost(report: Report) -> float:
     """Return the report's cost: the default rank."""
     return report.cost
 
 
-def standing(contacts: Iterable[Report], rank: Callable[[Report], float] = cost_of) -> tuple[Report, ...]:
+def standing(contacts: Iterable[Report], rank: Callable[[Report], float] = get_cost) -> tuple[Report, ...]:
     """Return the valid reports of the newest epoch, one per task and agent, sorted by task and agent.
 
     Of several reports of one agent the one with the lowest ``rank`` counts. The operation is a join: order, grouping
@@ -186,7 +186,7 @@ def standing(contacts: Iterable[Report], rank: Callable[[Report], float] = cost_
     return tuple(best[key] for key in sorted(best))
 
 
-def led_by(
+def build_consensus(
     name: str,
     order: Sequence[Report],
     counted: Sequence[Report],
@@ -214,7 +214,7 @@ def led_by(
     )
 
 
-def reads_of(strategy: object) -> tuple[str, ...]:
+def find_read_fields(strategy: object) -> tuple[str, ...]:
     """Return the fields that ``strategy`` reads besides the cost, in the order of ``READABLE``.
 
     A strategy without ``reads`` gets all fields.
@@ -226,10 +226,10 @@ def reads_of(strategy: object) -> tuple[str, ...]:
         return READABLE
 
 
-def agreement(value: tuple[float, ...], choice: str) -> str:
+def format_agreement(value: tuple[float, ...], choice: str) -> str:
     """Format the agreed number, place or option for display; "" if there is none."""
     if choice:
-        return choice[:SHOWN]
+        return choice[:MAX_SHOWN_CHARACTERS]
     if len(value) == 1:
         return f"{value[0]:.2f}"
     return f"({', '.join(f'{number:.2f}' for number in value)})" if value else ""
@@ -241,7 +241,7 @@ def digest_of(contacts: Iterable[Report]) -> str:
     return hashlib.blake2s("".join(texts).encode(errors="replace"), digest_size=4).hexdigest()
 
 
-def strategy_for(name: str, dotted: bool = False, deployed: Deployed | None = None) -> ConsensusAlgorithm:
+def load_strategy(name: str, dotted: bool = False, deployed: DeployedModules | None = None) -> ConsensusAlgorithm:
     """Load the strategy called ``name``: a built-in one, or an entry point of the group ``swarm_node.strategies``.
 
     ``deployed:x`` is the module ``x`` in ``deployed``, which an operator deployed to the team. With ``dotted``,
@@ -250,7 +250,7 @@ def strategy_for(name: str, dotted: bool = False, deployed: Deployed | None = No
     """
     if is_deployed(name):
         return _create_deployed(name, deployed or {})
-    module, _, attribute = place_of(name, dotted).partition(":")
+    module, _, attribute = find_import_path(name, dotted).partition(":")
     try:
         strategy: ConsensusAlgorithm = getattr(importlib.import_module(module), attribute)()
     except Exception as error:  # third-party code may raise anything
@@ -258,13 +258,13 @@ def strategy_for(name: str, dotted: bool = False, deployed: Deployed | None = No
     return strategy
 
 
-def place_of(name: str, dotted: bool = False) -> str:
+def find_import_path(name: str, dotted: bool = False) -> str:
     """Return the import path ``module:Class`` of a strategy without importing it; raises ``UnknownStrategy``."""
     target = name if dotted and ":" in name else BUILT_IN.get(name)
     if target is None:
         from importlib.metadata import entry_points  # slow to import, and rarely needed
 
-        found = {point.name: point.value for point in entry_points(group=ENTRY_POINTS)}
+        found = {point.name: point.value for point in entry_points(group=ENTRY_POINT_GROUP)}
         target = found.get(name)
         if target is None:
             raise UnknownStrategy(f"unknown strategy {name!r}; known: {', '.join(sorted(BUILT_IN | found))}")
@@ -301,8 +301,8 @@ def _optional_fields(report: Report) -> str:
     return "" if (given, more) == (("", 0, 0, (), "", 1.0, 1), (1.0, 0.0, 0.0)) else f"{given!r}{more!r};"
 
 
-def _create_deployed(name: str, deployed: Deployed) -> ConsensusAlgorithm:
-    make = maker_of(STRATEGY, name, deployed)
+def _create_deployed(name: str, deployed: DeployedModules) -> ConsensusAlgorithm:
+    make = find_factory(STRATEGY, name, deployed)
     try:
         strategy: ConsensusAlgorithm = make()
     except Exception as error:  # third-party code may raise anything

@@ -18,11 +18,11 @@ import sys
 from collections.abc import Callable
 from contextlib import suppress
 
-MEMORY = 256 * 1024 * 1024
+MEMORY_BYTES = 256 * 1024 * 1024
 """Bytes of address space in addition to the libraries."""
 CPU_S = 3600
 """Seconds of processor time per process; then it is killed, and restarted at the next request."""
-NOBODY = 65534
+NOBODY_ID = 65534
 
 _CLONE_NEWNET, _CLONE_NEWUSER, _CLONE_NEWIPC = 0x40000000, 0x10000000, 0x08000000
 _PR_SET_PDEATHSIG, _PR_SET_DUMPABLE, _PR_SET_NO_NEW_PRIVS = 1, 4, 38
@@ -32,7 +32,7 @@ _KILL, _ERRNO_EPERM, _ALLOW = 0x80000000, 0x00050001, 0x7FFF0000
 _LOAD, _JUMP_EQUAL, _RETURN = 0x20, 0x15, 0x06
 _NUMBER_AT, _ARCHITECTURE_AT = 0, 4
 
-CALLS = (
+ALLOWED_CALLS = (
     *("read", "write", "close", "lseek", "mmap", "munmap", "mprotect", "mremap", "madvise", "brk"),
     *("rt_sigaction", "rt_sigprocmask", "rt_sigreturn", "sigaltstack", "restart_syscall"),
     *("futex", "set_robust_list", "rseq", "sched_yield", "getpid", "getrandom"),
@@ -83,7 +83,7 @@ def confine(parent: int) -> list[str]:
     return held
 
 
-def filter_program(machine: str) -> bytes:
+def build_filter(machine: str) -> bytes:
     """Return the seccomp program for ``machine``, as ``struct sock_filter``; raises ``ValueError`` if it is unknown."""
     if machine not in _NUMBERS:
         raise ValueError(f"no system call numbers for {machine}")
@@ -105,7 +105,7 @@ def _set_limits() -> bool:
     with suppress(OSError, ValueError, IndexError), open("/proc/self/statm", encoding="ascii") as file:
         used = int(file.read().split()[0]) * resource.getpagesize()
     limits = {
-        "RLIMIT_AS": used + MEMORY,
+        "RLIMIT_AS": used + MEMORY_BYTES,
         "RLIMIT_CPU": CPU_S,
         "RLIMIT_NOFILE": 0,
         "RLIMIT_NPROC": 0,
@@ -133,8 +133,8 @@ def _leave_files() -> bool:
 
 def _become_nobody() -> bool:
     os.setgroups([])
-    os.setresgid(NOBODY, NOBODY, NOBODY)
-    os.setresuid(NOBODY, NOBODY, NOBODY)
+    os.setresgid(NOBODY_ID, NOBODY_ID, NOBODY_ID)
+    os.setresuid(NOBODY_ID, NOBODY_ID, NOBODY_ID)
     return True
 
 
@@ -152,7 +152,7 @@ def _end_with_parent(libc: ctypes.CDLL, parent: int) -> bool:
 
 
 def _install_filter(libc: ctypes.CDLL, machine: str) -> bool:
-    program = ctypes.create_string_buffer(filter_program(machine))
+    program = ctypes.create_string_buffer(build_filter(machine))
     size = (len(program) - 1) // 8
     # struct sock_fprog: a count and, after padding, the address of the instructions.
     pointer = struct.pack("@HP", size, ctypes.addressof(program))

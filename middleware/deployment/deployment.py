@@ -18,29 +18,36 @@ from twisted.logger import Logger
 
 from middleware.admission.roles import OPERATOR
 from middleware.config.settings import DeploymentSettings
-from middleware.consensus.deployed import STRATEGY, Make
-from middleware.deployment.frame import Spawn
-from middleware.deployment.manifest import MAX_SOURCE, Manifest, digest_of, manifest_of, manifests_key, source_key
+from middleware.consensus.deployed_modules import STRATEGY, Factory
+from middleware.deployment.manifest import (
+    MAX_SOURCE_BYTES,
+    Manifest,
+    compute_digest,
+    manifests_key,
+    parse_manifest,
+    source_key,
+)
+from middleware.deployment.module_channel import Spawn
+from middleware.deployment.module_store import ModuleStore
 from middleware.deployment.runner import PushedStrategy, Runner, State
-from middleware.deployment.shelf import Shelf
 from middleware.directory.presence import Presence
 from middleware.entangled.errors import EntangledError, NotRunning
 from middleware.entangled.node import EntangledNode
-from middleware.entangled.record import Record, hashed_key, unpacked
+from middleware.entangled.record import Record, hash_key, parse_record
 
-RETRY = 2.0
+RETRY_S = 2.0
 """Seconds until a source is requested again that no node could send."""
-WATCHING_S = 1.0
+WATCH_INTERVAL_S = 1.0
 """Seconds between two checks of authors and processes."""
-STARTING_S = 0.05
+START_CHECK_INTERVAL_S = 0.05
 """Seconds between two checks of a process that is starting."""
 IDLE_S = 60.0
 """Seconds after which the process of the previous version is ended if it is not used."""
-EDITIONS = 2
+STORED_EDITIONS = 2
 """Editions of one module that are stored: the running one and the previous one."""
-MAX_JUDGED = 256
+MAX_CHECKED_MANIFESTS = 256
 """Maximum number of manifests that are remembered as checked; a dropped one is checked and reported again."""
-MAX_NAME = 16
+MAX_AUTHOR_CHARACTERS = 16
 CONFINED = "seccomp"
 """The limit without which the device reports a module as not confined."""
 
@@ -79,19 +86,19 @@ class Deployment:
         wall: Callable[[], float],
         later: Later,
         allowed: DeploymentSettings,
-        shelf: Shelf,
+        shelf: ModuleStore,
         author_of: Callable[[bytes], Author],
         spawn: Spawn,
         seconds: Callable[[], float],
     ) -> None:
-        self.modules: dict[tuple[str, str], Make] = {}
+        self.modules: dict[tuple[str, str], Factory] = {}
         self._entangled = entangled
         self._presence = presence
         self._wall = wall
         self._later = later
         self._allowed = allowed
-        self._shelf = shelf
-        self._author_of = author_of
+        self._module_store = shelf
+        self._find_author = author_of
         self._spawn = spawn
         self._seconds = seconds
         self._wanted: dict[str, tuple[Manifest, Record]] = {}
@@ -104,21 +111,21 @@ class Deployment:
         self._unauthorized: dict[tuple[bytes, str], int] = {}
 
     @property
-    def held(self) -> Mapping[str, Manifest]:
+    def running_manifests(self) -> Mapping[str, Manifest]:
         """The manifests of the modules that run on this node, by name."""
         return {name: runner.manifest for name, (runner, _) in self._running.items()}
 
-    def open(self) -> None:
+    def load_stored(self) -> None:
         """Load the stored modules that the node would accept now."""
         found: dict[str, list[_Candidate]] = {}
-        for name, content in self._shelf.everything():
+        for name, content in self._module_store.list_modules():
             pair = _parse_stored(content)
             if pair is None:
                 self._publish_message(f"deployed file {name} is damaged and ignored")
                 continue
             record, source = pair
-            manifest = manifest_of(record)
-            reason = self._objection(record, manifest)
+            manifest = parse_manifest(record)
+            reason = self._find_objection(record, manifest)
             if manifest is None or reason:
                 self._refuse(record, manifest, reason)
             else:
@@ -127,7 +134,7 @@ class Deployment:
             # The newest one that loads; the previous one is used if the newest does not load.
             self._start(sorted(found[name], key=lambda each: each.manifest.rank, reverse=True), is_new=False)
         self._report()
-        self._later(WATCHING_S, self._watch)
+        self._later(WATCH_INTERVAL_S, self._watch)
 
     def follow(self) -> None:
         """Watch for pushed modules; call this once the node has joined."""
@@ -147,32 +154,32 @@ class Deployment:
             if known is not None and known.sequence == record.sequence:
                 continue
             self._records[slot] = record
-            while len(self._records) > MAX_JUDGED:
+            while len(self._records) > MAX_CHECKED_MANIFESTS:
                 del self._records[next(iter(self._records))]
-            self._judge(record)
+            self._check_record(record)
         self._report()
 
-    def _judge(self, record: Record) -> None:
-        manifest = manifest_of(record)
-        objection = self._author_objection(record) if self._is_listed(record) else ""
+    def _check_record(self, record: Record) -> None:
+        manifest = parse_manifest(record)
+        objection = self._check_author(record) if self._is_listed(record) else ""
         slot = (record.owner, record.name)
         if objection:
             self._unauthorized[slot] = record.sequence
         else:
             self._unauthorized.pop(slot, None)
-        reason = self._objection(record, manifest) or self._rank_objection(manifest)
+        reason = self._find_objection(record, manifest) or self._check_rank(manifest)
         if manifest is None or reason:
             self._refuse(record, manifest, reason)
-        elif manifest != self.held.get(manifest.name):
+        elif manifest != self.running_manifests.get(manifest.name):
             wanted = self._wanted.get(manifest.name)
-            if wanted is None or manifest.rank > wanted[0].rank or self._objection(wanted[1], wanted[0]):
+            if wanted is None or manifest.rank > wanted[0].rank or self._find_objection(wanted[1], wanted[0]):
                 self._wanted[manifest.name] = (manifest, record)
                 self._request_source(manifest, record)
 
     def _is_listed(self, record: Record) -> bool:
         return record.name in self._allowed.modules and record.owner.hex() in self._allowed.operators
 
-    def _objection(self, record: Record, manifest: Manifest | None) -> str:
+    def _find_objection(self, record: Record, manifest: Manifest | None) -> str:
         """Return the reason why this record may not run on this node; empty if it may."""
         if record.name not in self._allowed.modules:
             return "is not among this node's modules"
@@ -180,25 +187,25 @@ class Deployment:
             return f"comes from {record.owner.hex()[:8]}, no operator of this node"
         if not record.is_genuine():
             return "is not signed by its operator"
-        objection = self._author_objection(record)
+        objection = self._check_author(record)
         if objection:
             return objection
         if manifest is None:
             return "has a manifest that cannot be read"
-        if manifest.size > MAX_SOURCE:
-            return f"has {manifest.size} bytes, more than {MAX_SOURCE}"
+        if manifest.size > MAX_SOURCE_BYTES:
+            return f"has {manifest.size} bytes, more than {MAX_SOURCE_BYTES}"
         return ""
 
-    def _author_objection(self, record: Record) -> str:
+    def _check_author(self, record: Record) -> str:
         """Return the reason why the author may not push modules now; empty if it may."""
-        author = self._author_of(record.owner)
+        author = self._find_author(record.owner)
         if author.roles is None or OPERATOR in author.roles:
             return ""
         return f"comes from {record.owner.hex()[:8]}, which is no operator of the team now"
 
-    def _rank_objection(self, manifest: Manifest | None) -> str:
+    def _check_rank(self, manifest: Manifest | None) -> str:
         """Return the reason why the current version stays; empty if ``manifest`` is newer or identical."""
-        held = None if manifest is None else self.held.get(manifest.name)
+        held = None if manifest is None else self.running_manifests.get(manifest.name)
         if manifest is None or held is None or manifest == held:
             return ""
         if manifest.kind != held.kind:
@@ -214,7 +221,7 @@ class Deployment:
         if self._wanted.get(manifest.name) != (manifest, record):
             return
         try:
-            asked: Deferred[list[Record]] = self._entangled.get(hashed_key(source_key(manifest.digest)))
+            asked: Deferred[list[Record]] = self._entangled.get(hash_key(source_key(manifest.digest)))
         except NotRunning:
             return
         asked.addCallback(self._on_source, manifest, record)
@@ -222,12 +229,12 @@ class Deployment:
 
     def _on_source(self, records: list[Record], manifest: Manifest, record: Record) -> None:
         sources = [each.value for each in records if each.value is not None and len(each.value) == manifest.size]
-        source = next((each for each in sources if digest_of(each) == manifest.digest), None)
+        source = next((each for each in sources if compute_digest(each) == manifest.digest), None)
         if self._wanted.get(manifest.name) != (manifest, record):
             return
         if source is None:
             self._log.info("no node has the source of {name} {label} yet", name=manifest.name, label=manifest.label)
-            self._later(RETRY, self._request_source, manifest, record)
+            self._later(RETRY_S, self._request_source, manifest, record)
             return
         del self._wanted[manifest.name]
         self._start([_Candidate(manifest, record, source)], is_new=True)
@@ -236,7 +243,7 @@ class Deployment:
     def _on_source_error(self, failure: Any, manifest: Manifest, record: Record) -> None:
         failure.trap(EntangledError)
         if failure.check(NotRunning) is None:
-            self._later(RETRY, self._request_source, manifest, record)
+            self._later(RETRY_S, self._request_source, manifest, record)
 
     # -- processes --------------------------------------------------------------------------------------------------
 
@@ -249,7 +256,7 @@ class Deployment:
         if known is not None:
             known[0].stop("a newer one was pushed")
         runner = Runner(
-            manifest, candidates[0].source, self._spawn, self._seconds, lambda: self._objection(record, manifest)
+            manifest, candidates[0].source, self._spawn, self._seconds, lambda: self._find_objection(record, manifest)
         )
         self._starting[manifest.name] = (runner, record)
         runner.start()
@@ -260,9 +267,9 @@ class Deployment:
         name = runner.manifest.name
         if self._starting.get(name, (None,))[0] is not runner:
             return
-        runner.look()
+        runner.poll()
         if runner.state is State.STARTING:
-            self._later(STARTING_S, self._check_start, runner, candidates, is_new)
+            self._later(START_CHECK_INTERVAL_S, self._check_start, runner, candidates, is_new)
             return
         del self._starting[name]
         if runner.state is State.READY:
@@ -297,18 +304,18 @@ class Deployment:
 
     def _watch(self) -> None:
         """Stop modules that may no longer run, supervise processes, and check again authors that were not operators."""
-        self._later(WATCHING_S, self._watch)
+        self._later(WATCH_INTERVAL_S, self._watch)
         now = self._seconds()
         for runner, record in (*self._running.values(), *self._starting.values()):
-            reason = self._objection(record, runner.manifest)
+            reason = self._find_objection(record, runner.manifest)
             if reason:
                 self._stop_module(runner, record, reason)
             else:
-                runner.look()
+                runner.poll()
         for name, (runner, record) in list(self._previous.items()):
-            runner.look()
-            is_idle = not runner.instances and now - runner.asked_at > IDLE_S
-            reason = self._objection(record, runner.manifest) or ("a newer one was pushed" if is_idle else "")
+            runner.poll()
+            is_idle = not runner.instances and now - runner.last_request_at > IDLE_S
+            reason = self._find_objection(record, runner.manifest) or ("a newer one was pushed" if is_idle else "")
             if reason or runner.state is State.OUT:
                 runner.stop(reason)
                 del self._previous[name]
@@ -316,8 +323,8 @@ class Deployment:
             known = self._records.get(slot)
             if known is None or known.sequence != sequence:
                 del self._unauthorized[slot]
-            elif not self._author_objection(known):
-                self._judge(known)
+            elif not self._check_author(known):
+                self._check_record(known)
         self._report()
 
     def _stop_module(self, runner: Runner, record: Record, reason: str) -> None:
@@ -332,27 +339,27 @@ class Deployment:
             if before is not None:
                 before[0].stop(reason)
         for known in [each for each in self._records.values() if each.name == manifest.name]:
-            self._judge(known)
+            self._check_record(known)
         self._refuse(record, manifest, reason)
 
     # -- storage and reports ----------------------------------------------------------------------------------------
 
     def _store(self, candidate: _Candidate) -> None:
         manifest = candidate.manifest
-        content = bytes(msgpack.packb([candidate.record.packed(), candidate.source]))
+        content = bytes(msgpack.packb([candidate.record.pack(), candidate.source]))
         try:
-            self._shelf.keep(_file_name(manifest), content)
+            self._module_store.save(_file_name(manifest), content)
         except OSError as error:
             self._publish_message(f"cannot store {manifest.name} {manifest.version}: {error.strerror or error}")
             return
         kept = []
-        for name, data in self._shelf.everything():
+        for name, data in self._module_store.list_modules():
             pair = _parse_stored(data)
-            other = None if pair is None else manifest_of(pair[0])
+            other = None if pair is None else parse_manifest(pair[0])
             if other is not None and other.name == manifest.name:
                 kept.append((other.rank, name))
-        for _, name in sorted(kept, reverse=True)[EDITIONS:]:
-            self._shelf.drop(name)
+        for _, name in sorted(kept, reverse=True)[STORED_EDITIONS:]:
+            self._module_store.delete(name)
 
     def _refuse(self, record: Record, manifest: Manifest | None, reason: str) -> None:
         version = "" if manifest is None else f" {manifest.version}"
@@ -384,11 +391,11 @@ class Deployment:
     def _describe(self, record: Record, manifest: Manifest | None) -> str:
         """Return version, digest and author of a module for display."""
         label = "" if manifest is None else f"{manifest.label} "
-        name = "".join(c for c in self._author_of(record.owner).name[:MAX_NAME] if c.isprintable())
+        name = "".join(c for c in self._find_author(record.owner).name[:MAX_AUTHOR_CHARACTERS] if c.isprintable())
         return f"{label}by {name} {record.owner.hex()[:8]}".replace("  ", " ")
 
     def _publish_message(self, text: str) -> None:
-        self._presence.say(self._wall(), text)
+        self._presence.add_message(self._wall(), text)
 
 
 def _describe_state(runner: Runner) -> str:
@@ -409,5 +416,5 @@ def _parse_stored(content: bytes) -> tuple[Record, bytes] | None:
         return None
     if not isinstance(fields, list) or len(fields) != 2 or not isinstance(fields[1], bytes):
         return None
-    record = unpacked(fields[0])
+    record = parse_record(fields[0])
     return None if record is None else (record, fields[1])

@@ -13,16 +13,16 @@ from dataclasses import asdict, dataclass
 
 import msgpack
 
-from middleware.consensus.deployed import KINDS
-from middleware.entangled.record import Record, hashed_key
-from middleware.entangled.value import bounded, is_whole, mapping_of
+from middleware.consensus.deployed_modules import KINDS
+from middleware.entangled.record import Record, hash_key
+from middleware.entangled.value import check_size, is_natural, parse_mapping
 
 DEPLOYMENTS = "deployments"
-NAME = r"[a-z][a-z0-9_-]{0,31}"
-MAX_SOURCE = 256 * 1024
+NAME_PATTERN = r"[a-z][a-z0-9_-]{0,31}"
+MAX_SOURCE_BYTES = 256 * 1024
 """Maximum size of a module's source in bytes; a strategy has a few thousand."""
 MAX_VERSION = 10**9
-KEPT = 4
+MAX_PREVIOUS_EDITIONS = 4
 """Number of previous versions that a manifest lists for a rollback."""
 
 
@@ -69,15 +69,15 @@ class Manifest:
         """Version and first digits of the digest, as devices report them."""
         return f"{self.version} {self.digest[:8]}"
 
-    def packed(self) -> bytes:
+    def pack(self) -> bytes:
         """Return the value of the manifest's record."""
         content = asdict(self)
         content["digest"] = bytes.fromhex(self.digest)
         content["before"] = [[e.version, bytes.fromhex(e.digest), e.size] for e in self.before]
-        return bounded(bytes(msgpack.packb(content)))
+        return check_size(bytes(msgpack.packb(content)))
 
 
-def digest_of(source: bytes) -> str:
+def compute_digest(source: bytes) -> str:
     """Return the SHA-256 of a source, in hex."""
     return hashlib.sha256(source).hexdigest()
 
@@ -89,24 +89,26 @@ def source_key(digest: str) -> str:
 
 def manifests_key() -> bytes:
     """Return the key of all manifests of a team."""
-    return hashed_key(DEPLOYMENTS)
+    return hash_key(DEPLOYMENTS)
 
 
-def newest(manifests: Iterable[Manifest]) -> Manifest | None:
+def find_newest(manifests: Iterable[Manifest]) -> Manifest | None:
     """Return the winning manifest among several of one name."""
     return max(manifests, key=lambda manifest: (manifest.rank, manifest.digest), default=None)
 
 
-def pushed(name: str, kind: str, source: bytes, held: Manifest | None, version: int | None = None) -> Manifest:
+def make_next_manifest(
+    name: str, kind: str, source: bytes, held: Manifest | None, version: int | None = None
+) -> Manifest:
     """Return the manifest of a new version after ``held``; ``version`` defaults to the next number."""
     if held is None:
-        return Manifest(name, kind, 1 if version is None else version, digest_of(source), len(source))
+        return Manifest(name, kind, 1 if version is None else version, compute_digest(source), len(source))
     following = held.rank[0] + 1 if version is None else version
-    before = (held.edition, *held.before)[:KEPT]
-    return Manifest(name, kind, following, digest_of(source), len(source), before, held.withdrawn)
+    before = (held.edition, *held.before)[:MAX_PREVIOUS_EDITIONS]
+    return Manifest(name, kind, following, compute_digest(source), len(source), before, held.withdrawn)
 
 
-def rolled_back(held: Manifest) -> Manifest | None:
+def make_rollback(held: Manifest) -> Manifest | None:
     """Return the manifest that rolls ``held`` back to the previous version, or None if there is none."""
     if not held.before:
         return None
@@ -114,24 +116,29 @@ def rolled_back(held: Manifest) -> Manifest | None:
     return Manifest(held.name, held.kind, edition.version, edition.digest, edition.size, rest, held.rank[0])
 
 
-def manifest_of(record: Record) -> Manifest | None:
+def parse_manifest(record: Record) -> Manifest | None:
     """Return the manifest in a record, or None if its value is not a valid manifest; never raises.
 
     Signature and permission of the author are not checked.
     """
-    content = mapping_of(record)
+    content = parse_mapping(record)
     if content is None:
         return None
     name, kind, before = content.get("name"), content.get("kind"), content.get("before")
     edition = _parse_edition([content.get("version"), content.get("digest"), content.get("size")])
     withdrawn = content.get("withdrawn")
-    if not isinstance(name, str) or name != record.name or not re.fullmatch(NAME, name, re.ASCII) or kind not in KINDS:
+    if (
+        not isinstance(name, str)
+        or name != record.name
+        or not re.fullmatch(NAME_PATTERN, name, re.ASCII)
+        or kind not in KINDS
+    ):
         return None
-    if not isinstance(withdrawn, int) or not is_whole(withdrawn) or withdrawn > MAX_VERSION:
+    if not isinstance(withdrawn, int) or not is_natural(withdrawn) or withdrawn > MAX_VERSION:
         return None
     if edition is None or not isinstance(before, list):
         return None
-    editions = [_parse_edition(fields) for fields in before[:KEPT]]
+    editions = [_parse_edition(fields) for fields in before[:MAX_PREVIOUS_EDITIONS]]
     valid = tuple(each for each in editions if each is not None)
     if len(valid) != len(editions) or any(each.version >= edition.version for each in valid):
         return None
@@ -142,5 +149,5 @@ def _parse_edition(fields: object) -> Edition | None:
     if not isinstance(fields, list) or len(fields) != 3:
         return None
     version, digest, size = fields
-    valid = is_whole(version) and 0 < version <= MAX_VERSION and is_whole(size)
+    valid = is_natural(version) and 0 < version <= MAX_VERSION and is_natural(size)
     return Edition(version, digest.hex(), size) if valid and isinstance(digest, bytes) and len(digest) == 32 else None

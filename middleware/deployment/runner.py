@@ -15,20 +15,20 @@ from typing import Any
 
 from twisted.logger import Logger
 
-from middleware.consensus.deployed import PREFIX
-from middleware.consensus.guard import STRIKES, Lost, NoOpinion
-from middleware.consensus.remote import RemoteStrategy
+from middleware.consensus.deployed_modules import PREFIX
+from middleware.consensus.guarded_strategy import MAX_LOSSES, StrategyError, StrategyLost
+from middleware.consensus.remote_strategy import RemoteStrategy
 from middleware.consensus.strategy import READABLE
-from middleware.deployment import frame
-from middleware.deployment.frame import CALL, DROP, FIRST, LOAD, MAKE, Channel, Gone, Spawn
+from middleware.deployment import module_channel
 from middleware.deployment.manifest import Manifest
+from middleware.deployment.module_channel import CALL, DROP, LOAD, MAKE, STRATEGY_INSTANCE, Channel, ProcessEnded, Spawn
 from middleware.errors import UnknownTask
 
 DEADLINE_S = 0.2
 """Maximum seconds that the node waits for the reply of a strategy; well below a third of a lease."""
-PATIENCE_S = 1.0
+REPLY_TIMEOUT_S = 1.0
 """Seconds after which a behaviour that has not replied is killed."""
-START_S = 20.0
+START_TIMEOUT_S = 20.0
 """Seconds within which a process has to be ready."""
 MAX_PENDING = 256
 """Maximum number of pending requests."""
@@ -56,7 +56,7 @@ TRANSITIONS: Mapping[State, frozenset[State]] = {
 @dataclass
 class _Pending:
     asked_at: float
-    take: Callable[[bool, Any], None]
+    on_reply: Callable[[bool, Any], None]
 
 
 class Runner:
@@ -82,12 +82,12 @@ class Runner:
         self.why = ""
         self.limits: tuple[str, ...] = ()
         self.reads: tuple[str, ...] = READABLE
-        self.instances: set[Instance] = set()
-        self.asked_at = seconds()
+        self.instances: set[BehaviourInstance] = set()
+        self.last_request_at = seconds()
         self._source = source
         self._spawn = spawn
         self._seconds = seconds
-        self._objection = objection
+        self._find_objection = objection
         self._channel: Channel | None = None
         self._pending: dict[int, _Pending] = {}
         self._number = 0
@@ -96,7 +96,7 @@ class Runner:
 
     def start(self) -> None:
         """Start the process and have it load the module; poll the result with ``look``."""
-        why = self._objection()
+        why = self._find_objection()
         if why:
             return self.stop(why)
         self._set_state(State.STARTING)
@@ -104,20 +104,22 @@ class Runner:
         m = self.manifest
         try:
             self._channel = self._spawn()
-            self.ask(LOAD, [m.name, m.kind, m.version, m.digest, m.size, self._source], self._on_loaded)
-        except (Gone, OSError) as error:
+            self.send_request(LOAD, [m.name, m.kind, m.version, m.digest, m.size, self._source], self._on_loaded)
+        except (ProcessEnded, OSError) as error:
             self._kill(f"its process cannot be started: {error}")
 
-    def look(self) -> None:
+    def poll(self) -> None:
         """Process replies, and kill a process that is late."""
         self._process_replies(0.0)
         if self._channel is None:
             return
         now = self._seconds()
-        if self.state is State.STARTING and now - self._started_at > START_S:
-            self._kill(f"it was not loaded within {START_S:g} s")
-        elif self.state is State.READY and any(now - each.asked_at > PATIENCE_S for each in self._pending.values()):
-            self._kill(f"it did not answer within {PATIENCE_S:g} s")
+        if self.state is State.STARTING and now - self._started_at > START_TIMEOUT_S:
+            self._kill(f"it was not loaded within {START_TIMEOUT_S:g} s")
+        elif self.state is State.READY and any(
+            now - each.asked_at > REPLY_TIMEOUT_S for each in self._pending.values()
+        ):
+            self._kill(f"it did not answer within {REPLY_TIMEOUT_S:g} s")
 
     def stop(self, why: str) -> None:
         """End the process permanently."""
@@ -125,64 +127,64 @@ class Runner:
             self._set_state(State.OUT)
             self._end_process(why)
 
-    def wait_for(self, verb: str, arguments: list[Any]) -> Any:
+    def call(self, verb: str, arguments: list[Any]) -> Any:
         """Return the reply to one request, waiting at most ``DEADLINE_S``; raises ``NoOpinion``."""
-        self.asked_at = self._seconds()
+        self.last_request_at = self._seconds()
         if self.state is State.LOST:
             self.start()
         if self.state is State.STARTING:
-            self.look()
+            self.poll()
         if self.state is State.STARTING:
-            raise NoOpinion("it is still being loaded")
+            raise StrategyError("it is still being loaded")
         if self.state is not State.READY:
-            raise NoOpinion(self.why)
+            raise StrategyError(self.why)
         answers: list[tuple[bool, Any]] = []
         try:
-            self.ask(verb, arguments, lambda is_well, content: answers.append((is_well, content)))
-        except Gone as error:
+            self.send_request(verb, arguments, lambda is_well, content: answers.append((is_well, content)))
+        except ProcessEnded as error:
             self._kill(str(error))
         if not answers:
             self._process_replies(DEADLINE_S, lambda: bool(answers))
         if not answers:
             if self.state is State.READY:
                 self._kill(f"it did not answer within {DEADLINE_S:g} s")
-            raise Lost(self.why)
+            raise StrategyLost(self.why)
         is_well, content = answers[0]
         if not is_well:
-            raise NoOpinion(str(content))
+            raise StrategyError(str(content))
         return content
 
-    def ask(self, verb: str, arguments: list[Any], take: Callable[[bool, Any], None]) -> None:
+    def send_request(self, verb: str, arguments: list[Any], take: Callable[[bool, Any], None]) -> None:
         """Send a request without waiting; ``take`` is called with the reply, or with False and an error text.
 
         Raises ``Gone``.
         """
         if self._channel is None:
-            raise Gone(self.why or "its process has ended")
+            raise ProcessEnded(self.why or "its process has ended")
         if len(self._pending) >= MAX_PENDING:
-            raise Gone(f"{MAX_PENDING} requests are pending")
-        self.asked_at = self._seconds()
-        number = self.take_number()
-        self._pending[number] = _Pending(self.asked_at, take)
-        self._channel.send(frame.pack([number, verb, arguments]))
+            raise ProcessEnded(f"{MAX_PENDING} requests are pending")
+        self.last_request_at = self._seconds()
+        number = self.next_number()
+        self._pending[number] = _Pending(self.last_request_at, take)
+        self._channel.send(module_channel.pack([number, verb, arguments]))
 
-    def take_number(self) -> int:
+    def next_number(self) -> int:
         """Return a new number for a request or an instance."""
         self._number += 1
         return self._number
 
     @property
-    def is_behind(self) -> bool:
+    def has_unsent(self) -> bool:
         """Whether a part of a message is not sent yet."""
-        return self._channel is not None and self._channel.is_behind
+        return self._channel is not None and self._channel.has_unsent
 
-    def create(self, parameters: Mapping[str, Any], rng: random.Random) -> Instance:
+    def create(self, parameters: Mapping[str, Any], rng: random.Random) -> BehaviourInstance:
         """Create an instance of a behaviour; raises ``UnknownTask`` if it may not run."""
         if self.state is State.LOST:
             self.start()
         if self.state not in (State.STARTING, State.READY):
             raise UnknownTask(f"the behaviour {PREFIX}{self.manifest.name} does not run: {self.why}")
-        return Instance(self, dict(parameters), rng.getrandbits(48))
+        return BehaviourInstance(self, dict(parameters), rng.getrandbits(48))
 
     # -- implementation ---------------------------------------------------------------------------------------------
 
@@ -194,17 +196,17 @@ class Runner:
                 messages = self._channel.receive(max(0.0, end - self._seconds()))
                 for message in messages:
                     if self._channel is not None:
-                        self._take(*frame.unpack_answer(message))
+                        self._handle_reply(*module_channel.parse_reply(message))
                 if not messages or is_done():
                     return
-        except (Gone, frame.BadFrame) as error:
+        except (ProcessEnded, module_channel.BadFrame) as error:
             self._kill(str(error))
 
-    def _take(self, number: int, is_well: bool, content: Any) -> None:
+    def _handle_reply(self, number: int, is_well: bool, content: Any) -> None:
         pending = self._pending.pop(number, None)
         if pending is None:
-            raise Gone("it sent a reply without a request")
-        pending.take(is_well, content)
+            raise ProcessEnded("it sent a reply without a request")
+        pending.on_reply(is_well, content)
 
     def _on_loaded(self, is_well: bool, content: Any) -> None:
         if self.state is not State.STARTING:
@@ -221,18 +223,18 @@ class Runner:
             return
         self._log.warn("{name}: process killed: {why}", name=self.manifest.name, why=why)
         self._losses += 1
-        self._set_state(State.OUT if self._losses >= STRIKES else State.LOST)
+        self._set_state(State.OUT if self._losses >= MAX_LOSSES else State.LOST)
         self._end_process(why)
 
     def _end_process(self, why: str) -> None:
         self.why = why
         channel, self._channel = self._channel, None
         if channel is not None:
-            channel.end()
+            channel.kill()
         pending, self._pending = self._pending, {}
         self.instances.clear()
         for each in pending.values():
-            each.take(False, why)
+            each.on_reply(False, why)
 
     def _set_state(self, state: State) -> None:
         assert state in TRANSITIONS[self.state], (self.state, state)
@@ -247,12 +249,12 @@ class PushedStrategy(RemoteStrategy):
         self.name, self.version, self.reads = f"{PREFIX}{manifest.name}", manifest.label, runner.reads
         self._runner = runner
 
-    def ask(self, method: str, arguments: list[Any]) -> Any:
+    def call(self, method: str, arguments: list[Any]) -> Any:
         """Return the reply of the process; raises ``NoOpinion``."""
-        return self._runner.wait_for(CALL, [FIRST, method, arguments])
+        return self._runner.call(CALL, [STRATEGY_INSTANCE, method, arguments])
 
 
-class Instance:
+class BehaviourInstance:
     """One instance of a behaviour; it ends with the process that created it.
 
     ``fault`` is the reason why it cannot be called, empty while it can.
@@ -263,28 +265,28 @@ class Instance:
         self.facts: dict[str, Any] = {}
         self._runner = runner
         self._is_created = False
-        self._place = runner.take_number()
+        self._place = runner.next_number()
         self._creation: list[Any] | None = [self._place, [parameters, seed]]
         runner.instances.add(self)
         self._request_creation()
 
     @property
-    def is_behind(self) -> bool:
+    def has_unsent(self) -> bool:
         """Whether a part of a message is not sent yet."""
-        return self._runner.is_behind
+        return self._runner.has_unsent
 
-    def ask(self, method: str, arguments: list[Any], take: Callable[[bool, Any], None]) -> bool:
+    def send_request(self, method: str, arguments: list[Any], take: Callable[[bool, Any], None]) -> bool:
         """Send a request without waiting; returns whether that was possible.  ``take`` is as in ``Runner.ask``."""
-        self.look()
+        self.poll()
         if self.fault or not self._is_created:
             return False
         self._send(CALL, [self._place, method, arguments], take)
         return not self.fault
 
-    def look(self) -> None:
+    def poll(self) -> None:
         """Process replies."""
         if not self.fault:
-            self._runner.look()
+            self._runner.poll()
             self._request_creation()
 
     def close(self) -> None:
@@ -302,7 +304,7 @@ class Instance:
         elif self._creation is not None and self._runner.state is State.READY:
             creation, self._creation = self._creation, None
             self._send(MAKE, creation, self._on_created)
-            self._runner.look()
+            self._runner.poll()
 
     def _on_created(self, is_well: bool, content: Any) -> None:
         if is_well and isinstance(content, dict):
@@ -312,6 +314,6 @@ class Instance:
 
     def _send(self, verb: str, arguments: list[Any], take: Callable[[bool, Any], None]) -> None:
         try:
-            self._runner.ask(verb, arguments, take)
-        except Gone as error:
+            self._runner.send_request(verb, arguments, take)
+        except ProcessEnded as error:
             self.fault = str(error)

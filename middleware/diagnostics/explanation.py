@@ -9,10 +9,10 @@ from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 
-from middleware.consensus.strategy import agreement
-from middleware.consensus.verdict import MANY, Reported, Verdict
+from middleware.consensus.decision_record import MAX_REPORTS, DecisionRecord, RecordedReport
+from middleware.consensus.strategy import format_agreement
 
-TOLD = 3
+MAX_DIFFERENCES = 3
 """Maximum number of differing reports that are listed individually."""
 
 
@@ -25,7 +25,7 @@ class Difference:
 
 
 @dataclass(frozen=True)
-class Ruling:
+class EpochExplanation:
     """The result of one epoch: the agents' decision records compared.
 
     ``winner`` is the uuid that most agents named (the lowest on a tie), ``chosen`` its name.  ``agree`` are the names
@@ -48,7 +48,7 @@ class Ruling:
     digest: str
     token: int
     reported: int
-    reports: tuple[Reported, ...]
+    reports: tuple[RecordedReport, ...]
     silent: tuple[str, ...]
     agreed: str = ""
 
@@ -58,80 +58,80 @@ class Explanation:
     """The explanation of a task's assignments: its rulings, newest epoch first."""
 
     task: str
-    epochs: tuple[Ruling, ...] = ()
+    epochs: tuple[EpochExplanation, ...] = ()
 
 
-def explained(verdicts: Iterable[Verdict]) -> Explanation:
+def explain_decisions(verdicts: Iterable[DecisionRecord]) -> Explanation:
     """Compare the decision records of one task, in any order."""
-    epochs: dict[int, dict[str, Verdict]] = {}
+    epochs: dict[int, dict[str, DecisionRecord]] = {}
     task = ""
-    for verdict in sorted(verdicts, key=lambda v: (v.epoch, v.agent, v.packed())):
+    for verdict in sorted(verdicts, key=lambda v: (v.epoch, v.agent, v.pack())):
         task = verdict.task
         epochs.setdefault(verdict.epoch, {})[verdict.agent] = verdict
-    rulings = [_make_ruling(epoch, list(epochs[epoch].values())) for epoch in sorted(epochs, reverse=True)]
+    rulings = [_explain_epoch(epoch, list(epochs[epoch].values())) for epoch in sorted(epochs, reverse=True)]
     return Explanation(task, tuple(rulings))
 
 
-def as_text(explanation: Explanation) -> str:
+def format_explanation(explanation: Explanation) -> str:
     """Return the explanation as text, newest epoch first; empty if there is no decision yet."""
-    return "".join(_format_ruling(ruling) for ruling in explanation.epochs)
+    return "".join(_format_epoch(ruling) for ruling in explanation.epochs)
 
 
 # -- implementation -----------------------------------------------------------------------------------------------
 
 
-def _make_ruling(epoch: int, verdicts: Sequence[Verdict]) -> Ruling:
+def _explain_epoch(epoch: int, verdicts: Sequence[DecisionRecord]) -> EpochExplanation:
     votes = Counter(v.winner for v in verdicts)
     winner = min(votes, key=lambda uuid: (-votes[uuid], not uuid, uuid))
     agreeing = [v for v in verdicts if v.winner == winner]
-    grounds = Counter(_basis(v) for v in agreeing)
+    grounds = Counter(_get_basis(v) for v in agreeing)
     most = min(grounds, key=lambda ground: (-grounds[ground], ground))
-    reference = next(v for v in agreeing if _basis(v) == most)
+    reference = next(v for v in agreeing if _get_basis(v) == most)
     names = {r.agent: r.name for v in verdicts for r in v.reports} | {v.agent: v.name for v in verdicts}
     differ = [Difference(v.name, what) for v in verdicts if (what := _describe_differences(v, reference, names))]
     deciders = {v.agent for v in verdicts}
     missing = [r.name for r in reference.reports if r.agent not in deciders]
     differ += [Difference(name, "has no decision record") for name in missing]
-    return Ruling(
+    return EpochExplanation(
         epoch,
         winner,
-        _name(winner, names),
+        _find_name(winner, names),
         tuple(sorted(v.name for v in agreeing)),
-        max(len(verdicts), reference.participants if reference.participants <= MANY else len(reference.reports)),
+        max(len(verdicts), reference.participants if reference.participants <= MAX_REPORTS else len(reference.reports)),
         tuple(sorted(differ, key=lambda each: (each.name, each.what))),
         reference.rule,
         reference.version,
         reference.hysteresis,
-        tuple(_name(uuid, names) for uuid in reference.standby),
+        tuple(_find_name(uuid, names) for uuid in reference.standby),
         reference.digest,
         max((v.token for v in agreeing if v.agent == winner), default=0),
         reference.reported,
         reference.reports,
         reference.silent,
-        agreement(reference.value, reference.choice),
+        format_agreement(reference.value, reference.choice),
     )
 
 
-def _basis(verdict: Verdict) -> tuple[str, str, str]:
+def _get_basis(verdict: DecisionRecord) -> tuple[str, str, str]:
     return (verdict.rule, verdict.version, verdict.digest)
 
 
-def _describe_differences(verdict: Verdict, reference: Verdict, names: Mapping[str, str]) -> str:
+def _describe_differences(verdict: DecisionRecord, reference: DecisionRecord, names: Mapping[str, str]) -> str:
     """Return the differences between a decision record and the majority's; empty if there are none."""
     differences = []
     if verdict.winner != reference.winner:
-        differences.append(f"names {_name(verdict.winner, names)}")
+        differences.append(f"names {_find_name(verdict.winner, names)}")
     if (verdict.rule, verdict.version) != (reference.rule, reference.version):
-        differences.append(f"decided by {_rule(verdict)}, not {_rule(reference)}")
-    agreed = agreement(verdict.value, verdict.choice)
-    if agreed != agreement(reference.value, reference.choice):
+        differences.append(f"decided by {_format_rule(verdict)}, not {_format_rule(reference)}")
+    agreed = format_agreement(verdict.value, verdict.choice)
+    if agreed != format_agreement(reference.value, reference.choice):
         differences.append(f"agreed on {agreed or 'nothing'}")
     if verdict.digest != reference.digest:
         differences.append(_describe_other_reports(verdict, reference))
     return "; ".join(differences)
 
 
-def _describe_other_reports(verdict: Verdict, reference: Verdict) -> str:
+def _describe_other_reports(verdict: DecisionRecord, reference: DecisionRecord) -> str:
     are_whole = all(len(v.reports) == v.reported for v in (verdict, reference))
     own, other = ({r.agent: r for r in v.reports} for v in (verdict, reference))
     differences = []
@@ -146,11 +146,11 @@ def _describe_other_reports(verdict: Verdict, reference: Verdict) -> str:
             differences.append(f"{own[agent].name} with {own[agent].more or 'nothing more'}")
     if not are_whole or not differences:
         return "knew other reports"
-    more = [f"{len(differences) - TOLD} more"] if len(differences) > TOLD else []
-    return f"knew {', '.join([*differences[:TOLD], *more])}"
+    more = [f"{len(differences) - MAX_DIFFERENCES} more"] if len(differences) > MAX_DIFFERENCES else []
+    return f"knew {', '.join([*differences[:MAX_DIFFERENCES], *more])}"
 
 
-def _format_ruling(ruling: Ruling) -> str:
+def _format_epoch(ruling: EpochExplanation) -> str:
     """Return one ruling as lines of text."""
     token = f", token {ruling.token}" if ruling.token else ""
     lines = [f"epoch {ruling.epoch}: {ruling.chosen}, {len(ruling.agree)} of {ruling.of} agree{token}"]
@@ -172,9 +172,9 @@ def _format_ruling(ruling: Ruling) -> str:
     return "".join(f"{line}\n" for line in lines)
 
 
-def _rule(verdict: Verdict) -> str:
+def _format_rule(verdict: DecisionRecord) -> str:
     return f"{verdict.rule} {verdict.version}".rstrip()
 
 
-def _name(uuid: str, names: Mapping[str, str]) -> str:
+def _find_name(uuid: str, names: Mapping[str, str]) -> str:
     return names.get(uuid, uuid[:8]) or "nobody"

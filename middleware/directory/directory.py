@@ -11,20 +11,28 @@ from typing import Any, NamedTuple
 
 from twisted.internet.defer import Deferred, DeferredList
 
-from middleware.directory.listing import Listing, standing
-from middleware.directory.prefix import ROOT, Prefix, depth_for, lease_at, places_of, prefix_of, size_of
+from middleware.directory.listing import Listing, select_listed
+from middleware.directory.prefix import (
+    ROOT,
+    Prefix,
+    choose_depth,
+    compute_lease,
+    compute_places,
+    compute_prefix,
+    estimate_size,
+)
 from middleware.directory.presence import Device
-from middleware.entangled.background import Background, paced
+from middleware.entangled.background import Background, run_limited
 from middleware.entangled.errors import EntangledError
 from middleware.entangled.node import EntangledNode
 from middleware.entangled.record import Record
-from middleware.entangled.replication.reader import ReadConcern
+from middleware.entangled.replication.reader import ReadConsistency
 
-AT_ONCE = 8
+CONCURRENT_READS = 8
 """Number of places that one listing reads concurrently."""
-PLACED, PLACED_STEP = 50, 0.1
+PLACEMENT_STEPS, PLACEMENT_STEP_S = 50, 0.1
 """Number of steps for which a new node waits until it knows its neighbours, and their duration in seconds."""
-WIDER = 2
+PARTIAL_SEARCH_LEVELS = 2
 """Number of depths above its own at which a device starts a partial search: about four places."""
 
 Matches = Callable[[Device], bool]
@@ -38,7 +46,7 @@ class Page(NamedTuple):
     """
 
     records: list[Record]
-    following: bytes | None
+    next_id: bytes | None
     is_complete: bool
 
 
@@ -58,38 +66,40 @@ class Directory:
         """The estimated number of devices; in a small team the number of known ones."""
         overlay = self.entangled.overlay
         contacts = overlay.contacts()
-        is_large = overlay.roster.is_full or (overlay.is_large and not overlay.is_complete)
-        return size_of(self._own_id, contacts) if is_large else len(contacts) + 1
+        is_large = overlay.members.is_full or (overlay.is_large and not overlay.is_complete)
+        return estimate_size(self._own_id, contacts) if is_large else len(contacts) + 1
 
     @property
     def lease(self) -> float:
         """Seconds for which this device remains listed after its last renewal."""
-        return lease_at(self.depth, self.entangled.lease)
+        return compute_lease(self.depth, self.entangled.lease)
 
     # -- the own record -----------------------------------------------------------------------------------------------
 
-    async def arrive(self) -> int:
+    async def choose_initial_depth(self) -> int:
         """Return the initial depth; in a large team, wait first until this node knows its neighbours."""
         overlay = self.entangled.overlay
-        for _ in range(PLACED):
-            if overlay.is_placed or not overlay.is_large:
+        for _ in range(PLACEMENT_STEPS):
+            if overlay.has_found_neighbours or not overlay.is_large:
                 break
-            await self.chores.sleep(PLACED_STEP)
-        self.depth = depth_for(self.size)
+            await self.chores.sleep(PLACEMENT_STEP_S)
+        self.depth = choose_depth(self.size)
         return self.depth
 
-    def review(self) -> int:
+    def update_depth(self) -> int:
         """Return the depth from now on: one more or less if the team's size has changed."""
-        self.depth = depth_for(self.size, self.depth)
+        self.depth = choose_depth(self.size, self.depth)
         return self.depth
 
     def announce(self, name: str, value: bytes, depth: int) -> Deferred[Any]:
         """Write the device's packed record at its places at ``depth``, then release its previous places."""
-        lease = lease_at(depth, self.entangled.lease)
-        new_places = {(key, name) for key in places_of(self._own_id, depth)}
+        lease = compute_lease(depth, self.entangled.lease)
+        new_places = {(key, name) for key in compute_places(self._own_id, depth)}
         self._old_places = (self._old_places | self._current_places) - new_places
         self._current_places = new_places
-        puts = [self.entangled.put(key, name, value, "leased", lease=lease) for key in places_of(self._own_id, depth)]
+        puts = [
+            self.entangled.put(key, name, value, "leased", lease=lease) for key in compute_places(self._own_id, depth)
+        ]
         return puts[0] if len(puts) == 1 and not self._old_places else self._release_old(puts)
 
     def _release_old(self, puts: list[Deferred[Any]]) -> Deferred[Any]:
@@ -106,15 +116,15 @@ class Directory:
     # -- other devices
     # --------------------------------------------------------------------------------------------------
 
-    async def around(self) -> list[Record]:
+    async def read_neighbourhood(self) -> list[Record]:
         """Return the devices in this device's own neighbourhood, including itself; all devices of an undivided team."""
-        place = prefix_of(self._own_id, max(0, self.depth - 1))
+        place = compute_prefix(self._own_id, max(0, self.depth - 1))
         records = await self.entangled.get(place.key)
-        return [record for _, record in standing(place.key, records)] if self.depth else records
+        return [record for _, record in select_listed(place.key, records)] if self.depth else records
 
-    async def listed(
+    async def list_devices(
         self,
-        concern: ReadConcern = "majority",
+        concern: ReadConsistency = "majority",
         under: Prefix = ROOT,
         heard: Callable[[Listing], None] = lambda listing: None,
         pause: float = 0.0,
@@ -128,27 +138,27 @@ class Directory:
 
         async def visit(place: Prefix) -> None:
             try:
-                return listing.read(place, await self.entangled.get(place.key, concern))
+                return listing.add_records(place, await self.entangled.get(place.key, concern))
             except EntangledError:
                 pass
             try:
                 # If half of the replicas have failed at once, use the records of any other, but mark the place as
                 # incomplete.
-                listing.read(place, await self.entangled.get(place.key, "fast"))
+                listing.add_records(place, await self.entangled.get(place.key, "fast"))
                 listing.missed.append(place)
             except EntangledError:
-                listing.failed(place)
+                listing.on_failure(place)
 
         while True:
-            places = [place for _ in range(AT_ONCE) if (place := listing.next()) is not None]
+            places = [place for _ in range(CONCURRENT_READS) if (place := listing.take_next()) is not None]
             if not places:
                 return listing
-            await paced(AT_ONCE, map(visit, places))
+            await run_limited(CONCURRENT_READS, map(visit, places))
             heard(listing)
             if pause and not listing.is_over:
                 await self.chores.sleep(pause)
 
-    async def some(
+    async def find_devices(
         self, count: int, matches: Matches = lambda device: True, after: bytes | None = None, most_reads: int = 64
     ) -> Page:
         """Find ``count`` or more devices for which ``matches`` returns True, and the id to continue from.
@@ -157,12 +167,12 @@ class Directory:
         replicas, and continues around the id space.  It stops after ``most_reads`` places in any case.
         """
         begin = self._own_id if after is None else after
-        depth = max(0, self.depth - WIDER)
+        depth = max(0, self.depth - PARTIAL_SEARCH_LEVELS)
         found: dict[bytes, Record] = {}
         is_complete, reads = True, 0
-        place = prefix_of(begin, depth)
+        place = compute_prefix(begin, depth)
         for _ in range(1 << depth):
-            listing = await self.listed(under=place)
+            listing = await self.list_devices(under=place)
             is_complete &= listing.is_complete
             reads += listing.reads
             found.update((record.owner, record) for device, record in listing.devices if matches(device))

@@ -9,12 +9,12 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 
-from middleware.directory.prefix import ROOT, Prefix, places_of
-from middleware.directory.presence import Device, device_of
-from middleware.entangled.identity import node_id
+from middleware.directory.prefix import ROOT, Prefix, compute_places
+from middleware.directory.presence import Device, parse_device
+from middleware.entangled.identity import derive_node_id
 from middleware.entangled.record import Record
 
-MOST_READS = 20_000
+MAX_READS = 20_000
 """Maximum number of places that one listing reads; beyond it the listing is incomplete."""
 
 
@@ -26,49 +26,49 @@ class Listing:
 
     def __init__(self, floor: int = 0, under: Prefix = ROOT) -> None:
         self._floor = floor
-        self._waiting = [under]
+        self._unread = [under]
         self._found: dict[bytes, tuple[Device, Record]] = {}
-        self._open = 0
+        self._pending_reads = 0
         self.reads = 0
         self.missed: list[Prefix] = []
 
-    def next(self) -> Prefix | None:
+    def take_next(self) -> Prefix | None:
         """Return a place to read now, or None if none is known at present (call again after the next ``read``)."""
-        if not self._waiting:
+        if not self._unread:
             return None
-        if self.reads >= MOST_READS:
-            self.missed += self._waiting
-            self._waiting.clear()
+        if self.reads >= MAX_READS:
+            self.missed += self._unread
+            self._unread.clear()
             return None
         self.reads += 1
-        self._open += 1
-        return self._waiting.pop()
+        self._pending_reads += 1
+        return self._unread.pop()
 
-    def read(self, place: Prefix, records: Iterable[Record]) -> None:
+    def add_records(self, place: Prefix, records: Iterable[Record]) -> None:
         """Process the ``records`` under the key of ``place``."""
-        self._open -= 1
+        self._pending_reads -= 1
         below = []
-        for device, record in standing(place.key, records):
+        for device, record in select_listed(place.key, records):
             known = self._found.get(record.owner)
             if known is None or record.sequence > known[1].sequence:
                 self._found[record.owner] = (device, record)
-            below.append((node_id(record.owner), device.depth))
+            below.append((derive_node_id(record.owner), device.depth))
         while True:
             depths = [depth for uuid, depth in below if place.has(uuid)]
             if place.depth >= max([self._floor, *depths]):
                 return
-            self._waiting.append(place.aside)
-            place = place.along
+            self._unread.append(place.other_key_half)
+            place = place.same_key_half
 
-    def failed(self, place: Prefix) -> None:
+    def on_failure(self, place: Prefix) -> None:
         """Record that no replica of ``place`` answered."""
-        self._open -= 1
+        self._pending_reads -= 1
         self.missed.append(place)
 
     @property
     def is_over(self) -> bool:
         """Whether all places have been read."""
-        return not (self._waiting or self._open)
+        return not (self._unread or self._pending_reads)
 
     @property
     def is_complete(self) -> bool:
@@ -86,7 +86,11 @@ class Listing:
         return [record for _, record in self.devices]
 
 
-def standing(key: bytes, records: Iterable[Record]) -> list[tuple[Device, Record]]:
+def select_listed(key: bytes, records: Iterable[Record]) -> list[tuple[Device, Record]]:
     """Return the devices in ``records`` whose places include ``key``; other records are ignored."""
-    known = [(device, record) for record in records if (device := device_of(record)) is not None]
-    return [(device, record) for device, record in known if key in places_of(node_id(record.owner), device.depth)]
+    known = [(device, record) for record in records if (device := parse_device(record)) is not None]
+    return [
+        (device, record)
+        for device, record in known
+        if key in compute_places(derive_node_id(record.owner), device.depth)
+    ]

@@ -20,18 +20,18 @@ from middleware.entangled.identity import ID_BYTES
 from middleware.entangled.kademlia.distance import distance
 
 BITS = 8 * ID_BYTES
-FEW = 12
+MIN_DEVICES_PER_PLACE = 12
 """Estimated minimum number of devices at a place: for each listed device about two of them hold its records."""
-WHOLE = 64
+MAX_UNDIVIDED = 64
 """Maximum size of a team with complete membership that has one place; in larger teams no node knows all."""
-STILL_WHOLE = 48
+UNDIVIDED_AGAIN = 48
 """Size below which a team that was larger has one place again."""
-SHALLOW = 2
-MARGIN = 0.25
+ROOT_LISTED_DEPTH = 2
+DEPTH_HYSTERESIS = 0.25
 """Hysteresis, in powers of two of the size, before a device moves."""
-NEAR = 8
+NEAREST_CONTACTS = 8
 """Number of nearest contacts by which the size of a team is estimated: a node knows these reliably."""
-LONGEST = 60.0
+MAX_LEASE_S = 60.0
 """Maximum seconds for which a failed device remains listed."""
 
 
@@ -45,17 +45,17 @@ class Prefix(NamedTuple):
     def key(self) -> bytes:
         """The key of this place."""
         free = BITS - self.depth
-        return (self.bits << free | _ROOT & ((1 << free) - 1)).to_bytes(ID_BYTES)
+        return (self.bits << free | _ROOT_NUMBER & ((1 << free) - 1)).to_bytes(ID_BYTES)
 
     @property
-    def along(self) -> Prefix:
+    def same_key_half(self) -> Prefix:
         """The half with the same key."""
-        return Prefix(self.depth + 1, self.bits << 1 | self._next)
+        return Prefix(self.depth + 1, self.bits << 1 | self._next_bit)
 
     @property
-    def aside(self) -> Prefix:
+    def other_key_half(self) -> Prefix:
         """The half with another key."""
-        return Prefix(self.depth + 1, self.bits << 1 | 1 - self._next)
+        return Prefix(self.depth + 1, self.bits << 1 | 1 - self._next_bit)
 
     @property
     def first(self) -> bytes:
@@ -67,61 +67,63 @@ class Prefix(NamedTuple):
         return int.from_bytes(node_id) >> (BITS - self.depth) == self.bits
 
     @property
-    def _next(self) -> int:
-        return _ROOT >> (BITS - self.depth - 1) & 1
+    def _next_bit(self) -> int:
+        return _ROOT_NUMBER >> (BITS - self.depth - 1) & 1
 
 
-_ROOT = int.from_bytes(DEVICES)
+_ROOT_NUMBER = int.from_bytes(DEVICES)
 ROOT = Prefix(0, 0)
 
 
-def prefix_of(node_id: bytes, depth: int) -> Prefix:
+def compute_prefix(node_id: bytes, depth: int) -> Prefix:
     """Return the prefix of ``node_id`` with ``depth`` bits."""
     return Prefix(depth, int.from_bytes(node_id) >> (BITS - depth))
 
 
-def places_of(node_id: bytes, depth: int) -> list[bytes]:
+def compute_places(node_id: bytes, depth: int) -> list[bytes]:
     """Return the one to three keys under which a device with that id and depth is listed.
 
     Up to ``SHALLOW`` depth 0 is included: when a team becomes undivided, some nodes read only that place earlier.
     """
-    depths = (depth, max(0, depth - 1), *((0,) if depth <= SHALLOW else ()))
-    return list(dict.fromkeys(prefix_of(node_id, each).key for each in depths))
+    depths = (depth, max(0, depth - 1), *((0,) if depth <= ROOT_LISTED_DEPTH else ()))
+    return list(dict.fromkeys(compute_prefix(node_id, each).key for each in depths))
 
 
 def is_place(key: bytes, node_id: bytes) -> bool:
     """Return whether ``key`` is a place of a device with that id at any depth."""
     if key[MAX_DEPTH // 8 :] != DEVICES[MAX_DEPTH // 8 :]:
         return False
-    return any(key == prefix_of(node_id, depth).key for depth in range(MAX_DEPTH + 1))
+    return any(key == compute_prefix(node_id, depth).key for depth in range(MAX_DEPTH + 1))
 
 
-def depth_for(size: float, depth: int | None = None) -> int:
+def choose_depth(size: float, depth: int | None = None) -> int:
     """Return the depth for a team of ``size``, at most one step from ``depth`` (None: no depth yet)."""
     if depth is None:
-        return 0 if size <= WHOLE else min(MAX_DEPTH, max(0, math.floor(math.log2(size / FEW))))
-    if size <= (STILL_WHOLE if depth else WHOLE):
+        return (
+            0 if size <= MAX_UNDIVIDED else min(MAX_DEPTH, max(0, math.floor(math.log2(size / MIN_DEVICES_PER_PLACE))))
+        )
+    if size <= (UNDIVIDED_AGAIN if depth else MAX_UNDIVIDED):
         return max(0, depth - 1)
-    level = math.log2(size / FEW)
-    if level >= depth + 1 + MARGIN and depth < MAX_DEPTH:
+    level = math.log2(size / MIN_DEVICES_PER_PLACE)
+    if level >= depth + 1 + DEPTH_HYSTERESIS and depth < MAX_DEPTH:
         return depth + 1
-    return depth - 1 if depth and level < depth - MARGIN else depth
+    return depth - 1 if depth and level < depth - DEPTH_HYSTERESIS else depth
 
 
-def lease_at(depth: int, lease: float) -> float:
+def compute_lease(depth: int, lease: float) -> float:
     """Return the seconds for which a device at ``depth`` remains listed after its last renewal.
 
     ``lease`` is the lease of its node.  Twice as many devices renew half as often, up to a minute.
     """
-    return lease if not depth else max(lease, min(LONGEST, lease * 2.0**depth))
+    return lease if not depth else max(lease, min(MAX_LEASE_S, lease * 2.0**depth))
 
 
-def size_of(own_id: bytes, contacts: Iterable[Contact]) -> int:
+def estimate_size(own_id: bytes, contacts: Iterable[Contact]) -> int:
     """Estimate the number of nodes, including this one, from the density of ids around it.
 
     Ids are uniformly distributed, so the n-th nearest of N nodes is about n / N of the key space away.
     """
     distances = sorted(distance(own_id, contact.node_id) for contact in contacts)
-    if len(distances) < NEAR:
+    if len(distances) < NEAREST_CONTACTS:
         return len(distances) + 1
-    return max(len(distances) + 1, NEAR * (1 << BITS) // max(1, distances[NEAR - 1]))
+    return max(len(distances) + 1, NEAREST_CONTACTS * (1 << BITS) // max(1, distances[NEAREST_CONTACTS - 1]))

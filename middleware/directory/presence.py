@@ -13,19 +13,19 @@ from typing import Any
 
 import msgpack
 
-from middleware.entangled.identity import node_id
-from middleware.entangled.record import Record, hashed_key
-from middleware.entangled.value import MAX_VALUE, are_capabilities, is_number, is_whole, mapping_of
+from middleware.entangled.identity import derive_node_id
+from middleware.entangled.record import Record, hash_key
+from middleware.entangled.value import MAX_VALUE_BYTES, are_capabilities, is_natural, is_number, parse_mapping
 
-DEVICES = hashed_key("devices")
+DEVICES = hash_key("devices")
 IDLE, ASSIGNED, SEARCHING, WAITING, EXECUTING, DONE = "IDLE", "ASSIGNED", "SEARCHING", "WAITING", "EXECUTING", "DONE"
 STATUSES = (IDLE, ASSIGNED, SEARCHING, WAITING, EXECUTING, DONE)
 MAX_DEPTH = 16
 """Maximum depth of the directory: 2**16 places are enough for a million devices."""
-ID_SHOWN = 6
-MESSAGES_KEPT = 5
-MESSAGE_CHARACTERS = 70
-STOPS_SHOWN = 4
+SHOWN_ID_CHARACTERS = 6
+MAX_MESSAGES = 5
+MAX_MESSAGE_CHARACTERS = 70
+MAX_STOPS = 4
 """Maximum number of stops in a device's record; each takes 34 bytes."""
 
 Capabilities = Mapping[str, Mapping[str, float | str]]
@@ -46,7 +46,7 @@ class Device:
     - ``laptop``, ``agent``: display names of the computer and of the agent (thesis, Table 5.1)
     - ``depth``: the depth of its place in the directory (``middleware.directory.prefix``)
     - ``stops``: the ids in hex of the stops that it obeys, at most ``STOPS_SHOWN``
-    - ``obeys``: its activity while the team is stopped (``middleware.stop.halt``)
+    - ``obeys``: its activity while the team is stopped (``middleware.stop.stop_state``)
     """
 
     uuid: str
@@ -73,10 +73,10 @@ class Device:
 
     def with_message(self, now: float, text: str) -> Device:
         """Return this device with one more line; at most ``MESSAGES_KEPT`` are kept."""
-        line = (now, text[:MESSAGE_CHARACTERS])
-        return replace(self, messages=(*self.messages, line)[-MESSAGES_KEPT:])
+        line = (now, text[:MAX_MESSAGE_CHARACTERS])
+        return replace(self, messages=(*self.messages, line)[-MAX_MESSAGES:])
 
-    def packed(self) -> bytes:
+    def pack(self) -> bytes:
         """Return the value of its record.
 
         If it is too large, messages, description and ``deployed`` are removed in that order.
@@ -89,7 +89,7 @@ class Device:
                 if not content[name]:
                     del content[name]
             value = bytes(msgpack.packb(content))
-            if len(value) <= MAX_VALUE or not (device.messages or device.description or device.deployed):
+            if len(value) <= MAX_VALUE_BYTES or not (device.messages or device.description or device.deployed):
                 return value
             if device.messages:
                 device = replace(device, messages=device.messages[1:])
@@ -99,13 +99,13 @@ class Device:
                 device = replace(device, deployed={})
 
 
-def device_of(record: Record) -> Device | None:
+def parse_device(record: Record) -> Device | None:
     """Decode the device in a record; None if it is invalid or of another node.
 
     Its name must be the name of the record's slot, which replicas compare with the owner's certificate.
     """
-    value = mapping_of(record)
-    if value is None or value.get("uuid") != node_id(record.owner).hex() or value.get("name") != record.name:
+    value = parse_mapping(record)
+    if value is None or value.get("uuid") != derive_node_id(record.owner).hex() or value.get("name") != record.name:
         return None
     content = {f.name: value[f.name] for f in fields(Device) if f.name in value}
     try:
@@ -126,10 +126,10 @@ def device_of(record: Record) -> Device | None:
             for text in (*texts, *device.pages, *device.stops, *(text for _, text in device.messages))
         )
         and device.status in STATUSES
-        and is_whole(device.joined)
-        and is_whole(device.depth)
+        and is_natural(device.joined)
+        and is_natural(device.depth)
         and device.depth <= MAX_DEPTH
-        and len(device.stops) <= STOPS_SHOWN
+        and len(device.stops) <= MAX_STOPS
         and all(is_number(n) for n in (device.since, *(t for t, _ in device.messages)))
         and are_capabilities(device.capabilities)
         and isinstance(device.network, dict)
@@ -142,15 +142,20 @@ def device_of(record: Record) -> Device | None:
     return device if is_valid else None
 
 
-def devices_of(records: list[Record]) -> list[tuple[Device, Record]]:
+def parse_devices(records: list[Record]) -> list[tuple[Device, Record]]:
     """Decode the devices in ``records``, sorted by their order of joining, each with its record.
 
     Devices with equal names get a prefix of their id appended.
     """
-    known = [(device, record) for record in records if (device := device_of(record)) is not None]
+    known = [(device, record) for record in records if (device := parse_device(record)) is not None]
     counts = Counter(name for name, _ in {(device.name, device.uuid) for device, _ in known})
     known = [
-        (replace(device, name=f"{device.name}-{device.uuid[:ID_SHOWN]}") if counts[device.name] > 1 else device, record)
+        (
+            replace(device, name=f"{device.name}-{device.uuid[:SHOWN_ID_CHARACTERS]}")
+            if counts[device.name] > 1
+            else device,
+            record,
+        )
         for device, record in known
     ]
     return sorted(known, key=lambda pair: (pair[0].joined, pair[0].uuid))
@@ -163,7 +168,7 @@ Later = Callable[[float, Callable[[], None]], object]
 class Presence:
     """This node's own device record, announced after changes at most every ``PAUSE`` seconds."""
 
-    PAUSE = 0.1
+    PAUSE_S = 0.1
 
     def __init__(self, device: Device, announce: Announce, later: Later) -> None:
         self.device = device
@@ -176,7 +181,7 @@ class Presence:
         """Announce the device for the first time, with its number in the order of joining."""
         self.device = replace(self.device, joined=joined)
         self._has_appeared = True
-        self._announce(self.device.packed())
+        self._announce(self.device.pack())
 
     def change(self, **changes: Any) -> None:
         """Announce changed fields; unchanged ones cause no message."""
@@ -186,16 +191,16 @@ class Presence:
         self.device = device
         if self._has_appeared and not self._is_pending:
             self._is_pending = True
-            self._later(self.PAUSE, self._publish)
+            self._later(self.PAUSE_S, self._publish)
 
-    def say(self, now: float, text: str) -> None:
+    def add_message(self, now: float, text: str) -> None:
         """Add a line to the device's messages."""
         self.change(messages=self.device.with_message(now, text).messages)
 
-    def obey(self, stops: Collection[bytes], words: str) -> None:
+    def announce_stops(self, stops: Collection[bytes], words: str) -> None:
         """Announce the stops that the device obeys, and its activity; without stops it continues normally."""
-        self.change(stops=tuple(stop.hex() for stop in list(stops)[-STOPS_SHOWN:]), obeys=words)
+        self.change(stops=tuple(stop.hex() for stop in list(stops)[-MAX_STOPS:]), obeys=words)
 
     def _publish(self) -> None:
         self._is_pending = False
-        self._announce(self.device.packed())
+        self._announce(self.device.pack())

@@ -26,7 +26,7 @@ class Background:
 
     def __init__(self, clock: IReactorTime) -> None:
         self._clock = clock
-        self._waiting: dict[IDelayedCall, None] = {}
+        self._calls: dict[IDelayedCall, None] = {}
         self.is_stopped = False
 
     def later(self, delay: float, work: Callable[..., object], *arguments: object) -> Callable[[], None]:
@@ -35,16 +35,16 @@ class Background:
             return lambda: None
 
         def run() -> None:
-            self._waiting.pop(call, None)
+            self._calls.pop(call, None)
             work(*arguments)
 
         def cancel() -> None:
-            self._waiting.pop(call, None)
+            self._calls.pop(call, None)
             if call.active():
                 call.cancel()
 
         call = self._clock.callLater(delay, run)
-        self._waiting[call] = None
+        self._calls[call] = None
         return cancel
 
     def every(self, period: float, work: Callable[[], object]) -> None:
@@ -74,13 +74,13 @@ class Background:
     def stop(self) -> None:
         """Cancel every timer."""
         self.is_stopped = True
-        for call in self._waiting:
+        for call in self._calls:
             if call.active():
                 call.cancel()
-        self._waiting.clear()
+        self._calls.clear()
 
 
-async def until(enough: Callable[[list[Any]], bool], work: Iterable[Coroutine[Any, Any, Any]]) -> list[Any]:
+async def gather_until(enough: Callable[[list[Any]], bool], work: Iterable[Coroutine[Any, Any, Any]]) -> list[Any]:
     """Return the results of ``work`` as soon as they are ``enough``, or all of it has ended; the rest continues.
 
     Work that ends with an ``EntangledError`` gives no result.
@@ -113,7 +113,7 @@ async def until(enough: Callable[[list[Any]], bool], work: Iterable[Coroutine[An
     return list(results)
 
 
-async def paced(width: int, work: Iterable[Coroutine[Any, Any, Any]]) -> None:
+async def run_limited(width: int, work: Iterable[Coroutine[Any, Any, Any]]) -> None:
     """Run all of ``work``, at most ``width`` at a time, ignoring each ``EntangledError``.
 
     ``work`` should be a generator, so that a coroutine is created only when it starts.
@@ -125,9 +125,9 @@ async def paced(width: int, work: Iterable[Coroutine[Any, Any, Any]]) -> None:
             with suppress(EntangledError):
                 await coroutine
 
-    await until(lambda _: False, [lane() for _ in range(width)])
+    await gather_until(lambda _: False, [lane() for _ in range(width)])
 
 
-async def first(needed: int, work: Iterable[Coroutine[Any, Any, Any]]) -> list[Any]:
+async def gather_first(needed: int, work: Iterable[Coroutine[Any, Any, Any]]) -> list[Any]:
     """Return the first ``needed`` results of ``work``, or fewer if all has ended; the rest continues."""
-    return await until(lambda results: len(results) >= needed, work)
+    return await gather_until(lambda results: len(results) >= needed, work)

@@ -9,7 +9,7 @@ Key = TypeVar("Key", bound=Hashable)
 Value = TypeVar("Value")
 
 
-def keep(table: dict[Key, Value], key: Key, value: Value, most: int) -> None:
+def put_bounded(table: dict[Key, Value], key: Key, value: Value, most: int) -> None:
     """Put ``value`` at the end of a table, and delete its first entry if it has more than ``most``."""
     table.pop(key, None)
     table[key] = value

@@ -21,7 +21,7 @@ from zope.interface import implementer
 _COMPACT_FROM = 64
 
 
-def boot_time() -> Callable[[], float]:
+def find_boot_clock() -> Callable[[], float]:
     """Return a clock of the seconds since the machine started, including suspension, independent of the wall clock.
 
     On systems without CLOCK_BOOTTIME it is ``time.monotonic``, which may stop during suspension.
@@ -42,7 +42,7 @@ def use_monotonic_time() -> None:
 
     Call this before timers are created; repeated calls have no effect.
     """
-    ReactorBase.seconds = staticmethod(boot_time())
+    ReactorBase.seconds = staticmethod(find_boot_clock())
 
 
 @implementer(IDelayedCall)
@@ -122,7 +122,7 @@ class HeapClock:
         self._now = now
         self._heap: list[tuple[float, int, _HeapCall]] = []
         self._orders = itertools.count(1)
-        self._dead = 0
+        self._dead_entries = 0
 
     def seconds(self) -> float:
         """Return the simulated time in seconds."""
@@ -150,7 +150,7 @@ class HeapClock:
         while heap and heap[0][0] <= moment:
             due, order, call = pop(heap)
             if call.order != order:
-                self._dead -= 1
+                self._dead_entries -= 1
                 continue
             if due > self._now:
                 self._now = due
@@ -162,7 +162,7 @@ class HeapClock:
         """Advance the time by ``seconds``."""
         self.run_until(self._now + seconds)
 
-    def leap(self, seconds: float) -> None:
+    def suspend(self, seconds: float) -> None:
         """Simulate a suspension of ``seconds``: the time advances without running calls, which are late then."""
         self._now += seconds
 
@@ -178,8 +178,8 @@ class HeapClock:
 
     def _count_dead_entry(self) -> None:
         # Timeouts are mostly cancelled; without this, dead entries would make up nearly all of the heap.
-        self._dead += 1
-        if self._dead > _COMPACT_FROM and self._dead * 2 > len(self._heap):
+        self._dead_entries += 1
+        if self._dead_entries > _COMPACT_FROM and self._dead_entries * 2 > len(self._heap):
             self._heap = [entry for entry in self._heap if entry[2].order == entry[1]]
             heapq.heapify(self._heap)
-            self._dead = 0
+            self._dead_entries = 0

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 
-from middleware.entangled.identity import node_id
-from middleware.entangled.network.network import Address, relayed
+from middleware.entangled.identity import derive_node_id
+from middleware.entangled.network.network import Address, relayed_address
 
 
 @dataclass(frozen=True, slots=True)
@@ -17,15 +17,15 @@ class Contact:
     node_id: bytes = field(init=False, compare=False)
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "node_id", node_id(self.public))
+        object.__setattr__(self, "node_id", derive_node_id(self.public))
 
-    def packed(self) -> list[object]:
+    def pack(self) -> list[object]:
         """Encode the contact for a message; a virtual address of this node (a tunnel) becomes a relayed one."""
-        host, port = relayed(self.node_id) if self.address.is_virtual else self.address
+        host, port = relayed_address(self.node_id) if self.address.is_virtual else self.address
         return [self.public, host, port]
 
 
-def unpacked(fields: object) -> Contact | None:
+def parse_contact(fields: object) -> Contact | None:
     """Decode a contact, or return None if the fields are invalid."""
     if not isinstance(fields, list) or len(fields) != 3:
         return None
@@ -38,4 +38,4 @@ def unpacked(fields: object) -> Contact | None:
         return None
     contact = Contact(public, Address(host, port))
     # A peer cannot name a virtual address of this node: any such host only means that the contact needs a relay.
-    return Contact(public, relayed(contact.node_id)) if host[0] == "~" else contact
+    return Contact(public, relayed_address(contact.node_id)) if host[0] == "~" else contact

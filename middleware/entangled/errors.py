@@ -43,11 +43,11 @@ class Forged(RemoteError):
     """The bytes or the record are not authentic."""
 
 
-class WeatherError(EntangledError):
+class TransientError(EntangledError):
     """The network did not deliver in time; a retry may succeed."""
 
 
-class NoAnswer(WeatherError):
+class NoAnswer(TransientError):
     """The peer did not answer any of the tries."""
 
 
@@ -65,7 +65,7 @@ class NotAcknowledged(NoAnswer):
         self.needed = needed
 
 
-class Unavailable(WeatherError):
+class Unavailable(TransientError):
     """Too few replicas answered a read, so the content of the key is unknown.
 
     ``answered`` replicas gave a valid answer, ``needed`` were required.
@@ -77,7 +77,7 @@ class Unavailable(WeatherError):
         self.needed = needed
 
 
-class Crowded(WeatherError):
+class Crowded(TransientError):
     """This node has reached a limit of pending messages; nothing was sent, and the state of the peer is unknown."""
 
 

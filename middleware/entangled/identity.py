@@ -30,7 +30,7 @@ class Identity:
         public, signing = bindings.crypto_sign_seed_keypair(self.seed)
         object.__setattr__(self, "public", public)
         object.__setattr__(self, "_signing", signing)
-        object.__setattr__(self, "node_id", node_id(public))
+        object.__setattr__(self, "node_id", derive_node_id(public))
         object.__setattr__(self, "exchange_secret", bindings.crypto_sign_ed25519_sk_to_curve25519(signing))
 
     def sign(self, message: bytes) -> bytes:
@@ -38,13 +38,13 @@ class Identity:
         return bindings.crypto_sign(message, self._signing)[: bindings.crypto_sign_BYTES]
 
 
-def node_id(public: bytes) -> bytes:
+def derive_node_id(public: bytes) -> bytes:
     """Return the 160-bit id of the node with the key ``public``."""
     return hashlib.blake2s(public, digest_size=ID_BYTES).digest()
 
 
 @lru_cache(maxsize=128)  # a handshake calls it twice, and it costs as much as a key exchange
-def exchange_key(public: bytes) -> bytes:
+def derive_exchange_key(public: bytes) -> bytes:
     """Convert an Ed25519 public key to its X25519 key; raise ``ValueError`` if it is invalid."""
     try:
         return bindings.crypto_sign_ed25519_pk_to_curve25519(public)
@@ -52,7 +52,7 @@ def exchange_key(public: bytes) -> bytes:
         raise ValueError("not an Ed25519 public key") from error
 
 
-def verified(public: bytes, message: bytes, signature: bytes) -> bool:
+def is_signature_valid(public: bytes, message: bytes, signature: bytes) -> bool:
     """Return whether ``signature`` over ``message`` was made with the key of ``public``."""
     try:
         bindings.crypto_sign_open(signature + message, public)

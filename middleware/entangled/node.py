@@ -17,37 +17,53 @@ from twisted.internet.interfaces import IReactorTime
 from twisted.logger import Logger
 
 from middleware.entangled.background import Background
-from middleware.entangled.contact import Contact, unpacked
+from middleware.entangled.contact import Contact, parse_contact
 from middleware.entangled.data.store import Store
 from middleware.entangled.errors import NotRunning, Refused, TooLarge
-from middleware.entangled.identity import Identity, node_id
-from middleware.entangled.kademlia.discovery import Discovery
+from middleware.entangled.identity import Identity, derive_node_id
+from middleware.entangled.kademlia.lan_discovery import LanDiscovery
 from middleware.entangled.kademlia.membership import Membership
 from middleware.entangled.kademlia.overlay import Overlay
+from middleware.entangled.nat.relayed_network import RelayedNetwork
+from middleware.entangled.nat.traversal import NatTraversal
 from middleware.entangled.network.multicast import Multicast
-from middleware.entangled.network.network import Address, Network, detours_of
-from middleware.entangled.reach.path import PathNetwork
-from middleware.entangled.reach.reach import Reach
-from middleware.entangled.record import KEY_BYTES, MAX_NAME, MAX_VALUE, TOLERATED_ABSENCE, Lifetime, Record, Slot
+from middleware.entangled.network.network import Address, Network, find_alternate_paths
+from middleware.entangled.record import (
+    KEY_BYTES,
+    MAX_NAME_BYTES,
+    MAX_VALUE_BYTES,
+    TOLERATED_ABSENCE_S,
+    Lifetime,
+    Record,
+    Slot,
+)
 from middleware.entangled.replication.handover import Handover
-from middleware.entangled.replication.owner import Concern, Owner, Stored
-from middleware.entangled.replication.reader import ReadConcern, Reader
+from middleware.entangled.replication.owner import ConsistencyLevel, Owner, Stored
+from middleware.entangled.replication.reader import ReadConsistency, Reader
 from middleware.entangled.replication.replica import Replica
 from middleware.entangled.replication.subscriber import Subscriber
-from middleware.entangled.replication.watch import Changed, Watch
-from middleware.entangled.wire.door import DOUBLED, OPEN, REVOKED, ROLE, SUPERSEDED, Door, meaning
+from middleware.entangled.replication.watch import OnChanged, Watch
+from middleware.entangled.wire.admission_check import (
+    DOUBLED,
+    OPEN_ADMISSION,
+    REVOKED,
+    ROLE,
+    SUPERSEDED,
+    AdmissionCheck,
+    explain,
+)
 from middleware.entangled.wire.endpoint import Endpoint
 
 if TYPE_CHECKING:
-    from middleware.entangled.space.seat import Seat
+    from middleware.entangled.space.take_acceptor import TakeAcceptor
 
-NOTE = 30.0
+NOTE_INTERVAL_S = 30.0
 """Seconds between two notes of time and contacts; a new or lost contact is noted at once."""
-CONTACTS = "contacts"
-LAST_SEEN = "last seen"
-SEATED = "decree/incarnation"
+CONTACTS_NOTE = "contacts"
+LAST_SEEN_NOTE = "last seen"
+INCARNATION_NOTE = "decree/incarnation"
 """Name of the note of a node that was a member of tuple councils in an earlier run."""
-MAX_NOTED = 64
+MAX_NOTED_CONTACTS = 64
 
 Answers = TypeVar("Answers", bound=Callable[..., object])
 
@@ -73,7 +89,7 @@ class EntangledNode:
         rng: random.Random,
         lease: float = 1.0,
         wall: Callable[[], float] | None = None,
-        door: Door = OPEN,
+        door: AdmissionCheck = OPEN_ADMISSION,
         lan: Multicast | None = None,
     ) -> None:
         self.identity = identity
@@ -81,46 +97,46 @@ class EntangledNode:
         self.lease = lease
         self._network = network
         self._wall = wall
-        self._chores = chores = Background(clock)
-        paths = PathNetwork(network)
+        self._background = chores = Background(clock)
+        paths = RelayedNetwork(network)
         self.endpoint = Endpoint(identity, team_key, paths, clock, rng, door)
         self.overlay = Overlay(lambda: self.contact, self.endpoint, clock, chores)
-        self.reach = Reach(identity.node_id, self.endpoint, paths, self.overlay.contacts, clock, chores)
-        self.overlay.on_named.add(self.reach.acquaintances.named)
+        self.nat = NatTraversal(identity.node_id, self.endpoint, paths, self.overlay.contacts, clock, chores)
+        self.overlay.on_named.add(self.nat.selector.record_namer)
         self.replica = Replica(store, self.endpoint, self.overlay, clock, chores)
         self._owner = Owner(identity, lease, store, self.replica, self.overlay, self.endpoint, clock, chores)
         self._membership = membership = Membership(self.overlay, self.endpoint, clock, rng, chores)
-        membership.sounding.needs_use = self.reach.ways.needs_use
-        self._detour = membership.detour
+        membership.prober.needs_keep_alive = self.nat.paths.needs_keep_alive
+        self._alternate_paths = membership.alternate_paths
         self.discovery = (
-            None if lan is None else Discovery(lan, self.endpoint, self.overlay, membership, clock, rng, chores)
+            None if lan is None else LanDiscovery(lan, self.endpoint, self.overlay, membership, clock, rng, chores)
         )
         self._handover = Handover(store, self.replica, self.overlay, self._owner, self.endpoint, clock, rng, chores)
         self._reader = Reader(self.replica, self.overlay, self._owner, chores)
         self._subscriber = Subscriber(
             identity.node_id, self.replica, self.overlay, self._reader, self.endpoint, clock, chores
         )
-        self.replica.is_sure = self._handover.is_sure
+        self.replica.is_synced = self._handover.is_synced
         self._acceptor_arguments = (clock, rng)
         self.endpoint.expose("decree.enrol", self._answer_enrol)
-        self.overlay.on_newcomer.add(self._handle_new_contact)
+        self.overlay.on_new_contact.add(self._handle_new_contact)
         self.overlay.on_lost.add(self._handle_lost_contact)
         self.replica.on_record.add(self._handle_stored_record)
         self.replica.on_gone.add(self._handle_removed_record)
         if wall is not None:
-            self.endpoint.echoer.wall = wall
-        self.endpoint.on_refused.add(self._handle_rejection)
-        self.endpoint.on_refusing.add(self._handle_rejected_peer)
+            self.endpoint.probe_responder.unix_time = wall
+        self.endpoint.on_rejected.add(self._handle_rejection)
+        self.endpoint.on_rejecting.add(self._handle_rejected_peer)
         self._running = False
 
     @cached_property
-    def seat(self) -> Seat:
+    def take_acceptor(self) -> TakeAcceptor:
         """This node's acceptor for takes in tuple spaces."""
         # Imported on first use: a node without councils saves half a MiB.
-        from middleware.entangled.space.seat import Seat
+        from middleware.entangled.space.take_acceptor import TakeAcceptor
 
-        seat = Seat(self.endpoint, self.store, *self._acceptor_arguments)
-        seat.written = self.store.written
+        seat = TakeAcceptor(self.endpoint, self.store, *self._acceptor_arguments)
+        seat.wait_for_write = self.store.wait_for_write
         return seat
 
     # -- lifecycle -----------------------------------------------------------------------------------------------------
@@ -135,12 +151,12 @@ class EntangledNode:
         self.endpoint.start()
         self._running = True
         has_dropped = self._drop_records_after_absence()
-        if self.store.noted(SEATED) is not None:
-            self.seat.sit()
+        if self.store.get_note(INCARNATION_NOTE) is not None:
+            self.take_acceptor.load()
         self._handover.start(has_dropped)
         for part in (self._membership, self.replica, self._owner, self._subscriber):
             part.start()
-        self._chores.every(NOTE, self._note_contacts)
+        self._background.every(NOTE_INTERVAL_S, self._note_contacts)
         if self.discovery is not None:
             self.discovery.start()
 
@@ -153,7 +169,7 @@ class EntangledNode:
         soon as a team member answers there or none did for a short time.  The node then looks up its own id, meets the
         others, and fetches the records it should hold.
         """
-        self.reach.acquaintances.bootstraps |= {*known, *detours_of(self._network)}
+        self.nat.selector.bootstrap_addresses |= {*known, *find_alternate_paths(self._network)}
         return _run(self._join(known))
 
     def stop(self) -> None:
@@ -161,15 +177,15 @@ class EntangledNode:
         if self._running:
             self._note_contacts()
             for contact in self.overlay.contacts():
-                self.endpoint.tell(contact, "goodbye")
-        self.vanish()
+                self.endpoint.notify(contact, "goodbye")
+        self.stop_silently()
 
-    def vanish(self) -> None:
+    def stop_silently(self) -> None:
         """Stop without sending anything, as after a failure of power or radio."""
         if self._running:
             self._running = False
             self._subscriber.stop()
-            self._chores.stop()
+            self._background.stop()
             if self.discovery is not None:
                 self.discovery.stop()
             self.endpoint.stop()
@@ -187,10 +203,10 @@ class EntangledNode:
         self.endpoint.evict(public, code)
         self._drop_member(public)
 
-    def review(self) -> None:
+    def recheck(self) -> None:
         """Check all held, owned and watched records again, after a change of their owners' authority."""
         for part in (self._owner, self.replica, self._subscriber):
-            part.review()
+            part.recheck()
 
     # -- public ------------------------------------------------------------------------------------------------------
 
@@ -200,7 +216,7 @@ class EntangledNode:
         name: str,
         value: bytes,
         lifetime: Lifetime = "team",
-        concern: Concern = "majority",
+        concern: ConsistencyLevel = "majority",
         expect: int | None = None,
         lease: float | None = None,
     ) -> Deferred[Stored]:
@@ -218,8 +234,8 @@ class EntangledNode:
         Raises ``TooLarge`` at once for a value over ``MAX_VALUE`` or a name over ``MAX_NAME`` bytes, and
         ``ValueError`` for an invalid key.
         """
-        if len(value) > MAX_VALUE:
-            raise TooLarge(f"value of {len(value)} bytes; a record carries at most {MAX_VALUE}")
+        if len(value) > MAX_VALUE_BYTES:
+            raise TooLarge(f"value of {len(value)} bytes; a record carries at most {MAX_VALUE_BYTES}")
         return self._put(key, name, value, lifetime, concern, expect, lease)
 
     def release(self, key: bytes, name: str) -> None:
@@ -227,7 +243,7 @@ class EntangledNode:
         self._owner.release(Slot(key, self.identity.public, name))
 
     def remove(
-        self, key: bytes, name: str, concern: Concern = "majority", expect: int | None = None
+        self, key: bytes, name: str, concern: ConsistencyLevel = "majority", expect: int | None = None
     ) -> Deferred[Stored]:
         """Replace this node's record in a slot by a tombstone; fails as ``put`` does.
 
@@ -235,7 +251,7 @@ class EntangledNode:
         """
         return self._put(key, name, None, "team", concern, expect)
 
-    def get(self, key: bytes, concern: ReadConcern = "majority") -> Deferred[list[Record]]:
+    def get(self, key: bytes, concern: ReadConsistency = "majority") -> Deferred[list[Record]]:
         """Read the records under ``key``.
 
         A ``majority`` read returns at least all records acknowledged by a majority write or returned by an earlier
@@ -243,15 +259,15 @@ class EntangledNode:
         lack a slot that this replica missed.  An empty result is confirmed by a majority.  Fails with ``Unavailable``
         if too few replicas answer.
         """
-        self._check(key)
+        self._check_key(key)
         return _run(self._reader.read(key, concern))
 
-    def watch(self, key: bytes, changed: Changed, keep: bool = False) -> Watch:
+    def watch(self, key: bytes, changed: OnChanged, keep: bool = False) -> Watch:
         """Call ``changed`` with all records of ``key`` on each change, until ``stop()`` of the returned watch.
 
         With ``keep`` the node's own store also has them during the watch, for readers of the store's file.
         """
-        self._check(key)
+        self._check_key(key)
         return self._subscriber.watch(key, changed, keep)
 
     def refresh(self, watch: Watch) -> None:
@@ -285,10 +301,10 @@ class EntangledNode:
 
     def find_node(self, node_id: bytes) -> Deferred[list[Contact]]:
         """Look up the k live nodes closest to ``node_id`` (Kademlia, section 2.3)."""
-        self._check(node_id)
+        self._check_key(node_id)
         return _run(self.overlay.lookup(node_id))
 
-    def newest(self, contact: Contact) -> Contact:
+    def find_newest(self, contact: Contact) -> Contact:
         """Return ``contact`` with the last address it was observed at."""
         return self.overlay.table.get(contact.node_id) or contact
 
@@ -300,112 +316,112 @@ class EntangledNode:
         name: str,
         value: bytes | None,
         lifetime: Lifetime,
-        concern: Concern,
+        concern: ConsistencyLevel,
         expect: int | None,
         lease: float | None = None,
     ) -> Deferred[Stored]:
-        self._check(key)
-        if len(name.encode()) > MAX_NAME:
-            raise TooLarge(f"name of {len(name.encode())} bytes; a record's name has at most {MAX_NAME}")
+        self._check_key(key)
+        if len(name.encode()) > MAX_NAME_BYTES:
+            raise TooLarge(f"name of {len(name.encode())} bytes; a record's name has at most {MAX_NAME_BYTES}")
         if not self.replica.may_store(Slot(key, self.identity.public, name)):
-            return fail(Refused(f"this node may not write {name!r} there: {meaning(ROLE)}", ROLE))
+            return fail(Refused(f"this node may not write {name!r} there: {explain(ROLE)}", ROLE))
         if expect is not None:
             return _run(self._compare_and_set(Slot(key, self.identity.public, name), value, lifetime, concern, expect))
-        return _run(self._owner.put(self._owner.next(key, name, value, lifetime, lease=lease), concern))
+        return _run(self._owner.put(self._owner.make_record(key, name, value, lifetime, lease=lease), concern))
 
     async def _compare_and_set(
-        self, slot: Slot, value: bytes | None, lifetime: Lifetime, concern: Concern, expect: int
+        self, slot: Slot, value: bytes | None, lifetime: Lifetime, concern: ConsistencyLevel, expect: int
     ) -> Stored:
         # Only this node writes the slot, but an earlier run may have done so.
-        read = None if self._owner.owns(slot) else (await self._reader.newest(slot.key)).get(slot)
-        record = self._owner.next(slot.key, slot.name, value, lifetime, expect, read)
+        read = None if self._owner.owns(slot) else (await self._reader.read_newest(slot.key)).get(slot)
+        record = self._owner.make_record(slot.key, slot.name, value, lifetime, expect, read)
         return await self._owner.put(record, concern)
 
     async def _join(self, known: Sequence[Address]) -> None:
-        alternate_paths, noted = detours_of(self._network), self._noted_contacts()
-        self._detour.begin(alternate_paths, known)
+        alternate_paths, noted = find_alternate_paths(self._network), self._load_contacts()
+        self._alternate_paths.configure(alternate_paths, known)
         if self.discovery is not None and not known:
-            await self.discovery.first()
-        if alternate_paths and not self._membership.is_entered:
-            await self._detour.beside(self._membership.join(known, noted) if known else None)
+            await self.discovery.wait_for_first()
+        if alternate_paths and not self._membership.has_entered:
+            await self._alternate_paths.enter_with_fallback(self._membership.join(known, noted) if known else None)
         else:
             await self._membership.join(known, noted)
-        self._chores.fork(self._settle())
+        self._background.fork(self._lookup_neighbours())
 
-    async def _settle(self) -> None:
-        await self._membership.settle()
+    async def _lookup_neighbours(self) -> None:
+        await self._membership.lookup_neighbours()
         if self._running:
-            self._handover.joined()
+            self._handover.start_catch_up()
             self._note_contacts()
 
     def _handle_stored_record(self, record: Record) -> None:
-        self._handover.stored(record)
-        self._subscriber.held_here(record)
+        self._handover.record_republication(record)
+        self._subscriber.handle_stored(record)
 
     def _drop_records_after_absence(self) -> bool:
         """Drop all records after an absence longer than tombstones are kept; return whether that was so."""
         try:
-            absent_s = self._wall() - float(self.store.noted(LAST_SEEN) or b"nan") if self._wall else 0.0
+            absent_s = self._wall() - float(self.store.get_note(LAST_SEEN_NOTE) or b"nan") if self._wall else 0.0
         except ValueError:  # a corrupt file may hold anything
             absent_s = 0.0
-        if is_long := absent_s > TOLERATED_ABSENCE:
+        if is_long := absent_s > TOLERATED_ABSENCE_S:
             self._log.warn("away for {days:.0f} days: all records in the store are dropped", days=absent_s / 86400)
             for record in self.store.records():
                 self.store.discard(record.slot)
         return is_long
 
     def _answer_enrol(self, peer: Contact) -> bytes:
-        return self.seat.answer_enrol(peer)
+        return self.take_acceptor.answer_enrol(peer)
 
     def _handle_new_contact(self, contact: Contact) -> None:
         if not self.overlay.is_large:  # in a large network the periodic note is enough
             self._note_contacts()
         for part in (self._owner, self._handover, self._subscriber):
-            part.welcome(contact)
+            part.handle_new_contact(contact)
 
     def _handle_lost_contact(self, contact: Contact) -> None:
-        self._subscriber.forget(contact.node_id)
-        self._handover.lost(contact)
-        self._membership.lost(contact)
-        self.reach.ways.lost(contact)
+        self._subscriber.forget_replica(contact.node_id)
+        self._handover.handle_lost_contact(contact)
+        self._membership.remember_lost(contact)
+        self.nat.paths.forget_path(contact)
 
     def _handle_rejection(self, contact: Contact, code: str) -> None:
         """Count a member that rejects this node as absent."""
-        self.overlay.turned_away(contact)
+        self.overlay.mark_rejecting(contact)
 
     def _handle_rejected_peer(self, contact: Contact, code: str) -> None:
         if code not in (DOUBLED, SUPERSEDED):  # for these the other node with that identity stays a member
             self._drop_member(contact.public)
 
     def _drop_member(self, public: bytes) -> None:
-        contact = self.overlay.known(node_id(public))
+        contact = self.overlay.find_known(derive_node_id(public))
         if contact is not None:
             self.replica.answer_goodbye(contact)
             self._membership.forget(contact)
             self._note_contacts()
 
     def _handle_removed_record(self, record: Record) -> None:
-        if not self._owner.lost_here(record):
-            self._subscriber.gone_here(record)
+        if not self._owner.restore(record):
+            self._subscriber.handle_removed(record)
 
     def _note_contacts(self) -> None:
         if self._wall is not None:
-            self.store.note(LAST_SEEN, repr(self._wall()).encode())
-        known = {c.node_id: c for c in [*self.overlay.contacts(), *self.overlay.roster.absent()]}
-        contacts = sorted(known.values(), key=lambda c: c.node_id)[:MAX_NOTED]
+            self.store.set_note(LAST_SEEN_NOTE, repr(self._wall()).encode())
+        known = {c.node_id: c for c in [*self.overlay.contacts(), *self.overlay.members.list_absent()]}
+        contacts = sorted(known.values(), key=lambda c: c.node_id)[:MAX_NOTED_CONTACTS]
         if contacts:
             # A node without contacts keeps the last note of them.
-            self.store.note(CONTACTS, msgpack.packb([c.packed() for c in contacts]))
+            self.store.set_note(CONTACTS_NOTE, msgpack.packb([c.pack() for c in contacts]))
 
-    def _noted_contacts(self) -> list[Contact]:
+    def _load_contacts(self) -> list[Contact]:
         try:
-            noted = msgpack.unpackb(self.store.noted(CONTACTS) or b"\x90")
+            noted = msgpack.unpackb(self.store.get_note(CONTACTS_NOTE) or b"\x90")
         except Exception:  # a corrupt file may hold anything
             return []
-        contacts = [unpacked(fields) for fields in noted] if isinstance(noted, list) else []
-        return [c for c in contacts if c is not None and c.node_id != self.identity.node_id][:MAX_NOTED]
+        contacts = [parse_contact(fields) for fields in noted] if isinstance(noted, list) else []
+        return [c for c in contacts if c is not None and c.node_id != self.identity.node_id][:MAX_NOTED_CONTACTS]
 
-    def _check(self, key: bytes) -> None:
+    def _check_key(self, key: bytes) -> None:
         if not self._running:
             raise NotRunning("the node is not running; start it first")
         if len(key) != KEY_BYTES:

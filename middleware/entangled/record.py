@@ -14,22 +14,22 @@ from typing import Literal, NamedTuple
 
 import msgpack
 
-from middleware.entangled.identity import Identity, verified
+from middleware.entangled.identity import Identity, is_signature_valid
 
 Lifetime = Literal["leased", "team"]
 KEY_BYTES = 20
-MAX_VALUE = 2**20
-MAX_NAME = 64
-MAX_SIGNED = 512
+MAX_VALUE_BYTES = 2**20
+MAX_NAME_BYTES = 64
+MAX_CACHED = 512
 FRAME_BYTES = 160
 """Bytes of a record in a message in addition to its name and value."""
-MAX_TTL = 30 * 86400.0
-TEAM_TTL = 86400.0
+MAX_TTL_S = 30 * 86400.0
+TEAM_TTL_S = 86400.0
 """Seconds that a team record stays after it was stored or refreshed."""
-TOLERATED_ABSENCE = 6 * 86400.0
+TOLERATED_ABSENCE_S = 6 * 86400.0
 """Seconds; a node that was away for longer joins with an empty store, because tombstones of records that it still holds
 may have expired meanwhile."""
-TOMBSTONE_TTL = TOLERATED_ABSENCE + 86400.0
+TOMBSTONE_TTL_S = TOLERATED_ABSENCE_S + 86400.0
 """Seconds that a tombstone stays: a day longer than ``TOLERATED_ABSENCE``, for clock errors and late delivery."""
 
 
@@ -73,33 +73,33 @@ class Record:
         """The approximate size of this record in a message; ``data.store.weight`` is its size in a store."""
         return len(self.value or b"") + len(self.name.encode()) + FRAME_BYTES
 
-    def beats(self, other: Record | None) -> bool:
+    def supersedes(self, other: Record | None) -> bool:
         """Return whether this record replaces ``other`` in their slot; a total order, so replicas converge."""
         if other is None:
             return True
         return (self.sequence, self.signature) > (other.sequence, other.signature)
 
-    def signed(self, identity: Identity) -> Record:
+    def sign(self, identity: Identity) -> Record:
         """Return a copy of this record signed by its owner's ``identity``."""
         return replace(self, signature=identity.sign(self._signed_bytes()))
 
     def is_genuine(self) -> bool:
         """Return whether the owner's signature over all fields is valid."""
-        return verified(self.owner, self._signed_bytes(), self.signature)
+        return is_signature_valid(self.owner, self._signed_bytes(), self.signature)
 
     def digest(self) -> bytes:
         """Return the 32-byte hash of all fields and the signature."""
         return hashlib.blake2s(self._signed_bytes() + self.signature).digest()
 
     def _signed_bytes(self) -> bytes:
-        return bytes(msgpack.packb([b"swarm-record-1", *self.packed()[:-1]]))
+        return bytes(msgpack.packb([b"swarm-record-1", *self.pack()[:-1]]))
 
-    def packed(self) -> list[object]:
+    def pack(self) -> list[object]:
         """Return the fields for a message."""
         return [self.key, self.name, self.owner, self.sequence, self.lifetime, self.ttl, self.value, self.signature]
 
 
-def unpacked(fields: object) -> Record | None:
+def parse_record(fields: object) -> Record | None:
     """Parse the fields of ``Record.packed``; None if a type, length or range is wrong."""
     if not isinstance(fields, list) or len(fields) != 8:
         return None
@@ -108,29 +108,29 @@ def unpacked(fields: object) -> Record | None:
         isinstance(key, bytes)
         and len(key) == KEY_BYTES
         and isinstance(name, str)
-        and len(name) <= MAX_NAME
+        and len(name) <= MAX_NAME_BYTES
         and isinstance(owner, bytes)
         and len(owner) == 32
         and type(sequence) is int
         and 0 <= sequence < 2**63
         and lifetime in ("leased", "team")
         and type(ttl) is float
-        and 0.0 < ttl <= MAX_TTL
-        and (value is None or (isinstance(value, bytes) and len(value) <= MAX_VALUE))
+        and 0.0 < ttl <= MAX_TTL_S
+        and (value is None or (isinstance(value, bytes) and len(value) <= MAX_VALUE_BYTES))
         and isinstance(signature, bytes)
         and len(signature) == 64
     )
     return Record(key, name, owner, sequence, lifetime, ttl, value, signature) if is_valid else None
 
 
-def slot_unpacked(fields: object) -> Slot | None:
+def parse_slot(fields: object) -> Slot | None:
     """Parse a slot, [key, owner, name]; None if a type is wrong."""
     if not isinstance(fields, list) or [type(part) for part in fields] != [bytes, bytes, str]:
         return None
     return Slot(*fields)
 
 
-class Signed:
+class SignatureCache:
     """A cache of the last ``MAX_SIGNED`` records with a valid signature; verifying one takes 80 us."""
 
     def __init__(self) -> None:
@@ -148,11 +148,11 @@ class Signed:
         if not record.is_genuine():
             return False
         self._digests[digest] = None
-        if len(self._digests) > MAX_SIGNED:
+        if len(self._digests) > MAX_CACHED:
             self._digests.popitem(last=False)
         return True
 
 
-def hashed_key(text: str) -> bytes:
+def hash_key(text: str) -> bytes:
     """Return the 160-bit key of ``text`` (thesis, Algorithm 4.2)."""
     return hashlib.blake2s(text.encode(), digest_size=KEY_BYTES).digest()

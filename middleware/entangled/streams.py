@@ -20,35 +20,35 @@ from middleware.entangled.wire.endpoint import Endpoint
 PART_BYTES = 1100
 MAX_PARTS = 64
 MAX_VIEWERS = 64
-OPEN_TTL = 3.0
-RENEW = 1.0
-PATIENCE = 1.0
+SUBSCRIPTION_TTL_S = 3.0
+RENEW_INTERVAL_S = 1.0
+RESTART_AFTER_S = 1.0
 """The seconds without a newer frame after which a lower number is accepted, because the publisher restarted."""
-MAX_CHANNEL = 32
+MAX_CHANNEL_CHARS = 32
 
-MAX_AGE = 600.0
+MAX_AGE_S = 600.0
 OnFrame = Callable[[int, bytes, float], None]
 """Called with the number, the frame, and its age in seconds."""
 
 
 @dataclass
-class _Assembly:
+class _IncomingFrame:
     """The parts of the newest frame of one channel; ``at`` is the arrival of its first part, ``age`` its age then."""
 
     sequence: int = -1
     count: int = 0
-    at: float = 0.0
-    age: float = 0.0
+    arrived_at: float = 0.0
+    age_s: float = 0.0
     parts: dict[int, bytes] = field(default_factory=dict)
     is_done: bool = False
 
     def add(self, sequence: int, number: int, count: int, part: bytes, age: float, now: float) -> bytes | None:
         """Add one part; return the frame if it is complete."""
-        if sequence < self.sequence and now - self.at <= PATIENCE:
+        if sequence < self.sequence and now - self.arrived_at <= RESTART_AFTER_S:
             return None
         if sequence != self.sequence or count != self.count:
             self.sequence, self.count, self.parts, self.is_done = sequence, count, {}, False
-            self.at, self.age = now, age
+            self.arrived_at, self.age_s = now, age
         self.parts[number] = part
         if self.is_done or len(self.parts) < count:
             return None
@@ -69,7 +69,7 @@ class Streams:
 
     # -- publisher --------------------------------------------------------------------------------------------------
 
-    def is_wanted(self, channel: str) -> bool:
+    def has_viewers(self, channel: str) -> bool:
         """Return whether ``channel`` has viewers now."""
         now = self._clock.seconds()
         viewers = self._viewers.get(channel, {})
@@ -79,36 +79,36 @@ class Streams:
             self._viewers.pop(channel, None)
         return bool(viewers)
 
-    def offer(self, channel: str, sequence: int, frame: bytes, age: float = 0.0) -> None:
+    def publish(self, channel: str, sequence: int, frame: bytes, age: float = 0.0) -> None:
         """Send ``frame``, taken ``age`` seconds ago, to the viewers of ``channel``.
 
         Frames of more than ``MAX_PARTS`` parts are not sent.
         """
-        if not self.is_wanted(channel):
+        if not self.has_viewers(channel):
             return
         parts = [frame[i : i + PART_BYTES] for i in range(0, len(frame), PART_BYTES)]
         if len(parts) > MAX_PARTS:
             return
-        age_ms = round(1000 * min(max(age, 0.0), MAX_AGE))
+        age_ms = round(1000 * min(max(age, 0.0), MAX_AGE_S))
         for viewer, _ in self._viewers[channel].values():
             for number, part in enumerate(parts):
-                self._endpoint.tell(viewer, "stream.part", channel, sequence, number, len(parts), part, age_ms)
+                self._endpoint.notify(viewer, "stream.part", channel, sequence, number, len(parts), part, age_ms)
 
     def _answer_open(self, peer: Contact, channel: str) -> bool:
-        if len(channel) > MAX_CHANNEL:
-            raise Refused(f"the name of a channel has at most {MAX_CHANNEL} characters")
+        if len(channel) > MAX_CHANNEL_CHARS:
+            raise Refused(f"the name of a channel has at most {MAX_CHANNEL_CHARS} characters")
         for other in list(self._viewers):
-            self.is_wanted(other)  # deletes expired viewers
+            self.has_viewers(other)  # deletes expired viewers
         viewers = self._viewers.get(channel, {})
         if peer.node_id not in viewers and sum(map(len, self._viewers.values())) >= MAX_VIEWERS:
             raise Refused("too many viewers")
-        viewers[peer.node_id] = (peer, self._clock.seconds() + OPEN_TTL)
+        viewers[peer.node_id] = (peer, self._clock.seconds() + SUBSCRIPTION_TTL_S)
         self._viewers[channel] = viewers
         return True
 
     # -- viewer -----------------------------------------------------------------------------------------------------
 
-    def look(self, publisher: Contact, channel: str, on_frame: OnFrame) -> Callable[[], None]:
+    def view(self, publisher: Contact, channel: str, on_frame: OnFrame) -> Callable[[], None]:
         """Call ``on_frame(sequence, frame, age)`` for each complete new frame; return a function that stops it.
 
         ``age`` is the seconds since the frame was taken: its age at the publisher and half a measured round trip.
@@ -118,13 +118,13 @@ class Streams:
         if look is None:
             look = self._views[place] = _View(self, publisher, channel)
             look.renew()
-        look.watchers.append(on_frame)
+        look.listeners.append(on_frame)
 
         def stop() -> None:
-            if on_frame in look.watchers:
-                look.watchers.remove(on_frame)
-            if not look.watchers and self._views.get(place) is look:
-                look.end()
+            if on_frame in look.listeners:
+                look.listeners.remove(on_frame)
+            if not look.listeners and self._views.get(place) is look:
+                look.stop()
                 del self._views[place]
 
         return stop
@@ -132,7 +132,7 @@ class Streams:
     def stop(self) -> None:
         """Stop all channels, viewed and published."""
         for look in self._views.values():
-            look.end()
+            look.stop()
         self._views.clear()
         self._viewers.clear()
 
@@ -142,13 +142,13 @@ class Streams:
         look = self._views.get((peer.node_id, channel))
         if look is None or not 0 <= number < count <= MAX_PARTS or len(part) > PART_BYTES:
             return
-        if not 0 <= age_ms <= 1000 * MAX_AGE:
+        if not 0 <= age_ms <= 1000 * MAX_AGE_S:
             return
-        now, assembly = self._clock.seconds(), look.assembly
+        now, assembly = self._clock.seconds(), look.frame
         frame = assembly.add(sequence, number, count, part, age_ms / 1000, now)
         if frame is not None:
-            age = assembly.age + now - assembly.at + (self._endpoint.round_trip(peer) or 0.0) / 2
-            for on_frame in list(look.watchers):
+            age = assembly.age_s + now - assembly.arrived_at + (self._endpoint.round_trip(peer) or 0.0) / 2
+            for on_frame in list(look.listeners):
                 on_frame(sequence, frame, age)
 
 
@@ -156,8 +156,8 @@ class _View:
     """One viewed channel, renewed while it has watchers."""
 
     def __init__(self, streams: Streams, publisher: Contact, channel: str) -> None:
-        self.watchers: list[OnFrame] = []
-        self.assembly = _Assembly()
+        self.listeners: list[OnFrame] = []
+        self.frame = _IncomingFrame()
         self._streams = streams
         self._publisher = publisher
         self._channel = channel
@@ -165,10 +165,10 @@ class _View:
 
     def renew(self) -> None:
         """Renew the subscription."""
-        self._timer = self._streams._clock.callLater(RENEW, self.renew)
+        self._timer = self._streams._clock.callLater(RENEW_INTERVAL_S, self.renew)
         opened = self._streams._endpoint.ask(self._publisher, "stream.open", self._channel, changes=True)
         opened.addErrback(lambda failure: failure.trap(EntangledError))
 
-    def end(self) -> None:
+    def stop(self) -> None:
         """Stop renewing; the subscription expires at the publisher."""
         cancel(self._timer)

@@ -26,7 +26,7 @@ class TokenBucket:
         self._tokens -= amount
         return True
 
-    def give(self) -> None:
+    def refund(self) -> None:
         """Return one token that was not used."""
         self._tokens = min(self._size, self._tokens + 1.0)
 

@@ -12,13 +12,13 @@ import msgpack
 from middleware.entangled.errors import TooLarge
 from middleware.entangled.record import Record
 
-MAX_VALUE = 1000
+MAX_VALUE_BYTES = 1000
 """Bytes of a value that all devices of the team store; its record fits into one datagram."""
-LARGEST = 2**53
+MAX_NUMBER = 2**53
 """Largest absolute value of a number: JavaScript represents integers exactly up to here."""
 
 
-def mapping_of(record: Record, most: int = MAX_VALUE) -> dict[str, Any] | None:
+def parse_mapping(record: Record, most: int = MAX_VALUE_BYTES) -> dict[str, Any] | None:
     """Return the mapping in a record's value; None if it is no mapping or longer than ``most`` bytes; never raises."""
     if record.value is None or len(record.value) > most:
         return None
@@ -29,21 +29,23 @@ def mapping_of(record: Record, most: int = MAX_VALUE) -> dict[str, Any] | None:
     return content if isinstance(content, dict) else None
 
 
-def bounded(value: bytes) -> bytes:
+def check_size(value: bytes) -> bytes:
     """Return ``value``; raise ``TooLarge`` if it has more than ``MAX_VALUE`` bytes."""
-    if len(value) > MAX_VALUE:
-        raise TooLarge(f"{len(value)} bytes; a value that all devices store has at most {MAX_VALUE}; shorten the texts")
+    if len(value) > MAX_VALUE_BYTES:
+        raise TooLarge(
+            f"{len(value)} bytes; a value that all devices store has at most {MAX_VALUE_BYTES}; shorten the texts"
+        )
     return value
 
 
 def is_number(value: object) -> bool:
     """Return whether ``value`` is a number of at most ``LARGEST``, not a boolean, infinity or NaN."""
-    return type(value) in (int, float) and -LARGEST <= value <= LARGEST  # type: ignore[operator]
+    return type(value) in (int, float) and -MAX_NUMBER <= value <= MAX_NUMBER  # type: ignore[operator]
 
 
-def is_whole(value: object) -> bool:
+def is_natural(value: object) -> bool:
     """Return whether ``value`` is an integer from 0 to ``LARGEST``."""
-    return type(value) is int and 0 <= value <= LARGEST
+    return type(value) is int and 0 <= value <= MAX_NUMBER
 
 
 def are_capabilities(value: object) -> bool:

@@ -20,17 +20,17 @@ from twisted.logger import Logger
 from middleware.entangled.contact import Contact
 from middleware.entangled.errors import Refused
 from middleware.entangled.network.network import Network
-from middleware.entangled.network.switchboard import CALM, Weather
+from middleware.entangled.network.switchboard import PERFECT, LinkConditions
 from middleware.errors import BadFault, UnknownTask
-from middleware.faults.kinds import ASKED, ASSIGN, CAUSE, KINDS, Fault, parse_fault
+from middleware.faults.kinds import ASSIGN_METHOD, CAUSE_METHOD, KINDS, LIST_METHOD, Fault, parse_fault
 from middleware.faults.network import FaultyNetwork
 from middleware.node import SwarmNode
 from middleware.tasks.task import Task
 
 MakeTask = Callable[[str, str, float], Task]
 """Creates a predefined task from its name, a new task id, and the wall clock."""
-LEVEL = "power.level"
-AFTER_ANSWERS = 0.5
+BATTERY_LEVEL = "power.level"
+START_DELAY_S = 0.5
 """Seconds from the reply to the fault: a node that is isolated or dead could not confirm the order.  With packet loss,
 the reply may have to be sent several times."""
 
@@ -71,7 +71,7 @@ class Process(Protocol):
 
 
 @dataclass(eq=False)
-class _Order:
+class _OrderedFault:
     fault: Fault
     until: float = 0.0
     state: State = State.ORDERED
@@ -117,10 +117,10 @@ class LowBattery:
         return end
 
     def _limit(self, seen: Any) -> Any:
-        level = None if seen is None else seen.values.get(LEVEL)
+        level = None if seen is None else seen.values.get(BATTERY_LEVEL)
         if self.level is None or not isinstance(level, float | int) or level <= self.level:
             return seen
-        return replace(seen, values={**seen.values, LEVEL: self.level})
+        return replace(seen, values={**seen.values, BATTERY_LEVEL: self.level})
 
 
 class FaultInjector:
@@ -148,7 +148,7 @@ class FaultInjector:
         self._process = process
         self._network: FaultyNetwork | None = None
         self._battery: LowBattery | None = None
-        self._active: dict[str, _Order] = {}
+        self._active: dict[str, _OrderedFault] = {}
 
     def open_network(self) -> Network:
         """Create the node's network with fault injection."""
@@ -172,15 +172,17 @@ class FaultInjector:
                 fault = parse_fault(kind, seconds, amount)
             except BadFault as error:
                 raise Refused(str(error)) from error
-            if fault.kind not in self.kinds():
-                raise Refused(f"kind: this device cannot have {fault.kind}; choose one of {', '.join(self.kinds())}")
-            node.later(AFTER_ANSWERS, self._begin, node, _Order(fault))
-            return AFTER_ANSWERS
+            if fault.kind not in self.list_kinds():
+                raise Refused(
+                    f"kind: this device cannot have {fault.kind}; choose one of {', '.join(self.list_kinds())}"
+                )
+            node.later(START_DELAY_S, self._begin, node, _OrderedFault(fault))
+            return START_DELAY_S
 
         def list_faults(peer: Contact) -> dict[str, Any]:
             now = self._clock.seconds()
             active = [[each.fault.kind, each.until - now, each.fault.amount] for each in self._active.values()]
-            return {"kinds": self.kinds(), "active": active}
+            return {"kinds": self.list_kinds(), "active": active}
 
         def assign(peer: Contact, name: str) -> Deferred[str]:
             try:
@@ -190,18 +192,18 @@ class FaultInjector:
             return Deferred.fromCoroutine(node.submit(task)).addCallback(lambda task: task.task_id)
 
         expose = node.entangled.endpoint.expose
-        expose(CAUSE, cause, changes=True)
-        expose(ASKED, list_faults)
-        expose(ASSIGN, assign, changes=True)
+        expose(CAUSE_METHOD, cause, changes=True)
+        expose(LIST_METHOD, list_faults)
+        expose(ASSIGN_METHOD, assign, changes=True)
 
-    def kinds(self) -> list[str]:
+    def list_kinds(self) -> list[str]:
         """Return the kinds of faults that this node supports."""
         lacks = {*(() if self._process else ("kill", "freeze")), *(() if self._battery else ("battery",))}
         return [kind for kind in KINDS if kind not in lacks]
 
     # -- implementation ---------------------------------------------------------------------------------------------
 
-    def _begin(self, node: SwarmNode, order: _Order) -> None:
+    def _begin(self, node: SwarmNode, order: _OrderedFault) -> None:
         fault, name = order.fault, node.presence.device.name
         self._log.warn("fault injected: {name}, {kind} for {s:g} s", name=name, kind=fault.kind, s=fault.seconds)
         if fault.kind == "kill" and self._process is not None:
@@ -217,7 +219,7 @@ class FaultInjector:
         if fault.kind == "freeze" and self._process is not None:
             self._process.freeze(fault.seconds)
 
-    def _end(self, order: _Order) -> None:
+    def _end(self, order: _OrderedFault) -> None:
         if order.advance(Event.END):
             del self._active[order.fault.kind]
             self._apply()
@@ -230,10 +232,10 @@ class FaultInjector:
 
         self.wall.ahead = amount("skew")
         if self._network is not None:
-            weather = Weather(delay_s=amount("delay"), loss=amount("loss"))
-            self._network.weather = CALM if weather == CALM else weather
-            self._network.is_deaf = "radio" in self._active
-            self._network.is_mute = "radio" in self._active or "one-way" in self._active
+            weather = LinkConditions(delay_s=amount("delay"), loss=amount("loss"))
+            self._network.weather = PERFECT if weather == PERFECT else weather
+            self._network.is_receive_blocked = "radio" in self._active
+            self._network.is_send_blocked = "radio" in self._active or "one-way" in self._active
         if self._battery is not None:
             level = amount("battery", math.inf)
             self._battery.level = None if level == math.inf else level

@@ -11,15 +11,15 @@ from dataclasses import dataclass
 from middleware.entangled.value import is_number
 from middleware.errors import BadFault
 
-CAUSE, ASKED, ASSIGN = "device.fault", "device.faults", "device.assign"
+CAUSE_METHOD, LIST_METHOD, ASSIGN_METHOD = "device.fault", "device.faults", "device.assign"
 """Methods of a node that allows faults: inject one; list its kinds and the active ones; publish a predefined task."""
-MIN_S, MAX_S, USUAL_S = 0.1, 600.0, 15.0
-MOST_AHEAD_S = 2.0
+MIN_S, MAX_S, DEFAULT_S = 0.1, 600.0, 15.0
+MAX_DELAY_S = 2.0
 """The longest delay between the answer of a device and its fault."""
 
 
 @dataclass(frozen=True)
-class Kind:
+class FaultKind:
     """The properties of one kind of fault.
 
     ``is_lost``: a device that executes a task has to be replaced.  A kind with a ``unit`` has an amount: ``amount`` is
@@ -35,15 +35,19 @@ class Kind:
     means: str = ""
 
 
-KINDS: Mapping[str, Kind] = {
-    "kill": Kind("its process is killed (SIGKILL); a supervisor restarts it", is_lost=True),
-    "freeze": Kind("its process stops (SIGSTOP), and continues at the end", is_lost=True),
-    "radio": Kind("no datagram passes in either direction", is_lost=True),
-    "one-way": Kind("it receives datagrams, but cannot send any", is_lost=True),
-    "delay": Kind("all its datagrams are delayed in both directions", False, 0.3, 0.0, 5.0, "s", "late by"),
-    "loss": Kind("a share of its datagrams is lost in both directions", False, 0.2, 0.0, 1.0, "of 1", "share lost"),
-    "skew": Kind("its wall clock is wrong, which must have no effect", False, 3600.0, -1e6, 1e6, "s", "ahead by"),
-    "battery": Kind("its battery reads low; below 0.05 it gives up its task", True, 0.03, 0.0, 1.0, "of 1", "charge"),
+KINDS: Mapping[str, FaultKind] = {
+    "kill": FaultKind("its process is killed (SIGKILL); a supervisor restarts it", is_lost=True),
+    "freeze": FaultKind("its process stops (SIGSTOP), and continues at the end", is_lost=True),
+    "radio": FaultKind("no datagram passes in either direction", is_lost=True),
+    "one-way": FaultKind("it receives datagrams, but cannot send any", is_lost=True),
+    "delay": FaultKind("all its datagrams are delayed in both directions", False, 0.3, 0.0, 5.0, "s", "late by"),
+    "loss": FaultKind(
+        "a share of its datagrams is lost in both directions", False, 0.2, 0.0, 1.0, "of 1", "share lost"
+    ),
+    "skew": FaultKind("its wall clock is wrong, which must have no effect", False, 3600.0, -1e6, 1e6, "s", "ahead by"),
+    "battery": FaultKind(
+        "its battery reads low; below 0.05 it gives up its task", True, 0.03, 0.0, 1.0, "of 1", "charge"
+    ),
 }
 
 
@@ -52,7 +56,7 @@ class Fault:
     """A fault of a ``kind`` out of ``KINDS`` that lasts for ``seconds``."""
 
     kind: str
-    seconds: float = USUAL_S
+    seconds: float = DEFAULT_S
     amount: float = 0.0
 
 
@@ -61,7 +65,7 @@ def parse_fault(kind: object, seconds: object = None, amount: object = None) -> 
     if not isinstance(kind, str) or kind not in KINDS:
         raise BadFault("kind", f"there is no fault {str(kind)[:40]!r}", f"choose one of {', '.join(KINDS)}")
     rule = KINDS[kind]
-    lasts = _check_number("seconds", USUAL_S if seconds is None else seconds, MIN_S, MAX_S, "s")
+    lasts = _check_number("seconds", DEFAULT_S if seconds is None else seconds, MIN_S, MAX_S, "s")
     if not rule.unit:
         if amount is not None and amount != 0:
             raise BadFault("amount", f"a fault of the kind {kind} has none", "leave it out")
@@ -70,9 +74,9 @@ def parse_fault(kind: object, seconds: object = None, amount: object = None) -> 
     return Fault(kind, lasts, much)
 
 
-def begins_in(answer: object) -> float:
+def parse_delay(answer: object) -> float:
     """Return the seconds until a fault begins from a device's answer to the order; 0 for an invalid answer."""
-    return float(answer) if is_number(answer) and 0.0 < answer <= MOST_AHEAD_S else 0.0  # type: ignore[operator,arg-type]
+    return float(answer) if is_number(answer) and 0.0 < answer <= MAX_DELAY_S else 0.0  # type: ignore[operator,arg-type]
 
 
 def _check_number(field: str, value: object, least: float, most: float, unit: str) -> float:

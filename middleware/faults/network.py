@@ -10,8 +10,15 @@ import random
 
 from twisted.internet.interfaces import IReactorTime
 
-from middleware.entangled.network.network import Address, Network, Ports, Receiver, detours_of, ports_of
-from middleware.entangled.network.switchboard import CALM
+from middleware.entangled.network.network import (
+    Address,
+    LocalPorts,
+    Network,
+    Receiver,
+    find_alternate_paths,
+    find_ports,
+)
+from middleware.entangled.network.switchboard import PERFECT
 
 
 class FaultyNetwork:
@@ -22,9 +29,9 @@ class FaultyNetwork:
     """
 
     def __init__(self, network: Network, clock: IReactorTime, rng: random.Random) -> None:
-        self.weather = CALM
-        self.is_deaf = False
-        self.is_mute = False
+        self.weather = PERFECT
+        self.is_receive_blocked = False
+        self.is_send_blocked = False
         self._network = network
         self._clock = clock
         self._rng = rng
@@ -36,14 +43,14 @@ class FaultyNetwork:
         return self._network.address
 
     @property
-    def ports(self) -> Ports | None:
+    def ports(self) -> LocalPorts | None:
         """The local ports of the network."""
-        return ports_of(self._network)
+        return find_ports(self._network)
 
     @property
     def detours(self) -> list[Address]:
         """The alternate paths of the network."""
-        return detours_of(self._network)
+        return find_alternate_paths(self._network)
 
     def listen(self, receiver: Receiver) -> None:
         """Open the port, and call ``receiver`` with datagrams that pass; raises ``PortInUse`` if it is in use."""
@@ -52,7 +59,7 @@ class FaultyNetwork:
 
     def send(self, datagram: bytes, to: Address) -> None:
         """Send a datagram, unless a fault drops it."""
-        if not self.is_mute:
+        if not self.is_send_blocked:
             self._forward(self._deliver_sent, datagram, to)
 
     def close(self) -> None:
@@ -61,21 +68,21 @@ class FaultyNetwork:
         self._network.close()
 
     def _on_datagram(self, datagram: bytes, source: Address) -> None:
-        if not self.is_deaf:
+        if not self.is_receive_blocked:
             self._forward(self._deliver_received, datagram, source)
 
     def _forward(self, deliver: Receiver, datagram: bytes, address: Address) -> None:
         """Forward a datagram according to the weather: now, late, twice or not at all."""
-        for delay in (0.0,) if self.weather is CALM else self.weather.delays(self._rng):
+        for delay in (0.0,) if self.weather is PERFECT else self.weather.draw_delays(self._rng):
             if delay > 0.0:
                 self._clock.callLater(delay, deliver, datagram, address)
             else:
                 deliver(datagram, address)
 
     def _deliver_sent(self, datagram: bytes, to: Address) -> None:
-        if self._receiver is not None and not self.is_mute:
+        if self._receiver is not None and not self.is_send_blocked:
             self._network.send(datagram, to)
 
     def _deliver_received(self, datagram: bytes, source: Address) -> None:
-        if self._receiver is not None and not self.is_deaf:
+        if self._receiver is not None and not self.is_receive_blocked:
             self._receiver(datagram, source)

@@ -10,12 +10,12 @@ from typing import Annotated, Any
 
 from msgspec import Meta
 
-from formats.convert import Invalid, Unit, convert_table
+from formats.convert import InvalidValue, Unit, convert_table
 from middleware.errors import BadFault, BadSetting
 from middleware.faults.kinds import Fault, parse_fault
 
-WHO_ACTS, ANY = "executing", "any"
-MAX_FAULTS, MAX_AT = 100, 3600.0
+EXECUTING_DEVICE, ANY_DEVICE = "executing", "any"
+MAX_FAULTS, MAX_AT_S = 100, 3600.0
 
 
 @dataclass(frozen=True)
@@ -23,8 +23,8 @@ class _FaultTable:
     """A table ``[[fault]]``; ``parse_fault`` checks the kind, the seconds and the amount."""
 
     kind: Any = None
-    at: Annotated[float, Meta(ge=0.0, le=MAX_AT), Unit("seconds")] = 0.0
-    device: Annotated[str, Meta(min_length=1, examples=[WHO_ACTS])] = WHO_ACTS
+    at: Annotated[float, Meta(ge=0.0, le=MAX_AT_S), Unit("seconds")] = 0.0
+    device: Annotated[str, Meta(min_length=1, examples=[EXECUTING_DEVICE])] = EXECUTING_DEVICE
     seconds: Any = None
     amount: Any = None
 
@@ -59,10 +59,10 @@ class Scenario:
     seed: int = 1
 
 
-def loaded(path: Path) -> Scenario:
+def load_scenario(path: Path) -> Scenario:
     """Load a scenario file; raises ``BadSetting``."""
     try:
-        return scenario_of(tomllib.loads(path.read_text(encoding="utf-8")), str(path))
+        return parse_scenario(tomllib.loads(path.read_text(encoding="utf-8")), str(path))
     except OSError as error:
         problem = f"cannot be read: {error.strerror or error}"
         raise BadSetting(str(path), "", problem, "name a scenario, such as examples/scenarios/takeover.toml") from error
@@ -70,11 +70,11 @@ def loaded(path: Path) -> Scenario:
         raise BadSetting(str(path), "", f"is not TOML: {error}", "fix that line") from error
 
 
-def scenario_of(content: Mapping[str, Any], origin: str) -> Scenario:
+def parse_scenario(content: Mapping[str, Any], origin: str) -> Scenario:
     """Parse the content of a scenario file; raises ``BadSetting``."""
     try:
         file = convert_table(content, _File)
-    except Invalid as error:
+    except InvalidValue as error:
         key = "[[fault]]" if error.key == "fault" else error.key
         raise BadSetting(origin, key, error.problem, error.remedy) from None
     steps = [_parse_step(fault, origin, f"[[fault]] {number}") for number, fault in enumerate(file.fault, start=1)]
@@ -85,7 +85,7 @@ def _parse_step(content: Any, origin: str, where: str) -> Step:
     try:
         table = convert_table(content, _FaultTable)
         return Step(table.at, table.device, parse_fault(table.kind, table.seconds, table.amount))
-    except Invalid as error:
+    except InvalidValue as error:
         raise BadSetting(origin, f"{where} {error.key}".strip(), error.problem, error.remedy) from None
     except BadFault as error:
         raise BadSetting(origin, f"{where} {error.field}", error.problem, error.remedy) from error

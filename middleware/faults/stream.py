@@ -22,7 +22,7 @@ class StreamFaults:
     half_open: bool = False
     split: bool = False
 
-    def wire(self, data: bytes, rng: random.Random) -> Iterator[bytes]:
+    def apply(self, data: bytes, rng: random.Random) -> Iterator[bytes]:
         """Yield the pieces of ``data`` that are sent, in order; none if it is lost."""
         if self.half_open or rng.random() < self.drop:
             return

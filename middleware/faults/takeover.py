@@ -9,11 +9,11 @@ from middleware.directory.presence import EXECUTING, Device
 
 TARGET_S = 2.0
 """Seconds within which another device should take over."""
-WATCHED_S = 5.0
+OBSERVATION_S = 5.0
 """Seconds after the end of a fault in which a takeover still counts."""
 
 
-def acting(devices: Iterable[Device]) -> dict[str, str]:
+def find_executing(devices: Iterable[Device]) -> dict[str, str]:
     """Return the devices that execute a task: uuid to task."""
     return {device.uuid: device.task for device in devices if device.status == EXECUTING and device.task}
 
@@ -34,7 +34,7 @@ class Takeover:
     seconds: float | None = None
     to: str = ""
 
-    def look(self, acts: Mapping[str, str], now: float) -> bool:
+    def observe(self, acts: Mapping[str, str], now: float) -> bool:
         """Record the executing devices (uuid to task) at ``now``; returns True if this call detects the takeover."""
         if not self.is_open(now):
             return False
@@ -45,4 +45,4 @@ class Takeover:
 
     def is_open(self, now: float) -> bool:
         """Return whether a takeover can still be observed."""
-        return bool(self.task) and self.seconds is None and now < self.until + WATCHED_S
+        return bool(self.task) and self.seconds is None and now < self.until + OBSERVATION_S

@@ -8,17 +8,17 @@ from typing import Any
 
 from twisted.internet.defer import Deferred, fail
 
-from middleware.consensus.verdict import verdicts_key
+from middleware.consensus.decision_record import decision_records_key
 from middleware.directory.presence import DEVICES
 from middleware.entangled.contact import Contact
 from middleware.entangled.errors import EntangledError, NoAnswer
 from middleware.entangled.record import Record
 from middleware.entangled.replication.watch import Watch
-from middleware.frontend.view import TeamView
+from middleware.frontend.team_view import TeamView
 from middleware.node import CAMERA, SwarmNode
-from middleware.stop.halt import HALT
+from middleware.stop.stop_state import STOPS_KEY
 from middleware.tasks.order import Order
-from middleware.tasks.task import CANCELLED, TASKS, Result, Task, tasks_of
+from middleware.tasks.task import CANCELLED, TASKS, Result, Task, parse_tasks
 
 LOOKUP_S = 1.0
 """Timeout in seconds of the lookup of a task."""
@@ -38,7 +38,7 @@ class TeamClient:
         self.view = TeamView(self.read)
         self._devices = node.watch_devices(self._count_change, keep=True)
         self._tasks = node.watch_tasks(self._watch_tasks, keep=True)
-        node.halt.follow()
+        node.stop_state.follow()
 
     @property
     def name(self) -> str:
@@ -51,17 +51,17 @@ class TeamClient:
             return self._devices.records
         if key == TASKS:
             return self._tasks.records
-        if key == HALT:
-            return self._node.halt.records
+        if key == STOPS_KEY:
+            return self._node.stop_state.records
         watches = (watch for pair in self._tasks_watched.values() for watch in pair)
         return next((watch.records for watch in watches if watch.key == key), [])
 
     # -- devices ----------------------------------------------------------------------------------------------------
 
-    def contact(self, uuid: str) -> Contact | None:
+    def find_contact(self, uuid: str) -> Contact | None:
         """Return the contact of a device that is present, or None."""
-        record = self.view.record_of(uuid)
-        return None if record is None else self._node.contact_of(record)
+        record = self.view.find_record(uuid)
+        return None if record is None else self._node.find_contact(record)
 
     def call(self, uuid: str, method: str, *arguments: object, timeout: float, changes: bool = False) -> Deferred[Any]:
         """Call a method of a device; fails with ``EntangledError``, and with ``NoAnswer`` if it is not present.
@@ -69,24 +69,24 @@ class TeamClient:
         :param timeout: seconds
         :param changes: whether the call changes something, so that it may run only once
         """
-        contact = self.contact(uuid)
+        contact = self.find_contact(uuid)
         if contact is None:
-            return fail(NoAnswer(f"{self.view.name_of(uuid)} is not present"))
+            return fail(NoAnswer(f"{self.view.find_name(uuid)} is not present"))
         return self._node.entangled.endpoint.ask(contact, method, *arguments, timeout=timeout, changes=changes)
 
     def stream_camera(self, contact: Contact, on_frame: Callable[[int, bytes, float], None]) -> Callable[[], None]:
         """Receive the pictures of a device's camera until the returned function is called."""
-        return self._node.streams.look(contact, CAMERA, on_frame)
+        return self._node.streams.view(contact, CAMERA, on_frame)
 
     # -- stops ------------------------------------------------------------------------------------------------------
 
     def stop_all(self, by: str) -> Deferred[dict[str, str]]:
         """Stop every device; fires with the answer of each by uuid."""
-        return self._node.halt.stop(by, self._contacts())
+        return self._node.stop_state.stop(by, self._contacts())
 
     def release(self, stops: Iterable[bytes], by: str) -> Deferred[dict[str, str]]:
         """Release ``stops``; fires with the answer of each device by uuid."""
-        return self._node.halt.release(list(stops), by, self._contacts())
+        return self._node.stop_state.release(list(stops), by, self._contacts())
 
     # -- tasks ------------------------------------------------------------------------------------------------------
 
@@ -104,9 +104,9 @@ class TeamClient:
 
         def answer(records: Iterable[Record]) -> None:
             if not found.called:
-                found.callback(tasks_of([*self._tasks.records, *records]).get(task_id))
+                found.callback(parse_tasks([*self._tasks.records, *records]).get(task_id))
 
-        if self.view.task(task_id) is not None:
+        if self.view.find_task(task_id) is not None:
             answer(())
             return found
         cancel = self._node.later(LOOKUP_S, answer, ())
@@ -121,28 +121,28 @@ class TeamClient:
     def cancel(self, task_id: str) -> Deferred[Any]:
         """Record that the task is cancelled; its agents stop."""
         result = Result(CANCELLED, self.name)
-        task = self.view.task(task_id)
+        task = self.view.find_task(task_id)
         if task is None:
-            return self._node.conclude(task_id, result)
+            return self._node.record_result(task_id, result)
         return Deferred.fromCoroutine(self._node.cancel(task, result))
 
     def order(self, task_id: str, word: str) -> Deferred[Any]:
         """Pause or resume a task (``middleware.tasks.order``)."""
-        return self._node.order(task_id, Order(word, self.name, self._node.wall()).packed())
+        return self._node.record_order(task_id, Order(word, self.name, self._node.wall()).pack())
 
     # -- inside -----------------------------------------------------------------------------------------------------
 
     def _contacts(self) -> list[Contact]:
-        contacts = [self.contact(device.uuid) for device in self.view.devices]
+        contacts = [self.find_contact(device.uuid) for device in self.view.devices]
         return [contact for contact in contacts if contact is not None]
 
     def _watch_tasks(self, records: list[Record]) -> None:
         self._count_change(records)
-        for task_id in tasks_of(records):
+        for task_id in parse_tasks(records):
             if task_id not in self._tasks_watched:
                 self._tasks_watched[task_id] = (
                     self._node.watch_group(task_id, self._count_change, keep=True),
-                    self._node.entangled.watch(verdicts_key(task_id), self._count_change, keep=True),
+                    self._node.entangled.watch(decision_records_key(task_id), self._count_change, keep=True),
                 )
 
     def _count_change(self, records: list[Record]) -> None:

@@ -19,20 +19,20 @@ from typing import Any
 
 import msgpack
 
-from middleware.entangled.value import is_whole
+from middleware.entangled.value import is_natural
 
 ID_BYTES = 16
-MAX_NAMED = 8
+MAX_STOPS = 8
 """Maximum number of stops in one statement."""
-MAX_OF_SENDER = 16
+MAX_STOPS_OF_SENDER = 16
 """Maximum number of separate stops of one sender."""
 MAX_SENDERS = 64
 """Maximum number of senders with separate stops; further senders share one entry."""
 MAX_RELEASED = 512
 """Maximum number of stored releases, and of stops in one release."""
-MAX_BY = 64
+MAX_OPERATOR_CHARACTERS = 64
 """Maximum characters of the operator's name."""
-BY_BYTES = 48
+MAX_OPERATOR_BYTES = 48
 """Maximum bytes of that name in messages: eight stops fit into a record that every device holds."""
 _SHARED = b""
 """The sender for the stops of senders beyond ``MAX_SENDERS``."""
@@ -49,7 +49,7 @@ class Statement:
     released: tuple[bytes, ...] = ()
     by: str = ""
 
-    def packed(self) -> list[object]:
+    def pack(self) -> list[object]:
         """Return the arguments of ``device.halt``, which are also the value of the record."""
         return [[[stop, by] for stop, by in self.stops.items()], list(self.released), self.by]
 
@@ -66,7 +66,7 @@ class StopSet:
         """The stops that are not released, id to operator; empty if the team is not stopped."""
         return {stop: by for stops in self._stops.values() for stop, by in stops.items()}
 
-    def of(self, sender: bytes) -> dict[bytes, str]:
+    def get_stops(self, sender: bytes) -> dict[bytes, str]:
         """Return the stops of ``sender`` that are in force, the newest last."""
         return dict(self._stops.get(sender, {}))
 
@@ -80,7 +80,7 @@ class StopSet:
                 is_new |= self._add(sender, stop, by)
         return is_new
 
-    def packed(self) -> list[object]:
+    def pack(self) -> list[object]:
         """Return the encoding for the store."""
         stops = [[sender, [[stop, by] for stop, by in stops.items()]] for sender, stops in self._stops.items()]
         return [stops, list(self._released)]
@@ -103,35 +103,35 @@ class StopSet:
         if stop in stops:
             return False
         stops[stop] = by
-        if len(stops) > MAX_OF_SENDER:
+        if len(stops) > MAX_STOPS_OF_SENDER:
             (first, _), (second, by) = list(stops.items())[:2]
             rest = {each: by for each, by in stops.items() if each not in (first, second)}
-            self._stops[sender] = {derived_id(first, second): by, **rest}
+            self._stops[sender] = {derive_id(first, second): by, **rest}
         return True
 
 
-def derived_id(*parts: bytes) -> bytes:
+def derive_id(*parts: bytes) -> bytes:
     """Return the id of a stop without a random id."""
     return hashlib.blake2s(b"".join(parts), digest_size=ID_BYTES, person=b"stop").digest()
 
 
-def clipped(by: str) -> str:
+def clip_name(by: str) -> str:
     """Cut the name of an operator to at most ``BY_BYTES`` bytes."""
-    return by.encode(errors="ignore")[:BY_BYTES].decode(errors="ignore")
+    return by.encode(errors="ignore")[:MAX_OPERATOR_BYTES].decode(errors="ignore")
 
 
-def statement_of(fields: object) -> Statement | None:
+def parse_statement(fields: object) -> Statement | None:
     """Decode a statement; None if it is malformed."""
     if not isinstance(fields, list) or len(fields) != 3:
         return None
     stops, released, by = fields
-    found = _stops_of(stops, MAX_NAMED)
+    found = _parse_stops(stops, MAX_STOPS)
     if found is None or not _are_ids(released) or not _is_name(by):
         return None
     return Statement(found, tuple(released), by)
 
 
-def statement_in(owner: bytes, value: bytes | None) -> Statement | None:
+def parse_record_value(owner: bytes, value: bytes | None) -> Statement | None:
     """Decode the statement in a record of ``owner``; None if there is none.  Never raises.
 
     Earlier versions wrote ``[number, is on, by]``.  If "is on" is true, it counts as a stop, which must be released by
@@ -145,15 +145,15 @@ def statement_in(owner: bytes, value: bytes | None) -> Statement | None:
         isinstance(fields, list)
         and len(fields) == 3
         and fields[1] is True
-        and is_whole(fields[0])
+        and is_natural(fields[0])
         and _is_name(fields[2])
     ):
-        by = clipped(fields[2])
-        return Statement({derived_id(owner, value or b""): by}, (), by)
-    return statement_of(fields)
+        by = clip_name(fields[2])
+        return Statement({derive_id(owner, value or b""): by}, (), by)
+    return parse_statement(fields)
 
 
-def unpacked(fields: object) -> StopSet:
+def parse_stop_set(fields: object) -> StopSet:
     """Decode a set from the store; raises ``ValueError`` if it is malformed."""
     stops, released = fields if isinstance(fields, list) and len(fields) == 2 else (None, None)
     found = StopSet()
@@ -161,7 +161,7 @@ def unpacked(fields: object) -> StopSet:
         raise ValueError("malformed set of stops")
     for entry in stops:
         sender, listed = entry if isinstance(entry, list) and len(entry) == 2 else (None, None)
-        of_sender = _stops_of(listed, MAX_OF_SENDER)
+        of_sender = _parse_stops(listed, MAX_STOPS_OF_SENDER)
         if not isinstance(sender, bytes) or not of_sender:
             raise ValueError("malformed stops of a sender")
         found._stops[sender] = of_sender
@@ -179,10 +179,10 @@ def _are_ids(values: object) -> bool:
 
 
 def _is_name(by: object) -> bool:
-    return isinstance(by, str) and len(by) <= MAX_BY
+    return isinstance(by, str) and len(by) <= MAX_OPERATOR_CHARACTERS
 
 
-def _stops_of(listed: object, most: int) -> dict[bytes, str] | None:
+def _parse_stops(listed: object, most: int) -> dict[bytes, str] | None:
     if not isinstance(listed, list) or len(listed) > most:
         return None
     pairs: list[Any] = [pair for pair in listed if isinstance(pair, list) and len(pair) == 2 and are_ids(pair[:1])]

@@ -7,11 +7,11 @@ from dataclasses import dataclass, fields
 import msgpack
 
 from middleware.entangled.record import Record
-from middleware.entangled.value import bounded, is_number, mapping_of
+from middleware.entangled.value import check_size, is_number, parse_mapping
 from middleware.tasks.task import ORDER
 
 PAUSE, RESUME = "PAUSE", "RESUME"
-WORDS = (PAUSE, RESUME)
+ORDERS = (PAUSE, RESUME)
 
 
 @dataclass(frozen=True)
@@ -22,23 +22,23 @@ class Order:
     by: str
     at: float
 
-    def packed(self) -> bytes:
+    def pack(self) -> bytes:
         """Return the value of the order's record."""
-        return bounded(bytes(msgpack.packb(vars(self))))
+        return check_size(bytes(msgpack.packb(vars(self))))
 
 
-def order_of(records: list[Record]) -> Order | None:
+def find_newest_order(records: list[Record]) -> Order | None:
     """Return the newest order in the records of a group, or None; equal records give the same order at every node."""
-    orders = [order for record in records if (order := _order_in(record)) is not None]
+    orders = [order for record in records if (order := _parse_order(record)) is not None]
     return max(orders, key=lambda order: (order.at, order.word, order.by), default=None)
 
 
-def _order_in(record: Record) -> Order | None:
-    content = mapping_of(record)
+def _parse_order(record: Record) -> Order | None:
+    content = parse_mapping(record)
     if record.name != ORDER or content is None:
         return None
     try:
         order = Order(**{f.name: content[f.name] for f in fields(Order) if f.name in content})
     except TypeError:
         return None
-    return order if order.word in WORDS and isinstance(order.by, str) and is_number(order.at) else None
+    return order if order.word in ORDERS and isinstance(order.by, str) and is_number(order.at) else None

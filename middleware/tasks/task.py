@@ -15,42 +15,42 @@ from typing import Any
 
 import msgpack
 
-from middleware.consensus.lease.charter import Charter, charter_of, ending_of
+from middleware.consensus.lease.charter import Charter, parse_charter, parse_end_proof
 from middleware.consensus.lease.lease_codec import MAX_PROOF_BYTES
 from middleware.directory.presence import Capabilities
-from middleware.entangled.contact import Contact, unpacked
-from middleware.entangled.identity import node_id
-from middleware.entangled.record import Record, hashed_key
+from middleware.entangled.contact import Contact, parse_contact
+from middleware.entangled.identity import derive_node_id
+from middleware.entangled.record import Record, hash_key
 from middleware.entangled.value import (
-    MAX_VALUE,
+    MAX_VALUE_BYTES,
     are_capabilities,
     are_properties,
-    bounded,
+    check_size,
+    is_natural,
     is_number,
-    is_whole,
-    mapping_of,
+    parse_mapping,
 )
 
-TASKS = hashed_key("tasks")
+TASKS = hash_key("tasks")
 COMPLETED, FAILED, CANCELLED = "COMPLETED", "FAILED", "CANCELLED"
 OUTCOMES = (COMPLETED, FAILED, CANCELLED)
-MAX_LEASE_TTL = 60.0
+MAX_LEASE_TTL_S = 60.0
 MAX_TOLERATED = 3
 MEMBER = "member"
 RESULT = "result"
 ORDER = "order"
 COUNCIL, DONE = "council", "done"
-MAX_DONE = 2 * MAX_PROOF_BYTES
+MAX_DONE_BYTES = 2 * MAX_PROOF_BYTES
 MAX_PRIORITY = 1000
-MAX_CHOICE = 64
-MAX_PLACES = 8
+MAX_CHOICE_CHARACTERS = 64
+MAX_COORDINATES = 8
 MAX_WEIGHT = 1e9
 """Upper bound of weights, and of the numbers and coordinates of a value."""
 
 
 def group_key(task_id: str) -> bytes:
     """Return the key under which the participants of a task report."""
-    return hashed_key(f"task/{task_id}")
+    return hash_key(f"task/{task_id}")
 
 
 @dataclass(frozen=True)
@@ -105,19 +105,24 @@ class Task:
 
     def with_newer_council(self, other: Task) -> Task:
         """Return this task with the quorum members of ``other``, if these are newer."""
-        own, newer = charter_of(self.charter), charter_of(other.charter)
-        is_newer = own is not None and newer is not None and own.pin == newer.pin and len(own.links) < len(newer.links)
+        own, newer = parse_charter(self.charter), parse_charter(other.charter)
+        is_newer = (
+            own is not None
+            and newer is not None
+            and own.first_council_id == newer.first_council_id
+            and len(own.changes) < len(newer.changes)
+        )
         return self.with_council(newer) if is_newer and newer is not None else self
 
-    def packed(self) -> bytes:
+    def pack(self) -> bytes:
         """Return the value of the task's record, without default values and fields that the charter has."""
         content = _non_default_fields(self)
         if self.charter:
             content.pop("council", None)
             content.pop("configuration", None)
         elif self.council:
-            content["council"] = [contact.packed() for contact in self.council]
-        return bounded(bytes(msgpack.packb(content)))
+            content["council"] = [contact.pack() for contact in self.council]
+        return check_size(bytes(msgpack.packb(content)))
 
 
 @dataclass(frozen=True)
@@ -164,9 +169,9 @@ class Member:
     weight: float = 1.0
     electorate: float = 0.0
 
-    def packed(self) -> bytes:
+    def pack(self) -> bytes:
         """Return the value of the member's record, without default values."""
-        return bounded(bytes(msgpack.packb(_non_default_fields(self))))
+        return check_size(bytes(msgpack.packb(_non_default_fields(self))))
 
 
 @dataclass(frozen=True)
@@ -183,9 +188,9 @@ class Result:
     bids: tuple[tuple[str, float], ...] = ()
     why: str = ""
 
-    def packed(self) -> bytes:
+    def pack(self) -> bytes:
         """Return the value of the result's record."""
-        return bounded(bytes(msgpack.packb(vars(self))))
+        return check_size(bytes(msgpack.packb(vars(self))))
 
     @property
     def rank(self) -> tuple[int, str, str]:
@@ -193,7 +198,7 @@ class Result:
         return self.token, self.outcome, self.by
 
 
-def refusals(capabilities: Capabilities, requirements: Capabilities) -> list[str]:
+def find_unmet_requirements(capabilities: Capabilities, requirements: Capabilities) -> list[str]:
     """Return the requirements that ``capabilities`` do not meet, as text; empty if all are met (Algorithm 4.4)."""
     reasons = []
     for name, properties in requirements.items():
@@ -212,20 +217,20 @@ def refusals(capabilities: Capabilities, requirements: Capabilities) -> list[str
     return reasons
 
 
-def task_of(record: Record) -> Task | None:
+def parse_task(record: Record) -> Task | None:
     """Decode the task in a record; None if it is invalid."""
-    content = mapping_of(record)
+    content = parse_mapping(record)
     if content is None:
         return None
     content = {f.name: content[f.name] for f in fields(Task) if f.name in content}
     try:
-        council = [unpacked(fields_) for fields_ in content.get("council", ())]
+        council = [parse_contact(fields_) for fields_ in content.get("council", ())]
         content["council"] = tuple(contact for contact in council if contact is not None)
         task = Task(**content)
     except TypeError:
         return None
     if task.charter:
-        charter = charter_of(task.charter)
+        charter = parse_charter(task.charter)
         if charter is None:
             return None
         task = task.with_council(charter)
@@ -236,34 +241,34 @@ def task_of(record: Record) -> Task | None:
         and 1 <= task.tolerates <= MAX_TOLERATED
         and all(isinstance(text, str) for text in (task.task_id, task.kind, task.title, task.strategy, task.group))
         and all(is_number(n) and n >= 0 for n in (*times, task.hysteresis, task.value))
-        and all(is_whole(n) for n in (task.generation, task.configuration))
+        and all(is_natural(n) for n in (task.generation, task.configuration))
         and type(task.priority) is int
         and abs(task.priority) <= MAX_PRIORITY
         and isinstance(task.preemptible, bool)
         and isinstance(task.exclusive, bool)
-        and 0 < task.lease_ttl <= MAX_LEASE_TTL
+        and 0 < task.lease_ttl <= MAX_LEASE_TTL_S
         and are_capabilities(task.requirements)
         and are_properties(task.parameters)
     )
     return task if is_valid and task.task_id == record.name else None
 
 
-def tasks_of(records: Iterable[Record]) -> dict[str, Task]:
+def parse_tasks(records: Iterable[Record]) -> dict[str, Task]:
     """Decode the tasks in ``records``, by id.
 
     Each change of quorum members adds a record; the one with the newest members is used.
     """
-    known = [(task, record.owner) for record in records if (task := task_of(record)) is not None]
+    known = [(task, record.owner) for record in records if (task := parse_task(record)) is not None]
     known.sort(key=lambda pair: (pair[0].generation, pair[0].configuration, pair[0].created, pair[1]))
     return {task.task_id: task for task, _ in known}
 
 
-def member_of(record: Record) -> Member | None:
+def parse_member(record: Record) -> Member | None:
     """Decode the member report in a record, or None.
 
     The cost is None if it is invalid or the report has expired.
     """
-    content = mapping_of(record)
+    content = parse_mapping(record)
     if record.name != MEMBER or content is None:
         return None
     content = {f.name: content[f.name] for f in fields(Member) if f.name in content}
@@ -278,7 +283,7 @@ def member_of(record: Record) -> Member | None:
     places = (member.progress, member.angle, member.post)
     is_valid = (
         all(isinstance(text, str) for text in texts)
-        and all(is_whole(count) for count in counts)
+        and all(is_natural(count) for count in counts)
         and all(is_number(number) and number >= 0 for number in (member.age, member.valid_for))
         and all(place is None or is_number(place) for place in places)
         and isinstance(member.available, bool)
@@ -289,7 +294,7 @@ def member_of(record: Record) -> Member | None:
         and is_weight(member.weight)
         and is_weight(member.electorate)
     )
-    if not is_valid or node_id(record.owner).hex() != member.uuid:
+    if not is_valid or derive_node_id(record.owner).hex() != member.uuid:
         return None  # no node reports for another
     return member if is_bid(member.cost) and not is_stale(member, 0.0) else replace(member, cost=None)
 
@@ -303,14 +308,14 @@ def is_value(value: object) -> bool:
     """Return whether ``value`` is a number or a place to agree on: a tuple of numbers within ``MAX_WEIGHT``."""
     return (
         isinstance(value, tuple)
-        and len(value) <= MAX_PLACES
+        and len(value) <= MAX_COORDINATES
         and all(is_number(n) and abs(n) <= MAX_WEIGHT for n in value)
     )
 
 
 def is_choice(choice: object) -> bool:
     """Return whether ``choice`` is a printable option, or "" for none."""
-    return isinstance(choice, str) and len(choice) <= MAX_CHOICE and choice.isprintable()
+    return isinstance(choice, str) and len(choice) <= MAX_CHOICE_CHARACTERS and choice.isprintable()
 
 
 def is_weight(weight: object) -> bool:
@@ -323,9 +328,9 @@ def is_stale(member: Member, since: float) -> bool:
     return 0.0 < member.valid_for < member.age + since
 
 
-def result_of(record: Record, most: int = MAX_VALUE) -> Result | None:
+def parse_result(record: Record, most: int = MAX_VALUE_BYTES) -> Result | None:
     """Decode the outcome in a record, or None."""
-    content = mapping_of(record, most)
+    content = parse_mapping(record, most)
     if record.name != RESULT or content is None:
         return None
     content = {f.name: content[f.name] for f in fields(Result) if f.name in content}
@@ -338,19 +343,19 @@ def result_of(record: Record, most: int = MAX_VALUE) -> Result | None:
         result.outcome in OUTCOMES
         and isinstance(result.by, str)
         and is_number(result.took)
-        and is_whole(result.token)
+        and is_natural(result.token)
         and isinstance(result.why, str)
         and all(isinstance(name, str) and is_number(cost) for name, cost in result.bids)
     )
     return result if is_valid else None
 
 
-def done_packed(result: Result, proof: bytes) -> bytes:
+def pack_done(result: Result, proof: bytes) -> bytes:
     """Return the value of the record with which an agent reports the end of its task, with the proof of its lease."""
     return bytes(msgpack.packb({**vars(result), "proof": proof}))
 
 
-def outcome_of(task: Task, records: Iterable[Record]) -> Result | None:
+def find_outcome(task: Task, records: Iterable[Record]) -> Result | None:
     """Return the outcome of ``task``, or None while it is open; of several results the one with the highest token.
 
     A result is valid if a node that may order tasks wrote it (``RESULT``), or an agent with the signatures of a
@@ -359,38 +364,38 @@ def outcome_of(task: Task, records: Iterable[Record]) -> Result | None:
     results = [
         result
         for record in records
-        if (result := result_of(record) if record.name == RESULT else _done(task, record)) is not None
+        if (result := parse_result(record) if record.name == RESULT else _parse_done(task, record)) is not None
     ]
     return max(results, key=lambda result: result.rank, default=None)
 
 
-def council_of(task: Task, records: Iterable[Record]) -> Task:
+def with_newest_council(task: Task, records: Iterable[Record]) -> Task:
     """Return ``task`` with the newest quorum members that the records of its group prove."""
-    pinned = charter_of(task.charter)
+    pinned = parse_charter(task.charter)
     newest = pinned
     for record in records:
-        charter = charter_of(record.value) if record.name == COUNCIL and newest is not None else None
+        charter = parse_charter(record.value) if record.name == COUNCIL and newest is not None else None
         if charter is None or newest is None or charter.configuration <= newest.configuration:
             continue
-        if charter.pin == newest.pin and charter.is_genuine(task.task_id):
+        if charter.first_council_id == newest.first_council_id and charter.is_genuine(task.task_id):
             newest = charter
     return task if newest is pinned or newest is None else task.with_council(newest)
 
 
-def _done(task: Task, record: Record) -> Result | None:
-    if record.name != DONE or record.value is None or len(record.value) > MAX_DONE:
+def _parse_done(task: Task, record: Record) -> Result | None:
+    if record.name != DONE or record.value is None or len(record.value) > MAX_DONE_BYTES:
         return None
-    return _done_of(task.task_id, task.charter, record)
+    return _verify_done(task.task_id, task.charter, record)
 
 
 @lru_cache(maxsize=64)  # checking signatures is slow, and the same record is read often
-def _done_of(task_id: str, charter: bytes, record: Record) -> Result | None:
-    result = result_of(replace(record, name=RESULT), MAX_DONE)
-    pinned, content = charter_of(charter), mapping_of(record, MAX_DONE)
+def _verify_done(task_id: str, charter: bytes, record: Record) -> Result | None:
+    result = parse_result(replace(record, name=RESULT), MAX_DONE_BYTES)
+    pinned, content = parse_charter(charter), parse_mapping(record, MAX_DONE_BYTES)
     if result is None or pinned is None or content is None:
         return None
-    ending = ending_of(content.get("proof"), pinned)
-    is_proved = ending is not None and ending.is_genuine(task_id, node_id(record.owner).hex(), result.token)
+    ending = parse_end_proof(content.get("proof"), pinned)
+    is_proved = ending is not None and ending.is_genuine(task_id, derive_node_id(record.owner).hex(), result.token)
     return result if is_proved else None
 
 

@@ -10,13 +10,13 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from sim.demo.cast import LOOPBACK, Robot
+from sim.demo.robots import LOOPBACK, Robot
 
 BOOTSTRAP = "vaio"
 RESERVE = "pi"
 DOGS = ("dog1", "dog2", "dog3")
 
-JUDGE, YARD = "judge", "yard"
+JUDGE, SIMULATOR = "judge", "yard"
 """The two processes of a demonstration that are not nodes: this one, and the robot simulator."""
 
 Table = Mapping[str, object]
@@ -25,7 +25,7 @@ FAULTS: Table = {"allow": True}
 
 
 @dataclass(frozen=True)
-class Place:
+class Location:
     """The network location of one process of a demonstration; by default all are on one machine.
 
     ``host`` is the address on which it listens, ``entry`` the address of the bootstrap and web node and ``yard`` the
@@ -45,7 +45,7 @@ class Plan:
     run_dir: Path
     web_host: str
     web_port: int
-    yard_port: int
+    simulator_port: int
     nodes: Mapping[str, int]
     code: str
     """The operators' sign-in code of the page."""
@@ -55,29 +55,29 @@ class Plan:
     """The TLS ports of the two pages; 0 for none."""
     robots: Mapping[str, Robot] = field(default_factory=dict)
     """The robots by the names of the dogs."""
-    places: Mapping[str, Place] = field(default_factory=dict)
+    locations: Mapping[str, Location] = field(default_factory=dict)
     """The location of each process by name; other processes run on this machine."""
 
-    def place(self, name: str) -> Place:
+    def get_location(self, name: str) -> Location:
         """Return the location of the process ``name``."""
-        return self.places.get(name, Place())
+        return self.locations.get(name, Location())
 
-    def file(self, name: str) -> Path:
+    def get_config_path(self, name: str) -> Path:
         """Return the path of the configuration file of the node ``name``."""
         return self.run_dir / f"{name}.toml"
 
-    def texts(self) -> dict[str, str]:
+    def make_configs(self) -> dict[str, str]:
         """Return the configuration of every node: the bootstrap node, the second web node, then the dogs."""
-        laptop = self._node(BOOTSTRAP, "laptop", "Bootstrap node and web node", ["bootstrap", "edge", "web"])
-        reserve = self._node(RESERVE, "computer", "Web node for when the other is lost", ["edge", "web"])
+        laptop = self._make_node_table(BOOTSTRAP, "laptop", "Bootstrap node and web node", ["bootstrap", "edge", "web"])
+        reserve = self._make_node_table(RESERVE, "computer", "Web node for when the other is lost", ["edge", "web"])
         ports = zip((self.web_port, self.reserve_port), self.tls_ports, strict=True)
         webs = {
-            name: self._web(name, node, *each)
+            name: self._make_web_config(name, node, *each)
             for (name, node), each in zip(((BOOTSTRAP, laptop), (RESERVE, reserve)), ports, strict=True)
         }
-        return {**webs, **{name: self._dog(name) for name in DOGS}}
+        return {**webs, **{name: self._make_dog_config(name) for name in DOGS}}
 
-    def founding(self) -> list[str]:
+    def make_init_arguments(self) -> list[str]:
         """Return the arguments of ``swarm init`` that create the demonstration's closed team with all memberships."""
         team, folder = f"demo-{self.nodes[BOOTSTRAP]}", str(self.run_dir)
         words = [team, "--first", BOOTSTRAP, "--folder", folder, "--operator", str(self.run_dir / "operator.key")]
@@ -85,55 +85,55 @@ class Plan:
         return [*words, *(word for member in members for word in ("--member", member))]
 
     @property
-    def played(self) -> str:
+    def emulated_robots(self) -> str:
         """The robots that the simulator emulates in addition to its own dogs, as TOML; empty if there are none."""
-        return toml({name: robot.played for name, robot in self.robots.items() if robot.kind != "sim"})
+        return encode_toml({name: robot.simulator_table for name, robot in self.robots.items() if robot.kind != "sim"})
 
-    def _node(self, name: str, kind: str, description: str, roles: list[str]) -> Table:
+    def _make_node_table(self, name: str, kind: str, description: str, roles: list[str]) -> Table:
         return {
             "name": name,
             "kind": kind,
             "description": description,
-            "host": self.place(name).host,
+            "host": self.get_location(name).host,
             "port": self.nodes[name],
-            "known_nodes": [] if name == BOOTSTRAP else [f"{self.place(name).entry}:{self.nodes[BOOTSTRAP]}"],
+            "known_nodes": [] if name == BOOTSTRAP else [f"{self.get_location(name).entry}:{self.nodes[BOOTSTRAP]}"],
             "store": str(self.run_dir / f"{name}.sqlite"),
             "membership": str(self.run_dir / f"{name}.membership"),
             "roles": roles,
         }
 
-    def _web(self, name: str, node: Table, port: int, tls_port: int) -> str:
-        yard = f"{self.place(name).yard}:{self.yard_port}"
+    def _make_web_config(self, name: str, node: Table, port: int, tls_port: int) -> str:
+        yard = f"{self.get_location(name).yard}:{self.simulator_port}"
         web = {"host": self.web_host, "port": port, "yard": yard, "code": self.code}
         tls = {"tls": "auto", "tls_port": tls_port} if tls_port else {}
-        return toml({"node": node, "web": {**web, **tls}, "faults": FAULTS})
+        return encode_toml({"node": node, "web": {**web, **tls}, "faults": FAULTS})
 
-    def _dog(self, name: str) -> str:
+    def _make_dog_config(self, name: str) -> str:
         robot = self.robots[name]
-        return toml(
+        return encode_toml(
             {
-                "node": self._node(name, robot.model, robot.about, ["edge"]),
+                "node": self._make_node_table(name, robot.model, robot.description, ["edge"]),
                 "agent": {"module": "search"},
-                "driver": robot.driver,
+                "driver": robot.driver_table,
                 "faults": FAULTS,
             }
         )
 
 
-def toml(tables: Mapping[str, Table]) -> str:
+def encode_toml(tables: Mapping[str, Table]) -> str:
     """Encode ``tables`` as TOML; values are texts, numbers, lists of them, or one more level of tables."""
     lines: list[str] = []
     for title, table in tables.items():
         lines.append(f"[{title}]")
-        lines += [f"{key} = {_value(value)}" for key, value in table.items()]
+        lines += [f"{key} = {_encode_value(value)}" for key, value in table.items()]
         lines.append("")
     return "\n".join(lines)
 
 
-def _value(value: object) -> str:
+def _encode_value(value: object) -> str:
     if isinstance(value, Mapping):
-        return "{ " + ", ".join(f"{key} = {_value(item)}" for key, item in value.items()) + " }"
+        return "{ " + ", ".join(f"{key} = {_encode_value(item)}" for key, item in value.items()) + " }"
     if isinstance(value, list | tuple):
-        return "[" + ", ".join(_value(item) for item in value) + "]"
+        return "[" + ", ".join(_encode_value(item) for item in value) + "]"
     # JSON texts, numbers, booleans and lists are valid TOML, except DEL, which JSON does not escape.
     return json.dumps(value, ensure_ascii=False).replace("\x7f", "\\u007f")

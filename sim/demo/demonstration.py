@@ -22,20 +22,20 @@ from twisted.internet.defer import Deferred
 from twisted.internet.task import deferLater, react
 
 from drivers.link import TcpConnector
-from drivers.sim.operator import YardOperator
-from sim.demo.cast import CASTS, LOOPBACK
-from sim.demo.configuration import DOGS, JUDGE, YARD, Plan
-from sim.demo.experiment import Experiment, report, table
-from sim.demo.port import PortBusy
-from sim.demo.processes import RESTART_S, Team
-from sim.demo.stage import WEB_PORT, Trouble, arranged, fresh, has_tls, say
-from sim.demo.story import present, told
-from sim.demo.visitor import PageError, Visitor
+from drivers.sim.client import SimulatorClient
+from sim.demo.configuration import DOGS, JUDGE, SIMULATOR, Plan
+from sim.demo.experiment import Experiment, format_table, make_report
+from sim.demo.free_ports import PortBusy
+from sim.demo.page_client import PageClient, PageError
+from sim.demo.preparation import WEB_PORT, DemoError, has_tls, lock_run_dir, make_plan, print_line
+from sim.demo.processes import RESTART_S, ProcessGroup
+from sim.demo.robots import LOOPBACK, ROBOT_SETS
+from sim.demo.state_changes import describe_changes, find_present
 
-START_S = 40.0
+START_LIMIT_S = 40.0
 SEARCH_S = 3.0
 """Seconds that the dogs search before the target is placed."""
-TICK_S = 0.05
+POLL_S = 0.05
 
 
 class Demonstration:
@@ -49,63 +49,70 @@ class Demonstration:
         self._plan = plan
         self._seed = seed
         self._say = say
-        self._born = reactor.seconds()
-        self._lost: set[str] = set()
-        self._team = Team(reactor, plan.run_dir)
-        here = plan.place(JUDGE)
-        self._operator = YardOperator(TcpConnector(reactor), reactor, here.yard, plan.yard_port, rate=20.0)
+        self._started_at = reactor.seconds()
+        self._ended: set[str] = set()
+        self._processes = ProcessGroup(reactor, plan.run_dir)
+        here = plan.get_location(JUDGE)
+        self._operator = SimulatorClient(TcpConnector(reactor), reactor, here.yard, plan.simulator_port, rate=20.0)
         host = here.entry if plan.web_host == "0.0.0.0" else plan.web_host
-        self._visitor = Visitor(reactor, host, plan.web_port, self._on_state, plan.code)
+        self._page = PageClient(reactor, host, plan.web_port, self._on_state, plan.code)
         self.address = f"http://{host}:{plan.web_port}/#code={plan.code}"
         tls = plan.tls_ports[0]
-        self.secure = f"https://{host}:{tls}/#code={plan.code}" if tls else ""
+        self.secure_address = f"https://{host}:{tls}/#code={plan.code}" if tls else ""
         """The address over TLS; empty without TLS."""
 
     async def start(self) -> None:
         """Start everything and wait until the page lists the three dogs."""
         # Create the team while the simulator starts.
-        founding = [sys.executable, "-m", "swarmnode.team.init", *self._plan.founding()]
+        founding = [sys.executable, "-m", "swarmnode.team.init", *self._plan.make_init_arguments()]
         founder = subprocess.Popen(founding, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True)
-        yard = ["--host", self._plan.place(YARD).host, "--port", str(self._plan.yard_port), "--seed", str(self._seed)]
-        if self._plan.played:
+        yard = [
+            "--host",
+            self._plan.get_location(SIMULATOR).host,
+            "--port",
+            str(self._plan.simulator_port),
+            "--seed",
+            str(self._seed),
+        ]
+        if self._plan.emulated_robots:
             path = self._plan.run_dir / "robots.toml"
-            path.write_text(self._plan.played, encoding="utf-8")
+            path.write_text(self._plan.emulated_robots, encoding="utf-8")
             yard += ["--robots", str(path)]
-        self._team.add(YARD, ["-m", "sim.robots.server", *yard], self._plan.place(YARD).enter)
-        self._team.start()
+        self._processes.add(SIMULATOR, ["-m", "sim.robots.server", *yard], self._plan.get_location(SIMULATOR).enter)
+        self._processes.start()
         _, trouble = founder.communicate()
         if founder.returncode != 0:
-            raise Trouble(f"cannot create the team: {trouble.strip()}")
-        for name, text in self._plan.texts().items():
-            path = self._plan.file(name)
+            raise DemoError(f"cannot create the team: {trouble.strip()}")
+        for name, text in self._plan.make_configs().items():
+            path = self._plan.get_config_path(name)
             path.touch(mode=0o600)
             path.write_text(text, encoding="utf-8")
         twistd = str(Path(sys.executable).parent / "twistd")
         for name in self._plan.nodes:
-            node = [twistd, "-n", "--pidfile=", "swarm-node", "--config", str(self._plan.file(name))]
-            self._team.add(name, node, self._plan.place(name).enter)
+            node = [twistd, "-n", "--pidfile=", "swarm-node", "--config", str(self._plan.get_config_path(name))]
+            self._processes.add(name, node, self._plan.get_location(name).enter)
         self._operator.connect().addErrback(lambda _: None)
-        self._visitor.follow()
-        await self._until(self._is_complete, START_S, "the page does not list all three dogs")
+        self._page.follow()
+        await self._wait_until(self._is_complete, START_LIMIT_S, "the page does not list all three dogs")
 
     def stop(self) -> Deferred[None]:
         """End all processes; fires when they have ended."""
-        self._visitor.leave()
+        self._page.stop()
         self._operator.disconnect()
-        return self._team.stop()
+        return self._processes.stop()
 
-    async def experiment(self, number: int) -> Experiment:
+    async def run_experiment(self, number: int) -> Experiment:
         """Run experiment 1 or 2 of the thesis to its end."""
-        await self._until(self._is_complete, START_S, "a dog is missing before the experiment")
+        await self._wait_until(self._is_complete, START_LIMIT_S, "a dog is missing before the experiment")
         await self._operator.clear_target()
         await self._operator.scatter(self._seed + number)
         title = f"Experiment {number}: " + ("the nearest dog approaches", "the dog on its way is lost")[number - 1]
         self._say(title)
-        answer = await self._visitor.post("/api/v1/demo")
+        answer = await self._page.post("/api/v1/demo")
         run = Experiment(title, str(answer.get("id", "")), number == 2, self._reactor.seconds())
         target_at = self._reactor.seconds() + SEARCH_S
         while not run.is_over:
-            await self._pause(TICK_S)
+            await self._pause(POLL_S)
             now = self._reactor.seconds()
             snapshot = self._operator.snapshot
             if target_at <= now and snapshot is not None:
@@ -113,67 +120,69 @@ class Demonstration:
                 # The page may place the target itself; it has done so by now.
                 if snapshot["target"] is None:
                     await self._operator.place_target_at_random()
-                    self._tell("the red target is placed")
+                    self._report("the red target is placed")
             still = run.takeover_s is None
-            victim = run.look(now, self._visitor.state, snapshot)
+            victim = run.update(now, self._page.state, snapshot)
             if still and run.takeover_s is not None:
                 loss = "loss of the link" if self._loses_link else "kill"
-                self._tell(f"{run.takeover_s:.2f} s from the {loss} to the next dog moving")
+                self._report(f"{run.takeover_s:.2f} s from the {loss} to the next dog moving")
             if victim:
                 await self._inject_failure(victim)
             self._check_processes()
         if run.killed and self._loses_link:
-            await self._operator.plug(run.killed)
+            await self._operator.restore_robot_link(run.killed)
         return run
 
     async def _inject_failure(self, victim: str) -> None:
         """Let the approaching dog fail: its node, or the link between its node and the robot."""
         if self._loses_link:
-            self._tell(f"{victim} has come nearer; the link between its node and the robot is lost")
-            await self._operator.unplug(victim)
+            self._report(f"{victim} has come nearer; the link between its node and the robot is lost")
+            await self._operator.break_robot_link(victim)
         else:
-            self._tell(f"{victim} has come nearer; its node is killed (SIGKILL, process {self._team.pid(victim)})")
-            self._lost.add(victim)
-            self._team.kill(victim)
+            self._report(
+                f"{victim} has come nearer; its node is killed (SIGKILL, process {self._processes.get_pid(victim)})"
+            )
+            self._ended.add(victim)
+            self._processes.kill(victim)
 
-    def watch(self) -> None:
+    def watch_processes(self) -> None:
         """Report a process that ends; the team restarts it."""
-        missing = set(self._team.missing())
-        for name in sorted(missing - self._lost):
+        missing = set(self._processes.list_ended())
+        for name in sorted(missing - self._ended):
             log = self._plan.run_dir / f"{name}.log"
-            self._tell(f"the process of {name} ended; it starts again in {RESTART_S:g} s (see {log})")
-        self._lost = missing
-        self._reactor.callLater(1.0, self.watch)
+            self._report(f"the process of {name} ended; it starts again in {RESTART_S:g} s (see {log})")
+        self._ended = missing
+        self._reactor.callLater(1.0, self.watch_processes)
 
     def _is_complete(self) -> bool:
-        return set(DOGS) <= set(present(self._visitor.state)) and self._operator.snapshot is not None
+        return set(DOGS) <= set(find_present(self._page.state)) and self._operator.snapshot is not None
 
     def _on_state(self, before: dict[str, Any], after: dict[str, Any]) -> None:
-        for line in told(before, after):
-            self._tell(line)
+        for line in describe_changes(before, after):
+            self._report(line)
 
-    def _tell(self, line: str) -> None:
-        self._say(f"{self._reactor.seconds() - self._born:7.2f} s  {line}")
+    def _report(self, line: str) -> None:
+        self._say(f"{self._reactor.seconds() - self._started_at:7.2f} s  {line}")
 
-    async def _until(self, holds: Callable[[], bool], limit_s: float, problem: str) -> None:
+    async def _wait_until(self, holds: Callable[[], bool], limit_s: float, problem: str) -> None:
         end = self._reactor.seconds() + limit_s
         while not holds():
             self._check_processes()
             if self._reactor.seconds() > end:
-                raise Trouble(f"{problem} after {limit_s:g} s; the logs are in {self._plan.run_dir}/")
-            await self._pause(TICK_S)
+                raise DemoError(f"{problem} after {limit_s:g} s; the logs are in {self._plan.run_dir}/")
+            await self._pause(POLL_S)
 
     async def _pause(self, seconds: float) -> None:
         await deferLater(self._reactor, seconds)
 
     def _check_processes(self) -> None:
-        for name in self._team.missing():
-            if name not in self._lost:
-                tail = "\n  ".join(self._team.tail(name))
-                raise Trouble(f"the process of {name} ended; its last lines:\n  {tail}")
+        for name in self._processes.list_ended():
+            if name not in self._ended:
+                tail = "\n  ".join(self._processes.get_tail(name))
+                raise DemoError(f"the process of {name} ended; its last lines:\n  {tail}")
 
 
-async def judged(
+async def run_experiments(
     demonstration: Demonstration, begun: Callable[[], Awaitable[None]], path: Path | None, say: Callable[[str], None]
 ) -> None:
     """Run both experiments after ``start`` and ``begun``, then end everything.
@@ -183,22 +192,22 @@ async def judged(
     try:
         await demonstration.start()
         await begun()
-        runs = [await demonstration.experiment(number) for number in (1, 2)]
+        runs = [await demonstration.run_experiment(number) for number in (1, 2)]
     finally:
         await demonstration.stop()
-    say(table(runs))
+    say(format_table(runs))
     if path is not None:
-        path.write_text(json.dumps(report(runs), indent=1) + "\n", encoding="utf-8")
-    if not all(run.held for run in runs):
+        path.write_text(json.dumps(make_report(runs), indent=1) + "\n", encoding="utf-8")
+    if not all(run.has_passed for run in runs):
         raise SystemExit(1)
 
 
-def options(prog: str, description: str) -> argparse.ArgumentParser:
+def make_parser(prog: str, description: str) -> argparse.ArgumentParser:
     """Return a parser with the common options of demonstrations on one machine and across several."""
     parser = argparse.ArgumentParser(prog=prog, description=description)
     parser.add_argument(
         "--robot",
-        choices=sorted(CASTS),
+        choices=sorted(ROBOT_SETS),
         default="aibo",
         help="kind of the three robots; mixed: an AIBO, a Create 2 and a Bittle (default %(default)s)",
     )
@@ -214,13 +223,13 @@ def options(prog: str, description: str) -> argparse.ArgumentParser:
     return parser
 
 
-def _arguments(arguments: Sequence[str]) -> argparse.Namespace:
-    parser = options("swarm demo", "Three robots, a red target and the page.")
+def _parse_arguments(arguments: Sequence[str]) -> argparse.Namespace:
+    parser = make_parser("swarm demo", "Three robots, a red target and the page.")
     parser.add_argument("--headless", action="store_true", help="run and check both experiments, exit with 0 or 1")
     parser.add_argument("--web-host", default=LOOPBACK, help="address of the page; 0.0.0.0 opens it to the network")
     parser.add_argument(
         "--web-port",
-        type=_port,
+        type=_parse_port,
         default=None,
         help=f"port of the page (default {WEB_PORT}, or a free one; 0: only free ports, for several demonstrations)",
     )
@@ -233,7 +242,7 @@ def _arguments(arguments: Sequence[str]) -> argparse.Namespace:
     return given
 
 
-def _port(word: str) -> int:
+def _parse_port(word: str) -> int:
     """Parse a port number of the command line; 0 is any port."""
     if not (word.isdecimal() and len(word) <= 5 and int(word) <= 65535):
         raise argparse.ArgumentTypeError(f"must be 0 to 65535, is {word!r}")
@@ -242,48 +251,52 @@ def _port(word: str) -> int:
 
 async def _run(reactor: Any, given: argparse.Namespace) -> None:
     try:
-        with fresh(given.run_dir.absolute()):
+        with lock_run_dir(given.run_dir.absolute()):
             folder = given.run_dir.absolute()
             # For this machine alone browsers trust http, so TLS is not needed.
             with_tls = given.tls or (has_tls() and not given.headless and given.web_host != LOOPBACK)
             if given.tls and not has_tls():
-                raise Trouble("--tls needs libraries that are not installed; run: pip install 'swarm-node[tls]'")
+                raise DemoError("--tls needs libraries that are not installed; run: pip install 'swarm-node[tls]'")
             is_usual = not given.headless and given.web_port != 0
-            plan = arranged(folder, given.web_host, given.web_port, is_usual, say, with_tls, given.robot)
-            demonstration = Demonstration(reactor, plan, given.seed, say, given.lose == "link")
+            plan = make_plan(folder, given.web_host, given.web_port, is_usual, print_line, with_tls, given.robot)
+            demonstration = Demonstration(reactor, plan, given.seed, print_line, given.lose == "link")
             reactor.addSystemEventTrigger("before", "shutdown", demonstration.stop)
 
             async def begun() -> None:
-                _invite(demonstration, plan)
+                _print_addresses(demonstration, plan)
                 if not given.headless:
-                    demonstration.watch()
+                    demonstration.watch_processes()
                     await Deferred()
 
-            await judged(demonstration, begun, given.report, say)
-    except (Trouble, PageError, PortBusy, OSError) as problem:
+            await run_experiments(demonstration, begun, given.report, print_line)
+    except (DemoError, PageError, PortBusy, OSError) as problem:
         sys.stderr.write(f"swarm demo: {problem}\n")
         raise SystemExit(2 if isinstance(problem, PortBusy) else 1) from None
 
 
-def _invite(demonstration: Demonstration, plan: Plan) -> None:
-    say(f"The page: {demonstration.address}   (logs: {plan.run_dir}; end with Ctrl-C)")
-    if demonstration.secure:
-        say(f"Over TLS: {demonstration.secure}   (a browser warns until it trusts the team: docs/how-to/https.md)")
-    say("If its node fails, the page switches to another: end the process of vaio to see it.")
+def _print_addresses(demonstration: Demonstration, plan: Plan) -> None:
+    print_line(f"The page: {demonstration.address}   (logs: {plan.run_dir}; end with Ctrl-C)")
+    if demonstration.secure_address:
+        print_line(
+            f"Over TLS: {demonstration.secure_address}   (a browser warns until it trusts the team: docs/how-to/https.md)"
+        )
+    print_line("If its node fails, the page switches to another: end the process of vaio to see it.")
     if plan.web_host == LOOPBACK:
-        say("To open it on phones and tablets in the same network, then also over TLS: make demo WEB_HOST=0.0.0.0")
+        print_line(
+            "To open it on phones and tablets in the same network, then also over TLS: make demo WEB_HOST=0.0.0.0"
+        )
     else:
         here, tls = os.uname().nodename, plan.tls_ports[0]
         also = f", https://{here}.local:{tls} (required for the camera of a phone)" if tls else ""
-        say(f"In the same network: http://{here}.local:{plan.web_port}{also}, or this machine's address;")
-        say(f"sign-in code: {plan.code}.  For phones the page shows a QR code: Invite")
+        print_line(f"In the same network: http://{here}.local:{plan.web_port}{also}, or this machine's address;")
+        print_line(f"sign-in code: {plan.code}.  For phones the page shows a QR code: Invite")
         if not tls:
-            say("The camera of a phone requires https, which is not installed: pip install 'swarm-node[tls]'")
+            print_line("The camera of a phone requires https, which is not installed: pip install 'swarm-node[tls]'")
 
 
 def main(arguments: Sequence[str] = tuple(sys.argv[1:])) -> None:
     """Run the demonstration according to the command line."""
-    given = _arguments(arguments)
+    given = _parse_arguments(arguments)
     # Twisted's timers use the wall clock; a step of that clock would delay or fire all of them.
     ReactorBase.seconds = staticmethod(time.monotonic)
     react(lambda reactor: Deferred.fromCoroutine(_run(reactor, given)))

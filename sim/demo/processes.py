@@ -25,7 +25,7 @@ RESTART_S = 30.0
 """Delay before a process is restarted: longer than another robot needs to finish on a busy machine."""
 
 
-class Team:
+class ProcessGroup:
     """Processes by name, started and ended together.
 
     :param reactor: starts the processes and provides the time
@@ -47,7 +47,7 @@ class Team:
         monitor.threshold = inf  # type: ignore[assignment]
         monitor.minRestartDelay = monitor.maxRestartDelay = RESTART_S  # type: ignore[assignment]
         monitor.killTime = 4
-        monitor.log = Logger(namespace="team", observer=self._observe)  # type: ignore[arg-type]
+        monitor.log = Logger(namespace="team", observer=self._on_log_event)  # type: ignore[arg-type]
         self._monitor = monitor
 
     def add(self, name: str, arguments: Sequence[str], enter: Sequence[str] = ()) -> None:
@@ -59,7 +59,7 @@ class Team:
             self._logs[name] = (self._run_dir / f"{name}.log").open("a", encoding="utf-8", buffering=1)
             self._tails[name] = deque(maxlen=TAIL_LINES)
         environment = {**os.environ, "PYTHONUNBUFFERED": "1"}
-        self._monitor.addProcess(name, [*enter, *on_leash(arguments)], env=environment)
+        self._monitor.addProcess(name, [*enter, *make_child_command(arguments)], env=environment)
 
     def start(self) -> None:
         """Start every process."""
@@ -86,16 +86,16 @@ class Team:
         assert self._stopped is not None
         self._stopped.callback(None)
 
-    def pid(self, name: str) -> int | None:
+    def get_pid(self, name: str) -> int | None:
         """Return the process id; None while the process does not run."""
         protocol = self._monitor.protocols.get(name)
         return None if protocol is None or protocol.transport is None else protocol.transport.pid
 
-    def missing(self) -> list[str]:
+    def list_ended(self) -> list[str]:
         """Return the names of the processes that do not run."""
-        return [name for name in self._logs if self.pid(name) is None]
+        return [name for name in self._logs if self.get_pid(name) is None]
 
-    def tail(self, name: str) -> list[str]:
+    def get_tail(self, name: str) -> list[str]:
         """Return the last lines of the process's output."""
         return list(self._tails[name])
 
@@ -112,7 +112,7 @@ class Team:
         except ProcessExitedAlready:
             raise KeyError(f"{name} does not run") from None
 
-    def _observe(self, event: dict[str, Any]) -> None:
+    def _on_log_event(self, event: dict[str, Any]) -> None:
         name, line = event.get("tag"), event.get("line")
         if not isinstance(name, str) or not isinstance(line, str):
             failure = event.get("log_failure")
@@ -128,6 +128,6 @@ class Team:
         self._on_line(name, line)
 
 
-def on_leash(arguments: Sequence[str]) -> list[str]:
-    """Return the command line that runs Python ``arguments`` and ends with this process (see ``sim.demo.leash``)."""
-    return [sys.executable, "-m", "sim.demo.leash", *arguments]
+def make_child_command(arguments: Sequence[str]) -> list[str]:
+    """Return the command line that runs Python ``arguments`` and ends with this process (see ``sim.demo.parent_monitor``)."""
+    return [sys.executable, "-m", "sim.demo.parent_monitor", *arguments]

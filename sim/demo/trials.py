@@ -24,18 +24,18 @@ from typing import Any, Protocol
 
 from sim.demo.experiment import Experiment
 
-LOOK_S = 0.032
+POLL_S = 0.032
 """Virtual seconds between two evaluations of the team: one sensor frame."""
 LIMIT_S = 120.0
-SETTLED_S = 1.0
+SETTLE_S = 1.0
 
 
-class Team(Protocol):
+class DemoTeam(Protocol):
     """A team in virtual time (``VirtualTeam`` of package ``swarmnode``)."""
 
     clock: Any
-    board: Any
-    yard: Any
+    switchboard: Any
+    simulator: Any
 
     def run_demo(self) -> str:
         """Assign the demonstration's task."""
@@ -43,7 +43,7 @@ class Team(Protocol):
     def state(self) -> dict[str, Any]:
         """Return the state that the page shows."""
 
-    def truth(self) -> dict[str, Any]:
+    def get_true_state(self) -> dict[str, Any]:
         """Return the true positions of the robots and the target."""
 
     def scatter(self, seed: int) -> None:
@@ -56,7 +56,7 @@ class Team(Protocol):
         """End everything."""
 
 
-MakeTeam = Callable[[int], Team]
+MakeTeam = Callable[[int], DemoTeam]
 
 
 @dataclass
@@ -83,32 +83,32 @@ class Outcome:
     broken: list[str] = field(default_factory=list)
 
 
-def trial(make_team: MakeTeam, experiment: int, seed: int, pictures: Path | None = None) -> Outcome:
+def run_trial(make_team: MakeTeam, experiment: int, seed: int, pictures: Path | None = None) -> Outcome:
     """Run one experiment from ``seed``; draw each phase into the folder ``pictures`` if it is given."""
     team = make_team(seed)
     team.scatter(seed)
-    draw = _painter(team, pictures, experiment, seed)
+    draw = _make_draw(team, pictures, experiment, seed)
     draw("1-without-target", "The dogs in the yard, no target yet")
     began = team.clock.seconds()
     run = Experiment(f"experiment {experiment}", team.run_demo(), experiment == 2, began)
     outcome = Outcome(seed, experiment)
     while not run.is_over and team.clock.seconds() - began < LIMIT_S:
-        team.clock.advance(LOOK_S)
-        state, truth = team.state(), team.truth()
+        team.clock.advance(POLL_S)
+        state, truth = team.state(), team.get_true_state()
         _record_times(outcome, state, truth, team.clock.seconds() - began, draw)
-        killed = run.look(team.clock.seconds(), state, truth)
+        killed = run.update(team.clock.seconds(), state, truth)
         if killed:
             draw("5-lost", f"{killed} is lost on its way")
             team.kill(killed)
     draw("6-reached", f"{run.by or 'nobody'} stands at the target")
-    team.clock.advance(SETTLED_S)
-    outcome.digest = team.board.digest()
+    team.clock.advance(SETTLE_S)
+    outcome.digest = team.switchboard.digest()
     team.stop()
-    checks = run.checks()
-    outcome.by, outcome.killed, outcome.reach, outcome.takeover = run.by, run.killed, run.took_s, run.takeover_s
-    outcome.right = bool(checks) and checks[-1].held and "nearest" in checks[-1].what
-    outcome.broken = [check.what for check in checks if not check.held]
-    outcome.held = run.held
+    checks = run.list_checks()
+    outcome.by, outcome.killed, outcome.reach, outcome.takeover = run.by, run.killed, run.duration_s, run.takeover_s
+    outcome.right = bool(checks) and checks[-1].is_met and "nearest" in checks[-1].description
+    outcome.broken = [check.description for check in checks if not check.is_met]
+    outcome.held = run.has_passed
     return outcome
 
 
@@ -131,10 +131,10 @@ def _record_times(outcome: Outcome, state: dict[str, Any], truth: dict[str, Any]
         draw("4-approach", f"All agree: {group['assigned']} goes")
 
 
-def _painter(team: Team, folder: Path | None, experiment: int, seed: int) -> Draw:
+def _make_draw(team: DemoTeam, folder: Path | None, experiment: int, seed: int) -> Draw:
     if folder is None:
         return lambda phase, caption: None
-    from sim.robots.picture import overhead
+    from sim.robots.picture import draw_map
 
     drawn: set[str] = set()
 
@@ -142,7 +142,7 @@ def _painter(team: Team, folder: Path | None, experiment: int, seed: int) -> Dra
         if phase not in drawn:
             drawn.add(phase)
             path = folder / f"experiment{experiment}-seed{seed}-{phase}.png"
-            path.write_bytes(overhead(team.truth(), caption=caption))
+            path.write_bytes(draw_map(team.get_true_state(), caption=caption))
 
     return draw
 
@@ -153,7 +153,7 @@ def percentile(values: Sequence[float], share: float) -> float:
     return ordered[max(0, math.ceil(share * len(ordered)) - 1)]
 
 
-def table(outcomes: Iterable[Outcome]) -> str:
+def format_table(outcomes: Iterable[Outcome]) -> str:
     """Return one line per experiment: counts held, found, agreed, right; times as median (95th percentile)."""
     rows = [f"{'':12}{'trials':>7}{'held':>7}{'found':>7}{'agreed':>8}{'right':>7}"]
     rows[0] += "".join(f"{name:>16}" for name in ("find s", "agree s", "reach s", "take over s"))
@@ -173,10 +173,10 @@ def table(outcomes: Iterable[Outcome]) -> str:
 
 def _run_job(job: tuple[MakeTeam, int, int, Path | None]) -> Outcome:
     make_team, experiment, seed, pictures = job
-    return trial(make_team, experiment, seed, pictures)
+    return run_trial(make_team, experiment, seed, pictures)
 
 
-def real(count: int, seed: int, run_dir: Path) -> list[bool]:
+def run_real(count: int, seed: int, run_dir: Path) -> list[bool]:
     """Run both experiments with real processes ``count`` times; returns whether each run passed."""
     held = []
     for number in range(count):
@@ -185,7 +185,7 @@ def real(count: int, seed: int, run_dir: Path) -> list[bool]:
     return held
 
 
-def whole(text: str) -> int:
+def parse_count(text: str) -> int:
     """Parse a non-negative integer of the command line."""
     if not (text.isdecimal() and len(text) <= 9):
         raise argparse.ArgumentTypeError(f"must be a whole number from 0 on, is {text!r}")
@@ -195,12 +195,12 @@ def whole(text: str) -> int:
 def main(arguments: Sequence[str], make_team: MakeTeam) -> int:
     """Run the command line; returns 0 if every trial passed."""
     parser = argparse.ArgumentParser(prog="swarm trials", description=__doc__.splitlines()[0] if __doc__ else None)
-    parser.add_argument("--count", type=whole, default=20, help="trials of each experiment in virtual time")
+    parser.add_argument("--count", type=parse_count, default=20, help="trials of each experiment in virtual time")
     parser.add_argument("--seed", type=int, default=1, help="the first seed")
-    parser.add_argument("--real", type=whole, default=0, help="runs of both experiments with real processes")
+    parser.add_argument("--real", type=parse_count, default=0, help="runs of both experiments with real processes")
     parser.add_argument("--out", type=Path, default=Path("run/trials"), help="folder for the report and the pictures")
-    parser.add_argument("--pictures", type=whole, default=1, help="number of seeds for which pictures are drawn")
-    parser.add_argument("--jobs", type=whole, default=os.cpu_count() or 1, help="parallel trials")
+    parser.add_argument("--pictures", type=parse_count, default=1, help="number of seeds for which pictures are drawn")
+    parser.add_argument("--jobs", type=parse_count, default=os.cpu_count() or 1, help="parallel trials")
     given = parser.parse_args(list(arguments))
     try:
         given.out.mkdir(parents=True, exist_ok=True)
@@ -227,11 +227,11 @@ def main(arguments: Sequence[str], make_team: MakeTeam) -> int:
             sys.stdout.write(f"{line}: {outcome.by or 'nobody'} reached it{broken}\n")
             sys.stdout.flush()
     (given.out / "trials.json").write_text(json.dumps([asdict(o) for o in outcomes], indent=1), encoding="utf-8")
-    sys.stdout.write(f"\n{table(outcomes)}\n")
+    sys.stdout.write(f"\n{format_table(outcomes)}\n")
     virtual = sum(o.reach or 0.0 for o in outcomes)
     spent = time.monotonic() - began
     sys.stdout.write(f"{virtual:.0f} s of team time in {spent:.0f} s; report and pictures in {given.out}\n")
-    held = real(given.real, given.seed, given.out)
+    held = run_real(given.real, given.seed, given.out)
     if held:
         sys.stdout.write(f"real processes: {sum(held)} of {len(held)} runs held, both experiments each\n")
     return 0 if all(o.held for o in outcomes) and all(held) else 1

@@ -24,8 +24,8 @@ from types import TracebackType
 from typing import Any, BinaryIO
 
 from sim.namespaces.internet import Internet
-from sim.namespaces.kind import WAN
-from sim.namespaces.switch import EVERYTHING, FILE_HEADER, SNAP, recorded
+from sim.namespaces.nat import WAN
+from sim.namespaces.switch import ETH_P_ALL, PCAP_HEADER, SNAPLEN_BYTES, make_pcap_record
 
 OUTGOING = 4
 IPV4, UDP = 0x0800, 17
@@ -80,29 +80,29 @@ class Capture:
                 whole.sent_bytes += each.sent_bytes
         return whole
 
-    def found(self, words: Iterable[bytes]) -> list[bytes]:
+    def find_plain_text(self, words: Iterable[bytes]) -> list[bytes]:
         """Return those of ``words`` that occur in the captured frames in plain text."""
-        return readable(self.file.read_bytes(), words)
+        return find_words(self.file.read_bytes(), words)
 
 
-def readable(passed: bytes, words: Iterable[bytes]) -> list[bytes]:
+def find_words(passed: bytes, words: Iterable[bytes]) -> list[bytes]:
     """Return those of ``words`` that occur in ``passed`` in any case, or as UTF-16."""
     text = passed.lower()
     return [w for w in words if w.lower() in text or w.decode().lower().encode("utf-16-le") in text]
 
 
-def datagrams(file: Path) -> Iterator[tuple[str, str, bytes]]:
+def read_datagrams(file: Path) -> Iterator[tuple[str, str, bytes]]:
     """Yield source, target and payload of the UDP datagrams of a capture file."""
-    data, place = file.read_bytes(), len(FILE_HEADER)
+    data, place = file.read_bytes(), len(PCAP_HEADER)
     while place + 16 <= len(data):
         length = struct.unpack_from("=I", data, place + 8)[0]
-        held = payload(data[place + 16 : place + 16 + length])
+        held = parse_datagram(data[place + 16 : place + 16 + length])
         if held is not None:
             yield held
         place += 16 + length
 
 
-def payload(frame: bytes) -> tuple[str, str, bytes] | None:
+def parse_datagram(frame: bytes) -> tuple[str, str, bytes] | None:
     """Return source, target and payload of a frame's datagram; None unless it is UDP over IPv4."""
     if len(frame) < 42 or int.from_bytes(frame[12:14]) != IPV4 or frame[23] != UDP:
         return None
@@ -116,11 +116,11 @@ def payload(frame: bytes) -> tuple[str, str, bytes] | None:
 
 def capture(interface: str, out: BinaryIO, orders: int, ready: Any) -> dict[str, Traffic]:
     """Write frames to ``out`` until the file ``orders`` ends; returns the traffic by peer."""
-    raw = socket.socket(socket.AF_PACKET, socket.SOCK_RAW, socket.htons(EVERYTHING))
+    raw = socket.socket(socket.AF_PACKET, socket.SOCK_RAW, socket.htons(ETH_P_ALL))
     raw.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 8 << 20)
     raw.bind((interface, 0))
     counts: defaultdict[str, Traffic] = defaultdict(Traffic)
-    out.write(FILE_HEADER)
+    out.write(PCAP_HEADER)
     ready()
     is_over = False
     files: list[Any] = [raw, orders]
@@ -129,9 +129,9 @@ def capture(interface: str, out: BinaryIO, orders: int, ready: Any) -> dict[str,
         is_over = is_over or orders in readable
         if raw not in readable:
             continue
-        frame, (_, _, direction, *_) = raw.recvfrom(SNAP)
-        out.write(recorded(frame))
-        datagram = payload(frame)
+        frame, (_, _, direction, *_) = raw.recvfrom(SNAPLEN_BYTES)
+        out.write(make_pcap_record(frame))
+        datagram = parse_datagram(frame)
         if datagram is None:
             continue
         source, target, held = datagram

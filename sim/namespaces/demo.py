@@ -18,57 +18,58 @@ from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
-from sim.demo.cast import LOOPBACK, MOST_PORTS, Robot, chosen
-from sim.demo.configuration import BOOTSTRAP, DOGS, JUDGE, RESERVE, YARD, Place, Plan
-from sim.demo.demonstration import Demonstration, judged, options
-from sim.demo.stage import Trouble, fresh, say
-from sim.demo.visitor import PageError
+from sim.demo.configuration import BOOTSTRAP, DOGS, JUDGE, RESERVE, SIMULATOR, Location, Plan
+from sim.demo.demonstration import Demonstration, make_parser, run_experiments
+from sim.demo.page_client import PageError
+from sim.demo.preparation import DemoError, lock_run_dir, print_line
+from sim.demo.robots import LOOPBACK, MAX_PORTS, Robot, make_robots
 from sim.namespaces.internet import Internet, Site
-from sim.namespaces.kind import Kind
-from sim.namespaces.room import refusal
+from sim.namespaces.namespace import find_unavailable_reason
+from sim.namespaces.nat import NatKind
 
 NODE_PORT, WEB_PORT, YARD_PORT, ROBOT_PORT = 7000, 8080, 7400, 7500
-HOME, KINDS = "home", (Kind.PORT, Kind.SYM)
+HOME, KINDS = "home", (NatKind.PORT, NatKind.SYM)
 HOSTS = {BOOTSTRAP: "home1", RESERVE: "home2", DOGS[2]: "home3", DOGS[0]: "far1", DOGS[1]: "farther1", JUDGE: "cafe1"}
 """The host of each process."""
 SITES = (
-    Site(HOME, Kind.PORT, 3),
+    Site(HOME, NatKind.PORT, 3),
     Site("far", KINDS[0]),
     Site("farther", KINDS[1]),
-    Site("cafe", Kind.PORT),
+    Site("cafe", NatKind.PORT),
 )
 
 
-def laid_out(net: Internet) -> dict[str, Place]:
+def connect_robots(net: Internet) -> dict[str, Location]:
     """Connect the robots to their computers and forward the ports of the home; returns the location of each process."""
-    net.island(YARD)
-    cables = {name: net.cable(host, YARD)[1] for name, host in HOSTS.items()}
+    net.add_isolated_host(SIMULATOR)
+    cables = {name: net.connect_cable(host, SIMULATOR)[1] for name, host in HOSTS.items()}
     inside = net.address(HOSTS[BOOTSTRAP])
-    net.forward(HOME, HOSTS[BOOTSTRAP], ("udp", NODE_PORT), ("tcp", WEB_PORT))
-    places = {YARD: Place(host="0.0.0.0", enter=net.room(YARD).inner_entry)}
+    net.forward_ports(HOME, HOSTS[BOOTSTRAP], ("udp", NODE_PORT), ("tcp", WEB_PORT))
+    places = {SIMULATOR: Location(host="0.0.0.0", enter=net.get_namespace(SIMULATOR).inner_entry_command)}
     for name, host in HOSTS.items():
-        entry = inside if host.startswith(HOME) else net.outside(HOME)
-        places[name] = Place(net.address(host), entry, cables[name], net.room(host).inner_entry)
+        entry = inside if host.startswith(HOME) else net.get_external_address(HOME)
+        places[name] = Location(net.address(host), entry, cables[name], net.get_namespace(host).inner_entry_command)
     return places
 
 
-def planned(run_dir: Path, robot: str, places: dict[str, Place], code: str) -> Plan:
+def make_namespace_plan(run_dir: Path, robot: str, places: dict[str, Location], code: str) -> Plan:
     """Return the plan of the demonstration at ``places``."""
-    ports = iter(range(ROBOT_PORT, ROBOT_PORT + MOST_PORTS * len(DOGS)))
+    ports = iter(range(ROBOT_PORT, ROBOT_PORT + MAX_PORTS * len(DOGS)))
     robots = {
-        name: _cabled(each, places[name].yard) for name, each in chosen(robot, DOGS, run_dir, ports, YARD_PORT).items()
+        name: _with_cable_address(each, places[name].yard)
+        for name, each in make_robots(robot, DOGS, run_dir, ports, YARD_PORT).items()
     }
     nodes = dict.fromkeys((BOOTSTRAP, RESERVE, *DOGS), NODE_PORT)
-    return Plan(run_dir, "0.0.0.0", WEB_PORT, YARD_PORT, nodes, code, WEB_PORT, robots=robots, places=places)
+    return Plan(run_dir, "0.0.0.0", WEB_PORT, YARD_PORT, nodes, code, WEB_PORT, robots=robots, locations=places)
 
 
-def _cabled(robot: Robot, yard: str) -> Robot:
+def _with_cable_address(robot: Robot, yard: str) -> Robot:
     """Return ``robot`` with the address of the simulator's end of its cable."""
     there = json.loads(json.dumps({"options": robot.options, "parts": robot.parts}).replace(LOOPBACK, yard))
     return replace(robot, options=there["options"], parts=tuple(there["parts"]))
 
 
-def inside(given: argparse.Namespace) -> None:
+def run_inside(given: argparse.Namespace) -> None:
     """Run and judge both experiments; called on the host of the browser."""
     from twisted.internet.base import ReactorBase
     from twisted.internet.defer import Deferred
@@ -79,18 +80,20 @@ def inside(given: argparse.Namespace) -> None:
 
     async def run(reactor: Any) -> None:
         try:
-            with fresh(folder):
+            with lock_run_dir(folder):
                 given_places = json.loads(sys.stdin.readline())
-                places = {name: Place(**{**each, "enter": tuple(each["enter"])}) for name, each in given_places.items()}
-                plan = planned(folder, given.robot, places, "over-there")
-                demonstration = Demonstration(reactor, plan, given.seed, say, given.lose == "link")
+                places = {
+                    name: Location(**{**each, "enter": tuple(each["enter"])}) for name, each in given_places.items()
+                }
+                plan = make_namespace_plan(folder, given.robot, places, "over-there")
+                demonstration = Demonstration(reactor, plan, given.seed, print_line, given.lose == "link")
                 reactor.addSystemEventTrigger("before", "shutdown", demonstration.stop)
 
                 async def begun() -> None:
-                    say(f"{time.monotonic() - began:7.2f} s  the page lists all dogs: {demonstration.address}")
+                    print_line(f"{time.monotonic() - began:7.2f} s  the page lists all dogs: {demonstration.address}")
 
-                await judged(demonstration, begun, given.report, say)
-        except (Trouble, PageError, OSError) as problem:
+                await run_experiments(demonstration, begun, given.report, print_line)
+        except (DemoError, PageError, OSError) as problem:
             sys.stderr.write(f"demo across namespaces: {problem}\n")
             raise SystemExit(1) from None
 
@@ -100,7 +103,7 @@ def inside(given: argparse.Namespace) -> None:
 
 def main(arguments: Sequence[str] = tuple(sys.argv[1:])) -> int:
     """Run the command line; returns 0 if both experiments passed, 2 if namespaces are not available."""
-    parser = options("python -m sim.namespaces.demo", "Run both experiments behind NAT routers.")
+    parser = make_parser("python -m sim.namespaces.demo", "Run both experiments behind NAT routers.")
     parser.add_argument("--loss", type=float, default=0.0, help="percent of datagrams lost on every link (%(default)s)")
     parser.add_argument("--record", type=Path, default=None, help="write every frame of the wide area to this file")
     for ignored in ("--web-host", "--web-port"):
@@ -110,8 +113,8 @@ def main(arguments: Sequence[str] = tuple(sys.argv[1:])) -> int:
     parser.add_argument("--inside", action="store_true", help=argparse.SUPPRESS)
     given = parser.parse_args(list(arguments))
     if given.inside:
-        inside(given)
-    why = refusal()
+        run_inside(given)
+    why = find_unavailable_reason()
     if why:
         sys.stderr.write(f"!!!\n!!! NO DEMONSTRATION ACROSS NAMESPACES HERE: {why}\n!!!\n")
         return 2
@@ -119,11 +122,13 @@ def main(arguments: Sequence[str] = tuple(sys.argv[1:])) -> int:
     for number in (signal.SIGTERM, signal.SIGINT):
         signal.signal(number, lambda *_: sys.exit(130))
     with Internet(SITES, given.seed) as net:
-        places = laid_out(net)
+        places = connect_robots(net)
         for site in net.sites:
-            net.weather(site, loss=given.loss)
-        net.record(given.record)
-        say(f"dog1 behind a router ({KINDS[0].meaning}), dog2 behind another ({KINDS[1].meaning}), dog3 at home")
+            net.impair(site, loss=given.loss)
+        net.record_frames(given.record_frames)
+        print_line(
+            f"dog1 behind a router ({KINDS[0].description}), dog2 behind another ({KINDS[1].description}), dog3 at home"
+        )
         command = [sys.executable, "-m", "sim.namespaces.demo", "--inside", *arguments]
         process = net.start(HOSTS[JUDGE], command, stdin=subprocess.PIPE, cwd=Path.cwd(), text=True)
         assert process.stdin is not None

@@ -20,16 +20,16 @@ from pathlib import Path
 from types import TracebackType
 from typing import Any, Literal
 
-from sim.namespaces.kind import LAN, WAN, Forward, Kind
-from sim.namespaces.line import Weather
-from sim.namespaces.room import Room, environment
+from sim.namespaces.impairment import Impairments
+from sim.namespaces.namespace import Namespace, make_environment
+from sim.namespaces.nat import LAN, WAN, NatKind, PortForward
 
 ROOT = Path(__file__).resolve().parents[2]
-PUB = "pub"
-PUBS = ("198.18.0.10", "198.18.0.11")
+PUBLIC_HOST = "pub"
+PUBLIC_ADDRESSES = ("198.18.0.10", "198.18.0.11")
 """The two addresses of the public host."""
 MAX_SITES = 200
-Way = Literal["in", "out", "both"]
+Direction = Literal["in", "out", "both"]
 
 
 @dataclass(frozen=True)
@@ -37,7 +37,7 @@ class Site:
     """A site with ``hosts`` computers behind a router of one kind."""
 
     name: str
-    kind: Kind
+    kind: NatKind
     hosts: int = 1
 
 
@@ -50,14 +50,14 @@ class Internet:
         self.sites = {site.name: site for site in sites}
         self._numbers = {site.name: number for number, site in enumerate(sites, start=1)}
         self._seed = seed
-        self._rooms: dict[str, Room] = {}
+        self._namespaces: dict[str, Namespace] = {}
         self._ports: dict[str, str] = {}
         self._addresses: dict[str, str] = {}
         self._external: dict[str, str] = {}
-        self._places: dict[str, str] = {}
-        self._started: list[subprocess.Popen[Any]] = []
+        self._site_of_host: dict[str, str] = {}
+        self._processes: list[subprocess.Popen[Any]] = []
         self._switch: subprocess.Popen[str] | None = None
-        self._forwards: dict[str, list[Forward]] = {}
+        self._forwards: dict[str, list[PortForward]] = {}
         self._move_count = self._cables = 0
 
     def __enter__(self) -> Internet:
@@ -75,18 +75,18 @@ class Internet:
 
     def close(self) -> None:
         """End all started processes and every namespace; may be called repeatedly."""
-        for process in self._started:
+        for process in self._processes:
             if process.poll() is None:
                 process.kill()
-        for process in self._started:
+        for process in self._processes:
             process.wait()
             for pipe in (process.stdin, process.stdout, process.stderr):
                 if pipe is not None:
                     pipe.close()
-        self._started.clear()
+        self._processes.clear()
         # The wide area last, as it owns the user namespace of the others.
-        for name in sorted(self._rooms, key=lambda name: name == ""):
-            self._rooms.pop(name).close()
+        for name in sorted(self._namespaces, key=lambda name: name == ""):
+            self._namespaces.pop(name).close()
 
     # -- hosts ------------------------------------------------------------------------------------------------------
 
@@ -99,23 +99,23 @@ class Internet:
         """Return the address of a host in its own network."""
         return self._addresses[host]
 
-    def outside(self, site: str) -> str:
+    def get_external_address(self, site: str) -> str:
         """Return the external address of a site's router."""
         return self._external[site]
 
-    def room(self, name: str) -> Room:
+    def get_namespace(self, name: str) -> Namespace:
         """Return the namespace of a host, of a router (``a-gw``), or of the wide area (the empty name)."""
-        return self._rooms[name]
+        return self._namespaces[name]
 
     def command(self, host: str, arguments: Sequence[str]) -> list[str]:
         """Return the command that runs ``arguments`` on ``host``."""
-        return self._rooms[host].command(arguments)
+        return self._namespaces[host].command(arguments)
 
     def start(self, host: str, arguments: Sequence[str], **options: Any) -> subprocess.Popen[Any]:
         """Start a program on ``host``, with options of ``Popen``; it is killed by ``close`` at the latest."""
-        options = {"stdin": subprocess.DEVNULL, "cwd": ROOT, "env": environment(), **options}
+        options = {"stdin": subprocess.DEVNULL, "cwd": ROOT, "env": make_environment(), **options}
         process = subprocess.Popen(self.command(host, arguments), **options)
-        self._started.append(process)
+        self._processes.append(process)
         return process
 
     def run(self, host: str, arguments: Sequence[str], timeout: float = 60.0) -> subprocess.CompletedProcess[str]:
@@ -123,7 +123,7 @@ class Internet:
         return subprocess.run(
             self.command(host, arguments),
             cwd=ROOT,
-            env=environment(),
+            env=make_environment(),
             stdin=subprocess.DEVNULL,
             capture_output=True,
             text=True,
@@ -132,44 +132,44 @@ class Internet:
 
     # -- links ------------------------------------------------------------------------------------------------------
 
-    def weather(self, site: str, way: Way = "both", to: str = "", **figures: float) -> None:
+    def impair(self, site: str, way: Direction = "both", to: str = "", **figures: float) -> None:
         """Impair the link of a site (or of ``pub``) according to ``figures`` (see ``Weather``).
 
         ``way`` is relative to the site.  With ``to`` only the direction from this site to that one is impaired.
         """
-        impairments = asdict(Weather(**figures))
+        impairments = asdict(Impairments(**figures))
         for port in self._ports_of(site):
             if to:
                 for other in self._ports_of(to):
-                    self._order(do="weather", port=port, to=other, weather=impairments)
+                    self._send_order(do="weather", port=port, to=other, weather=impairments)
                 continue
             for is_up in (True, False):
                 if way == "both" or is_up == (way == "out"):
-                    self._order(do="weather", port=port, to="", is_up=is_up, weather=impairments)
+                    self._send_order(do="weather", port=port, to="", is_up=is_up, weather=impairments)
 
-    def cut(self, site: str, way: Way = "both", to: str = "") -> None:
+    def cut(self, site: str, way: Direction = "both", to: str = "") -> None:
         """Block traffic into a site, out of it, or both; with ``to`` only from this site to that one."""
-        self.weather(site, way, to, loss=100.0)
+        self.impair(site, way, to, loss=100.0)
 
     def heal(self, site: str) -> None:
         """Remove all impairments of a site's link."""
-        self.weather(site)
+        self.impair(site)
 
-    def counted(self) -> dict[str, Any]:
+    def read_counts(self) -> dict[str, Any]:
         """Return frames passed and lost and bytes carried so far, by link name and by ``up`` and ``down``."""
-        counts: dict[str, Any] = self._order(do="count")
+        counts: dict[str, Any] = self._send_order(do="count")
         return counts
 
-    def record(self, file: Path | None) -> None:
+    def record_frames(self, file: Path | None) -> None:
         """Write every frame that enters the wide area to ``file`` (in the format of ``tcpdump -w``); None stops it."""
-        self._order(do="record", file="" if file is None else str(file.absolute()))
+        self._send_order(do="record", file="" if file is None else str(file.absolute()))
 
     # -- routers ----------------------------------------------------------------------------------------------------
 
-    def forget(self, site: str) -> None:
+    def reset_mappings(self, site: str) -> None:
         """Drop all mappings of a router, as its restart does."""
-        self._router(site).run(
-            f"conntrack -F 2>/dev/null || true\nnft -f - <<'END'\nflush ruleset\n{self._rules(site)}END\n"
+        self._get_router(site).run(
+            f"conntrack -F 2>/dev/null || true\nnft -f - <<'END'\nflush ruleset\n{self._make_rules(site)}END\n"
         )
 
     def renumber(self, site: str) -> str:
@@ -179,67 +179,69 @@ class Internet:
         new, old = f"198.18.{1 + self._move_count % 9}.{number}", self._external[site]
         if new == old:
             return self.renumber(site)
-        self._router(site).run(
+        self._get_router(site).run(
             f"ip address add {new}/16 dev {WAN}\nip address del {old}/16 dev {WAN}\n"
             f"ip address show dev {WAN} | grep -q {new}/16 || ip address add {new}/16 dev {WAN}\n"
         )
         self._external[site] = new
-        self.forget(site)
+        self.reset_mappings(site)
         return new
 
-    def mapping_life(self, site: str, seconds: int) -> None:
+    def set_mapping_timeout(self, site: str, seconds: int) -> None:
         """Set the timeout of a router's idle mappings."""
         folder = "/proc/sys/net/netfilter/nf_conntrack_udp_timeout"
-        self._router(site).run(f"echo {seconds} >{folder}\necho {seconds} >{folder}_stream\n")
+        self._get_router(site).run(f"echo {seconds} >{folder}\necho {seconds} >{folder}_stream\n")
 
     def move(self, host: str, site: str) -> str:
         """Move a host to another site, as a phone leaves Wi-Fi; returns its new address there."""
-        if Kind.NONE in (self.sites[site].kind, self.sites[self._places[host]].kind):
+        if NatKind.NONE in (self.sites[site].kind, self.sites[self._site_of_host[host]].kind):
             raise ValueError(f"{host} can only move between sites with a router")
-        self._rooms[host].run(f"ip link del {WAN}\n")
+        self._namespaces[host].run(f"ip link del {WAN}\n")
         self._move_count += 1
         self._attach_host(host, site, 100 + self._move_count)
         return self._addresses[host]
 
-    def forward(self, site: str, host: str, *ports: tuple[Literal["udp", "tcp"], int]) -> None:
+    def forward_ports(self, site: str, host: str, *ports: tuple[Literal["udp", "tcp"], int]) -> None:
         """Forward ports of a site's router to a host."""
         opened = self._forwards.setdefault(site, [])
-        opened += [Forward(protocol, port, self._addresses[host]) for protocol, port in ports]
-        self.forget(site)
+        opened += [PortForward(protocol, port, self._addresses[host]) for protocol, port in ports]
+        self.reset_mappings(site)
 
-    def island(self, name: str) -> None:
+    def add_isolated_host(self, name: str) -> None:
         """Create a host without a network connection."""
-        self._make_room(name)
+        self._make_namespace(name)
 
-    def cable(self, host: str, other: str) -> tuple[str, str]:
+    def connect_cable(self, host: str, other: str) -> tuple[str, str]:
         """Connect two hosts by a separate link, as a robot and its computer; returns their addresses on it."""
         self._cables += 1
         name, first = f"cable{self._cables}", 4 * self._cables
-        ends = [(self._rooms[end], f"198.19.255.{first + place}") for place, end in enumerate((host, other), start=1)]
+        ends = [
+            (self._namespaces[end], f"198.19.255.{first + place}") for place, end in enumerate((host, other), start=1)
+        ]
         pids = [room.pid for room, _ in ends]
-        self._rooms[""].run(f"ip link add {name} netns {pids[0]} type veth peer name {name} netns {pids[1]}\n")
+        self._namespaces[""].run(f"ip link add {name} netns {pids[0]} type veth peer name {name} netns {pids[1]}\n")
         for room, address in ends:
             room.run(f"ip address add {address}/30 dev {name}\nip link set {name} up\n")
         return ends[0][1], ends[1][1]
 
-    def _router(self, site: str) -> Room:
-        if self.sites[site].kind is Kind.NONE:
+    def _get_router(self, site: str) -> Namespace:
+        if self.sites[site].kind is NatKind.NONE:
             raise ValueError(f"the site {site} has no router")
-        return self._rooms[f"{site}-gw"]
+        return self._namespaces[f"{site}-gw"]
 
     # -- construction -----------------------------------------------------------------------------------------------
 
     def _build(self) -> None:
-        self._rooms[""] = Room()
-        self._disable_ipv6(self._rooms[""])
-        self._make_room(PUB)
-        self._uplink(PUB, PUBS)
-        self._addresses[PUB] = self._external[PUB] = PUBS[0]
+        self._namespaces[""] = Namespace()
+        self._disable_ipv6(self._namespaces[""])
+        self._make_namespace(PUBLIC_HOST)
+        self._connect_wan(PUBLIC_HOST, PUBLIC_ADDRESSES)
+        self._addresses[PUBLIC_HOST] = self._external[PUBLIC_HOST] = PUBLIC_ADDRESSES[0]
         for name, site in self.sites.items():
-            if site.kind is not Kind.NONE:
+            if site.kind is not NatKind.NONE:
                 self._make_router(name)
             for number in range(1, site.hosts + 1):
-                self._make_room(f"{name}{number}")
+                self._make_namespace(f"{name}{number}")
                 self._attach_host(f"{name}{number}", name, number)
         ports = [f"{name}={interface}" for name, interface in self._ports.items()]
         pipe = subprocess.PIPE
@@ -249,20 +251,20 @@ class Internet:
         if not self._switch.stdout.readline():
             raise RuntimeError("the switch of the wide area did not start")
 
-    def _make_room(self, name: str) -> Room:
-        room = self._rooms[name] = Room(self._rooms[""])
+    def _make_namespace(self, name: str) -> Namespace:
+        room = self._namespaces[name] = Namespace(self._namespaces[""])
         self._disable_ipv6(room)
         return room
 
-    def _disable_ipv6(self, room: Room) -> None:
+    def _disable_ipv6(self, room: Namespace) -> None:
         # IPv6 would send unsolicited datagrams.
         room.run("for f in /proc/sys/net/ipv6/conf/*/disable_ipv6; do echo 1 >$f; done\nip link set lo up\n")
 
-    def _uplink(self, name: str, addresses: Sequence[str]) -> None:
+    def _connect_wan(self, name: str, addresses: Sequence[str]) -> None:
         """Connect a router or host to the wide area."""
         interface = f"way{len(self._ports)}"
         self._ports[name] = interface
-        wide, room = self._rooms[""], self._rooms[name]
+        wide, room = self._namespaces[""], self._namespaces[name]
         wide.run(f"ip link add {interface} type veth peer name {WAN} netns {room.pid}\nip link set {interface} up\n")
         # The switch copies raw frames: they must have their checksums, and must not exceed the frame size.
         given = "".join(f"ip address add {address}/16 dev {WAN}\n" for address in addresses)
@@ -271,29 +273,29 @@ class Internet:
         )
 
     def _make_router(self, site: str) -> None:
-        room, number = self._make_room(f"{site}-gw"), self._numbers[site]
+        room, number = self._make_namespace(f"{site}-gw"), self._numbers[site]
         self._external[site] = f"198.18.1.{number}"
-        self._uplink(f"{site}-gw", (self._external[site],))
+        self._connect_wan(f"{site}-gw", (self._external[site],))
         room.run(
             f"echo 1 >/proc/sys/net/ipv4/ip_forward\n"
             f"ip link add {LAN} type bridge stp_state 0 forward_delay 0\nip link set {LAN} up\n"
-            f"ip address add 198.19.{number}.1/24 dev {LAN}\nnft -f - <<'END'\n{self._rules(site)}END\n"
+            f"ip address add 198.19.{number}.1/24 dev {LAN}\nnft -f - <<'END'\n{self._make_rules(site)}END\n"
         )
 
-    def _rules(self, site: str) -> str:
-        return self.sites[site].kind.rules(self._forwards.get(site, ()))
+    def _make_rules(self, site: str) -> str:
+        return self.sites[site].kind.make_rules(self._forwards.get(site, ()))
 
     def _attach_host(self, host: str, site: str, place: int) -> None:
-        number, room = self._numbers[site], self._rooms[host]
-        self._places[host] = site
-        if self.sites[site].kind is Kind.NONE:
+        number, room = self._numbers[site], self._namespaces[host]
+        self._site_of_host[host] = site
+        if self.sites[site].kind is NatKind.NONE:
             self._addresses[host] = f"198.18.{20 + number}.{place}"
-            self._uplink(host, (self._addresses[host],))
+            self._connect_wan(host, (self._addresses[host],))
             return
         self._addresses[host] = f"198.19.{number}.{place + 1}"
         port = f"h{place}"
-        router = self._rooms[f"{site}-gw"]
-        self._rooms[""].run(f"ip link add {WAN} netns {room.pid} type veth peer name {port} netns {router.pid}\n")
+        router = self._namespaces[f"{site}-gw"]
+        self._namespaces[""].run(f"ip link add {WAN} netns {room.pid} type veth peer name {port} netns {router.pid}\n")
         router.run(f"ip link set {port} master {LAN} up\n")
         room.run(
             f"ip address add {self._addresses[host]}/24 dev {WAN}\nip link set {WAN} up\n"
@@ -303,11 +305,11 @@ class Internet:
     def _ports_of(self, site: str) -> list[str]:
         if site in self._ports:
             return [site]
-        if self.sites[site].kind is Kind.NONE:
-            return [host for host, place in self._places.items() if place == site]
+        if self.sites[site].kind is NatKind.NONE:
+            return [host for host, place in self._site_of_host.items() if place == site]
         return [f"{site}-gw"]
 
-    def _order(self, **order: Any) -> Any:
+    def _send_order(self, **order: Any) -> Any:
         assert self._switch is not None and self._switch.stdin is not None and self._switch.stdout is not None
         self._switch.stdin.write(json.dumps(order) + "\n")
         self._switch.stdin.flush()

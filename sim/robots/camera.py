@@ -11,24 +11,24 @@ import cv2
 import numpy as np
 
 from sim.robots.dog import Dog
-from sim.robots.lens import (
-    EYE,
-    NEAR_PLANE,
-    SUB_BITS,
+from sim.robots.rendering import (
+    LENS_HEIGHT_M,
+    NEAR_PLANE_M,
+    SUBPIXEL_BITS,
+    CameraFrame,
     Colour,
     Image,
     Points,
     Room,
-    View,
     draw_shadow,
     draw_target,
-    encoded,
-    filled,
-    pixels,
+    encode_jpeg,
+    fill_polygon,
+    project,
 )
 from sim.robots.world import Target, World
 
-TILE = 0.3
+TILE_M = 0.3
 _JOINT: Colour = (96, 118, 106)
 _YELLOW: Colour = (25, 205, 245)
 _WHITE: Colour = (226, 226, 222)
@@ -47,17 +47,17 @@ class Camera:
     def __init__(self, rng: Random, world: World) -> None:
         self._world = world
         self._room = Room(rng, world.scene.width, world.scene.height, world.scene.wall_height)
-        self._meshes = {name: _dog_mesh(dog.stripes) for name, dog in world.dogs.items()}
-        self._joints = _joints(world.scene.width, world.scene.height)
+        self._meshes = {name: _make_dog_mesh(dog.stripes) for name, dog in world.dogs.items()}
+        self._joints = _make_joints(world.scene.width, world.scene.height)
 
-    def jpeg(self, dog: Dog, is_halved: bool = False) -> bytes:
+    def render_jpeg(self, dog: Dog, is_halved: bool = False) -> bytes:
         """Return the picture as a JPEG, optionally at half the width and height."""
-        return encoded(self.image(dog), is_halved)
+        return encode_jpeg(self.render_image(dog), is_halved)
 
-    def image(self, dog: Dog) -> Image:
+    def render_image(self, dog: Dog) -> Image:
         """Return the picture as blue, green and red bytes, with sensor noise."""
-        view = View(dog.x, dog.y, dog.body.angle)
-        image = self._room.floor()
+        view = CameraFrame(dog.x, dog.y, dog.body.angle)
+        image = self._room.draw_floor()
         self._draw_joints(image, view)
         self._room.draw_walls(image, view)
         things: list[tuple[float, int, Dog | Target]] = [
@@ -73,24 +73,24 @@ class Camera:
                 draw_target(image, view, thing.x, thing.y, thing.radius, thing.height)
             else:
                 _draw_dog(image, view, thing, self._meshes[thing.name])
-        return self._room.noisy(image)
+        return self._room.add_noise(image)
 
-    def _draw_joints(self, image: Image, view: View) -> None:
-        seen = view.seen(self._joints).reshape(-1, 2, 3)
+    def _draw_joints(self, image: Image, view: CameraFrame) -> None:
+        seen = view.transform(self._joints).reshape(-1, 2, 3)
         ahead = seen[:, :, 0]
-        seen = seen[ahead.max(axis=1) > NEAR_PLANE]
+        seen = seen[ahead.max(axis=1) > NEAR_PLANE_M]
         one, other = seen[:, 0], seen[:, 1]
         for end, opposite in ((one, other), (other, one)):
-            behind = end[:, 0] < NEAR_PLANE
+            behind = end[:, 0] < NEAR_PLANE_M
             if behind.any():
                 start, stop = end[behind], opposite[behind]
-                share = (NEAR_PLANE - start[:, 0]) / (stop[:, 0] - start[:, 0])
+                share = (NEAR_PLANE_M - start[:, 0]) / (stop[:, 0] - start[:, 0])
                 end[behind] = start + share[:, None] * (stop - start)
-        lines = pixels(seen.reshape(-1, 3)).reshape(-1, 2, 2)
-        cv2.polylines(image, list(lines), False, _JOINT, 1, cv2.LINE_AA, SUB_BITS)
+        lines = project(seen.reshape(-1, 3)).reshape(-1, 2, 2)
+        cv2.polylines(image, list(lines), False, _JOINT, 1, cv2.LINE_AA, SUBPIXEL_BITS)
 
 
-def _draw_dog(image: Image, view: View, dog: Dog, mesh: _Mesh) -> None:
+def _draw_dog(image: Image, view: CameraFrame, dog: Dog, mesh: _Mesh) -> None:
     x, y = dog.x - view.x, dog.y - view.y
     ahead, left = view.cos * x + view.sin * y, view.cos * y - view.sin * x
     if ahead < -0.2 or abs(left) > 0.6 * max(ahead, 0.0) + 0.35:
@@ -98,26 +98,26 @@ def _draw_dog(image: Image, view: View, dog: Dog, mesh: _Mesh) -> None:
     cos, sin = math.cos(dog.body.angle), math.sin(dog.body.angle)
     draw_shadow(image, view, dog.x, dog.y, 0.14)
     # The position of the lens in the dog's frame determines the visible faces.
-    eye = np.array([-cos * x - sin * y, sin * x - cos * y, EYE])
+    eye = np.array([-cos * x - sin * y, sin * x - cos * y, LENS_HEIGHT_M])
     towards = eye - mesh.centres[: mesh.count]
     is_visible = (towards * mesh.normals[: mesh.count]).sum(axis=1) > 0.0
     depth = (towards * towards).sum(axis=1)
     placed = mesh.corners @ np.array([(cos, sin, 0.0), (-sin, cos, 0.0), (0.0, 0.0, 1.0)]) + (dog.x, dog.y, 0.0)
-    seen = view.seen(placed)
+    seen = view.transform(placed)
     order = [face for face in np.argsort(-depth, kind="stable").tolist() if is_visible[face]]
     parts = [part for face in order for part in (face, *mesh.marks[face])]
-    if seen[:, 0].min() < NEAR_PLANE:
+    if seen[:, 0].min() < NEAR_PLANE_M:
         for part in parts:
-            filled(image, seen[4 * part : 4 * part + 4].tolist(), mesh.colours[part])
+            fill_polygon(image, seen[4 * part : 4 * part + 4].tolist(), mesh.colours[part])
         return
-    for part, quad in zip(parts, pixels(seen).reshape(-1, 4, 2)[parts], strict=True):
-        cv2.fillConvexPoly(image, quad, mesh.colours[part], cv2.LINE_AA, SUB_BITS)
+    for part, quad in zip(parts, project(seen).reshape(-1, 4, 2)[parts], strict=True):
+        cv2.fillConvexPoly(image, quad, mesh.colours[part], cv2.LINE_AA, SUBPIXEL_BITS)
 
 
-def _joints(width: float, height: float) -> Points:
+def _make_joints(width: float, height: float) -> Points:
     """Return the joints between the floor tiles as pairs of points."""
-    across = [((x, 0.0, 0.0), (x, height, 0.0)) for x in np.arange(TILE, width - 0.01, TILE)]
-    along = [((0.0, y, 0.0), (width, y, 0.0)) for y in np.arange(TILE, height - 0.01, TILE)]
+    across = [((x, 0.0, 0.0), (x, height, 0.0)) for x in np.arange(TILE_M, width - 0.01, TILE_M)]
+    along = [((0.0, y, 0.0), (width, y, 0.0)) for y in np.arange(TILE_M, height - 0.01, TILE_M)]
     return np.array(across + along).reshape(-1, 3)
 
 
@@ -136,17 +136,17 @@ class _Mesh:
     count: int
 
 
-def _dog_mesh(stripes: int) -> _Mesh:
+def _make_dog_mesh(stripes: int) -> _Mesh:
     """Build a simplified ERS-7: body, head with ``stripes`` yellow stripes, ears, legs, tail, the shade below."""
     faces: list[Points] = []
     plain: list[Colour] = []
     bands: list[list[Points]] = []
-    for x, y, z, colour, marked in _boxes(stripes):
+    for x, y, z, colour, marked in _list_boxes(stripes):
         corners = [(x[i & 1], y[i >> 1 & 1], z[i >> 2]) for i in range(8)]
         for row in _FACES:
             faces.append(np.array([corners[i] for i in row]))
             plain.append(colour)
-            bands.append(_bands(faces[-1], marked))
+            bands.append(_make_bands(faces[-1], marked))
     marks = []
     for some in bands:
         marks.append(range(len(faces), len(faces) + len(some)))
@@ -160,7 +160,7 @@ def _dog_mesh(stripes: int) -> _Mesh:
     return _Mesh(quads.reshape(-1, 3), normals, quads.mean(axis=1), colours, marks, len(marks))
 
 
-def _boxes(stripes: int) -> Iterator[tuple[Span, Span, Span, Colour, int]]:
+def _list_boxes(stripes: int) -> Iterator[tuple[Span, Span, Span, Colour, int]]:
     """Yield the boxes of a dog: spans of x, y and z in metres, the colour, and the number of stripes on each side.
 
     The trunk is as high as the target, so a dog in front of the target hides it completely.
@@ -177,7 +177,7 @@ def _boxes(stripes: int) -> Iterator[tuple[Span, Span, Span, Colour, int]]:
         yield (0.045, 0.085), (y, y + 0.014), (0.215, 0.295), _DARK, 0
 
 
-def _bands(face: Points, stripes: int) -> list[Points]:
+def _make_bands(face: Points, stripes: int) -> list[Points]:
     """Return ``stripes`` upright bands across a face, in its plane."""
     a, b, c, d = face
     edges = np.arange(1, 2 * stripes + 1) / (2 * stripes + 1)

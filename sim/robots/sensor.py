@@ -10,21 +10,21 @@ import math
 from random import Random
 
 from sim.robots.dog import Dog
-from sim.robots.world import SUBSTEP, World
+from sim.robots.world import SUBSTEP_S, World
 
-NOSE = 0.105
+NOSE_M = 0.105
 """Distance of the rangers and the camera from the centre of the dog, in metres."""
-NEAR = (0.05, 0.5)
-FAR = (0.2, 1.5)
-CHEST = (0.1, 0.9)
-CHEST_HEIGHT = 0.102
-CHEST_PITCH = math.radians(30.0)
-GRAVITY = 9.80665
+NEAR_RANGE_M = (0.05, 0.5)
+FAR_RANGE_M = (0.2, 1.5)
+CHEST_RANGE_M = (0.1, 0.9)
+CHEST_HEIGHT_M = 0.102
+CHEST_PITCH_RAD = math.radians(30.0)
+GRAVITY_MPS2 = 9.80665
 BATTERY_S = 90 * 60.0
-SAMPLED = ("range.near", "range.far", "range.chest", "imu.ax", "imu.ay", "imu.az")
+SAMPLED_KEYS = ("range.near", "range.far", "range.chest", "imu.ax", "imu.ay", "imu.az")
 
-FLOOR = CHEST_HEIGHT / math.sin(CHEST_PITCH)
-CHEST_REACH = CHEST_HEIGHT / math.tan(CHEST_PITCH)
+FLOOR_DISTANCE_M = CHEST_HEIGHT_M / math.sin(CHEST_PITCH_RAD)
+CHEST_REACH_M = CHEST_HEIGHT_M / math.tan(CHEST_PITCH_RAD)
 
 
 class Sensors:
@@ -34,8 +34,8 @@ class Sensors:
         self._rng = rng
         self._world = world
         self._dog = dog
-        self._samples: dict[str, list[float]] = {key: [] for key in SAMPLED}
-        self._newest = dict.fromkeys(SAMPLED, math.nan)
+        self._samples: dict[str, list[float]] = {key: [] for key in SAMPLED_KEYS}
+        self._newest = dict.fromkeys(SAMPLED_KEYS, math.nan)
         self._odometry = [0.0, 0.0, 0.0]
         # Each dog's stride differs slightly from its nominal length, so its odometry drifts steadily.
         self._stride_error = 1.0 + rng.gauss(0.0, 0.01)
@@ -48,22 +48,22 @@ class Sensors:
         """Take one sample of every sensor, 8 ms after the previous one."""
         dog, gauss = self._dog, self._rng.gauss
         moving = dog.is_moving
-        ahead = self._world.distance_ahead(dog, NOSE, FAR[1] * 1.1)
-        chest = self._world.distance_ahead(dog, NOSE, CHEST_REACH)
-        slant = FLOOR if chest is None else chest / math.cos(CHEST_PITCH)
+        ahead = self._world.distance_ahead(dog, NOSE_M, FAR_RANGE_M[1] * 1.1)
+        chest = self._world.distance_ahead(dog, NOSE_M, CHEST_REACH_M)
+        slant = FLOOR_DISTANCE_M if chest is None else chest / math.cos(CHEST_PITCH_RAD)
         shake = 0.25 if moving else 0.04
         for key, value in (
-            ("range.near", self._read_ranger(ahead, NEAR)),
-            ("range.far", self._read_ranger(ahead, FAR)),
-            ("range.chest", self._read_ranger(slant, CHEST)),
-            ("imu.ax", dog.felt[0] + gauss(0.0, shake)),
-            ("imu.ay", dog.felt[1] + gauss(0.0, shake)),
-            ("imu.az", GRAVITY + gauss(0.0, shake)),
+            ("range.near", self._read_ranger(ahead, NEAR_RANGE_M)),
+            ("range.far", self._read_ranger(ahead, FAR_RANGE_M)),
+            ("range.chest", self._read_ranger(slant, CHEST_RANGE_M)),
+            ("imu.ax", dog.acceleration[0] + gauss(0.0, shake)),
+            ("imu.ay", dog.acceleration[1] + gauss(0.0, shake)),
+            ("imu.az", GRAVITY_MPS2 + gauss(0.0, shake)),
         ):
             self._samples[key].append(value)
             self._newest[key] = value
         self._update_odometry(moving)
-        self._power = max(0.0, self._power - SUBSTEP / BATTERY_S * (1.0 if moving else 0.5))
+        self._power = max(0.0, self._power - SUBSTEP_S / BATTERY_S * (1.0 if moving else 0.5))
 
     def values(self) -> dict[str, float | bool]:
         """Return the newest values under the keys of an observation, NaN for nothing in range."""
@@ -82,7 +82,7 @@ class Sensors:
             "power.level": self._power,
         }
 
-    def taken_samples(self) -> dict[str, tuple[float, ...]]:
+    def pop_samples(self) -> dict[str, tuple[float, ...]]:
         """Return the samples since the last call, oldest first."""
         taken = {key: tuple(samples) for key, samples in self._samples.items()}
         for samples in self._samples.values():
@@ -103,6 +103,6 @@ class Sensors:
         vx, vy, wz = self._dog.motion
         slip = self._stride_error * (1.0 + self._rng.gauss(0.0, 0.05))
         yaw = self._odometry[2]
-        self._odometry[0] += (vx * math.cos(yaw) - vy * math.sin(yaw)) * slip * SUBSTEP
-        self._odometry[1] += (vx * math.sin(yaw) + vy * math.cos(yaw)) * slip * SUBSTEP
-        self._odometry[2] = yaw + wz * self._turn_error * (1.0 + self._rng.gauss(0.0, 0.05)) * SUBSTEP
+        self._odometry[0] += (vx * math.cos(yaw) - vy * math.sin(yaw)) * slip * SUBSTEP_S
+        self._odometry[1] += (vx * math.sin(yaw) + vy * math.cos(yaw)) * slip * SUBSTEP_S
+        self._odometry[2] = yaw + wz * self._turn_error * (1.0 + self._rng.gauss(0.0, 0.05)) * SUBSTEP_S

@@ -25,10 +25,10 @@ from twisted.logger import (
 from drivers.errors import UsageError
 from drivers.link import TcpLinkFactory
 from drivers.sim.option import DEFAULT_PORT
-from sim.robots.scene import SceneError, loaded
-from sim.robots.yard import Yard
+from sim.robots.scene import SceneError, load_scene
+from sim.robots.simulator import RobotSimulator
 
-USAGE = 2
+EXIT_USAGE = 2
 
 
 def main(arguments: list[str] | None = None, output: TextIO = sys.stdout, errors: TextIO = sys.stderr) -> int:
@@ -51,7 +51,7 @@ def main(arguments: list[str] | None = None, output: TextIO = sys.stdout, errors
     if not 0 <= args.port <= 65535:
         return _print_error(errors, f"port {args.port} is invalid; choose one from 1 to 65535, or 0 for any")
     try:
-        scene = loaded(args.scene)
+        scene = load_scene(args.scene)
         table = _read_table(args.robots)
     except (SceneError, UsageError) as error:
         return _print_error(errors, str(error))
@@ -69,7 +69,7 @@ def main(arguments: list[str] | None = None, output: TextIO = sys.stdout, errors
     globalLogBeginner.beginLoggingTo(
         [FilteringLogObserver(textFileLogObserver(errors), [warnings])], redirectStandardIO=False
     )
-    yard = Yard(reactor, Random(args.seed), scene)
+    yard = RobotSimulator(reactor, Random(args.seed), scene)
     try:
         robots = _make_emulators(reactor, args.seed, yard, table)
     except UsageError as error:
@@ -109,18 +109,18 @@ def _read_table(path: Path | None) -> dict[str, Any]:
     return table
 
 
-def _make_emulators(reactor: Any, seed: int, yard: Yard, table: dict[str, Any]) -> Any:
+def _make_emulators(reactor: Any, seed: int, yard: RobotSimulator, table: dict[str, Any]) -> Any:
     """Return the emulators of ``table``; without any, their modules are not imported, to save memory."""
     if not table:
         return None
-    from sim.robots.table import Robots
+    from sim.robots.emulated_robots import EmulatedRobots
 
-    return Robots(reactor, Random(seed), yard, table)
+    return EmulatedRobots(reactor, Random(seed), yard, table)
 
 
 def _print_error(errors: TextIO, problem: str) -> int:
     print(f"swarm yard: {problem}", file=errors)
-    return USAGE
+    return EXIT_USAGE
 
 
 if __name__ == "__main__":

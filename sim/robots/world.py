@@ -13,18 +13,18 @@ from random import Random
 import pymunk
 
 from sim.robots.dog import DOG, REST, TARGET, WALL, Dog, Motion
-from sim.robots.scene import FOOTPRINT, Scene
+from sim.robots.scene import FOOTPRINT_RADIUS_M, Scene
 
-SUBSTEP = 0.008
+SUBSTEP_S = 0.008
 """Duration of one ``step`` in seconds; the ERS-7 samples its sensors at this interval."""
 SUBSTEPS = 4
-TICK = SUBSTEPS * SUBSTEP
+TICK_S = SUBSTEPS * SUBSTEP_S
 """Duration of one tick in seconds: one sensor frame of the ERS-7."""
-WALL_THICKNESS = 0.04
-TRIES = 2000
-CLEARANCE, APART, FROM_WALLS = 0.75, 0.25, 0.25
+WALL_THICKNESS_M = 0.04
+MAX_TRIES = 2000
+CLEARANCE_M, DISTANCE_GAP_M, FROM_WALLS_M = 0.75, 0.25, 0.25
 """Metres that a random target keeps from the dogs, between its distances to two of them, and from the walls."""
-LATEST = 3600.0
+MAX_DELAY_S = 3600.0
 """Longest delay in seconds of placing a target later."""
 
 
@@ -51,14 +51,14 @@ class World:
         self.collisions = 0
         self._rng = rng
         self._steps = 0
-        self._placing_at = math.inf
+        self._place_target_at = math.inf
         self._space = pymunk.Space()
         # The library's default slop is for pixels: in metres, bodies would overlap by 10 cm.
         self._space.collision_slop = 0.001
         self._target_shape: pymunk.Shape | None = None
         self._build_walls()
         self.dogs: dict[str, Dog] = {}
-        for number, kennel in enumerate(scene.kennels, 1):
+        for number, kennel in enumerate(scene.dogs, 1):
             dog = self.dogs[kennel.name] = Dog(kennel, number)
             self._space.add(dog.body, dog.shape)
         for other in (DOG, TARGET, WALL):
@@ -67,7 +67,7 @@ class World:
     @property
     def t(self) -> float:
         """Simulated time in seconds since the start."""
-        return self._steps * SUBSTEP
+        return self._steps * SUBSTEP_S
 
     @property
     def walls(self) -> list[tuple[float, float, float, float]]:
@@ -78,15 +78,15 @@ class World:
 
     def step(self) -> None:
         """Simulate ``SUBSTEP`` seconds."""
-        if self.t >= self._placing_at:
-            self._placing_at = math.inf
+        if self.t >= self._place_target_at:
+            self._place_target_at = math.inf
             with suppress(NotPossible):  # no place is free, and no caller waits for an answer
                 self.place_target_at_random()
         for dog in self.dogs.values():
-            dog.strive(SUBSTEP)
-        self._space.step(SUBSTEP)
+            dog.accelerate(SUBSTEP_S)
+        self._space.step(SUBSTEP_S)
         for dog in self.dogs.values():
-            dog.feel(SUBSTEP)
+            dog.record_motion(SUBSTEP_S)
         self._steps += 1
 
     def drive(self, name: str, vx: float, vy: float, wz: float) -> None:
@@ -109,7 +109,7 @@ class World:
         radius = self.scene.target_radius
         self._check_inside("the target", x, y, radius)
         for dog in self.dogs.values():
-            if math.hypot(dog.x - x, dog.y - y) < FOOTPRINT + radius:
+            if math.hypot(dog.x - x, dog.y - y) < FOOTPRINT_RADIUS_M + radius:
                 raise NotPossible(f"{dog.name} stands at ({x:.2f}, {y:.2f}); choose a free place")
         self.clear_target()
         self.target = Target(x, y, radius, self.scene.target_height)
@@ -126,15 +126,15 @@ class World:
         raises ``NotPossible`` if no place is free.
         """
         best, best_fit = None, -math.inf
-        for _ in range(TRIES):
-            x = self._rng.uniform(FROM_WALLS, self.scene.width - FROM_WALLS)
-            y = self._rng.uniform(FROM_WALLS, self.scene.height - FROM_WALLS)
+        for _ in range(MAX_TRIES):
+            x = self._rng.uniform(FROM_WALLS_M, self.scene.width - FROM_WALLS_M)
+            y = self._rng.uniform(FROM_WALLS_M, self.scene.height - FROM_WALLS_M)
             distances = sorted(math.hypot(dog.x - x, dog.y - y) for dog in self.dogs.values())
-            if distances and distances[0] < FOOTPRINT + 2 * self.scene.target_radius:
+            if distances and distances[0] < FOOTPRINT_RADIUS_M + 2 * self.scene.target_radius:
                 continue
-            gap = min((b - a for a, b in zip(distances, distances[1:], strict=False)), default=APART)
-            room = distances[0] if distances else CLEARANCE
-            fit = min(gap / APART, 1.0) + min(room / CLEARANCE, 1.0)
+            gap = min((b - a for a, b in zip(distances, distances[1:], strict=False)), default=DISTANCE_GAP_M)
+            room = distances[0] if distances else CLEARANCE_M
+            fit = min(gap / DISTANCE_GAP_M, 1.0) + min(room / CLEARANCE_M, 1.0)
             if fit > best_fit:
                 best, best_fit = (x, y), fit
         if best is None:
@@ -143,13 +143,13 @@ class World:
 
     def place_target_later(self, seconds: float) -> None:
         """Move the target to a free place after ``seconds``, unless it is placed or removed before."""
-        if not 0.0 <= seconds <= LATEST:
-            raise NotPossible(f"the delay of the target must be from 0 to {LATEST:g} s, not {seconds:g}")
-        self._placing_at = self.t + seconds
+        if not 0.0 <= seconds <= MAX_DELAY_S:
+            raise NotPossible(f"the delay of the target must be from 0 to {MAX_DELAY_S:g} s, not {seconds:g}")
+        self._place_target_at = self.t + seconds
 
     def clear_target(self) -> None:
         """Remove the target, if there is one."""
-        self._placing_at = math.inf
+        self._place_target_at = math.inf
         if self._target_shape is not None:
             self._space.remove(self._target_shape)
         self.target = self._target_shape = None
@@ -159,18 +159,18 @@ class World:
         dog = self.dogs.get(name)
         if dog is None:
             raise NotPossible(f"no dog is named {name!r}; known are {', '.join(self.dogs)}")
-        self._check_inside(name, x, y, FOOTPRINT)
+        self._check_inside(name, x, y, FOOTPRINT_RADIUS_M)
         if not math.isfinite(heading):
             raise NotPossible("a heading must be a finite number of radians")
         for other in self.dogs.values():
-            if other is not dog and math.hypot(other.x - x, other.y - y) < 2 * FOOTPRINT:
+            if other is not dog and math.hypot(other.x - x, other.y - y) < 2 * FOOTPRINT_RADIUS_M:
                 raise NotPossible(f"{other.name} stands at ({x:.2f}, {y:.2f}); choose a free place")
         if (
             self.target is not None
-            and math.hypot(self.target.x - x, self.target.y - y) < FOOTPRINT + self.target.radius
+            and math.hypot(self.target.x - x, self.target.y - y) < FOOTPRINT_RADIUS_M + self.target.radius
         ):
             raise NotPossible(f"the target stands at ({x:.2f}, {y:.2f}); choose a free place")
-        self._put(dog, x, y, heading)
+        self._place_dog(dog, x, y, heading)
 
     def scatter(self, seed: int, clearance: float = 0.45, from_walls: float = 0.3) -> None:
         """Move all dogs to random free places, at rest; the same ``seed`` gives the same places."""
@@ -178,7 +178,7 @@ class World:
         taken = [] if self.target is None else [(self.target.x, self.target.y)]
         places = []
         for _ in self.dogs:
-            for _ in range(TRIES):
+            for _ in range(MAX_TRIES):
                 x = rng.uniform(from_walls, self.scene.width - from_walls)
                 y = rng.uniform(from_walls, self.scene.height - from_walls)
                 if all(math.hypot(x - a, y - b) >= clearance for a, b in taken):
@@ -190,7 +190,7 @@ class World:
             taken.append((x, y))
             places.append((x, y, rng.uniform(-math.pi, math.pi)))
         for dog, place in zip(self.dogs.values(), places, strict=True):
-            self._put(dog, *place)
+            self._place_dog(dog, *place)
 
     def snapshot(self) -> dict[str, object]:
         """Return the true state as plain data, for the map and the judge."""
@@ -213,8 +213,8 @@ class World:
             "collisions": self.collisions,
         }
 
-    def _put(self, dog: Dog, x: float, y: float, heading: float) -> None:
-        dog.put(x, y, heading)
+    def _place_dog(self, dog: Dog, x: float, y: float, heading: float) -> None:
+        dog.place(x, y, heading)
         self._space.reindex_shapes_for_body(dog.body)
 
     def _check_inside(self, what: str, x: float, y: float, radius: float) -> None:
@@ -226,7 +226,7 @@ class World:
             )
 
     def _build_walls(self) -> None:
-        half = WALL_THICKNESS / 2
+        half = WALL_THICKNESS_M / 2
         for x1, y1, x2, y2 in self.walls:
             # Thickness prevents tunnelling; the wall lies outside, so its inner face is the boundary.
             length = math.hypot(x2 - x1, y2 - y1)

@@ -14,24 +14,24 @@ from collections.abc import Callable, Iterable, Iterator
 from types import ModuleType
 
 from sim.team.event import Event
-from sim.team.invariant import agreement, durability, execution, taking, wire
+from sim.team.invariant import agreement, durability, execution, tuple_space, wire
 
 Invariant = Callable[[Iterable[Event]], Iterator[str]]
-Kinds = tuple[type[Event], ...]
+EventKinds = tuple[type[Event], ...]
 
 
-def _named(part: ModuleType) -> tuple[tuple[str, Invariant], ...]:
+def _find_invariants(part: ModuleType) -> tuple[tuple[str, Invariant], ...]:
     """Return the invariants of a module: its functions named by a letter and a digit."""
     return tuple((name.upper(), found) for name, found in vars(part).items() if re.fullmatch(r"[a-z]\d", name))
 
 
-PARTS: tuple[tuple[Kinds, tuple[tuple[str, Invariant], ...]], ...] = tuple(
-    (part.KINDS, _named(part)) for part in (execution, agreement, durability, taking, wire)
+PARTS: tuple[tuple[EventKinds, tuple[tuple[str, Invariant], ...]], ...] = tuple(
+    (part.KINDS, _find_invariants(part)) for part in (execution, agreement, durability, tuple_space, wire)
 )
 """For each part of a team the relevant events and its invariants; E5 applies to devices and to agents."""
 
 
-def check(events: Iterable[Event]) -> list[str]:
+def find_violations(events: Iterable[Event]) -> list[str]:
     """Return every violation as a line that starts with its invariant, without duplicates."""
     listed = list(events)
     found: dict[str, None] = {}

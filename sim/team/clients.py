@@ -15,8 +15,8 @@ from twisted.python.failure import Failure
 from middleware.entangled.errors import EntangledError, Unavailable
 from middleware.entangled.node import EntangledNode
 from middleware.entangled.record import Record
-from middleware.entangled.replication.owner import Concern
-from middleware.entangled.replication.reader import ReadConcern
+from middleware.entangled.replication.owner import ConsistencyLevel
+from middleware.entangled.replication.reader import ReadConsistency
 from sim.team.history import History
 from sim.team.invariant.durability import Slot
 
@@ -27,63 +27,69 @@ WRITE, REMOVE, READ = "write", "remove", "read"
 T = TypeVar("T")
 
 
-def follow(
+def record_outcome(
     history: History, number: int, work: Deferred[T], shown: Callable[[T], object] = lambda result: None
 ) -> None:
     """Record the outcome of ``work``, the request ``number``: ``shown(result)``, or the reason of its failure."""
 
     def failed(failure: Failure) -> None:
         failure.trap(EntangledError)
-        history.unanswered(number, failure.value, failure.check(Unavailable) is not None)
+        history.record_failure(number, failure.value, failure.check(Unavailable) is not None)
 
-    work.addCallbacks(lambda result: history.answered(number, shown(result)), failed)
+    work.addCallbacks(lambda result: history.record_answer(number, shown(result)), failed)
 
 
 class Clients:
     """The clients of one run; ``asked`` and ``answered`` count operations."""
 
     def __init__(self, history: History) -> None:
-        self.asked: Counter[str] = Counter()
-        self.answered: Counter[str] = Counter()
+        self.request_counts: Counter[str] = Counter()
+        self.answer_counts: Counter[str] = Counter()
         self._history = history
-        self._written: Counter[Slot] = Counter()
+        self._write_counts: Counter[Slot] = Counter()
 
-    def slots(self, owner: bytes) -> list[Slot]:
+    def list_slots(self, owner: bytes) -> list[Slot]:
         """Return the slots that the node with this public key has written or removed, in order of first use."""
-        return [slot for slot in self._written if slot.owner == owner]
+        return [slot for slot in self._write_counts if slot.owner == owner]
 
     def write(
-        self, place: int, node: EntangledNode, key: bytes, name: str, concern: Concern = "majority", act: str = WRITE
+        self,
+        place: int,
+        node: EntangledNode,
+        key: bytes,
+        name: str,
+        concern: ConsistencyLevel = "majority",
+        act: str = WRITE,
     ) -> None:
         """Write the next number into a slot of the ``node`` at ``place``, or remove it if ``act`` is ``REMOVE``."""
         slot = Slot(key, node.identity.public, name)
-        self._written[slot] += 1
-        count = self._written[slot]
-        number = self._asked(place, act, slot, count)
+        self._write_counts[slot] += 1
+        count = self._write_counts[slot]
+        number = self._record_request(place, act, slot, count)
         done = node.put(key, name, b"%d" % count, "team", concern) if act == WRITE else node.remove(key, name, concern)
-        done.addCallbacks(lambda _: self._answered(number, act), self._failed, errbackArgs=(number,))
+        done.addCallbacks(lambda _: self._record_answer(number, act), self._on_failure, errbackArgs=(number,))
 
     def read(
-        self, place: int, life: int, node: EntangledNode, key: bytes, concern: ReadConcern = "majority"
+        self, place: int, life: int, node: EntangledNode, key: bytes, concern: ReadConsistency = "majority"
     ) -> Deferred[list[Record]]:
         """Read at the ``node`` at ``place`` in its ``life``; fires with the records, or with [] on failure."""
         # Each life counts as another client, as a node may forget its own reads.
-        number = self._asked((place, life), READ, key, concern)
-        return node.get(key, concern).addCallbacks(self._shown, self._failed, (number,), {}, (number,))
+        number = self._record_request((place, life), READ, key, concern)
+        return node.get(key, concern).addCallbacks(self._on_records, self._on_failure, (number,), {}, (number,))
 
-    def _asked(self, client: Hashable, act: str, subject: Hashable, argument: object) -> int:
-        self.asked[act] += 1
-        return self._history.asked(client, act, subject, argument)
+    def _record_request(self, client: Hashable, act: str, subject: Hashable, argument: object) -> int:
+        self.request_counts[act] += 1
+        return self._history.record_request(client, act, subject, argument)
 
-    def _answered(self, number: int, act: str, result: object = None) -> None:
-        self.answered[act] += 1
-        self._history.answered(number, result)
+    def _record_answer(self, number: int, act: str, result: object = None) -> None:
+        self.answer_counts[act] += 1
+        self._history.record_answer(number, result)
 
-    def _shown(self, records: list[Record], number: int) -> list[Record]:
-        self._answered(number, READ, {Slot(*record.slot): int(record.value or b"0") for record in records})
+    def _on_records(self, records: list[Record], number: int) -> list[Record]:
+        self._record_answer(number, READ, {Slot(*record.slot): int(record.value or b"0") for record in records})
         return records
 
-    def _failed(self, failure: Failure, number: int) -> list[Record]:
+    def _on_failure(self, failure: Failure, number: int) -> list[Record]:
         failure.trap(EntangledError)
-        self._history.unanswered(number, failure.value, failure.check(Unavailable) is not None)
+        self._history.record_failure(number, failure.value, failure.check(Unavailable) is not None)
         return []

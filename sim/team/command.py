@@ -11,17 +11,17 @@ from typing import TextIO
 
 from middleware.errors import BadSetting
 from sim.team.load.catalogue import LOADS
-from sim.team.memory import Read, check, resident
-from sim.team.picture import drawn
+from sim.team.membership import MEMBERSHIP
+from sim.team.memory import Read, check_memory, measure_resident_bytes
+from sim.team.picture import draw_svg
 from sim.team.progress import Progress
-from sim.team.report import Cost, Samples, Trace, again, packed, text
+from sim.team.report import Cost, Samples, Trace, format_json, format_text, make_repeat_command
 from sim.team.run import Run
-from sim.team.scenario import Scenario, loaded, names, place_of, remedy_of
-from sim.team.standing import STANDING
-from sim.team.workload import Kinds
+from sim.team.scenario import Scenario, find_position, list_names, load_scenario, make_remedy
+from sim.team.workload import WorkloadKinds
 
-KINDS: Kinds = {"standing": STANDING, **LOADS}
-MISSED, ENDED = 1, 130
+KINDS: WorkloadKinds = {"standing": MEMBERSHIP, **LOADS}
+EXIT_MISSED, EXIT_INTERRUPTED = 1, 130
 
 
 @dataclass
@@ -39,72 +39,74 @@ class Environment:
     read: Read
     columns: int = 0
     is_stopped: Callable[[], bool] = field(default=lambda: False)
-    grown: Callable[[], None] = field(default=lambda: None)
+    on_allocated: Callable[[], None] = field(default=lambda: None)
 
 
-def run(arguments: Sequence[str], world: Environment, kinds: Kinds = KINDS) -> int:
+def run(arguments: Sequence[str], world: Environment, kinds: WorkloadKinds = KINDS) -> int:
     """Run the scenario of the arguments; returns 1 if a target or invariant is missed.  Raises ``BadSetting``."""
-    wanted = _parsed(arguments)
+    wanted = _parse_arguments(arguments)
     changes = {} if wanted.nodes is None else {"nodes": wanted.nodes}
-    scenario = loaded(wanted.scenario, {name: kind.settings for name, kind in kinds.items()}, changes)
-    check(scenario, world.read)
-    line = again(wanted.scenario, wanted.seed, wanted.nodes)
+    scenario = load_scenario(wanted.scenario, {name: kind.settings for name, kind in kinds.items()}, changes)
+    check_memory(scenario, world.read)
+    line = make_repeat_command(wanted.scenario, wanted.seed, wanted.nodes)
     began, cpu = world.wall(), world.cpu()
-    memory = lambda: resident(world.read)  # noqa: E731
+    memory = lambda: measure_resident_bytes(world.read)  # noqa: E731
     progress, samples = Progress(world.err, world.columns, world.wall, memory), Samples()
 
     def looked(run: Run) -> bool:
-        samples.looked(run)
+        samples.update(run)
         return False
 
     def watched(run: Run) -> bool:
-        progress.looked(run)
+        progress.update(run)
         return world.is_stopped()
 
-    going = Run(scenario, wanted.seed, kinds, looked, world.grown, watched, world.wall)
-    check_targets(scenario, [figure.name for figure in going.figures()], wanted.scenario)
+    going = Run(scenario, wanted.seed, kinds, looked, world.on_allocated, watched, world.wall)
+    check_targets(scenario, [figure.name for figure in going.collect_metrics()], wanted.scenario)
     faults: list[tuple[float, str]] = []
     with ExitStack() as files:
         # Opened before the run, so that a missing folder is reported at once and not after an hour.
-        json_out = _opened(wanted.json, "--json", files)
-        trace_out = _opened(wanted.trace, "--trace", files)
-        picture_out = _opened(wanted.picture, "--picture", files)
-        going.team.told.append(lambda now, what, _, more: faults.append((now, more)) if what == "fault" else None)
+        json_out = _open_file(wanted.json, "--json", files)
+        trace_out = _open_file(wanted.trace, "--trace", files)
+        picture_out = _open_file(wanted.picture, "--picture", files)
+        going.team.event_listeners.append(
+            lambda now, what, _, more: faults.append((now, more)) if what == "fault" else None
+        )
         trace = None if trace_out is None else Trace(trace_out)
         if trace is not None:
             trace.begin(scenario=scenario.name, seed=wanted.seed, nodes=scenario.nodes, again=line)
-            going.team.told.append(trace.told)
-        outcome = going.go()
+            going.team.event_listeners.append(trace.write_event)
+        outcome = going.run()
         progress.close()
         cost = Cost(world.cpu() - cpu, world.wall() - began, memory())
         if trace is not None:
             trace.end(partial=outcome.is_partial, hash=outcome.digest)
         if json_out is not None:
-            json_out.write(packed(scenario, outcome, cost, line, samples.series))
+            json_out.write(format_json(scenario, outcome, cost, line, samples.series))
         if picture_out is not None:
             title = f"{scenario.name}, {scenario.nodes:,} nodes, seed {wanted.seed}"
-            picture_out.write(drawn(title + (" (partial)" if outcome.is_partial else ""), samples.series, faults))
-        world.out.write(text(scenario, outcome, cost, line))
+            picture_out.write(draw_svg(title + (" (partial)" if outcome.is_partial else ""), samples.series, faults))
+        world.out.write(format_text(scenario, outcome, cost, line))
     if outcome.is_partial:
-        return ENDED
-    return MISSED if outcome.missed or outcome.violations else 0
+        return EXIT_INTERRUPTED
+    return EXIT_MISSED if outcome.missed or outcome.violations else 0
 
 
 def check_targets(scenario: Scenario, known: Sequence[str], origin: str) -> None:
     """Raise ``BadSetting`` for a target that is not one of the ``known`` figures."""
     for name, _ in scenario.targets:
         if name not in known:
-            place = place_of(origin, "targets", name)
-            raise BadSetting(place, f"[targets] {name}", "is not a figure", remedy_of(name, known))
+            place = find_position(origin, "targets", name)
+            raise BadSetting(place, f"[targets] {name}", "is not a figure", make_remedy(name, known))
 
 
-def _parsed(arguments: Sequence[str]) -> argparse.Namespace:
+def _parse_arguments(arguments: Sequence[str]) -> argparse.Namespace:
     parser = argparse.ArgumentParser(
         prog="sim run",
         description="Run a scenario with whole nodes in this process and judge it; Ctrl-C gives the partial result.",
         epilog="Exit code: 0 success, 1 a target or an invariant is missed, 2 it cannot be run, 130 interrupted.",
     )
-    parser.add_argument("--scenario", required=True, metavar="NAME", help=f"{', '.join(names())}, or a .toml file")
+    parser.add_argument("--scenario", required=True, metavar="NAME", help=f"{', '.join(list_names())}, or a .toml file")
     parser.add_argument("--seed", type=int, default=1, metavar="N", help="seed of all random numbers (default 1)")
     parser.add_argument("--nodes", type=int, metavar="N", help="number of nodes, instead of the scenario's")
     parser.add_argument("--json", type=Path, metavar="FILE", help="write the report as JSON")
@@ -113,7 +115,7 @@ def _parsed(arguments: Sequence[str]) -> argparse.Namespace:
     return parser.parse_args(arguments)
 
 
-def _opened(path: Path | None, key: str, files: ExitStack) -> TextIO | None:
+def _open_file(path: Path | None, key: str, files: ExitStack) -> TextIO | None:
     if path is None:
         return None
     try:

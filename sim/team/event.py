@@ -84,17 +84,17 @@ class Settled(Event):
 
 
 @dataclass(frozen=True, slots=True)
-class Terms(Event):
+class Assumptions(Event):
     """The assumptions from now on: lease ttl, clock drift, stopping time of robots, maximum network delay."""
 
     ttl: float
     drift: float
     stop_time: float
-    slowest: float
+    max_delay: float
 
 
 @dataclass(frozen=True, slots=True)
-class Won(Event):
+class LeaseWon(Event):
     """An agent believes that it holds a lease, with a token that is new to it."""
 
     task: str
@@ -103,7 +103,7 @@ class Won(Event):
 
 
 @dataclass(frozen=True, slots=True)
-class Held(Event):
+class LeaseHeld(Event):
     """``place`` won or renewed its lease; ``others`` also believe that they hold it, each by its own clock."""
 
     task: str
@@ -112,7 +112,7 @@ class Held(Event):
 
 
 @dataclass(frozen=True, slots=True)
-class Issued(Event):
+class CommandSent(Event):
     """An agent sent a command.
 
     Its lease ends at ``ends`` by its own clock, and at ``truly`` by an equal clock that was never suspended.
@@ -120,12 +120,12 @@ class Issued(Event):
 
     task: str
     place: int
-    ends: float
-    truly: float
+    ends_at: float
+    true_end: float
 
 
 @dataclass(frozen=True, slots=True)
-class Commanded(Event):
+class CommandReceived(Event):
     """The gate of a device accepted or refused a command; the device moves until ``until`` without a further one."""
 
     task: str
@@ -133,29 +133,29 @@ class Commanded(Event):
     token: int
     is_accepted: bool
     until: float
-    truly: float
+    true_end: float
 
 
 @dataclass(frozen=True, slots=True)
-class Halted(Event):
+class RobotStopped(Event):
     """An agent stopped its robot, which stands still from ``still`` on."""
 
     task: str
     place: int
-    still: float
+    still_at: float
 
 
 @dataclass(frozen=True, slots=True)
-class Reached(Event):
+class MajorityReachable(Event):
     """Whether an agent and a majority of a task's council can communicate from now on."""
 
     task: str
     place: int
-    is_reached: bool
+    is_reachable: bool
 
 
 @dataclass(frozen=True, slots=True)
-class Awaited(Event):
+class CommandExpected(Event):
     """A command with a token ``above`` this one must follow within ``within`` seconds after ``since``."""
 
     task: str
@@ -169,14 +169,14 @@ class Awaited(Event):
 
 
 @dataclass(frozen=True, slots=True)
-class Calm(Event):
+class FaultFree(Event):
     """This run has no faults and a perfect network; messages reach all nodes ``within`` so many seconds."""
 
     within: float
 
 
 @dataclass(frozen=True, slots=True)
-class Engaged(Event):
+class ActiveTasks(Event):
     """The tasks on which an agent acts now, and the tasks whose leases it holds."""
 
     place: int
@@ -185,7 +185,7 @@ class Engaged(Event):
 
 
 @dataclass(frozen=True, slots=True)
-class Concluded(Event):
+class OutcomeStored(Event):
     """A majority of replicas has the outcome of a task."""
 
     task: str
@@ -193,20 +193,20 @@ class Concluded(Event):
 
 
 @dataclass(frozen=True, slots=True)
-class Expired(Event):
+class OutcomeExpired(Event):
     """The record of a task's outcome has expired; the task has ended and may still be listed."""
 
     task: str
 
 
 @dataclass(frozen=True, slots=True)
-class Open(Event):
+class OpenTask(Event):
     """At the end: an agent regards a task as open, and is in this state of it."""
 
     task: str
     place: int
     state: str
-    is_docketed: bool
+    is_listed: bool
 
 
 class Report(NamedTuple):
@@ -245,12 +245,12 @@ class Stored(Event):
     name: str
     sequence: int
     signature: bytes
-    is_lasting: bool
+    is_durable: bool
     is_genuine: bool
 
 
 @dataclass(frozen=True, slots=True)
-class Met(Event):
+class ContactKnown(Event):
     """A node has a contact in its table."""
 
     place: int
@@ -259,7 +259,7 @@ class Met(Event):
 
 
 @dataclass(frozen=True, slots=True)
-class Counted(Event):
+class MembersListed(Event):
     """At the end: the ids of the members that a node regards as alive, in its order."""
 
     place: int
@@ -270,7 +270,7 @@ class Counted(Event):
 
 
 @dataclass(frozen=True, slots=True)
-class Posted(Event):
+class TupleStored(Event):
     """A replica holds a tuple, on which these members decide."""
 
     mark: Hashable
@@ -280,7 +280,7 @@ class Posted(Event):
 
 
 @dataclass(frozen=True, slots=True)
-class Voted(Event):
+class VoteAccepted(Event):
     """A council member accepted, under a ballot, that a tuple goes to ``taker``."""
 
     mark: Hashable
@@ -290,26 +290,26 @@ class Voted(Event):
 
 
 @dataclass(frozen=True, slots=True)
-class Seated(Event):
+class LivingMembers(Event):
     """The living members, with their incarnations: a new incarnation has forgotten its votes."""
 
     members: tuple[tuple[bytes, bytes], ...]
 
 
 @dataclass(frozen=True, slots=True)
-class Repeated(Event):
+class AnswerRepeated(Event):
     """A member was asked again for the tuple that it accepted for ``taker``, and answered this (None: invalid)."""
 
     fields: Hashable
     taker: bytes
-    said: bytes | None
+    answer: bytes | None
 
 
 # -- the wire -----------------------------------------------------------------------------------------------------
 
 
 @dataclass(frozen=True, slots=True)
-class Shot(Event):
+class InvalidDatagram(Event):
     """An invalid datagram, which must change nothing, reached a node: digests of the node's state, and its reaction."""
 
     place: int
@@ -324,24 +324,24 @@ class Shot(Event):
 
 
 @dataclass(frozen=True, slots=True)
-class Ran(Event):
+class RequestExecuted(Event):
     """A node executed the request ``question``, which may happen once per life."""
 
     place: int
     life: int
-    question: int
+    request: int
 
 
 @dataclass(frozen=True, slots=True)
-class Strange(Event):
+class UnvalidatedTraffic(Event):
     """At the end: bytes sent to an unvalidated address, and bytes received from it."""
 
     sent: int
-    got: int
+    received: int
 
 
 @dataclass(frozen=True, slots=True)
-class Size(Event):
+class TableSize(Event):
     """The number of entries in a table of a node, and its limit ``cap``."""
 
     place: int

@@ -18,7 +18,7 @@ class History:
     def __init__(self, seconds: Callable[[], float]) -> None:
         self.events: list[Event] = []
         self._seconds = seconds
-        self._asked = 0
+        self._request_count = 0
 
     def __iter__(self) -> Iterator[Event]:
         return iter(self.events)
@@ -26,21 +26,21 @@ class History:
     def __len__(self) -> int:
         return len(self.events)
 
-    def note(self, kind: Callable[..., Event], *facts: object) -> None:
+    def record(self, kind: Callable[..., Event], *facts: object) -> None:
         """Append an event of the class ``kind``."""
         self.events.append(kind(self._seconds(), *facts))
 
-    def asked(self, client: Hashable, what: str, subject: Hashable, argument: object = None) -> int:
+    def record_request(self, client: Hashable, what: str, subject: Hashable, argument: object = None) -> int:
         """Append a client's request; returns its number, for the answer."""
-        self._asked += 1
-        self.events.append(Asked(self._seconds(), self._asked, client, what, subject, argument))
-        return self._asked
+        self._request_count += 1
+        self.events.append(Asked(self._seconds(), self._request_count, client, what, subject, argument))
+        return self._request_count
 
-    def answered(self, number: int, result: object = None) -> None:
+    def record_answer(self, number: int, result: object = None) -> None:
         """Append the answer to a request."""
         self.events.append(Answered(self._seconds(), number, result))
 
-    def unanswered(self, number: int, why: object, is_unavailable: bool = False) -> None:
+    def record_failure(self, number: int, why: object, is_unavailable: bool = False) -> None:
         """Append that the client gave up; the outcome of the request is unknown."""
         self.events.append(Unanswered(self._seconds(), number, str(why), is_unavailable))
 

@@ -18,11 +18,11 @@ from formats.convert import Unit, one_of
 from middleware.entangled.network.network import Address
 
 KINDS = ("none", "lan", "wifi", "internet")
-MEAN_RTT = 0.156
+MEAN_RTT_S = 0.156
 """Mean round-trip time of the King data set in seconds, as in the simulations that results are compared with."""
-HEIGHT = 0.0125
+ACCESS_DELAY_S = 0.0125
 """Mean one-way delay of a node's access link in seconds, for every peer."""
-SIDE = (MEAN_RTT / 2 - 2 * HEIGHT) / 0.521405
+SIDE_S = (MEAN_RTT_S / 2 - 2 * ACCESS_DELAY_S) / 0.521405
 """Side of the square of node positions, in seconds one way; 0.5214 is the mean distance in a unit square."""
 SPREAD = 0.05
 """Relative variation of the delays of one pair."""
@@ -65,7 +65,7 @@ class TeamLink:
 
     def __init__(self, settings: LinkSettings, seed: str) -> None:
         self.settings = settings
-        self.worse = 0.0
+        self.extra_loss = 0.0
         """Additional share of datagrams lost while a fault of kind ``weather`` is active."""
         self._seed = seed
         self._loss = settings.loss
@@ -76,11 +76,11 @@ class TeamLink:
         self._delay = getattr(self, f"_{settings.kind}")
         self._is_plain = not (settings.duplicate or settings.reorder or settings.bandwidth)
 
-    def delays(self, source: Address, to: Address, size: int, now: float, rng: random.Random) -> Sequence[float]:
+    def draw_delays(self, source: Address, to: Address, size: int, now: float, rng: random.Random) -> Sequence[float]:
         """Return the delay of each copy of a datagram in seconds; empty if it is lost."""
         if self._loss and self._is_lost(source, to, now, rng):
             return LOST
-        if self.worse and rng.random() < self.worse:
+        if self.extra_loss and rng.random() < self.extra_loss:
             return LOST
         if self._is_plain:
             return (self._delay(source, to, rng),)
@@ -99,7 +99,7 @@ class TeamLink:
 
     def distance(self, source: Address, to: Address) -> float:
         """Return the one-way delay between two nodes on the internet in seconds, without variation."""
-        (x, y, height), (x2, y2, height2) = self._position(source), self._position(to)
+        (x, y, height), (x2, y2, height2) = self._get_position(source), self._get_position(to)
         return math.hypot(x - x2, y - y2) + height + height2
 
     # -- inside -----------------------------------------------------------------------------------------------------
@@ -119,14 +119,14 @@ class TeamLink:
         self._bursts[source] = now, is_bad
         return is_bad
 
-    def _position(self, address: Address) -> tuple[float, float, float]:
+    def _get_position(self, address: Address) -> tuple[float, float, float]:
         position = self._positions.get(address)
         if position is None:
             position_rng = random.Random(f"{self._seed}/{address}")
             position = (
-                position_rng.uniform(0, SIDE),
-                position_rng.uniform(0, SIDE),
-                position_rng.expovariate(1 / HEIGHT),
+                position_rng.uniform(0, SIDE_S),
+                position_rng.uniform(0, SIDE_S),
+                position_rng.expovariate(1 / ACCESS_DELAY_S),
             )
             self._positions[address] = position
         return position

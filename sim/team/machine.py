@@ -13,13 +13,13 @@ from twisted.internet.error import AlreadyCalled, AlreadyCancelled
 from twisted.internet.interfaces import IDelayedCall, IReactorTime
 from zope.interface import implementer
 
-from drivers.link import Caller, Connector, Line, Link
-from middleware.entangled.network.network import Address, Network, Receiver, ports_of
+from drivers.link import Connector, Link, LinkClient, Reconnector
+from middleware.entangled.network.network import Address, Network, Receiver, find_ports
 
-LEAST = 1e-6
+MIN_DELAY_S = 1e-6
 """Minimum delay of a timer in seconds, unless it is 0.  A remainder from rounding between two clocks may be too small
 to advance the simulator's clock: code that waits for it repeatedly would wait for ever."""
-MOST_WAITING = 200
+MAX_QUEUED_DATAGRAMS = 200
 """Maximum number of datagrams queued for a frozen machine; others are dropped, as by a full socket buffer."""
 
 
@@ -37,10 +37,10 @@ class _MachineCall:
         self._keywords = keywords
         self._state = "waiting"
 
-    def due(self) -> None:
+    def on_due(self) -> None:
         """Run the call, or queue it until the machine continues."""
-        if self._machine.is_still:
-            self._machine.timers.append(self)
+        if self._machine.is_frozen:
+            self._machine.overdue_calls.append(self)
         else:
             self.run()
 
@@ -64,7 +64,7 @@ class _MachineCall:
     def getTime(self) -> float:
         """Return the time of the call on the machine's clock."""
         assert self.inner is not None
-        return self._machine.shown_at(self.inner.getTime())
+        return self._machine.to_machine_time(self.inner.getTime())
 
     def reset(self, seconds: float) -> None:
         """Reschedule the call to ``seconds`` of the machine's clock from now."""
@@ -95,8 +95,8 @@ class Machine:
     def __init__(self, world: IReactorTime, rate: float = 1.0, offset: float = 0.0) -> None:
         self.rate = rate
         self.is_alive = True
-        self.is_still = False
-        self.timers: list[_MachineCall] = []
+        self.is_frozen = False
+        self.overdue_calls: list[_MachineCall] = []
         self._pending_input: list[tuple[Callable[..., object], tuple[Any, ...]]] = []
         self._clock = world
         # The clock's value at the last change of its rate, and the simulator's time of it.
@@ -107,21 +107,21 @@ class Machine:
 
     def seconds(self) -> float:
         """Return the machine's time; it continues while the machine is frozen."""
-        return self.shown_at(self._clock.seconds())
+        return self.to_machine_time(self._clock.seconds())
 
-    def shown_at(self, moment: float) -> float:
+    def to_machine_time(self, moment: float) -> float:
         """Return the value of its clock at a ``moment`` of the simulator's clock, if its rate stays the same."""
         if self._stopped_at is not None:
             moment = self._stopped_at
         return self._base_value + self.rate * (moment - self._base_time)
 
-    def at(self, shown: float) -> float:
+    def to_simulator_time(self, shown: float) -> float:
         """Return the simulator's time at which the clock shows ``shown``, if its rate stays the same."""
         return self._base_time + (shown - self._base_value) / self.rate
 
-    def unstopped_at(self, shown: float) -> float:
+    def to_unsuspended_time(self, shown: float) -> float:
         """Return the simulator's time at which the clock would show ``shown`` without any suspension."""
-        return self.at(shown) - self._suspended_s
+        return self.to_simulator_time(shown) - self._suspended_s
 
     def set_rate(self, rate: float) -> None:
         """Change the rate from now on; existing timers keep their times on the simulator's clock."""
@@ -131,40 +131,40 @@ class Machine:
     def callLater(self, delay: float, callable: Callable[..., object], *args: Any, **kw: Any) -> IDelayedCall:  # noqa: A002
         """Schedule a call after ``delay`` seconds of the machine's clock."""
         call = _MachineCall(self, callable, args, kw)
-        call.inner = self._clock.callLater(max(delay / self.rate, LEAST) if delay else 0.0, call.due)
+        call.inner = self._clock.callLater(max(delay / self.rate, MIN_DELAY_S) if delay else 0.0, call.on_due)
         return call
 
     def getDelayedCalls(self) -> Sequence[IDelayedCall]:
         """Return all calls on the simulator's clock, which all machines share."""
         return list(self._clock.getDelayedCalls())
 
-    def heard(self, receive: Callable[..., object], *arguments: Any) -> None:
+    def deliver(self, receive: Callable[..., object], *arguments: Any) -> None:
         """Deliver external input, now or when the machine continues."""
-        if self.is_still:
+        if self.is_frozen:
             self._pending_input.append((receive, arguments))
         elif self.is_alive:
             receive(*arguments)
 
-    def take(self, receive: Callable[..., object], *arguments: Any) -> None:
+    def deliver_datagram(self, receive: Callable[..., object], *arguments: Any) -> None:
         """Deliver a datagram; a frozen machine queues at most ``MOST_WAITING``."""
-        if not self.is_still or len(self._pending_input) < MOST_WAITING:
-            self.heard(receive, *arguments)
+        if not self.is_frozen or len(self._pending_input) < MAX_QUEUED_DATAGRAMS:
+            self.deliver(receive, *arguments)
 
     def freeze(self, is_suspended: bool = False) -> None:
         """Stop the process like SIGSTOP, or suspend the whole machine."""
-        self.is_still = True
+        self.is_frozen = True
         if is_suspended and not self.COUNTS_SUSPENSION:
             self._stopped_at = self._clock.seconds()
 
     def thaw(self) -> None:
         """Continue, with everything that is overdue."""
-        self.is_still = False
+        self.is_frozen = False
         if self._stopped_at is not None:
             stopped = self._clock.seconds() - self._stopped_at
             self._stopped_at = None
             self._suspended_s += stopped
             self._base_time += stopped
-        timers, self.timers = self.timers, []
+        timers, self.overdue_calls = self.overdue_calls, []
         arrived, self._pending_input = self._pending_input, []
         for call in timers:
             call.run()
@@ -175,7 +175,7 @@ class Machine:
     def die(self) -> None:
         """Stop for ever."""
         self.is_alive = False
-        self.timers.clear()
+        self.overdue_calls.clear()
         self._pending_input.clear()
 
 
@@ -187,7 +187,7 @@ class MachineNetwork:
         self._network = network
         self.send = network.send
         self.close = network.close
-        self.ports = ports_of(network)
+        self.ports = find_ports(network)
 
     @property
     def address(self) -> Address:
@@ -196,7 +196,7 @@ class MachineNetwork:
 
     def listen(self, receiver: Receiver) -> None:
         """Open the port; datagrams reach ``receiver`` through the machine."""
-        self._network.listen(lambda datagram, source: self._machine.take(receiver, datagram, source))
+        self._network.listen(lambda datagram, source: self._machine.deliver_datagram(receiver, datagram, source))
 
 
 class MachineConnector:
@@ -206,21 +206,21 @@ class MachineConnector:
         self._machine = machine
         self._connector = connector
 
-    def call(self, host: str, port: int, caller: Caller) -> Line:
+    def connect(self, host: str, port: int, caller: LinkClient) -> Reconnector:
         """Open a link; its data reaches ``caller`` through the machine."""
-        return self._connector.call(host, port, _MachineCaller(self._machine, caller))
+        return self._connector.connect(host, port, _MachineCaller(self._machine, caller))
 
 
 class _MachineCaller:
-    def __init__(self, machine: Machine, caller: Caller) -> None:
+    def __init__(self, machine: Machine, caller: LinkClient) -> None:
         self._machine = machine
         self._caller = caller
 
     def link_up(self, link: Link) -> None:
-        self._machine.heard(self._caller.link_up, link)
+        self._machine.deliver(self._caller.link_up, link)
 
     def link_down(self) -> None:
-        self._machine.heard(self._caller.link_down)
+        self._machine.deliver(self._caller.link_down)
 
-    def received(self, data: bytes) -> None:
-        self._machine.heard(self._caller.received, data)
+    def data_received(self, data: bytes) -> None:
+        self._machine.deliver(self._caller.data_received, data)

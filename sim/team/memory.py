@@ -8,37 +8,37 @@ from contextlib import suppress
 from middleware.errors import BadSetting
 from sim.team.scenario import Scenario
 
-KIB = {"entangled": 250, "swarm": 1000}
+KIB_PER_NODE = {"entangled": 250, "swarm": 1000}
 """KiB per node, rounded up from measurements: 231 per node of 1,000 peers of the library; 937 per node of 120 whole
 device nodes, each of which reads the whole directory when it joins."""
-BASE = 60 * 2**20
+BASE_BYTES = 60 * 2**20
 """Memory of the interpreter and all modules in bytes."""
-SPARED = 0.9
+USABLE_SHARE = 0.9
 """Share of the free memory that a run may use."""
-GROUPS = "/proc/self/cgroup"
+CGROUPS_FILE = "/proc/self/cgroup"
 V2, V1 = "/sys/fs/cgroup", "/sys/fs/cgroup/memory"
-NO_LIMIT = 2**60
+NO_LIMIT_BYTES = 2**60
 
 Read = Callable[[str], str]
 """Returns the text of a file; raises ``OSError``."""
 
 
-def foreseen(scenario: Scenario) -> int:
+def estimate_bytes(scenario: Scenario) -> int:
     """Return the estimated memory of a scenario's team in bytes."""
     newcomers = sum(fault.count for fault in scenario.faults if fault.kind == "crowd")
-    return BASE + (scenario.nodes + newcomers) * KIB[scenario.kind] * 1024
+    return BASE_BYTES + (scenario.nodes + newcomers) * KIB_PER_NODE[scenario.kind] * 1024
 
 
-def free(read: Read) -> int:
+def measure_free_bytes(read: Read) -> int:
     """Return the bytes that this process can still allocate: the machine's free memory or a limit of its cgroups."""
-    found = [NO_LIMIT, *_group_limits(read)]
+    found = [NO_LIMIT_BYTES, *_group_limits(read)]
     with suppress(OSError, ValueError, IndexError):
         line = next(line for line in read("/proc/meminfo").splitlines() if line.startswith("MemAvailable:"))
         found.append(int(line.split()[1]) * 1024)
     return min(found)
 
 
-def resident(read: Read) -> int:
+def measure_resident_bytes(read: Read) -> int:
     """Return the resident memory of this process in bytes; 0 if the system does not tell."""
     with suppress(OSError, ValueError, StopIteration):
         line = next(line for line in read("/proc/self/status").splitlines() if line.startswith("VmRSS:"))
@@ -46,20 +46,20 @@ def resident(read: Read) -> int:
     return 0
 
 
-def check(scenario: Scenario, read: Read) -> None:
+def check_memory(scenario: Scenario, read: Read) -> None:
     """Raise ``BadSetting`` if the team of a scenario does not fit into memory."""
-    needed, left = foreseen(scenario), free(read)
-    if needed <= left * SPARED:
+    needed, left = estimate_bytes(scenario), measure_free_bytes(read)
+    if needed <= left * USABLE_SHARE:
         return
-    fit = max(0, int((left * SPARED - BASE) / (KIB[scenario.kind] * 1024)))
-    problem = f"{scenario.nodes:,} nodes need {_size(needed)} of memory, but {_size(int(left * SPARED))} are available"
+    fit = max(0, int((left * USABLE_SHARE - BASE_BYTES) / (KIB_PER_NODE[scenario.kind] * 1024)))
+    problem = f"{scenario.nodes:,} nodes need {_format_size(needed)} of memory, but {_format_size(int(left * USABLE_SHARE))} are available"
     raise BadSetting("command line", "--nodes", problem, f"use at most {fit:,}, or a machine with more memory")
 
 
 def _group_limits(read: Read) -> Iterator[int]:
     """Yield the free memory of each cgroup of this process."""
     try:
-        lines = read(GROUPS).splitlines()
+        lines = read(CGROUPS_FILE).splitlines()
     except OSError:
         return
     for line in lines:
@@ -78,5 +78,5 @@ def _group_limits(read: Read) -> Iterator[int]:
                 yield max(0, int(read(f"{folder}/{most}")) - int(read(f"{folder}/{used}")))
 
 
-def _size(number: int) -> str:
+def _format_size(number: int) -> str:
     return f"{number / 2**30:.1f} GiB" if number >= 2**30 else f"{number / 2**20:.0f} MiB"

@@ -12,7 +12,7 @@ WIDE, HIGH, LEFT, TOP, GAP, COLUMNS = 360, 120, 62, 46, 46, 2
 LINE, AXIS, FAULT = "#2563a8", "#6b7280", "#c2410c"
 
 
-def drawn(title: str, series: Series, faults: Sequence[tuple[float, str]] = ()) -> str:
+def draw_svg(title: str, series: Series, faults: Sequence[tuple[float, str]] = ()) -> str:
     """Return the SVG; ``faults`` are times and descriptions, drawn as vertical lines."""
     parts: list[str] = []
     shown = {name: points for name, points in series.items() if len(points) > 1}
@@ -20,7 +20,7 @@ def drawn(title: str, series: Series, faults: Sequence[tuple[float, str]] = ()) 
     for number, (name, points) in enumerate(shown.items()):
         x = LEFT + number % COLUMNS * (WIDE + LEFT + 20)
         y = TOP + number // COLUMNS * (HIGH + GAP)
-        parts.append(_diagram(x, y, name, points, end, faults))
+        parts.append(_draw_diagram(x, y, name, points, end, faults))
     rows = math.ceil(len(shown) / COLUMNS)
     width, height = COLUMNS * (WIDE + LEFT + 20), TOP + max(1, rows) * (HIGH + GAP) + 10
     text = escape("; ".join(f"{moment:g} s {what}" for moment, what in faults) or "no faults")
@@ -33,7 +33,7 @@ def drawn(title: str, series: Series, faults: Sequence[tuple[float, str]] = ()) 
     )
 
 
-def _diagram(
+def _draw_diagram(
     x: float,
     y: float,
     name: str,
@@ -58,13 +58,13 @@ def _diagram(
     return (
         f'<text x="{x}" y="{y - 6}" font-weight="bold">{escape(name)}</text>'
         f'<path d="M{x} {y}V{y + HIGH}H{x + WIDE}" fill="none" stroke="{AXIS}"/>'
-        f'<text x="{x - 6}" y="{y + 9}" text-anchor="end">{_short(most)}</text>'
-        f'<text x="{x - 6}" y="{y + HIGH}" text-anchor="end">{_short(least)}</text>'
+        f'<text x="{x - 6}" y="{y + 9}" text-anchor="end">{_format_value(most)}</text>'
+        f'<text x="{x - 6}" y="{y + HIGH}" text-anchor="end">{_format_value(least)}</text>'
         f'<text x="{x}" y="{y + HIGH + 14}">0</text>'
         f'<text x="{x + WIDE}" y="{y + HIGH + 14}" text-anchor="end">{end:g} s</text>'
         f'{marks}<polyline points="{line}" fill="none" stroke="{LINE}" stroke-width="1.5"/>'
     )
 
 
-def _short(value: float) -> str:
+def _format_value(value: float) -> str:
     return f"{value:,.0f}" if abs(value) >= 100 else f"{value:.3g}"

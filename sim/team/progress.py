@@ -5,13 +5,13 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import TextIO
 
-from sim.team.figure import shown
+from sim.team.metric import format_number
 from sim.team.run import Run
 
-BAR = 24
+BAR_WIDTH = 24
 OFTEN, RARELY = 0.2, 10.0
 """Seconds between two updates on a terminal, and between two lines elsewhere."""
-FIGURES_EVERY = 2.0
+METRICS_INTERVAL_S = 2.0
 """Seconds between two evaluations of the workloads' figures, as some of them are expensive."""
 
 
@@ -28,10 +28,10 @@ class Progress:
         self._resident = resident
         self._last: tuple[float, float] | None = None
         self._width = 0
-        self._figures = ""
-        self._figures_at = float("-inf")
+        self._metrics = ""
+        self._metrics_at = float("-inf")
 
-    def looked(self, run: Run) -> None:
+    def update(self, run: Run) -> None:
         """Show the progress, unless it was shown recently."""
         now, moment = self._seconds(), run.team.clock.seconds()
         if self._last is None:
@@ -41,31 +41,31 @@ class Progress:
         if now - before < (OFTEN if self._columns else RARELY):
             return
         self._last = now, moment
-        if run.began_at is not None and now - self._figures_at >= FIGURES_EVERY:
-            self._figures_at = now
-            self._figures = "".join(
-                f", {figure.name} {shown(figure.value)}{'' if figure.holds else ' (!)'}"
-                for figure in run.figures()
+        if run.began_at is not None and now - self._metrics_at >= METRICS_INTERVAL_S:
+            self._metrics_at = now
+            self._metrics = "".join(
+                f", {figure.name} {format_number(figure.value)}{'' if figure.holds else ' (!)'}"
+                for figure in run.collect_metrics()
                 if figure.target and figure.value is not None
             )
-        self._say(self.line(run, (moment - then) / (now - before)))
+        self._write(self.format_line(run, (moment - then) / (now - before)))
 
-    def line(self, run: Run, pace: float) -> str:
+    def format_line(self, run: Run, pace: float) -> str:
         """Return the progress as one line, with the figures that have targets; missed ones are marked.
 
         ``pace`` is the speed relative to real time.
         """
         team, moment, end = run.team, run.team.clock.seconds(), run.expected_end
         share = min(1.0, moment / end) if end else 0.0
-        done = round(BAR * share)
-        bar = f"[{'#' * done}{'.' * (BAR - done)}] " if self._columns else ""
-        alive, inside = len(team.living), len(team.inside())
+        done = round(BAR_WIDTH * share)
+        bar = f"[{'#' * done}{'.' * (BAR_WIDTH - done)}] " if self._columns else ""
+        alive, inside = len(team.living), len(team.get_joined())
         who = f"{alive:,} alive" + (f", {alive - inside:,} of them not in" if alive != inside else "")
-        sent = team.board.counters["sent"]
+        sent = team.switchboard.counters["sent"]
         memory = f", {self._resident() / 2**20:,.0f} MiB" if self._resident() else ""
         return (
             f"{bar}{share:4.0%} {run.phase}, {moment:.1f} of {end:.0f} s, {who}, {sent:,} datagrams, "
-            f"{pace:.2g} x real time{memory}{self._figures}"
+            f"{pace:.2g} x real time{memory}{self._metrics}"
         )
 
     def close(self) -> None:
@@ -75,7 +75,7 @@ class Progress:
             self._out.flush()
             self._width = 0
 
-    def _say(self, line: str) -> None:
+    def _write(self, line: str) -> None:
         if self._columns:
             line = line[: self._columns - 1]
             self._out.write("\r" + line.ljust(self._width))

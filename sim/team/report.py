@@ -8,15 +8,15 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import TextIO
 
-from sim.team.figure import table
+from sim.team.metric import format_table
 from sim.team.run import Outcome, Run
 from sim.team.scenario import Scenario
 
 VERSION = 1
-MOST_SHOWN = 20
-MOST_SAMPLES = 240
+MAX_SHOWN_VIOLATIONS = 20
+MAX_SAMPLES = 240
 """Number of samples of a run; if a run takes longer than expected, every other one is dropped."""
-FIGURES_EVERY = 6
+METRICS_EVERY = 6
 """Figures of workloads are taken in every sixth sample only, as some are expensive."""
 
 Series = dict[str, list[tuple[float, float]]]
@@ -32,29 +32,29 @@ class Samples:
         self._taken = 0
         self._before = (0.0, 0, 0)
 
-    def looked(self, run: Run) -> None:
+    def update(self, run: Run) -> None:
         """Take a sample if one is due."""
         now = run.team.clock.seconds()
         if now < self._next:
             return
-        self._every = self._every or run.expected_end / MOST_SAMPLES
+        self._every = self._every or run.expected_end / MAX_SAMPLES
         self._next = now + self._every
         self._taken += 1
         team, (then, sent, size) = run.team, self._before
-        total = team.board.counters["sent"]
+        total = team.switchboard.counters["sent"]
         bytes_sent = sum(team.traffic(place).sent_bytes for place in team.places)
         passed, alive = now - then, len(team.living)
         self._add("nodes alive", now, alive)
-        self._add("nodes in the network", now, len(team.inside()))
+        self._add("nodes in the network", now, len(team.get_joined()))
         if passed and alive:
             self._add("datagrams per node and second", now, (total - sent) / passed / alive)
             self._add("bytes per node and second", now, (bytes_sent - size) / passed / alive)
         self._before = now, total, bytes_sent
-        if run.began_at is not None and self._taken % FIGURES_EVERY == 0:
-            for figure in run.figures():
+        if run.began_at is not None and self._taken % METRICS_EVERY == 0:
+            for figure in run.collect_metrics():
                 if figure.is_exact and figure.value is not None:
                     self._add(figure.name, now, figure.value)
-        if self._taken > 2 * MOST_SAMPLES:
+        if self._taken > 2 * MAX_SAMPLES:
             self.series = {name: points[::2] for name, points in self.series.items()}
             self._every *= 2
             self._taken //= 2
@@ -72,20 +72,20 @@ class Cost:
     resident: int
 
 
-def again(scenario: str, seed: int, nodes: int | None) -> str:
+def make_repeat_command(scenario: str, seed: int, nodes: int | None) -> str:
     """Return the command that repeats a run."""
     words = ["sim", "run", "--scenario", scenario, "--seed", str(seed)]
     return shlex.join(words if nodes is None else [*words, "--nodes", str(nodes)])
 
 
-def text(scenario: Scenario, outcome: Outcome, cost: Cost, line: str) -> str:
+def format_text(scenario: Scenario, outcome: Outcome, cost: Cost, line: str) -> str:
     """Return the report as text."""
-    lines = [table(outcome.figures)] if outcome.figures else []
+    lines = [format_table(outcome.metrics)] if outcome.metrics else []
     if outcome.is_partial:
         lines.append(f"PARTIAL   ended while {outcome.phase}, after {outcome.seconds:.1f} s; nothing above is final")
-    lines += [f"VIOLATED  {violation}" for violation in outcome.violations[:MOST_SHOWN]]
-    if len(outcome.violations) > MOST_SHOWN:
-        lines.append(f"VIOLATED  and {len(outcome.violations) - MOST_SHOWN} more")
+    lines += [f"VIOLATED  {violation}" for violation in outcome.violations[:MAX_SHOWN_VIOLATIONS]]
+    if len(outcome.violations) > MAX_SHOWN_VIOLATIONS:
+        lines.append(f"VIOLATED  and {len(outcome.violations) - MAX_SHOWN_VIOLATIONS} more")
     lines += [f"MISSED    {figure.name}: {figure.target}" for figure in outcome.missed]
     pace = f", {outcome.seconds / cost.cpu:.2g} x real time on one core" if cost.cpu else ""
     memory = f", {cost.resident / 2**20:,.0f} MiB" if cost.resident else ""
@@ -97,7 +97,7 @@ def text(scenario: Scenario, outcome: Outcome, cost: Cost, line: str) -> str:
     return "\n".join(lines) + "\n"
 
 
-def packed(scenario: Scenario, outcome: Outcome, cost: Cost, line: str, series: Series) -> str:
+def format_json(scenario: Scenario, outcome: Outcome, cost: Cost, line: str, series: Series) -> str:
     """Return the report as JSON."""
     content = {
         "report": VERSION,
@@ -109,7 +109,7 @@ def packed(scenario: Scenario, outcome: Outcome, cost: Cost, line: str, series: 
         "partial": outcome.is_partial,
         "phase": outcome.phase,
         "seconds": round(outcome.seconds, 6),
-        "figures": [figure.packed() for figure in outcome.figures],
+        "figures": [figure.to_json() for figure in outcome.metrics],
         "violations": outcome.violations,
         "missed": [figure.name for figure in outcome.missed],
         "hash": outcome.digest,
@@ -118,12 +118,12 @@ def packed(scenario: Scenario, outcome: Outcome, cost: Cost, line: str, series: 
         "wall_seconds": round(cost.wall, 3),
         "resident_bytes": cost.resident,
         "faults": [str(fault) for fault in scenario.faults],
-        "series": _finite(series),
+        "series": _replace_infinite(series),
     }
     return json.dumps(content, indent=1, allow_nan=False) + "\n"
 
 
-def _finite(series: Series) -> dict[str, Sequence[tuple[float, float | None]]]:
+def _replace_infinite(series: Series) -> dict[str, Sequence[tuple[float, float | None]]]:
     """Return ``series`` with None for values that are not finite, as JSON has none."""
     return {
         name: [(moment, value if abs(value) != float("inf") and value == value else None) for moment, value in points]
@@ -131,26 +131,26 @@ def _finite(series: Series) -> dict[str, Sequence[tuple[float, float | None]]]:
     }
 
 
-MOST_LINES = 200_000
+MAX_LINES = 200_000
 """Maximum number of lines; after them only the last line follows, with the number of omitted ones."""
 
 
 class Trace:
     """Writes the events of a team to ``out`` (``Team.told``)."""
 
-    def __init__(self, out: TextIO, most: int = MOST_LINES) -> None:
+    def __init__(self, out: TextIO, most: int = MAX_LINES) -> None:
         self._out = out
-        self._most = most
+        self._max_lines = most
         self._count = 0
 
     def begin(self, **facts: object) -> None:
         """Write the parameters of the run."""
         self._write({"trace": 1, **facts})
 
-    def told(self, now: float, event: str, place: int, more: str) -> None:
+    def write_event(self, now: float, event: str, place: int, more: str) -> None:
         """Write one event: the time in seconds, its name, its place, and details."""
         self._count += 1
-        if self._count > self._most:
+        if self._count > self._max_lines:
             return
         line: dict[str, object] = {"at": round(now, 6), "event": event}
         if place >= 0:
@@ -161,7 +161,7 @@ class Trace:
 
     def end(self, **facts: object) -> None:
         """Write the last line, with the number of omitted events."""
-        self._write({"end": True, "events": self._count, "left_out": max(0, self._count - self._most), **facts})
+        self._write({"end": True, "events": self._count, "left_out": max(0, self._count - self._max_lines), **facts})
         self._out.flush()
 
     def _write(self, line: dict[str, object]) -> None:

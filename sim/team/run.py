@@ -9,28 +9,28 @@ from typing import cast
 
 from twisted.logger import ILogObserver, LogEvent, Logger, globalLogPublisher
 
-from sim.team.checker import check
+from sim.team.checker import find_violations
 from sim.team.event import Settled
 from sim.team.faults.injector import TeamFaults
-from sim.team.figure import Bound, Figure
+from sim.team.metric import Bound, Metric
 from sim.team.scenario import Scenario
 from sim.team.team import Team
-from sim.team.workload import Kinds, Workload
+from sim.team.workload import Workload, WorkloadKinds
 
-ASKED = 10.0
+FINAL_REQUESTS_S = 10.0
 """Seconds that the workloads get for their final requests."""
-SLICE = 0.25
+SLICE_S = 0.25
 """Seconds of the team's time between two calls of the observers."""
-MOST_VIOLATIONS = 1000
-NONE = 1e-9
+MAX_VIOLATIONS = 1000
+EPSILON_S = 1e-9
 """Tolerance in seconds for rounding errors of summed steps."""
-LONG, SHORT, LEAST_GRAIN = 0.5, 0.1, 1e-4
+LONG_S, SHORT_S, MIN_GRAIN_S = 0.5, 0.1, 1e-4
 """Real seconds for one grain: above ``LONG`` the grain becomes finer, so that a user can stop the run soon, and below
 ``SHORT`` coarser.  ``LEAST_GRAIN`` is the finest one in seconds of the team's time."""
 
 Phase = str
 JOINING, SETTLING, RUNNING, REPAIRING, ASKING, DONE = "joining", "settling", "running", "repairing", "asking", "done"
-Looked = Callable[["Run"], bool]
+OnProgress = Callable[["Run"], bool]
 """Called after every slice; True stops the run."""
 
 
@@ -41,7 +41,7 @@ class Outcome:
     seed: int
     phase: Phase
     seconds: float
-    figures: list[Figure] = field(default_factory=list)
+    metrics: list[Metric] = field(default_factory=list)
     violations: list[str] = field(default_factory=list)
     digest: str = ""
 
@@ -51,9 +51,9 @@ class Outcome:
         return self.phase != DONE
 
     @property
-    def missed(self) -> list[Figure]:
+    def missed(self) -> list[Metric]:
         """The figures that miss their targets."""
-        return [figure for figure in self.figures if figure.holds is False]
+        return [figure for figure in self.metrics if figure.holds is False]
 
 
 class Run:
@@ -70,10 +70,10 @@ class Run:
         self,
         scenario: Scenario,
         seed: int,
-        kinds: Kinds,
-        looked: Looked = lambda run: False,
+        kinds: WorkloadKinds,
+        looked: OnProgress = lambda run: False,
         grown: Callable[[], None] = lambda: None,
-        watched: Looked = lambda run: False,
+        watched: OnProgress = lambda run: False,
         seconds: Callable[[], float] = lambda: 0.0,
     ) -> None:
         self.scenario = scenario
@@ -86,24 +86,26 @@ class Run:
         ]
         self.violations: list[str] = []
         join = scenario.join
-        self.expected_end = join.settle + scenario.seconds + scenario.repair + (ASKED if self.workloads else 0.0)
+        self.expected_end = (
+            join.settle + scenario.seconds + scenario.repair + (FINAL_REQUESTS_S if self.workloads else 0.0)
+        )
         """The expected end on the team's clock."""
-        self._looked = looked
-        self._grown = grown
-        self._watched = watched
-        self._seconds = seconds
-        self._grain = SLICE
+        self._on_slice = looked
+        self._on_allocated = grown
+        self._on_grain = watched
+        self._real_time = seconds
+        self._grain = SLICE_S
         self._faults = TeamFaults(self.team)
         self._is_ended = False
 
-    def go(self) -> Outcome:
+    def run(self) -> Outcome:
         """Run all phases and return the result."""
         phases = (
             (JOINING, self._join),
             (SETTLING, self._settle),
-            (RUNNING, self._act),
+            (RUNNING, self._run_workloads),
             (REPAIRING, self._repair),
-            (ASKING, self._ask),
+            (ASKING, self._make_final_requests),
         )
         observer = cast(ILogObserver, self._on_log_event)
         globalLogPublisher.addObserver(observer)
@@ -111,27 +113,27 @@ class Run:
             for self.phase, work in phases:
                 work()
                 if self._is_ended:
-                    return self.outcome()
+                    return self.make_outcome()
         finally:
             globalLogPublisher.removeObserver(observer)
         self.phase = DONE
-        return self.outcome()
+        return self.make_outcome()
 
-    def figures(self) -> list[Figure]:
+    def collect_metrics(self) -> list[Metric]:
         """Return every figure so far, with the targets of the scenario."""
-        found = [figure for _, workload in self.workloads for figure in workload.figures()]
+        found = [figure for _, workload in self.workloads for figure in workload.collect_metrics()]
         targets: dict[str, Bound] = dict(self.scenario.targets)
-        return [figure.against(targets[figure.name]) if figure.name in targets else figure for figure in found]
+        return [figure.with_target(targets[figure.name]) if figure.name in targets else figure for figure in found]
 
-    def outcome(self) -> Outcome:
+    def make_outcome(self) -> Outcome:
         """Return the result so far."""
         team = self.team
-        figures = self.figures()
+        figures = self.collect_metrics()
         violations = [
             *self.violations,
-            *self._unmatched_targets(figures),
-            *(line for _, workload in self.workloads for line in workload.verdict()),
-            *check(team.history),
+            *self._find_unmatched_targets(figures),
+            *(line for _, workload in self.workloads for line in workload.find_violations()),
+            *find_violations(team.history),
         ]
         whole = hashlib.blake2b(digest_size=16)
         whole.update(team.digest().encode())
@@ -147,33 +149,33 @@ class Run:
     def _on_log_event(self, event: LogEvent) -> None:
         """Record a failure that a node logged as a violation, as no client would notice it."""
         failure = event.get("log_failure")
-        if failure is not None and len(self.violations) < MOST_VIOLATIONS:
+        if failure is not None and len(self.violations) < MAX_VIOLATIONS:
             name, moment = failure.type.__name__, self.team.clock.seconds()
             self.violations.append(f"exception: {name} at {moment:.3f} s: {failure.getErrorMessage()}")
 
     def _join(self) -> None:
         team, within = self.team, self.scenario.join.within
-        last = team.come()
+        last = team.start_all()
         self.expected_end += last
         self._advance(last)
-        self._advance(within, until=team.is_standing)
+        self._advance(within, until=team.is_joined)
         self.expected_end += team.clock.seconds() - last
-        outside = len(team.living) - len(team.inside())
+        outside = len(team.living) - len(team.get_joined())
         if outside and not self._is_ended:
             self.violations.append(f"join: {outside} nodes have not joined {within:g} s after the last one started")
 
     def _settle(self) -> None:
-        self._grown()
+        self._on_allocated()
         self._advance(self.scenario.join.settle)
 
-    def _act(self) -> None:
+    def _run_workloads(self) -> None:
         """Apply faults and sessions while the workloads run."""
         scenario, clock = self.scenario, self.team.clock
         self.began_at = began = clock.seconds()
         self._faults.begin()
         end = began + scenario.seconds
-        while not self._is_ended and clock.seconds() < end - NONE:
-            if clock.seconds() >= began + scenario.lead - NONE:
+        while not self._is_ended and clock.seconds() < end - EPSILON_S:
+            if clock.seconds() >= began + scenario.lead - EPSILON_S:
                 for _, workload in self.workloads:
                     workload.step()
             self._advance(min(scenario.step, end - clock.seconds()))
@@ -183,14 +185,14 @@ class Run:
             self._faults.end()
         self._advance(self.scenario.repair)
 
-    def _ask(self) -> None:
+    def _make_final_requests(self) -> None:
         if self.scenario.repair:
-            self.team.history.note(Settled)
+            self.team.history.record(Settled)
         for _, workload in self.workloads:
-            workload.settled()
-        self._advance(ASKED if self.workloads else 0.0)
+            workload.make_final_requests()
+        self._advance(FINAL_REQUESTS_S if self.workloads else 0.0)
 
-    def _unmatched_targets(self, figures: list[Figure]) -> list[str]:
+    def _find_unmatched_targets(self, figures: list[Metric]) -> list[str]:
         """Return the targets that match no figure."""
         names = [figure.name for figure in figures]
         unmatched = [] if self.phase != DONE else [name for name, _ in self.scenario.targets if name not in names]
@@ -200,23 +202,23 @@ class Run:
         """Let time pass in slices."""
         clock = self.team.clock
         end = clock.seconds() + seconds
-        while not self._is_ended and clock.seconds() < end - NONE and not until():
-            self._slice(min(SLICE, end - clock.seconds()))
-            self._is_ended = self._is_ended or self._looked(self)
+        while not self._is_ended and clock.seconds() < end - EPSILON_S and not until():
+            self._run_slice(min(SLICE_S, end - clock.seconds()))
+            self._is_ended = self._is_ended or self._on_slice(self)
 
-    def _slice(self, seconds: float) -> None:
+    def _run_slice(self, seconds: float) -> None:
         """Let time pass in grains, whose size does not affect the result."""
         clock = self.team.clock
         end = clock.seconds() + seconds
         while not self._is_ended and clock.seconds() < end:
-            began = self._seconds()
+            began = self._real_time()
             try:
                 clock.run_until(min(end, clock.seconds() + self._grain))
             except Exception:  # a reactor would continue as well
                 self._log.failure("a scheduled call of the team failed")
-            self._is_ended = self._watched(self)
-            took = self._seconds() - began
-            if took > LONG:
-                self._grain = max(LEAST_GRAIN, self._grain / 4)
-            elif took < SHORT:
-                self._grain = min(SLICE, self._grain * 2)
+            self._is_ended = self._on_grain(self)
+            took = self._real_time() - began
+            if took > LONG_S:
+                self._grain = max(MIN_GRAIN_S, self._grain / 4)
+            elif took < SHORT_S:
+                self._grain = min(SLICE_S, self._grain * 2)

@@ -15,19 +15,19 @@ from typing import Annotated, Any, TypeVar
 
 from msgspec import Meta
 
-from formats.convert import LINE, Invalid, Unit, convert_field, convert_table, one_of, some_of
+from formats.convert import PRINTABLE, InvalidValue, Unit, convert_field, convert_table, one_of, some_of
 from middleware.errors import BadSetting
-from sim.team.faults.settings import Fault, fault_problem
-from sim.team.figure import Bound, bound_of
+from sim.team.durations import KINDS, DurationDistribution
+from sim.team.faults.settings import Fault, find_problem
 from sim.team.link import LinkSettings
-from sim.team.session import KINDS, Session
+from sim.team.metric import Bound, parse_bound
 
 FOLDER = Path(__file__).resolve().parent.parent / "scenarios"
 NODE_KINDS = ("entangled", "swarm")
-WAYS = ("one by one", "batches", "at once")
+JOIN_ORDERS = ("one by one", "batches", "at once")
 NAT_KINDS = ("full", "addr", "port", "leaky", "sym", "noudp")
-MOST_NODES = 100_000
-MOST_FAULTS = 1000
+MAX_NODES = 100_000
+MAX_FAULTS = 1000
 T = TypeVar("T")
 Settings = Mapping[str, type[Any]]
 """The settings dataclass (frozen) of each kind of workload, by name."""
@@ -37,13 +37,13 @@ Settings = Mapping[str, type[Any]]
 class Join:
     """``[join]``: the order and pace of joining."""
 
-    how: Annotated[str, one_of(WAYS)] = "one by one"
+    how: Annotated[str, one_of(JOIN_ORDERS)] = "one by one"
     """``one by one``, ``pause`` seconds apart; in ``batches`` of ``size``; or all ``at once`` after the first node."""
 
     pause: Annotated[float, Meta(ge=0.0, le=3600.0), Unit("seconds")] = 0.05
     """Seconds between two nodes or two batches."""
 
-    size: Annotated[int, Meta(ge=1, le=MOST_NODES)] = 50
+    size: Annotated[int, Meta(ge=1, le=MAX_NODES)] = 50
     """Number of nodes in a batch."""
 
     known: Annotated[int, Meta(ge=1, le=20)] = 2
@@ -76,14 +76,14 @@ class Sessions:
     """Whether the same node returns with its disk; otherwise a new node takes its place."""
 
     @property
-    def stays(self) -> Session | None:
+    def session_durations(self) -> DurationDistribution | None:
         """The durations of sessions; None if they do not end."""
-        return Session(self.kind, self.median) if self.median else None
+        return DurationDistribution(self.kind, self.median) if self.median else None
 
     @property
-    def breaks(self) -> Session:
+    def absence_durations(self) -> DurationDistribution:
         """The durations of absences."""
-        return Session(self.kind, self.away)
+        return DurationDistribution(self.kind, self.away)
 
 
 @dataclass(frozen=True)
@@ -112,10 +112,10 @@ class Nats:
 class Scenario:
     """A scenario."""
 
-    about: Annotated[str, Meta(max_length=200), LINE] = ""
+    about: Annotated[str, Meta(max_length=200), PRINTABLE] = ""
     """A description for people, one line."""
 
-    nodes: Annotated[int, Meta(ge=1, le=MOST_NODES)] = 10
+    nodes: Annotated[int, Meta(ge=1, le=MAX_NODES)] = 10
     """Number of places in the team; ``--nodes`` replaces it."""
 
     kind: Annotated[str, one_of(NODE_KINDS)] = "entangled"
@@ -172,20 +172,20 @@ TABLES: dict[str, type[Any]] = {
 }
 
 
-def names() -> list[str]:
+def list_names() -> list[str]:
     """Return the names of the built-in scenarios."""
     return sorted(path.stem for path in FOLDER.glob("*.toml"))
 
 
-def loaded(name: str, settings: Settings, changes: Mapping[str, object] = {}) -> Scenario:  # noqa: B006  (never changed)
+def load_scenario(name: str, settings: Settings, changes: Mapping[str, object] = {}) -> Scenario:  # noqa: B006  (never changed)
     """Load a scenario by name or file; ``changes`` are keys of the command line that override the file.
 
     ``settings`` has the kinds of workloads.  Raises ``BadSetting``.
     """
-    path = _path(name)
+    path = _find_path(name)
     if not name.endswith(".toml") and not path.exists():
-        near = get_close_matches(name, names(), n=1)
-        remedy = f"there are {', '.join(names())}{f'; the nearest is {near[0]}' if near else ''}"
+        near = get_close_matches(name, list_names(), n=1)
+        remedy = f"there are {', '.join(list_names())}{f'; the nearest is {near[0]}' if near else ''}"
         raise BadSetting("command line", "--scenario", f"unknown scenario {name!r}", remedy)
     try:
         text = path.read_text(encoding="utf-8")
@@ -194,23 +194,23 @@ def loaded(name: str, settings: Settings, changes: Mapping[str, object] = {}) ->
         raise BadSetting(str(path), "", problem, "name a scenario, such as steady, or a file") from error
     except UnicodeDecodeError as error:
         raise BadSetting(str(path), "", "is not UTF-8 text", "save it in UTF-8") from error
-    return scenario_of(text, str(path), path.stem, settings, changes)
+    return parse_scenario(text, str(path), path.stem, settings, changes)
 
 
-def place_of(name: str, where: str, key: str) -> str:
+def find_position(name: str, where: str, key: str) -> str:
     """Return the file and line of a key of the table ``where`` in a scenario that was loaded by ``name``."""
-    path = _path(name)
-    line = dict(_places(path.read_text(encoding="utf-8"))).get((where, key))
+    path = _find_path(name)
+    line = dict(_find_lines(path.read_text(encoding="utf-8"))).get((where, key))
     return f"{path}:{line}" if line else str(path)
 
 
-def remedy_of(word: str, known: Sequence[str]) -> str:
+def make_remedy(word: str, known: Sequence[str]) -> str:
     """Return a remedy for an unknown word: the nearest of ``known``, or all of them."""
     near = get_close_matches(word, known, n=1)
     return f"the nearest is {near[0]}" if near else f"there are {', '.join(known)}"
 
 
-def scenario_of(
+def parse_scenario(
     text: str,
     origin: str,
     name: str,
@@ -223,12 +223,12 @@ def scenario_of(
     except tomllib.TOMLDecodeError as error:
         raise BadSetting(origin, "", f"is not TOML: {error}", "fix that line") from error
     reader = _Reader(origin, text)
-    scenario = reader.scenario(content, name, settings, changes)
+    scenario = reader.read_scenario(content, name, settings, changes)
     reader.check(scenario)
     return scenario
 
 
-def _path(name: str) -> Path:
+def _find_path(name: str) -> Path:
     return Path(name) if name.endswith(".toml") else FOLDER / f"{name}.toml"
 
 
@@ -237,53 +237,57 @@ class _Reader:
 
     def __init__(self, origin: str, text: str) -> None:
         self._origin = origin
-        self._lines = dict(_places(text))
+        self._lines = dict(_find_lines(text))
 
-    def scenario(
+    def read_scenario(
         self, content: dict[str, Any], name: str, settings: Settings, changes: Mapping[str, object]
     ) -> Scenario:
         """Return the scenario, with each value validated on its own."""
         own = [f.name for f in fields(Scenario) if f.name not in (*TABLES, "faults", "loads", "targets", "name")]
         known = [*own, *TABLES, "fault", "load", "targets"]
         self._require_known(content, "", known)
-        parts: dict[str, Any] = {key: self._value(key, content[key]) for key in own if key in content}
+        parts: dict[str, Any] = {key: self._read_value(key, content[key]) for key in own if key in content}
         for key, value in changes.items():
-            parts[key] = self._value(key, value, f"--{key}")
+            parts[key] = self._read_value(key, value, f"--{key}")
         for key, sort in TABLES.items():
-            parts[key] = self._table(sort, content.get(key, {}), key)
+            parts[key] = self._read_table(sort, content.get(key, {}), key)
         faults = content.get("fault", [])
-        if not isinstance(faults, list) or len(faults) > MOST_FAULTS:
-            raise self.bad("", "fault", f"must be tables, {MOST_FAULTS} at most", "write [[fault]] for each")
-        parts["faults"] = tuple(self._table(Fault, fault, f"fault {n}") for n, fault in enumerate(faults, 1))
-        parts["loads"] = tuple(self._loads(content.get("load", {}), settings))
-        parts["targets"] = tuple(self._targets(content.get("targets", {})))
+        if not isinstance(faults, list) or len(faults) > MAX_FAULTS:
+            raise self.make_error("", "fault", f"must be tables, {MAX_FAULTS} at most", "write [[fault]] for each")
+        parts["faults"] = tuple(self._read_table(Fault, fault, f"fault {n}") for n, fault in enumerate(faults, 1))
+        parts["loads"] = tuple(self._read_loads(content.get("load", {}), settings))
+        parts["targets"] = tuple(self._read_targets(content.get("targets", {})))
         return Scenario(**parts, name=name)
 
     def check(self, scenario: Scenario) -> None:
         """Raise ``BadSetting`` for values that are invalid together."""
         link, nat, join = scenario.link, scenario.nat, scenario.join
         if scenario.lead and scenario.lead >= scenario.seconds:
-            raise self.bad("", "lead", f"is not below the {scenario.seconds:g} s of the run", "increase seconds")
+            raise self.make_error("", "lead", f"is not below the {scenario.seconds:g} s of the run", "increase seconds")
         if link.burst and not link.loss:
-            raise self.bad("link", "burst", "has no effect without loss", "write loss = 0.05, or leave burst out")
+            raise self.make_error(
+                "link", "burst", "has no effect without loss", "write loss = 0.05, or leave burst out"
+            )
         if link.burst and link.asymmetry:
-            raise self.bad("link", "asymmetry", "cannot be combined with burst", "leave one of them out")
+            raise self.make_error("link", "asymmetry", "cannot be combined with burst", "leave one of them out")
         if link.asymmetry and not link.loss:
-            raise self.bad("link", "asymmetry", "has no effect without loss", "write loss = 0.05, or leave it out")
+            raise self.make_error(
+                "link", "asymmetry", "has no effect without loss", "write loss = 0.05, or leave it out"
+            )
         if nat.share and scenario.nodes <= join.known:
-            raise self.bad("nat", "share", f"has no effect in a team of {scenario.nodes}", "use more nodes")
+            raise self.make_error("nat", "share", f"has no effect in a team of {scenario.nodes}", "use more nodes")
         if join.how == "batches" and join.size > scenario.nodes:
-            raise self.bad("join", "size", f"is more than the {scenario.nodes} nodes", 'write how = "at once"')
+            raise self.make_error("join", "size", f"is more than the {scenario.nodes} nodes", 'write how = "at once"')
         if scenario.sessions.median and scenario.nodes < 3:
-            raise self.bad("sessions", "median", "needs nodes that stay", "use at least 3 nodes")
+            raise self.make_error("sessions", "median", "needs nodes that stay", "use at least 3 nodes")
         for number, fault in enumerate(scenario.faults, 1):
-            problem = fault_problem(fault, scenario.nodes, scenario.seconds)
+            problem = find_problem(fault, scenario.nodes, scenario.seconds)
             if problem is None and fault.kind == "rebind" and not nat.share:
                 problem = "kind", "needs routers to restart", "write [nat] share = 0.3"
             if problem is not None:
-                raise self.bad(f"fault {number}", *problem)
+                raise self.make_error(f"fault {number}", *problem)
 
-    def bad(self, where: str, key: str, problem: str, remedy: str, shown: str = "") -> BadSetting:
+    def make_error(self, where: str, key: str, problem: str, remedy: str, shown: str = "") -> BadSetting:
         """Return the error with its line."""
         whole = f"{where}.{key}".strip(".")
         above, _, last = whole.rpartition(".")
@@ -297,44 +301,50 @@ class _Reader:
 
     # -- inside -----------------------------------------------------------------------------------------------------
 
-    def _table(self, sort: type[T], content: object, where: str) -> T:
+    def _read_table(self, sort: type[T], content: object, where: str) -> T:
         try:
             return convert_table(content, sort)
-        except Invalid as error:
-            raise self.bad(*((where, error.key) if error.key else ("", where)), error.problem, error.remedy) from error
+        except InvalidValue as error:
+            raise self.make_error(
+                *((where, error.key) if error.key else ("", where)), error.problem, error.remedy
+            ) from error
 
-    def _value(self, key: str, value: object, shown: str = "") -> object:
+    def _read_value(self, key: str, value: object, shown: str = "") -> object:
         try:
             return convert_field(value, Scenario, key)
-        except Invalid as error:
-            raise self.bad("", key, error.problem, error.remedy, shown) from error
+        except InvalidValue as error:
+            raise self.make_error("", key, error.problem, error.remedy, shown) from error
 
     def _require_known(self, content: Mapping[str, object], where: str, known: list[str]) -> None:
         for key in content:
             if key not in known:
-                raise self.bad(where, key, "is an unknown key", remedy_of(key, known))
+                raise self.make_error(where, key, "is an unknown key", make_remedy(key, known))
 
-    def _loads(self, content: object, settings: Settings) -> Iterator[tuple[str, Any]]:
+    def _read_loads(self, content: object, settings: Settings) -> Iterator[tuple[str, Any]]:
         if not isinstance(content, dict):
-            raise self.bad("", "load", "must be tables", "write [load.NAME] for each")
+            raise self.make_error("", "load", "must be tables", "write [load.NAME] for each")
         for name, table in content.items():
             sort = settings.get(name)
             if sort is None:
                 known = ", ".join(sorted(settings)) or "none"
-                raise self.bad(f"load.{name}", "", "is an unknown workload", f"there are {known}")
-            yield name, self._table(sort, table, f"load.{name}")
+                raise self.make_error(f"load.{name}", "", "is an unknown workload", f"there are {known}")
+            yield name, self._read_table(sort, table, f"load.{name}")
 
-    def _targets(self, content: object) -> Iterator[tuple[str, Bound]]:
+    def _read_targets(self, content: object) -> Iterator[tuple[str, Bound]]:
         if not isinstance(content, dict):
-            raise self.bad("", "targets", "must be a table", 'write [targets], and lines such as "hops" = "<= 5"')
+            raise self.make_error(
+                "", "targets", "must be a table", 'write [targets], and lines such as "hops" = "<= 5"'
+            )
         for name, text in content.items():
             try:
-                yield name, bound_of(text if isinstance(text, str) else "")
+                yield name, parse_bound(text if isinstance(text, str) else "")
             except ValueError:
-                raise self.bad("targets", name, "is not a bound", 'write "<= 450" or ">= 0.999", in quotes') from None
+                raise self.make_error(
+                    "targets", name, "is not a bound", 'write "<= 450" or ">= 0.999", in quotes'
+                ) from None
 
 
-def _places(text: str) -> Iterator[tuple[tuple[str, str], int]]:
+def _find_lines(text: str) -> Iterator[tuple[tuple[str, str], int]]:
     """Yield the line of each (table, key), and of each table with an empty key; a [[fault]] is "fault N"."""
     where, faults = "", 0
     for number, line in enumerate(text.splitlines(), 1):

@@ -10,19 +10,19 @@ import random
 from collections.abc import Sequence
 
 from middleware.entangled.network.network import Address
-from middleware.entangled.network.switchboard import CALM, Weather
+from middleware.entangled.network.switchboard import PERFECT, LinkConditions
 from middleware.entangled.node import EntangledNode
-from sim.team.checker import check
+from sim.team.checker import find_violations
 from sim.team.event import Settled
 from sim.team.faults.timeline import TimedFault, Timeline
-from sim.team.shrink import WHOLE, Trim
+from sim.team.reduction import NO_REDUCTION, Reduction
+from sim.team.simulation import EntangledTeam
 from sim.team.workload import Workload
-from sim.team.world import Fleet
 
-STRANDED = 0.15
+STRANDED_SHARE = 0.15
 """Share of schedules in which a partition separates a minority together with newcomers."""
-STEP = 0.5
-SETTLE = 45.0
+STEP_S = 0.5
+REPAIR_S = 45.0
 """Repair interval in seconds: retries, three rounds of anti-entropy, and the removal of a dead member."""
 
 
@@ -33,80 +33,80 @@ class Schedule:
     generators, so that a seed that shows a bug keeps showing it.  ``world`` makes the nodes; ``trim`` reduces the run.
     """
 
-    def __init__(self, seed: int, world: type[Fleet] = Fleet, trim: Trim = WHOLE) -> None:
+    def __init__(self, seed: int, world: type[EntangledTeam] = EntangledTeam, trim: Reduction = NO_REDUCTION) -> None:
         self.seed = seed
         self.trim = trim
         self.rng = random.Random(f"invariants/{seed}")
         generator = random.Random(f"faults/{seed}")
         self.n = generator.choice([3, 4, 5, 5, 6, 7, 9, 10, 11])
         self.seconds = generator.choice([20.0, 30.0, 45.0])
-        self.fleet = world(self.n, seed, Weather(delay_s=0.002))
-        self.history = self.fleet.history
-        self.liar: int | None = generator.randrange(self.n) if generator.random() < 0.2 else None
-        self.weather = Weather(
+        self.team = world(self.n, seed, LinkConditions(delay_s=0.002))
+        self.history = self.team.history
+        self.lying_place: int | None = generator.randrange(self.n) if generator.random() < 0.2 else None
+        self.conditions = LinkConditions(
             delay_s=generator.choice([0.001, 0.01, 0.05]),
             jitter_s=generator.choice([0.0, 0.01]),
             loss=generator.choice([0.0, 0.0, 0.05, 0.2]),
             duplicate=generator.choice([0.0, 0.1]),
             reorder=generator.choice([0.0, 0.2]),
         )
-        self.faults = self._faults(generator)
+        self.faults = self._draw_faults(generator)
         if trim.calm:
-            self.weather = Weather(delay_s=self.weather.delay_s)
+            self.conditions = LinkConditions(delay_s=self.conditions.delay_s)
         generator = random.Random(f"stranded/{seed}")
-        if generator.random() < STRANDED and self.n <= 7:
-            self.faults += self._minority_faults(generator)
-        self.seconds = trim.within(self.seconds)
-        self.down: set[int] = set()
+        if generator.random() < STRANDED_SHARE and self.n <= 7:
+            self.faults += self._draw_minority_faults(generator)
+        self.seconds = trim.limit_duration(self.seconds)
+        self.restarting: set[int] = set()
         """The places whose nodes will restart."""
 
     def alive(self) -> list[int]:
         """Return the places with running nodes."""
-        return self.fleet.alive()
+        return self.team.alive()
 
     def node(self, place: int) -> EntangledNode:
         """Return the node at a place in its present life."""
-        return self.fleet.nodes[place]
+        return self.team.nodes[place]
 
     def addresses(self, places: Sequence[int]) -> list[Address]:
         """Return the addresses of these places."""
-        return [self.fleet.address(place) for place in places]
+        return [self.team.address(place) for place in places]
 
     def run(self, workloads: Sequence[Workload]) -> list[str]:
         """Run the schedule; returns the violations, one line each."""
-        fleet = self.fleet
+        fleet = self.team
         fleet.run(2.0)
-        fleet.board.weather = self.weather
+        fleet.switchboard.conditions = self.conditions
         timeline, now = Timeline(self.faults, self.trim), 0.0
         while now < self.seconds:
-            for fault, is_end in timeline.due(now):
+            for fault, is_end in timeline.pop_due(now):
                 (self._end_fault if is_end else self._start_fault)(fault)
             for workload in workloads:
                 workload.step()
-            fleet.run(STEP)
-            now += STEP
-        fleet.board.heal()
-        fleet.board.weather = CALM
-        for place in sorted(self.down):
+            fleet.run(STEP_S)
+            now += STEP_S
+        fleet.switchboard.heal()
+        fleet.switchboard.conditions = PERFECT
+        for place in sorted(self.restarting):
             self.restart(place)
-        fleet.run(SETTLE)
-        self.history.note(Settled)
+        fleet.run(REPAIR_S)
+        self.history.record(Settled)
         for workload in workloads:
-            workload.settled()
+            workload.make_final_requests()
         fleet.run(10.0)
-        found = [line for workload in workloads for line in workload.verdict()]
+        found = [line for workload in workloads for line in workload.find_violations()]
         fleet.stop()
-        return found + check(self.history)
+        return found + find_violations(self.history)
 
     def restart(self, place: int) -> None:
         """Restart the node of a place with the store of its former life."""
-        self.down.discard(place)
+        self.restarting.discard(place)
         others = sorted({*self.alive(), place})
-        self.fleet.restart(place, [one for one in self.rng.sample(others, min(2, len(others))) if one != place])
+        self.team.restart(place, [one for one in self.rng.sample(others, min(2, len(others))) if one != place])
 
     # -- inside -----------------------------------------------------------------------------------------------------
 
-    def _faults(self, generator: random.Random) -> list[TimedFault]:
+    def _draw_faults(self, generator: random.Random) -> list[TimedFault]:
         places, faults = list(range(self.n)), []
         # Permanent failures never exceed a minority of the smallest replica set.
         mortal = generator.sample(places, max(0, (min(self.n, 8) - 1) // 2))
@@ -127,7 +127,7 @@ class Schedule:
             faults.append(TimedFault(at, until, kind, tuple(chosen)))
         return faults
 
-    def _minority_faults(self, generator: random.Random) -> list[TimedFault]:
+    def _draw_minority_faults(self, generator: random.Random) -> list[TimedFault]:
         """Cut off a minority, which newcomers join until they are a majority together."""
         few = generator.sample(range(self.n), (self.n - 1) // 2)
         newcomers = range(self.n, 2 * self.n - 2 * len(few) + 1)
@@ -137,12 +137,12 @@ class Schedule:
         return faults + [TimedFault(first + n, first + n, "join", (place, *few)) for n, place in enumerate(newcomers)]
 
     def _start_fault(self, fault: TimedFault) -> None:
-        board = self.fleet.board
+        board = self.team.switchboard
         if fault.kind == "join":
             known: Sequence[int] = fault.places[1:]
-            if not {*self.alive(), *self.down}.intersection(known):
+            if not {*self.alive(), *self.restarting}.intersection(known):
                 known = self.alive()[:1]  # a newcomer that knows only dead nodes could not join
-            self.fleet.restart(len(self.fleet.nodes), known)
+            self.team.restart(len(self.team.nodes), known)
             self.n += 1
         elif fault.kind == "cut":
             board.partition(self.addresses(fault.places))
@@ -151,15 +151,15 @@ class Schedule:
             board.cut(source, target, one_way=True)
         else:
             for place in fault.places:
-                if place in self.fleet.living:
+                if place in self.team.living:
                     if fault.kind != "die":
-                        self.down.add(place)
-                    self.fleet.kill(place)
+                        self.restarting.add(place)
+                    self.team.kill(place)
 
     def _end_fault(self, fault: TimedFault) -> None:
         if fault.kind in ("cut", "one way"):
-            self.fleet.board.heal()
+            self.team.switchboard.heal()
         elif fault.kind not in ("die", "join"):
             for place in fault.places:
-                if place in self.down:
+                if place in self.restarting:
                     self.restart(place)

@@ -18,46 +18,46 @@ from twisted.logger import Logger
 from middleware.directory.presence import Device
 from middleware.entangled.errors import NotRunning
 from middleware.entangled.identity import Identity
-from middleware.entangled.network.nat import Nat
+from middleware.entangled.network.nat_router import NatRouter
 from middleware.entangled.network.network import Address, Network
-from middleware.entangled.network.switchboard import Traffic
+from middleware.entangled.network.switchboard import TrafficCounters
 from middleware.entangled.node import EntangledNode
 from middleware.node import SwarmNode
-from sim.team.disk import Disk, Memory, next_life
+from sim.team.disk import SimulatedDisk, SurvivingMemory, restore_store
 from sim.team.link import TeamLink
 from sim.team.machine import Machine, MachineNetwork
 from sim.team.scenario import Scenario
-from sim.team.world import CAPABILITIES, PORT, TEAM, World
+from sim.team.simulation import CAPABILITIES, FIRST_PORT, TEAM_KEY, Simulation
 
 Node = EntangledNode | SwarmNode
-Told = Callable[[float, str, int, str], object]
+EventListener = Callable[[float, str, int, str], object]
 """Called with the time, the event, its place (-1: none), and details."""
 
 
-def core(node: Node) -> EntangledNode:
+def get_entangled(node: Node) -> EntangledNode:
     """Return the library's node that ``node`` is or contains."""
     return node.entangled if isinstance(node, SwarmNode) else node
 
 
-class Place:
+class PlaceState:
     """The state of a place that is kept from life to life; ``step`` is the error of its wall clock."""
 
-    __slots__ = ("address", "identity", "store", "traffic", "step", "rate", "home", "machine", "entered")
+    __slots__ = ("address", "identity", "store", "traffic", "wall_error", "rate", "nat", "machine", "join_waiters")
 
-    def __init__(self, address: Address, identity: Identity, store: Memory) -> None:
+    def __init__(self, address: Address, identity: Identity, store: SurvivingMemory) -> None:
         self.address = address
         self.identity = identity
         self.store = store
-        self.traffic = Traffic()
-        self.step = 0.0
+        self.traffic = TrafficCounters()
+        self.wall_error = 0.0
         self.rate = 1.0
-        self.home: Nat | None = None
+        self.nat: NatRouter | None = None
         self.machine: Machine | None = None
-        self.entered: list[Deferred[bool]] | None = None
+        self.join_waiters: list[Deferred[bool]] | None = None
         """Deferreds that wait for the node to join; None if it has joined."""
 
 
-class Team(World):
+class Team(Simulation):
     """The team of a ``scenario``; no node exists before ``stand`` or ``come``."""
 
     seed: int
@@ -68,12 +68,12 @@ class Team(World):
         super().__init__(seed)
         self.scenario = scenario
         self.link = TeamLink(scenario.link, f"{seed}/spots")
-        self.board.link = self.link
-        self.told: list[Told] = []
-        self._places: list[Place] = []
-        self._rng = self.generator("team")
-        self._inside: list[int] = []
-        self._inside_at: dict[int, int] = {}
+        self.switchboard.link_model = self.link
+        self.event_listeners: list[EventListener] = []
+        self._places: list[PlaceState] = []
+        self._rng = self.make_rng("team")
+        self._joined: list[int] = []
+        self._joined_index: dict[int, int] = {}
         self._hash = hashlib.blake2b(digest_size=32)
         for _ in range(scenario.nodes):
             self._new_place()
@@ -85,9 +85,9 @@ class Team(World):
         """All places, also those without a living node."""
         return range(len(self._places))
 
-    def inside(self) -> list[int]:
+    def get_joined(self) -> list[int]:
         """Return the places whose nodes have joined, in no particular order; must not be modified."""
-        return self._inside
+        return self._joined
 
     def address(self, place: int) -> Address:
         """Return the address of the node at a place."""
@@ -97,26 +97,26 @@ class Team(World):
         """Return the node at a place in its present life; raises ``KeyError`` if there is none."""
         return self.living[place]
 
-    def entangled(self, place: int) -> EntangledNode:
+    def get_entangled(self, place: int) -> EntangledNode:
         """Return the library's node at a place."""
-        return core(self.living[place])
+        return get_entangled(self.living[place])
 
     def identity(self, place: int) -> Identity:
         """Return the identity of the node at a place."""
         return self._places[place].identity
 
-    def traffic(self, place: int) -> Traffic:
+    def traffic(self, place: int) -> TrafficCounters:
         """Return the traffic of the node at a place over all its lives."""
         return self._places[place].traffic
 
-    def place(self, place: int) -> Place:
+    def get_state(self, place: int) -> PlaceState:
         """Return the state of a place that is kept from life to life."""
         return self._places[place]
 
-    def entered(self, place: int) -> Deferred[bool]:
+    def when_joined(self, place: int) -> Deferred[bool]:
         """Fire with True when the node at a place has joined, or with False if it ends before."""
         done: Deferred[bool] = Deferred()
-        waiting = self._places[place].entered
+        waiting = self._places[place].join_waiters
         if place not in self.living:
             done.callback(False)
         elif waiting is None:
@@ -127,26 +127,26 @@ class Team(World):
 
     # -- time -------------------------------------------------------------------------------------------------------
 
-    def at(self, seconds: float, call: Callable[[], object]) -> IDelayedCall:
+    def schedule(self, seconds: float, call: Callable[[], object]) -> IDelayedCall:
         """Schedule a call after ``seconds``."""
         return self.clock.callLater(seconds, call)
 
-    def tell(self, event: str, place: int = -1, more: str = "") -> None:
+    def report_event(self, event: str, place: int = -1, more: str = "") -> None:
         """Report an event, which becomes part of the digest."""
         now = self.clock.seconds()
         self._hash.update(f"{now!r} {event} {place} {more}\n".encode())
-        for told in self.told:
+        for told in self.event_listeners:
             told(now, event, place, more)
 
     def digest(self) -> str:
         """Return the hash of every delivered datagram and every reported event, in hex."""
         whole = self._hash.copy()
-        whole.update(self.board.digest().encode())
+        whole.update(self.switchboard.digest().encode())
         return whole.hexdigest()
 
     # -- joining ----------------------------------------------------------------------------------------------------
 
-    def come(self) -> float:
+    def start_all(self) -> float:
         """Start the nodes as the scenario says; returns the seconds until the last one starts."""
         join, moment = self.scenario.join, 0.0
         for place in self.places:
@@ -156,19 +156,19 @@ class Team(World):
                 or (join.how == "batches" and (place == 1 or (place - 1) % join.size == 0))
             ):
                 moment += join.pause
-            self.at(moment, partial(self.start, place))
+            self.schedule(moment, partial(self.start, place))
         return moment
 
-    def is_standing(self) -> bool:
+    def is_joined(self) -> bool:
         """Return whether every living node has joined."""
-        return len(self._inside) == len(self.living)
+        return len(self._joined) == len(self.living)
 
-    def stand(self) -> None:
+    def form(self) -> None:
         """Start the nodes and let the team settle; nodes that have not joined by then keep trying."""
         join = self.scenario.join
-        self.run(self.come())
+        self.run(self.start_all())
         end = self.clock.seconds() + join.within
-        while not self.is_standing() and self.clock.seconds() < end:
+        while not self.is_joined() and self.clock.seconds() < end:
             self.run(0.5)
         self.run(join.settle)
 
@@ -179,14 +179,14 @@ class Team(World):
         if place in self.living:
             raise ValueError(f"the node at place {place} is alive")
         here = self._places[place]
-        if self.life[place]:
-            here.store = next_life(here.store, self._store(place), self.clock.seconds())
-        here.entered = []
+        if self.life_numbers[place]:
+            here.store = restore_store(here.store, self._make_store(place), self.clock.seconds())
+        here.join_waiters = []
         through = [self.address(other) for other in (self._draw_known(place) if known is None else known)]
         node = self._make_node(place, here, through)
-        self.tell("born", place, here.identity.node_id.hex())
+        self.report_event("born", place, here.identity.node_id.hex())
         self.begin_life(place, node, here.identity)
-        life = self.life[place]
+        life = self.life_numbers[place]
         if isinstance(node, SwarmNode):
             node.startService()
             joined: Deferred[Any] = node.joined
@@ -211,14 +211,14 @@ class Team(World):
         here = self._places[place]
         if here.machine is not None:
             here.machine.die()
-        if isinstance(here.store, Disk):
+        if isinstance(here.store, SimulatedDisk):
             here.store.lose_power()
-        node.vanish()
+        node.stop_silently()
 
     def leave(self, place: int) -> None:
         """Let a node leave gracefully; a frozen one is killed."""
         machine = self._places[place].machine
-        if machine is not None and machine.is_still:
+        if machine is not None and machine.is_frozen:
             self.kill(place)
             return
         node = self._end_node(place, "left")
@@ -233,18 +233,18 @@ class Team(World):
         if place in self.living:
             raise ValueError(f"the node at place {place} is alive")
         here = self._places[place]
-        here.identity = self._identity(place, self.life[place])
-        here.store = self._store(place)  # empty, so the next life starts with nothing
+        here.identity = self._make_identity(place, self.life_numbers[place])
+        here.store = self._make_store(place)  # empty, so the next life starts with nothing
 
     def freeze(self, place: int) -> None:
         """Freeze a node; raises ``ValueError`` if the scenario has no simulated machines."""
-        self._machine(place).freeze()
-        self.tell("frozen", place)
+        self._get_machine(place).freeze()
+        self.report_event("frozen", place)
 
     def thaw(self, place: int) -> None:
         """Let a frozen node continue."""
-        self.tell("thawed", place)
-        self._machine(place).thaw()
+        self.report_event("thawed", place)
+        self._get_machine(place).thaw()
 
     def stop(self) -> None:
         """End every node."""
@@ -255,78 +255,80 @@ class Team(World):
 
     def _new_place(self) -> int:
         place = len(self._places)
-        address = Address(f"10.{place >> 16}.{place >> 8 & 255}.{place & 255}", PORT)
-        here = Place(address, self._identity(place, 0), self._store(place))
-        scenario, place_rng = self.scenario, self.generator(f"place/{place}")
+        address = Address(f"10.{place >> 16}.{place >> 8 & 255}.{place & 255}", FIRST_PORT)
+        here = PlaceState(address, self._make_identity(place, 0), self._make_store(place))
+        scenario, place_rng = self.scenario, self.make_rng(f"place/{place}")
         if scenario.clocks.drift:
             here.rate = 1 + place_rng.uniform(-1, 1) * scenario.clocks.drift
         if scenario.clocks.wall:
-            here.step = place_rng.uniform(-1, 1) * scenario.clocks.wall
+            here.wall_error = place_rng.uniform(-1, 1) * scenario.clocks.wall
         nat = scenario.nat
         if nat.share and place >= scenario.join.known and place_rng.random() < nat.share:
             kind: Any = nat.kinds[place % len(nat.kinds)]
-            here.home = self.board.router(Nat(kind, f"100.{place >> 16}.{place >> 8 & 255}.{place & 255}", place_rng))
+            here.nat = self.switchboard.add_router(
+                NatRouter(kind, f"100.{place >> 16}.{place >> 8 & 255}.{place & 255}", place_rng)
+            )
         self._places.append(here)
         return place
 
-    def _identity(self, place: int, lives: int) -> Identity:
-        return Identity(self.generator(f"identity/{place}/{lives}").randbytes(32))
+    def _make_identity(self, place: int, lives: int) -> Identity:
+        return Identity(self.make_rng(f"identity/{place}/{lives}").randbytes(32))
 
-    def _store(self, place: int) -> Memory:
-        return Disk(self.clock, self._rng) if self.scenario.has_disks else Memory()
+    def _make_store(self, place: int) -> SurvivingMemory:
+        return SimulatedDisk(self.clock, self._rng) if self.scenario.has_disks else SurvivingMemory()
 
-    def _make_node(self, place: int, here: Place, known: Sequence[Address]) -> Node:
-        port = self.board.network(*here.address, here.home, here.traffic)
+    def _make_node(self, place: int, here: PlaceState, known: Sequence[Address]) -> Node:
+        port = self.switchboard.make_network(*here.address, here.nat, here.traffic)
         network: Network = port
         clock: IReactorTime = self.clock
         if self.scenario.has_machines:
             clock = here.machine = Machine(self.clock, here.rate)
             network = MachineNetwork(here.machine, port)
-        rng = self.generator(f"{place}/{self.life[place] + 1}")  # never the numbers of a former life
+        rng = self.make_rng(f"{place}/{self.life_numbers[place] + 1}")  # never the numbers of a former life
 
         def wall() -> float:
-            return self.clock.seconds() + here.step
+            return self.clock.seconds() + here.wall_error
 
         lease = self.scenario.lease
         if self.scenario.kind == "entangled":
-            return EntangledNode(here.identity, TEAM, network, here.store, clock, rng, lease, wall)
+            return EntangledNode(here.identity, TEAM_KEY, network, here.store, clock, rng, lease, wall)
         device = Device("", f"dog{place}", capabilities=CAPABILITIES)
-        return SwarmNode(device, here.identity, TEAM, known, network, here.store, clock, rng, wall, lease)
+        return SwarmNode(device, here.identity, TEAM_KEY, known, network, here.store, clock, rng, wall, lease)
 
     def _draw_known(self, place: int) -> list[int]:
         """Return the places that a new node knows: some that have joined, or the first one."""
-        others = self._inside if self._inside else [other for other in list(self.living)[:1] if other != place]
+        others = self._joined if self._joined else [other for other in list(self.living)[:1] if other != place]
         count = min(self.scenario.join.known, len(others))
         if self.scenario.nat.share:  # nodes behind a router cannot be reached without an introduction
-            others = [other for other in others if self._places[other].home is None]
+            others = [other for other in others if self._places[other].nat is None]
             count = min(count, len(others))
         return self._rng.sample(others, count)
 
     def _on_joined(self, place: int, life: int) -> None:
         here = self._places[place]
-        if self.life[place] != life or place not in self.living or here.entered is None:
+        if self.life_numbers[place] != life or place not in self.living or here.join_waiters is None:
             return
-        self._inside_at[place] = len(self._inside)
-        self._inside.append(place)
-        waiting, here.entered = here.entered, None
-        self.tell("entered", place)
+        self._joined_index[place] = len(self._joined)
+        self._joined.append(place)
+        waiting, here.join_waiters = here.join_waiters, None
+        self.report_event("entered", place)
         for done in waiting:
             done.callback(True)
 
     def _end_node(self, place: int, how: str) -> Node:
         node: Node = self.end_life(place)
-        at = self._inside_at.pop(place, None)
+        at = self._joined_index.pop(place, None)
         if at is not None:
-            last = self._inside.pop()
+            last = self._joined.pop()
             if last != place:
-                self._inside[at], self._inside_at[last] = last, at
-        self.tell(how, place)
-        waiting, self._places[place].entered = self._places[place].entered or [], None
+                self._joined[at], self._joined_index[last] = last, at
+        self.report_event(how, place)
+        waiting, self._places[place].join_waiters = self._places[place].join_waiters or [], None
         for done in waiting:
             done.callback(False)
         return node
 
-    def _machine(self, place: int) -> Machine:
+    def _get_machine(self, place: int) -> Machine:
         machine = self._places[place].machine
         if machine is None:
             raise ValueError("the scenario has no simulated machines; write [clocks] drift = 0.001")

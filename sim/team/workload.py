@@ -6,7 +6,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Any
 
-from sim.team.figure import Figure
+from sim.team.metric import Metric
 from sim.team.team import Team
 
 
@@ -19,14 +19,14 @@ class Workload:
     def step(self) -> None:
         """Act; called repeatedly while the faults last."""
 
-    def settled(self) -> None:
+    def make_final_requests(self) -> None:
         """Make the final requests, after the faults and the repair interval; 10 s remain for the answers."""
 
-    def verdict(self) -> list[str]:
+    def find_violations(self) -> list[str]:
         """Record the final state; returns the violations that only this workload can judge, one line each."""
         return []
 
-    def figures(self) -> list[Figure]:
+    def collect_metrics(self) -> list[Metric]:
         """Return the figures so far; called repeatedly during the run, and at its end.
 
         All names are present from the beginning, so that targets can be validated; values are None until measured.
@@ -35,7 +35,7 @@ class Workload:
 
 
 @dataclass(frozen=True)
-class Kind:
+class WorkloadKind:
     """A kind of workload: ``settings`` is a frozen dataclass with constrained fields (``formats.convert``).
 
     ``make(team, settings)`` creates one.
@@ -45,4 +45,4 @@ class Kind:
     make: Callable[[Team, Any], Workload]
 
 
-Kinds = Mapping[str, Kind]
+WorkloadKinds = Mapping[str, WorkloadKind]

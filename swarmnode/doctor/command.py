@@ -10,23 +10,23 @@ from dataclasses import asdict
 from typing import Any, TextIO
 
 from middleware.config.settings import Settings
-from middleware.entangled.control.command import Ask, asked
-from middleware.entangled.control.link import Link, link
-from middleware.entangled.control.place import NoControl, found
-from middleware.entangled.control.word import printable
-from middleware.entangled.network.interface import interfaces
+from middleware.entangled.control.command import SendRequest, send_request
+from middleware.entangled.control.conversion import remove_control_characters
+from middleware.entangled.control.link_quality import LinkQuality, compute_quality
+from middleware.entangled.control.socket_path import NoControl, find_socket
+from middleware.entangled.network.interface import list_interfaces
 from middleware.errors import SwarmError
-from swarmnode.doctor.diagnosis import diagnosed
+from swarmnode.doctor.diagnosis import diagnose
 from swarmnode.doctor.facts import Facts, Finding, Health
-from swarmnode.doctor.measure import measured
-from swarmnode.links import figures
-from swarmnode.world import resolved
+from swarmnode.doctor.measure import measure_facts
+from swarmnode.environment import resolve_hosts
+from swarmnode.links import format_link
 
-WELL, ILL, WRONG = 0, 1, 2
-Measure = Callable[[Settings, bool, Health | None], Facts]
+NO_PROBLEM, PROBLEM_FOUND, INVALID_COMMAND = 0, 1, 2
+MeasureFacts = Callable[[Settings, bool, Health | None], Facts]
 
 
-def parser() -> argparse.ArgumentParser:
+def make_parser() -> argparse.ArgumentParser:
     """Return the parser of the command line."""
     doctor = argparse.ArgumentParser(
         prog="swarm doctor",
@@ -40,34 +40,37 @@ def parser() -> argparse.ArgumentParser:
 
 
 def main(
-    words: Sequence[str] | None = None, out: TextIO | None = None, ask: Ask = asked, measure: Measure = measured
+    words: Sequence[str] | None = None,
+    out: TextIO | None = None,
+    ask: SendRequest = send_request,
+    measure: MeasureFacts = measure_facts,
 ) -> int:
     """Run the command; returns 0 if there is no problem, 1 if there is one, 2 if the command or a file is wrong."""
     out = out or sys.stdout
-    options = parser().parse_args(words)
+    options = make_parser().parse_args(words)
     try:
-        settings = resolved(Settings.load(options.settings)) if options.settings else None
+        settings = resolve_hosts(Settings.load(options.settings)) if options.settings else None
         name = options.node or (settings.node.name if settings is not None else None)
         answers = _ask_node(name, ask)
         if settings is None:
             if answers is None:
-                raise NoControl(_not_running(name))
-            facts = _facts_of_running(name or "", answers[0])
+                raise NoControl(_describe_not_running(name))
+            facts = _make_running_facts(name or "", answers[0])
         else:
             facts = measure(settings, answers is not None, None if answers is None else _parse_health(answers[0]))
     except (SwarmError, NoControl) as problem:
-        sys.stderr.write(printable(f"swarm doctor: {problem}") + "\n")
-        return WRONG
-    findings = diagnosed(facts)
+        sys.stderr.write(remove_control_characters(f"swarm doctor: {problem}") + "\n")
+        return INVALID_COMMAND
+    findings = diagnose(facts)
     links = [] if answers is None else [_parse_link(each) for each in answers[1]]
-    out.write(_as_json(findings, links) if options.json else _as_text(findings, links, answers is not None))
-    return ILL if any(finding.weight != "note" for finding in findings) else WELL
+    out.write(_to_json(findings, links) if options.json else _format_text(findings, links, answers is not None))
+    return PROBLEM_FOUND if any(finding.weight != "note" for finding in findings) else NO_PROBLEM
 
 
-def _ask_node(name: str | None, ask: Ask) -> tuple[dict[str, Any], list[dict[str, Any]]] | None:
+def _ask_node(name: str | None, ask: SendRequest) -> tuple[dict[str, Any], list[dict[str, Any]]] | None:
     """Return the health and the links of the running node; None if it does not run."""
     try:
-        path = found(name)
+        path = find_socket(name)
         answer: list[Any] = []
         for verb in ("health", "links"):
             line: dict[str, Any] = next(iter(ask(path, {"verb": verb, "with": {}})), {})
@@ -79,7 +82,7 @@ def _ask_node(name: str | None, ask: Ask) -> tuple[dict[str, Any], list[dict[str
     return answer[0], answer[1]
 
 
-def _not_running(name: str | None) -> str:
+def _describe_not_running(name: str | None) -> str:
     which = f"node {name!r} does not run on this machine" if name else "no node, or more than one, runs on this machine"
     return f"{which}; pass its settings file (swarm doctor SETTINGS), or --node NAME"
 
@@ -90,23 +93,23 @@ def _parse_health(answer: dict[str, Any]) -> Health:
     return Health(**figures, trouble=str(answer.get("trouble", "")), refusals=refusals)
 
 
-def _facts_of_running(name: str, answer: dict[str, Any]) -> Facts:
+def _make_running_facts(name: str, answer: dict[str, Any]) -> Facts:
     host, _, port = str(answer["address"]).rpartition(":")
-    return Facts(name, host, int(port), 0.0, tuple(interfaces()), is_running=True, health=_parse_health(answer))
+    return Facts(name, host, int(port), 0.0, tuple(list_interfaces()), is_running=True, health=_parse_health(answer))
 
 
-def _parse_link(answer: dict[str, Any]) -> tuple[str, str, Link]:
-    return str(answer["id"]), str(answer["address"]), link(answer["times"], bool(answer["relayed"]))
+def _parse_link(answer: dict[str, Any]) -> tuple[str, str, LinkQuality]:
+    return str(answer["id"]), str(answer["address"]), compute_quality(answer["times"], bool(answer["relayed"]))
 
 
-def _as_json(findings: Sequence[Finding], links: Sequence[tuple[str, str, Link]]) -> str:
+def _to_json(findings: Sequence[Finding], links: Sequence[tuple[str, str, LinkQuality]]) -> str:
     rows = [
         {"id": node_id, "address": address, "score": each.score, **asdict(each)} for node_id, address, each in links
     ]
     return json.dumps({"findings": [asdict(finding) for finding in findings], "links": rows}) + "\n"
 
 
-def _as_text(findings: Sequence[Finding], links: Sequence[tuple[str, str, Link]], is_running: bool) -> str:
+def _format_text(findings: Sequence[Finding], links: Sequence[tuple[str, str, LinkQuality]], is_running: bool) -> str:
     lines = []
     for finding in findings:
         lines += [
@@ -116,7 +119,7 @@ def _as_text(findings: Sequence[Finding], links: Sequence[tuple[str, str, Link]]
         ]
     for node_id, address, each in links:
         relayed = ", relayed" if each.is_relayed and each.round_trip is not None else ""
-        lines.append(f"link  {node_id[:10]}  {address}  {each.score:3}/100  {figures(each)}{relayed}")
+        lines.append(f"link  {node_id[:10]}  {address}  {each.score:3}/100  {format_link(each)}{relayed}")
     if not findings:
         lines.append("no problem found" if is_running else "no problem found; run it again while the node runs")
-    return "".join(printable(line) + "\n" for line in lines)
+    return "".join(remove_control_characters(line) + "\n" for line in lines)

@@ -8,10 +8,10 @@ from typing import Literal
 
 from middleware.entangled.network.interface import Interface
 from middleware.entangled.network.network import Address
-from middleware.entangled.wire.hail import VERSION
+from middleware.entangled.wire.probe import VERSION
 
-Weight = Literal["error", "warning", "note"]
-ORDER: tuple[Weight, ...] = ("error", "warning", "note")
+Severity = Literal["error", "warning", "note"]
+SEVERITIES: tuple[Severity, ...] = ("error", "warning", "note")
 
 
 @dataclass(frozen=True)
@@ -44,18 +44,18 @@ class Probe:
     is_tcp: bool | None = None
 
     @property
-    def is_heard(self) -> bool:
+    def has_reply(self) -> bool:
         """Whether any UDP reply was received."""
         return self.answer is not None or self.is_member
 
 
 @dataclass(frozen=True)
-class Lan:
+class LanDiscovery:
     """Discovery on the LAN: the replies to a multicast probe, and whether this machine received its own probe."""
 
     answers: tuple[Answer, ...] = ()
     is_sent: bool = False
-    is_own_heard: bool = False
+    has_received_own: bool = False
 
 
 @dataclass(frozen=True)
@@ -99,11 +99,11 @@ class Facts:
     wall: float
     interfaces: tuple[Interface, ...] = ()
     known: tuple[Probe, ...] = ()
-    lan: Lan | None = None
+    lan: LanDiscovery | None = None
     port_problem: str = ""
     is_running: bool = False
     fingerprint: bytes = bytes(8)
-    way_out: str = ""
+    source_address: str = ""
     """The address from which this machine reaches the known nodes."""
     is_gateway_resolved: bool | None = None
     certificate: Certificate | None = None
@@ -120,14 +120,16 @@ class Facts:
         return tuple({answer.address: answer for answer in reversed(found)}.values())[::-1]
 
     @property
-    def own(self) -> frozenset[str]:
+    def own_addresses(self) -> frozenset[str]:
         """The addresses of this machine."""
         return frozenset(address for interface in self.interfaces for address in interface.addresses)
 
     @property
-    def others(self) -> tuple[Answer, ...]:
+    def other_answers(self) -> tuple[Answer, ...]:
         """The replies on the LAN from other machines."""
-        return () if self.lan is None else tuple(a for a in self.lan.answers if a.address.host not in self.own)
+        return (
+            () if self.lan is None else tuple(a for a in self.lan.answers if a.address.host not in self.own_addresses)
+        )
 
 
 def is_local(host: str) -> bool:
@@ -145,23 +147,23 @@ class Finding:
     An ``error`` prevents the node from reaching its team, a ``warning`` may do so, a ``note`` is information.
     """
 
-    weight: Weight
+    weight: Severity
     cause: str
     what: str
     why: str
     remedy: str
 
 
-def error(cause: str, what: str, why: str, remedy: str) -> Finding:
+def make_error(cause: str, what: str, why: str, remedy: str) -> Finding:
     """Return a problem that prevents the node from reaching its team."""
     return Finding("error", cause, what, why, remedy)
 
 
-def warning(cause: str, what: str, why: str, remedy: str) -> Finding:
+def make_warning(cause: str, what: str, why: str, remedy: str) -> Finding:
     """Return a problem that may prevent the node from reaching its team."""
     return Finding("warning", cause, what, why, remedy)
 
 
-def note(cause: str, what: str, why: str, remedy: str) -> Finding:
+def make_note(cause: str, what: str, why: str, remedy: str) -> Finding:
     """Return information without a problem."""
     return Finding("note", cause, what, why, remedy)

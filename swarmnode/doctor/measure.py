@@ -25,20 +25,20 @@ from pathlib import Path
 
 from middleware.config.settings import IN_MEMORY, Settings
 from middleware.entangled.errors import Forged, Malformed
-from middleware.entangled.network.interface import Interface, chosen, interfaces, is_any
+from middleware.entangled.network.interface import Interface, is_any, list_interfaces, select_interfaces
 from middleware.entangled.network.multicast import GROUP
 from middleware.entangled.network.network import Address
-from middleware.entangled.wire.greeting import opened_greeting, who
-from middleware.entangled.wire.hail import ECHO, echo_of, hail
-from middleware.entangled.wire.session import derived_key
-from swarmnode.doctor.facts import Answer, Certificate, Facts, Health, Lan, Probe, Storage, is_local
+from middleware.entangled.wire.discovery import open_discovery, pack_discovery
+from middleware.entangled.wire.probe import PROBE_REPLY, pack_probe, parse_reply
+from middleware.entangled.wire.session import derive_key
+from swarmnode.doctor.facts import Answer, Certificate, Facts, Health, LanDiscovery, Probe, Storage, is_local
 from swarmnode.ports import is_free
 
-TRIES = 4
-EACH_S = 0.3
-TCP_S = 1.0
-TUNNEL = 443
-MAX_KNOWN = 32
+PROBE_COUNT = 4
+PROBE_INTERVAL_S = 0.3
+TCP_TIMEOUT_S = 1.0
+TUNNEL_PORT = 443
+MAX_PROBED = 32
 _IP_RECVERR, _IP_PKTINFO, _IP_MULTICAST_ALL = 11, 8, 49
 
 
@@ -54,16 +54,16 @@ class Team:
 
 @dataclass
 class _Replies:
-    calls: set[bytes] = field(default_factory=set)
-    on_lan: dict[Address, Answer] = field(default_factory=dict)
+    lan_tokens: set[bytes] = field(default_factory=set)
+    lan_answers: dict[Address, Answer] = field(default_factory=dict)
     answers: dict[Address, Answer] = field(default_factory=dict)
     members: set[Address] = field(default_factory=set)
     errors: dict[Address, str] = field(default_factory=dict)
     is_sent: bool = False
-    is_own_heard: bool = False
+    has_received_own: bool = False
 
 
-def measured(
+def measure_facts(
     settings: Settings,
     is_running: bool = False,
     health: Health | None = None,
@@ -71,15 +71,15 @@ def measured(
 ) -> Facts:
     """Measure the facts of the node with these settings; host names must be resolved already."""
     node = settings.node
-    team = team_of(settings)
-    found = tuple(interfaces())
+    team = load_team(settings)
+    found = tuple(list_interfaces())
     named = dict.fromkeys([*node.known_nodes, *team.known])
     known = [each for each in named if _is_numeric(each) and not _is_self(each, node.host, node.port, found)]
-    known = known[:MAX_KNOWN]
+    known = known[:MAX_PROBED]
     port_problem = ""
     if node.port and not is_free(socket.SOCK_DGRAM, "" if is_any(node.host) else node.host, node.port):
         port_problem = f"Another program uses {node.host}:{node.port}."
-    lan_interfaces = chosen(list(found), node.host) if node.lan and not is_local(node.host) else []
+    lan_interfaces = select_interfaces(list(found), node.host) if node.lan and not is_local(node.host) else []
     replies = _probe_all(node.host, known, team.secrets, lan_interfaces, wall)
     gateway = _find_router()
     return Facts(
@@ -89,20 +89,22 @@ def measured(
         wall(),
         interfaces=found,
         known=tuple(_make_probe(address, replies, found) for address in known),
-        lan=Lan(tuple(replies.on_lan.values()), replies.is_sent, replies.is_own_heard) if lan_interfaces else None,
+        lan=LanDiscovery(tuple(replies.lan_answers.values()), replies.is_sent, replies.has_received_own)
+        if lan_interfaces
+        else None,
         port_problem=port_problem if settings.is_given("node", "port") else "",
         is_running=is_running,
         fingerprint=team.fingerprint,
-        way_out=_source_address([each.host for each in known if not is_local(each.host)]),
+        source_address=_find_source_address([each.host for each in known if not is_local(each.host)]),
         is_gateway_resolved=_is_resolved(gateway) if gateway else None,
         certificate=team.certificate,
         storage=_check_storage(node.store),
-        open_files=tuple(_readable_by_others(_secret_files(settings))),
+        open_files=tuple(_find_readable_files(_list_secret_files(settings))),
         health=health,
     )
 
 
-def team_of(settings: Settings) -> Team:
+def load_team(settings: Settings) -> Team:
     """Return the team that the settings name."""
     path = settings.node.membership
     if not path:
@@ -117,15 +119,15 @@ def team_of(settings: Settings) -> Team:
         return Team([], certificate=Certificate(problem=str(error)))
     mark = hashlib.blake2s(kept.operator, digest_size=8, person=b"team").digest()
     secrets = [secret for _, secret, _ in kept.secrets]
-    return Team(secrets, mark, Certificate(member.not_before, member.not_after), kept.known)
+    return Team(secrets, mark, Certificate(member.not_before, member.not_after), kept.known_nodes)
 
 
-def on_lan() -> list[Answer]:
+def discover_on_lan() -> list[Answer]:
     """Return the replies to a discovery probe on the LAN, of any team; takes ``TRIES`` times ``EACH_S`` seconds.
 
     A newcomer without a team finds bootstrap nodes by this.  In a large team only some nodes reply to each call.
     """
-    return list(_probe_all("*", [], [], chosen(interfaces(), "*"), time.time).on_lan.values())
+    return list(_probe_all("*", [], [], select_interfaces(list_interfaces(), "*"), time.time).lan_answers.values())
 
 
 # -- network ----------------------------------------------------------------------------------------------------------
@@ -141,22 +143,24 @@ def _probe_all(
     """Probe all known nodes from one socket, so they report the same port; also probe the LAN by ``lan_interfaces``."""
     replies = _Replies()
     rng = random.SystemRandom()
-    keys = [derived_key(secret, b"greet") for secret in secrets]
+    keys = [derive_key(secret, b"greet") for secret in secrets]
     tokens = {rng.randbytes(16): address for address in known}
     sockets = _open_sockets(host, known)
     multicast = _open_multicast_socket(lan_interfaces) if lan_interfaces else None
     try:
-        for _ in range(TRIES):
+        for _ in range(PROBE_COUNT):
             for token, address in tokens.items():
-                _send(sockets, hail(token), address, replies)
+                _send(sockets, pack_probe(token), address, replies)
                 if address not in replies.members:
                     for key in keys:
-                        _send(sockets, who(key, token, rng), address, replies)
+                        _send(sockets, pack_discovery(key, token, rng), address, replies)
             if lan_interfaces:
                 call = rng.randbytes(16)
-                replies.calls.add(call)
-                _send_multicast(sockets, hail(call), lan_interfaces, replies)
-            _listen([*sockets.values(), *([] if multicast is None else [multicast])], multicast, keys, replies, wall)
+                replies.lan_tokens.add(call)
+                _send_multicast(sockets, pack_probe(call), lan_interfaces, replies)
+            _receive_replies(
+                [*sockets.values(), *([] if multicast is None else [multicast])], multicast, keys, replies, wall
+            )
             if known and not lan_interfaces and replies.members >= set(known) and replies.answers.keys() >= set(known):
                 break
     finally:
@@ -234,14 +238,14 @@ def _send_multicast(
                 replies.is_sent = True
 
 
-def _listen(
+def _receive_replies(
     sockets: Sequence[socket.socket],
     multicast: socket.socket | None,
     keys: Sequence[bytes],
     replies: _Replies,
     wall: Callable[[], float],
 ) -> None:
-    until = time.monotonic() + EACH_S
+    until = time.monotonic() + PROBE_INTERVAL_S
     ours = {each.getsockname()[1] for each in sockets if each is not multicast}
     while (left := until - time.monotonic()) > 0:
         for ready in select.select(sockets, [], [], left)[0]:
@@ -251,27 +255,27 @@ def _listen(
             except OSError:
                 continue
             if ready is multicast:
-                replies.is_own_heard = replies.is_own_heard or source[1] in ours
-            elif datagram[:1] == bytes([ECHO]):
-                _on_echo(datagram, Address(source[0], source[1]), replies, wall())
+                replies.has_received_own = replies.has_received_own or source[1] in ours
+            elif datagram[:1] == bytes([PROBE_REPLY]):
+                _on_probe_reply(datagram, Address(source[0], source[1]), replies, wall())
             else:
-                _on_here(datagram, Address(source[0], source[1]), keys, replies)
+                _on_discovery_reply(datagram, Address(source[0], source[1]), keys, replies)
 
 
-def _on_echo(datagram: bytes, source: Address, replies: _Replies, now: float) -> None:
+def _on_probe_reply(datagram: bytes, source: Address, replies: _Replies, now: float) -> None:
     try:
-        echo = echo_of(datagram)
+        echo = parse_reply(datagram)
     except Malformed:
         return
-    offset = echo.wall - now if echo.wall else None
-    answers = replies.on_lan if echo.token in replies.calls else replies.answers
-    answers.setdefault(source, Answer(source, echo.version, echo.fingerprint, offset, echo.seen))
+    offset = echo.unix_time_s - now if echo.unix_time_s else None
+    answers = replies.lan_answers if echo.token in replies.lan_tokens else replies.answers
+    answers.setdefault(source, Answer(source, echo.version, echo.fingerprint, offset, echo.observed_address))
 
 
-def _on_here(datagram: bytes, source: Address, keys: Sequence[bytes], replies: _Replies) -> None:
+def _on_discovery_reply(datagram: bytes, source: Address, keys: Sequence[bytes], replies: _Replies) -> None:
     for key in keys:
         with suppress(Forged):
-            opened_greeting(key, datagram)
+            open_discovery(key, datagram)
             replies.members.add(source)
             return
 
@@ -298,7 +302,7 @@ def _make_probe(address: Address, replies: _Replies, found: Sequence[Interface])
         replies.errors.get(address, ""),
         _is_near(address.host, found),
     )
-    if probe.is_heard:
+    if probe.has_reply:
         return replace(probe, error="")
     if probe.is_near:
         resolved = _is_resolved(address.host)
@@ -308,9 +312,9 @@ def _make_probe(address: Address, replies: _Replies, found: Sequence[Interface])
 
 def _answers_tcp(address: Address) -> bool:
     """Return whether the machine replies to TCP, possibly by a refusal."""
-    for port in (address.port, TUNNEL):
+    for port in (address.port, TUNNEL_PORT):
         try:
-            socket.create_connection((address.host, port), TCP_S).close()
+            socket.create_connection((address.host, port), TCP_TIMEOUT_S).close()
             return True
         except ConnectionRefusedError:
             return True
@@ -335,7 +339,7 @@ def _is_self(address: Address, host: str, port: int, found: Sequence[Interface])
     return bool(port) and address.port == port and address.host in mine
 
 
-def _source_address(hosts: Sequence[str]) -> str:
+def _find_source_address(hosts: Sequence[str]) -> str:
     """Return the source address for datagrams to the first host."""
     for host in hosts[:1]:
         family = socket.AF_INET6 if ":" in host else socket.AF_INET
@@ -418,14 +422,14 @@ def _check_storage(path: str) -> Storage | None:
     return Storage(path, problem, free)
 
 
-def _secret_files(settings: Settings) -> list[str]:
+def _list_secret_files(settings: Settings) -> list[str]:
     paths = [settings.node.membership, settings.node.store]
     if settings.is_given("node", "team_key"):
         paths.append(settings.origin)
     return [path for path in paths if path and path != IN_MEMORY]
 
 
-def _readable_by_others(paths: Iterable[str]) -> Iterable[tuple[str, int]]:
+def _find_readable_files(paths: Iterable[str]) -> Iterable[tuple[str, int]]:
     for path in paths:
         with suppress(OSError):
             mode = stat.S_IMODE(os.stat(path).st_mode)

@@ -14,14 +14,14 @@ from importlib import import_module
 from importlib.util import find_spec
 
 from drivers.errors import UsageError
-from drivers.registry import built_in_kinds, kinds, maker, manifest_of, places
+from drivers.registry import list_built_in_kinds, list_entry_points, list_kinds, load_factory, load_manifest
 from drivers.serial import PROBLEMS
 
-PATTERNS = ("/dev/ttyUSB*", "/dev/ttyACM*", "/dev/cu.usb*")
+DEVICE_PATTERNS = ("/dev/ttyUSB*", "/dev/ttyACM*", "/dev/cu.usb*")
 
 
 @dataclass(frozen=True)
-class Entry:
+class KindEntry:
     """One kind of robot; ``is_ready``: nothing has to be installed; ``problem``: the reason why it cannot be loaded."""
 
     kind: str
@@ -31,17 +31,19 @@ class Entry:
     problem: str = ""
 
 
-def catalogue(is_there: Callable[[str], bool] = lambda library: find_spec(library) is not None) -> list[Entry]:
+def list_kind_entries(
+    is_there: Callable[[str], bool] = lambda library: find_spec(library) is not None,
+) -> list[KindEntry]:
     """Return every kind of robot; a broken driver of another distribution is listed with its problem."""
-    built_in, installed = built_in_kinds(), places()
+    built_in, installed = list_built_in_kinds(), list_entry_points()
     return [
         _make_built_in_entry(kind, is_there) if kind in built_in else _make_installed_entry(kind, installed[kind])
-        for kind in kinds()
+        for kind in list_kinds()
         if kind in built_in or kind in installed
     ]
 
 
-def catalogue_lines(entries: list[Entry]) -> list[str]:
+def format_kind_entries(entries: list[KindEntry]) -> list[str]:
     """Return the catalogue as lines of text."""
     width = max((len(entry.kind) for entry in entries), default=0)
     lines = []
@@ -52,28 +54,28 @@ def catalogue_lines(entries: list[Entry]) -> list[str]:
     return lines
 
 
-def _make_built_in_entry(kind: str, is_there: Callable[[str], bool]) -> Entry:
+def _make_built_in_entry(kind: str, is_there: Callable[[str], bool]) -> KindEntry:
     package = import_module(f"drivers.{kind}")
     about = (package.__doc__ or "").strip().split("\n")[0].partition(": ")[0].rstrip(".")
-    manifest = manifest_of(kind)
+    manifest = load_manifest(kind)
     if not manifest.library or is_there(manifest.library):
-        return Entry(kind, about)
-    return Entry(
+        return KindEntry(kind, about)
+    return KindEntry(
         kind, about, f"pip install 'swarm-node[{manifest.extra}]'{manifest.when and ', ' + manifest.when}", False
     )
 
 
-def _make_installed_entry(kind: str, place: str) -> Entry:
+def _make_installed_entry(kind: str, place: str) -> KindEntry:
     try:
-        factory: object = getattr(maker(kind, place), "args", (kind, None))[1]
+        factory: object = getattr(load_factory(kind, place), "args", (kind, None))[1]
     except UsageError as error:
-        return Entry(kind, "", "", False, f"broken: {error}")
+        return KindEntry(kind, "", "", False, f"broken: {error}")
     about = (getattr(factory, "__doc__", None) or "").strip().split("\n")[0].rstrip(".")
-    return Entry(kind, f"{about or 'a driver of another distribution'} ({place})")
+    return KindEntry(kind, f"{about or 'a driver of another distribution'} ({place})")
 
 
 @dataclass(frozen=True)
-class Candidate:
+class SerialDevice:
     """A serial device; ``about`` is the description by its plug."""
 
     device: str
@@ -81,24 +83,24 @@ class Candidate:
     is_allowed: bool
 
 
-def candidates(
+def list_serial_devices(
     ports: Callable[[], Iterable[tuple[str, str]]] | None = None, may: Callable[[str], bool] | None = None
-) -> list[Candidate]:
+) -> list[SerialDevice]:
     """Return the serial devices, with their descriptions if pyserial is installed."""
     may = may or (lambda device: os.access(device, os.R_OK | os.W_OK))
-    return [Candidate(device, about, may(device)) for device, about in sorted((ports or serial_ports)())]
+    return [SerialDevice(device, about, may(device)) for device, about in sorted((ports or list_serial_ports)())]
 
 
-def serial_ports() -> list[tuple[str, str]]:
+def list_serial_ports() -> list[tuple[str, str]]:
     """Return each serial device with its description, without unused ports of the board."""
     try:
         from serial.tools.list_ports import comports
     except ImportError:
-        return [(device, "") for pattern in PATTERNS for device in glob.glob(pattern)]
-    return [(port.device, _about(port)) for port in comports() if port.hwid != "n/a"]
+        return [(device, "") for pattern in DEVICE_PATTERNS for device in glob.glob(pattern)]
+    return [(port.device, _describe_port(port)) for port in comports() if port.hwid != "n/a"]
 
 
-def candidate_lines(found: list[Candidate]) -> list[str]:
+def format_serial_devices(found: list[SerialDevice]) -> list[str]:
     """Return the devices found, with the next command for each, as lines of text."""
     if not found:
         return [
@@ -111,15 +113,15 @@ def candidate_lines(found: list[Candidate]) -> list[str]:
         lines.append(f"{each.device}  {each.about}".rstrip())
         if not each.is_allowed:
             lines.append(f"  {PROBLEMS[errno.EACCES]}")
-        lines += [f"  swarm driver probe --kind {kind} --option port={each.device}" for kind in cable_kinds()]
+        lines += [f"  swarm driver probe --kind {kind} --option port={each.device}" for kind in list_cable_kinds()]
     return lines
 
 
-def cable_kinds() -> list[str]:
+def list_cable_kinds() -> list[str]:
     """Return the kinds of robots with a cable; a serial device does not show which kind it is."""
-    return [kind for kind in built_in_kinds() if manifest_of(kind).is_on_cable]
+    return [kind for kind in list_built_in_kinds() if load_manifest(kind).is_on_cable]
 
 
-def _about(port: object) -> str:
+def _describe_port(port: object) -> str:
     words = [str(getattr(port, name, None) or "") for name in ("manufacturer", "description")]
     return " ".join(word for word in words if word and word != "n/a")

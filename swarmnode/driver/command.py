@@ -13,19 +13,19 @@ from typing import Any, TextIO
 
 from drivers.driver import Driver
 from drivers.errors import DriverError
-from middleware.entangled.control.word import printable
+from middleware.entangled.control.conversion import remove_control_characters
 from middleware.errors import BadSetting
-from swarmnode.driver.choice import Choice, add_arguments, chosen, meant
-from swarmnode.driver.ground import Ear, Ground, RealGround
+from swarmnode.driver.environment import CommandEnvironment, RealEnvironment, WarningCollector
+from swarmnode.driver.selection import RobotSelection, add_arguments, select_robot, select_robot_by_word
 
 FAILED, WRONG = 1, 2
 """Exit codes: the robot is not reachable or has a problem; the command is wrong."""
 
-Say = Callable[[Iterable[str]], None]
-Problems = Callable[[], list[str]]
+WriteLines = Callable[[Iterable[str]], None]
+ListProblems = Callable[[], list[str]]
 
 
-def parser() -> argparse.ArgumentParser:
+def make_parser() -> argparse.ArgumentParser:
     """Return the parser of the command line."""
     main_parser = argparse.ArgumentParser(
         prog="swarm driver",
@@ -56,13 +56,15 @@ def parser() -> argparse.ArgumentParser:
     return main_parser
 
 
-def main(words: Sequence[str] | None = None, out: TextIO | None = None, ground: Ground | None = None) -> int:
+def main(
+    words: Sequence[str] | None = None, out: TextIO | None = None, ground: CommandEnvironment | None = None
+) -> int:
     """Run the command; returns 0, 1 if the robot is not reachable or has a problem, 2 if the command is wrong."""
     out = out or sys.stdout
-    options = parser().parse_args(words)
+    options = make_parser().parse_args(words)
 
     def say(lines: Iterable[str]) -> None:
-        out.write("".join(f"{printable(line)}\n" for line in lines))
+        out.write("".join(f"{remove_control_characters(line)}\n" for line in lines))
         out.flush()
 
     try:
@@ -70,51 +72,51 @@ def main(words: Sequence[str] | None = None, out: TextIO | None = None, ground: 
             return _list(options, say)
         if options.verb == "info":
             return _info(options, say)
-        ground = ground or RealGround()
-        choice = chosen(options)
+        ground = ground or RealEnvironment()
+        choice = select_robot(options)
         if choice is None:
-            return _candidates(options, say)
+            return _list_devices(options, say)
         return _run(options, choice, ground, say)
     except (DriverError, BadSetting) as problem:
-        sys.stderr.write(f"swarm driver {options.verb}: {printable(str(problem))}\n")
+        sys.stderr.write(f"swarm driver {options.verb}: {remove_control_characters(str(problem))}\n")
         return WRONG
 
 
-def _list(options: argparse.Namespace, say: Say) -> int:
-    from swarmnode.driver.catalogue import catalogue, catalogue_lines
+def _list(options: argparse.Namespace, say: WriteLines) -> int:
+    from swarmnode.driver.catalogue import format_kind_entries, list_kind_entries
 
-    entries = catalogue()
-    say([json.dumps([asdict(entry) for entry in entries])] if options.json else catalogue_lines(entries))
+    entries = list_kind_entries()
+    say([json.dumps([asdict(entry) for entry in entries])] if options.json else format_kind_entries(entries))
     return 0
 
 
-def _info(options: argparse.Namespace, say: Say) -> int:
-    from swarmnode.driver.sheet import lines
+def _info(options: argparse.Namespace, say: WriteLines) -> int:
+    from swarmnode.driver.formatting import format_description
 
-    body = meant(options.robot, options).description()
-    say([json.dumps(asdict(body))] if options.json else lines(body))
+    body = select_robot_by_word(options.robot, options).get_description()
+    say([json.dumps(asdict(body))] if options.json else format_description(body))
     return 0
 
 
-def _candidates(options: argparse.Namespace, say: Say) -> int:
-    from swarmnode.driver.catalogue import candidate_lines, candidates
+def _list_devices(options: argparse.Namespace, say: WriteLines) -> int:
+    from swarmnode.driver.catalogue import format_serial_devices, list_serial_devices
 
-    found = candidates()
+    found = list_serial_devices()
     if options.verb != "probe":
         sys.stderr.write(f"swarm driver {options.verb}: name the robot by --kind and --option, or by --config\n")
         return WRONG
-    say([json.dumps([asdict(each) for each in found])] if options.json else candidate_lines(found))
+    say([json.dumps([asdict(each) for each in found])] if options.json else format_serial_devices(found))
     return 0 if found else FAILED
 
 
-def _run(options: argparse.Namespace, choice: Choice, ground: Ground, say: Say) -> int:
+def _run(options: argparse.Namespace, choice: RobotSelection, ground: CommandEnvironment, say: WriteLines) -> int:
     """Create a driver of the robot, and probe, drive or monitor it."""
-    connector, of_links = ground.connector(options.verb == "drive")
-    driver = choice.driver(ground.clock, connector)
-    observer = Ear()
+    connector, of_links = ground.make_connector(options.verb == "drive")
+    driver = choice.create_driver(ground.clock, connector)
+    observer = WarningCollector()
 
     def problems() -> list[str]:
-        return [*of_links(), *observer.heard]
+        return [*of_links(), *observer.warnings]
 
     try:
         return {"probe": _probe, "drive": _drive, "monitor": _monitor}[options.verb](
@@ -124,31 +126,37 @@ def _run(options: argparse.Namespace, choice: Choice, ground: Ground, say: Say) 
         observer.close()
 
 
-def _probe(options: argparse.Namespace, driver: Driver, ground: Ground, say: Say, problems: Problems) -> int:
-    from swarmnode.driver.probe import Probe, lines
+def _probe(
+    options: argparse.Namespace, driver: Driver, ground: CommandEnvironment, say: WriteLines, problems: ListProblems
+) -> int:
+    from swarmnode.driver.probe import Probe, format_result
 
     probe = Probe(driver, ground.clock, options.seconds, problems)
     finding = ground.run(probe.start, probe.end)
-    say([json.dumps(finding.as_data())] if options.json else lines(finding))
-    return 0 if finding.is_there else FAILED
+    say([json.dumps(finding.to_data())] if options.json else format_result(finding))
+    return 0 if finding.is_reachable else FAILED
 
 
-def _drive(options: argparse.Namespace, driver: Driver, ground: Ground, say: Say, problems: Problems) -> int:
-    from swarmnode.driver.drive import Drive
+def _drive(
+    options: argparse.Namespace, driver: Driver, ground: CommandEnvironment, say: WriteLines, problems: ListProblems
+) -> int:
+    from swarmnode.driver.drive import DriveSession
 
     if not driver.description.limits:
         kind = driver.description.kind
         sys.stderr.write(f"swarm driver drive: a robot of kind {kind} does not move; use swarm driver monitor\n")
         return WRONG
-    terminal = ground.terminal()
+    terminal = ground.open_terminal()
     try:
-        drive = Drive(driver, ground.clock, terminal, problems)
+        drive = DriveSession(driver, ground.clock, terminal, problems)
         return int(ground.run(drive.start, drive.end))
     finally:
         terminal.close()
 
 
-def _monitor(options: argparse.Namespace, driver: Driver, ground: Ground, say: Say, problems: Problems) -> int:
+def _monitor(
+    options: argparse.Namespace, driver: Driver, ground: CommandEnvironment, say: WriteLines, problems: ListProblems
+) -> int:
     from swarmnode.driver.monitor import Monitor
 
     monitor = Monitor(driver, ground.clock, say, options.seconds, options.picture, options.json, problems)

@@ -13,11 +13,11 @@ from twisted.python.failure import Failure
 from drivers.driver import Driver
 from drivers.reading import Observation
 from drivers.timer import Timer
-from swarmnode.driver.pilot import HELP, KEY_S, Pilot
-from swarmnode.driver.probe import PATIENCE_S
+from swarmnode.driver.keyboard import HELP, KEY_HOLD_S, KeyboardController
+from swarmnode.driver.probe import SILENCE_TIMEOUT_S
 
 TICK_S = 0.05
-LINE_S = 0.1
+STATUS_INTERVAL_S = 0.1
 """Seconds between two updates of the status line."""
 
 
@@ -27,38 +27,40 @@ class Terminal(Protocol):
     def start(self, pressed: Callable[[str], None]) -> None:
         """Call ``pressed`` with each key immediately, without echo; with an empty string at the end of input."""
 
-    def line(self, text: str) -> None:
+    def show_status(self, text: str) -> None:
         """Overwrite the status line."""
 
-    def say(self, text: str) -> None:
+    def write_line(self, text: str) -> None:
         """Write a permanent line."""
 
     def close(self) -> None:
         """Restore the terminal."""
 
 
-class Drive:
+class DriveSession:
     """One session of ``driver``, from the connection until a key ends it; then the motors are off."""
 
     def __init__(
         self, driver: Driver, clock: IReactorTime, terminal: Terminal, problems: Callable[[], list[str]]
     ) -> None:
-        self.pilot = Pilot(driver)
+        self.controller = KeyboardController(driver)
         self._driver = driver
         self._clock = clock
         self._terminal = terminal
         self._problems = problems
-        self._shown: set[str] = set()
-        self._began = clock.seconds()
-        self._line_at = -math.inf
+        self._shown_problems: set[str] = set()
+        self._started_at = clock.seconds()
+        self._status_at = -math.inf
         self._timer = Timer(clock)
         self._is_over = False
         self._ended: Deferred[int] = Deferred()
 
     def start(self) -> Deferred[int]:
         """Begin; fires with the exit code when the robot stands, its motors are off, and the link is closed."""
-        self._terminal.say(HELP)
-        self._terminal.say(f"a key has effect for {KEY_S:g} s: hold it to continue; release it to stop the robot")
+        self._terminal.write_line(HELP)
+        self._terminal.write_line(
+            f"a key has effect for {KEY_HOLD_S:g} s: hold it to continue; release it to stop the robot"
+        )
         self._driver.connect().addCallbacks(self._on_connected, self._on_refused)
         self._terminal.start(self._on_key)
         if not self._is_over:
@@ -70,7 +72,7 @@ class Drive:
         if not self._is_over:
             self._is_over = True
             self._timer.cancel()
-            self.pilot.rest()
+            self.controller.stop()
             leaving = self._driver.disable() if self._driver.state == "ready" else self._driver.disconnect()
             leaving.addErrback(lambda _: None)
             leaving.addCallback(lambda _: self._driver.disconnect())
@@ -86,13 +88,13 @@ class Drive:
 
     def _enable(self) -> None:
         def failed(failure: Failure) -> None:
-            self.pilot.said = " ".join(failure.getErrorMessage().split())
+            self.controller.message = " ".join(failure.getErrorMessage().split())
 
         self._driver.enable().addErrback(failed)
 
     def _on_refused(self, failure: Failure) -> None:
         if not self._is_over:
-            self._terminal.say(" ".join(failure.getErrorMessage().split()))
+            self._terminal.write_line(" ".join(failure.getErrorMessage().split()))
             self.end(1)
 
     def _on_key(self, key: str) -> None:
@@ -100,32 +102,34 @@ class Drive:
             return
         if key == "m":
             self._enable()
-        elif not self.pilot.press(key, self._clock.seconds()):
+        elif not self.controller.press(key, self._clock.seconds()):
             self.end()
             return
-        self._show()
+        self._show_status()
 
     def _on_tick(self) -> None:
         self._timer.set(TICK_S, self._on_tick)
-        self.pilot.tick(self._clock.seconds())
-        if self._clock.seconds() - self._line_at > LINE_S - 1e-9:
-            self._show()
+        self.controller.tick(self._clock.seconds())
+        if self._clock.seconds() - self._status_at > STATUS_INTERVAL_S - 1e-9:
+            self._show_status()
 
-    def _show(self) -> None:
-        self._line_at = self._clock.seconds()
+    def _show_status(self) -> None:
+        self._status_at = self._clock.seconds()
         problems = self._problems()
-        if self._driver.observe() is None and self._clock.seconds() - self._began > PATIENCE_S:
-            problems = [*problems, f"no data within {PATIENCE_S:g} s; run swarm driver probe for details"]
+        if self._driver.observe() is None and self._clock.seconds() - self._started_at > SILENCE_TIMEOUT_S:
+            problems = [*problems, f"no data within {SILENCE_TIMEOUT_S:g} s; run swarm driver probe for details"]
         for problem in problems:
-            if problem not in self._shown:
-                self._shown.add(problem)
-                self._terminal.say(f"! {problem}")
-        self._terminal.line(state_line(self._driver.state, self._driver.observe(), self.pilot, self._clock.seconds()))
+            if problem not in self._shown_problems:
+                self._shown_problems.add(problem)
+                self._terminal.write_line(f"! {problem}")
+        self._terminal.show_status(
+            format_status(self._driver.state, self._driver.observe(), self.controller, self._clock.seconds())
+        )
 
 
-def state_line(state: str, newest: Observation | None, pilot: Pilot, now: float) -> str:
+def format_status(state: str, newest: Observation | None, pilot: KeyboardController, now: float) -> str:
     """Return the status line: state, motion, position, nearest range, battery, age of data, last message."""
-    words = [f"{state:10}", " ".join(f"{key[5:]} {value + 0.0:+.2f}" for key, value in pilot.done.items())]
+    words = [f"{state:10}", " ".join(f"{key[5:]} {value + 0.0:+.2f}" for key, value in pilot.last_motion.items())]
     if newest is not None:
         values = newest.values
         if values.get("estop.engaged") is True:
@@ -140,4 +144,4 @@ def state_line(state: str, newest: Observation | None, pilot: Pilot, now: float)
         if "power.level" in values:
             words.append(f"battery {100.0 * float(values['power.level']):.0f} %")
         words.append(f"age {now - newest.t_host:.2f} s")
-    return "  ".join(word for word in (*words, pilot.said) if word)
+    return "  ".join(word for word in (*words, pilot.message) if word)

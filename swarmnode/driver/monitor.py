@@ -16,10 +16,10 @@ from twisted.python.failure import Failure
 from drivers.driver import Driver
 from drivers.reading import Frame, Observation
 from drivers.timer import Timer
-from swarmnode.driver.probe import PATIENCE_S
-from swarmnode.driver.sheet import plain, shown
+from swarmnode.driver.formatting import format_reading, make_json_safe
+from swarmnode.driver.probe import SILENCE_TIMEOUT_S
 
-SHOW_S = 1.0
+DISPLAY_INTERVAL_S = 1.0
 """Seconds between two displays, and between two saved pictures."""
 
 
@@ -47,9 +47,9 @@ class Monitor:
         self._picture = picture
         self._is_json = is_json
         self._problems = problems
-        self._shown: set[str] = set()
-        self._saved = -1
-        self._began = clock.seconds()
+        self._shown_problems: set[str] = set()
+        self._saved_seq = -1
+        self._started_at = clock.seconds()
         self._first_at: float | None = None
         self._timer = Timer(clock)
         self._is_over = False
@@ -70,7 +70,7 @@ class Monitor:
             newest = self._driver.observe()
             if newest is None:
                 self.code = 1
-            elif self._picture is not None and self._saved < 0 and self.code == 0:
+            elif self._picture is not None and self._saved_seq < 0 and self.code == 0:
                 self._fail("no picture received; check that its camera is on")
             leaving = self._driver.disconnect()
             leaving.addBoth(lambda _: self._ended.callback(self.code))
@@ -84,28 +84,28 @@ class Monitor:
     def _on_time(self) -> None:
         now, newest = self._clock.seconds(), self._driver.observe()
         for problem in self._problems():
-            if problem not in self._shown:
-                self._shown.add(problem)
+            if problem not in self._shown_problems:
+                self._shown_problems.add(problem)
                 self._show([f"! {problem}"])
-        if newest is None and now - self._began > PATIENCE_S:
-            self._fail(f"no data within {PATIENCE_S:g} s; run swarm driver probe for details")
+        if newest is None and now - self._started_at > SILENCE_TIMEOUT_S:
+            self._fail(f"no data within {SILENCE_TIMEOUT_S:g} s; run swarm driver probe for details")
             self.end()
             return
         if newest is not None:
             self._first_at = now if self._first_at is None else self._first_at
-            self._show(list(self._readings(newest, now)))
-            if self._picture is not None and newest.frame is not None and newest.frame.seq != self._saved:
+            self._show(list(self._format_readings(newest, now)))
+            if self._picture is not None and newest.frame is not None and newest.frame.seq != self._saved_seq:
                 self._save(newest.frame)
             if self._is_over or now - self._first_at >= self._seconds - 1e-9:
                 self.end()
                 return
-        self._timer.set(0.1 if newest is None else SHOW_S, self._on_time)
+        self._timer.set(0.1 if newest is None else DISPLAY_INTERVAL_S, self._on_time)
 
-    def _readings(self, newest: Observation, now: float) -> Iterator[str]:
+    def _format_readings(self, newest: Observation, now: float) -> Iterator[str]:
         if self._is_json:
-            yield json.dumps(as_data(self._driver.state, newest, now))
+            yield json.dumps(observation_to_data(self._driver.state, newest, now))
         else:
-            yield from readings(self._driver.state, newest, self._driver.diagnostics(), now)
+            yield from format_readings(self._driver.state, newest, self._driver.diagnostics(), now)
 
     def _save(self, frame: Frame) -> None:
         assert self._picture is not None
@@ -121,28 +121,28 @@ class Monitor:
             self._fail(f"cannot write {self._picture}: {error.strerror or error}")
             self.end()
             return
-        self._saved = frame.seq
+        self._saved_seq = frame.seq
 
     def _fail(self, problem: str) -> None:
         self.code = 1
         self._show([f"! {problem}"])
 
 
-def readings(state: str, newest: Observation, counts: dict[str, float], now: float) -> Iterator[str]:
+def format_readings(state: str, newest: Observation, counts: dict[str, float], now: float) -> Iterator[str]:
     """Yield a line about the link, then each reading on a line."""
     yield f"{state}, {now - newest.t_host:.2f} s old, {counts['frames']:g} frames, {counts['bad_frames']:g} bad"
     width = max(map(len, newest.values), default=0)
     for key in sorted(newest.values):
-        yield f"  {key:{width}}  {shown(key, newest.values[key])}"
+        yield f"  {key:{width}}  {format_reading(key, newest.values[key])}"
     if newest.frame is not None:
         frame = newest.frame
         yield f"  {'camera':{width}}  {frame.width} x {frame.height} {frame.encoding}, number {frame.seq}"
 
 
-def as_data(state: str, newest: Observation, now: float) -> dict[str, Any]:
+def observation_to_data(state: str, newest: Observation, now: float) -> dict[str, Any]:
     """Return an observation as plain data for JSON; NaN and infinities become None."""
     data: dict[str, Any] = {"state": state, "age": now - newest.t_host, "t_robot": newest.t_robot}
-    data["values"] = plain(newest.values)
+    data["values"] = make_json_safe(newest.values)
     if newest.frame is not None:
         data["picture"] = {"seq": newest.frame.seq, "width": newest.frame.width, "height": newest.frame.height}
     return data

@@ -13,15 +13,15 @@ from twisted.python.failure import Failure
 from drivers.driver import Driver
 from drivers.reading import Observation, Value
 from drivers.timer import Timer
-from swarmnode.driver.sheet import plain, shown
+from swarmnode.driver.formatting import format_reading, make_json_safe
 
-PATIENCE_S = 8.0
+SILENCE_TIMEOUT_S = 8.0
 """Seconds after which a silent robot is given up; the slowest error report is the AIBO's, after 5 s."""
-SURE_S = 3.0
+PROBLEM_TIMEOUT_S = 3.0
 """Seconds after which a silent robot with a known problem is given up."""
-SLOW = 0.7
+MIN_RATE_SHARE = 0.7
 """Share of the specified rate below which a robot is reported as slow."""
-TOLD = (
+REPORTED_KEYS = (
     "mode",
     "firmware",
     "skill.running",
@@ -35,7 +35,7 @@ TOLD = (
 
 
 @dataclass(frozen=True)
-class Finding:
+class ProbeResult:
     """The result of a probe.
 
     ``first`` is the time in seconds until the first observation, None without one; ``rate`` and ``promised`` are
@@ -55,14 +55,14 @@ class Finding:
     problems: tuple[str, ...] = ()
 
     @property
-    def is_there(self) -> bool:
+    def is_reachable(self) -> bool:
         """Whether the robot was observed and is still connected."""
         return self.first is not None and self.state in ("ready", "stopped")
 
-    def as_data(self) -> dict[str, Any]:
+    def to_data(self) -> dict[str, Any]:
         """Return plain data for JSON; NaN and infinities become None."""
-        data = {**asdict(self), "is_there": self.is_there}
-        return data | {"readings": plain(self.readings), "counts": plain(self.counts)}
+        data = {**asdict(self), "is_there": self.is_reachable}
+        return data | {"readings": make_json_safe(self.readings), "counts": make_json_safe(self.counts)}
 
 
 class Probe:
@@ -75,35 +75,35 @@ class Probe:
         self._clock = clock
         self._seconds = seconds
         self._problems = problems
-        self._began = clock.seconds()
-        self._first: float | None = None
-        self._seen = 0
+        self._started_at = clock.seconds()
+        self._first_s: float | None = None
+        self._observation_count = 0
         self._pictures: set[int] = set()
         self._keys: dict[str, None] = {}
-        self._refusal = ""
+        self._connect_error = ""
         self._timer = Timer(clock)
         self._is_over = False
-        self._found: Deferred[Finding] = Deferred()
+        self._result: Deferred[ProbeResult] = Deferred()
 
-    def start(self) -> Deferred[Finding]:
+    def start(self) -> Deferred[ProbeResult]:
         """Begin; fires with the finding, and never fails."""
-        self._timer.set(SURE_S, self._on_silence)
+        self._timer.set(PROBLEM_TIMEOUT_S, self._on_silence)
         self._driver.subscribe(self._on_observation)
         self._driver.connect().addCallbacks(self._on_connected, self._on_refused)
-        return self._found
+        return self._result
 
     def end(self) -> Deferred[Any]:
         """End now with the data so far; fires when the robot is disconnected."""
         if not self._is_over:
             self._is_over = True
             self._timer.cancel()
-            finding = self._finding()
-            self._driver.disconnect().addBoth(lambda _: self._found.callback(finding))
-        return self._found
+            finding = self._make_result()
+            self._driver.disconnect().addBoth(lambda _: self._result.callback(finding))
+        return self._result
 
     def _on_connected(self, _: object) -> None:
-        self._first = self._clock.seconds() - self._began
-        self._seen = 0
+        self._first_s = self._clock.seconds() - self._started_at
+        self._observation_count = 0
         self._pictures.clear()
         self._timer.set(self._seconds, self.end)
 
@@ -111,41 +111,41 @@ class Probe:
         if self._problems():
             self.end()
         else:
-            self._timer.set(PATIENCE_S - SURE_S, self.end)
+            self._timer.set(SILENCE_TIMEOUT_S - PROBLEM_TIMEOUT_S, self.end)
 
     def _on_refused(self, failure: Failure) -> None:
         if not self._is_over:
-            self._refusal = " ".join(failure.getErrorMessage().split())
+            self._connect_error = " ".join(failure.getErrorMessage().split())
             self.end()
 
     def _on_observation(self, seen: Observation) -> None:
-        self._seen += 1
+        self._observation_count += 1
         self._keys |= dict.fromkeys(seen.values)
         if seen.frame is not None:
             self._pictures.add(seen.frame.seq)
 
-    def _finding(self) -> Finding:
+    def _make_result(self) -> ProbeResult:
         body, newest = self._driver.description, self._driver.observe()
-        duration = self._clock.seconds() - self._began - (self._first or 0.0)
-        rate = self._seen / duration if self._first is not None and duration > 0 else 0.0
+        duration = self._clock.seconds() - self._started_at - (self._first_s or 0.0)
+        rate = self._observation_count / duration if self._first_s is not None and duration > 0 else 0.0
         promised = body.rates.get("state", max(body.rates.values(), default=0.0))
         values = {} if newest is None else newest.values
         frame = None if newest is None else newest.frame
-        problems = [*([self._refusal] if self._refusal else []), *self._problems()]
-        if self._first is None and not problems:
-            problems.append(f"no data within {PATIENCE_S:g} s; check that it is switched on, and the options")
-        if self._first is not None and rate < SLOW * promised:
+        problems = [*([self._connect_error] if self._connect_error else []), *self._problems()]
+        if self._first_s is None and not problems:
+            problems.append(f"no data within {SILENCE_TIMEOUT_S:g} s; check that it is switched on, and the options")
+        if self._first_s is not None and rate < MIN_RATE_SHARE * promised:
             problems.append(f"it is slow: {rate:.1f} of {promised:g} observations per second; check the radio link")
-        if "camera" in body.capabilities and self._first is not None and not self._pictures:
+        if "camera" in body.capabilities and self._first_s is not None and not self._pictures:
             problems.append("no picture received, although it has a camera; check that the camera is on")
-        return Finding(
+        return ProbeResult(
             kind=body.kind,
-            first=self._first,
+            first=self._first_s,
             state=self._driver.state,
             rate=rate,
             promised=promised,
             keys=tuple(sorted(self._keys)),
-            readings={key: values[key] for key in TOLD if key in values},
+            readings={key: values[key] for key in REPORTED_KEYS if key in values},
             picture="" if frame is None else f"{frame.width} x {frame.height} {frame.encoding}",
             pictures=len(self._pictures) / duration if duration > 0 else 0.0,
             counts=self._driver.diagnostics(),
@@ -153,7 +153,7 @@ class Probe:
         )
 
 
-def lines(finding: Finding) -> Iterator[str]:
+def format_result(finding: ProbeResult) -> Iterator[str]:
     """Return the finding as lines of text."""
     if finding.first is None:
         yield f"{finding.kind}: not reached"
@@ -163,7 +163,7 @@ def lines(finding: Finding) -> Iterator[str]:
         yield f"  state         {finding.state}"
         yield f"  rate          {finding.rate:.1f}{promised} per second"
         for key, value in finding.readings.items():
-            yield f"  {key:13} {shown(key, value)}"
+            yield f"  {key:13} {format_reading(key, value)}"
         if finding.picture:
             yield f"  pictures      {finding.picture}, {finding.pictures:.1f} per second"
         yield f"  bad frames    {finding.counts.get('bad_frames', 0):g} of {finding.counts.get('frames', 0):g}"

@@ -13,7 +13,7 @@ from twisted.python.failure import Failure
 from zope.interface import implementer
 
 from drivers.errors import UsageError
-from middleware.entangled.control.word import printable
+from middleware.entangled.control.conversion import remove_control_characters
 
 
 @implementer(IReadDescriptor)
@@ -33,27 +33,27 @@ class RealTerminal:
             raise UsageError("this system's terminal does not support single keys; use Linux or macOS") from None
         self._reactor = reactor
         self._out = out
-        self._number = keys.fileno()
-        before = termios.tcgetattr(self._number)
-        tty.setcbreak(self._number)
-        self._restore: Callable[[], None] = lambda: termios.tcsetattr(self._number, termios.TCSADRAIN, before)
-        self._pressed: Callable[[str], None] | None = None
+        self._fd = keys.fileno()
+        before = termios.tcgetattr(self._fd)
+        tty.setcbreak(self._fd)
+        self._restore: Callable[[], None] = lambda: termios.tcsetattr(self._fd, termios.TCSADRAIN, before)
+        self._on_key: Callable[[str], None] | None = None
         self._is_closed = False
 
     def start(self, pressed: Callable[[str], None]) -> None:
         """Call ``pressed`` with each key immediately; with an empty string at the end of input."""
-        self._pressed = pressed
+        self._on_key = pressed
         self._reactor.addReader(self)
 
-    def line(self, text: str) -> None:
+    def show_status(self, text: str) -> None:
         """Overwrite the status line, cut to the width of the terminal."""
         width = shutil.get_terminal_size().columns
-        self._out.write(f"\r{printable(text)[: width - 1]}\x1b[K")
+        self._out.write(f"\r{remove_control_characters(text)[: width - 1]}\x1b[K")
         self._out.flush()
 
-    def say(self, text: str) -> None:
+    def write_line(self, text: str) -> None:
         """Write a permanent line."""
-        self._out.write(f"\r{printable(text)}\x1b[K\n")
+        self._out.write(f"\r{remove_control_characters(text)}\x1b[K\n")
         self._out.flush()
 
     def close(self) -> None:
@@ -68,30 +68,30 @@ class RealTerminal:
 
     def fileno(self) -> int:
         """Return the file descriptor of standard input."""
-        return self._number
+        return self._fd
 
     def doRead(self) -> None:  # noqa: N802 (Twisted's)
         """Read keys; escape sequences, such as arrow keys, are ignored."""
         try:
-            data = os.read(self._number, 64)
+            data = os.read(self._fd, 64)
         except OSError:
             data = b""
         if not data:
             self._reactor.removeReader(self)
-        if self._pressed is not None:
+        if self._on_key is not None:
             keys = [""] if not data else [] if data.startswith(b"\x1b") else list(data.decode("ascii", "ignore"))
             for key in keys:
-                self._pressed(key)
+                self._on_key(key)
 
     def connectionLost(self, reason: Failure) -> None:  # noqa: D102 (Twisted's)
-        if self._pressed is not None:
-            self._pressed("")
+        if self._on_key is not None:
+            self._on_key("")
 
     def logPrefix(self) -> str:  # noqa: N802 (Twisted's)
         """Return the name in the log."""
         return "terminal"
 
 
-def real_terminal(reactor: Any) -> RealTerminal:
+def open_terminal(reactor: Any) -> RealTerminal:
     """Return the terminal of this process; raises ``UsageError`` if there is none."""
     return RealTerminal(reactor, sys.stdin, sys.stdout)

@@ -16,19 +16,19 @@ from pathlib import Path
 from typing import TextIO
 
 from middleware.config.settings import IN_MEMORY, Settings
-from middleware.entangled.control.word import printable
+from middleware.entangled.control.conversion import remove_control_characters
 from middleware.errors import SwarmError
-from swarmnode.systemd.unit import MEMORY, PREFIX, SETTINGS, Unit, unit_for
+from swarmnode.systemd.unit import MEMORY_LIMIT, PREFIX, SETTINGS_FILE, Unit, make_unit
 
 DONE, FAILED, WRONG = 0, 1, 2
-Run = Callable[[Sequence[str]], int]
+RunCommand = Callable[[Sequence[str]], int]
 
 
 class CannotInstall(SwarmError):
     """The service cannot be installed; the message has the reason and the remedy."""
 
 
-def run(words: Sequence[str]) -> int:
+def run_command(words: Sequence[str]) -> int:
     """Run a systemd command; returns its exit code, 127 if it does not exist."""
     try:
         return subprocess.run(words, check=False).returncode  # noqa: S603 (ours, with no shell)
@@ -36,7 +36,7 @@ def run(words: Sequence[str]) -> int:
         return 127
 
 
-def parser() -> argparse.ArgumentParser:
+def make_parser() -> argparse.ArgumentParser:
     """Return the parser of the command line."""
     main_parser = argparse.ArgumentParser(
         prog="swarm service",
@@ -52,7 +52,9 @@ def parser() -> argparse.ArgumentParser:
         verb = verbs.add_parser(name, help=purpose, description=purpose, epilog=example)
         verb.add_argument("settings", metavar="SETTINGS", help="settings file of the node")
         verb.add_argument("--user", action="store_true", help="service of this user, without root")
-        verb.add_argument("--memory", default=MEMORY, metavar="SIZE", help=f"memory limit (default: {MEMORY})")
+        verb.add_argument(
+            "--memory", default=MEMORY_LIMIT, metavar="SIZE", help=f"memory limit (default: {MEMORY_LIMIT})"
+        )
         verb.add_argument("--no-start", action="store_true", help="write the files, but do not call systemd")
     for name, purpose in (
         ("restart", "Restart the service, for example after an upgrade."),
@@ -69,35 +71,35 @@ def main(
     out: TextIO | None = None,
     root: Path = Path("/"),
     uid: int | None = None,
-    run: Run = run,
+    run: RunCommand = run_command,
     executable: str = sys.executable,
     can_enter: Callable[[Path], bool] = lambda folder: bool(folder.stat().st_mode & 0o001),
 ) -> int:
     """Run the command; returns 0, 1 if systemd failed, 2 if the command or the settings are wrong."""
     out = out or sys.stdout
-    options = parser().parse_args(words)
+    options = make_parser().parse_args(words)
     is_user = options.user or (os.getuid() if uid is None else uid) != 0
     try:
         if options.verb in ("restart", "remove"):
-            return _Service(options.name, is_user, root, run, out).do(options.verb)
-        program, interpreter = twistd(executable, is_user, can_enter), str(_interpreter(executable))
+            return _Service(options.name, is_user, root, run, out).apply(options.verb)
+        program, interpreter = find_twistd(executable, is_user, can_enter), str(_resolve_interpreter(executable))
         settings = Settings.load(str(Path(options.settings).absolute()))
-        unit = unit_for(settings, program, is_user, options.memory, interpreter)
+        unit = make_unit(settings, program, is_user, options.memory, interpreter)
         if options.verb == "show":
             out.write(unit.text)
             return DONE
         return _Service(unit.name, is_user, root, run, out).install(unit, is_started=not options.no_start)
     except (SwarmError, OSError) as problem:
-        sys.stderr.write(printable(f"swarm service: {problem}") + "\n")
+        sys.stderr.write(remove_control_characters(f"swarm service: {problem}") + "\n")
         return WRONG
 
 
-def twistd(executable: str, is_user: bool, can_enter: Callable[[Path], bool]) -> str:
+def find_twistd(executable: str, is_user: bool, can_enter: Callable[[Path], bool]) -> str:
     """Return ``twistd`` of this environment; raises ``CannotInstall`` if the service's user cannot run it."""
     path = Path(executable).with_name("twistd")
     if not path.exists():
         raise CannotInstall(f"{path} does not exist; install swarm-node into this Python environment")
-    folders = [] if is_user else [*path.parents, *_interpreter(executable).parents]
+    folders = [] if is_user else [*path.parents, *_resolve_interpreter(executable).parents]
     for folder in folders:
         if not can_enter(folder):
             remedy = "create an environment below /opt with the system's Python, or use --user"
@@ -105,7 +107,7 @@ def twistd(executable: str, is_user: bool, can_enter: Callable[[Path], bool]) ->
     return str(path)
 
 
-def _interpreter(executable: str) -> Path:
+def _resolve_interpreter(executable: str) -> Path:
     """Return the real path of the interpreter; in an environment it is often a link."""
     return Path(executable).resolve()
 
@@ -113,7 +115,7 @@ def _interpreter(executable: str) -> Path:
 class _Service:
     """The files of one node's service, and the calls to systemd."""
 
-    def __init__(self, name: str, is_user: bool, root: Path, run: Run, out: TextIO) -> None:
+    def __init__(self, name: str, is_user: bool, root: Path, run: RunCommand, out: TextIO) -> None:
         home = Path(os.environ.get("XDG_CONFIG_HOME") or Path.home() / ".config")
         units = home / "systemd/user" if is_user else Path("/etc/systemd/system")
         self._label = PREFIX + name
@@ -121,13 +123,13 @@ class _Service:
         # systemd moves it below `private` at the first start, and makes a link.
         self._state = root / "var/lib" / self._label
         self._is_user = is_user
-        self._run = run
+        self._run_command = run
         self._out = out
 
     def install(self, unit: Unit, is_started: bool) -> int:
         """Write the unit and its files, and start it."""
         if not self._is_user:
-            self._copy(unit.settings)
+            self._copy_settings(unit.settings)
         self._unit.parent.mkdir(parents=True, exist_ok=True)
         _write_atomically(self._unit, unit.text.encode(), 0o644)
         self._out.write(f"{self._unit}\n")
@@ -140,7 +142,7 @@ class _Service:
             self._out.write("It stops when you sign out, unless you run: loginctl enable-linger\n")
         return DONE
 
-    def do(self, verb: str) -> int:
+    def apply(self, verb: str) -> int:
         """Restart or remove the service; raises ``CannotInstall`` if it is not installed."""
         if not self._unit.exists():
             raise CannotInstall(f"{self._unit} does not exist; install it by: swarm service install SETTINGS")
@@ -153,7 +155,7 @@ class _Service:
         self._out.write(f"removed {self._unit}{kept}\n")
         return DONE if ended == DONE else FAILED
 
-    def _copy(self, path: str) -> None:
+    def _copy_settings(self, path: str) -> None:
         """Copy the settings to the service's folder, and the files that they name unless they are there."""
         settings, folder = Settings.load(path), Path(path).parent
         self._state.mkdir(mode=0o700, parents=True, exist_ok=True)
@@ -171,7 +173,7 @@ class _Service:
                     target.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
                     shutil.copyfile(each, target)
                     target.chmod(0o600)
-        _write_atomically(self._state / SETTINGS, Path(path).read_bytes(), 0o600)
+        _write_atomically(self._state / SETTINGS_FILE, Path(path).read_bytes(), 0o600)
         self._set_owner()
 
     def _set_owner(self) -> None:
@@ -182,7 +184,7 @@ class _Service:
                 os.chown(file, owner.st_uid, owner.st_gid, follow_symlinks=False)
 
     def _systemctl(self, *words: str) -> int:
-        return self._run(["systemctl", *(["--user"] if self._is_user else []), *words])
+        return self._run_command(["systemctl", *(["--user"] if self._is_user else []), *words])
 
     def _report_failure(self) -> int:
         user = "--user " if self._is_user else ""

@@ -12,18 +12,26 @@ from typing import Any
 from middleware.admission import membership as memberships
 from middleware.admission import operator as operators
 from middleware.admission.membership import Membership
-from middleware.admission.operator import FIRST, Operator
+from middleware.admission.operator import FIRST_NODE_ROLES, Operator
 from middleware.admission.statement import ROLES
 from middleware.config.settings import COMMAND_LINE, NODE_PORT, Settings
 from middleware.entangled.network.interface import is_loopback
-from middleware.entangled.network.network import EVERYWHERE
+from middleware.entangled.network.network import ANY_HOST
 from middleware.errors import BadSetting
-from swarmnode.team.office import ENDING, Answer, Desk, Wrong, key_folder, options, run
+from swarmnode.team.common import (
+    KEY_FILE_SUFFIX,
+    Answer,
+    CommandContext,
+    InvalidCommand,
+    get_key_folder,
+    make_parser,
+    run_verb,
+)
 
-MEMBERSHIP, SETTINGS = ".membership", ".toml"
-SHARED = ("port", "lan", "store_rows", "store_bytes", "durable", "presence_lease")
+MEMBERSHIP_SUFFIX, SETTINGS_SUFFIX = ".membership", ".toml"
+SHARED_KEYS = ("port", "lan", "store_rows", "store_bytes", "durable", "presence_lease")
 """Keys of ``[node]`` that an operator may share with newcomers: none runs code, opens a page or grants a permission."""
-ANYWHERE = f"{EVERYWHERE}:{NODE_PORT}"
+ANY_ADDRESS = f"{ANY_HOST}:{NODE_PORT}"
 """Every address of the machine, because the addresses of a laptop change."""
 
 
@@ -36,17 +44,17 @@ class _Member:
     folder: Path
 
     @property
-    def membership(self) -> Path:
-        return self.folder / f"{self.name}{MEMBERSHIP}"
+    def membership_path(self) -> Path:
+        return self.folder / f"{self.name}{MEMBERSHIP_SUFFIX}"
 
     @property
-    def settings(self) -> Path:
-        return self.folder / f"{self.name}{SETTINGS}"
+    def settings_path(self) -> Path:
+        return self.folder / f"{self.name}{SETTINGS_SUFFIX}"
 
 
-def main(words: Sequence[str] | None = None, desk: Desk | None = None) -> int:
+def main(words: Sequence[str] | None = None, desk: CommandContext | None = None) -> int:
     """Run the command; returns its exit code."""
-    init = options(
+    init = make_parser(
         "init",
         "Create a closed team: the operator's key, and the membership of its first node.",
         is_asked=False,
@@ -69,40 +77,40 @@ def main(words: Sequence[str] | None = None, desk: Desk | None = None) -> int:
         default=[],
         help="create files for another node, to be copied to it; can be repeated (default role: device)",
     )
-    return run(init, words, desk, _create)
+    return run_verb(init, words, desk, _create)
 
 
-def _create(arguments: argparse.Namespace, desk: Desk) -> Answer:
-    operator = replace(operators.drawn(arguments.team, desk.rng), settings=team_settings(arguments.set))
-    key = arguments.operator or key_folder() / f"{arguments.team}{ENDING}"
+def _create(arguments: argparse.Namespace, desk: CommandContext) -> Answer:
+    operator = replace(operators.create_operator(arguments.team, desk.rng), settings=parse_team_settings(arguments.set))
+    key = arguments.operator or get_key_folder() / f"{arguments.team}{KEY_FILE_SUFFIX}"
     team = dict(operator.settings)
-    first = _Member(arguments.first, FIRST, arguments.folder)
+    first = _Member(arguments.first, FIRST_NODE_ROLES, arguments.folder)
     members = [first]
     for text in arguments.member:
         member = _parse_member(text, arguments.folder)
         if member.name in {each.name for each in members}:
-            raise Wrong(f"--member {text}: another member has this name; choose another one")
+            raise InvalidCommand(f"--member {text}: another member has this name; choose another one")
         members.append(member)
-    texts = _settings_files(members, arguments.at, arguments.page, team)
-    for path in (key, *(each.membership for each in members), *texts):
+    texts = _format_settings_files(members, arguments.at, arguments.page, team)
+    for path in (key, *(each.membership_path for each in members), *texts):
         if path.exists():
-            raise Wrong(f"{path} is there already; choose another team name, or --folder DIR")
+            raise InvalidCommand(f"{path} is there already; choose another team name, or --folder DIR")
     created = _create_memberships(operator, members, desk)
     _make_folders(key.parent, arguments.folder)
-    operators.made(key, operator)
+    operators.create_operator_file(key, operator)
     for path, membership in created.items():
-        memberships.made(path, replace(membership, settings=team))
+        memberships.create_membership_file(path, replace(membership, settings=team))
     for path, text in texts.items():
-        written(path, text)
+        write_settings(path, text)
     answer = {"team": arguments.team, "operator": str(key)}
-    return {**answer, "membership": str(first.membership), "settings": str(first.settings)}, [
+    return {**answer, "membership": str(first.membership_path), "settings": str(first.settings_path)}, [
         f"Created the team {arguments.team}.",
         f"  {key}  the operator's key: it admits and revokes members; no node needs it. Keep a copy in a safe place.",
-        f"  {first.membership}  the first node's membership: a secret of that node",
-        f"  {first.settings}  its settings; start it by: twistd -n --pidfile= swarm-node --config {first.settings}",
+        f"  {first.membership_path}  the first node's membership: a secret of that node",
+        f"  {first.settings_path}  its settings; start it by: twistd -n --pidfile= swarm-node --config {first.settings_path}",
         *(
-            f"  {each.membership}  for {each.name} ({', '.join(each.roles)}): "
-            f"copy it and {each.settings.name} to that node, then delete them here"
+            f"  {each.membership_path}  for {each.name} ({', '.join(each.roles)}): "
+            f"copy it and {each.settings_path.name} to that node, then delete them here"
             for each in members[1:]
         ),
         "Next, admit other nodes: swarm invite NAME",
@@ -114,34 +122,38 @@ def _parse_member(text: str, folder: Path) -> _Member:
     found = roles.split(",") if roles else ["device"]
     unknown = [role for role in found if role not in ROLES]
     if unknown:
-        raise Wrong(f"--member {text}: no role {unknown[0]!r}; roles: {', '.join(ROLES)}")
+        raise InvalidCommand(f"--member {text}: no role {unknown[0]!r}; roles: {', '.join(ROLES)}")
     return _Member(name, found, folder)
 
 
-def _settings_files(
+def _format_settings_files(
     members: Sequence[_Member], at: str | None, has_page: bool, team: Mapping[str, Any]
 ) -> dict[Path, str]:
     """Return the settings files: the first node listens at ``at``, and the others have it as a known node."""
     first, *others = members
     does = ["bootstrap", "edge", *(["web"] if has_page else [])]
-    texts = {first.settings: settings_text(first.name, first.membership.name, does, at or ANYWHERE, (), team)}
+    texts = {
+        first.settings_path: format_settings(first.name, first.membership_path.name, does, at or ANY_ADDRESS, (), team)
+    }
     known = [at] if at else []
-    host = {} if at and is_loopback(at.rpartition(":")[0]) else {"host": EVERYWHERE}
+    host = {} if at and is_loopback(at.rpartition(":")[0]) else {"host": ANY_HOST}
     for each in others:
-        texts[each.settings] = settings_text(each.name, each.membership.name, ["edge"], None, known, {**host, **team})
+        texts[each.settings_path] = format_settings(
+            each.name, each.membership_path.name, ["edge"], None, known, {**host, **team}
+        )
     return texts
 
 
-def _create_memberships(operator: Operator, members: Sequence[_Member], desk: Desk) -> dict[Path, Membership]:
+def _create_memberships(operator: Operator, members: Sequence[_Member], desk: CommandContext) -> dict[Path, Membership]:
     """Return the memberships, all with the same team secret; raises ``Wrong``."""
     found: dict[Path, Membership] = {}
     secret = None
     for each in members:
         try:
-            membership = operator.founded(each.name, each.roles, desk.wall(), desk.rng, secret)
+            membership = operator.create_membership(each.name, each.roles, desk.wall(), desk.rng, secret)
         except ValueError as error:
-            raise Wrong(f"a member's name or role: {error}") from error
-        found[each.membership] = membership
+            raise InvalidCommand(f"a member's name or role: {error}") from error
+        found[each.membership_path] = membership
         secret = membership.secrets[0][1]
     return found
 
@@ -151,25 +163,25 @@ def _make_folders(keys: Path, members: Path) -> None:
         keys.mkdir(mode=0o700, parents=True, exist_ok=True)
         members.mkdir(parents=True, exist_ok=True)
     except OSError as error:
-        raise Wrong(f"cannot create {error.filename}: {error.strerror}") from error
+        raise InvalidCommand(f"cannot create {error.filename}: {error.strerror}") from error
 
 
-def team_settings(given: Sequence[str]) -> dict[str, Any]:
+def parse_team_settings(given: Sequence[str]) -> dict[str, Any]:
     """Parse ``KEY=VALUE`` settings and check each by the rule of its key; raises ``Wrong``."""
     found: dict[str, Any] = {}
     for each in given:
         key, sign, value = each.partition("=")
-        if not sign or key not in SHARED:
-            raise Wrong(f"--set {each}: write KEY=VALUE, with one of the keys {', '.join(SHARED)}")
+        if not sign or key not in SHARED_KEYS:
+            raise InvalidCommand(f"--set {each}: write KEY=VALUE, with one of the keys {', '.join(SHARED_KEYS)}")
         try:
             whole = Settings.from_mapping({"node": {"name": "any"}}, COMMAND_LINE).with_flags(**{key: value})
         except BadSetting as error:
-            raise Wrong(str(error)) from error
+            raise InvalidCommand(str(error)) from error
         found[key] = getattr(whole.node, key)
     return found
 
 
-def settings_text(
+def format_settings(
     name: str, membership: str, roles: Sequence[str], at: str | None, known: Sequence[str], team: Mapping[str, Any]
 ) -> str:
     """Return the text of a settings file for a new member; raises ``Wrong`` for an invalid value."""
@@ -182,17 +194,17 @@ def settings_text(
     if at is not None:
         host, colon, port = at.rpartition(":")
         if not colon or not port.isdecimal():
-            raise Wrong(f"--at {at}: write HOST:PORT")
+            raise InvalidCommand(f"--at {at}: write HOST:PORT")
         node.update(host=host.strip("[]"), port=int(port))
     tables = {"node": node, **({"web": {"host": "0.0.0.0"}} if "web" in roles else {})}
     try:
         Settings.from_mapping(tables, COMMAND_LINE)
     except BadSetting as error:
-        raise Wrong(str(error)) from error
+        raise InvalidCommand(str(error)) from error
     return tomli_w.dumps(tables)
 
 
-def written(path: Path, text: str) -> None:
+def write_settings(path: Path, text: str) -> None:
     """Create a settings file, unless it exists; raises ``Wrong``."""
     try:
         # Private, because users may add codes and passwords.
@@ -201,7 +213,7 @@ def written(path: Path, text: str) -> None:
     except FileExistsError:
         return
     except OSError as error:
-        raise Wrong(f"cannot write {path}: {error.strerror}") from error
+        raise InvalidCommand(f"cannot write {path}: {error.strerror}") from error
 
 
 if __name__ == "__main__":

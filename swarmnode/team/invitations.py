@@ -7,28 +7,28 @@ from collections.abc import Sequence
 from typing import Any
 
 from middleware.admission.statement import Invite
-from swarmnode.team.office import Answer, Desk, Known, day, known, options, run
+from swarmnode.team.common import Answer, CommandContext, VerifiedTeam, fetch_team, format_time, make_parser, run_verb
 
 OPEN, USED, EXPIRED, REVOKED = "open", "used", "expired", "revoked"
 
 
-def main(words: Sequence[str] | None = None, desk: Desk | None = None) -> int:
+def main(words: Sequence[str] | None = None, desk: CommandContext | None = None) -> int:
     """Run the command; returns its exit code."""
     purpose = "List the invitations that can be used; end one by swarm revoke."
-    invitations = options("invitations", purpose, needs_key=False, example="--all")
+    invitations = make_parser("invitations", purpose, needs_key=False, example="--all")
     invitations.add_argument("--all", action="store_true", help="also list used, expired and revoked invitations")
-    return run(invitations, words, desk, _list)
+    return run_verb(invitations, words, desk, _list)
 
 
-def _list(arguments: argparse.Namespace, desk: Desk) -> Answer:
+def _list(arguments: argparse.Namespace, desk: CommandContext) -> Answer:
     now = desk.wall()
-    found = known(arguments.node, desk)
-    rows = [_row(found, each, now) for each in found.roll.invites()]
+    found = fetch_team(arguments.node, desk)
+    rows = [_make_row(found, each, now) for each in found.membership_list.list_invitations()]
     rows = [row for row in rows if arguments.all or row["state"] == OPEN]
     width = max((len(row["name"]) for row in rows), default=0)
     lines = []
     for row in rows:
-        until = day(row["until"], has_time=True)
+        until = format_time(row["until"], has_time=True)
         line = f"{row['name']:{width}}  {', '.join(row['roles'])}  {row['left']} of {row['uses']} left"
         came = f"  joined: {', '.join(row['came'])}" if row["came"] else ""
         lines.append(f"{line}  until {until}  {row['state']}{came}")
@@ -36,14 +36,16 @@ def _list(arguments: argparse.Namespace, desk: Desk) -> Answer:
     return {"team": found.team, "invitations": rows}, [*lines, end] if lines else ["no open invitations"]
 
 
-def _row(found: Known, invite: Invite, now: float) -> dict[str, Any]:
+def _make_row(found: VerifiedTeam, invite: Invite, now: float) -> dict[str, Any]:
     """Return one invitation as plain data."""
-    came = [each.member.name for each in found.roll.admissions() if each.member.invitation == invite.public]
+    came = [
+        each.member.name for each in found.membership_list.list_admissions() if each.member.invitation == invite.public
+    ]
     left = max(0, invite.uses - len(came))
     state = OPEN if left else USED
     if invite.not_after <= now:
         state = EXPIRED
-    if found.roll.revoked(invite.public) is not None:
+    if found.membership_list.find_revocation(invite.public) is not None:
         state = REVOKED
     about = {"name": invite.name, "roles": list(invite.roles), "uses": invite.uses, "left": left}
     return about | {"until": invite.not_after, "state": state, "came": came, "key": invite.public.hex()}

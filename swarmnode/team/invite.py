@@ -6,62 +6,81 @@ import argparse
 import io
 from collections.abc import Sequence
 
-from middleware.admission.statement import MAX_USES, ROLES, YEAR
-from swarmnode.asker import Refusal
-from swarmnode.team.office import Answer, Desk, Wrong, known, operator_in, options, run, seconds, span, tell
+from middleware.admission.statement import DEFAULT_LIFE_S, MAX_USES, ROLES
+from swarmnode.control_client import Rejection
+from swarmnode.team.common import (
+    Answer,
+    CommandContext,
+    InvalidCommand,
+    fetch_team,
+    format_duration,
+    load_operator,
+    make_parser,
+    parse_duration,
+    publish_statement,
+    run_verb,
+)
 
-DAY = 86_400.0
-INVITED = tuple(role for role in ROLES if role != "bootstrap")
+DAY_S = 86_400.0
+INVITABLE_ROLES = tuple(role for role in ROLES if role != "bootstrap")
 
 
-def main(words: Sequence[str] | None = None, desk: Desk | None = None) -> int:
+def main(words: Sequence[str] | None = None, desk: CommandContext | None = None) -> int:
     """Run the command; returns its exit code."""
-    invite = options("invite", "Create a code by which a newcomer joins the team.", example="dog1 --expires 24h")
+    invite = make_parser("invite", "Create a code by which a newcomer joins the team.", example="dog1 --expires 24h")
     invite.add_argument("name", metavar="NAME", help="name of the newcomer")
-    invite.add_argument("--role", choices=INVITED, action="append", help="role; can be repeated (default: device)")
+    invite.add_argument(
+        "--role", choices=INVITABLE_ROLES, action="append", help="role; can be repeated (default: device)"
+    )
     invite.add_argument("--uses", type=int, default=1, metavar="N", help=f"number of newcomers, 1 to {MAX_USES}")
     invite.add_argument(
-        "--expires", type=seconds, default=DAY, metavar="TIME", help="validity of the code, such as 10m (default: 24h)"
+        "--expires",
+        type=parse_duration,
+        default=DAY_S,
+        metavar="TIME",
+        help="validity of the code, such as 10m (default: 24h)",
     )
     invite.add_argument(
         "--for",
         dest="life",
-        type=seconds,
-        default=float(YEAR),
+        type=parse_duration,
+        default=float(DEFAULT_LIFE_S),
         metavar="TIME",
         help="validity of the certificate (default: 365d); a year or more is renewed automatically",
     )
-    return run(invite, words, desk, _invite)
+    return run_verb(invite, words, desk, _invite)
 
 
-def _invite(arguments: argparse.Namespace, desk: Desk) -> Answer:
-    operator = operator_in(arguments.operator)
+def _invite(arguments: argparse.Namespace, desk: CommandContext) -> Answer:
+    operator = load_operator(arguments.operator)
     roles = arguments.role or ["device"]
     try:
         code, statement, terms = operator.invite(
             arguments.name, roles, arguments.uses, desk.wall(), arguments.expires, desk.rng, arguments.life
         )
     except ValueError as error:
-        raise Wrong(f"{error}: a name has 1 to 40 letters, digits, _ or -, and a code 1 to {MAX_USES} uses") from error
-    found = known(arguments.node, desk, operator)
-    if arguments.uses == 1 and arguments.name in {each.name for each in found.members(desk.wall())}:
-        raise Refusal(
+        raise InvalidCommand(
+            f"{error}: a name has 1 to 40 letters, digits, _ or -, and a code 1 to {MAX_USES} uses"
+        ) from error
+    found = fetch_team(arguments.node, desk, operator)
+    if arguments.uses == 1 and arguments.name in {each.name for each in found.list_members(desk.wall())}:
+        raise Rejection(
             f"the team already has a member {arguments.name}; choose another name, or revoke that member first"
         )
-    doors = found.doors
-    tell(arguments.node, desk, terms)
-    tell(arguments.node, desk, statement)
+    doors = found.bootstrap_addresses
+    publish_statement(arguments.node, desk, terms)
+    publish_statement(arguments.node, desk, statement)
     text = f"{code.text}@{','.join(doors)}" if doors else code.text
     answer = {"code": code.text, "at": list(doors), "text": text, "name": arguments.name, "roles": list(roles)}
     times = "once" if arguments.uses == 1 else f"{arguments.uses} times"
-    lines = [f"{code.text}   admits {arguments.name}, {times}, within {span(arguments.expires)}"]
+    lines = [f"{code.text}   admits {arguments.name}, {times}, within {format_duration(arguments.expires)}"]
     lines.append(f"On the newcomer:  swarm join {text}")
     if not doors:
         lines.append("No bootstrap node is reachable now; name one by: swarm join CODE --at HOST:PORT")
-    return answer, [*lines, *picture(text)]
+    return answer, [*lines, *render_qr_code(text)]
 
 
-def picture(text: str) -> list[str]:
+def render_qr_code(text: str) -> list[str]:
     """Return a QR code of ``text`` as characters; a hint if the library for it is missing."""
     try:
         import segno

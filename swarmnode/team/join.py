@@ -18,35 +18,35 @@ from twisted.internet.defer import Deferred
 from middleware.admission import code as codes
 from middleware.admission import keyfile
 from middleware.admission import membership as memberships
-from middleware.admission.code import Code
+from middleware.admission.code import JoinCode
 from middleware.admission.errors import BadCode, BadKeyFile
+from middleware.admission.join_client import JOIN_TIMEOUT_S, JoinClient
 from middleware.admission.membership import Membership
-from middleware.admission.newcomer import PATIENCE, Newcomer
-from middleware.admission.statement import NAME, sized
+from middleware.admission.statement import NAME_PATTERN, check_bytes
 from middleware.config.settings import COMMAND_LINE, NodeSettings, Settings
 from middleware.entangled.errors import EntangledError, RemoteError
 from middleware.entangled.network.interface import is_loopback
-from middleware.entangled.network.network import EVERYWHERE, Address
+from middleware.entangled.network.network import ANY_HOST, Address
 from middleware.errors import BadSetting
-from swarmnode.asker import Refusal
-from swarmnode.team.init import SHARED, settings_text, written
-from swarmnode.team.office import Answer, Desk, Wrong, options, run, seconds
+from swarmnode.control_client import Rejection
+from swarmnode.team.common import Answer, CommandContext, InvalidCommand, make_parser, parse_duration, run_verb
+from swarmnode.team.init import SHARED_KEYS, format_settings, write_settings
 
-JOINING = "swarm-node joining 1"
-Knocking = Callable[[Code, bytes, str, Sequence[Address], float], Membership]
-Around = Callable[[], Sequence[Address]]
+SEED_FILE_KIND = "swarm-node joining 1"
+SendJoinRequests = Callable[[JoinCode, bytes, str, Sequence[Address], float], Membership]
+FindNodes = Callable[[], Sequence[Address]]
 
 
 def main(
     words: Sequence[str] | None = None,
-    desk: Desk | None = None,
-    knocking: Knocking | None = None,
-    around: Around | None = None,
+    desk: CommandContext | None = None,
+    knocking: SendJoinRequests | None = None,
+    around: FindNodes | None = None,
 ) -> int:
     """Run the command; returns its exit code."""
     purpose = "Join a closed team with a code of its operator."
     example = "K9TJ7-17QR2-Z31JA-KH77T@192.168.1.10:8484"
-    join = options("join", purpose, needs_key=False, is_asked=False, example=example)
+    join = make_parser("join", purpose, needs_key=False, is_asked=False, example=example)
     join.add_argument("code", metavar="CODE", help="code shown by swarm invite, with or without @HOST:PORT")
     join.add_argument(
         "--at", metavar="HOST:PORT", action="append", default=[], help="bootstrap node (default: search the LAN)"
@@ -57,30 +57,34 @@ def main(
     join.add_argument("--name", metavar="NAME", default="", help="name of this member, if the code does not fix it")
     join.add_argument("--folder", metavar="DIR", type=Path, default=Path("."), help="folder of its files (default: .)")
     join.add_argument("--files", metavar="NAME", default="swarm", help="base name of its files (default: swarm)")
-    join.add_argument("--timeout", type=seconds, default=PATIENCE, metavar="TIME", help="maximum time (default: 20s)")
+    join.add_argument(
+        "--timeout", type=parse_duration, default=JOIN_TIMEOUT_S, metavar="TIME", help="maximum time (default: 20s)"
+    )
 
-    def work(arguments: argparse.Namespace, desk: Desk) -> Answer:
-        return _join(arguments, desk, knocking or _with_tunnels(arguments.tunnel), around or on_the_lan)
+    def work(arguments: argparse.Namespace, desk: CommandContext) -> Answer:
+        return _join(arguments, desk, knocking or _make_join_function(arguments.tunnel), around or find_lan_nodes)
 
-    return run(join, words, desk, work)
+    return run_verb(join, words, desk, work)
 
 
-def _join(arguments: argparse.Namespace, desk: Desk, knocking: Knocking, around: Around) -> Answer:
+def _join(arguments: argparse.Namespace, desk: CommandContext, knocking: SendJoinRequests, around: FindNodes) -> Answer:
     text, _, behind = arguments.code.partition("@")
     try:
-        code = codes.read(text)
+        code = codes.parse_code(text)
     except BadCode as error:
-        raise Wrong(str(error)) from error
-    if arguments.name and not re.fullmatch(NAME, arguments.name, re.ASCII):
-        raise Wrong(f"--name {arguments.name}: a name has 1 to 40 letters, digits, _ or -")
-    doors = [address for each in [*arguments.at, *filter(None, behind.split(","))] for address in addresses(each)]
+        raise InvalidCommand(str(error)) from error
+    if arguments.name and not re.fullmatch(NAME_PATTERN, arguments.name, re.ASCII):
+        raise InvalidCommand(f"--name {arguments.name}: a name has 1 to 40 letters, digits, _ or -")
+    doors = [address for each in [*arguments.at, *filter(None, behind.split(","))] for address in resolve_address(each)]
     path = arguments.folder / f"{arguments.files}.membership"
     if path.exists():
         # A code has a single use: do not spend it if the result cannot be stored.
-        raise Wrong(f"{path} is there already: this is a member; remove it to join again, or pass --files NAME")
+        raise InvalidCommand(
+            f"{path} is there already: this is a member; remove it to join again, or pass --files NAME"
+        )
     doors = doors or list(around())
     if not doors:
-        raise Wrong("no bootstrap node was named, and none replies on the LAN; pass --at HOST:PORT")
+        raise InvalidCommand("no bootstrap node was named, and none replies on the LAN; pass --at HOST:PORT")
     try:
         arguments.folder.mkdir(parents=True, exist_ok=True)
         seed_file = arguments.folder / f".{arguments.files}.joining"
@@ -90,21 +94,21 @@ def _join(arguments: argparse.Namespace, desk: Desk, knocking: Knocking, around:
     except BadKeyFile:
         raise
     except EntangledError as error:
-        raise Refusal(str(error)) from error
+        raise Rejection(str(error)) from error
     except OSError as error:
-        raise Wrong(f"cannot create {arguments.folder}: {error.strerror}") from error
+        raise InvalidCommand(f"cannot create {arguments.folder}: {error.strerror}") from error
     settings = arguments.folder / f"{arguments.files}.toml"
     name, roles = membership.member.name, membership.member.roles
-    known = [f"[{host}]:{port}" if ":" in host else f"{host}:{port}" for host, port in membership.known]
+    known = [f"[{host}]:{port}" if ":" in host else f"{host}:{port}" for host, port in membership.known_nodes]
     # The default host is loopback only; every address is used, because a laptop's addresses change.
-    host = {} if all(is_loopback(address.host) for address in membership.known) else {"host": EVERYWHERE}
+    host = {} if all(is_loopback(address.host) for address in membership.known_nodes) else {"host": ANY_HOST}
     own = {**host, **({"tunnels": ["auto", *arguments.tunnel]} if arguments.tunnel else {})}
-    given = {key: value for key, value in membership.settings.items() if key in SHARED}
-    text = settings_text(name, path.name, ["edge"], None, known, {**given, **own})
+    given = {key: value for key, value in membership.settings.items() if key in SHARED_KEYS}
+    text = format_settings(name, path.name, ["edge"], None, known, {**given, **own})
     is_kept = settings.exists() and settings.read_text(encoding="utf-8", errors="replace") != text
-    written(settings, text)
+    write_settings(settings, text)
     # The membership is written last: if it exists, the other files do.
-    memberships.made(path, membership)
+    memberships.create_membership_file(path, membership)
     seed_file.unlink(missing_ok=True)
     lines = [
         f"This machine is now {name}, a member of the team {membership.team} ({', '.join(roles)}).",
@@ -116,13 +120,13 @@ def _join(arguments: argparse.Namespace, desk: Desk, knocking: Knocking, around:
     ignored = sorted(set(membership.settings) - set(given))
     if ignored:
         lines.append(f"Ignored settings of the invitation, which a team cannot set: {', '.join(map(repr, ignored))}")
-    if membership.member.trouble(desk.wall()):
+    if membership.member.check_dates(desk.wall()):
         lines.append("The clock of this machine or of the bootstrap node is wrong; set it before you start the node")
     answer = {"team": membership.team, "name": name, "roles": list(roles), "membership": str(path)}
     return {**answer, "settings": str(settings)}, lines
 
 
-def _load_or_create_seed(path: Path, code: Code, desk: Desk) -> bytes:
+def _load_or_create_seed(path: Path, code: JoinCode, desk: CommandContext) -> bytes:
     """Return the newcomer's key, stored at ``path`` before it is sent.
 
     After an interrupted join the same key is sent again, so the code's use is not lost.
@@ -132,44 +136,44 @@ def _load_or_create_seed(path: Path, code: Code, desk: Desk) -> bytes:
         stored = keyfile.read(path)
         if stored.get("invitation") == invitation:
             try:
-                return sized(bytes.fromhex(stored["seed"]), 32)
+                return check_bytes(bytes.fromhex(stored["seed"]), 32)
             except (KeyError, ValueError, TypeError, RemoteError):
                 pass
     seed = desk.rng.randbytes(32)
-    keyfile.write(path, {"kind": JOINING, "invitation": invitation, "seed": seed.hex()})
+    keyfile.write(path, {"kind": SEED_FILE_KIND, "invitation": invitation, "seed": seed.hex()})
     return seed
 
 
-def addresses(text: str) -> list[Address]:
+def resolve_address(text: str) -> list[Address]:
     """Resolve ``HOST:PORT``; raises ``Wrong``."""
     host, colon, port = text.rpartition(":")
     if not colon or not port.isdecimal() or not 0 < int(port) < 65536:
-        raise Wrong(f"{text!r} is not an address; write HOST:PORT")
+        raise InvalidCommand(f"{text!r} is not an address; write HOST:PORT")
     try:
         found = socket.getaddrinfo(host.strip("[]"), int(port), type=socket.SOCK_DGRAM)
     except (OSError, UnicodeError) as error:
-        raise Wrong(f"no address is known for {host!r}; fix the name, or write a numeric address") from error
+        raise InvalidCommand(f"no address is known for {host!r}; fix the name, or write a numeric address") from error
     return list(dict.fromkeys(Address(str(each[4][0]), int(port)) for each in found))
 
 
-def on_the_lan() -> list[Address]:
+def find_lan_nodes() -> list[Address]:
     """Return the nodes on the LAN that reply, of any team; only the code's team accepts the request."""
-    from swarmnode.doctor.measure import on_lan
+    from swarmnode.doctor.measure import discover_on_lan
 
-    return [each.address for each in on_lan()]
+    return [each.address for each in discover_on_lan()]
 
 
-def _with_tunnels(tunnels: Sequence[str]) -> Knocking:
+def _make_join_function(tunnels: Sequence[str]) -> SendJoinRequests:
     """Return ``knocked`` with these tunnels and port 443 of each bootstrap node; raises ``Wrong``."""
     try:
         named = Settings.from_mapping({"node": {"name": "newcomer", "tunnels": ["auto", *tunnels]}}, COMMAND_LINE)
     except BadSetting as error:
-        raise Wrong(f"--tunnel {' '.join(tunnels)}: {error.remedy}") from error
-    return partial(knocked, settings=named.node)
+        raise InvalidCommand(f"--tunnel {' '.join(tunnels)}: {error.remedy}") from error
+    return partial(send_join_requests, settings=named.node)
 
 
-def knocked(
-    code: Code,
+def send_join_requests(
+    code: JoinCode,
     seed: bytes,
     wish: str,
     doors: Sequence[Address],
@@ -188,9 +192,9 @@ def knocked(
     from twisted.internet import reactor
     from twisted.internet.task import react
 
-    from middleware.entangled.kademlia.detour import AFTER_S
+    from middleware.entangled.kademlia.alternate_path import FALLBACK_AFTER_S
     from middleware.entangled.network.udp import UdpNetwork
-    from swarmnode.tunnels import with_tunnels
+    from swarmnode.tunnels import add_tunnels
 
     outcome: list[Membership | EntangledError] = []
 
@@ -198,14 +202,14 @@ def knocked(
         is_new = any(":" in door.host for door in doors)
         rng = random.SystemRandom()
         udp = partial(UdpNetwork, clock, "::" if is_new else "0.0.0.0")
-        network = with_tunnels(replace(settings, known_nodes=tuple(doors)), udp, clock, rng, os.environ)()
+        network = add_tunnels(replace(settings, known_nodes=tuple(doors)), udp, clock, rng, os.environ)()
         mapped = [
             Address(f"::ffff:{each.host}", each.port) if is_new and ":" not in each.host else each for each in doors
         ]
-        newcomer = Newcomer(code, seed, network, clock, rng, wish)
+        newcomer = JoinClient(code, seed, network, clock, rng, wish)
         work = newcomer.join(mapped, timeout)
         for way in getattr(network, "detours", ()):
-            clock.callLater(AFTER_S, newcomer.add, way)
+            clock.callLater(FALLBACK_AFTER_S, newcomer.add_address, way)
 
         def failed(failure: Any) -> None:
             failure.trap(EntangledError)
@@ -223,6 +227,9 @@ def knocked(
     if isinstance(found, EntangledError):
         raise found
     # A tunnel's address has no meaning for other nodes or after the next start.
-    known = [*(doors if found.known[0].is_virtual else ()), *(each for each in found.known if not each.is_virtual)]
+    known = [
+        *(doors if found.known_nodes[0].is_virtual else ()),
+        *(each for each in found.known_nodes if not each.is_virtual),
+    ]
     plain = dict.fromkeys(Address(host.removeprefix("::ffff:"), port) for host, port in known)
-    return replace(found, known=tuple(plain))
+    return replace(found, known_nodes=tuple(plain))

@@ -5,40 +5,40 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from typing import Any
 
-from agents.pushed import BehaviourKind
-from middleware.consensus.deployed import Make
-from middleware.deployment import frame
+from agents.behaviour_process import BehaviourKind
+from middleware.consensus.deployed_modules import Factory
+from middleware.deployment import module_channel
 
 
 class Loopback:
     """A conversation with a behaviour that answers at once, or on ``let`` if ``is_held`` is set."""
 
-    def __init__(self, make: Make, parameters: Mapping[str, Any] | None = None) -> None:
+    def __init__(self, make: Factory, parameters: Mapping[str, Any] | None = None) -> None:
         self.fault = ""
         self.facts: dict[str, Any] = {}
-        self.is_behind = False
+        self.has_unsent = False
         self.is_held = False
         self.is_closed = False
         self.asked: list[str] = []
         self._kind = BehaviourKind()
         self._thing = self._kind.make(make, [dict(parameters or {}), 1])
-        self.facts = self._kind.facts(self._thing)
+        self.facts = self._kind.describe_instance(self._thing)
         self._held: list[Callable[[], None]] = []
 
     @classmethod
-    def of(cls, make: Make) -> Callable[..., Loopback]:
+    def of(cls, make: Factory) -> Callable[..., Loopback]:
         """Return a factory of conversations with behaviours that ``make`` creates."""
         return lambda parameters, rng: cls(make, parameters)
 
-    def ask(self, method: str, arguments: list[Any], take: Callable[[bool, Any], None]) -> bool:
+    def send_request(self, method: str, arguments: list[Any], take: Callable[[bool, Any], None]) -> bool:
         """Call ``method`` of the behaviour and pass the result to ``take``."""
         if self.fault:
             return False
         self.asked.append(method)
-        number, _, carried = frame.unpack_question(frame.pack([1, method, arguments])[4:])
+        number, _, carried = module_channel.parse_request(module_channel.pack([1, method, arguments])[4:])
         try:
             content = self._kind.call(self._thing, method, carried)
-            answer = frame.unpack_answer(frame.pack([number, True, content])[4:])[1:]
+            answer = module_channel.parse_reply(module_channel.pack([number, True, content])[4:])[1:]
         except Exception as error:  # as the other process does
             answer = False, f"{type(error).__name__}: {error}"
         self._held.append(lambda: take(*answer))
@@ -52,7 +52,7 @@ class Loopback:
         for each in held:
             each()
 
-    def look(self) -> None:
+    def poll(self) -> None:
         """Do nothing: no events arrive without a call."""
 
     def close(self) -> None:

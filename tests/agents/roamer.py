@@ -12,19 +12,19 @@ from dataclasses import replace
 from random import Random
 
 from agents.context import Context
-from agents.means import Means
+from agents.motion import MotionCapabilities
 from agents.search import SearchAndApproach
-from drivers.bittle.gait import GAITS, Velocity, chosen
+from drivers.bittle.gait import GAITS, Velocity, select_gait
 from drivers.reading import Action, Description, Frame, Observation, Value
 from drivers.registry import describe
 from sim.robots.camera import Camera
 from sim.robots.dog import Motion
-from sim.robots.scene import loaded
+from sim.robots.scene import load_scene
 from sim.robots.sensor import Sensors
-from sim.robots.world import SUBSTEP, World
+from sim.robots.world import SUBSTEP_S, World
 
 STEPS = 6
-TICK = STEPS * SUBSTEP
+TICK = STEPS * SUBSTEP_S
 LIT = 0.35
 """The range in metres of the light bumpers of a Create 2."""
 TOUCH = 0.012
@@ -61,7 +61,7 @@ def quantised(description: Description, gaits: Mapping[str, Velocity] = GAITS) -
 
     def does(action: Action) -> Action:
         wished = clipped(description)(action)
-        _, done = chosen(wished["base.vx"], wished["base.wz"], gaits)
+        _, done = select_gait(wished["base.vx"], wished["base.wz"], gaits)
         return {"base.vx": done.vx, "base.wz": done.wz}
 
     return does
@@ -76,14 +76,14 @@ class Roamer:
         self.description = description or described(kind)
         make = {"bittle": quantised}.get(kind, clipped)
         self.does = does or make(self.description)
-        self.world = World(Random(seed), loaded("three-dogs"))
+        self.world = World(Random(seed), load_scene("three-dogs"))
         self.camera = Camera(Random(seed + 1), self.world)
         self.world.scatter(seed)
         self.world.place_target_at_random()
         self.dog = self.world.dogs["dog1"]
         self.dog.shape.unsafe_set_radius(self.description.radius)
         self.senses = Sensors(Random(seed + 2), self.world, self.dog)
-        self.means = Means(self.description)
+        self.means = MotionCapabilities(self.description)
         self.behaviour = SearchAndApproach({}, Random(seed + 3))
         self.behaviour.embody(self.means)
         self.now = 0.0
@@ -152,14 +152,14 @@ class Roamer:
         frame = None
         if self.now - self._frame_at >= 1.0 / self.description.rates["camera"]:
             self._frames, self._frame_at = self._frames + 1, self.now
-            frame = Frame(self._frames, 208, 160, self.camera.jpeg(self.dog), self.now)
+            frame = Frame(self._frames, 208, 160, self.camera.render_jpeg(self.dog), self.now)
         self.behaviour.look(Observation(self.now, self.now, self.sense(), frame=frame), self.now)
         action = act(self.now)
-        wished = self.means.fitted(action or {"base.vx": 0.0, "base.vy": 0.0, "base.wz": 0.0})
+        wished = self.means.remove_missing_axes(action or {"base.vx": 0.0, "base.vy": 0.0, "base.wz": 0.0})
         unknown = set(wished) - set(self.description.limits)
         assert not unknown, f"{self._kind} has no {unknown}"
         before, self.done = self.done, self.does(wished)
-        self.means.did(wished, self.done)
+        self.means.learn(wished, self.done)
         self.reversals += self.done.get("base.wz", 0.0) * before.get("base.wz", 0.0) < 0.0
         self._lag.append(Motion(*(self.done.get(key, 0.0) for key in ("base.vx", "base.vy", "base.wz"))))
         self._reckon()

@@ -9,8 +9,8 @@ from typing import Any
 
 from twisted.trial.unittest import SynchronousTestCase
 
-from agents.behaviour import KINDS, behaviour_for
-from agents.means import Means
+from agents.behaviour import KINDS, create_behaviour
+from agents.motion import MotionCapabilities
 from middleware.errors import MissingExtra, UnknownTask
 from middleware.tasks.task import Task
 from tests.agents.loopback import Loopback
@@ -21,33 +21,33 @@ TASK = Task("t1", "turn-around", "Turn")
 class BehaviourTests(SynchronousTestCase):
     def refusal(self, task: Task) -> str:
         """Return the error message of a task that gets no behaviour."""
-        return str(self.assertRaises(UnknownTask, behaviour_for, task, random.Random(1)))
+        return str(self.assertRaises(UnknownTask, create_behaviour, task, random.Random(1)))
 
     def test_known_kinds_are_made(self) -> None:
         """Each listed kind can be created, and has no cost before the first observation."""
         for kind in KINDS:
-            self.assertIsNone(behaviour_for(replace(TASK, kind=kind), random.Random(1)).cost)
+            self.assertIsNone(create_behaviour(replace(TASK, kind=kind), random.Random(1)).cost)
 
     def test_behaviour_is_told_what_its_body_can_do(self) -> None:
         """An installed or deployed behaviour receives the motion capabilities if it has the method ``embody``."""
-        told: list[Means] = []
+        told: list[MotionCapabilities] = []
 
         class Bodied:
             def __init__(self, parameters: object, rng: object) -> None: ...
 
-            def embody(self, means: Means) -> None:
+            def embody(self, means: MotionCapabilities) -> None:
                 told.append(means)
 
         class Other:
             def __init__(self, parameters: object, rng: object) -> None: ...
 
-        means = Means()
+        means = MotionCapabilities()
         deployed = {("behaviour", "bodied"): Loopback.of(Bodied), ("behaviour", "other"): Loopback.of(Other)}
         for kind in ("deployed:bodied", "deployed:other"):
-            behaviour_for(replace(TASK, kind=kind), random.Random(1), deployed, means)
+            create_behaviour(replace(TASK, kind=kind), random.Random(1), deployed, means)
         self.assertEqual([vars(each) for each in told], [vars(means)])
-        turn: Any = behaviour_for(TASK, random.Random(1), None, means)
-        self.assertIs(turn._means, means)
+        turn: Any = create_behaviour(TASK, random.Random(1), None, means)
+        self.assertIs(turn._motion, means)
 
     def test_unknown_kind_names_those_there_are(self) -> None:
         """An unknown kind is refused with the list of the known kinds."""
@@ -59,7 +59,7 @@ class BehaviourTests(SynchronousTestCase):
     def test_kind_from_the_wire_is_never_imported(self) -> None:
         """A kind with the form ``module:name`` is unknown, and the node imports nothing."""
         sys.modules.pop("this", None)
-        for kind in ("this:s", "os:system", "subprocess:Popen", "agents.turn:TurnAround"):
+        for kind in ("this:s", "os:system", "subprocess:Popen", "agents.turn_around:TurnAround"):
             self.assertIn("no behaviour", self.refusal(replace(TASK, kind=kind)))
         self.assertNotIn("this", sys.modules)
 
@@ -81,5 +81,5 @@ class BehaviourTests(SynchronousTestCase):
             sys.modules.update(hidden)
 
         self.addCleanup(restore)
-        error = self.assertRaises(MissingExtra, behaviour_for, replace(TASK, kind="find-target"), random.Random(1))
+        error = self.assertRaises(MissingExtra, create_behaviour, replace(TASK, kind="find-target"), random.Random(1))
         self.assertIn("pip install 'swarm-node[vision]'", str(error))

@@ -9,9 +9,9 @@ from random import Random
 from twisted.trial.unittest import SynchronousTestCase
 
 from agents.context import Context
-from agents.means import WALK, Means
+from agents.motion import WALK_SPEED_MPS, MotionCapabilities
 from agents.search import SearchAndApproach
-from agents.vision import Sighting
+from agents.vision import Detection
 from drivers.bittle.gait import Velocity
 from drivers.reading import Action, Observation, Value
 from tests.agents.roamer import Roamer, described, quantised
@@ -42,7 +42,7 @@ class BodyTests(SynchronousTestCase):
         """Check that the robot reaches the target, stops close to it, and touched nothing faster than a slow walk."""
         self.assertTrue(robot.reach(limit), "never done")
         self.assertLessEqual(robot.gap, 0.15)
-        self.assertLessEqual(robot.hardest, max(WALK, robot.means.walk) + 0.01)
+        self.assertLessEqual(robot.hardest, max(WALK_SPEED_MPS, robot.means.walk) + 0.01)
 
     def test_robots_that_feel_their_way_find_it_too(self) -> None:
         """A robot without a ranger walks for a minute, bumps no faster than it walks, and then reaches the target."""
@@ -131,9 +131,9 @@ class BumpTests(SynchronousTestCase):
             now += 0.05
             values = {"odom.x": 1.0, "odom.y": 1.0, "odom.yaw": math.remainder(yaw, math.tau)}
             behaviour.look(Observation(now, now, values), now)
-            action = means.fitted(behaviour.search(now))
+            action = means.remove_missing_axes(behaviour.search(now))
             done = robot.does(action)
-            means.did(action, done)
+            means.learn(action, done)
             yaw += done["base.wz"] * 0.05
             if done["base.vx"] < 0.0:
                 backed.append(now)
@@ -144,7 +144,7 @@ class Told:
     """A behaviour on a robot of this kind that receives target positions instead of camera frames."""
 
     def __init__(self, kind: str) -> None:
-        self.means = Means(described(kind))
+        self.means = MotionCapabilities(described(kind))
         self.behaviour = SearchAndApproach({}, Random(1))
         self.behaviour.embody(self.means)
         self.now = 0.0
@@ -155,7 +155,7 @@ class Told:
         told: dict[str, Value] = {"odom.x": 0.0, "odom.y": 0.0, "odom.yaw": 0.0}
         told |= {key.replace("_", "."): value for key, value in values.items()}
         self.behaviour.look(Observation(self.now, self.now, told), self.now)
-        self.behaviour._add_sighting(self.now, self.behaviour._pose, Sighting(bearing, distance, True))
+        self.behaviour._add_detection(self.now, self.behaviour._pose, Detection(bearing, distance, True))
 
     def execute(self) -> Action | None:
         """Return the next action."""

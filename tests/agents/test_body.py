@@ -1,4 +1,4 @@
-"""Tests of ``agents.body``: the actions that reach a robot, and the capabilities learned from their execution."""
+"""Tests of ``agents.robot``: the actions that reach a robot, and the capabilities learned from their execution."""
 
 from __future__ import annotations
 
@@ -7,9 +7,9 @@ from typing import cast
 from twisted.internet.task import Clock
 from twisted.trial.unittest import SynchronousTestCase
 
-from agents.body import Body
-from agents.engagement import Deed
-from agents.means import STAND
+from agents.engagement import RobotCommand
+from agents.motion import STAND
+from agents.robot import AgentRobot
 from drivers.driver import Driver, Permit
 from drivers.reading import Action
 from tests.agents.roamer import described, quantised
@@ -32,12 +32,12 @@ class Robot:
 class BodyTests(SynchronousTestCase):
     def setUp(self) -> None:
         self.robot = Robot()
-        self.body = Body(cast(Driver, self.robot), Clock(), lambda seen: None, lambda why: None)
+        self.body = AgentRobot(cast(Driver, self.robot), Clock(), lambda seen: None, lambda why: None)
 
     def do(self, **wished: float) -> None:
         """Send these velocities to the body; all other axes rest."""
         action = {**STAND, **{f"base.{axis}": value for axis, value in wished.items()}}
-        self.assertTrue(self.body.do(Deed(action, Permit(1, 1.0))))
+        self.assertTrue(self.body.perform(RobotCommand(action, Permit(1, 1.0))))
 
     def test_robot_is_asked_for_nothing_that_it_has_not(self) -> None:
         """A robot without a sideways gait receives no sideways value, which its driver would refuse as unknown."""
@@ -46,6 +46,6 @@ class BodyTests(SynchronousTestCase):
 
     def test_what_it_really_does_is_learned(self) -> None:
         """A robot that turns faster than requested makes the aim of all its behaviours coarser."""
-        self.assertFalse(self.body.means.is_coarse)
+        self.assertFalse(self.body.motion.is_coarse)
         self.do(wz=0.15)
-        self.assertTrue(self.body.means.is_coarse)
+        self.assertTrue(self.body.motion.is_coarse)

@@ -1,4 +1,4 @@
-"""Tests of ``agents.part``: the council of a task survives the successive failure of its members."""
+"""Tests of ``agents.participation``: the council of a task survives the successive failure of its members."""
 
 from __future__ import annotations
 
@@ -8,30 +8,30 @@ from typing import Any
 from twisted.internet.defer import Deferred
 from twisted.trial.unittest import SynchronousTestCase
 
-from agents.catalogue import task_named
-from agents.part import LOOK_AGAIN_S, VISIT_S
-from middleware.consensus.lease.charter import pin
+from agents.catalogue import create_task
+from agents.participation import COUNCIL_CHECK_S, SUCCESSOR_RETRY_S
+from middleware.consensus.lease.charter import create_charter
 from middleware.entangled.record import Record
-from middleware.tasks.councils import SILENT
+from middleware.tasks.council_manager import SILENT_S
 from middleware.tasks.order import PAUSE, RESUME, Order
-from middleware.tasks.task import COMPLETED, TASKS, Task, council_of, outcome_of, tasks_of
-from swarmnode.rehearsal import VirtualTeam
+from middleware.tasks.task import COMPLETED, TASKS, Task, find_outcome, parse_tasks, with_newest_council
+from swarmnode.simulated_team import SimulatedTeam
 
 OTHERS = ("witness1", "witness2", "witness3")
-LATEST = SILENT + LOOK_AGAIN_S + VISIT_S + 2.0
+LATEST = SILENT_S + SUCCESSOR_RETRY_S + COUNCIL_CHECK_S + 2.0
 """The time in seconds within which a silent member is replaced."""
 TURNS = 60.0
 
 
 class CaretakerTests(SynchronousTestCase):
     def setUp(self) -> None:
-        self.made(VirtualTeam(3, 0.1, others=OTHERS))
+        self.made(SimulatedTeam(3, 0.1, others=OTHERS))
 
-    def made(self, team: VirtualTeam) -> None:
+    def made(self, team: SimulatedTeam) -> None:
         """Use ``team`` in this test."""
         self.team = team
         self.addCleanup(self.team.stop)
-        self.node = self.team.services[VirtualTeam.BOOTSTRAP].assembly.node
+        self.node = self.team.services[SimulatedTeam.BOOTSTRAP].assembly.node
         self.records: list[Record] = []
         self.group: list[Record] = []
         self.node.watch_tasks(lambda records: self.records.__setitem__(slice(None), records))
@@ -39,17 +39,17 @@ class CaretakerTests(SynchronousTestCase):
 
     def given(self, *council: str, turns: float = TURNS) -> None:
         """Write a long turn-around task with these nodes as its council."""
-        task = replace(task_named("turn-around", "turn", 0.0), waiting_period=1.0, parameters={"turns": turns})
+        task = replace(create_task("turn-around", "turn", 0.0), waiting_period=1.0, parameters={"turns": turns})
         members = tuple(self.team.services[name].assembly.node.entangled.contact for name in council)
-        task = task.with_council(pin(self.node.entangled.identity, "turn", members))
-        put = self.node.entangled.put(TASKS, "turn", task.packed(), "team")
+        task = task.with_council(create_charter(self.node.entangled.identity, "turn", members))
+        put = self.node.entangled.put(TASKS, "turn", task.pack(), "team")
         self.team.clock.advance(0.5)
         self.successResultOf(put)
 
     @property
     def task(self) -> Task:
         """Return the task with its newest council."""
-        return council_of(tasks_of(self.records)["turn"], self.group)
+        return with_newest_council(parse_tasks(self.records)["turn"], self.group)
 
     @property
     def council(self) -> list[str]:
@@ -59,7 +59,7 @@ class CaretakerTests(SynchronousTestCase):
 
     def moving(self) -> list[str]:
         """Return the names of the dogs that move."""
-        return [name for name, dog in self.team.yard.world.dogs.items() if dog.is_moving]
+        return [name for name, dog in self.team.simulator.world.dogs.items() if dog.is_moving]
 
     def run_for(self, seconds: float) -> None:
         """Advance the time in steps, and check in each that at most one dog moves."""
@@ -82,10 +82,10 @@ class CaretakerTests(SynchronousTestCase):
             self.team.kill(gone)
             self.run_for(LATEST)
             self.assertNotIn(gone, self.council)
-        outcome = outcome_of(self.task, self.group)
+        outcome = find_outcome(self.task, self.group)
         while outcome is None and self.team.clock.seconds() < 400.0:
             self.run_for(5.0)
-            outcome = outcome_of(self.task, self.group)
+            outcome = find_outcome(self.task, self.group)
         assert outcome is not None
         self.assertEqual(outcome.outcome, COMPLETED)
         self.assertNotEqual(outcome.by, first)
@@ -104,7 +104,7 @@ class CaretakerTests(SynchronousTestCase):
 
     def test_nobody_to_follow(self) -> None:
         """If no node is left to replace a dead member, the council stays, and the acting agent is not interrupted."""
-        self.made(VirtualTeam(4, 0.1, dogs=("dog1", "dog2")))
+        self.made(SimulatedTeam(4, 0.1, dogs=("dog1", "dog2")))
         self.given("vaio", "dog1", "dog2")
         self.run_for(3.0)
         (first,) = self.moving()
@@ -114,6 +114,6 @@ class CaretakerTests(SynchronousTestCase):
 
     def ordered(self, word: str) -> Deferred[Any]:
         """Write a pause or resume order."""
-        done = self.node.order("turn", Order(word, "test", 0.0).packed())
+        done = self.node.record_order("turn", Order(word, "test", 0.0).pack())
         self.team.clock.advance(0.5)
         return done

@@ -4,39 +4,43 @@ from __future__ import annotations
 
 from twisted.trial.unittest import SynchronousTestCase
 
-from agents.catalogue import DEMO, TASKS, task_named
+from agents.catalogue import DEMO_TASK, TASKS, create_task
 from drivers.registry import describe
-from middleware.consensus.strategy import strategy_for
+from middleware.consensus.strategy import load_strategy
 from middleware.entangled.record import Record
 from middleware.errors import UnknownTask
 from middleware.tasks.task import TASKS as KEY
-from middleware.tasks.task import refusals, task_of
+from middleware.tasks.task import find_unmet_requirements, parse_task
 
 
 class CatalogueTests(SynchronousTestCase):
     def test_tasks_survive_the_wire(self) -> None:
         """Each predefined task survives encoding in a valid record, and its strategy exists."""
         for name in TASKS:
-            task = task_named(name, "t1", 5.0)
-            record = Record(KEY, "t1", bytes(32), 1, "team", 60.0, task.packed())
-            self.assertEqual(task_of(record), task)
-            strategy_for(task.strategy)
+            task = create_task(name, "t1", 5.0)
+            record = Record(KEY, "t1", bytes(32), 1, "team", 60.0, task.pack())
+            self.assertEqual(parse_task(record), task)
+            load_strategy(task.strategy)
 
     def test_yards_dog_can_do_what_it_is_made_for(self) -> None:
         """A simulated dog meets the requirements of the demonstration, and lacks the gripper to fetch the ball."""
         capabilities = describe("sim", {}, "dog1").capabilities
-        self.assertEqual(refusals(capabilities, TASKS[DEMO].requirements), [])
-        self.assertEqual(refusals(capabilities, TASKS["turn-around"].requirements), [])
-        self.assertEqual(refusals(capabilities, TASKS["fetch-the-ball"].requirements), ["has no gripper"])
+        self.assertEqual(find_unmet_requirements(capabilities, TASKS[DEMO_TASK].requirements), [])
+        self.assertEqual(find_unmet_requirements(capabilities, TASKS["turn-around"].requirements), [])
+        self.assertEqual(
+            find_unmet_requirements(capabilities, TASKS["fetch-the-ball"].requirements), ["has no gripper"]
+        )
 
     def test_phone_can_watch_and_no_more(self) -> None:
         """A phone meets the requirements to watch the target; the tasks that need a mobile base refuse it."""
         phone, dog = describe("phone", {}).capabilities, describe("sim", {}, "dog1").capabilities
-        self.assertEqual([refusals(each, TASKS["watch-target"].requirements) for each in (phone, dog)], [[], []])
-        self.assertIn("has no base2d", refusals(phone, TASKS[DEMO].requirements))
-        self.assertIn("has no base2d", refusals(phone, TASKS["turn-around"].requirements))
+        self.assertEqual(
+            [find_unmet_requirements(each, TASKS["watch-target"].requirements) for each in (phone, dog)], [[], []]
+        )
+        self.assertIn("has no base2d", find_unmet_requirements(phone, TASKS[DEMO_TASK].requirements))
+        self.assertIn("has no base2d", find_unmet_requirements(phone, TASKS["turn-around"].requirements))
 
     def test_unknown_name_lists_the_known(self) -> None:
         """An unknown task name is refused with the list of the known names."""
-        error = self.assertRaises(UnknownTask, task_named, "dance", "t1", 0.0)
+        error = self.assertRaises(UnknownTask, create_task, "dance", "t1", 0.0)
         self.assertIn("'dance'; known tasks: fetch-the-ball, find-red-target, turn-around, watch-target", str(error))

@@ -10,10 +10,10 @@ from hypothesis import strategies as st
 from twisted.trial.unittest import SynchronousTestCase
 
 from agents.decision import Decision, decide
-from middleware.consensus.bidding.panel import PATIENCE
-from middleware.consensus.guard import Guard
+from middleware.consensus.bidding.reporters import ANNOUNCEMENT_TIMEOUT_S
+from middleware.consensus.guarded_strategy import GuardedStrategy
 from middleware.consensus.strategies.nearest import Nearest
-from middleware.consensus.strategy import strategy_for
+from middleware.consensus.strategy import load_strategy
 from middleware.directory.presence import EXECUTING, SEARCHING, WAITING
 from middleware.tasks.task import Member
 
@@ -41,7 +41,7 @@ REPORTS = st.lists(
 
 def by(strategy: str, *members: Member) -> Decision:
     """Return the decision of another strategy, long after the waiting period."""
-    return decide(members, Guard(strategy_for(strategy)), 0.1, 8.0, 100.0)
+    return decide(members, GuardedStrategy(load_strategy(strategy)), 0.1, 8.0, 100.0)
 
 
 class ReadingTests(SynchronousTestCase):
@@ -148,8 +148,8 @@ class PanelTests(SynchronousTestCase):
         """Complete reports of the subset decide nothing until the council answers or a timeout ends."""
         panel = member("a", 2.0), member("b", 1.0)
         self.assertIsNone(self.panelled(0.0, False, *panel))
-        self.assertIsNone(self.panelled(8.0 + PATIENCE - 0.1, False, *panel))
-        self.assertEqual(self.panelled(8.0 + PATIENCE, False, *panel), "b")
+        self.assertIsNone(self.panelled(8.0 + ANNOUNCEMENT_TIMEOUT_S - 0.1, False, *panel))
+        self.assertEqual(self.panelled(8.0 + ANNOUNCEMENT_TIMEOUT_S, False, *panel), "b")
 
     def test_word_of_the_council_decides(self) -> None:
         """After the council's answer, or while an agent acts, no missing report is waited for."""

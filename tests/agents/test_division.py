@@ -1,4 +1,4 @@
-"""Tests of ``agents.division``: each agent divides the tasks of a group by the same reports."""
+"""Tests of ``agents.task_group``: each agent divides the tasks of a group by the same reports."""
 
 from __future__ import annotations
 
@@ -11,10 +11,10 @@ from typing import Any
 from twisted.trial.unittest import SynchronousTestCase
 
 from agents.decision import Decision, decide
-from agents.division import GATHERING, Division, group_of
-from agents.loop import due
-from middleware.consensus.guard import Guard
-from middleware.consensus.strategy import strategy_for
+from agents.loop import select_participation
+from agents.task_group import GROUP_SETTLE_S, TaskGroup, get_group_key
+from middleware.consensus.guarded_strategy import GuardedStrategy
+from middleware.consensus.strategy import load_strategy
 from middleware.directory.presence import EXECUTING, SEARCHING, WAITING
 from middleware.tasks.task import Member, Task
 from tests.invariants.tasks import Groups
@@ -38,9 +38,9 @@ def members(costs: dict[str, float | None], acting: str = "") -> list[Member]:
 
 
 class DivisionTests(SynchronousTestCase):
-    def division(self, costs: Costs, strategy: str = "group_optimal", **acting: str) -> Division:
+    def division(self, costs: Costs, strategy: str = "group_optimal", **acting: str) -> TaskGroup:
         """Return the division of all tasks after the gathering period; ``acting`` maps a task to its acting agent."""
-        division = Division(Guard(strategy_for(strategy)))
+        division = TaskGroup(GuardedStrategy(load_strategy(strategy)))
         for name, row in costs.items():
             here = members(row, acting.get(name, ""))
             division.join(task(name), lambda now, here=here: here, 0.0)  # type: ignore[misc]
@@ -51,7 +51,7 @@ class DivisionTests(SynchronousTestCase):
         division = self.division(costs, **acting)
         found = {}
         for name, row in costs.items():
-            share = division.share(task(name), now, since)
+            share = division.make_strategy(task(name), now, since)
             found[name] = decide(members(row, acting.get(name, "")), share, 0.1, 8.0, since)
         return found
 
@@ -83,7 +83,7 @@ class DivisionTests(SynchronousTestCase):
         self.assertNotEqual(first["t1"].digest, other["t1"].digest)
         self.assertNotEqual(first["t1"].basis, other["t1"].basis)
         one_by_one = self.division(costs, "nearest")
-        shares = [one_by_one.share(task(name), 50.0, 40.0).find([]) for name in costs]
+        shares = [one_by_one.make_strategy(task(name), 50.0, 40.0).find([]) for name in costs]
         self.assertEqual(len({point.digest for point in shares}), 1)
 
     def test_more_tasks_than_agents(self) -> None:
@@ -104,13 +104,16 @@ class DivisionTests(SynchronousTestCase):
             self.assertEqual(self.assigned({"t1": {"a": 1.0, "b": cost}}, t1="a"), {"t1": given})
         costs: Costs = {"t1": {"a": 1.0, "b": 0.95}, "t2": {"b": 9.0}}
         for strategy in ("group_optimal", "cbba"):
-            points = self.division(costs, strategy, t1="a").share(task("t2"), 50.0, 40.0).find([])
+            points = self.division(costs, strategy, t1="a").make_strategy(task("t2"), 50.0, 40.0).find([])
             self.assertEqual(points.assigned_agent, "b", strategy)
 
     def test_group_is_gathered_first(self) -> None:
         """No agent is assigned before the gathering period ends; an agent that acts already continues."""
         costs: Costs = {"t1": {"a": 1.0, "b": 0.1}, "t2": {"a": 2.0, "b": 2.0}}
-        for now, given, why in ((GATHERING - 0.1, None, "waiting for the rest of the group"), (GATHERING, "b", "")):
+        for now, given, why in (
+            (GROUP_SETTLE_S - 0.1, None, "waiting for the rest of the group"),
+            (GROUP_SETTLE_S, "b", ""),
+        ):
             decision = self.decided(costs, now)["t1"]
             self.assertEqual(decision.assigned, given)
             self.assertTrue(decision.why.startswith(why))
@@ -129,10 +132,10 @@ class DivisionTests(SynchronousTestCase):
         """Tasks with the same group, strategy and requirements are divided together; a task without a group is not."""
         one = task("t1", requirements={"camera": {"width": 1, "colour": "rgb"}, "legs": {}})
         two = task("t2", requirements={"legs": {}, "camera": {"colour": "rgb", "width": 1}})
-        self.assertEqual(group_of(one), group_of(two))
+        self.assertEqual(get_group_key(one), get_group_key(two))
         for other in (replace(two, group="h"), replace(two, strategy="cbba"), replace(two, requirements={})):
-            self.assertNotEqual(group_of(one), group_of(other))
-        self.assertIsNone(group_of(replace(one, group="")))
+            self.assertNotEqual(get_group_key(one), get_group_key(other))
+        self.assertIsNone(get_group_key(replace(one, group="")))
 
     def test_schedules(self) -> None:
         """In random schedules each task ends once, no agent acts on two tasks, and all agents agree."""
@@ -151,16 +154,16 @@ class DueTests(SynchronousTestCase):
     def test_given_task_has_it(self) -> None:
         """The robot works on its agent's assigned task, unless it acts on another one or records its outcome."""
         other, given = self.part(None), self.part(assigned="a")
-        self.assertIs(due([other, given], other), given)
+        self.assertIs(select_participation([other, given], other), given)
         for holder in (self.part(is_acting=True), self.part(is_free=False)):
-            self.assertIs(due([given, holder], holder), holder)
+            self.assertIs(select_participation([given, holder], holder), holder)
 
     def test_else_what_it_cannot_tell_yet(self) -> None:
         """Without an assigned task the robot measures a task of unknown cost; if there is none, it keeps its task."""
         told, blind, also = self.part(), self.part(None), self.part(None, assigned="b")
-        self.assertIs(due([told, blind, also], told), blind)
-        self.assertIs(due([told, blind, also], also), also)
-        self.assertIs(due([told, blind], None), blind)
+        self.assertIs(select_participation([told, blind, also], told), blind)
+        self.assertIs(select_participation([told, blind, also], also), also)
+        self.assertIs(select_participation([told, blind], None), blind)
         last = self.part(assigned="b")
-        self.assertIs(due([told, last], last), last)
-        self.assertIs(due([told, last], None), told)
+        self.assertIs(select_participation([told, last], last), last)
+        self.assertIs(select_participation([told, last], None), told)

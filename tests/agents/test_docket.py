@@ -1,12 +1,12 @@
-"""Tests of ``agents.docket``: the task that uses the robot, and the tasks that have ended."""
+"""Tests of ``agents.task_queue``: the task that uses the robot, and the tasks that have ended."""
 
 from __future__ import annotations
 
 from twisted.trial.unittest import SynchronousTestCase
 
-from agents.docket import KEPT, MOST, Docket, next_task
-from middleware.entangled.record import TOLERATED_ABSENCE
-from middleware.tasks.task import MAX_LEASE_TTL, Task
+from agents.task_queue import MAX_FOLLOWED, TOMBSTONE_TTL_S, TaskQueue, select_task
+from middleware.entangled.record import TOLERATED_ABSENCE_S
+from middleware.tasks.task import MAX_LEASE_TTL_S, Task
 
 
 def task(name: str, created: float = 0.0, priority: int = 0) -> Task:
@@ -20,26 +20,26 @@ OLD, NEW, URGENT = task("old", 1.0), task("new", 2.0), task("urgent", 3.0, 5)
 class DocketTests(SynchronousTestCase):
     def test_order(self) -> None:
         """The task with the highest priority is first, then the oldest; the number of followed tasks is limited."""
-        docket = Docket()
+        docket = TaskQueue()
         for one in (NEW, URGENT, OLD):
             docket.add(one)
-        self.assertEqual(docket.followed(), [URGENT, OLD, NEW])
-        for number in range(2 * MOST):
+        self.assertEqual(docket.list_followed(), [URGENT, OLD, NEW])
+        for number in range(2 * MAX_FOLLOWED):
             docket.add(task(f"t{number}", 9.0))
-        self.assertEqual(len(docket.followed()), MOST)
+        self.assertEqual(len(docket.list_followed()), MAX_FOLLOWED)
 
     def test_ended_task_never_starts_again(self) -> None:
         """An ended task is not accepted again within the longest lease plus the longest absence of a node."""
-        docket = Docket()
+        docket = TaskQueue()
         docket.add(OLD)
-        docket.bury("old", 0.0)
+        docket.mark_over("old", 0.0)
         self.assertFalse(docket.is_new("old"))
         self.assertFalse(docket.add(OLD))
-        docket.forget([], TOLERATED_ABSENCE + MAX_LEASE_TTL)
+        docket.expire_tombstones([], TOLERATED_ABSENCE_S + MAX_LEASE_TTL_S)
         self.assertFalse(docket.add(OLD))
-        docket.forget(["old"], 2 * KEPT)
+        docket.expire_tombstones(["old"], 2 * TOMBSTONE_TTL_S)
         self.assertFalse(docket.add(OLD))
-        docket.forget([], 2 * KEPT)
+        docket.expire_tombstones([], 2 * TOMBSTONE_TTL_S)
         self.assertTrue(docket.is_new("old"))
 
 
@@ -47,9 +47,9 @@ class NextTaskTests(SynchronousTestCase):
     def test_who_gets_the_body(self) -> None:
         """The first task in order uses the robot, unless the present one must not stop or acts at equal priority."""
         every = [NEW, OLD, URGENT]
-        self.assertIs(next_task(every, None, True), URGENT)
-        self.assertIs(next_task(every, OLD, True), URGENT)
-        self.assertIs(next_task(every, OLD, False), OLD)
-        self.assertIs(next_task([OLD, NEW], NEW, True), OLD)
-        self.assertIs(next_task([OLD, NEW], NEW, False), NEW)
-        self.assertIsNone(next_task([], None, True))
+        self.assertIs(select_task(every, None, True), URGENT)
+        self.assertIs(select_task(every, OLD, True), URGENT)
+        self.assertIs(select_task(every, OLD, False), OLD)
+        self.assertIs(select_task([OLD, NEW], NEW, True), OLD)
+        self.assertIs(select_task([OLD, NEW], NEW, False), NEW)
+        self.assertIsNone(select_task([], None, True))

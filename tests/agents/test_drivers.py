@@ -12,20 +12,20 @@ from twisted.internet.task import Clock, LoopingCall
 from twisted.trial.unittest import SynchronousTestCase
 
 from agents.context import Context
-from agents.means import Means
+from agents.motion import MotionCapabilities
 from agents.search import SearchAndApproach
 from drivers.driver import Driver, Permit
 from drivers.link import MemoryConnector
 from drivers.reading import Frame, Observation, Value
-from drivers.registry import driver_for
+from drivers.registry import create_driver
 from sim.robots.camera import Camera
 from sim.robots.emulator.aibo_dog import AiboEmulator
 from sim.robots.emulator.bittle import Bittle
 from sim.robots.emulator.create2 import Create2
 from sim.robots.emulator.rosbridge import RosbridgeRobot
-from sim.robots.scene import FOOTPRINT, loaded
+from sim.robots.scene import FOOTPRINT_RADIUS_M, load_scene
 from sim.robots.sensor import Sensors
-from sim.robots.world import SUBSTEP, World
+from sim.robots.world import SUBSTEP_S, World
 from tests.agents.roamer import filming
 
 STEPS = 2
@@ -39,7 +39,7 @@ class DogBody:
     """A simulated dog in a separate world, moved and sensed by an emulator."""
 
     def __init__(self, clock: Clock, seed: int) -> None:
-        self.world = World(Random(seed), loaded("three-dogs"))
+        self.world = World(Random(seed), load_scene("three-dogs"))
         self.world.scatter(seed)
         self.world.place_target_at_random()
         self.dog = self.world.dogs["dog1"]
@@ -47,7 +47,7 @@ class DogBody:
         self._camera = Camera(Random(seed + 2), self.world)
         self._loop = LoopingCall(self._turn)
         self._loop.clock = clock
-        self._loop.start(STEPS * SUBSTEP)
+        self._loop.start(STEPS * SUBSTEP_S)
 
     def drive(self, vx: float, vy: float, wz: float) -> None:
         """Set the velocity."""
@@ -63,7 +63,7 @@ class DogBody:
 
     def picture(self, is_halved: bool = False) -> bytes | None:
         """Return a camera frame."""
-        return self._camera.jpeg(self.dog, is_halved)
+        return self._camera.render_jpeg(self.dog, is_halved)
 
     def _turn(self) -> None:
         for _ in range(STEPS):
@@ -77,14 +77,14 @@ def driven(kind: str, body: DogBody, clock: Clock) -> Driver:
     if kind == "aibo":
         emulator = AiboEmulator(clock, body, Random(1))
         emulator.start()
-        return driver_for(kind, {"host": "dog"}, "robot", clock, emulator.connector())
+        return create_driver(kind, {"host": "dog"}, "robot", clock, emulator.connector())
     if kind == "rosbridge":
         emulator = RosbridgeRobot(clock, body, Random(1))
         emulator.start()
         options = {"image_topic": "/camera/image_raw/compressed", "camera_lens": 56.9}
-        return driver_for(kind, options, "robot", clock, MemoryConnector(clock, emulator.accept))
+        return create_driver(kind, options, "robot", clock, MemoryConnector(clock, emulator.accept))
     emulator = (Create2 if kind == "create2" else Bittle)(body, clock, Random(1))
-    return driver_for(kind, {"port": "memory"}, "robot", clock, MemoryConnector(clock, emulator.accept))
+    return create_driver(kind, {"port": "memory"}, "robot", clock, MemoryConnector(clock, emulator.accept))
 
 
 class DriverTests(SynchronousTestCase):
@@ -95,7 +95,7 @@ class DriverTests(SynchronousTestCase):
         driver = driven(kind, body, clock)
         fps = FPS.get(kind, 15.0)
         has_camera = "camera" in driver.description.capabilities
-        means = Means(driver.description if has_camera else filming(driver.description, fps))
+        means = MotionCapabilities(driver.description if has_camera else filming(driver.description, fps))
         behaviour = SearchAndApproach({}, Random(seed))
         behaviour.embody(means)
         enabled: list[bool] = []
@@ -119,8 +119,8 @@ class DriverTests(SynchronousTestCase):
                 for _ in range(100):
                     clock.advance(0.01)
                 return body, now - began
-            action = means.fitted(action)
-            means.did(action, driver.act(action, Permit(1, now + 0.5)))
+            action = means.remove_missing_axes(action)
+            means.learn(action, driver.act(action, Permit(1, now + 0.5)))
         self.fail(f"{kind} never reached the target")
 
     def test_robots_reach_the_target_over_their_own_wire(self) -> None:
@@ -132,6 +132,6 @@ class DriverTests(SynchronousTestCase):
                     target = body.world.target
                     assert target is not None
                     away = math.dist((target.x, target.y), (body.dog.x, body.dog.y))
-                    self.assertLess(away - target.radius - FOOTPRINT, TOUCH)
+                    self.assertLess(away - target.radius - FOOTPRINT_RADIUS_M, TOUCH)
                     self.assertEqual(body.world.collisions, 0)
                     self.assertLess(took, 60.0)

@@ -10,16 +10,16 @@ from twisted.trial.unittest import SynchronousTestCase
 
 from agents.behaviour import STAND
 from agents.context import Context
-from agents.engagement import SEARCH_TTL, Deed, Engagement
+from agents.engagement import SEARCH_TTL_S, Engagement, RobotCommand
 from agents.state import Event
 from drivers.driver import Permit
 from drivers.reading import Action, Observation
-from middleware.consensus.bidding.panel import Panel
-from middleware.consensus.guard import Guard
-from middleware.consensus.lease.lessee import Lease
+from middleware.consensus.bidding.reporters import Reporters
+from middleware.consensus.decision_record import DecisionRecord
+from middleware.consensus.guarded_strategy import GuardedStrategy
+from middleware.consensus.lease.lease_client import Lease
 from middleware.consensus.strategies.nearest import Nearest
 from middleware.consensus.strategy import Consensus, ConsensusAlgorithm, Report
-from middleware.consensus.verdict import Verdict
 from middleware.directory.presence import ASSIGNED, DONE, EXECUTING, SEARCHING, WAITING
 from middleware.entangled.clock import HeapClock
 from middleware.entangled.contact import Contact
@@ -128,33 +128,33 @@ class Recorder:
         self.told: list[Member] = []
         self.results: list[Result] = []
         self.said: list[str] = []
-        self.accounts: list[Verdict] = []
+        self.accounts: list[DecisionRecord] = []
         self.known: dict[str, Contact] = {}
         self.moves_for = 0.0
         self._events = events
 
-    def tell(self, member: Member) -> None:
+    def publish_report(self, member: Member) -> None:
         """Record a report."""
         self.told.append(member)
 
-    def conclude(self, result: Result) -> None:
+    def record_outcome(self, result: Result) -> None:
         """Record an outcome."""
         self.results.append(result)
 
-    def say(self, text: str) -> None:
+    def log_event(self, text: str) -> None:
         """Record a log line."""
         self.said.append(text)
 
-    def justify(self, verdict: Verdict) -> None:
+    def publish_decision_record(self, verdict: DecisionRecord) -> None:
         """Record a decision record."""
         self.accounts.append(verdict)
 
-    def halt(self) -> float:
+    def stop_robot(self) -> float:
         """Stop the robot, which may not receive the message."""
         self._events.append("halted")
         return self.moves_for
 
-    def reached(self, uuids: Sequence[str]) -> Sequence[Contact]:
+    def find_contacts(self, uuids: Sequence[str]) -> Sequence[Contact]:
         """Return the contacts of these agents."""
         return [self.known[uuid] for uuid in uuids if uuid in self.known]
 
@@ -173,9 +173,9 @@ class EngagementTests(SynchronousTestCase):
     def begin(self, task: Task, strategy: ConsensusAlgorithm | None = None) -> None:
         """Take part in ``task`` with the robot."""
         uuid = ME.node_id.hex()
-        me, panel, now = Member(uuid, "dog1", ""), Panel(uuid), self.clock.seconds()
+        me, panel, now = Member(uuid, "dog1", ""), Reporters(uuid), self.clock.seconds()
         self.engagement = Engagement(task, me, self.dog, strategy or Nearest(), self.ports, panel, 4, now)
-        self.engagement.take_body(self.council, 4)  # type: ignore[arg-type]
+        self.engagement.take_robot(self.council, 4)  # type: ignore[arg-type]
 
     def report(self, number: int, cost: float | None, status: str = WAITING) -> Member:
         """Return a report of another dog."""
@@ -183,18 +183,18 @@ class EngagementTests(SynchronousTestCase):
 
     def hear(self, *members: Member) -> None:
         """Deliver the reports of the group for the open task."""
-        self.engagement.heard(list(members), None, self.clock.seconds())
+        self.engagement.process_reports(list(members), None, self.clock.seconds())
 
     def end(self, outcome: str, by: str) -> None:
         """Deliver the outcome of the task."""
-        self.engagement.heard([], Result(outcome, by, 1.0, 5), self.clock.seconds())
+        self.engagement.process_reports([], Result(outcome, by, 1.0, 5), self.clock.seconds())
 
     def see(self, cost: float | None) -> None:
         """Deliver an observation with this cost."""
         seen = Observation(0.0, 0.0, {"cost": "none" if cost is None else cost})
         self.engagement.look(seen, self.clock.seconds())
 
-    def step(self) -> Deed:
+    def step(self) -> RobotCommand:
         """Run one step that must return an action."""
         deed = self.engagement.step(self.clock.seconds())
         assert deed is not None
@@ -242,7 +242,7 @@ class EngagementTests(SynchronousTestCase):
     def test_looking_around_is_permitted_for_a_moment_only(self) -> None:
         """A motion without a lease carries the highest token that the robot has obeyed, and a short deadline."""
         permit = self.step().permit
-        self.assertEqual((permit.token, permit.deadline), (4, self.clock.seconds() + SEARCH_TTL))
+        self.assertEqual((permit.token, permit.deadline), (4, self.clock.seconds() + SEARCH_TTL_S))
 
     def test_body_stops_before_the_lease_goes_back(self) -> None:
         """When a better report takes the task away, the agent stops the robot before it returns the lease."""
@@ -314,7 +314,7 @@ class EngagementTests(SynchronousTestCase):
         """At a safe point the agent stops, the council changes, and the agent resumes with a new lease."""
         self.acting()
         self.dog.is_safe = False
-        self.engagement.hand_council([CONTACT] * 3)
+        self.engagement.schedule_council_change([CONTACT] * 3)
         self.assertEqual((self.step().action, self.events), (GO, []))
         self.dog.is_safe = True
         self.assertIsNone(self.engagement.step(self.clock.seconds()))
@@ -323,7 +323,7 @@ class EngagementTests(SynchronousTestCase):
         self.assertIsNone(self.engagement.step(self.clock.seconds()))
         self.assertEqual(self.told[-1].status, EXECUTING)
         self.council.grant(9)
-        self.assertEqual(self.step(), Deed(GO, Permit(9, self.council.deadline)))
+        self.assertEqual(self.step(), RobotCommand(GO, Permit(9, self.council.deadline)))
         self.assertEqual(self.events, ["halted", "moved to 3"])
 
     def test_moved_target_is_reported_again(self) -> None:
@@ -345,7 +345,7 @@ class EngagementTests(SynchronousTestCase):
 
     def test_lost_body_may_still_move(self) -> None:
         """An agent that cannot stop its robot returns the lease with the time for which the robot may still move."""
-        for leave in (lambda: self.engagement.lose_body(), lambda: self.engagement.abandon(self.clock.seconds())):
+        for leave in (lambda: self.engagement.on_robot_lost(), lambda: self.engagement.leave(self.clock.seconds())):
             self.setUp()
             self.acting()
             self.ports.moves_for = 0.8
@@ -357,7 +357,7 @@ class EngagementTests(SynchronousTestCase):
         """An agent without a connection to its robot is unavailable until the next observation."""
         for cost in (None, 1.0):
             self.see(cost)
-            self.engagement.lose_body()
+            self.engagement.on_robot_lost()
             self.assertEqual((self.told[-1].cost, self.told[-1].available), (None, False), str(cost))
             self.see(cost)
             self.assertEqual((self.told[-1].cost, self.told[-1].available), (cost, True), str(cost))
@@ -373,7 +373,7 @@ class EngagementTests(SynchronousTestCase):
         self.assertEqual(self.results[0].bids, (("dog1", 1.0), ("dog2", 2.0)))
         self.assertEqual(self.events, ["halted"])
         self.end(COMPLETED, "dog1")
-        self.engagement.abandon(self.clock.seconds())
+        self.engagement.leave(self.clock.seconds())
         self.assertEqual(self.events[-1], "released")
 
     def test_task_changes_hands_at_safe_points_only(self) -> None:
@@ -389,13 +389,13 @@ class EngagementTests(SynchronousTestCase):
     def test_pause_and_resume(self) -> None:
         """A pause stops the robot and returns the lease; after the resume the behaviour continues from its state."""
         self.acting()
-        self.engagement.ordered(Order(PAUSE, "vaio", 1.0))
+        self.engagement.process_order(Order(PAUSE, "vaio", 1.0))
         self.assertIsNone(self.engagement.step(self.clock.seconds()))
         self.assertEqual(self.events, ["halted", "released"])
         self.assertEqual((self.engagement.me.cost, self.engagement.me.available), (None, False))
         self.see(0.9)
         self.assertIsNone(self.engagement.me.cost)
-        self.engagement.ordered(Order(RESUME, "vaio", 2.0))
+        self.engagement.process_order(Order(RESUME, "vaio", 2.0))
         self.see(0.9)
         self.hear(self.report(2, 2.0))
         self.step()
@@ -408,11 +408,11 @@ class EngagementTests(SynchronousTestCase):
         self.dog.steps = 1
         self.acting()
         self.step()
-        self.assertFalse(self.engagement.may_be_put_aside)
-        self.engagement.put_aside("busy with T", self.clock.seconds())
+        self.assertFalse(self.engagement.can_yield_robot)
+        self.engagement.yield_robot("busy with T", self.clock.seconds())
         self.assertEqual(self.events, ["halted"])
         self.end(COMPLETED, "dog1")
-        self.engagement.abandon(self.clock.seconds())
+        self.engagement.leave(self.clock.seconds())
         self.assertEqual(self.events, ["halted", "released"])
 
     def test_deadline_fails_the_task_once(self) -> None:
@@ -440,7 +440,7 @@ class EngagementTests(SynchronousTestCase):
     def test_deadline_is_told_by_who_holds_the_task(self) -> None:
         """An agent that ends a task on which no agent acts claims the lease first, as its outcome needs the token."""
         self.begin(replace(TASK, deadline=5.0))
-        self.patch(self.engagement._conference, "is_first", lambda now: True)
+        self.patch(self.engagement._decider, "is_first", lambda now: True)
         self.acting()
         self.clock.advance(5.1)
         for _ in range(2):
@@ -456,7 +456,7 @@ class EngagementTests(SynchronousTestCase):
         self.acting()
         self.step()
         self.assertIsNone(self.engagement.step(self.clock.seconds()))
-        self.engagement.on(Event.REOPENED, self.clock.seconds())
+        self.engagement.apply_event(Event.REOPENED, self.clock.seconds())
         self.assertEqual(self.events[-1], "released")
         self.assertIsNotNone(self.engagement.step(self.clock.seconds()))
 
@@ -501,7 +501,7 @@ class EngagementTests(SynchronousTestCase):
                 """Fail."""
                 raise ZeroDivisionError("no luck")
 
-        self.begin(TASK, Guard(Broken()))
+        self.begin(TASK, GuardedStrategy(Broken()))
         self.hear(self.report(2, 0.5))
         self.see(1.0)
         self.step()
@@ -518,9 +518,9 @@ class EngagementTests(SynchronousTestCase):
         self.see(1.0)
         self.assertIsNone(self.engagement.step(self.clock.seconds()))
         self.assertTrue(self.engagement.is_over)
-        self.engagement.heard([], Result(COMPLETED, "dog2", 1.0, 9), self.clock.seconds())
+        self.engagement.process_reports([], Result(COMPLETED, "dog2", 1.0, 9), self.clock.seconds())
         self.assertEqual(self.engagement.result, Result(COMPLETED, "dog2", 1.0, 9))
-        self.engagement.heard([], Result(CANCELLED, "vaio"), self.clock.seconds())
+        self.engagement.process_reports([], Result(CANCELLED, "vaio"), self.clock.seconds())
         self.assertEqual(self.engagement.result, Result(COMPLETED, "dog2", 1.0, 9))
 
     def test_older_life_is_counted_on(self) -> None:
@@ -538,7 +538,7 @@ class EngagementTests(SynchronousTestCase):
         self.step()
         self.council.grant(1)
         self.step()
-        self.engagement.abandon(self.clock.seconds())
+        self.engagement.leave(self.clock.seconds())
         self.assertEqual(self.council.heirs, [contacts[3], contacts[2]])
 
     def test_each_decision_is_accounted_for_once(self) -> None:

@@ -35,7 +35,7 @@ class ExecutionTests(SynchronousTestCase):
         digger = Digger()
         execution = self.execution(digger)
         for now, token in ((1.0, 5), (2.0, 5), (3.0, 6), (4.0, 6)):
-            execution.go_on(now, token, now + 1.0)
+            execution.step(now, token, now + 1.0)
         told = [(c.now, c.token, c.deadline, c.began, c.is_resumed) for c in digger.contexts]
         self.assertEqual(told[0], (1.0, 5, 2.0, 1.0, False))
         self.assertEqual(told[1], (2.0, 5, 3.0, 1.0, True))
@@ -46,23 +46,23 @@ class ExecutionTests(SynchronousTestCase):
         digger = Digger()
         execution = self.execution(digger)
         for token, choice, value in ((5, "red", (1.0, 2.0)), (5, "", ()), (5, "blue", ()), (6, "", ())):
-            execution.go_on(0.0, token, 9.0, Consensus("a", choice=choice, value=value))
+            execution.step(0.0, token, 9.0, Consensus("a", choice=choice, value=value))
         told = [(context.choice, context.value) for context in digger.contexts]
         self.assertEqual(told, [("red", (1.0, 2.0)), ("red", (1.0, 2.0)), ("blue", ()), ("", ())])
 
     def test_progress_is_told_in_quarters(self) -> None:
         """Progress is rounded to quarters; an invalid value becomes None."""
         for said, told in ((0.0, 0.0), (0.3, 0.25), (0.75, 0.75), (7.0, 1.0), (-1, 0.0), ("much", None)):
-            self.assertEqual(self.execution(Digger(said)).go_on(0.0, 1, 1.0).progress, told, said)
-        self.assertIsNone(self.execution(Digger(float("nan"))).go_on(0.0, 1, 1.0).progress)
+            self.assertEqual(self.execution(Digger(said)).step(0.0, 1, 1.0).progress, told, said)
+        self.assertIsNone(self.execution(Digger(float("nan"))).step(0.0, 1, 1.0).progress)
 
     def test_who_is_kept_from_it_does_not_stall(self) -> None:
         """Time without calls, because the team is stopped, does not count as time without progress."""
         execution = self.execution(Digger(), 2.0)
         for moment in (0.0, 0.5, 1.0, 61.0, 61.5):
-            execution.go_on(moment, 1, 99.0)
+            execution.step(moment, 1, 99.0)
             self.assertFalse(execution.has_stalled(moment), moment)
-        execution.go_on(62.2, 1, 99.0)
+        execution.step(62.2, 1, 99.0)
         self.assertTrue(execution.has_stalled(62.2))
 
     def test_stall(self) -> None:
@@ -71,9 +71,9 @@ class ExecutionTests(SynchronousTestCase):
         execution = self.execution(digger, 2.0)
         for tenth in range(30):
             digger.progress = tenth / 30
-            execution.go_on(tenth / 10, 1, 9.0)
+            execution.step(tenth / 10, 1, 9.0)
             self.assertFalse(execution.has_stalled(tenth / 10))
         for tenth in range(30, 53):
-            execution.go_on(tenth / 10, 1, 9.0)
+            execution.step(tenth / 10, 1, 9.0)
         self.assertTrue(execution.has_stalled(5.2))
         self.assertFalse(execution.has_stalled(7.2))

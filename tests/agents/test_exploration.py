@@ -9,18 +9,18 @@ import random
 from twisted.trial.unittest import SynchronousTestCase
 
 from agents.exploration import (
-    AWAY,
-    BACK,
-    CLEARANCE,
-    DETOUR_LEG,
-    DETOUR_PATIENCE_S,
-    LEG,
-    OPEN,
+    BACK_OFF_M,
+    CLEARANCE_M,
+    DETOUR_LEG_M,
+    DETOUR_LEG_TIMEOUT_S,
+    DETOUR_TURN_RAD,
+    LEG_M,
+    OPEN_RANGE_M,
     Detour,
     Exploration,
     Pose,
 )
-from agents.means import TURN_SPEED, Means
+from agents.motion import MAX_SEARCH_TURN_RADPS, MotionCapabilities
 
 TICK = 0.05
 
@@ -41,11 +41,11 @@ class Walker:
         cos, sin = math.cos(yaw), math.sin(yaw)
         walls = [(self.side - x) / cos if cos > 0 else -x / cos if cos < 0 else math.inf]
         walls.append((self.side - y) / sin if sin > 0 else -y / sin if sin < 0 else math.inf)
-        return min(walls) if min(walls) < OPEN else math.nan
+        return min(walls) if min(walls) < OPEN_RANGE_M else math.nan
 
     def live(self) -> float:
         """Run one tick and return the forward speed."""
-        self.exploration.saw(self.pose, self.turned, self.ahead)
+        self.exploration.update(self.pose, self.turned, self.ahead)
         action = self.exploration.step(self.pose, self.ahead)
         x, y, yaw = self.pose
         v, w = action["base.vx"], action["base.wz"]
@@ -76,7 +76,7 @@ class ExplorationTests(SynchronousTestCase):
             walker = Walker(seed)
             for _ in range(2400):
                 if walker.live() > 0.0:
-                    self.assertFalse(walker.ahead < CLEARANCE - 0.02, (seed, walker.pose))
+                    self.assertFalse(walker.ahead < CLEARANCE_M - 0.02, (seed, walker.pose))
                 x, y, _yaw = walker.pose
                 self.assertTrue(0.0 < x < 3.0 and 0.0 < y < 3.0, (seed, walker.pose))
 
@@ -87,9 +87,9 @@ class ExplorationTests(SynchronousTestCase):
             pass
         start = walker.pose[:2]
         while walker.live() > 0.0:
-            self.assertLess(math.dist(start, walker.pose[:2]), LEG + 0.05)
+            self.assertLess(math.dist(start, walker.pose[:2]), LEG_M + 0.05)
         walker.live()
-        self.assertAlmostEqual(abs(walker.turned), TURN_SPEED * TICK)
+        self.assertAlmostEqual(abs(walker.turned), MAX_SEARCH_TURN_RADPS * TICK)
 
     def test_most_open_way_is_taken(self) -> None:
         """The robot walks in the direction with the longest range."""
@@ -99,7 +99,7 @@ class ExplorationTests(SynchronousTestCase):
         for n in range(70):
             yaw = math.remainder(n * 0.1, math.tau)
             pose = (0.0, 0.0, yaw)
-            exploration.saw(pose, turned, math.nan if abs(yaw - 2.0) < 0.15 else 0.5)
+            exploration.update(pose, turned, math.nan if abs(yaw - 2.0) < 0.15 else 0.5)
             turned = 0.1
         exploration.step(pose, 0.5)
         walks = [yaw for yaw in (n * 0.1 - 3.1 for n in range(63)) if self.walks_at(exploration, yaw)]
@@ -110,9 +110,9 @@ class ExplorationTests(SynchronousTestCase):
         """Without a ranger, the robot does not choose the heading of a recent bump while it is near that place."""
         for seed in range(20):
             exploration = Exploration(random.Random(seed))
-            exploration.bumped((0.1, 0.0, 2.0))
+            exploration.on_bump((0.1, 0.0, 2.0))
             for n in range(70):
-                exploration.saw((0.0, 0.0, math.remainder(n * 0.1, math.tau)), 0.1 if n else 0.0, math.nan)
+                exploration.update((0.0, 0.0, math.remainder(n * 0.1, math.tau)), 0.1 if n else 0.0, math.nan)
             self.assertGreater(abs(math.remainder(exploration._choose_heading((0.0, 0.0, 0.0)) - 2.0, math.tau)), 1.0)
         far = {round(exploration._choose_heading((3.0, 0.0, 0.0))) for _ in range(200)}
         self.assertIn(2, far)
@@ -139,36 +139,36 @@ class DetourTests(SynchronousTestCase):
     def test_who_touched_backs_off_turns_away_and_walks(self) -> None:
         """After a contact the robot backs off, turns away from the contact, and walks a leg in the new direction."""
         for side in (1.0, -1.0):
-            detour = Detour(Means())
-            detour.begin((0.0, 0.0, 0.0), side, 0.0, has_touched=True)
+            detour = Detour(MotionCapabilities())
+            detour.start((0.0, 0.0, 0.0), side, 0.0, has_touched=True)
             poses, _ = self.gone(detour)
-            self.assertLess(abs(min(x for x, _, _ in poses) + BACK), 0.01)
+            self.assertLess(abs(min(x for x, _, _ in poses) + BACK_OFF_M), 0.01)
             x, y, yaw = poses[-1]
-            self.assertLess(abs(yaw - side * AWAY), 0.15)
-            self.assertLess(abs(math.dist((x, y), (-BACK, 0.0)) - DETOUR_LEG), 0.02)
+            self.assertLess(abs(yaw - side * DETOUR_TURN_RAD), 0.15)
+            self.assertLess(abs(math.dist((x, y), (-BACK_OFF_M, 0.0)) - DETOUR_LEG_M), 0.02)
             self.assertGreater(side * y, 0.2)
 
     def test_leg_ends_before_the_next_thing(self) -> None:
         """With an obstacle close ahead the robot skips the leg."""
-        detour = Detour(Means())
-        detour.begin((0.0, 0.0, 0.0), 1.0, 0.0, has_touched=False)
+        detour = Detour(MotionCapabilities())
+        detour.start((0.0, 0.0, 0.0), 1.0, 0.0, has_touched=False)
         poses, _ = self.gone(detour, ahead=0.2)
         self.assertEqual(poses[-1][:2], (0.0, 0.0))
 
     def test_who_is_stuck_gives_up(self) -> None:
         """A robot that does not move ends the detour after a timeout for each of its three phases."""
-        detour = Detour(Means())
-        detour.begin((0.0, 0.0, 0.0), 1.0, 0.0, has_touched=True)
+        detour = Detour(MotionCapabilities())
+        detour.start((0.0, 0.0, 0.0), 1.0, 0.0, has_touched=True)
         _, took = self.gone(detour, moves=False)
-        self.assertLess(took, 3 * DETOUR_PATIENCE_S + 0.5)
-        self.assertFalse(detour.is_on(took))
+        self.assertLess(took, 3 * DETOUR_LEG_TIMEOUT_S + 0.5)
+        self.assertFalse(detour.is_active(took))
 
     def test_detour_that_nobody_walks_is_none(self) -> None:
         """A detour without calls expires after its timeout, and ``end`` ends it at any time."""
-        detour = Detour(Means())
-        detour.begin((0.0, 0.0, 0.0), 1.0, 0.0, has_touched=True)
-        self.assertTrue(detour.is_on(1.0))
-        self.assertFalse(detour.is_on(DETOUR_PATIENCE_S + 1.0))
-        detour.end()
-        self.assertFalse(detour.is_on(1.0))
+        detour = Detour(MotionCapabilities())
+        detour.start((0.0, 0.0, 0.0), 1.0, 0.0, has_touched=True)
+        self.assertTrue(detour.is_active(1.0))
+        self.assertFalse(detour.is_active(DETOUR_LEG_TIMEOUT_S + 1.0))
+        detour.cancel()
+        self.assertFalse(detour.is_active(1.0))
         self.assertIsNone(detour.step((0.0, 0.0, 0.0), math.nan, 1.0))

@@ -9,7 +9,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from twisted.trial.unittest import SynchronousTestCase
 
-from agents.formation import NEAREST, Circling, Formation, Post, posts, sector
+from agents.formation import MIN_CIRCLING_RADIUS_M, Formation, Post, PostPath, assign_posts, assign_sector
 from middleware.tasks.task import Member
 
 ANGLES = st.lists(st.floats(-math.pi, math.pi), min_size=1, max_size=6, unique=True)
@@ -26,9 +26,9 @@ class PostTests(SynchronousTestCase):
     def test_even_and_the_same_for_all(self, angles: list[float], rng: Any) -> None:
         """The posts are evenly spaced around the target, and do not depend on the order of the reports."""
         named = [(f"{number}", angle) for number, angle in enumerate(angles)]
-        placed = posts(named, None)
+        placed = assign_posts(named, None)
         rng.shuffle(named)
-        self.assertEqual(posts(named, None), placed)
+        self.assertEqual(assign_posts(named, None), placed)
         around = sorted(angle % math.tau for angle in placed.values())
         for one, other in zip(around, around[1:], strict=False):
             self.assertAlmostEqual(other - one, math.tau / len(angles), 6)
@@ -38,7 +38,7 @@ class PostTests(SynchronousTestCase):
     def test_no_way_crosses_another(self, angles: list[float]) -> None:
         """The robots keep their angular order, and the assigned robot stays."""
         named = sorted(((f"{number}", angle) for number, angle in enumerate(angles)), key=lambda one: one[1] % math.tau)
-        placed = posts(named, named[0][0])
+        placed = assign_posts(named, named[0][0])
         self.assertAlmostEqual(apart(placed[named[0][0]], named[0][1]), 0.0, 6)
         turns = [(placed[uuid] - placed[named[0][0]]) % math.tau for uuid, _ in named[1:]]
         self.assertEqual(turns, sorted(turns))
@@ -47,14 +47,14 @@ class PostTests(SynchronousTestCase):
         """Robots that are already evenly spaced keep their positions."""
         named = [(name, math.remainder(0.7 + n * math.tau / 3, math.tau)) for n, name in enumerate("abc")]
         for assigned in (None, "b"):
-            placed = posts(named, assigned)
+            placed = assign_posts(named, assigned)
             for name, angle in named:
                 self.assertAlmostEqual(apart(placed[name], angle), 0.0, 6)
 
     def test_sectors_share_the_circle(self) -> None:
         """Three robots search a third of the circle each; after one leaves, the other two search half each."""
-        self.assertEqual(sector("b", {"a", "b", "c"}), (math.pi, math.tau / 3))
-        self.assertEqual(sector("b", {"a", "b"}), (math.remainder(1.5 * math.pi, math.tau), math.pi))
+        self.assertEqual(assign_sector("b", {"a", "b", "c"}), (math.pi, math.tau / 3))
+        self.assertEqual(assign_sector("b", {"a", "b"}), (math.remainder(1.5 * math.pi, math.tau), math.pi))
 
 
 class Robot:
@@ -77,40 +77,40 @@ class FormationTests(SynchronousTestCase):
 
     def test_rests_until_somebody_leaves(self) -> None:
         """While no robot leaves, none moves; after a departure the others, and later members, get even posts."""
-        self.assertEqual(self.formation.hear(self.others), [])
-        self.assertIsNone(self.formation.close_up(self.me, self.others, None))
+        self.assertEqual(self.formation.update_members(self.others), [])
+        self.assertIsNone(self.formation.assign_post(self.me, self.others, None))
         self.assertEqual(self.robot.sent, [])
-        self.assertEqual(self.formation.hear(self.others[:1]), ["c"])
-        self.assertAlmostEqual(self.formation.close_up(self.me, self.others[:1], "b") or 0.0, 0.2 - math.pi, 1)
+        self.assertEqual(self.formation.update_members(self.others[:1]), ["c"])
+        self.assertAlmostEqual(self.formation.assign_post(self.me, self.others[:1], "b") or 0.0, 0.2 - math.pi, 1)
         self.assertEqual(self.robot.sent[-1].sector[1], math.pi)
-        self.formation.hear(self.others)
-        self.formation.close_up(self.me, self.others, "b")
+        self.formation.update_members(self.others)
+        self.formation.assign_post(self.me, self.others, "b")
         self.assertEqual(self.robot.sent[-1].sector[1], math.tau / 3)
 
     def test_who_is_to_act_has_no_post(self) -> None:
         """The assigned robot gets no post."""
-        self.formation.hear(self.others)
-        self.formation.hear([])
-        self.assertIsNone(self.formation.close_up(self.me, self.others, "a"))
+        self.formation.update_members(self.others)
+        self.formation.update_members([])
+        self.assertIsNone(self.formation.assign_post(self.me, self.others, "a"))
         self.assertIsNone(self.robot.sent[-1].angle)
 
     def test_post_does_not_follow_every_word(self) -> None:
         """A post changes only if it would move far."""
-        self.formation.hear(self.others)
-        self.formation.hear([])
-        first = self.formation.close_up(self.me, self.others[:1], "b")
+        self.formation.update_members(self.others)
+        self.formation.update_members([])
+        first = self.formation.assign_post(self.me, self.others[:1], "b")
         near = [Member("b", "dog2", "WAITING", 1.0, angle=0.3)]
-        self.assertEqual(self.formation.close_up(self.me, near, "b"), first)
+        self.assertEqual(self.formation.assign_post(self.me, near, "b"), first)
         far = [Member("b", "dog2", "WAITING", 1.0, angle=1.3)]
-        self.assertNotEqual(self.formation.close_up(self.me, far, "b"), first)
+        self.assertNotEqual(self.formation.assign_post(self.me, far, "b"), first)
 
 
 class CirclingTests(SynchronousTestCase):
     def walk(self, radius: float, post: float, ahead: float = math.nan, seconds: float = 60.0) -> tuple[float, float]:
         """Move a robot to its post around a target at (0, 0); return its final angle and distance."""
         x, y, yaw = radius, 0.0, math.pi
-        circling = Circling()
-        circling.send(post)
+        circling = PostPath()
+        circling.set_post(post)
         for _ in range(int(seconds / 0.05)):
             facing = math.remainder(math.atan2(-y, -x) - yaw, math.tau)
             action = circling.step((x, y, yaw), (0.0, 0.0), math.atan2(y, x), ahead, abs(facing) < 0.05)
@@ -132,4 +132,4 @@ class CirclingTests(SynchronousTestCase):
     def test_stops_before_what_is_in_the_way(self) -> None:
         """The robot stays if an obstacle is ahead or if it is close to the target."""
         self.assertLess(apart(self.walk(1.2, 2.0, ahead=0.3)[0], 0.0), 0.05)
-        self.assertLess(apart(self.walk(NEAREST - 0.05, 2.0)[0], 0.0), 0.01)
+        self.assertLess(apart(self.walk(MIN_CIRCLING_RADIUS_M - 0.05, 2.0)[0], 0.0), 0.01)

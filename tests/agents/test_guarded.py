@@ -1,4 +1,4 @@
-"""Tests of ``agents.guarded``: a behaviour that runs in another process."""
+"""Tests of ``agents.behaviour_proxy``: a behaviour that runs in another process."""
 
 from __future__ import annotations
 
@@ -8,12 +8,12 @@ from typing import Any
 
 from twisted.trial.unittest import SynchronousTestCase
 
-from agents.behaviour import STAND, behaviour_for
+from agents.behaviour import STAND, create_behaviour
+from agents.behaviour_proxy import ACTION_TTL_S, BehaviourProxy
 from agents.context import Context
-from agents.guarded import FRESH_S, Guarded
-from agents.means import Means
+from agents.motion import MotionCapabilities
 from drivers.reading import Action, Frame, Observation
-from middleware.consensus.deployed import Make
+from middleware.consensus.deployed_modules import Factory
 from middleware.errors import UnknownTask
 from middleware.tasks.task import Task
 from tests.agents.loopback import Loopback
@@ -49,7 +49,7 @@ class Spin:
 def guarded(spin: object) -> tuple[Any, Loopback]:
     """Return a guarded behaviour and its connection."""
     way = Loopback(lambda parameters, rng: spin)
-    return Guarded(way, STAND), way
+    return BehaviourProxy(way, STAND), way
 
 
 class GuardedTests(SynchronousTestCase):
@@ -76,11 +76,11 @@ class GuardedTests(SynchronousTestCase):
         behaviour, way = guarded(Spin())
         self.assertEqual(behaviour.search(1.0), GO)
         way.is_held = True
-        self.assertEqual(behaviour.search(0.99 + FRESH_S), GO)
-        self.assertEqual(behaviour.search(1.01 + FRESH_S), STAND)
+        self.assertEqual(behaviour.search(0.99 + ACTION_TTL_S), GO)
+        self.assertEqual(behaviour.search(1.01 + ACTION_TTL_S), STAND)
         self.assertEqual(way.asked, ["search", "search"])
         way.let()
-        self.assertEqual(behaviour.search(1.1 + FRESH_S), GO)
+        self.assertEqual(behaviour.search(1.1 + ACTION_TTL_S), GO)
 
     def test_action_of_another_lease_or_method(self) -> None:
         """An answer to a call with another token or of another method moves nothing."""
@@ -99,7 +99,7 @@ class GuardedTests(SynchronousTestCase):
             behaviour.look(SEEN, now)
         way.let()
         behaviour.look(SEEN, 0.3)
-        way.is_behind = True
+        way.has_unsent = True
         way.let()
         behaviour.look(SEEN, 0.4)
         self.assertEqual([now for _, now in spin.seen], [0.0, 0.3])
@@ -124,7 +124,7 @@ class GuardedTests(SynchronousTestCase):
                 take(True, a)
                 return True
 
-            way.ask = ask  # type: ignore[method-assign]
+            way.send_request = ask  # type: ignore[method-assign]
             self.assertEqual((behaviour.search(0.0), behaviour.has_failed), (STAND, True), answer)
 
     def test_what_it_may_have_beside(self) -> None:
@@ -141,11 +141,11 @@ class GuardedTests(SynchronousTestCase):
 
     def test_means_follow(self) -> None:
         """Changed motion capabilities reach the behaviour before the next observation."""
-        told: list[Means] = []
+        told: list[MotionCapabilities] = []
         spin = Spin()
         spin.embody = told.append  # type: ignore[attr-defined]
         behaviour, way = guarded(spin)
-        means = Means()
+        means = MotionCapabilities()
         behaviour.embody(means)
         means.circle = 0.25
         behaviour.look(SEEN, 0.0)
@@ -162,14 +162,14 @@ class GuardedTests(SynchronousTestCase):
 
     def test_behaviour_by_its_deployed_name(self) -> None:
         """The kind ``deployed:x`` selects the deployed behaviour ``x``; another kind is refused with the known ones."""
-        deployed: dict[tuple[str, str], Make] = {
+        deployed: dict[tuple[str, str], Factory] = {
             ("behaviour", "spin"): Loopback.of(Spin),
             ("strategy", "best"): Spin,
         }
-        made = behaviour_for(Task("t", "deployed:spin", ""), random.Random(1), deployed)
-        self.assertIsInstance(made, Guarded)
+        made = create_behaviour(Task("t", "deployed:spin", ""), random.Random(1), deployed)
+        self.assertIsInstance(made, BehaviourProxy)
         self.assertEqual(made.cost, 1.5)
         for kind in ("deployed:best", "deployed:other"):
-            error = self.assertRaises(UnknownTask, behaviour_for, Task("t", kind, ""), random.Random(1), deployed)
+            error = self.assertRaises(UnknownTask, create_behaviour, Task("t", kind, ""), random.Random(1), deployed)
             self.assertIn("deployed: deployed:spin", str(error))
-        self.assertRaises(UnknownTask, behaviour_for, Task("t", "deployed:spin", ""), random.Random(1))
+        self.assertRaises(UnknownTask, create_behaviour, Task("t", "deployed:spin", ""), random.Random(1))

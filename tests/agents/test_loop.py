@@ -13,15 +13,15 @@ from agents.loop import Agent
 from drivers.driver import Permit
 from drivers.errors import NotEnabled
 from drivers.reading import Action, Frame, Observation
-from middleware.consensus.lease.lessee import Lease
+from middleware.consensus.lease.lease_client import Lease
 from middleware.errors import UnknownStrategy
 from middleware.tasks.task import TASKS, Task
-from swarmnode.rehearsal import VirtualTeam
+from swarmnode.simulated_team import SimulatedTeam
 
 
 class LoopTests(SynchronousTestCase):
     def setUp(self) -> None:
-        self.team = VirtualTeam(11, dogs=("dog1", "dog2"))
+        self.team = SimulatedTeam(11, dogs=("dog1", "dog2"))
         self.addCleanup(self.team.stop)
         self.agent = self.agent_of("dog1")
 
@@ -52,7 +52,7 @@ class LoopTests(SynchronousTestCase):
         assert isinstance(agent, Agent)
         ages: list[float] = []
         uuid = self.team.services["dog1"].assembly.node.uuid
-        self.team.desk.watch(uuid, lambda seq, jpeg, age: ages.append(age) if jpeg == b"seen" else None)
+        self.team.desk.stream_camera(uuid, lambda seq, jpeg, age: ages.append(age) if jpeg == b"seen" else None)
         self.team.clock.advance(0.2)
         frame = Frame(900, 1, 1, b"seen", 4.7)
         agent._on_observation(Observation(self.team.clock.seconds() - 0.2, 5.0, {}, {}, frame))
@@ -64,7 +64,7 @@ class LoopTests(SynchronousTestCase):
         """An agent with a task sends no command before its robot's motors are enabled."""
         self.submit()
         refused: list[str] = []
-        self.team.add("dog3")
+        self.team.add_node("dog3")
         driver: Any = self.team.services["dog3"].assembly.driver
         act = driver.act
 
@@ -81,14 +81,14 @@ class LoopTests(SynchronousTestCase):
         driver.enable = lambda: deferLater(self.team.clock, 1.5, enable)  # a robot that starts slowly
         self.team.clock.advance(1.3)
         self.assertIsNot(self.agent_of("dog3").engagement, None)
-        self.assertFalse(self.agent_of("dog3")._body.is_awake)
+        self.assertFalse(self.agent_of("dog3")._robot.is_enabled)
         self.team.clock.advance(2.0)
-        self.assertTrue(self.agent_of("dog3")._body.is_awake)
+        self.assertTrue(self.agent_of("dog3")._robot.is_enabled)
         self.assertEqual(refused, [])
 
     def test_motors_are_asked_for_until_they_are_on(self) -> None:
         """If the connection breaks while the motors start, the agent enables them again after it reconnects."""
-        self.team.add("dog3")
+        self.team.add_node("dog3")
         service = self.team.services["dog3"]
         connector = self.team.connectors["dog3"]
         driver: Any = service.assembly.driver
@@ -98,7 +98,7 @@ class LoopTests(SynchronousTestCase):
         self.team.clock.advance(3.0)
         self.team.desk.assign("turn-around")
         self.team.clock.advance(1.0)
-        self.assertTrue(self.agent_of("dog3")._body.is_awake)
+        self.assertTrue(self.agent_of("dog3")._robot.is_enabled)
         self.assertIsNot(self.agent_of("dog3").engagement, None)
 
     def test_switched_off_robot_takes_no_part(self) -> None:
@@ -124,14 +124,16 @@ class LoopTests(SynchronousTestCase):
         count = 0
         for name in ("dog1", "dog2"):
             agent = self.agent_of(name)
-            driver: Any = agent._body.driver
+            driver: Any = agent._robot.driver
 
             def watched(action: Action, permit: Permit, agent: Agent = agent, act: Any = driver.act) -> Action:
                 nonlocal count
                 if any(action.values()):
                     count += 1
                     engagement = agent.engagement
-                    lease = None if engagement is None or engagement.lessee is None else engagement.lessee.lease
+                    lease = (
+                        None if engagement is None or engagement.lease_client is None else engagement.lease_client.lease
+                    )
                     if lease != Lease("t1", permit.token, permit.deadline):
                         bad.append((action, permit, lease))
                 done: Action = act(action, permit)
@@ -181,7 +183,7 @@ class LoopTests(SynchronousTestCase):
         task = Task("t0", "turn-around", "Odd", strategy="os:system")
         self.failureResultOf(Deferred.fromCoroutine(node.submit(task)), UnknownStrategy)
         for odd in (task, replace(task, task_id="t2", created=1.0, strategy="loudest")):
-            node.entangled.put(TASKS, odd.task_id, odd.packed(), "team")
+            node.entangled.put(TASKS, odd.task_id, odd.pack(), "team")
             self.team.clock.advance(1.0)
             self.assertIn(f"unknown strategy {odd.strategy!r}", self.lines("dog1")[-1])
 
@@ -189,10 +191,10 @@ class LoopTests(SynchronousTestCase):
         """A dog that joins after the end of a task does not start it."""
         self.submit()
         self.team.clock.advance(8.0)
-        self.team.add("dog3")
+        self.team.add_node("dog3")
         self.team.clock.advance(3.0)
         self.assertEqual(self.device("dog3")["status"], "IDLE")
-        self.assertEqual(self.agent_of("dog3")._docket.open, set())
+        self.assertEqual(self.agent_of("dog3")._task_queue.open_ids, set())
 
     def test_task_is_taken_up_when_nobody_could_tell_at_first(self) -> None:
         """If no node answers a query for the group of a task, the agent repeats the query until one does."""
@@ -205,7 +207,7 @@ class LoopTests(SynchronousTestCase):
             return (
                 get(key)
                 if len(tries) > 2
-                else node.entangled.endpoint.greet(node.entangled.contact.address._replace(port=9), 0.1)
+                else node.entangled.endpoint.discover(node.entangled.contact.address._replace(port=9), 0.1)
             )
 
         node.entangled.get = silent  # type: ignore[method-assign]
@@ -216,7 +218,7 @@ class LoopTests(SynchronousTestCase):
 
     def test_robot_that_the_yard_does_not_have_is_said(self) -> None:
         """A device whose robot does not exist shows an error, and the other devices complete the task."""
-        self.team.add("dog3", tables={"driver": {"kind": "sim", "options": {"robot": "ghost", "camera_fps": 0.0}}})
+        self.team.add_node("dog3", tables={"driver": {"kind": "sim", "options": {"robot": "ghost", "camera_fps": 0.0}}})
         self.team.clock.advance(2.0)
         self.assertIn("has no robot: no robot is named 'ghost'", self.lines("dog3")[-1])
         self.submit(waiting_period=2.0)
@@ -228,9 +230,9 @@ class LoopTests(SynchronousTestCase):
         """An agent that stops while its robot moves stops the robot."""
         self.submit()
         self.team.clock.advance(1.0)
-        moving = [dog.name for dog in self.team.yard.world.dogs.values() if dog.is_moving]
+        moving = [dog.name for dog in self.team.simulator.world.dogs.values() if dog.is_moving]
         self.assertEqual(len(moving), 1)
         stopped = self.agent_of(moving[0]).stopService()
         self.team.clock.advance(0.3)
-        self.assertFalse(self.team.yard.world.dogs[moving[0]].is_moving)
+        self.assertFalse(self.team.simulator.world.dogs[moving[0]].is_moving)
         self.successResultOf(stopped)

@@ -7,7 +7,7 @@ from typing import Any
 
 from twisted.trial.unittest import SynchronousTestCase
 
-from agents.report import PAUSE, Reporter
+from agents.report import MIN_REPORT_INTERVAL_S, ReportBuilder
 from drivers.reading import Observation
 from middleware.consensus.strategy import READABLE
 from middleware.entangled.clock import HeapClock
@@ -30,7 +30,7 @@ class ReporterTests(SynchronousTestCase):
     def setUp(self) -> None:
         self.clock = HeapClock()
         self.minded = self.made()
-        self.reporter = Reporter(self.minded, READABLE)
+        self.reporter = ReportBuilder(self.minded, READABLE)
         self.me = ME
 
     def made(self) -> Any:
@@ -41,7 +41,7 @@ class ReporterTests(SynchronousTestCase):
         """Return the changed values, and store them as reported."""
         seen = Observation(0.0, 0.0, {"power.level": charge})
         self.reporter.load = load
-        told = self.reporter.news(self.me, False, seen, self.clock.seconds()) or {}
+        told = self.reporter.find_changes(self.me, False, seen, self.clock.seconds()) or {}
         self.me = replace(self.me, **told)
         return told
 
@@ -71,7 +71,7 @@ class ReporterTests(SynchronousTestCase):
         self.news()
         self.minded.choice, self.minded.value = "blue", (1.1, 2.0)
         self.assertEqual(self.news(), {"choice": "blue"})
-        self.clock.advance(PAUSE)
+        self.clock.advance(MIN_REPORT_INTERVAL_S)
         self.assertEqual(self.news(), {"value": (1.1, 2.0)})
         self.minded.value = ()
         self.assertEqual(self.news(), {"value": ()})
@@ -89,5 +89,5 @@ class ReporterTests(SynchronousTestCase):
         for name, values in bad.items():
             for value in values:
                 setattr(self.minded, name, value)
-                self.clock.advance(PAUSE)
+                self.clock.advance(MIN_REPORT_INTERVAL_S)
                 self.assertEqual(self.news(), {}, (name, value))

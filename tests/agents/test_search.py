@@ -9,22 +9,22 @@ from typing import Any
 from twisted.trial.unittest import SynchronousTestCase
 
 from agents.context import Context
-from agents.means import STOP_AT
-from agents.search import HIDDEN, MEMORY, SearchAndApproach
+from agents.motion import STOP_DISTANCE_M
+from agents.search import HIDDEN_TARGET_MEMORY_S, TARGET_MEMORY_S, SearchAndApproach
 from drivers.reading import Action, Frame, Observation
 from sim.robots.camera import Camera
-from sim.robots.scene import FOOTPRINT, loaded
-from sim.robots.sensor import NOSE, Sensors
-from sim.robots.world import SUBSTEP, World
+from sim.robots.scene import FOOTPRINT_RADIUS_M, load_scene
+from sim.robots.sensor import NOSE_M, Sensors
+from sim.robots.world import SUBSTEP_S, World
 
-TICK = 8 * SUBSTEP
+TICK = 8 * SUBSTEP_S
 
 
 class Walk:
     """A simulated dog and its behaviour; the other dogs stand far away."""
 
     def __init__(self, seed: int = 1, x: float = 0.4, y: float = 1.2, heading: float = 0.0) -> None:
-        self.world = World(Random(seed), loaded("three-dogs"))
+        self.world = World(Random(seed), load_scene("three-dogs"))
         self.camera = Camera(Random(seed + 1), self.world)
         self.world.move_dog("dog2", 2.85, 0.15, 0.0)
         self.world.move_dog("dog3", 2.85, 2.25, 0.0)
@@ -49,7 +49,7 @@ class Walk:
         self.now += TICK
         self.frames += 1
         values = {**self.senses.values(), **self.replaced}
-        data = b"" if "camera" in self.turned_off else self.camera.jpeg(self.dog)
+        data = b"" if "camera" in self.turned_off else self.camera.render_jpeg(self.dog)
         frame = Frame(self.frames, 208, 160, data, self.now)
         self.behaviour.look(Observation(self.now, self.now, values, frame=frame), self.now)
         action: Action | None = (act or self.behaviour.search)(self.now)
@@ -66,14 +66,14 @@ class Walk:
     def distance(self) -> float:
         """Return the true distance in metres from the lens to the target's axis."""
         assert self.world.target is not None
-        x, y = self.dog.x + NOSE * math.cos(self.dog.heading), self.dog.y + NOSE * math.sin(self.dog.heading)
+        x, y = self.dog.x + NOSE_M * math.cos(self.dog.heading), self.dog.y + NOSE_M * math.sin(self.dog.heading)
         return math.hypot(self.world.target.x - x, self.world.target.y - y)
 
     def gap(self) -> float:
         """Return the distance in metres between the robot's footprint and the target."""
         target = self.world.target
         assert target is not None
-        return math.hypot(target.x - self.dog.x, target.y - self.dog.y) - target.radius - FOOTPRINT
+        return math.hypot(target.x - self.dog.x, target.y - self.dog.y) - target.radius - FOOTPRINT_RADIUS_M
 
 
 class SearchTests(SynchronousTestCase):
@@ -91,7 +91,7 @@ class RangerTests(SynchronousTestCase):
     def told(self, replaced: dict[str, float]) -> float:
         """Return the reported distance, relative to the true one, of a target at 0.9 m with these ranger values."""
         walk = Walk()
-        walk.world.place_target(0.4 + NOSE + 0.9, 1.2)
+        walk.world.place_target(0.4 + NOSE_M + 0.9, 1.2)
         walk.replaced = replaced
         cost = walk.find()
         assert cost is not None
@@ -122,7 +122,7 @@ class ApproachTests(SynchronousTestCase):
             walk.find()
             self.reach(walk)
             self.assertEqual(walk.world.collisions, 0, (x, y))
-            self.assertTrue(0.0 < walk.gap() <= STOP_AT + 0.03, (x, y, walk.gap()))
+            self.assertTrue(0.0 < walk.gap() <= STOP_DISTANCE_M + 0.03, (x, y, walk.gap()))
 
     def test_moved_target_is_followed(self) -> None:
         """If the target moves while the dog walks, the dog walks to its new position."""
@@ -133,7 +133,7 @@ class ApproachTests(SynchronousTestCase):
             walk.live(walk.execute)
         walk.world.place_target(1.3, 1.9)
         self.reach(walk)
-        self.assertLessEqual(walk.gap(), STOP_AT + 0.03)
+        self.assertLessEqual(walk.gap(), STOP_DISTANCE_M + 0.03)
 
     def test_target_that_is_taken_away_is_never_reached(self) -> None:
         """If the target is removed, the task does not complete: the cost expires, and the dog searches again."""
@@ -159,10 +159,10 @@ class MemoryTests(SynchronousTestCase):
         walk = self.found()
         walk.turned_off.add("camera")
         hidden = walk.now
-        while walk.now - hidden < MEMORY - 0.3:
+        while walk.now - hidden < TARGET_MEMORY_S - 0.3:
             walk.live()
             self.assertIsNotNone(walk.behaviour.cost)
-        while walk.now - hidden < MEMORY + 0.3:
+        while walk.now - hidden < TARGET_MEMORY_S + 0.3:
             walk.live()
         self.assertIsNone(walk.behaviour.cost)
 
@@ -170,7 +170,7 @@ class MemoryTests(SynchronousTestCase):
         """A repeated camera frame does not extend the memory of the target."""
         walk = self.found()
         observation = Observation(0.0, 0.0, walk.senses.values(), frame=Frame(walk.frames, 208, 160, b"", 0.0))
-        walk.behaviour.look(observation, walk.now + MEMORY + 0.1)
+        walk.behaviour.look(observation, walk.now + TARGET_MEMORY_S + 0.1)
         self.assertIsNone(walk.behaviour.cost)
 
 
@@ -183,7 +183,7 @@ class HiddenTests(SynchronousTestCase):
         walk.world.place_target(1.9, 1.4)
         self.assertIsNotNone(walk.find())
         heading = math.atan2(1.4 - walk.dog.y, 1.9 - walk.dog.x)
-        away = NOSE + at
+        away = NOSE_M + at
         walk.world.move_dog("dog2", 0.4 + away * math.cos(heading), 1.2 + away * math.sin(heading), heading)
         return walk
 
@@ -191,10 +191,10 @@ class HiddenTests(SynchronousTestCase):
         """A target hidden by another robot keeps its cost for ``HIDDEN`` seconds, then the cost is removed."""
         walk = self.hidden()
         began = walk.now
-        while walk.now - began < HIDDEN - 0.5:
+        while walk.now - began < HIDDEN_TARGET_MEMORY_S - 0.5:
             walk.live(walk.behaviour.hold)
             self.assertIsNotNone(walk.behaviour.cost)
-        while walk.now - began < HIDDEN + 0.5:
+        while walk.now - began < HIDDEN_TARGET_MEMORY_S + 0.5:
             walk.live(walk.behaviour.hold)
         self.assertIsNone(walk.behaviour.cost)
 
@@ -205,7 +205,7 @@ class HiddenTests(SynchronousTestCase):
         place = other.x, other.y
         while walk.live(walk.execute) is not None:
             self.assertLess(walk.now, 60.0)
-        self.assertLess(abs(walk.gap() - STOP_AT + 0.02), 0.05)
+        self.assertLess(abs(walk.gap() - STOP_DISTANCE_M + 0.02), 0.05)
         self.assertLess(math.dist((other.x, other.y), place), 0.01)
 
 

@@ -9,10 +9,10 @@ from typing import Any
 
 from twisted.trial.unittest import SynchronousTestCase
 
-from agents.engagement import Deed, Engagement
-from agents.state import ROWS, TABLE, Course, Effect, Event, State, build_table
+from agents.engagement import Engagement, RobotCommand
+from agents.state import ROWS, TABLE, Effect, Event, State, StateMachine, build_table
 from drivers.reading import Observation
-from middleware.consensus.bidding.panel import Panel
+from middleware.consensus.bidding.reporters import Reporters
 from middleware.consensus.strategies.nearest import Nearest
 from middleware.directory.presence import EXECUTING, STATUSES, WAITING
 from middleware.entangled.clock import HeapClock
@@ -62,14 +62,14 @@ class TableTests(SynchronousTestCase):
 
     def test_rank_is_shown(self) -> None:
         """The text of a waiting agent contains its rank, which stays until an event changes it."""
-        course = Course()
+        course = StateMachine()
         course.state = S.OBSERVING
         for event, rank, shown in (
             (Event.PASSED_OVER, 2, "WAITING(2)"),
             (Event.LENT, None, "WAITING(2)"),
             (Event.NAMED, 0, "CLAIMING"),
         ):
-            course.go(event, rank)
+            course.apply(event, rank)
             self.assertEqual(str(course), shown)
 
     def test_page_has_the_table(self) -> None:
@@ -91,17 +91,23 @@ class Rig:
         self.is_moving = self.is_late = self.has_left = False
         task = Task("t1", "find-target", "Find it", waiting_period=DEADLINE, deadline=DEADLINE, preemptible=True)
         me = Member(ME, "dog1", "")
-        self.engagement = Engagement(task, me, self.dog, Nearest(), self.ports, Panel(ME), 0, 0.0)
+        self.engagement = Engagement(task, me, self.dog, Nearest(), self.ports, Reporters(ME), 0, 0.0)
 
     @property
     def key(self) -> tuple[object, ...]:
         """The part of the state that determines the event of an input."""
         one, council = self.engagement, self.council
-        held = one.course.state, one.lessee is not None, council.lease is not None, self.has_left, self.is_moving
+        held = (
+            one.state_machine.state,
+            one.lease_client is not None,
+            council.lease is not None,
+            self.has_left,
+            self.is_moving,
+        )
         if one.is_over or self.has_left:
             return held
-        asked = council.is_wanted, council.places[-1:] > [0], one.claim.is_lent, one.is_paused, self.is_late
-        moves = one.course.state is S.EXECUTING and (self.dog.is_safe, bool(one.claim.successors))
+        asked = council.is_wanted, council.places[-1:] > [0], one.task_lease.is_lent, one.is_paused, self.is_late
+        moves = one.state_machine.state is S.EXECUTING and (self.dog.is_safe, bool(one.task_lease.next_members))
         return (*held, *asked, moves, one.me.cost, *(other.cost for other in self.others))
 
     def feed(self, name: str) -> list[str]:
@@ -115,11 +121,11 @@ class Rig:
         faults = self.faults(deed)
         if was_over and (deed or self.events not in ([], ["released"]) or self.ports.told):
             faults.append("something follows the outcome")
-        if was_over and self.engagement.course.state is not S.DONE:
+        if was_over and self.engagement.state_machine.state is not S.DONE:
             faults.append("the outcome does not stay")
         return faults
 
-    def faults(self, deed: Deed | None) -> list[str]:
+    def faults(self, deed: RobotCommand | None) -> list[str]:
         """Return the invariants that the events and ``deed`` of a step violate."""
         faults = []
         for event in self.events:
@@ -134,7 +140,7 @@ class Rig:
                 faults.append("the body acts without a lease")
         elif self.is_moving and deed is not None:
             faults.append("the body is not stopped before it does something else")
-        if self.is_moving and (lease is None or self.engagement.lessee is None):
+        if self.is_moving and (lease is None or self.engagement.lease_client is None):
             faults.append("the body moves on without a lease")
         return faults
 
@@ -142,31 +148,31 @@ class Rig:
 def hear(rig: Rig, one: Engagement, now: float, *others: Member) -> None:
     """The other agents report; without ``others``, they have left."""
     rig.others = list(others)
-    one.heard(rig.others, None, now)
+    one.process_reports(rig.others, None, now)
 
 
 def take(rig: Rig, one: Engagement, now: float) -> None:
     """The agent gives its robot to the task."""
-    if one.lessee is None and not rig.has_left:
-        one.take_body(rig.lessee, one.claim.token)
+    if one.lease_client is None and not rig.has_left:
+        one.take_robot(rig.lessee, one.task_lease.token)
 
 
 def lend(rig: Rig, one: Engagement, now: float) -> None:
     """Another task of the group gets the robot, unless this one acts."""
-    if not one.is_acting and one.may_be_put_aside:
-        one.lend_body(True, now)
+    if not one.is_acting and one.can_yield_robot:
+        one.set_robot_lent(True, now)
 
 
 def finish(rig: Rig, one: Engagement, now: float) -> None:
     """The behaviour completes its task, if the agent acts."""
-    if one.course.state is S.EXECUTING:
+    if one.state_machine.state is S.EXECUTING:
         rig.dog.steps = 0
 
 
 def grant(rig: Rig, one: Engagement, now: float) -> None:
     """The council grants the lease if the agent wants it."""
-    if one.lessee is not None and (rig.council.is_wanted or rig.council.places[-1:] > [0]):
-        rig.council.grant(one.claim.token + 1)
+    if one.lease_client is not None and (rig.council.is_wanted or rig.council.places[-1:] > [0]):
+        rig.council.grant(one.task_lease.token + 1)
 
 
 def lose(rig: Rig, one: Engagement, now: float) -> None:
@@ -177,7 +183,7 @@ def lose(rig: Rig, one: Engagement, now: float) -> None:
 def leave(rig: Rig, one: Engagement, now: float) -> None:
     """The agent leaves the task."""
     rig.has_left = True
-    one.abandon(now)
+    one.leave(now)
 
 
 def expire(rig: Rig, one: Engagement, now: float) -> None:
@@ -197,19 +203,19 @@ INPUTS: dict[str, Callable[[Rig, Engagement, float], object]] = {
     "take": take,
     "grant": grant,
     "lose": lose,
-    "outrank": lambda rig, one, now: one.on(Event.OUTRANKED, now),
+    "outrank": lambda rig, one, now: one.apply_event(Event.OUTRANKED, now),
     "lend": lend,
-    "return": lambda rig, one, now: one.lend_body(False, now),
-    "aside": lambda rig, one, now: one.put_aside("busy", now),
-    "pause": lambda rig, one, now: one.ordered(Order(PAUSE, "vaio", 1.0)),
-    "resume": lambda rig, one, now: one.ordered(Order(RESUME, "vaio", 2.0)),
-    "silent": lambda rig, one, now: one.lose_body(),
+    "return": lambda rig, one, now: one.set_robot_lent(False, now),
+    "aside": lambda rig, one, now: one.yield_robot("busy", now),
+    "pause": lambda rig, one, now: one.process_order(Order(PAUSE, "vaio", 1.0)),
+    "resume": lambda rig, one, now: one.process_order(Order(RESUME, "vaio", 2.0)),
+    "silent": lambda rig, one, now: one.on_robot_lost(),
     "unsafe": lambda rig, one, now: setattr(rig.dog, "is_safe", False),
     "safe": lambda rig, one, now: setattr(rig.dog, "is_safe", True),
     "finish": finish,
-    "council": lambda rig, one, now: one.hand_council([CONTACT] * 3),
-    "reopen": lambda rig, one, now: one.on(Event.REOPENED, now),
-    "outcome": lambda rig, one, now: one.heard([], Result(COMPLETED, "dog2", 1.0, 9), now),
+    "council": lambda rig, one, now: one.schedule_council_change([CONTACT] * 3),
+    "reopen": lambda rig, one, now: one.apply_event(Event.REOPENED, now),
+    "outcome": lambda rig, one, now: one.process_reports([], Result(COMPLETED, "dog2", 1.0, 9), now),
     "leave": leave,
     "expire": expire,
 }

@@ -1,4 +1,4 @@
-"""Tests of ``agents.turn``."""
+"""Tests of ``agents.turn_around``."""
 
 from __future__ import annotations
 
@@ -9,8 +9,8 @@ from twisted.trial.unittest import SynchronousTestCase
 
 from agents.behaviour import STAND
 from agents.context import Context
-from agents.means import Means
-from agents.turn import TurnAround
+from agents.motion import MotionCapabilities
+from agents.turn_around import TurnAround
 from drivers.reading import Description, Observation, Value
 
 
@@ -57,6 +57,6 @@ class TurnTests(SynchronousTestCase):
         """A robot that turns more slowly than a dog gets its maximum turn velocity."""
         turn = TurnAround({}, random.Random(1))
         limits = {"base.vx": (-0.1, 0.1), "base.wz": (-0.5, 0.5)}
-        turn.embody(Means(Description("slow", "", {}, limits, 0.1)))
+        turn.embody(MotionCapabilities(Description("slow", "", {}, limits, 0.1)))
         turn.look(seen(odom_yaw=0.0), 0.0)
         self.assertEqual(turn.execute(Context(0.0, is_resumed=True)), {**STAND, "base.wz": 0.5})

@@ -9,20 +9,20 @@ import cv2
 import numpy as np
 from twisted.trial.unittest import SynchronousTestCase
 
-from agents.vision import Sighting, Size, find_target
+from agents.vision import Detection, TargetSize, find_target
 from sim.robots.camera import Camera
-from sim.robots.scene import loaded
-from sim.robots.sensor import NOSE
+from sim.robots.scene import load_scene
+from sim.robots.sensor import NOSE_M
 from sim.robots.world import World
 
-SIZE = Size(0.08, 0.22)
+SIZE = TargetSize(0.08, 0.22)
 
 
 class Studio:
     """A dog at the left wall with a camera on its nose, which points along the map."""
 
     def __init__(self, seed: int = 1) -> None:
-        self.world = World(Random(seed), loaded("three-dogs"))
+        self.world = World(Random(seed), load_scene("three-dogs"))
         self.camera = Camera(Random(seed + 1), self.world)
         self.world.move_dog("dog2", 2.85, 0.15, 0.0)
         self.world.move_dog("dog3", 0.15, 2.25, 0.0)
@@ -31,15 +31,15 @@ class Studio:
     def target(self, distance: float, bearing: float = 0.0) -> None:
         """Place the target ``distance`` metres from the lens."""
         reach = distance
-        self.world.place_target(0.3 + NOSE + reach * math.cos(bearing), 1.2 + reach * math.sin(bearing))
+        self.world.place_target(0.3 + NOSE_M + reach * math.cos(bearing), 1.2 + reach * math.sin(bearing))
 
-    def look(self) -> Sighting | None:
+    def look(self) -> Detection | None:
         """Return the sighting in the next camera frame."""
-        return find_target(self.camera.jpeg(self.world.dogs["dog1"]), SIZE)
+        return find_target(self.camera.render_jpeg(self.world.dogs["dog1"]), SIZE)
 
 
 class VisionTests(SynchronousTestCase):
-    def seen(self, studio: Studio) -> Sighting:
+    def seen(self, studio: Studio) -> Detection:
         """Return the next sighting, which must not be None."""
         sighting = studio.look()
         assert sighting is not None
@@ -58,7 +58,7 @@ class VisionTests(SynchronousTestCase):
         """With a lens half as wide, the same frame gives about twice the distance and a smaller bearing."""
         studio = Studio()
         studio.target(0.9, 0.2)
-        picture = studio.camera.jpeg(studio.world.dogs["dog1"])
+        picture = studio.camera.render_jpeg(studio.world.dogs["dog1"])
         wide = find_target(picture, SIZE)
         narrow = find_target(picture, SIZE, (math.radians(28.4), None))
         assert wide is not None and narrow is not None
@@ -112,7 +112,7 @@ class VisionTests(SynchronousTestCase):
         """Empty data, noise, a truncated frame and a frame of one pixel give no sighting and no error."""
         studio = Studio()
         studio.target(1.0)
-        whole = studio.camera.jpeg(studio.world.dogs["dog1"])
+        whole = studio.camera.render_jpeg(studio.world.dogs["dog1"])
         dot = cv2.imencode(".jpg", np.zeros((1, 1, 3), np.uint8))[1].tobytes()
         for data in (b"", b"\x00", Random(1).randbytes(5000), whole[:100], dot):
             self.assertIsNone(find_target(data, SIZE))

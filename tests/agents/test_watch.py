@@ -1,4 +1,4 @@
-"""Tests of ``agents.watch``: a phone that reports target positions, and a dog that detects the target itself."""
+"""Tests of ``agents.watch_target``: a phone that reports target positions, and a dog that detects the target itself."""
 
 from __future__ import annotations
 
@@ -12,8 +12,8 @@ from twisted.trial.unittest import SynchronousTestCase
 
 import agents
 from agents.context import Context
-from agents.means import Means
-from agents.watch import FRESH, MEMORY, SETTLE, WatchTarget
+from agents.motion import MotionCapabilities
+from agents.watch_target import DETECTION_TTL_S, MIN_DETECTIONS, TARGET_MEMORY_S, WatchTarget
 from drivers.reading import Action, Description, Frame, Observation, Value
 from tests.agents.test_search import Walk
 
@@ -50,7 +50,7 @@ class PhoneTests(SynchronousTestCase):
         phone = Phone()
         phone.live()
         self.assertIsNone(phone.behaviour.cost)
-        phone.live(0.5, SETTLE - 1)
+        phone.live(0.5, MIN_DETECTIONS - 1)
         self.assertIsNone(phone.behaviour.cost)
         phone.live(9.0)
         self.assertEqual(phone.behaviour.cost, 0.5)
@@ -58,12 +58,12 @@ class PhoneTests(SynchronousTestCase):
     def test_cost_goes_with_the_target(self) -> None:
         """A short loss of sight keeps the cost; after a longer one it is None until enough new sightings arrive."""
         phone = Phone()
-        phone.live(0.5, SETTLE)
-        phone.live(ticks=round(MEMORY / TICK) - 1)
+        phone.live(0.5, MIN_DETECTIONS)
+        phone.live(ticks=round(TARGET_MEMORY_S / TICK) - 1)
         self.assertEqual(phone.behaviour.cost, 0.5)
         phone.live(ticks=2)
         self.assertIsNone(phone.behaviour.cost)
-        phone.live(2.0, SETTLE - 1)
+        phone.live(2.0, MIN_DETECTIONS - 1)
         self.assertIsNone(phone.behaviour.cost)
         phone.live(2.0)
         self.assertEqual(phone.behaviour.cost, 2.0)
@@ -75,7 +75,7 @@ class PhoneTests(SynchronousTestCase):
         self.assertAlmostEqual(phone.behaviour.progress, 0.5)
         phone.execute(math.nan, 30)
         told = phone.behaviour.progress
-        self.assertLessEqual(told, 0.5 + (FRESH + TICK) / 2.0)
+        self.assertLessEqual(told, 0.5 + (DETECTION_TTL_S + TICK) / 2.0)
         phone.execute(math.nan, 30)
         self.assertEqual(phone.behaviour.progress, told)
         self.assertTrue(phone.execute(0.5, 12))
@@ -96,7 +96,7 @@ class PhoneTests(SynchronousTestCase):
         """In search, hold and execution, a device without motors gets an empty action."""
         phone = Phone()
         self.assertEqual(phone.behaviour.search(0.0), {})
-        phone.live(0.5, SETTLE)
+        phone.live(0.5, MIN_DETECTIONS)
         actions = phone.behaviour.search(phone.now), phone.behaviour.hold(phone.now)
         self.assertEqual((*actions, phone.behaviour.execute(Context(phone.now))), ({}, {}, {}))
 
@@ -108,7 +108,7 @@ class PhoneTests(SynchronousTestCase):
     def test_a_phones_node_loads_no_vision(self) -> None:
         """If the phone detects the target itself, its gateway loads neither OpenCV nor NumPy (34 MiB)."""
         script = (
-            "import sys, random\nfrom agents.watch import WatchTarget\nfrom drivers.reading import Observation\n"
+            "import sys, random\nfrom agents.watch_target import WatchTarget\nfrom drivers.reading import Observation\n"
             "watch = WatchTarget({}, random.Random(1))\n"
             "watch.look(Observation(0.0, 0.0, {'target.bearing': 0.0, 'target.distance': 1.0}), 0.0)\n"
             "assert not {'cv2', 'numpy'} & set(sys.modules)"
@@ -146,11 +146,11 @@ class DogTests(SynchronousTestCase):
         """The lens from the robot's description is used, even if the first frame arrives later."""
         watch = WatchTarget({}, random.Random(1))
         lens = {"camera": {"fov_h_deg": 28.4}}
-        watch.embody(Means(Description("narrow", "", lens, {}, 0.1)))
+        watch.embody(MotionCapabilities(Description("narrow", "", lens, {}, 0.1)))
         walk = Walk()
         walk.world.place_target(1.4, 1.2)
         for n in range(4):
-            picture = Frame(n, 208, 160, walk.camera.jpeg(walk.dog), n * TICK)
+            picture = Frame(n, 208, 160, walk.camera.render_jpeg(walk.dog), n * TICK)
             watch.look(Observation(n * TICK, n * TICK, {"odom.yaw": 0.0}, frame=picture), n * TICK)
         cost = watch.cost
         assert cost is not None
@@ -162,7 +162,7 @@ class DogTests(SynchronousTestCase):
         watch = WatchTarget({}, random.Random(1))
         walk.world.place_target(1.2, 1.2)
         for n in range(10):
-            frame = Frame(n, 208, 160, walk.camera.jpeg(walk.dog), n * TICK)
+            frame = Frame(n, 208, 160, walk.camera.render_jpeg(walk.dog), n * TICK)
             self.assertEqual(watch.search(n * TICK), {})
             watch.look(Observation(n * TICK, n * TICK, {}, frame=frame), n * TICK)
         cost = watch.cost

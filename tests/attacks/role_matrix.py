@@ -25,7 +25,7 @@ from middleware.admission.roles import (
     OPERATOR,
     PRESENCE,
     VIEWER,
-    kind_of,
+    classify_slot,
     may_call,
     may_store,
 )
@@ -33,9 +33,9 @@ from middleware.entangled.contact import Contact
 from middleware.entangled.errors import NotAdmitted, Refused
 from middleware.entangled.identity import Identity
 from middleware.entangled.record import Record, Slot
-from middleware.entangled.wire.door import ROLE
+from middleware.entangled.wire.admission_check import ROLE
 from middleware.entangled.wire.endpoint import Endpoint
-from swarmnode.rehearsal import VirtualTeam
+from swarmnode.simulated_team import SimulatedTeam
 from tests.attacks.siege import PaperDoor
 
 REVOKED_OPERATOR = "revoked operator"
@@ -87,15 +87,15 @@ def list_slots(owner: bytes) -> list[Slot]:
 class Insider:
     """A subject of the trial: its key, its current roles, and its endpoint."""
 
-    def __init__(self, team: VirtualTeam, name: str, roles: Sequence[str], port: int) -> None:
+    def __init__(self, team: SimulatedTeam, name: str, roles: Sequence[str], port: int) -> None:
         rng = random.Random(f"insider {name}")
         secret = team._memberships[team.BOOTSTRAP].membership.secrets[0][1]
-        paper = team.operator.founded(name, roles, team.clock.seconds(), rng, secret)
+        paper = team.operator.create_membership(name, roles, team.clock.seconds(), rng, secret)
         self.identity: Identity = paper.identity
         self.roles = tuple(roles)
         self.name = name
-        network = team.board.network("127.0.0.1", port)
-        self.endpoint = Endpoint(self.identity, secret, network, team.clock, rng, PaperDoor(paper.shown))
+        network = team.switchboard.make_network("127.0.0.1", port)
+        self.endpoint = Endpoint(self.identity, secret, network, team.clock, rng, PaperDoor(paper.certificate))
         self.endpoint.start()
 
 
@@ -104,10 +104,14 @@ class Trial:
 
     def __init__(self, subject: str, seed: int = 1) -> None:
         self.counts = Counts(subject)
-        self.team = VirtualTeam(seed, camera_fps=0.5, dogs=("dog1", "dog2"), faults=True)
+        self.team = SimulatedTeam(seed, camera_fps=0.5, dogs=("dog1", "dog2"), faults=True)
         self.nodes = {name: service.assembly.node for name, service in self.team.services.items()}
         for node in self.nodes.values():
-            _ = node.entangled.seat, node.councils, node.dissemination  # their methods are exposed at their first use
+            _ = (
+                node.entangled.take_acceptor,
+                node.council_manager,
+                node.auction_service,
+            )  # their methods are exposed at their first use
             node.entangled.endpoint.expose(UNLISTED_METHOD, lambda peer: None, changes=True)
         is_revoked = subject == REVOKED_OPERATOR
         self.insider = Insider(self.team, "mallory", [OPERATOR] if is_revoked else [subject], 7601)
@@ -120,7 +124,7 @@ class Trial:
             team = self.nodes[self.team.BOOTSTRAP].team
             assert team is not None
             statement = self.team.operator.revoke(self.insider.identity.public, "mallory", self.team.clock.seconds())
-            self._wait(lambda: team.tell(statement))
+            self._wait(lambda: team.publish(statement))
             self.team.clock.advance(REVOCATION_S)
             self.insider.roles = ()
 
@@ -154,7 +158,7 @@ class Trial:
                 continue
             self.counts.methods += 1
             outcome = self._outcome(self.insider, contact, method, *ARGUMENTS.get(method, ()))
-            self.insider.endpoint.tell(contact, method, *ARGUMENTS.get(method, ()))
+            self.insider.endpoint.notify(contact, method, *ARGUMENTS.get(method, ()))
             if _is_refusal(outcome):
                 self.counts.methods_refused += 1
             else:
@@ -174,8 +178,8 @@ class Trial:
         for slot in list_slots(own.public):
             if may_store(self.insider.roles, slot):
                 continue
-            record = Record(slot.key, slot.name, slot.owner, 1, "team", 600.0, b"\xc3").signed(own)
-            packed = [record.packed()]
+            record = Record(slot.key, slot.name, slot.owner, 1, "team", 600.0, b"\xc3").sign(own)
+            packed = [record.pack()]
             for carrier, arguments in (
                 (self.insider, (packed,)),
                 (self.accomplice, (packed, [600.0])),
@@ -187,7 +191,7 @@ class Trial:
                 if is_refused and not is_held:
                     self.counts.records_refused += 1
                 else:
-                    self.counts.wrong.append(f"{name} {carrier.name} {kind_of(slot)} {slot.name}: {outcome!r}")
+                    self.counts.wrong.append(f"{name} {carrier.name} {classify_slot(slot)} {slot.name}: {outcome!r}")
 
     def _outcome(self, insider: Insider, contact: Contact, method: str, *arguments: object) -> Any:
         return self._wait(lambda: insider.endpoint.ask(contact, method, *arguments, changes=True, timeout=2.0))
@@ -209,21 +213,21 @@ class Trial:
         found: dict[tuple[str, Any], object] = {}
         for name, node in self.nodes.items():
             for record in node.store.records():
-                if kind_of(record.slot) != PRESENCE:
+                if classify_slot(record.slot) != PRESENCE:
                     found[name, record.slot] = record.digest()
-            found[name, "stopped"] = node.halt.is_on
-            found[name, "tuning"] = node.store.noted("tuning")
+            found[name, "stopped"] = node.stop_state.is_motion_forbidden
+            found[name, "tuning"] = node.store.get_note("tuning")
             found[name, "running"] = node.running
             assert node.team is not None
-            found[name, "roll"] = node.team.roll.digest
-        for robot in self.team.truth()["dogs"]:
+            found[name, "roll"] = node.team.membership_list.digest
+        for robot in self.team.get_true_state()["dogs"]:
             found[robot["name"], "position"] = (round(robot["x"], 3), round(robot["y"], 3))
         return found
 
 
 def _describe(key: tuple[str, Any]) -> str:
     node, item = key
-    return f"{node} {kind_of(item)} {item.name}" if isinstance(item, Slot) else f"{node} {item}"
+    return f"{node} {classify_slot(item)} {item.name}" if isinstance(item, Slot) else f"{node} {item}"
 
 
 def _is_refusal(outcome: object) -> bool:

@@ -11,26 +11,26 @@ from twisted.trial.unittest import SynchronousTestCase
 from middleware.entangled.contact import Contact
 from middleware.entangled.identity import Identity
 from middleware.entangled.network.network import Address
-from middleware.entangled.wire.door import Life, OpenDoor
+from middleware.entangled.wire.admission_check import Incarnation, OpenAdmission
 from middleware.entangled.wire.endpoint import Endpoint
 from tests.middleware.admission.village import Village, VillageCase
 
 SOURCE = Address("10.6.6.6", 666)
 
 
-class PaperDoor(OpenDoor):
+class PaperDoor(OpenAdmission):
     """The admission check of an attacker, which accepts every peer and presents any certificate."""
 
     def __init__(self, shown: bytes, room: int = 640, life: int = 1) -> None:
-        self.shown = shown
-        self.room = room
-        self.life = Life(life, b"attacker")
+        self.own_pass = shown
+        self.max_pass_bytes = room
+        self.incarnation = Incarnation(life, b"attacker")
         self.fingerprint = bytes(8)
 
-    def certificate(self, owner: bytes) -> bytes:
-        return self.shown
+    def find_certificate(self, owner: bytes) -> bytes:
+        return self.own_pass
 
-    def learn(self, owner: bytes, certificate: bytes) -> bool:
+    def add_certificate(self, owner: bytes, certificate: bytes) -> bool:
         return True
 
 
@@ -41,7 +41,7 @@ class SiegeCase(VillageCase):
         self, team: Village, identity: Identity, secret: bytes, shown: bytes, at: Address = SOURCE, life: int = 1
     ) -> Endpoint:
         """Return an endpoint that presents an arbitrary certificate, stopped when the test ends."""
-        network = team.board.network(*at)
+        network = team.switchboard.make_network(*at)
         dice = random.Random(f"attacker {at}")
         endpoint = Endpoint(identity, secret, network, team.clock, dice, PaperDoor(shown, life=life))
         endpoint.start()
@@ -52,7 +52,7 @@ class SiegeCase(VillageCase):
         """Return an endpoint with a valid certificate for these roles, but without the checks of a node."""
         paper = team.paper(name, *which)
         secret = paper.secrets[0][1]
-        return self.attacker(team, paper.identity, secret, paper.shown, at), paper.identity
+        return self.attacker(team, paper.identity, secret, paper.certificate, at), paper.identity
 
 
 class OneSession:

@@ -12,8 +12,8 @@ from pathlib import Path
 from twisted.logger import formatEvent
 from twisted.trial.unittest import SynchronousTestCase
 
-from middleware.entangled.record import hashed_key
-from middleware.entangled.wire.message import Answer, Question, Told, decoded, encoded
+from middleware.entangled.record import hash_key
+from middleware.entangled.wire.message import Answer, Notification, Request, decode, encode
 from tests.attacks.siege import events_of
 from tests.fleet import FleetCase
 
@@ -26,15 +26,15 @@ UNSAFE = (
 CALLS = ("eval", "exec", "compile", "__import__", "execfile", "input")
 ALLOWED = {
     # The content is signed by an operator that the node's owner allowed; see tests/swarmnode/test_deploy.py.
-    ("middleware.deployment.module", "exec"),
-    ("middleware.deployment.module", "compile"),
+    ("middleware.deployment.module_loader", "exec"),
+    ("middleware.deployment.module_loader", "compile"),
 }
 LOADERS = {
     # The name comes from the settings of the node's owner, or from a table in the source.
     "swarmnode.sandbox",
-    *("agents.behaviour", "agents.registry", "drivers.registry", "middleware.consensus.servant"),
+    *("agents.behaviour", "agents.registry", "drivers.registry", "middleware.consensus.strategy_worker"),
     *("middleware.consensus.strategy", "swarmnode.driver.catalogue", "swarmnode.command"),
-    "webnode.routes.table",
+    "webnode.routes.registry",
 }
 HOOKS = {("middleware.entangled.wire.message", hook) for hook in ("ext_hook", "object_hook")}
 """Hooks that are allowed: the first one refuses every extension, the second one counts."""
@@ -202,7 +202,7 @@ class ContentTests(FleetCase):
         """The corpus passes through records unchanged, and no code runs."""
         fleet = self.fleet(3)
         for place, value in enumerate(CORPUS):
-            key = hashed_key(f"corpus {place}")
+            key = hash_key(f"corpus {place}")
             self.done(fleet, fleet.nodes[0].put(key, f"{place}", value), 1.0)
             found = self.done(fleet, fleet.nodes[2].get(key), 1.0)
             self.assertEqual([record.value for record in found], [value])
@@ -211,10 +211,14 @@ class ContentTests(FleetCase):
     def test_messages_stay_data(self) -> None:
         """As methods, arguments, answers and reasons the corpus is data or malformed, and no code runs."""
         for text, raw in zip(TEXTS, CORPUS, strict=True):
-            for message in (Question(1, text[:60], (raw, text, [raw])), Answer(1, {text: raw}), Told("t", (raw,))):
-                self.assertEqual(decoded(encoded(message)), message)
+            for message in (
+                Request(1, text[:60], (raw, text, [raw])),
+                Answer(1, {text: raw}),
+                Notification("t", (raw,)),
+            ):
+                self.assertEqual(decode(encode(message)), message)
             try:
-                decoded(raw)
+                decode(raw)
             except Exception as error:
                 self.assertEqual(type(error).__name__, "Malformed")
         self.assertEqual(FIRED, [])

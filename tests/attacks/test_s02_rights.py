@@ -8,11 +8,11 @@ from typing import Any
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from middleware.admission.certificate import pass_of
-from middleware.admission.roles import KINDS, METHODS, ROLES, kind_of, may_call, may_store
+from middleware.admission.certificate import wrap_grant
+from middleware.admission.roles import KINDS, METHODS, ROLES, classify_slot, may_call, may_store
 from middleware.entangled.errors import Refused
 from middleware.entangled.identity import Identity
-from middleware.entangled.record import Record, hashed_key
+from middleware.entangled.record import Record, hash_key
 from middleware.entangled.replication.store_reply import Outcome
 from tests.attacks.siege import SOURCE, SiegeCase
 from tests.middleware.admission.paper import NOW
@@ -71,9 +71,9 @@ class RecordTests(SiegeCase):
             attacker, own = self.insider(team, role, role, at=SOURCE._replace(port=600 + number))
             for key in KEYS:
                 for name in NAMES:
-                    record = Record(hashed_key(key), name, own.public, 1, "team", 600.0, b"x").signed(own)
-                    kinds.add(kind_of(record.slot))
-                    asked = attacker.ask(team.contact(house), "store", [record.packed()], changes=True)
+                    record = Record(hash_key(key), name, own.public, 1, "team", 600.0, b"x").sign(own)
+                    kinds.add(classify_slot(record.slot))
+                    asked = attacker.ask(team.contact(house), "store", [record.pack()], changes=True)
                     [verdict] = self.outcome(team, asked, 0.1)
                     held = house.node.replica.holds(record)
                     self.assertEqual(held, may_store((role,), record.slot, role), (role, key, name))
@@ -88,7 +88,7 @@ class OwnerTests(SiegeCase):
         self.team = self.village()
         for name in ("dog", "cat"):
             self.team.enlist(name)
-        self.key = hashed_key("mine")
+        self.key = hash_key("mine")
         self.outcome(self.team, self.team.houses[0].node.put(self.key, "slot", b"true"))
         self.outcome(self.team, self.team.houses[0].node.put(self.key, "slot", b"truer"))
         [self.record] = self.held()
@@ -96,13 +96,13 @@ class OwnerTests(SiegeCase):
 
     def held(self) -> list[Record]:
         """Return the record at its replicas, which must be equal everywhere."""
-        found = [house.node.replica.held(self.key) for house in self.team.houses]
+        found = [house.node.replica.get_held(self.key) for house in self.team.houses]
         self.assertTrue(all(each == found[0] for each in found))
         return found[0]
 
     def attack(self, record: Record) -> None:
         """Send a record with every method that accepts one, to every node."""
-        packed, key = [record.packed()], record.key
+        packed, key = [record.pack()], record.key
         for house in self.team.houses:
             contact = self.team.contact(house)
             for method, arguments in (
@@ -126,11 +126,11 @@ class OwnerTests(SiegeCase):
             replace(self.record, value=b"false"),
             replace(self.record, value=None),
             newer,
-            replace(newer, value=None).signed(self.own),
+            replace(newer, value=None).sign(self.own),
             replace(newer, ttl=0.5),
             replace(newer, lifetime="leased"),
             replace(self.record, signature=bytes(64)),
-            newer.signed(other),
+            newer.sign(other),
             replace(self.record, name="slot2"),
         ):
             self.attack(record)
@@ -139,7 +139,7 @@ class OwnerTests(SiegeCase):
     def test_an_older_one(self) -> None:
         """An older version that its owner had signed does not replace the record."""
         first = Record(self.key, "slot", self.record.owner, 1, "team", self.record.ttl, b"true")
-        older = first.signed(self.team.houses[0].kept.membership.identity)
+        older = first.sign(self.team.houses[0].kept.membership.identity)
         self.attack(older)
         self.assertEqual(self.held(), [self.record])
 
@@ -163,7 +163,7 @@ class OwnerTests(SiegeCase):
             value=data.draw(st.none() | st.binary(max_size=8)),
         )
         if changed != self.record:
-            self.attack(changed.signed(self.own) if data.draw(st.booleans()) else changed)
+            self.attack(changed.sign(self.own) if data.draw(st.booleans()) else changed)
         self.assertEqual(self.held(), [self.record])
 
 
@@ -186,13 +186,13 @@ class CertificateTests(SiegeCase):
         good = team.signer.grant(own.public, "x", ("device",), NOW)
         foreign = other.signer.grant(own.public, "x", ("device",), NOW)
         passes = {
-            "over": (pass_of(over), "expired"),
-            "early": (pass_of(early), "early"),
-            "foreign": (pass_of(foreign), "foreign"),
-            "another's": (team.houses[0].kept.membership.shown, "foreign"),
-            "cut short": (pass_of(good)[:-1], "foreign"),
+            "over": (wrap_grant(over), "expired"),
+            "early": (wrap_grant(early), "early"),
+            "foreign": (wrap_grant(foreign), "foreign"),
+            "another's": (team.houses[0].kept.membership.certificate, "foreign"),
+            "cut short": (wrap_grant(good)[:-1], "foreign"),
             "none": (b"", "foreign"),
-            "changed": (pass_of(good).replace(b"\xa1x", b"\xa1y"), "foreign"),
+            "changed": (wrap_grant(good).replace(b"\xa1x", b"\xa1y"), "foreign"),
         }
         for number, (name, (shown, code)) in enumerate(passes.items()):
             self.assertEqual(self.refused(number, shown, own, secret), code, name)

@@ -14,14 +14,14 @@ from middleware.entangled.contact import Contact
 from middleware.entangled.errors import NoAnswer
 from middleware.entangled.identity import Identity
 from middleware.entangled.network.network import Address
-from middleware.entangled.wire.greeting import HERE, WHO, here, who
-from middleware.entangled.wire.hail import ECHO, HAIL
-from middleware.entangled.wire.message import Answer, Failure, Question, encoded
-from middleware.entangled.wire.session import DATA, INIT, RESP, derived_key
+from middleware.entangled.wire.discovery import DISCOVERY, DISCOVERY_REPLY, pack_discovery, pack_discovery_reply
+from middleware.entangled.wire.message import Answer, Failure, Request, encode
+from middleware.entangled.wire.probe import PROBE, PROBE_REPLY
+from middleware.entangled.wire.session import DATA, INIT, RESP, derive_key
 from tests.fuzz.ground import STRANGER, TEAM, Ground
 
 SEQUENCES = settings(max_examples=40, stateful_step_count=25)
-KINDS = (INIT, RESP, DATA, WHO, HERE, 0x16, 0x17, 0x18, HAIL, ECHO, 0x03, 0x00, 0xFF)
+KINDS = (INIT, RESP, DATA, DISCOVERY, DISCOVERY_REPLY, 0x16, 0x17, 0x18, PROBE, PROBE_REPLY, 0x03, 0x00, 0xFF)
 PLACES = (STRANGER, Address("10.0.0.2", 2), Address("10.0.0.1", 1), Address("::1", 9), Address("~" + "0" * 40, 1))
 
 
@@ -70,7 +70,7 @@ class Spoofing(RuleBasedStateMachine):
         """Send a recorded datagram with one changed bit."""
         datagram = bytearray(self.ground.recorded[index % len(self.ground.recorded)])
         datagram[bit // 8 % len(datagram)] ^= 1 << bit % 8
-        if datagram[0] != WHO:  # with another nonce it is still the same probe
+        if datagram[0] != DISCOVERY:  # with another nonce it is still the same probe
             self.fire(bytes(datagram), source)
 
     @rule(source=st.sampled_from(PLACES), counter=st.integers(0, 2**64 - 1), size=st.integers(16, 200))
@@ -83,14 +83,14 @@ class Spoofing(RuleBasedStateMachine):
     @rule(source=st.sampled_from(PLACES), size=st.integers(50, 1300))
     def guessed_handshake(self, source: Address, size: int) -> None:
         """Send RESP with the real number of a pending handshake."""
-        for index in list(self.ground.target._peers._openings)[:1]:
+        for index in list(self.ground.target._peers._handshakes)[:1]:
             self.fire(bytes([RESP]) + index.to_bytes(4, "little") + self.dice.randbytes(size), source)
 
     @rule(source=st.sampled_from(PLACES), key=st.booleans())
     def greeting(self, source: Address, key: bool) -> None:
         """Send an unsolicited HERE under another key or under the team's key."""
-        secret = derived_key(TEAM, b"greet") if key else bytes(32)
-        self.fire(here(secret, self.dice.randbytes(16), self.dice.randbytes(32), self.dice), source)
+        secret = derive_key(TEAM, b"greet") if key else bytes(32)
+        self.fire(pack_discovery_reply(secret, self.dice.randbytes(16), self.dice.randbytes(32), self.dice), source)
 
     @invariant()
     def nothing_changed(self) -> None:
@@ -110,7 +110,7 @@ class SpoofingTests(SynchronousTestCase):
         ground = Ground()
         self.addCleanup(ground.stop)
         before = ground.state()
-        ground.shoot(sealed(ground, encoded(Question(7, "add", (1,)))), member(ground).address)
+        ground.shoot(sealed(ground, encode(Request(7, "add", (1,)))), member(ground).address)
         self.assertNotEqual(ground.state(), before)
 
 
@@ -125,9 +125,9 @@ class ElsewhereTests(SynchronousTestCase):
         ground = self.ground
         silent = Contact(Identity(b"s" * 32).public, Address("10.0.0.7", 7))
         asked = ground.target.ask(silent, "echo", 1)
-        [number] = list(ground.target._asker._inquiries)
+        [number] = list(ground.target._requester._requests)
         for message in (Answer(number, "lie"), Failure(number, "refused", "lie")):
-            ground.shoot(sealed(ground, encoded(message)), member(ground).address)
+            ground.shoot(sealed(ground, encode(message)), member(ground).address)
         self.assertNoResult(asked)
         ground.clock.advance(5.0)
         self.failureResultOf(asked, NoAnswer)
@@ -135,10 +135,10 @@ class ElsewhereTests(SynchronousTestCase):
     def test_greeting_from_elsewhere(self) -> None:
         """A HERE with the right token from another address than the probed one is dropped and counted."""
         ground = self.ground
-        greeted = ground.target.greet(Address("10.0.0.8", 8))
-        [token] = list(ground.target.greeter._pending)
-        key = derived_key(TEAM, b"greet")
-        ground.shoot(here(key, token, Identity(b"e" * 32).public, random.Random(1)), STRANGER)
+        greeted = ground.target.discover(Address("10.0.0.8", 8))
+        [token] = list(ground.target.discoverer._pending)
+        key = derive_key(TEAM, b"greet")
+        ground.shoot(pack_discovery_reply(key, token, Identity(b"e" * 32).public, random.Random(1)), STRANGER)
         self.assertNoResult(greeted)
         self.assertEqual(self.counters["misdirected"], 1)
         ground.clock.advance(5.0)
@@ -148,15 +148,15 @@ class ElsewhereTests(SynchronousTestCase):
         """A HERE from the right address with another token is dropped."""
         ground = self.ground
         at = Address("10.0.0.8", 8)
-        greeted = ground.target.greet(at)
-        key = derived_key(TEAM, b"greet")
-        ground.shoot(here(key, bytes(16), Identity(b"e" * 32).public, random.Random(1)), at)
+        greeted = ground.target.discover(at)
+        key = derive_key(TEAM, b"greet")
+        ground.shoot(pack_discovery_reply(key, bytes(16), Identity(b"e" * 32).public, random.Random(1)), at)
         self.assertNoResult(greeted)
         ground.clock.advance(5.0)
         self.failureResultOf(greeted, NoAnswer)
 
     def test_who_of_a_stranger(self) -> None:
         """A WHO without the team's key gets no answer."""
-        datagram = who(bytes(32), bytes(16), random.Random(1))
+        datagram = pack_discovery(bytes(32), bytes(16), random.Random(1))
         self.assertEqual(self.ground.shoot(datagram), 0)
         self.assertEqual(self.counters["forged"], 1)

@@ -10,9 +10,9 @@ from twisted.internet.defer import Deferred
 
 from middleware.entangled.network.network import Address
 from middleware.entangled.network.switchboard import SwitchboardNetwork
-from middleware.entangled.record import hashed_key
-from middleware.entangled.wire.door import Noted
-from middleware.entangled.wire.method import KEPT_S
+from middleware.entangled.record import hash_key
+from middleware.entangled.wire.admission_check import LogLimiter
+from middleware.entangled.wire.method import KEEP_ANSWER_S
 from middleware.entangled.wire.session import MAX_RESPONSES, MAX_UNCONFIRMED
 from tests.attacks.siege import SiegeCase
 from tests.fuzz.ground import state_of
@@ -51,11 +51,11 @@ class ReplayCase(SiegeCase):
     def work(self, team: Village) -> None:
         """Let the team write, read, watch, remove and call."""
         first, second = team.houses[1].node, team.houses[2].node
-        key = hashed_key("task")
+        key = hash_key("task")
         team.houses[3].node.watch(key, lambda records: None)
         done: list[Deferred[Any]] = [first.put(key, "a", b"1"), second.put(key, "b", b"2" * 3000)]
         team.run(1.0)
-        done += [first.get(key), second.remove(key, "b"), first.put(hashed_key("here"), "dog", b"x", "leased")]
+        done += [first.get(key), second.remove(key, "b"), first.put(hash_key("here"), "dog", b"x", "leased")]
         team.run(1.0)
         done += [first.call(team.contact(team.houses[0]), "add", number, changes=True) for number in range(5)]
         team.run(2.0)
@@ -75,11 +75,11 @@ class ReplayCase(SiegeCase):
                 half.forget(session)
             half.clear()
             # A recording from before a restart looks like a copy of the node, and is logged once for each member.
-            self.assertLessEqual(len(endpoint._noted._logged), len(team.houses))
+            self.assertLessEqual(len(endpoint._log_limiter._logged), len(team.houses))
             timers = sorted(call.getTime() for call in team.clock.getDelayedCalls())
-            noted, endpoint._noted = endpoint._noted, Noted()
-            found.append(state_of([house.node, house.node.store, house.team.roll, timers]))
-            endpoint._noted = noted
+            noted, endpoint._log_limiter = endpoint._log_limiter, LogLimiter()
+            found.append(state_of([house.node, house.node.store, house.team.membership_list, timers]))
+            endpoint._log_limiter = noted
         return found
 
     def replay(
@@ -139,7 +139,7 @@ class ReplayTests(ReplayCase):
 
     def test_after_responses_are_forgotten(self) -> None:
         """A replay after the cached responses have expired has no effect."""
-        self.team.run(4 * KEPT_S)
+        self.team.run(4 * KEEP_ANSWER_S)
         self.freeze(self.team)
         self.replay(self.team)
 
@@ -169,7 +169,7 @@ class ReplayTests(ReplayCase):
     def test_after_a_rotation(self) -> None:
         """A replay after a rotation of the secret gets no answer."""
         members = [house.public for house in self.team.houses]
-        self.team.tell(self.team.signer.rotate(2, members, self.team.wall(), 5.0, self.team.dice))
+        self.team.tell(self.team.signer.rotate_secret(2, members, self.team.wall(), 5.0, self.team.dice))
         self.team.run(60.0)
         for house in self.team.houses:
             self.assertEqual(len(house.node.endpoint._peers.ring), 1)

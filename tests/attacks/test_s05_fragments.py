@@ -11,14 +11,14 @@ from twisted.trial.unittest import SynchronousTestCase
 
 from middleware.entangled.clock import HeapClock
 from middleware.entangled.identity import Identity
-from middleware.entangled.wire.courier import MAX_IN, MAX_IN_OF_PEER, Courier
-from middleware.entangled.wire.flow import IDLE_S
-from middleware.entangled.wire.message import MAX_MESSAGE, MAX_PARTS, PART, PART_BYTES, Key
+from middleware.entangled.wire.flow import IDLE_TIMEOUT_S
+from middleware.entangled.wire.fragmenter import MAX_IN_BYTES, MAX_IN_PER_PEER_BYTES, Fragmenter
+from middleware.entangled.wire.message import FRAGMENT_BYTES, MAX_FRAGMENTS, MAX_MESSAGE_BYTES, PART, MessageKey
 from tests.attacks.siege import OneSession
 from tests.fuzz.ground import Ground
 
 KIB = 1024
-HALF = MAX_MESSAGE // 2
+HALF = MAX_MESSAGE_BYTES // 2
 
 
 def part(number: int, total: int, place: int, data: bytes, is_wanted: bool = False) -> bytes:
@@ -35,7 +35,7 @@ class CourierCase(SynchronousTestCase):
         self.counters: Counter[str] = Counter()
         self.delivered: list[tuple[bytes, int]] = []
         self.receipts: list[bytes] = []
-        self.courier = Courier(
+        self.courier = Fragmenter(
             self.clock,
             lambda public, plain: self.receipts.append(plain),
             lambda session, key, data: self.delivered.append((session.contact.public, len(data))),
@@ -48,7 +48,7 @@ class CourierCase(SynchronousTestCase):
 
     def take(self, member: int, plain: bytes) -> None:
         session: Any = OneSession(member.to_bytes(32, "little"))
-        self.courier.on_part(session, plain)
+        self.courier.on_fragment(session, plain)
 
     def bytes_in(self) -> int:
         """Return the bytes reserved for incoming messages."""
@@ -56,8 +56,8 @@ class CourierCase(SynchronousTestCase):
 
     def send_whole(self, member: int, number: int, size: int) -> None:
         """Send a valid message in fragments, in order."""
-        for place in range(-(-size // PART_BYTES)):
-            here = min(PART_BYTES, size - place * PART_BYTES)
+        for place in range(-(-size // FRAGMENT_BYTES)):
+            here = min(FRAGMENT_BYTES, size - place * FRAGMENT_BYTES)
             self.take(member, part(number, size, place, bytes(here), True))
 
 
@@ -65,38 +65,38 @@ class FragmentTests(CourierCase):
     def test_never_completed(self) -> None:
         """One member has at most its share of incomplete messages, and ten seconds later none."""
         for number in range(2000):
-            self.take(1, part(number, HALF, 0, bytes(PART_BYTES)))
-        self.assertLessEqual(self.bytes_in(), MAX_IN_OF_PEER)
+            self.take(1, part(number, HALF, 0, bytes(FRAGMENT_BYTES)))
+        self.assertLessEqual(self.bytes_in(), MAX_IN_PER_PEER_BYTES)
         self.assertGreater(self.counters["crowded"], 1900)
-        self.clock.advance(IDLE_S + 2.0)
-        self.assertEqual((self.bytes_in(), len(self.courier._assemblies)), (0, 0))
+        self.clock.advance(IDLE_TIMEOUT_S + 2.0)
+        self.assertEqual((self.bytes_in(), len(self.courier._incoming)), (0, 0))
 
     def test_lies_about_its_size(self) -> None:
         """Fragments with invalid sizes or positions, or another total, are malformed and reserve nothing."""
         wrong = (
-            part(1, 2**32 - 1, 0, bytes(PART_BYTES)),
-            part(1, MAX_MESSAGE + 1, 0, bytes(PART_BYTES)),
-            part(1, HALF, 65535, bytes(PART_BYTES)),
-            part(1, HALF, MAX_PARTS, bytes(PART_BYTES)),
-            part(1, HALF, 0, bytes(PART_BYTES - 1)),
+            part(1, 2**32 - 1, 0, bytes(FRAGMENT_BYTES)),
+            part(1, MAX_MESSAGE_BYTES + 1, 0, bytes(FRAGMENT_BYTES)),
+            part(1, HALF, 65535, bytes(FRAGMENT_BYTES)),
+            part(1, HALF, MAX_FRAGMENTS, bytes(FRAGMENT_BYTES)),
+            part(1, HALF, 0, bytes(FRAGMENT_BYTES - 1)),
             part(1, 0, 0, b""),
             part(1, 10, 1, b""),
         )
         for plain in wrong:
             self.take(1, plain)
         self.assertEqual((self.counters["malformed"], self.bytes_in()), (len(wrong), 0))
-        self.take(1, part(1, HALF, 0, bytes(PART_BYTES)))
-        self.take(1, part(1, HALF - 5, 1, bytes(PART_BYTES)))
+        self.take(1, part(1, HALF, 0, bytes(FRAGMENT_BYTES)))
+        self.take(1, part(1, HALF - 5, 1, bytes(FRAGMENT_BYTES)))
         self.assertEqual(self.counters["malformed"], len(wrong) + 1)
 
     def test_overlapping(self) -> None:
         """With overlapping fragments the message has its announced length, and is delivered once."""
-        size = 3 * PART_BYTES
+        size = 3 * FRAGMENT_BYTES
         for fill in (b"a", b"b", b"a"):
             for place in (0, 2):
-                self.take(1, part(1, size, place, fill * PART_BYTES))
-        self.take(1, part(1, size, 1, b"c" * PART_BYTES))
-        self.take(1, part(1, size, 1, b"d" * PART_BYTES))
+                self.take(1, part(1, size, place, fill * FRAGMENT_BYTES))
+        self.take(1, part(1, size, 1, b"c" * FRAGMENT_BYTES))
+        self.take(1, part(1, size, 1, b"d" * FRAGMENT_BYTES))
         self.assertEqual(self.delivered, [((1).to_bytes(32, "little"), size)])
         self.assertEqual(self.counters["repeated"], 1)
 
@@ -107,21 +107,21 @@ class FragmentTests(CourierCase):
         base, _ = tracemalloc.get_traced_memory()
         for round_ in range(8):
             for member in range(1000):
-                self.take(member, part(round_ // 4, 64 * KIB, round_ % 4, bytes(PART_BYTES)))
+                self.take(member, part(round_ // 4, 64 * KIB, round_ % 4, bytes(FRAGMENT_BYTES)))
         used, _ = tracemalloc.get_traced_memory()
-        self.assertLessEqual(self.bytes_in(), MAX_IN)
-        self.assertLess(used - base, MAX_IN * 1.1)
+        self.assertLessEqual(self.bytes_in(), MAX_IN_BYTES)
+        self.assertLess(used - base, MAX_IN_BYTES * 1.1)
 
     def test_others_get_through(self) -> None:
         """If slowly growing messages take all the space, another one of 64 KiB arrives within two seconds."""
         for member in range(2, 200):
-            self.take(member, part(1, 64 * KIB, 0, bytes(PART_BYTES)))
-        self.assertGreater(self.bytes_in(), MAX_IN - 64 * KIB)
+            self.take(member, part(1, 64 * KIB, 0, bytes(FRAGMENT_BYTES)))
+        self.assertGreater(self.bytes_in(), MAX_IN_BYTES - 64 * KIB)
         for second in range(20):
             self.clock.advance(0.1)
             for member in range(2, 200):
                 if second % 5 == 0:
-                    self.take(member, part(1, 64 * KIB, second + 1, bytes(PART_BYTES)))
+                    self.take(member, part(1, 64 * KIB, second + 1, bytes(FRAGMENT_BYTES)))
             self.send_whole(1, 1, 64 * KIB)
             if self.delivered:
                 break
@@ -130,14 +130,14 @@ class FragmentTests(CourierCase):
     def test_busy_ones_are_not_pushed_out(self) -> None:
         """A message that grows quickly is not evicted."""
         for member in range(2, 120):
-            self.take(member, part(1, 64 * KIB, 0, bytes(PART_BYTES)))
+            self.take(member, part(1, 64 * KIB, 0, bytes(FRAGMENT_BYTES)))
         size = 60 * KIB
         for place in range(30):
-            self.take(1, part(1, size, place, bytes(PART_BYTES)))
+            self.take(1, part(1, size, place, bytes(FRAGMENT_BYTES)))
         self.clock.advance(1.5)
         for member in range(200, 300):
-            self.take(member, part(1, 64 * KIB, 0, bytes(PART_BYTES)))
-        self.assertTrue(((1).to_bytes(32, "little"), Key(False, 1)) in self.courier._assemblies)
+            self.take(member, part(1, 64 * KIB, 0, bytes(FRAGMENT_BYTES)))
+        self.assertTrue(((1).to_bytes(32, "little"), MessageKey(False, 1)) in self.courier._incoming)
 
 
 class EndToEndTests(SynchronousTestCase):
@@ -148,9 +148,9 @@ class EndToEndTests(SynchronousTestCase):
         session = next(iter(ground.other._sessions.values()))
         dice = random.Random(1)
         for number in range(500):
-            plain = part(dice.getrandbits(60), HALF, number % 300, bytes(PART_BYTES))
+            plain = part(dice.getrandbits(60), HALF, number % 300, bytes(FRAGMENT_BYTES))
             ground.shoot(session.seal(plain), ground.other.address)
         asked = ground.other.ask(ground.contact, "echo", bytes(64 * KIB), timeout=30.0)
-        ground.clock.advance(IDLE_S + 20.0)
+        ground.clock.advance(IDLE_TIMEOUT_S + 20.0)
         self.assertEqual(len(self.successResultOf(asked)), 64 * KIB)
         self.assertEqual(Identity(b"o" * 32).public, ground.identity.public)

@@ -8,25 +8,25 @@ from typing import Any
 
 from twisted.logger import LogLevel
 
-from middleware.admission import certificate, knock, reception
-from middleware.admission.code import drawn
-from middleware.admission.roll import invitation_id
-from middleware.entangled.identity import Identity, exchange_key
+from middleware.admission import certificate, join_codec, server
+from middleware.admission.code import draw_code
+from middleware.admission.membership_list import invitation_id
+from middleware.entangled.identity import Identity, derive_exchange_key
 from middleware.entangled.network.network import Address
-from middleware.entangled.wire import answerer
+from middleware.entangled.wire import dispatcher
 from middleware.entangled.wire import endpoint as wire
-from middleware.entangled.wire.greeting import MOST_RATE, QUIET_RATE
-from middleware.entangled.wire.hail import HAIL_BYTES, RATE, hail
-from middleware.entangled.wire.message import Question, encoded
+from middleware.entangled.wire.discovery import MAX_COOKIE_HANDSHAKES_PER_S, MAX_HANDSHAKES_PER_S
+from middleware.entangled.wire.message import Request, encode
+from middleware.entangled.wire.probe import PROBE_BYTES, REPLIES_PER_S, pack_probe
 from middleware.entangled.wire.session import (
     INIT,
-    MAC,
+    MAC_BYTES,
     MAX_RESPONSES,
     MAX_UNCONFIRMED,
-    Acceptance,
     Credentials,
-    Hello,
-    Invitation,
+    HandshakeFields,
+    InitiatorHandshake,
+    ResponderHandshake,
 )
 from tests.attacks.siege import SOURCE, SiegeCase, events_of
 from tests.middleware.admission.village import Village, network_of
@@ -48,9 +48,9 @@ class FloodCase(SiegeCase):
         self.exchanges: list[float] = []
         self.checked: list[float] = []
         self.sent: list[tuple[bytes, Address]] = []
-        accept, is_proof, send = Acceptance, certificate.is_proof, self.network.send
+        accept, is_proof, send = ResponderHandshake, certificate.is_join_signature, self.network.send
 
-        def accepted(*arguments: Any) -> Acceptance:
+        def accepted(*arguments: Any) -> ResponderHandshake:
             self.exchanges.append(self.team.clock.seconds())
             return accept(*arguments)
 
@@ -63,7 +63,7 @@ class FloodCase(SiegeCase):
             send(datagram, to)
 
         self.patch(wire, "Acceptance", accepted)
-        self.patch(reception, "is_proof", proved)
+        self.patch(server, "is_proof", proved)
         port.send = sends
         self.events = events_of(self)
 
@@ -98,14 +98,14 @@ class FloodTests(FloodCase):
 
     def handshakes(self) -> Callable[[int], bytes]:
         """Return INITs of a malicious member with the team's secret, with new ephemeral keys."""
-        own = Credentials.of(Identity(b"i" * 32), self.house.team.secret)
-        remote, dice = exchange_key(self.house.public), random.Random(2)
-        hello = Hello(room=640)
+        own = Credentials.derive(Identity(b"i" * 32), self.house.team.secret)
+        remote, dice = derive_exchange_key(self.house.public), random.Random(2)
+        hello = HandshakeFields(max_pass_bytes=640)
         kept: list[bytes] = []
 
         def made(number: int) -> bytes:
             if len(kept) < 1500:
-                kept.append(Invitation(own, remote, dice.randbytes(32), number + 1, b"", hello).datagram())
+                kept.append(InitiatorHandshake(own, remote, dice.randbytes(32), number + 1, b"", hello).make_init())
             return kept[number % len(kept)]
 
         return made
@@ -113,14 +113,14 @@ class FloodTests(FloodCase):
     def test_handshakes_of_a_member(self) -> None:
         """A member that floods and ignores the answers causes only a limited rate of key exchanges."""
         received = self.flood(self.handshakes())
-        self.assertLessEqual(len(self.exchanges), QUIET_RATE * (SECONDS + 2))
+        self.assertLessEqual(len(self.exchanges), MAX_HANDSHAKES_PER_S * (SECONDS + 2))
         self.assertLessEqual(sum(map(len, self.answers())), received)
         half = self.house.node.endpoint._half_open
         self.assertLessEqual(len(half._responses), MAX_RESPONSES)
         self.assertLessEqual(len(half._unconfirmed), MAX_UNCONFIRMED)
         self.assertGreater(self.house.node.endpoint.counters["crowded"], PER_SECOND / 2)
         self.assertLess(len(self.lines), 5)
-        self.assertLess(QUIET_RATE, MOST_RATE)
+        self.assertLess(MAX_HANDSHAKES_PER_S, MAX_COOKIE_HANDSHAKES_PER_S)
 
     def test_others_still_come_in(self) -> None:
         """During a flood another member opens a session in one additional round trip, with the cookie."""
@@ -134,9 +134,11 @@ class FloodTests(FloodCase):
     def test_knocks(self) -> None:
         """KNOCKs without an invitation cost one table lookup; few are answered, and few lines are logged."""
         dice = random.Random(3)
-        received = self.flood(lambda number: bytes([knock.KNOCK]) + dice.randbytes(knock.KNOCK_BYTES - 1))
+        received = self.flood(
+            lambda number: bytes([join_codec.JOIN_REQUEST]) + dice.randbytes(join_codec.JOIN_REQUEST_BYTES - 1)
+        )
         answers = self.answers()
-        self.assertLessEqual(len(answers), reception.HINTS * (SECONDS + 1))
+        self.assertLessEqual(len(answers), server.MAX_UNSIGNED_REFUSALS_PER_S * (SECONDS + 1))
         self.assertLessEqual(sum(map(len, answers)), received)
         self.assertEqual((self.checked, len(self.exchanges)), ([], 0))
         self.assertLessEqual(len(self.lines), 20 + SECONDS)
@@ -144,11 +146,11 @@ class FloodTests(FloodCase):
     def test_knocks_of_who_knows_the_id(self) -> None:
         """KNOCKs that name a real invitation but cannot be decrypted are dropped without a signature check."""
         code = self.team.invite("dog")
-        [invite] = self.team.houses[0].team.roll.invites()
+        [invite] = self.team.houses[0].team.membership_list.list_invitations()
         self.assertTrue(code)
         dice = random.Random(4)
-        head = bytes([knock.KNOCK]) + invitation_id(invite.public)
-        self.flood(lambda number: head + dice.randbytes(knock.KNOCK_BYTES - len(head)), 1)
+        head = bytes([join_codec.JOIN_REQUEST]) + invitation_id(invite.public)
+        self.flood(lambda number: head + dice.randbytes(join_codec.JOIN_REQUEST_BYTES - len(head)), 1)
         self.assertEqual(self.checked, [])
         self.assertEqual(self.answers(), [])
 
@@ -160,21 +162,22 @@ class FloodTests(FloodCase):
         self.team.run(1.0)
         dice = random.Random(6)
         kept = [
-            knock.knock(code.key, Identity(dice.randbytes(32)).public, dice.randbytes(32), "", dice) for _ in range(400)
+            join_codec.make_request(code.key, Identity(dice.randbytes(32)).public, dice.randbytes(32), "", dice)
+            for _ in range(400)
         ]
         received = self.flood(lambda number: kept[number % 400], 2)
-        self.assertLessEqual(len(self.checked), reception.RATE * 4)
+        self.assertLessEqual(len(self.checked), server.MAX_REQUESTS_PER_S * 4)
         self.assertLessEqual(sum(map(len, self.answers())), received)
         self.team.run(3.0)
         self.assertEqual(len(self.team.members()), 2)
-        self.assertNotEqual(drawn(self.team.signer.public, dice).text, code.text)
+        self.assertNotEqual(draw_code(self.team.signer.public, dice).text, code.text)
 
     def test_hails(self) -> None:
         """Twenty HAILs per second are answered, each with the size of the request."""
-        self.flood(lambda number: hail(number.to_bytes(16, "little")))
+        self.flood(lambda number: pack_probe(number.to_bytes(16, "little")))
         answers = self.answers()
-        self.assertLessEqual(len(answers), RATE * (SECONDS + 1))
-        self.assertLessEqual({len(datagram) for datagram in answers}, {HAIL_BYTES})
+        self.assertLessEqual(len(answers), REPLIES_PER_S * (SECONDS + 1))
+        self.assertLessEqual({len(datagram) for datagram in answers}, {PROBE_BYTES})
 
     def test_questions_of_a_member(self) -> None:
         """A member's requests are limited in rate, and those beyond the limit are refused as busy."""
@@ -186,14 +189,14 @@ class FloodTests(FloodCase):
         session = next(iter(bad._sessions.values()))
         began = self.team.clock.seconds()
         for number in range(15_000):
-            plain = encoded(Question(number, "device.settings", ()))
+            plain = encode(Request(number, "device.settings", ()))
             assert self.network.receiver is not None
             self.network.receiver(session.seal(plain), SOURCE)
             if not number % 1000:
                 self.team.run(0.1)
         seconds = self.team.clock.seconds() - began
-        self.assertLessEqual(len(ran), answerer.QUESTIONS_AT_ONCE + answerer.QUESTIONS * seconds)
-        self.assertGreater(len(ran), answerer.QUESTIONS_AT_ONCE)
+        self.assertLessEqual(len(ran), dispatcher.REQUEST_BURST + dispatcher.REQUESTS_PER_S * seconds)
+        self.assertGreater(len(ran), dispatcher.REQUEST_BURST)
         self.assertGreater(self.house.node.endpoint.counters["busy"], 2000)
         refused = self.outcome(self.team, bad.ask(contact, "device.settings"), 0.01)
         self.assertEqual(getattr(refused, "code", ""), "busy")
@@ -208,17 +211,17 @@ class FloodTests(FloodCase):
         """A cookie is valid only for the address that received it."""
         made = self.handshakes()
         self.flood(made, 1)
-        self.assertEqual(made(1)[-MAC:], bytes(MAC))
+        self.assertEqual(made(1)[-MAC_BYTES:], bytes(MAC_BYTES))
         cookies = self.house.node.endpoint._cookies
         here, there = Address("127.0.0.1", 1), Address("127.0.0.1", 2)
-        paid = Invitation(
-            Credentials.of(Identity(b"i" * 32), self.house.team.secret),
-            exchange_key(self.house.public),
+        paid = InitiatorHandshake(
+            Credentials.derive(Identity(b"i" * 32), self.house.team.secret),
+            derive_exchange_key(self.house.public),
             bytes(31) + b"\x01",
             7,
             b"",
-            Hello(room=640),
-        ).datagram(cookies._cookie(here, int(self.team.clock.seconds() / 120)))
+            HandshakeFields(max_pass_bytes=640),
+        ).make_init(cookies._make_cookie(here, int(self.team.clock.seconds() / 120)))
         now = self.team.clock.seconds()
-        self.assertTrue(cookies.is_lawful(paid, here, now))
-        self.assertFalse(cookies.is_lawful(paid, there, now))
+        self.assertTrue(cookies.is_valid(paid, here, now))
+        self.assertFalse(cookies.is_valid(paid, there, now))

@@ -6,23 +6,23 @@ import random
 from collections import Counter
 from typing import Any
 
-from middleware.admission import knock
+from middleware.admission import join_codec
 from middleware.entangled.clock import HeapClock
-from middleware.entangled.identity import Identity, exchange_key
-from middleware.entangled.network.network import MAX_DATAGRAM, Address, relayed
-from middleware.entangled.reach.relay import (
+from middleware.entangled.identity import Identity, derive_exchange_key
+from middleware.entangled.nat.relay import (
     ALL_BURST,
     ALL_RATE,
-    CARRY,
     MAX_PAIRS,
     PAIR_BURST,
     PAIR_RATE,
+    RELAY_REQUEST,
     Relay,
 )
-from middleware.entangled.wire.greeting import who
-from middleware.entangled.wire.hail import hail
-from middleware.entangled.wire.message import Question, encoded
-from middleware.entangled.wire.session import Credentials, Hello, Invitation, derived_key
+from middleware.entangled.network.network import MAX_DATAGRAM_BYTES, Address, relayed_address
+from middleware.entangled.wire.discovery import pack_discovery
+from middleware.entangled.wire.message import Request, encode
+from middleware.entangled.wire.probe import pack_probe
+from middleware.entangled.wire.session import Credentials, HandshakeFields, InitiatorHandshake, derive_key
 from tests.attacks.siege import OneSession, SiegeCase
 from tests.middleware.admission.village import network_of
 
@@ -59,28 +59,30 @@ class AmplificationTests(SiegeCase):
     def test_every_kind(self) -> None:
         """No answer to an unverified address is longer than its request."""
         secret = self.house.team.secret
-        own = Credentials.of(Identity(b"i" * 32), secret)
-        remote = exchange_key(self.house.public)
-        question = encoded(Question(1, "find_node", (bytes(20),)))
+        own = Credentials.derive(Identity(b"i" * 32), secret)
+        remote = derive_exchange_key(self.house.public)
+        question = encode(Request(1, "find_node", (bytes(20),)))
         paper = self.team.paper("ape")
-        passes = {"no": b"", "good": paper.shown, "long": paper.shown.ljust(640, b"x")}
+        passes = {"no": b"", "good": paper.certificate, "long": paper.certificate.ljust(640, b"x")}
         code, packed, terms = self.team.signer.invite("cub", ("device",), 1, self.team.wall(), 900.0, self.dice)
         self.team.tell(terms)
         self.team.tell(packed)
         self.team.run(2.0)
         cub = Identity(b"c" * 32)
         sent = {
-            "who": who(derived_key(secret, b"greet"), bytes(16), self.dice),
-            "hail": hail(bytes(16)),
-            "knock": knock.knock(code.key, cub.public, exchange_key(cub.public), "", self.dice),
-            "strange knock": bytes([knock.KNOCK]) + self.dice.randbytes(knock.KNOCK_BYTES - 1),
+            "who": pack_discovery(derive_key(secret, b"greet"), bytes(16), self.dice),
+            "hail": pack_probe(bytes(16)),
+            "knock": join_codec.make_request(code.key, cub.public, derive_exchange_key(cub.public), "", self.dice),
+            "strange knock": bytes([join_codec.JOIN_REQUEST]) + self.dice.randbytes(join_codec.JOIN_REQUEST_BYTES - 1),
         }
         for name, shown in passes.items():
-            member = Credentials.of(paper.identity, secret) if shown == paper.shown else own
+            member = Credentials.derive(paper.identity, secret) if shown == paper.certificate else own
             for rider in (b"", question):
-                hello = Hello(self.house.team.door.life, shown, 640)
-                made = Invitation(member, remote, self.dice.randbytes(32), self.dice.getrandbits(31), rider, hello)
-                sent[f"init with {name} pass{', asks' * bool(rider)}"] = made.datagram()
+                hello = HandshakeFields(self.house.team.admission.incarnation, shown, 640)
+                made = InitiatorHandshake(
+                    member, remote, self.dice.randbytes(32), self.dice.getrandbits(31), rider, hello
+                )
+                sent[f"init with {name} pass{', asks' * bool(rider)}"] = made.make_init()
         ratios = {name: self.back(datagram) / len(datagram) for name, datagram in sent.items()}
         answered = [name for name, ratio in ratios.items() if ratio]
         self.assertGreater(len(answered), 7, ratios)
@@ -88,9 +90,16 @@ class AmplificationTests(SiegeCase):
 
     def test_again_and_again(self) -> None:
         """A recorded INIT sent a hundred times gets at most as many bytes as it has."""
-        own = Credentials.of(Identity(b"i" * 32), self.house.team.secret)
-        made = Invitation(own, exchange_key(self.house.public), bytes(31) + b"\x02", 9, b"", Hello(room=640))
-        datagram = made.datagram()
+        own = Credentials.derive(Identity(b"i" * 32), self.house.team.secret)
+        made = InitiatorHandshake(
+            own,
+            derive_exchange_key(self.house.public),
+            bytes(31) + b"\x02",
+            9,
+            b"",
+            HandshakeFields(max_pass_bytes=640),
+        )
+        datagram = made.make_init()
         back = sum(self.back(datagram, 0.01) for _ in range(100))
         self.assertLessEqual(back, 100 * len(datagram))
 
@@ -103,7 +112,7 @@ class AmplificationTests(SiegeCase):
         self.sent.clear()
         for _ in range(500):
             self.network.receiver(self.dice.randbytes(1200), VICTIM)
-            self.network.receiver(hail(self.dice.randbytes(16)), VICTIM)
+            self.network.receiver(pack_probe(self.dice.randbytes(16)), VICTIM)
         self.team.run(5.0)
         self.sent.pop(VICTIM, None)
         self.assertLessEqual(sum(self.sent.values()), 1.2 * usual + 2000)
@@ -149,7 +158,7 @@ class RelayTests(SiegeCase):
         network: Any = network_of(team.houses[0])
         to = team.houses[1].node.contact.node_id
         before = team.houses[0].node.endpoint.counters["carried"]
-        network.receiver(bytes([CARRY]) + to + bytes(500), VICTIM)
+        network.receiver(bytes([RELAY_REQUEST]) + to + bytes(500), VICTIM)
         team.run(1.0)
         self.assertEqual(team.houses[0].node.endpoint.counters["carried"], before)
 
@@ -158,7 +167,7 @@ class RelayTests(SiegeCase):
         team = self.village()
         team.enlist("dog")
         paper = team.paper("bad")
-        bad = self.attacker(team, paper.identity, paper.secrets[0][1], paper.shown)
+        bad = self.attacker(team, paper.identity, paper.secrets[0][1], paper.certificate)
         self.outcome(team, bad.ask(team.contact(team.houses[0]), "ping", bytes(8), changes=True))
         counters = team.houses[0].node.endpoint.counters
 
@@ -167,7 +176,7 @@ class RelayTests(SiegeCase):
             session = next(iter(bad._sessions.values()), None)
             if session is not None:
                 to = team.houses[1].node.contact.node_id
-                bad._network.send(session.seal(bytes([CARRY]) + to + bytes(200)), team.address(0))
+                bad._network.send(session.seal(bytes([RELAY_REQUEST]) + to + bytes(200)), team.address(0))
                 team.run(0.1)
             return counters["carried"] - before
 
@@ -194,16 +203,16 @@ class RelayTests(SiegeCase):
         """One pair gets a burst and then 64 kbit/s, and if only one side sends, two minutes."""
         relay, clock, sent = self.relay()
         session: Any = OneSession(b"a" * 32)
-        plain = bytes([CARRY]) + b"b" * 20 + bytes(1000)
+        plain = bytes([RELAY_REQUEST]) + b"b" * 20 + bytes(1000)
         for _ in range(60):
             for _ in range(50):
-                relay.on_carry(session, plain, VICTIM)
+                relay.on_request(session, plain, VICTIM)
             clock.advance(1.0)
         self.assertLessEqual(sent[0], 1.05 * (PAIR_BURST + 60 * PAIR_RATE))
         self.assertGreater(sent[0], PAIR_BURST)
         clock.advance(90.0)
         before = sent[0]
-        relay.on_carry(session, plain, VICTIM)
+        relay.on_request(session, plain, VICTIM)
         self.assertEqual(sent[0], before)
 
     def test_quota_of_all(self) -> None:
@@ -212,7 +221,7 @@ class RelayTests(SiegeCase):
         for _ in range(10):
             for number in range(400):
                 session: Any = OneSession(number.to_bytes(32, "big"))
-                relay.on_carry(session, bytes([CARRY]) + b"b" * 20 + bytes(1300), VICTIM)
+                relay.on_request(session, bytes([RELAY_REQUEST]) + b"b" * 20 + bytes(1300), VICTIM)
             clock.advance(1.0)
         self.assertLessEqual(sent[0], 1.05 * (ALL_BURST + 10 * ALL_RATE))
         self.assertLessEqual(len(relay), MAX_PAIRS)
@@ -221,9 +230,9 @@ class RelayTests(SiegeCase):
         """A relay does not forward datagrams that were relayed, are too long or empty, or address their sender."""
         relay, _, sent = self.relay()
         session: Any = OneSession(b"a" * 32)
-        far: Any = OneSession(b"c" * 32, relayed(b"d" * 20))
-        relay.on_carry(far, bytes([CARRY]) + b"b" * 20 + b"x", VICTIM)
-        relay.on_carry(session, bytes([CARRY]) + b"b" * 20, VICTIM)
-        relay.on_carry(session, bytes([CARRY]) + b"b" * 20 + bytes(MAX_DATAGRAM + 1), VICTIM)
-        relay.on_carry(session, bytes([CARRY]) + session.contact.node_id + b"x", VICTIM)
+        far: Any = OneSession(b"c" * 32, relayed_address(b"d" * 20))
+        relay.on_request(far, bytes([RELAY_REQUEST]) + b"b" * 20 + b"x", VICTIM)
+        relay.on_request(session, bytes([RELAY_REQUEST]) + b"b" * 20, VICTIM)
+        relay.on_request(session, bytes([RELAY_REQUEST]) + b"b" * 20 + bytes(MAX_DATAGRAM_BYTES + 1), VICTIM)
+        relay.on_request(session, bytes([RELAY_REQUEST]) + session.contact.node_id + b"x", VICTIM)
         self.assertEqual(sent, [0])

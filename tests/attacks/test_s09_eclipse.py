@@ -9,12 +9,12 @@ from twisted.trial.unittest import SynchronousTestCase
 
 from middleware.entangled.contact import Contact
 from middleware.entangled.errors import NotAdmitted
-from middleware.entangled.identity import Identity, node_id
+from middleware.entangled.identity import Identity, derive_node_id
 from middleware.entangled.kademlia.routing import RoutingTable
 from middleware.entangled.network.network import Address
-from middleware.entangled.record import hashed_key
+from middleware.entangled.record import hash_key
 from tests.attacks.siege import SOURCE, SiegeCase
-from tests.fleet import Fleet, FleetCase
+from tests.fleet import EntangledTeam, FleetCase
 from tests.middleware.admission.village import Village
 
 K = 8
@@ -40,14 +40,16 @@ class OutsiderTests(SiegeCase):
         team = self.village()
         for name in ("dog", "cat", "pig", "cow"):
             team.enlist(name)
-        key = hashed_key("task")
+        key = hash_key("task")
         self.outcome(team, team.houses[1].node.put(key, "x", b"kept"))
         members = self.everybody(team)
-        crowd = sorted(sybils(10_000), key=lambda each: int.from_bytes(node_id(each.public)) ^ int.from_bytes(key))
+        crowd = sorted(
+            sybils(10_000), key=lambda each: int.from_bytes(derive_node_id(each.public)) ^ int.from_bytes(key)
+        )
         for house in team.houses:
             self.assertFalse(crowd[0] in house.node.overlay.contacts())
         bad, _ = self.insider(team, "bad")  # a member that names the invented identities
-        page = [contact.packed() for contact in crowd[:K]]
+        page = [contact.pack() for contact in crowd[:K]]
         bad.expose("find_node", lambda peer, target: page)
         bad.expose("members", lambda peer, after: page)
         bad.expose("ping", lambda peer, digest: bytes(8), changes=True)
@@ -81,31 +83,31 @@ class TableTests(SynchronousTestCase):
         old, [me] = sybils(40, 3), sybils(1, 2)
         table = RoutingTable(me.node_id, K)
         for contact in old:
-            table.saw(contact, 0.0)
-        before = set(table.contacts())
+            table.record_contact(contact, 0.0)
+        before = set(table.list_contacts())
         for moment, contact in enumerate(sybils(10_000)):
-            doubtful = table.saw(contact, 10.0 + moment / 100)
+            doubtful = table.record_contact(contact, 10.0 + moment / 100)
             if doubtful is not None and doubtful in before:
-                table.saw(doubtful, 10.0 + moment / 100)  # it answers
-        self.assertLessEqual(before, set(table.contacts()))
+                table.record_contact(doubtful, 10.0 + moment / 100)  # it answers
+        self.assertLessEqual(before, set(table.list_contacts()))
         self.assertLess(len(table), 40 * K)
 
     def test_own_id(self) -> None:
         """A contact with the node's own id is not added."""
         [contact] = sybils(1)
         table = RoutingTable(contact.node_id, K)
-        table.saw(contact, 0.0)
+        table.record_contact(contact, 0.0)
         self.assertEqual(len(table), 0)
 
 
 class InsiderTests(FleetCase):
-    def lied(self, fleet: Fleet, share: float) -> list[int]:
+    def lied(self, fleet: EntangledTeam, share: float) -> list[int]:
         """Let a share of the members lie in lookups and discard records; return the honest members."""
         dice = random.Random(4)
         count = round(share * len(fleet.nodes))
         liars = sorted(dice.sample(range(1, len(fleet.nodes)), count))
-        page = [fleet.nodes[place].contact.packed() for place in liars][:K]
-        page += [contact.packed() for contact in sybils(K)]
+        page = [fleet.nodes[place].contact.pack() for place in liars][:K]
+        page += [contact.pack() for contact in sybils(K)]
         for place in liars:
             methods: dict[str, Any] = {
                 "find_node": lambda peer, target: page[:K],
@@ -122,7 +124,7 @@ class InsiderTests(FleetCase):
         """Return the share of 40 keys, written before the lies, that honest members read correctly."""
         fleet = self.fleet(20)
         fleet.run(10.0)
-        values = {hashed_key(f"k{number}"): b"%d" % number for number in range(40)}
+        values = {hash_key(f"k{number}"): b"%d" % number for number in range(40)}
         for number, (key, value) in enumerate(values.items()):
             self.done(fleet, fleet.nodes[number % 20].put(key, "x", value), 0.5)
         honest = self.lied(fleet, share)

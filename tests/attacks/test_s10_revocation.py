@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import Any
 
 from middleware.admission.membership import Membership
-from middleware.entangled.record import hashed_key
+from middleware.entangled.record import hash_key
 from tests.attacks.siege import SOURCE, SiegeCase
 from tests.middleware.admission.village import House, Village, network_of
 
@@ -36,8 +36,8 @@ class RevocationCase(SiegeCase):
             house.name
             for house in among
             if self.bad.public in [contact.public for contact in house.node.overlay.contacts()]
-            or house.node.endpoint.is_met(self.team.contact(self.bad))
-            or self.bad.name in [member.name for member in house.team.members()]
+            or house.node.endpoint.has_session(self.team.contact(self.bad))
+            or self.bad.name in [member.name for member in house.team.list_members()]
         ]
 
     def refusals(self, bare: Any, among: list[House]) -> set[str]:
@@ -48,7 +48,7 @@ class RevocationCase(SiegeCase):
         """Return an endpoint with identity, certificate and secret of the stolen store, on another machine."""
         paper: Membership = self.bad.kept.membership
         where = SOURCE._replace(port=600 + at)
-        return self.attacker(self.team, paper.identity, paper.secrets[0][1], paper.shown, where, life)
+        return self.attacker(self.team, paper.identity, paper.secrets[0][1], paper.certificate, where, life)
 
 
 class TwentyTests(RevocationCase):
@@ -66,12 +66,12 @@ class TwentyTests(RevocationCase):
         """Nodes behind a partition exclude the member within ten seconds after it heals."""
         near = self.team.houses[:12]
         far = self.team.houses[12:]
-        self.team.board.partition([self.team.address_of(each) for each in near])
+        self.team.switchboard.partition([self.team.address_of(each) for each in near])
         self.team.run(30.0)
         self.revoke()
         self.team.run(IN_FORCE)
         self.assertEqual(self.out([house for house in near if house is not self.bad]), [])
-        self.team.board.heal()
+        self.team.switchboard.heal()
         self.team.run(IN_FORCE)
         self.assertEqual(self.out(far), [])
 
@@ -114,7 +114,7 @@ class RevocationTests(RevocationCase):
 
     def test_what_it_wrote_on_lease_goes(self) -> None:
         """Leased records of the revoked member expire."""
-        key = hashed_key("devices")
+        key = hash_key("devices")
         self.outcome(self.team, self.bad.node.put(key, "dog7", b"here", "leased"))
         self.assertEqual(len(self.outcome(self.team, self.others[0].node.get(key))), 1)
         self.revoke()
@@ -126,7 +126,7 @@ class RevocationTests(RevocationCase):
         self.revoke()
         members = [house.public for house in self.others]
         self.team.run(2.0)
-        self.team.tell(self.team.signer.rotate(2, members, self.team.wall(), 5.0, self.team.dice))
+        self.team.tell(self.team.signer.rotate_secret(2, members, self.team.wall(), 5.0, self.team.dice))
         self.team.run(30.0)
         self.team.close(self.bad, is_sudden=True)
         bare = self.bare()

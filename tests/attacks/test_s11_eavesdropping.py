@@ -9,8 +9,8 @@ from __future__ import annotations
 import base64
 from collections.abc import Iterable
 
-from middleware.entangled.identity import node_id
-from middleware.entangled.record import hashed_key
+from middleware.entangled.identity import derive_node_id
+from middleware.entangled.record import hash_key
 from tests.attacks.siege import SiegeCase
 from tests.middleware.admission.village import Tape, network_of
 
@@ -39,7 +39,7 @@ class EavesdroppingTests(SiegeCase):
         self.tape.tap(network_of(self.team.houses[0]))
         self.dog = self.team.enlist(WORDS[0])
         self.cat = self.team.welcome("hedgehog")
-        self.key = hashed_key("task")
+        self.key = hash_key("task")
         self.dog.node.watch(self.key, lambda records: None)
         self.outcome(self.team, self.cat.node.put(self.key, WORDS[4], WORDS[1].encode()))
         self.outcome(self.team, self.dog.node.put(self.key, "place", PLACE * 200))
@@ -60,24 +60,24 @@ class EavesdroppingTests(SiegeCase):
     def test_nobody_is_told_by_its_key(self) -> None:
         """No datagram contains a public key, node id or record key, which would identify the peers."""
         keys = [house.public for house in self.team.houses]
-        needles = set().union(*(forms(each) for each in (*keys, *map(node_id, keys), self.key)))
+        needles = set().union(*(forms(each) for each in (*keys, *map(derive_node_id, keys), self.key)))
         self.assertEqual(found(self.heard, needles), [])
 
     def test_no_secret_and_no_pass(self) -> None:
         """No datagram contains the team's secrets, identity seeds, certificates or statements of the operator."""
         secret = self.team.houses[0].team.secret
         seeds = [house.kept.membership.seed for house in self.team.houses]
-        shown = [house.kept.membership.shown for house in self.team.houses]
-        packed = self.team.houses[0].team.roll.packed()
+        shown = [house.kept.membership.certificate for house in self.team.houses]
+        packed = self.team.houses[0].team.membership_list.list_packed()
         pieces = [each[place : place + 32] for each in (*shown, *packed) for place in range(0, len(each) - 32, 32)]
         needles = set().union(*(forms(each) for each in (secret, self.team.signer.seed, *seeds)), pieces)
         self.assertEqual(found(self.heard, needles), [])
 
     def test_the_ear_hears(self) -> None:
         """The search finds the only plain text, the fingerprint of the team in an ECHO."""
-        self.outcome(self.team, self.dog.node.endpoint.hail(self.team.address(0)))
+        self.outcome(self.team, self.dog.node.endpoint.probe(self.team.address(0)))
         heard = [datagram for _, datagram, _ in self.tape.heard]
-        fingerprint = self.team.houses[0].team.door.fingerprint
+        fingerprint = self.team.houses[0].team.admission.fingerprint
         self.assertEqual(found(heard, [fingerprint]), [fingerprint])
 
     def test_the_same_word_looks_different(self) -> None:

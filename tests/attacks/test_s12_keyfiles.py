@@ -29,20 +29,20 @@ class FileTests(SiegeCase):
         self.folder = Path(self.mktemp())
         self.folder.mkdir()
         self.signer: Operator = drawn(1)
-        self.paper: Membership = self.signer.founded("vaio", ("device",), NOW, random.Random(1))
-        self.files = {self.folder / "membership": MembershipFile, self.folder / "operator": operator.load}
-        membership.made(self.folder / "membership", self.paper)
-        operator.made(self.folder / "operator", self.signer)
+        self.paper: Membership = self.signer.create_membership("vaio", ("device",), NOW, random.Random(1))
+        self.files = {self.folder / "membership": MembershipFile, self.folder / "operator": operator.load_operator}
+        membership.create_membership_file(self.folder / "membership", self.paper)
+        operator.create_operator_file(self.folder / "operator", self.signer)
 
     def test_made_for_the_owner_alone(self) -> None:
         """New and replaced key files, and the files of the store, have the mode 0600 under any umask."""
         before = os.umask(0)
         self.addCleanup(os.umask, before)
-        membership.made(self.folder / "other", self.paper)
+        membership.create_membership_file(self.folder / "other", self.paper)
         found = MembershipFile(self.folder / "other")
-        found.keep(self.paper.with_secret(2, bytes(32), 0))
+        found.save(self.paper.with_secret(2, bytes(32), 0))
         store = SqliteStore.open(self.folder / "store.db", 0.0)
-        store.note("x", b"y")
+        store.set_note("x", b"y")
         store.close()
         for path in (*self.files, self.folder / "other", *self.folder.glob("store.db*")):
             self.assertEqual(stat.S_IMODE(path.stat().st_mode), 0o600, path)
@@ -71,7 +71,7 @@ class FileTests(SiegeCase):
     def test_one_for_the_other(self) -> None:
         """An operator's key file is not accepted as a membership, and the reverse."""
         self.assertRaises(BadKeyFile, MembershipFile, self.folder / "operator")
-        self.assertRaises(BadKeyFile, operator.load, self.folder / "membership")
+        self.assertRaises(BadKeyFile, operator.load_operator, self.folder / "membership")
 
     def test_a_member_has_no_operators_key(self) -> None:
         """A member's file does not contain the operator's secret."""
@@ -105,7 +105,7 @@ class SaidTests(SiegeCase):
         stranger.ask(team.contact(dog), "ping", bytes(8), changes=True).addErrback(lambda failure: None)
         team.run(2.0)
         team.tell(team.signer.revoke(dog.public, "dog", team.wall()))
-        team.tell(team.signer.rotate(2, [team.houses[0].public], team.wall(), 5.0, team.dice))
+        team.tell(team.signer.rotate_secret(2, [team.houses[0].public], team.wall(), 5.0, team.dice))
         team.run(10.0)
         team.close(team.houses[0])
         team.open(team.houses[0])
@@ -123,9 +123,9 @@ class SaidTests(SiegeCase):
         shown = [
             *(repr(each) + str(each) for each in (house.kept.membership, house.kept, team.signer, house.team)),
             repr(house.kept.membership.identity) + str(house.kept.membership.identity),
-            repr(house.node.endpoint) + repr(house.team.door) + repr(house.team.roll),
+            repr(house.node.endpoint) + repr(house.team.admission) + repr(house.team.membership_list),
             repr(house.node.endpoint._credentials),
-            repr(house.team._build_welcome(house.kept.membership.shown)),
+            repr(house.team._build_reply(house.kept.membership.certificate)),
         ]
         self.assertEqual([each for each in self.secrets(team) if each in "\n".join(shown)], [])
 
@@ -138,7 +138,7 @@ class SaidTests(SiegeCase):
         answers = []
         for method, arguments in (
             ("roll.compare", (bytes(8),)),
-            ("roll.fetch", (team.houses[0].team.roll.digests,)),
+            ("roll.fetch", (team.houses[0].team.membership_list.digests,)),
             ("known", ()),
             ("members", (b"",)),
             ("find_node", (bytes(20),)),

@@ -9,24 +9,24 @@ import msgpack
 
 from middleware.admission.roles import DEVICE, OPERATOR, VIEWER
 from middleware.entangled.identity import Identity
-from middleware.entangled.record import Record, hashed_key
+from middleware.entangled.record import Record, hash_key
 from middleware.entangled.replication.watch import Watch
 from middleware.entangled.space.tuplespace import TupleSpace
-from middleware.stop.halt import HALT, SLOT
 from middleware.stop.stop_set import Statement
+from middleware.stop.stop_state import SLOT, STOPS_KEY
 from middleware.tasks.task import TASKS
 from tests.attacks.siege import SOURCE, SiegeCase
 from tests.middleware.admission.village import House, Village
 
 JUNK = 12_400
 PAGE = 60
-OTHER = hashed_key("whatever")
+OTHER = hash_key("whatever")
 STOP = bytes(range(16))
 
 
 def written(owner: Identity, key: bytes, name: str, value: bytes = b"\xc3", sequence: int = 1) -> Record:
     """Return a team record with a valid signature of its owner."""
-    return Record(key, name, owner.public, sequence, "team", 3600.0, value).signed(owner)
+    return Record(key, name, owner.public, sequence, "team", 3600.0, value).sign(owner)
 
 
 class RecordCase(SiegeCase):
@@ -41,12 +41,12 @@ class RecordCase(SiegeCase):
 
     def forged(self, owner: Identity) -> list[Record]:
         """Return a release of a stop, a task and another record, signed by ``owner``."""
-        release = msgpack.packb(Statement({}, (STOP,), "nobody").packed())
-        return [written(owner, HALT, SLOT, release), written(owner, TASKS, "t1"), written(owner, OTHER, "x")]
+        release = msgpack.packb(Statement({}, (STOP,), "nobody").pack())
+        return [written(owner, STOPS_KEY, SLOT, release), written(owner, TASKS, "t1"), written(owner, OTHER, "x")]
 
     def holders(self, records: list[Record], among: list[House]) -> list[str]:
         """Return the nodes that store any of the records."""
-        return [h.name for h in among if any(h.node.store.slot(record.slot) is not None for record in records)]
+        return [h.name for h in among if any(h.node.store.get_slot(record.slot) is not None for record in records)]
 
     def read(self, records: list[Record], house: House) -> list[Record]:
         """Return the given records that a node reads with the consistency level majority."""
@@ -61,7 +61,7 @@ class RecordCase(SiegeCase):
 
     def works(self, house: House) -> None:
         """Check that a node can write a record and a tuple, and publish an invitation."""
-        put = house.node.put(hashed_key("own"), "slot", b"\xc3")
+        put = house.node.put(hash_key("own"), "slot", b"\xc3")
         self.assertGreaterEqual(self.outcome(self.team, put), 3)
         space = TupleSpace(house.node, self.team.clock, random.Random(7), "yard")
         self.addCleanup(space.stop)
@@ -91,10 +91,10 @@ class InventedKeyTests(RecordCase):
         for house in team.houses:
             node: Any = house.node
             for watch in node._subscriber._watches:
-                watch.asked.add(own.node_id)
+                watch.requested.add(own.node_id)
             contact = team.contact(house)
             for record in self.records:
-                packed = [record.packed()]
+                packed = [record.pack()]
                 for method, arguments in (
                     ("store", (packed,)),
                     ("store", (packed, [600.0])),
@@ -115,15 +115,15 @@ class InventedKeyTests(RecordCase):
         team, house = self.team, self.team.houses[0]
         liar, _ = self.insider(team, "eye", VIEWER)
         by_key = {record.key: record for record in self.records}
-        liar.expose("find_value", lambda peer, key, *rest: [[by_key[key].packed()], None, 1])
-        liar.expose("watch", lambda peer, key, *rest: [1, [[by_key[key].packed()], None]], changes=True)
-        liar.expose("fetch", lambda peer, slots: [[by_key[slot[0]].packed(), 600.0] for slot in slots])
+        liar.expose("find_value", lambda peer, key, *rest: [[by_key[key].pack()], None, 1])
+        liar.expose("watch", lambda peer, key, *rest: [1, [[by_key[key].pack()], None]], changes=True)
+        liar.expose("fetch", lambda peer, slots: [[by_key[slot[0]].pack(), 600.0] for slot in slots])
         self.outcome(team, liar.ask(team.contact(house), "ping", bytes(8), changes=True))
         contact = next(iter([c for c in house.node.overlay.contacts() if c.address == SOURCE]), None)
         assert contact is not None
         node: Any = house.node
         for record in self.records:
-            reading = node._chores
+            reading = node._background
             answers: list[Any] = []
 
             async def read(record: Record = record, answers: list[Any] = answers) -> None:
@@ -145,7 +145,7 @@ class InventedKeyTests(RecordCase):
         others = [house for house in team.houses if house is not accomplice]
         watches = [watch for house in others for watch in self.watch(self.records, house)]
         for record in self.records:
-            accomplice.node.replica.keep(record)
+            accomplice.node.replica.store_locally(record)
         team.run(60.0)
         self.assertEqual(self.holders(self.records, [accomplice]), [accomplice.name])
         self.assertEqual(self.holders(self.records, others), [])
@@ -159,7 +159,7 @@ class InventedKeyTests(RecordCase):
         junk = [written(self.invented, OTHER, f"{number}") for number in range(JUNK)]
         for house in team.houses:
             for begin in range(0, JUNK, PAGE):
-                page = [record.packed() for record in junk[begin : begin + PAGE]]
+                page = [record.pack() for record in junk[begin : begin + PAGE]]
                 asked = viewer.ask(team.contact(house), "store", page, [600.0] * len(page), changes=True)
                 asked.addErrback(lambda failure: None)
                 team.run(0.05)
@@ -197,35 +197,35 @@ class RevokedKeyTests(RecordCase):
 
     def test_its_stop_stays(self) -> None:
         """A stop of a revoked operator stays in force, also across restarts, and the operator cannot release it."""
-        stop = msgpack.packb(Statement({STOP: "boss"}).packed())
-        self.outcome(self.team, self.boss.node.put(HALT, SLOT, stop))
+        stop = msgpack.packb(Statement({STOP: "boss"}).pack())
+        self.outcome(self.team, self.boss.node.put(STOPS_KEY, SLOT, stop))
         self.revoke()
         sleeper = self.others[1]
         self.team.close(sleeper)
         self.team.open(sleeper)
         self.team.run(5.0)
         for house in self.others:
-            found = self.outcome(self.team, house.node.get(HALT))
+            found = self.outcome(self.team, house.node.get(STOPS_KEY))
             self.assertEqual([record.value for record in found], [stop], house.name)
         bad, _ = self.insider(self.team, "bad", DEVICE)
-        lifted = msgpack.packb(Statement({}, (STOP,), "boss").packed())
-        release = written(self.boss.kept.membership.identity, HALT, SLOT, lifted, sequence=2**40)
+        lifted = msgpack.packb(Statement({}, (STOP,), "boss").pack())
+        release = written(self.boss.kept.membership.identity, STOPS_KEY, SLOT, lifted, sequence=2**40)
         for house in self.others:
-            bad.ask(self.team.contact(house), "store", [release.packed()], [600.0], changes=True)
+            bad.ask(self.team.contact(house), "store", [release.pack()], [600.0], changes=True)
         self.team.run(1.0)
         for house in self.others:
-            self.assertNotEqual(house.node.store.slot(release.slot), release)
+            self.assertNotEqual(house.node.store.get_slot(release.slot), release)
 
     def test_what_it_signs_afterwards(self) -> None:
         """Records signed after the revocation are refused from a member, and from an accomplice's node."""
         self.revoke()
         bad, _ = self.insider(self.team, "bad", DEVICE)
         for house in self.others:
-            asked = bad.ask(self.team.contact(house), "store", [self.later.packed()], [600.0], changes=True)
+            asked = bad.ask(self.team.contact(house), "store", [self.later.pack()], [600.0], changes=True)
             [verdict] = self.outcome(self.team, asked, 0.5)
             self.assertLess(verdict, 0)
         accomplice = self.accomplice()
-        accomplice.node.replica.keep(self.later)
+        accomplice.node.replica.store_locally(self.later)
         honest = [house for house in self.others if house is not accomplice]
         self.team.run(60.0)
         self.assertEqual(self.holders([self.later], honest), [])
@@ -243,7 +243,7 @@ class RevokedKeyTests(RecordCase):
         self.team.close(sleeper)
         sleeper.node.store.put(self.later, self.team.clock.seconds() + 600.0)
         self.team.open(sleeper)
-        self.assertEqual(sleeper.node.replica.held(TASKS), [])
+        self.assertEqual(sleeper.node.replica.get_held(TASKS), [])
         self.team.run(12.0)
         self.assertEqual(self.holders([self.later], self.others), [])
         self.assertEqual(self.read([self.later], sleeper), [])
@@ -255,7 +255,7 @@ class FloodTests(RecordCase):
         team = self.team
         bad, own = self.insider(team, "bad", DEVICE)
         names = [f"{number}" for number in range(JUNK)]
-        junk = [Record(OTHER, name, own.public, 1, "team", 3600.0, b"\xc3", bytes(64)).packed() for name in names]
+        junk = [Record(OTHER, name, own.public, 1, "team", 3600.0, b"\xc3", bytes(64)).pack() for name in names]
         refused = 0
         for house in team.houses:
             for begin in range(0, JUNK, PAGE):
@@ -267,7 +267,7 @@ class FloodTests(RecordCase):
         self.assertGreater(refused, 0)
         self.works(team.houses[1])
         first = Record(OTHER, names[0], own.public, 2, "team", 3600.0, None, bytes(64))
-        asked = bad.ask(team.contact(team.houses[0]), "store", [first.packed()], changes=True)
+        asked = bad.ask(team.contact(team.houses[0]), "store", [first.pack()], changes=True)
         self.assertEqual(self.outcome(team, asked), [0], "a full owner can still delete")
 
     def test_it_blocks_no_reads(self) -> None:
@@ -277,9 +277,11 @@ class FloodTests(RecordCase):
         for house in team.houses[1:]:
             usage = house.node.store.usage
             for number in range((usage.max_rows - usage.rows) // 2):
-                house.node.replica.keep(Record(OTHER, f"{number}", own.public, 1, "team", 3600.0, b"\xc3", bytes(64)))
+                house.node.replica.store_locally(
+                    Record(OTHER, f"{number}", own.public, 1, "team", 3600.0, b"\xc3", bytes(64))
+                )
         record = written(own, TASKS, "t1")
-        asked = bad.ask(team.contact(team.houses[0]), "store", [record.packed()], changes=True)
+        asked = bad.ask(team.contact(team.houses[0]), "store", [record.pack()], changes=True)
         self.assertEqual(self.outcome(team, asked), [0])
         for house in team.houses:
             found = self.outcome(team, house.node.get(TASKS), 5.0)
@@ -290,7 +292,7 @@ class GuestTests(RecordCase):
     def test_second_hand(self) -> None:
         """A node that joined after a guest left accepts the guest's record, also after a restart."""
         team = self.team
-        guest = team.move_in(team.houses[0].team.guest(bytes(range(32)), "phone"))
+        guest = team.move_in(team.houses[0].team.create_guest(bytes(range(32)), "phone"))
         team.run(5.0)
         self.outcome(team, guest.node.put(OTHER, "note", b"\xc3"))
         [record] = self.outcome(team, guest.node.get(OTHER))
@@ -299,10 +301,10 @@ class GuestTests(RecordCase):
         team.run(5.0)
         late = team.enlist("late", DEVICE)
         team.run(30.0)
-        self.assertEqual(late.node.replica.held(OTHER), [record])
+        self.assertEqual(late.node.replica.get_held(OTHER), [record])
         self.assertEqual(self.read([record], late), [record])
         for house in team.houses:
             if house is not guest:
                 team.close(house)
         team.open(late)
-        self.assertEqual(late.node.replica.held(OTHER), [record])
+        self.assertEqual(late.node.replica.get_held(OTHER), [record])

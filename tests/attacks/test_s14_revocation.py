@@ -4,14 +4,20 @@ from __future__ import annotations
 
 import random
 
-from middleware.admission.certificate import chained, guest_pass, proof
-from middleware.admission.code import Code, read
-from middleware.admission.doorkeeper import MAX_VOUCHED
-from middleware.admission.roll import MAX_ENTRIES, RESERVED, Roll, invitation_id, packed_admission
+from middleware.admission.certificate import issue_certificate, issue_guest_certificate, sign_join
+from middleware.admission.closed_admission import MAX_GUESTS_PER_GATEWAY
+from middleware.admission.code import JoinCode, parse_code
+from middleware.admission.membership_list import (
+    MAX_ENTRIES,
+    RESERVED_ENTRIES,
+    MembershipList,
+    invitation_id,
+    pack_admission,
+)
 from middleware.admission.statement import Invite
 from middleware.entangled.errors import Full, NotAdmitted
 from middleware.entangled.identity import Identity
-from middleware.entangled.wire.door import REVOKED, UNLISTED
+from middleware.entangled.wire.admission_check import REVOKED, UNLISTED
 from tests.attacks.siege import SOURCE, SiegeCase
 from tests.middleware.admission.paper import NOW, granted, identity, operator
 from tests.middleware.admission.village import Village
@@ -25,21 +31,21 @@ class BackdatingTests(SiegeCase):
         super().setUp()
         self.team: Village = self.village(bootstraps=2)
         self.thief = self.team.houses[1]
-        self.code: Code = read(self.team.invite("dog", uses=5))
-        invite = self.team.houses[0].team.roll.invites()[0]
-        grant = self.team.houses[0].team.roll.granted(self.thief.public)
+        self.code: JoinCode = parse_code(self.team.invite("dog", uses=5))
+        invite = self.team.houses[0].team.membership_list.list_invitations()[0]
+        grant = self.team.houses[0].team.membership_list.find_grant(self.thief.public)
         assert grant is not None
         self.invite, self.grant = invite, grant[1]
-        known = self.team.houses[0].team.roll.invited(invitation_id(invite.public))
+        known = self.team.houses[0].team.membership_list.find_invitation(invitation_id(invite.public))
         assert known is not None
         self.packed = known[1]
 
     def mint(self, seed: int, begin: int) -> tuple[Identity, bytes]:
         """Return a member that the malicious node admits with the code, with a certificate that starts at ``begin``."""
         own = Identity(bytes([seed]) * 32)
-        came = (own.public, "", proof(self.code.key, own.public, ""))
+        came = (own.public, "", sign_join(self.code.key, own.public, ""))
         thief = self.thief.kept.membership.identity
-        return own, chained(thief, self.grant, (self.packed, self.invite), came, f"dog-{seed}", begin)
+        return own, issue_certificate(thief, self.grant, (self.packed, self.invite), came, f"dog-{seed}", begin)
 
     def enter(self, own: Identity, shown: bytes, port: int) -> str:
         """Return the code with which the first node refuses the member, or "" if it admits it."""
@@ -79,7 +85,7 @@ class RoomTests(SiegeCase):
     def test_room_for_the_operator(self) -> None:
         """A membership list that a bootstrap node filled accepts the operator's revocation, which frees space."""
         signer = operator(1)
-        roll = Roll(signer.public)
+        roll = MembershipList(signer.public)
         grant = granted(signer, "boot", "bootstrap")
         roll.add(grant, NOW)
         rng = random.Random(1)
@@ -90,14 +96,14 @@ class RoomTests(SiegeCase):
                 assert isinstance(invite, Invite)
                 for number in range(invite.uses):
                     public = rng.randbytes(32)
-                    came = (public, "", proof(invitation.code.key, public, ""))
-                    shown = chained(BOOT, grant, (invitation.invite, invite), came, f"p{code}-{number}", NOW)
-                    roll.add(packed_admission(public, shown), NOW)
-        self.assertGreater(len(roll.admissions()), 400)
-        self.assertLessEqual(len(roll.admissions()), MAX_ENTRIES - RESERVED)
+                    came = (public, "", sign_join(invitation.code.key, public, ""))
+                    shown = issue_certificate(BOOT, grant, (invitation.invite, invite), came, f"p{code}-{number}", NOW)
+                    roll.add(pack_admission(public, shown), NOW)
+        self.assertGreater(len(roll.list_admissions()), 400)
+        self.assertLessEqual(len(roll.list_admissions()), MAX_ENTRIES - RESERVED_ENTRIES)
         roll.add(signer.revoke(BOOT.public, "boot", NOW), NOW)
-        self.assertIsNotNone(roll.revoked(BOOT.public))
-        self.assertEqual(roll.admissions(), [])
+        self.assertIsNotNone(roll.find_revocation(BOOT.public))
+        self.assertEqual(roll.list_admissions(), [])
 
 
 class UnlistedTests(SiegeCase):
@@ -121,7 +127,7 @@ class UnlistedTests(SiegeCase):
         paper = team.paper("ghost", "viewer")
         public = paper.identity.public
         self.outcome(team, team.tell(team.signer.revoke(public, "ghost", team.wall())))
-        hidden = self.attacker(team, paper.identity, paper.secrets[0][1], paper.shown)
+        hidden = self.attacker(team, paper.identity, paper.secrets[0][1], paper.certificate)
         self.assertEqual(self.refusal(team, hidden.ask, team.houses[0], 4.0), REVOKED)
 
 
@@ -131,8 +137,8 @@ class GuestTests(SiegeCase):
         team = self.village()
         paper = team.paper("gate", "gateway")
         refused = []
-        for number in range(MAX_VOUCHED + 3):
+        for number in range(MAX_GUESTS_PER_GATEWAY + 3):
             guest = Identity(number.to_bytes(32))
-            shown = guest_pass(paper.identity, paper.shown, guest.public, "phone", int(team.wall()))
-            refused.append(team.houses[0].team.door.admit(guest.public, shown))
-        self.assertEqual(refused, [""] * MAX_VOUCHED + [UNLISTED] * 3)
+            shown = issue_guest_certificate(paper.identity, paper.certificate, guest.public, "phone", int(team.wall()))
+            refused.append(team.houses[0].team.admission.admit(guest.public, shown))
+        self.assertEqual(refused, [""] * MAX_GUESTS_PER_GATEWAY + [UNLISTED] * 3)

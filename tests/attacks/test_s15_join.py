@@ -13,25 +13,25 @@ from nacl import bindings
 from twisted.internet.defer import Deferred
 from twisted.trial.unittest import SynchronousTestCase
 
-from middleware.admission import knock
-from middleware.admission.certificate import chained, proof
-from middleware.admission.code import Code, TermsContent, mark_of, read, seal_terms
-from middleware.admission.knock import Knock, Signer, Welcome
+from middleware.admission import join_codec
+from middleware.admission.certificate import issue_certificate, sign_join
+from middleware.admission.code import JoinCode, TermsContent, compute_fingerprint, parse_code, seal_terms
+from middleware.admission.join_client import JoinClient
+from middleware.admission.join_codec import JoinReply, JoinRequest, Signer
 from middleware.admission.membership import Membership
-from middleware.admission.newcomer import Newcomer
 from middleware.admission.operator import Operator
-from middleware.admission.statement import Invite, Terms, opened, signed
+from middleware.admission.statement import Invite, Terms, open_statement, sign_statement
 from middleware.entangled.errors import Forged
 from middleware.entangled.identity import Identity
 from middleware.entangled.network.network import Address
-from swarmnode.team.init import SHARED, settings_text
+from swarmnode.team.init import SHARED_KEYS, format_settings
 from tests.attacks.siege import SiegeCase
 from tests.middleware.admission.village import Village
 
 DOOR = Address("10.6.6.6", 666)
 LINE = st.text(st.characters(exclude_categories=("C", "Z")), min_size=1, max_size=40)
 NEWCOMER = Identity(b"n" * 32)
-Answer = Callable[[bytes, Knock], bytes]
+Answer = Callable[[bytes, JoinRequest], bytes]
 
 
 class JoinTests(SiegeCase):
@@ -40,27 +40,27 @@ class JoinTests(SiegeCase):
     def setUp(self) -> None:
         super().setUp()
         self.team: Village = self.village()
-        self.code: Code = read(self.team.invite("dog"))
+        self.code: JoinCode = parse_code(self.team.invite("dog"))
         self.invitation = self.code.key.public
         self.eye = self.team.enlist("eye", "viewer")
         self.rng = random.Random(7)
-        terms = self.eye.team.roll.terms_of(self.invitation)
+        terms = self.eye.team.membership_list.find_terms(self.invitation)
         assert terms is not None
         self.terms = terms
 
     def check_true_team(self, answer: Answer) -> None:
         """Let the hostile member ``answer`` each KNOCK before a bootstrap node; the real team must be joined."""
-        network = self.team.board.network(*DOOR)
-        answered: list[Knock] = []
+        network = self.team.switchboard.make_network(*DOOR)
+        answered: list[JoinRequest] = []
 
         def received(datagram: bytes, source: Address) -> None:
-            answered.append(knock.opened_knock(datagram, self.invitation))
+            answered.append(join_codec.open_request(datagram, self.invitation))
             network.send(answer(datagram, answered[-1]), source)
 
         network.listen(received)
         self.addCleanup(network.close)
-        port = self.team.board.network("10.0.0.2", 9999)
-        newcomer = Newcomer(self.code, NEWCOMER.seed, port, self.team.clock, random.Random(8))
+        port = self.team.switchboard.make_network("10.0.0.2", 9999)
+        newcomer = JoinClient(self.code, NEWCOMER.seed, port, self.team.clock, random.Random(8))
         joined: list[Membership] = []
         failed: list[Exception] = []
         work: Deferred[Any] = newcomer.join([DOOR, self.team.address_of(self.team.houses[0])], 12.0)
@@ -80,23 +80,23 @@ class JoinTests(SiegeCase):
 
     def give(self, signer: Signer, shown: bytes) -> Answer:
         """Answer each KNOCK with a certificate and secret that the operator did not issue."""
-        given = Welcome(shown, ((9, b"x" * 32, 0),))
-        return lambda datagram, heard: knock.welcome(self.invitation, heard, given, signer, self.rng)
+        given = JoinReply(shown, ((9, b"x" * 32, 0),))
+        return lambda datagram, heard: join_codec.make_reply(self.invitation, heard, given, signer, self.rng)
 
-    def forge(self, heard: Knock, operator: Operator, terms: bytes) -> bytes:
+    def forge(self, heard: JoinRequest, operator: Operator, terms: bytes) -> bytes:
         """Return a complete WELCOME of another operator, with its invitation, bootstrap node and certificate."""
         boot, now = Identity(b"b" * 32), int(self.team.wall())
         grant = operator.grant(boot.public, "boot", ("bootstrap",), now)
         invite = Invite(self.invitation, "dog", ("device",), 1, now, now + 3600, 3600)
-        came = (heard.public, heard.wish, heard.proof)
-        shown = chained(boot, grant, (signed(operator.identity, invite), invite), came, "dog", now)
-        given = Welcome(shown, ((1, b"x" * 32, 0),))
-        return knock.welcome(self.invitation, heard, given, Signer(boot, grant, terms), self.rng)
+        came = (heard.public, heard.requested_name, heard.proof)
+        shown = issue_certificate(boot, grant, (sign_statement(operator.identity, invite), invite), came, "dog", now)
+        given = JoinReply(shown, ((1, b"x" * 32, 0),))
+        return join_codec.make_reply(self.invitation, heard, given, Signer(boot, grant, terms), self.rng)
 
     def test_another_operator(self) -> None:
         """A reply for another operator with its own terms is rejected."""
         impostor = Operator("yard", b"i" * 32, {"presence_lease": 9.0})
-        false = Code(self.code.secret ^ 1, mark_of(impostor.public))
+        false = JoinCode(self.code.secret ^ 1, compute_fingerprint(impostor.public))
         terms = seal_terms(false, TermsContent(impostor.public, "yard", impostor.settings), self.rng)
         self.check_true_team(lambda datagram, heard: self.forge(heard, impostor, terms))
 
@@ -109,54 +109,58 @@ class JoinTests(SiegeCase):
         """An operator key with the same 20-bit mark is not enough: sealing terms needs the code's secret."""
         impostor = Operator("yard", b"i" * 32)
         # A search for a key with the code's mark takes a minute; instead the code gets the mark of the key.
-        code = Code(self.code.secret, mark_of(impostor.public))
+        code = JoinCode(self.code.secret, compute_fingerprint(impostor.public))
         self.invitation = code.key.public
-        false = Code(self.code.secret ^ 1, code.mark)
+        false = JoinCode(self.code.secret ^ 1, code.fingerprint)
         terms = seal_terms(false, TermsContent(impostor.public, "yard"), self.rng)
         ephemeral = bindings.crypto_scalarmult_base(b"e" * 32)
-        heard = Knock(NEWCOMER.public, ephemeral, "", proof(code.key, NEWCOMER.public, ""))
+        heard = JoinRequest(NEWCOMER.public, ephemeral, "", sign_join(code.key, NEWCOMER.public, ""))
         said = self.forge(heard, impostor, terms)
-        self.assertRaises(Forged, knock.opened_welcome, said, code, NEWCOMER.public, b"e" * 32)
+        self.assertRaises(Forged, join_codec.open_reply, said, code, NEWCOMER.public, b"e" * 32)
 
     def test_secrets_of_a_member(self) -> None:
         """A member without the role bootstrap cannot issue a secret or certificate in the operator's name."""
         signer = self.signer(self.eye.team.identity, self.eye.team.identity, "viewer")
-        self.check_true_team(self.give(signer, self.eye.kept.membership.shown))
+        self.check_true_team(self.give(signer, self.eye.kept.membership.certificate))
 
     def test_a_grant_of_another_node(self) -> None:
         """The terms, a grant and the newcomer's certificate, known to every member, do not let another key sign."""
         self.team.knock(self.code.text, seed=NEWCOMER.seed)
         self.team.run(8.0)
-        admission = self.eye.team.roll.admitted(NEWCOMER.public)
+        admission = self.eye.team.membership_list.find_admission(NEWCOMER.public)
         assert admission is not None
         signer = self.signer(self.eye.team.identity, self.team.houses[0].team.identity, "bootstrap")
-        self.check_true_team(self.give(signer, admission.shown))
+        self.check_true_team(self.give(signer, admission.certificate))
 
     def test_terms_of_another_invitation(self) -> None:
         """Terms sealed for another code can be opened only with that code."""
         other = self.team.signer.invite("cat", ("device",), 1, self.team.wall(), 3600.0, random.Random(9))
-        statement = opened(self.team.signer.public, other.terms)
+        statement = open_statement(self.team.signer.public, other.terms)
         assert isinstance(statement, Terms)
         boot = self.team.houses[0].team.identity
         signer = self.signer(boot, boot, "bootstrap", statement.sealed)
-        self.check_true_team(self.give(signer, self.team.houses[0].kept.membership.shown))
+        self.check_true_team(self.give(signer, self.team.houses[0].kept.membership.certificate))
 
     def test_an_old_answer(self) -> None:
         """A recorded reply of the real bootstrap node cannot be opened in a later attempt."""
         boot = self.team.houses[0].team.identity
-        old = Knock(NEWCOMER.public, bindings.crypto_scalarmult_base(b"o" * 32), "", b"")
-        answer = self.give(self.signer(boot, boot, "bootstrap"), self.team.houses[0].kept.membership.shown)
+        old = JoinRequest(NEWCOMER.public, bindings.crypto_scalarmult_base(b"o" * 32), "", b"")
+        answer = self.give(self.signer(boot, boot, "bootstrap"), self.team.houses[0].kept.membership.certificate)
         recorded = answer(b"", old)
         self.check_true_team(lambda datagram, heard: recorded)
 
     def test_a_forged_refusal(self) -> None:
         """A refusal signed by a member without the role bootstrap does not end the attempt."""
         signer = self.signer(self.eye.team.identity, self.eye.team.identity, "viewer")
-        self.check_true_team(lambda datagram, heard: knock.refusal(self.invitation, heard, "used", signer, self.rng))
+        self.check_true_team(
+            lambda datagram, heard: join_codec.make_refusal(self.invitation, heard, "used", signer, self.rng)
+        )
 
     def test_a_hint(self) -> None:
         """An unauthenticated hint that the code was used does not end the attempt."""
-        self.check_true_team(lambda datagram, heard: knock.hint(knock.id_of(datagram), "used"))
+        self.check_true_team(
+            lambda datagram, heard: join_codec.make_unsigned_refusal(join_codec.read_invitation_id(datagram), "used")
+        )
 
     def test_an_invitation_without_terms(self) -> None:
         """A newcomer with a code of an older version is refused with the advice to request another code."""
@@ -174,7 +178,7 @@ class SettingsTests(SynchronousTestCase):
     @given(LINE, LINE)
     def test_no_text_becomes_structure(self, kind: str, membership: str) -> None:
         """Text in generated settings is read back as the same text; it adds no table and no key."""
-        text = settings_text("dog", membership, ["edge"], None, (), {"kind": kind})
+        text = format_settings("dog", membership, ["edge"], None, (), {"kind": kind})
         found = tomllib.loads(text)
         self.assertEqual(set(found), {"node"})
         self.assertEqual((found["node"]["kind"], found["node"]["membership"]), (kind, membership))
@@ -183,4 +187,4 @@ class SettingsTests(SynchronousTestCase):
     def test_keys_that_may_be_given(self) -> None:
         """Newcomers cannot receive settings that run code, open a page, grant a right or name a file."""
         for key in ("name", "store", "membership", "team_key", "roles", "host", "known_nodes", "tunnels", "deployment"):
-            self.assertNotIn(key, SHARED)
+            self.assertNotIn(key, SHARED_KEYS)

@@ -17,36 +17,36 @@ from twisted.logger import capturedLogs, formatEvent
 from twisted.trial.unittest import SynchronousTestCase
 
 from middleware.admission.membership import MemoryMembership
-from middleware.admission.operator import FIRST
+from middleware.admission.operator import FIRST_NODE_ROLES
 from middleware.config.settings import Settings
-from swarmnode import invitation
-from swarmnode.rehearsal import VirtualTeam
+from swarmnode import page_access
+from swarmnode.simulated_team import SimulatedTeam
 from tests.webnode.memory import MemoryDesk
 from webnode.app import create_app
-from webnode.board import Board
+from webnode.auth import OpenSessions, Token, User
 from webnode.errors import Refusal
 from webnode.fallback import TeamFallbacks
-from webnode.session import SignedSessions, sessions
-from webnode.state import state_of
-from webnode.token import Claim, TokenKey, packed
-from webnode.visitor import OpenSessions, Token, Visitor
+from webnode.services import Services
+from webnode.session import SignedSessions, make_sessions
+from webnode.state import format_state
+from webnode.token import Claim, TokenKey, encode_claim
 
 CODE = "quiet-otter"
 HOME = "10.0.0.9"
-NOBODY = Visitor()
+NOBODY = User()
 IN_FORCE = 3.0
 
 
-class TokenTeam(VirtualTeam):
+class TokenTeam(SimulatedTeam):
     """Three web nodes with the role gateway, and a viewer, eve, with arbitrary code."""
 
     def __init__(self) -> None:
         super().__init__(16, dogs=(), others=("pi", "nuc", "eve"))
 
-    def _membership(self, name: str) -> MemoryMembership:
+    def _get_membership(self, name: str) -> MemoryMembership:
         if name not in self._memberships:
-            roles = ("viewer",) if name == "eve" else FIRST
-            made = self.operator.founded(name, roles, self.clock.seconds(), self._member_rng, self._secret)
+            roles = ("viewer",) if name == "eve" else FIRST_NODE_ROLES
+            made = self.operator.create_membership(name, roles, self.clock.seconds(), self._member_rng, self._secret)
             self._memberships[name] = MemoryMembership(made)
         return self._memberships[name]
 
@@ -78,9 +78,9 @@ class PageCase(SynchronousTestCase):
         node, rng = service.assembly.node, random.Random(name)
         settings = replace(service.settings, web=replace(service.settings.web, code=CODE))
         followed = TeamFallbacks(node, self.team.clock.seconds)
-        signed = sessions(settings, node, self.team.clock, rng, followed)
+        signed = make_sessions(settings, node, self.team.clock, rng, followed)
         assert isinstance(signed, SignedSessions)
-        followed.serves([f"http://127.0.0.1:{port}"])
+        followed.publish([f"http://127.0.0.1:{port}"])
         return Web(signed, followed, node, settings)
 
     def now(self) -> float:
@@ -99,14 +99,14 @@ class PageCase(SynchronousTestCase):
 
     def role(self, web: Web, token: str) -> str:
         """Return the role that a token gives at a web node."""
-        return web.sessions.visitor(token, self.now()).role
+        return web.sessions.authenticate(token, self.now()).role
 
     def passes(self, web: Web, token: str) -> dict[str, Token]:
         """Return the visitor's tokens for the other web nodes, by the name of the node."""
-        who = web.sessions.visitor(token, self.now())
+        who = web.sessions.authenticate(token, self.now())
         nodes = {each.node.uuid: name for name, each in self.webs.items()}
-        pages = [page.node for page in web.fallbacks.here() if not page.is_self]
-        return {nodes[uuid]: token for uuid, token in web.sessions.passes(who, pages, self.now()).items()}
+        pages = [page.node for page in web.fallbacks.list_pages() if not page.is_self]
+        return {nodes[uuid]: token for uuid, token in web.sessions.issue_peer_tokens(who, pages, self.now()).items()}
 
     def tell(self, packed: bytes) -> None:
         """Publish a statement of the operator, and wait for its distribution."""
@@ -120,7 +120,7 @@ class PageCase(SynchronousTestCase):
     def rotate(self) -> None:
         """Give the other members a new secret, effective at once."""
         members = [self.webs[name].node.entangled.identity.public for name in ("vaio", "nuc")]
-        self.tell(self.team.operator.rotate(2, members, self.now(), 0.0, random.Random(2)))
+        self.tell(self.team.operator.rotate_secret(2, members, self.now(), 0.0, random.Random(2)))
 
     def secrets(self) -> list[bytes]:
         """Return every secret of the team."""
@@ -131,14 +131,14 @@ class PageCase(SynchronousTestCase):
         """Return operator tokens forged with eve's key and with all knowledge that members share."""
         own = TokenKey(self.eve.node.entangled.identity)
         at = audience.node.entangled.identity.node_id
-        found = [own.token(claim), own.token(claim, at)]
+        found = [own.sign_token(claim), own.sign_token(claim, at)]
         # Sign in the name of the web node, with every key that can be derived from the members' knowledge.
         for secret in self.secrets():
             page = hashlib.blake2s(secret, person=b"page").hexdigest()
             for known in (secret, hashlib.blake2s(page.encode()).digest(), hashlib.blake2s(secret).digest()):
                 found.append(old_token(known, claim.until, claim.limit))
                 signer = Signer(known, key_derivation="none")
-                found.append(signer.sign(base64_encode(packed(claim))).decode())
+                found.append(signer.sign(base64_encode(encode_claim(claim))).decode())
         return found
 
 
@@ -160,7 +160,7 @@ class MintTests(PageCase):
         self.assertEqual(self.role(self.vaio, self.token.text), "operator")
         for web in (self.vaio, self.pi, self.nuc):
             for text in self.minted(self.claim(), web):
-                self.assertEqual(web.sessions.visitor(text, self.now()), NOBODY)
+                self.assertEqual(web.sessions.authenticate(text, self.now()), NOBODY)
                 self.assertIn(self.refused(web, text, f"10.0.{len(text)}.1"), (401, 429))
 
     def test_mint_after_revoke_and_rotate(self) -> None:
@@ -169,19 +169,23 @@ class MintTests(PageCase):
         self.rotate()
         self.assertGreater(len(self.secrets()), 1)
         for text in self.minted(self.claim(), self.vaio):
-            self.assertEqual(self.vaio.sessions.visitor(text, self.now()), NOBODY)
+            self.assertEqual(self.vaio.sessions.authenticate(text, self.now()), NOBODY)
 
     def test_serve_a_page_oneself(self) -> None:
         """Eve's web node accepts no code or token, because it lacks the role gateway."""
         self.assertEqual(self.refused(self.eve, CODE), 403)
-        self.assertEqual(self.role(self.eve, TokenKey(self.eve.node.entangled.identity).token(self.claim())), "anyone")
+        self.assertEqual(
+            self.role(self.eve, TokenKey(self.eve.node.entangled.identity).sign_token(self.claim())), "anyone"
+        )
 
     def test_invite_beyond_oneself(self) -> None:
         """A guest cannot invite another guest for longer than the guest's own invitation."""
-        who = self.vaio.sessions.visitor(self.token.text, self.now())
-        invited = self.signed(self.vaio, self.vaio.sessions.token(who, "guest", "operator", self.now(), 3600.0).text)
-        guest = self.vaio.sessions.visitor(invited.text, self.now())
-        further = self.vaio.sessions.token(guest, "friend", "operator", self.now(), 365 * 86_400.0)
+        who = self.vaio.sessions.authenticate(self.token.text, self.now())
+        invited = self.signed(
+            self.vaio, self.vaio.sessions.issue_guest_token(who, "guest", "operator", self.now(), 3600.0).text
+        )
+        guest = self.vaio.sessions.authenticate(invited.text, self.now())
+        further = self.vaio.sessions.issue_guest_token(guest, "friend", "operator", self.now(), 365 * 86_400.0)
         self.assertLessEqual(further.until, self.now() + 3600.0)
 
 
@@ -191,9 +195,9 @@ class StandingTests(PageCase):
         signed = self.signed(self.pi)
         given = self.passes(self.pi, signed.text)
         self.assertEqual(self.role(self.vaio, given["vaio"].text), "operator")
-        who = self.vaio.sessions.visitor(given["vaio"].text, self.now())
-        renewed = self.vaio.sessions.renewed(who, self.now())
-        invited = self.vaio.sessions.token(who, "guest", "operator", self.now(), 60.0)
+        who = self.vaio.sessions.authenticate(given["vaio"].text, self.now())
+        renewed = self.vaio.sessions.renew_token(who, self.now())
+        invited = self.vaio.sessions.issue_guest_token(who, "guest", "operator", self.now(), 60.0)
         further = self.passes(self.vaio, renewed.text)["nuc"]
         made = (given["vaio"], renewed, invited)
         self.assertEqual([self.role(self.vaio, each.text) for each in made], ["operator"] * 3)
@@ -201,12 +205,12 @@ class StandingTests(PageCase):
         self.revoke("pi")
         for each in made:
             for text in (each.text, each.ticket):
-                self.assertEqual(self.vaio.sessions.visitor(text, self.now()), NOBODY)
+                self.assertEqual(self.vaio.sessions.authenticate(text, self.now()), NOBODY)
         self.assertEqual(self.role(self.nuc, further.text), "anyone")
         self.assertEqual(self.refused(self.vaio, invited.text), 401)
         self.assertEqual(self.role(self.vaio, self.token.text), "operator")
         self.assertNotIn("pi", self.passes(self.vaio, self.token.text))
-        self.assertFalse(self.vaio.fallbacks.lets_in("http://127.0.0.1:8081"))
+        self.assertFalse(self.vaio.fallbacks.is_allowed_origin("http://127.0.0.1:8081"))
         self.rotate()
         self.assertEqual(self.role(self.vaio, made[0].text), "anyone")
 
@@ -238,14 +242,14 @@ class StandingTests(PageCase):
 class FailoverTests(PageCase):
     def test_advertise_a_page(self) -> None:
         """A viewer's page is not listed, its origin is not allowed, and no token is issued for it."""
-        told = {page.node for page in self.pi.fallbacks.here()}
+        told = {page.node for page in self.pi.fallbacks.list_pages()}
         self.assertIn(self.vaio.node.uuid, told)
         for web in (self.vaio, self.pi, self.nuc):
-            self.assertNotIn(self.eve.node.uuid, [page.node for page in web.fallbacks.here()])
-            self.assertFalse(web.fallbacks.lets_in("http://127.0.0.1:8083"))
+            self.assertNotIn(self.eve.node.uuid, [page.node for page in web.fallbacks.list_pages()])
+            self.assertFalse(web.fallbacks.is_allowed_origin("http://127.0.0.1:8083"))
             self.assertNotIn("eve", self.passes(web, self.signed(web).text))
-        who = self.vaio.sessions.visitor(self.token.text, self.now())
-        self.assertEqual(self.vaio.sessions.passes(who, [], self.now()), {})
+        who = self.vaio.sessions.authenticate(self.token.text, self.now())
+        self.assertEqual(self.vaio.sessions.issue_peer_tokens(who, [], self.now()), {})
 
     def test_use_a_token_elsewhere(self) -> None:
         """A token for one web node is invalid at all others, and thus useless to them."""
@@ -262,15 +266,15 @@ class FailoverTests(PageCase):
         """A failover token is valid for minutes, and only the session at the new web node renews it."""
         given = self.passes(self.vaio, self.token.text)["pi"]
         self.assertLessEqual(given.until - self.now(), 900.0)
-        roles = [self.pi.sessions.visitor(given.text, given.until + late).role for late in (-1.0, 1.0)]
+        roles = [self.pi.sessions.authenticate(given.text, given.until + late).role for late in (-1.0, 1.0)]
         self.assertEqual(roles, ["operator", "anyone"])
 
     def test_sign_out_everywhere(self) -> None:
         """Signing out at one web node also ends the sessions at the web nodes of a failover."""
         given = self.passes(self.vaio, self.token.text)["pi"]
-        moved = self.pi.sessions.renewed(self.pi.sessions.visitor(given.text, self.now()), self.now())
+        moved = self.pi.sessions.renew_token(self.pi.sessions.authenticate(given.text, self.now()), self.now())
         self.assertEqual(self.role(self.pi, moved.text), "operator")
-        who = self.vaio.sessions.visitor(self.token.text, self.now())
+        who = self.vaio.sessions.authenticate(self.token.text, self.now())
         self.vaio.sessions.revoke(who.token_id, who.limit)
         self.run_for(IN_FORCE)
         self.assertEqual([self.role(self.pi, each.text) for each in (given, moved)], ["anyone"] * 2)
@@ -290,12 +294,12 @@ class GuessTests(PageCase):
         for number in range(1000):
             self.refused(self.vaio, f"guess{number}", f"10.{number // 250}.{number % 250}.1")
         now = self.now()
-        who = self.vaio.sessions.visitor(self.token.text, now)
-        self.assertEqual(self.vaio.sessions.renewed(who, now).role, "operator")
+        who = self.vaio.sessions.authenticate(self.token.text, now)
+        self.assertEqual(self.vaio.sessions.renew_token(who, now).role, "operator")
         self.assertEqual(self.refused(self.vaio, CODE, "192.168.7.7"), 429)
         self.assertEqual(self.signed(self.vaio, CODE, "127.0.0.1").role, "operator")
         self.assertEqual(self.signed(self.vaio, CODE, HOME).role, "operator")
-        invited = self.vaio.sessions.token(who, "guest", "viewer", now, 60.0)
+        invited = self.vaio.sessions.issue_guest_token(who, "guest", "viewer", now, 60.0)
         self.assertEqual(self.signed(self.vaio, invited.text, "192.168.7.8").role, "viewer")
 
 
@@ -304,7 +308,7 @@ class LogTests(SynchronousTestCase):
         """The log contains the page's address, but neither the code nor a link with it."""
         self.patch(os, "environ", {**os.environ, "XDG_RUNTIME_DIR": self.mktemp()})
         with capturedLogs() as said:
-            invitation.invited("s16", "127.0.0.1", lambda: 8080, CODE)
+            page_access.announce_page("s16", "127.0.0.1", lambda: 8080, CODE)
         words = "\n".join(formatEvent(each) + str(each) for each in said)
         self.assertIn("http://127.0.0.1:8080/", words)
         self.assertNotIn(CODE, words)
@@ -313,7 +317,7 @@ class LogTests(SynchronousTestCase):
 class RebindingTests(SynchronousTestCase):
     def test_rebind_a_local_name(self) -> None:
         """A Host header with an unknown local name is refused; the node's and the configured names are accepted."""
-        board, state = Board(MemoryDesk(), OpenSessions()), state_of([], [], {}, node="vaio")
+        board, state = Services(MemoryDesk(), OpenSessions()), format_state([], [], {}, node="vaio")
         client = create_app(lambda: state, board, hosts=("vaio", "vaio.local", "robots.lan")).test_client()
 
         def status(host: str) -> int:
@@ -331,12 +335,12 @@ class TlsTests(PageCase):
 
     def test_sign_a_leaf(self) -> None:
         """No key that can be derived from the team's secrets is a web node's TLS authority; each node has another."""
-        from webnode.certificate import authority
-        from webnode.tls import door
+        from webnode.certificate import make_authority
+        from webnode.tls import make_tls_port
 
         def signer(web: Web) -> Any:
             rng = random.Random(web.settings.node.name)
-            return door(web.settings, web.node.store, self.team.clock, self.now, rng, list).signer
+            return make_tls_port(web.settings, web.node.store, self.team.clock, self.now, rng, list).signer
 
         signers = [signer(web) for web in (self.vaio, self.pi)]
         self.assertNotEqual(signers[0].pem, signers[1].pem)
@@ -344,5 +348,5 @@ class TlsTests(PageCase):
         for secret in [*self.secrets(), hashlib.blake2s(b"").digest()]:
             page = hashlib.blake2s(secret, person=b"page").hexdigest()
             for known in (secret, hashlib.blake2s(page.encode()).digest()):
-                mine = authority(known, "").key.private_numbers()
+                mine = make_authority(known, "").key.private_numbers()
                 self.assertNotIn(mine, [each.key.private_numbers() for each in signers])

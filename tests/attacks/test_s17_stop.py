@@ -14,8 +14,17 @@ from middleware.entangled.contact import Contact
 from middleware.entangled.errors import Refused, Unwritable
 from middleware.entangled.identity import Identity
 from middleware.entangled.record import Record, Slot
-from middleware.stop.halt import HALT, METHOD, NO_ROBOT, SLOT, STANDS, UNSAVED, Halt, answer_halt
-from middleware.stop.stop_set import ID_BYTES, MAX_NAMED, MAX_OF_SENDER, MAX_RELEASED, MAX_SENDERS
+from middleware.stop.stop_set import ID_BYTES, MAX_RELEASED, MAX_SENDERS, MAX_STOPS, MAX_STOPS_OF_SENDER
+from middleware.stop.stop_state import (
+    METHOD,
+    NO_ROBOT,
+    NOT_SAVED,
+    SLOT,
+    STANDS_STILL,
+    STOPS_KEY,
+    StopState,
+    expose_stops,
+)
 from tests.attacks.siege import SOURCE, SiegeCase
 from tests.middleware.admission.village import House, Tape, Village, network_of
 
@@ -26,30 +35,30 @@ class HaltingTeam(Village):
     """A closed team with ``device.halt`` at each node; ``halts`` are the current ones, by name."""
 
     def __init__(self, seed: int) -> None:
-        self.halts: dict[str, Halt] = {}
+        self.halts: dict[str, StopState] = {}
         super().__init__(seed)
 
     def open(self, house: House) -> None:
         """Start a node, which stands still until it has learned of the stops."""
         super().open(house)
         node: Any = house.node
-        halt = answer_halt(node, self.rng(house.place), node._chores.later, lambda stops, words: None)
+        halt = expose_stops(node, self.make_life_rng(house.place), node._chores.later, lambda stops, words: None)
 
         def obey() -> str:
             if not halt.is_known:
-                halt.learn()
-            return STANDS if halt.is_on else NO_ROBOT
+                halt.request_stops()
+            return STANDS_STILL if halt.is_motion_forbidden else NO_ROBOT
 
-        halt.watch(obey)
+        halt.subscribe(obey)
         self.halts[house.name] = halt
-        halt.learn()
-        node._chores.every(0.5, halt.refresh)
+        halt.request_stops()
+        node._chores.every(0.5, halt.recheck)
 
-    def halt(self, house: House) -> Halt:
+    def halt(self, house: House) -> StopState:
         return self.halts[house.name]
 
     def is_on(self) -> dict[str, bool]:
-        return {name: halt.is_on for name, halt in self.halts.items()}
+        return {name: halt.is_motion_forbidden for name, halt in self.halts.items()}
 
     def reopen(self, house: House) -> None:
         """Restart a node with its store."""
@@ -92,12 +101,12 @@ class StopCase(SiegeCase):
         return self.outcome(self.team, bare.ask(self.team.contact(house), METHOD, *arguments, changes=True), 0.2)
 
     def record(self, own: Identity, fields: object, sequence: int = 1) -> Record:
-        return Record(HALT, SLOT, own.public, sequence, "team", 600.0, msgpack.packb(fields)).signed(own)
+        return Record(STOPS_KEY, SLOT, own.public, sequence, "team", 600.0, msgpack.packb(fields)).sign(own)
 
     def store(self, bare: Any, record: Record) -> None:
         """Send a record to every node."""
         for house in self.team.houses:
-            asked = bare.ask(self.team.contact(house), "store", [record.packed()], changes=True)
+            asked = bare.ask(self.team.contact(house), "store", [record.pack()], changes=True)
             self.outcome(self.team, asked, 0.2)
         self.team.run(3.0)
 
@@ -136,15 +145,15 @@ class DisablingTests(StopCase):
         dice = random.Random(1)
         dog = self.dogs[0]
         for _ in range(300):
-            ids = [dice.randbytes(ID_BYTES) for _ in range(MAX_NAMED)]
+            ids = [dice.randbytes(ID_BYTES) for _ in range(MAX_STOPS)]
             self.team.halt(dog).answer(Contact(own.public, SOURCE), [[each, "thief"] for each in ids], [], "thief")
-        self.assertLessEqual(len(self.stops(dog)), MAX_OF_SENDER + 1)
+        self.assertLessEqual(len(self.stops(dog)), MAX_STOPS_OF_SENDER + 1)
         self.assertIn(stop, self.stops(dog))
         self.release(self.bob, [each for each in self.stops(dog) if each != stop], [dog])
         self.assertEqual(self.stops(dog), [stop])
-        self.assertTrue(self.team.halt(dog).is_on)
+        self.assertTrue(self.team.halt(dog).is_motion_forbidden)
         self.release(self.bob, [stop], [dog])
-        self.assertFalse(self.team.halt(dog).is_on)
+        self.assertFalse(self.team.halt(dog).is_motion_forbidden)
 
     def only_stop(self, house: House) -> list[bytes]:
         """Let an operator stop the team, and return the stops."""
@@ -202,7 +211,7 @@ class RightsTests(StopCase):
             [[], [b"x" * 16] * (MAX_RELEASED + 1), "x"],
             [[[b"x" * 16, 7]], [], "x"],
             [[[b"x" * 16]], [], "x"],
-            [[[b"x" * 16, "x"]] * (MAX_NAMED + 1), [], "x"],
+            [[[b"x" * 16, "x"]] * (MAX_STOPS + 1), [], "x"],
             [[], [], "x" * 65],
             [{}, {}, {}],
             [-1, True, "x"],
@@ -212,7 +221,7 @@ class RightsTests(StopCase):
             self.store(bare, self.record(own, fields, sequence))
             self.assertEqual(self.stops(self.dogs[0]), [stop], fields)
         for value in (b"", b"\xc1", b"\x93", b"\xff" * 2000):
-            record = Record(HALT, SLOT, own.public, 99, "team", 600.0, value).signed(own)
+            record = Record(STOPS_KEY, SLOT, own.public, 99, "team", 600.0, value).sign(own)
             self.store(bare, record)
         self.assertEqual([self.stops(house) for house in self.team.houses], [[stop]] * 4)
 
@@ -226,7 +235,7 @@ class ReplayTests(StopCase):
         for house in self.team.houses:
             tape.tap(network_of(house))
         self.release(self.bob, first)
-        old = [record for record in self.ann.node.store.get(HALT) if record.name == SLOT]
+        old = [record for record in self.ann.node.store.get(STOPS_KEY) if record.name == SLOT]
         self.assertEqual(set(self.team.is_on().values()), {False})
         self.stop(self.ann)
         heard, tape.heard = tape.heard, []
@@ -243,11 +252,11 @@ class ReplayTests(StopCase):
         """The record of a released stop, stored again, stops nothing."""
         self.stop(self.ann)
         stop = self.stops(self.dogs[0])
-        [old] = [record for record in self.dogs[0].node.store.get(HALT) if record.owner == self.ann.public]
+        [old] = [record for record in self.dogs[0].node.store.get(STOPS_KEY) if record.owner == self.ann.public]
         self.release(self.bob, stop)
         bare, _ = self.insider(self.team, "dog3", DEVICE)
         for house in self.team.houses:
-            house.node.store.discard(Slot(HALT, self.ann.public, SLOT))
+            house.node.store.discard(Slot(STOPS_KEY, self.ann.public, SLOT))
         self.store(bare, old)
         self.assertEqual(set(self.team.is_on().values()), {False})
 
@@ -255,7 +264,7 @@ class ReplayTests(StopCase):
 class LossTests(StopCase):
     def test_a_restart_of_all_releases_nothing(self) -> None:
         """After a sudden restart of all nodes all stand still at once, before they contact any peer."""
-        self.assertEqual(self.stop(self.ann)["dog1"], STANDS)
+        self.assertEqual(self.stop(self.ann)["dog1"], STANDS_STILL)
         for house in self.team.houses:
             self.team.close(house, is_sudden=True)
         for house in self.team.houses:
@@ -275,7 +284,7 @@ class LossTests(StopCase):
         self.team.close(self.bob, is_sudden=True)
         del self.team.halts["bob"]
         for house in self.team.houses:
-            self.lose(house, Slot(HALT, self.bob.public, SLOT))
+            self.lose(house, Slot(STOPS_KEY, self.bob.public, SLOT))
         self.team.run(60.0)
         self.assertEqual([self.stops(house) for house in self.team.houses if house is not self.bob], [stop] * 3)
         late = self.team.enlist("dog3", DEVICE)
@@ -290,7 +299,7 @@ class LossTests(StopCase):
 
     def lose(self, house: House, slot: Slot) -> None:
         """Let a replica drop a record, like an expired one."""
-        record = house.node.store.slot(slot)
+        record = house.node.store.get_slot(slot)
         if record is not None and house.node.store.discard(slot):
             house.node.replica._notify_gone([record])
 
@@ -298,12 +307,12 @@ class LossTests(StopCase):
         """A node that cannot store a stop obeys it, and answers that the stop is not saved."""
         store: Any = self.dogs[0].node.store
         self.patch(store, "written", lambda: fail(Unwritable("the disk is full")))
-        self.assertEqual(self.stop(self.ann)["dog1"], STANDS + UNSAVED)
-        self.assertTrue(self.team.halt(self.dogs[0]).is_on)
+        self.assertEqual(self.stop(self.ann)["dog1"], STANDS_STILL + NOT_SAVED)
+        self.assertTrue(self.team.halt(self.dogs[0]).is_motion_forbidden)
 
     def test_a_damaged_note_stands(self) -> None:
         """A node with a corrupt stored entry stands still until that stop is released by its id."""
-        self.dogs[0].node.store.note("halt/stops", b"\xc1junk")
+        self.dogs[0].node.store.set_note("halt/stops", b"\xc1junk")
         self.team.reopen(self.dogs[0])
         self.team.run(3.0)
         self.assertEqual(self.team.is_on(), {"vaio": False, "bob": False, "dog1": True, "dog2": False})
@@ -327,11 +336,11 @@ class LossTests(StopCase):
         for number in range(MAX_SENDERS + 40):
             peer = Contact(number.to_bytes(32, "big"), SOURCE)
             dog.answer(peer, [[dice.randbytes(ID_BYTES), "x"]], [], "x")
-        self.assertLessEqual(len(dog.stops), MAX_SENDERS + MAX_OF_SENDER)
+        self.assertLessEqual(len(dog.stops), MAX_SENDERS + MAX_STOPS_OF_SENDER)
         self.release(self.ann, list(dog.stops)[1:], [self.dogs[0]])
-        self.assertTrue(dog.is_on)
+        self.assertTrue(dog.is_motion_forbidden)
         self.release(self.ann, list(dog.stops), [self.dogs[0]])
-        self.assertFalse(dog.is_on)
+        self.assertFalse(dog.is_motion_forbidden)
 
 
 class SequenceTests(StopCase):
@@ -342,7 +351,7 @@ class SequenceTests(StopCase):
             dice = random.Random(seed)
             for number in range(STEPS):
                 self.step(dice, bare, own, number)
-            self.team.board.heal()
+            self.team.switchboard.heal()
             self.team.run(20.0)
             self.release(self.ann, sorted({stop for house in self.team.houses for stop in self.stops(house)}))
             self.team.run(20.0)
@@ -358,7 +367,7 @@ class SequenceTests(StopCase):
                 [stop] = set(self.stops(house)) - set(known)
                 told = self.said(asked)
                 for dog in self.dogs:
-                    if told.get(dog.name) == STANDS:
+                    if told.get(dog.name) == STANDS_STILL:
                         self.assertIn(stop, self.stops(dog))
             case 2:
                 named = dice.sample(known, dice.randrange(len(known) + 1))
@@ -368,7 +377,7 @@ class SequenceTests(StopCase):
                     self.assertLessEqual(before[dog.name] - set(self.stops(dog)), set(named) | self.released(dog))
             case 3:
                 near = [self.team.address_of(each) for each in self.team.houses if dice.random() < 0.5]
-                self.team.board.partition(near) if dice.random() < 0.6 else self.team.board.heal()
+                self.team.switchboard.partition(near) if dice.random() < 0.6 else self.team.switchboard.heal()
             case 4:
                 dog = dice.choice(self.dogs)
                 before_restart = self.stops(dog)
@@ -378,7 +387,7 @@ class SequenceTests(StopCase):
                 for dog in self.dogs:
                     self.ask(bare, dog, [], self.stops(dog), "eye")
                 record = self.record(own, [[], self.stops(self.dogs[0]), "eye"], number + 1)
-                bare.ask(self.team.contact(self.dogs[0]), "store", [record.packed()], changes=True).addErrback(str)
+                bare.ask(self.team.contact(self.dogs[0]), "store", [record.pack()], changes=True).addErrback(str)
         held = {dog.name: set(self.stops(dog)) for dog in self.dogs}
         self.team.run(dice.random() * 5.0)
         for dog in self.dogs:
@@ -386,4 +395,4 @@ class SequenceTests(StopCase):
 
     def released(self, dog: House) -> set[bytes]:
         """Return the ids that an operator has released."""
-        return {stop for house in (self.ann, self.bob) for stop in self.team.halt(house)._ordered}
+        return {stop for house in (self.ann, self.bob) for stop in self.team.halt(house)._own_releases}

@@ -9,16 +9,16 @@ from twisted.internet.defer import Deferred
 
 from middleware.admission.team import Team
 from middleware.consensus.bidding.group import Group
+from middleware.consensus.lease.lease_client import LeaseClient
 from middleware.consensus.lease.lease_codec import pack_members
-from middleware.consensus.lease.lessee import Lessee
-from middleware.directory.presence import DEVICES, Device, devices_of
+from middleware.directory.presence import DEVICES, Device, parse_devices
 from middleware.entangled.contact import Contact
 from middleware.entangled.errors import Refused
 from middleware.entangled.identity import Identity
-from middleware.entangled.quorum.register import Kind, Reply
+from middleware.entangled.quorum.register import Reply, ReplyKind
 from middleware.entangled.record import Record
 from middleware.node import SwarmNode
-from middleware.tasks.task import COMPLETED, RESULT, TASKS, Result, Task, group_key, tasks_of
+from middleware.tasks.task import COMPLETED, RESULT, TASKS, Result, Task, group_key, parse_tasks
 from tests.attacks.siege import SOURCE, SiegeCase
 from tests.middleware.admission.village import House, Village
 
@@ -39,19 +39,19 @@ class LeaseTeam(Village):
 
     def open(self, house: House) -> None:
         place = house.place
-        house.team = Team(house.kept, self.store(place), self.wall, self.rng(place))
-        name = house.team.door.me.name
+        house.team = Team(house.kept, self.store(place), self.wall, self.make_life_rng(place))
+        name = house.team.admission.me.name
         node = SwarmNode(
             Device("", name, capabilities={"camera": {"width": 208}}),
             house.team.identity,
             house.team.secret,
             [self.address(0)] if place else [],
-            self.board.network(*self.address(place)),
+            self.switchboard.make_network(*self.address(place)),
             self.store(place),
             self.clock,
-            self.rng(place),
+            self.make_life_rng(place),
             self.wall,
-            door=house.team.door,
+            door=house.team.admission,
         )
         house.team.attach(node.entangled, self.clock)
         node.team = house.team
@@ -70,26 +70,26 @@ class LeaseCase(SiegeCase):
         super().setUp()
         self.team = team = self.kept(LeaseTeam())
         self.task: Task = self.outcome(team, Deferred.fromCoroutine(team.nodes[0].submit(TASK)), 1.0)
-        self.lessees: list[Lessee] = []
+        self.lessees: list[LeaseClient] = []
         self.bad, self.own = self.insider(team, "bad", "device")
 
-    def lessee(self, place: int) -> Lessee:
+    def lessee(self, place: int) -> LeaseClient:
         """Return the lease client of an honest node, released when the test ends."""
-        lessee = self.team.nodes[place].lessee(self.task, lambda: None, 0)
+        lessee = self.team.nodes[place].make_lease_client(self.task, lambda: None, 0)
         self.lessees.append(lessee)
         self.addCleanup(self.team.run, 2.0)
         self.addCleanup(lessee.release)
         return lessee
 
-    def held_by(self, place: int, within: float = 1.0) -> Lessee:
+    def held_by(self, place: int, within: float = 1.0) -> LeaseClient:
         """Return the lease client of an honest node that gets the lease."""
         lessee = self.lessee(place)
-        lessee.want()
+        lessee.claim()
         self.team.run(within)
         self.assert_won(lessee)
         return lessee
 
-    def assert_won(self, lessee: Lessee) -> None:
+    def assert_won(self, lessee: LeaseClient) -> None:
         """Check that the client holds the lease, with a token far below the limit."""
         self.assertIsNotNone(lessee.lease, "an honest node does not win the lease")
         self.assertLess(lessee.token, 2**40)
@@ -103,7 +103,7 @@ class LeaseCase(SiegeCase):
         return found
 
     def store(self, *records: Record) -> list[Any]:
-        return self.attack("store", [record.packed() for record in records])
+        return self.attack("store", [record.pack() for record in records])
 
     def members(self) -> list[int]:
         """Return the council members' positions in the team."""
@@ -120,37 +120,37 @@ class ReconfigurationTests(LeaseCase):
         holder = self.held_by(self.members()[0])
         others = [self.team.contact(self.team.houses[place]) for place in self.outsiders()]
         own = Contact(self.own.public, SOURCE)
-        packed = [contact.packed() for contact in (*others, own)][:3]
+        packed = [contact.pack() for contact in (*others, own)][:3]
         self.attack("lease.install", TASK.task_id, 2, packed, 0, 0, 1.5)
         self.attack("lease.install", TASK.task_id, b"", False, 1.5)
         second = self.lessee(self.outsiders()[0])
-        second.want()
+        second.claim()
         self.team.run(1.0)
         self.assertIsNotNone(holder.lease)
         self.assertIsNone(second.lease)
-        self.assertEqual((second.council.configuration, second.council.members), (1, self.task.council))
+        self.assertEqual((second.proposer.configuration, second.proposer.members), (1, self.task.council))
 
     def test_member_that_lies_about_the_council(self) -> None:
         """A member that lies about the council redirects no client."""
         holder = self.held_by(self.members()[0])
         liar, accomplices = self.members()[1], self.outsiders()
         forged = tuple(self.team.contact(self.team.houses[place]) for place in accomplices)
-        desk: Any = self.team.nodes[liar].councils.desk
+        desk: Any = self.team.nodes[liar].council_manager.lease_service
         desk._after_write = lambda reply: ["moved", 0, "", 0, 0.0, 9, pack_members(forged)]
         second = self.lessee(accomplices[0])
-        second.want()
+        second.claim()
         self.team.run(3.0)
         self.assertIsNotNone(holder.lease)
         self.assertIsNone(second.lease)
-        self.assertEqual(second.council.members, self.task.council)
+        self.assertEqual(second.proposer.members, self.task.council)
 
     def test_council_of_the_device_alone(self) -> None:
         """A council rejects a change to a council with a majority of the device's own or invented keys."""
-        own = Contact(self.own.public, SOURCE).packed()
-        invented = [Contact(Identity(bytes([n]) * 32).public, SOURCE).packed() for n in range(2)]
+        own = Contact(self.own.public, SOURCE).pack()
+        invented = [Contact(Identity(bytes([n]) * 32).public, SOURCE).pack() for n in range(2)]
         viewer = Contact(self.insider(self.team, "eye", "viewer", at=SOURCE._replace(port=7))[1].public, SOURCE)
-        honest = [self.team.contact(house).packed() for house in self.team.houses]
-        for council in ([own], [own, honest[0]], [own, *invented], [*honest[:2], viewer.packed()]):
+        honest = [self.team.contact(house).pack() for house in self.team.houses]
+        for council in ([own], [own, honest[0]], [own, *invented], [*honest[:2], viewer.pack()]):
             self.attack("lease.prepare", TASK.task_id, 1, 2**20, 1.5)
             answers = self.attack("lease.change", TASK.task_id, 1, 2**20, council, 0, False)
             self.assertTrue(all(isinstance(answer, Refused) for answer in answers))
@@ -162,11 +162,11 @@ class ReconfigurationTests(LeaseCase):
         token = holder.token
         contacts = [self.team.contact(house) for house in self.team.houses]
         following = [self.task.council[0], *(contacts[place] for place in self.outsiders())]
-        self.assertIsNone(self.outcome(self.team, holder.move(following), 2.0))
-        self.assertEqual((holder.council.configuration, list(holder.council.members)), (2, following))
+        self.assertIsNone(self.outcome(self.team, holder.change_council(following), 2.0))
+        self.assertEqual((holder.proposer.configuration, list(holder.proposer.members)), (2, following))
         self.assert_won(holder)
         self.assertGreater(holder.token, token)
-        links = [holder.council.charter.links[0]] if holder.council.charter is not None else []
+        links = [holder.proposer.charter.changes[0]] if holder.proposer.charter is not None else []
         self.assertEqual([len(link.votes) for link in links], [2])
 
 
@@ -191,16 +191,16 @@ class ClosingTests(LeaseCase):
     def test_operator_closes(self) -> None:
         """The gateway, which may order, closes a task that another node holds."""
         holder = self.held_by(self.members()[0])
-        council = self.team.nodes[0].councils.of(self.task)
+        council = self.team.nodes[0].council_manager.make_proposer(self.task)
         self.assertIsNone(self.outcome(self.team, council.close(), 4.0))
         self.assertTrue(holder.is_over)
 
     def test_member_that_says_it_is_over(self) -> None:
         """One member that falsely reports the end does not keep a client from the lease."""
         liar = self.members()[1]
-        acceptor: Any = self.team.nodes[liar].councils.desk._acceptor
+        acceptor: Any = self.team.nodes[liar].council_manager.lease_service._acceptor
         for name in ("prepare", "lease"):
-            setattr(acceptor, name, lambda *_, **__: Reply(Kind.OVER))
+            setattr(acceptor, name, lambda *_, **__: Reply(ReplyKind.OVER))
         self.held_by(self.outsiders()[0], 2.0)
 
 
@@ -228,18 +228,18 @@ class NumberTests(LeaseCase):
         self.attack("lease.freed", TASK.task_id, HUGE, 0.0)
         lessee.release()
         self.team.run(1.0)
-        lessee.want()
+        lessee.claim()
         self.team.run(1.0)
         self.assert_won(lessee)
 
     def test_member_that_lies_about_numbers(self) -> None:
         """One member that answers with the highest numbers blocks no client."""
-        acceptor: Any = self.team.nodes[self.members()[1]].councils.desk._acceptor
+        acceptor: Any = self.team.nodes[self.members()[1]].council_manager.lease_service._acceptor
         genuine = acceptor.prepare
 
         def lie(*arguments: Any) -> Reply:
             reply: Reply = genuine(*arguments)
-            return reply._replace(kind=Kind.GRANTED, token=HUGE, promised=reply.promised._replace(counter=HUGE))
+            return reply._replace(kind=ReplyKind.GRANTED, token=HUGE, promised=reply.promised._replace(counter=HUGE))
 
         acceptor.prepare = lie
         self.held_by(self.outsiders()[0], 3.0)
@@ -248,11 +248,11 @@ class NumberTests(LeaseCase):
 class TaskTests(LeaseCase):
     def record(self, key: bytes, name: str, value: bytes, owner: Identity | None = None) -> Record:
         own = owner or self.own
-        return Record(key, name, own.public, 2**40, "team", 600.0, value).signed(own)
+        return Record(key, name, own.public, 2**40, "team", 600.0, value).sign(own)
 
     def seen(self) -> dict[str, Task]:
         """Return the tasks, which every node must read equally."""
-        all_seen = [tasks_of(self.outcome(self.team, node.entangled.get(TASKS), 1.0)) for node in self.team.nodes]
+        all_seen = [parse_tasks(self.outcome(self.team, node.entangled.get(TASKS), 1.0)) for node in self.team.nodes]
         self.assertTrue(all(seen == all_seen[0] for seen in all_seen))
         return all_seen[0]
 
@@ -261,7 +261,7 @@ class TaskTests(LeaseCase):
         before = self.seen()
         other = replace(self.task, generation=9, priority=9, council=self.task.council[:1], charter=b"")
         self.store(
-            self.record(TASKS, "t1", other.packed()), self.record(TASKS, "t2", replace(other, task_id="t2").packed())
+            self.record(TASKS, "t1", other.pack()), self.record(TASKS, "t2", replace(other, task_id="t2").pack())
         )
         self.assertEqual(self.seen(), before)
 
@@ -271,11 +271,11 @@ class TaskTests(LeaseCase):
 
         def follow(place: int) -> Group:
             node = self.team.nodes[place]
-            return node.group(self.task, lambda members, outcome: heard.update({place: outcome}))
+            return node.join_group(self.task, lambda members, outcome: heard.update({place: outcome}))
 
         groups = [follow(place) for place in range(len(self.team.nodes))]
         holder = self.held_by(self.members()[0])
-        forged = Result(COMPLETED, "dog1", 1.0, holder.token + 1).packed()
+        forged = Result(COMPLETED, "dog1", 1.0, holder.token + 1).pack()
         key = group_key(TASK.task_id)
         self.store(self.record(key, RESULT, forged), self.record(key, "done", forged))
         self.team.run(2.0)
@@ -290,11 +290,11 @@ class NameTests(LeaseCase):
         """A device that announces itself under another's name is not listed under it."""
         device = Device(self.own.node_id.hex(), DEVICE_NAME, capabilities={"camera": {"width": 208}}, joined=9)
         for slot in (DEVICE_NAME, "bad"):
-            self.store(Record(DEVICES, slot, self.own.public, 1, "leased", 60.0, device.packed()).signed(self.own))
+            self.store(Record(DEVICES, slot, self.own.public, 1, "leased", 60.0, device.pack()).sign(self.own))
         right = replace(device, name="bad")
         listing = self.outcome(self.team, self.team.nodes[0].list_devices(), 2.0)
         self.assertEqual(self.names(listing.records), ["dog1", "dog2", "dog3", "dog4", "vaio"])
-        self.store(Record(DEVICES, "bad", self.own.public, 2, "leased", 60.0, right.packed()).signed(self.own))
+        self.store(Record(DEVICES, "bad", self.own.public, 2, "leased", 60.0, right.pack()).sign(self.own))
         listing = self.outcome(self.team, self.team.nodes[0].list_devices(), 2.0)
         self.assertEqual(self.names(listing.records), ["bad", "dog1", "dog2", "dog3", "dog4", "vaio"])
 
@@ -311,4 +311,4 @@ class NameTests(LeaseCase):
 
     def names(self, records: list[Record]) -> list[str]:
         """Return the names under which devices are listed."""
-        return sorted(device.name for device, _ in devices_of(records))
+        return sorted(device.name for device, _ in parse_devices(records))

@@ -10,22 +10,22 @@ from twisted.internet.defer import Deferred
 
 from middleware.admission.roles import METHODS
 from middleware.entangled.contact import Contact
-from middleware.entangled.identity import Identity, exchange_key
+from middleware.entangled.identity import Identity, derive_exchange_key
 from middleware.entangled.network.network import Address
-from middleware.entangled.record import hashed_key
+from middleware.entangled.record import hash_key
 from middleware.entangled.streams import PART_BYTES, Streams
 from middleware.entangled.wire import peer
-from middleware.entangled.wire.door import MAX_LIVES, Life, Stamps
+from middleware.entangled.wire.admission_check import MAX_IDENTITIES, Incarnation, InitTimestamps
 from middleware.entangled.wire.endpoint import Endpoint
-from middleware.entangled.wire.message import Question, encoded
-from middleware.entangled.wire.session import INIT, RESPONSES_S, Credentials, Hello, Invitation
+from middleware.entangled.wire.message import Request, encode
+from middleware.entangled.wire.session import INIT, RESPONSES_S, Credentials, HandshakeFields, InitiatorHandshake
 from tests.attacks.siege import SiegeCase
 from tests.fuzz.ground import state_of
 from tests.middleware.admission.village import House, Tape, Village, network_of
 from tests.middleware.test_endpoint import DELAY, EndpointCase
 
 VICTIM = Address("10.7.7.7", 77)
-KEY = hashed_key("tasks")
+KEY = hash_key("tasks")
 LARGE = b"x" * 4000
 ARGUMENTS: dict[str, tuple[object, ...]] = {
     "ping": (bytes(8),),
@@ -80,7 +80,7 @@ class RecordedQuestionTests(SiegeCase):
         self.team.close(self.house, is_sudden=True)
         self.team.open(self.house)
         network, endpoint = network_of(self.house), self.house.node.endpoint
-        _ = self.house.node.seat
+        _ = self.house.node.take_acceptor
         self.streams = Streams(endpoint, self.team.clock)
 
         def answer(name: str, *arguments: object) -> bytes:
@@ -88,7 +88,7 @@ class RecordedQuestionTests(SiegeCase):
             return LARGE
 
         for name in METHODS:
-            if name not in endpoint._answerer.methods:
+            if name not in endpoint._dispatcher.methods:
                 endpoint.expose(name, partial(answer, name))
         send = network.send
 
@@ -99,19 +99,19 @@ class RecordedQuestionTests(SiegeCase):
 
         port: Any = network
         port.send = count
-        for method in endpoint._answerer.methods.values():
-            _ = method._form  # otherwise it is determined at the first call
+        for method in endpoint._dispatcher.methods.values():
+            _ = method._signature  # otherwise it is determined at the first call
         self.team.run(20.0)
 
     def recording(self, method: str) -> bytes:
         """Return a member's recorded INIT with a request in it."""
         self.numbers += 1
-        question = encoded(Question(self.numbers, method, ARGUMENTS.get(method, ())))
-        own = Credentials.of(self.member.identity, self.house.team.secret)
-        hello = Hello(Life(1, b"the life"), self.member.shown, 640)
+        question = encode(Request(self.numbers, method, ARGUMENTS.get(method, ())))
+        own = Credentials.derive(self.member.identity, self.house.team.secret)
+        hello = HandshakeFields(Incarnation(1, b"the life"), self.member.certificate, 640)
         secret = self.numbers.to_bytes(32, "little")
-        remote = exchange_key(self.house.public)
-        return Invitation(own, remote, secret, self.numbers, question, hello, self.numbers).datagram()
+        remote = derive_exchange_key(self.house.public)
+        return InitiatorHandshake(own, remote, secret, self.numbers, question, hello, self.numbers).make_init()
 
     def state(self) -> str:
         """Return the hash of the node's state without half-open sessions, which are limited and expire soon."""
@@ -120,10 +120,12 @@ class RecordedQuestionTests(SiegeCase):
         for session in list(half._unconfirmed.values()):
             half.forget(session)
         half.clear()
-        stamps, endpoint._stamps = endpoint._stamps, Stamps()
+        stamps, endpoint._timestamps = endpoint._timestamps, InitTimestamps()
         timers = sorted(call.getTime() for call in self.team.clock.getDelayedCalls())
-        found = state_of([self.house.node, self.house.node.store, self.house.team.roll, self.streams, timers])
-        endpoint._stamps = stamps
+        found = state_of(
+            [self.house.node, self.house.node.store, self.house.team.membership_list, self.streams, timers]
+        )
+        endpoint._timestamps = stamps
         return found
 
     def play(self, datagram: bytes) -> None:
@@ -135,12 +137,12 @@ class RecordedQuestionTests(SiegeCase):
     def show(self, seconds: float) -> None:
         """Let time pass while the camera takes ten pictures a second."""
         for number in range(int(10 * seconds)):
-            self.streams.offer("camera", number, bytes(20 * PART_BYTES))
+            self.streams.publish("camera", number, bytes(20 * PART_BYTES))
             self.team.run(0.1)
 
     def test_every_method(self) -> None:
         """A recorded INIT with a request for any method gets no more bytes than it has, and changes nothing."""
-        methods = self.house.node.endpoint._answerer.methods
+        methods = self.house.node.endpoint._dispatcher.methods
         self.assertLessEqual(set(METHODS), set(methods))
         answered = []
         for name in methods:
@@ -171,7 +173,7 @@ class RecordedQuestionTests(SiegeCase):
         viewer, _ = self.insider(self.team, "eye", "viewer")
         shown: list[int] = []
         watching = Streams(viewer, self.team.clock)
-        stop = watching.look(self.team.contact(self.house), "camera", lambda number, frame, age: shown.append(number))
+        stop = watching.view(self.team.contact(self.house), "camera", lambda number, frame, age: shown.append(number))
         self.show(3.0)
         stop()
         self.assertGreater(len(shown), 20)
@@ -212,7 +214,7 @@ class TimestampTests(SiegeCase):
             self.assertEqual(self.played(recording), (0, 0))
         self.assertEqual(self.house.node.endpoint.counters["replayed"], 3)
         self.open_again(dog)
-        self.assertTrue(self.house.node.endpoint.is_met(self.team.contact(dog)))
+        self.assertTrue(self.house.node.endpoint.has_session(self.team.contact(dog)))
 
     def test_one_of_an_earlier_life(self) -> None:
         """A recording from before its sender's restart opens no session, and its sender can still connect."""
@@ -221,7 +223,7 @@ class TimestampTests(SiegeCase):
         self.team.close(dog, is_sudden=True)
         self.team.open(dog)
         self.team.run(5.0)
-        self.assertTrue(self.house.node.endpoint.is_met(self.team.contact(dog)))
+        self.assertTrue(self.house.node.endpoint.has_session(self.team.contact(dog)))
         self.team.run(RESPONSES_S + 1.0)
         self.assertEqual(self.played(recording)[1], 0)
         self.open_again(dog)
@@ -229,22 +231,24 @@ class TimestampTests(SiegeCase):
 
     def test_bounded(self) -> None:
         """The table of newest INITs is limited, and an unverified later life does not block an earlier one."""
-        stamps, first, later = Stamps(), Life(1, b"1" * 8), Life(2, b"2" * 8)
-        answers = [stamps.take(b"a", life, stamp) for life, stamp in ((first, 5), (first, 5), (first, 4), (first, 6))]
+        stamps, first, later = InitTimestamps(), Incarnation(1, b"1" * 8), Incarnation(2, b"2" * 8)
+        answers = [stamps.accept(b"a", life, stamp) for life, stamp in ((first, 5), (first, 5), (first, 4), (first, 6))]
         self.assertEqual(answers, [True, False, False, True])
-        answers = [stamps.take(b"a", life, stamp) for life, stamp in ((later, 1), (first, 9), (later, 1), (later, 2))]
+        answers = [stamps.accept(b"a", life, stamp) for life, stamp in ((later, 1), (first, 9), (later, 1), (later, 2))]
         self.assertEqual(answers, [True, False, False, True])
-        self.assertEqual([stamps.take(b"b", Life(), 5), stamps.take(b"b", first, 0), len(stamps)], [True, True, 1])
-        for number in range(MAX_LIVES + 5):
-            stamps.take(number.to_bytes(4, "big"), first, 1)
-        self.assertEqual(len(stamps), MAX_LIVES)
+        self.assertEqual(
+            [stamps.accept(b"b", Incarnation(), 5), stamps.accept(b"b", first, 0), len(stamps)], [True, True, 1]
+        )
+        for number in range(MAX_IDENTITIES + 5):
+            stamps.accept(number.to_bytes(4, "big"), first, 1)
+        self.assertEqual(len(stamps), MAX_IDENTITIES)
 
 
 class RoundTripTests(EndpointCase):
     def asked(self, method: str, *arguments: object, changes: bool) -> float:
         """Return the round trips that the first request to a peer takes."""
         identity = Identity(self.rng.randbytes(32))
-        asker = Endpoint(identity, b"k" * 32, self.board.network("127.0.0.1", 0), self.clock, self.rng)
+        asker = Endpoint(identity, b"k" * 32, self.board.make_network("127.0.0.1", 0), self.clock, self.rng)
         asker.start()
         self.addCleanup(asker.stop)
         answered: list[object] = []

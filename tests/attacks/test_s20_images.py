@@ -19,29 +19,29 @@ from twisted.python.failure import Failure
 from twisted.trial.unittest import SynchronousTestCase, TestCase
 from zope.interface import directlyProvides
 
-from agents.behaviour import behaviour_for
-from agents.body import Body
+from agents.behaviour import create_behaviour
 from agents.detection import Detector, run_in_thread
-from agents.vision import ENOUGH, Size, find_target
+from agents.robot import AgentRobot
+from agents.vision import MAX_DETECTION_SIDE_PX, TargetSize, find_target
 from drivers.aibo import picture
 from drivers.aibo.picture import Block, PictureReader
-from drivers.camera.shots import FolderShots
+from drivers.camera.source import FolderSource
 from drivers.errors import BadFrame, LinkLost
 from drivers.link import MemoryConnector
 from drivers.pyro.camera import Camera as PyroCamera
 from drivers.reading import Frame, Observation
-from drivers.registry import describe, driver_for
+from drivers.registry import create_driver, describe
 from drivers.rosbridge import codec
-from formats.jpeg import MAX_DECODED, MAX_SIDE, size_of
+from formats.jpeg import MAX_DECODED_PX, MAX_SIDE_PX, read_size
 from middleware.tasks.task import Task
-from sim.robots.emulator.body import MemoryBody
 from sim.robots.emulator.camera import MjpegCamera
-from swarmnode.gateway import sides
+from sim.robots.emulator.simulated_robot import MemoryRobot
+from swarmnode.gateway import check_picture
 from tests.webnode.memory import MemoryFrames
-from webnode.camera import Camera as WebCamera
+from webnode.camera import CameraStream as WebCamera
 from webnode.errors import Refusal
 
-SIZE = Size(0.05, 0.2)
+SIZE = TargetSize(0.05, 0.2)
 START_OF_SCAN, END = b"\xff\xda", b"\xff\xd9"
 
 
@@ -70,8 +70,8 @@ def of_scans(width: int, height: int, count: int) -> bytes:
 
 BOMBS = {
     "629 bytes of 4 gigapixels": claiming(65500, 65500),
-    "one side too long": claiming(MAX_SIDE + 1, 8),
-    "the other side too long": claiming(8, MAX_SIDE + 1),
+    "one side too long": claiming(MAX_SIDE_PX + 1, 8),
+    "the other side too long": claiming(8, MAX_SIDE_PX + 1),
     "the height comes later": claiming(4000, 0),
     "3000 scans": of_scans(1000, 1000, 3000),
     "arithmetic coding": claiming(4000, 4000, b"\xff\xc9"),
@@ -107,19 +107,19 @@ class HeaderTests(BombCase):
         pyro.addFilter(lambda camera: len(camera.data))
         for number, (name, bomb) in enumerate(BOMBS.items(), start=1):
             self.assertLess(len(bomb), 2**19, name)
-            self.assertIsNone(size_of(bomb), name)
+            self.assertIsNone(read_size(bomb), name)
             self.assertIsNone(find_target(bomb, SIZE), name)
-            pyro.see(Frame(number, 8, 8, bomb, 0.0))
+            pyro.process_frame(Frame(number, 8, 8, bomb, 0.0))
             self.assertEqual((pyro.pictures, pyro.bad_pictures), (0, number), name)
         self.assertEqual(self.decoded, [])
 
     def streamed(self, jpeg: bytes) -> object:
         """Return the frame of a network camera that sends only ``jpeg``."""
         clock = Clock()
-        camera = MjpegCamera(clock, MemoryBody(jpeg=jpeg), 30.0)
+        camera = MjpegCamera(clock, MemoryRobot(jpeg=jpeg), 30.0)
         camera.start()
         table = {"url": "http://10.0.0.7:81/stream", "fps": 30}
-        driver = driver_for("camera", table, "cam", clock, MemoryConnector(clock, camera.accept))
+        driver = create_driver("camera", table, "cam", clock, MemoryConnector(clock, camera.accept))
         driver.connect().addErrback(lambda failure: failure.trap(LinkLost))
         clock.pump([0.01] * 30)
         seen = driver.observe()
@@ -132,10 +132,10 @@ class HeaderTests(BombCase):
         folder = Path(self.mktemp())
         folder.mkdir()
         (folder / "1.jpg").write_bytes(jpeg)
-        shots = FolderShots(str(folder))
+        shots = FolderSource(str(folder))
         shots.open()
         try:
-            return shots.shoot()
+            return shots.read_picture()
         except BadFrame:
             return None
 
@@ -152,13 +152,15 @@ class HeaderTests(BombCase):
         """A camera, a robot, a phone and a page reject all bombs, which are neither shown nor forwarded."""
         for name, bomb in BOMBS.items():
             text = base64.b64encode(bomb).decode()
-            self.assertRaises(BadFrame, codec.picture, {"format": "jpeg", "data": text})
-            self.assertRaises(Refusal, sides, bomb)
+            self.assertRaises(BadFrame, codec.decode_picture, {"format": "jpeg", "data": text})
+            self.assertRaises(Refusal, check_picture, bomb)
             self.assertIsNone(self.streamed(bomb), name)
             self.assertIsNone(self.from_folder(bomb), name)
             self.assertIsNone(self.on_page(bomb), name)
             reader = PictureReader()
-            packet = picture.header(0, 1, 208, 160, 1, 1) + picture.block(Block(208, 160, "JPEGColor", bomb))
+            packet = picture.encode_header(0, 1, 208, 160, 1, 1) + picture.encode_block(
+                Block(208, 160, "JPEGColor", bomb)
+            )
             self.assertEqual((list(reader.read(packet)), reader.bad_frames > 0), ([], True), name)
         good = encoded(208, 156)
         for taken in (self.streamed(good), self.from_folder(good), self.on_page(good)):
@@ -166,19 +168,19 @@ class HeaderTests(BombCase):
 
     def test_real_pictures_are_decoded(self) -> None:
         """Baseline and progressive pictures are searched; large ones are reduced to every second or fourth pixel."""
-        for width, height in ((208, 156), (1920, 1080), (MAX_SIDE, MAX_SIDE)):
-            for is_progressive in (0, 1) if width < MAX_SIDE else (0,):
+        for width, height in ((208, 156), (1920, 1080), (MAX_SIDE_PX, MAX_SIDE_PX)):
+            for is_progressive in (0, 1) if width < MAX_SIDE_PX else (0,):
                 seen = find_target(encoded(width, height, cv2.IMWRITE_JPEG_PROGRESSIVE, is_progressive), SIZE)
                 assert seen is not None
                 self.assertLess(abs(seen.bearing), 0.02)
-                self.assertLessEqual(max(self.decoded[-1]), ENOUGH)
+                self.assertLessEqual(max(self.decoded[-1]), MAX_DETECTION_SIDE_PX)
         self.assertEqual(len(self.decoded), 5)
 
     def test_most_that_is_decoded(self) -> None:
         """The limit counts the pixels of all scans."""
-        most = MAX_DECODED // 1024**2
-        self.assertEqual(size_of(of_scans(1024, 1024, most)), (1024, 1024))
-        self.assertIsNone(size_of(of_scans(1024, 1024, most + 1)))
+        most = MAX_DECODED_PX // 1024**2
+        self.assertEqual(read_size(of_scans(1024, 1024, most)), (1024, 1024))
+        self.assertIsNone(read_size(of_scans(1024, 1024, most + 1)))
 
 
 class PooledClock(Clock):
@@ -229,8 +231,8 @@ class QueueTests(BombCase):
             with self.subTest(kind=kind):
                 clock = PooledClock()
                 driver: Any = StillDriver()
-                body = Body(driver, clock, lambda seen: None, lambda why: None)
-                behaviour = behaviour_for(Task("t", kind, "t"), random.Random(1), means=body.means)
+                body = AgentRobot(driver, clock, lambda seen: None, lambda why: None)
+                behaviour = create_behaviour(Task("t", kind, "t"), random.Random(1), means=body.motion)
                 values = {"odom.x": 0.0, "odom.y": 0.0, "odom.yaw": 0.0}
                 self.decoded.clear()
                 for number in range(1, 101):

@@ -12,12 +12,12 @@ from wsproto.events import Event, Pong
 
 from drivers.errors import BadFrame, RobotError
 from drivers.link import MemoryConnector
-from drivers.rosbridge.codec import MOST_DIGITS, MOST_VALUES, Answered, Status, decoded
+from drivers.rosbridge.codec import MAX_NUMBER_CHARS, MAX_VALUES, ServiceResponse, Status, decode_message
 from drivers.rosbridge.driver import RosbridgeDriver
-from drivers.rosbridge.websocket import MAX_MESSAGE
-from formats.websocket import MAX_FRAMES, End
-from sim.robots.emulator.body import MemoryBody
+from drivers.rosbridge.websocket import MAX_MESSAGE_BYTES
+from formats.websocket import MAX_FRAMES, WebSocketEnd
 from sim.robots.emulator.rosbridge import RosbridgeRobot
+from sim.robots.emulator.simulated_robot import MemoryRobot
 from tests.formats.rfc6455 import CONTINUATION, PING, PONG, TEXT, framed
 
 READ = 65536
@@ -31,7 +31,7 @@ def published(inner: bytes) -> bytes:
     return b'{"op":"publish","topic":"/odom","msg":{"pose":' + inner + b"}}"
 
 
-def filled(one: bytes, size: int = MAX_MESSAGE - 100) -> bytes:
+def filled(one: bytes, size: int = MAX_MESSAGE_BYTES - 100) -> bytes:
     """Return a message filled with copies of one value."""
     return published(b"[" + one + (b"," + one) * ((size - len(one)) // (len(one) + 1)) + b"]")
 
@@ -65,7 +65,7 @@ class MessageTests(SynchronousTestCase):
         """Return whether a message is accepted, and the peak memory of a rejected one."""
         tracemalloc.start()
         try:
-            decoded(data)
+            decode_message(data)
         except BadFrame:
             return False, tracemalloc.get_traced_memory()[1]
         finally:
@@ -75,7 +75,7 @@ class MessageTests(SynchronousTestCase):
     def test_many_values(self) -> None:
         """Messages of 4 MB with up to two million values are rejected before they become objects."""
         for name, data in MANY.items():
-            self.assertLessEqual(len(data), MAX_MESSAGE)
+            self.assertLessEqual(len(data), MAX_MESSAGE_BYTES)
             is_taken, peak = self.peak(data)
             self.assertFalse(is_taken, name)
             self.assertLess(peak, 10_000, name)
@@ -98,21 +98,21 @@ class MessageTests(SynchronousTestCase):
             deep = b"[" * depth + b"]" * depth
             for data in (b'{"op":' + deep + b"}", b'{"op":"service_response","id":"1","values":' + deep + b"}"):
                 try:
-                    said = decoded(data)
+                    said = decode_message(data)
                 except BadFrame as error:
                     self.assertLess(len(str(error)), 100)
                 else:
-                    assert isinstance(said, Answered)
+                    assert isinstance(said, ServiceResponse)
                     self.assertEqual(said.values, {"error": "a list"})
-        status = decoded(b'{"op":"status","level":"error","msg":[[[1]]]}')
+        status = decode_message(b'{"op":"status","level":"error","msg":[[[1]]]}')
         self.assertEqual(status, Status("error", "a list"))
 
     def test_most_that_is_taken(self) -> None:
         """The most expensive accepted message uses limited memory; the largest scans and numbers are accepted."""
-        worst = published(b"[" + b",".join([b'{"":0}'] * (MOST_VALUES // 2 - 5)) + b"]")
+        worst = published(b"[" + b",".join([b'{"":0}'] * (MAX_VALUES // 2 - 5)) + b"]")
         tracemalloc.start()
         try:
-            message = decoded(worst)
+            message = decode_message(worst)
             self.assertLess(tracemalloc.get_traced_memory()[1], ROOM)
         finally:
             tracemalloc.stop()
@@ -120,7 +120,7 @@ class MessageTests(SynchronousTestCase):
         ranges = b",".join([b"1.2345678901234567"] * 20_000)
         scan = b'{"op":"publish","topic":"/scan","msg":{"ranges":[%b],"intensities":[%b]}}' % (ranges, ranges)
         self.assertTrue(self.peak(scan)[0])
-        self.assertTrue(self.peak(published(b"1" * MOST_DIGITS))[0])
+        self.assertTrue(self.peak(published(b"1" * MAX_NUMBER_CHARS))[0])
         self.assertTrue(self.peak(published(b"%.6f" % 1.7e308))[0])
 
 
@@ -128,7 +128,7 @@ class FloodTests(SynchronousTestCase):
     def setUp(self) -> None:
         """Connect a driver to an emulated robot, and count the processed frames."""
         self.clock = Clock()
-        self.robot = RosbridgeRobot(self.clock, MemoryBody(values={"power.level": 0.8}), Random(1))
+        self.robot = RosbridgeRobot(self.clock, MemoryRobot(values={"power.level": 0.8}), Random(1))
         self.robot.start()
         self.connector = MemoryConnector(self.clock, self.robot.accept)
         self.driver = RosbridgeDriver({}, self.connector, self.clock, "turtle")
@@ -136,22 +136,22 @@ class FloodTests(SynchronousTestCase):
         self.pass_time(0.5)
         self.assertEqual(self.driver.state, "ready")
         self.taken = 0
-        take, send = End._process_event, End._send
+        take, send = WebSocketEnd._process_event, WebSocketEnd._send
 
-        def counted(end: End, event: Event) -> bool:
+        def counted(end: WebSocketEnd, event: Event) -> bool:
             is_taken = take(end, event)
             self.taken += is_taken and end._request is not None
             return is_taken
 
-        self.patch(End, "_process_event", counted)
+        self.patch(WebSocketEnd, "_process_event", counted)
         self.pongs: list[int] = []
 
-        def noted(end: End, event: Event) -> bytes:
+        def noted(end: WebSocketEnd, event: Event) -> bytes:
             if isinstance(event, Pong) and end._request is not None:
                 self.pongs.append(len(event.payload))
             return send(end, event)
 
-        self.patch(End, "_send", noted)
+        self.patch(WebSocketEnd, "_send", noted)
         self.addCleanup(self.end)
 
     def end(self) -> None:
@@ -220,7 +220,7 @@ class FloodTests(SynchronousTestCase):
     def test_answers_to_calls(self) -> None:
         """A failed call with a deeply nested reason fails with a short text."""
         errors: list[object] = []
-        asked = self.driver._call("/dance")
+        asked = self.driver._call_service("/dance")
         asked.addErrback(lambda failure: errors.append(failure.check(RobotError) and failure.getErrorMessage()))
         number = next(reversed(self.driver._calls))
         deep = b"[" * 500 + b"]" * 500

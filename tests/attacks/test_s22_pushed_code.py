@@ -9,12 +9,12 @@ from twisted.internet.defer import Deferred
 from twisted.trial.unittest import SynchronousTestCase
 
 from middleware.admission.membership import MemoryMembership
-from middleware.deployment.shelf import MemoryShelf
-from middleware.entangled.control.place import made
+from middleware.deployment.module_store import MemoryModuleStore
+from middleware.entangled.control.socket_path import prepare_path
 from middleware.node import SwarmNode
 from middleware.tasks.task import Task
 from swarmnode.deploy import main
-from swarmnode.rehearsal import VirtualTeam
+from swarmnode.simulated_team import SimulatedTeam
 from tests.swarmnode.shell import Shell, runtime_folder
 
 CANARY = "swarm_canary"
@@ -47,18 +47,18 @@ class PushedCodeTests(SynchronousTestCase):
     def setUp(self) -> None:
         self.folder = runtime_folder(self, "author")
         self.addCleanup(sys.modules.pop, CANARY, None)
-        self.team = VirtualTeam(11, dogs=())
+        self.team = SimulatedTeam(11, dogs=())
         self.team._names += ("author", "second")
         self.addCleanup(self.team.stop)
-        self.shelf = MemoryShelf()
+        self.shelf = MemoryModuleStore()
 
     def join(self, name: str, *roles: str) -> SwarmNode:
         """Add a member to which the operator granted these roles."""
-        membership = self.team.operator.founded(
+        membership = self.team.operator.create_membership(
             name, roles, self.team.clock.seconds(), self.team._member_rng, self.team._secret
         )
         self.team._memberships[name] = MemoryMembership(membership)
-        self.team.add(name)
+        self.team.add_node(name)
         self.team.clock.advance(1.0)
         return self.team.services[name].assembly.node
 
@@ -66,7 +66,7 @@ class PushedCodeTests(SynchronousTestCase):
         """Start the dog with the keys of these authors in its settings."""
         keys = [author.entangled.identity.public.hex() for author in authors]
         allowed = {"allow": True, "operators": keys, "modules": ["best"]}
-        self.team.add("dog1", {"deployment": allowed}, self.shelf)
+        self.team.add_node("dog1", {"deployment": allowed}, self.shelf)
         self.team.clock.advance(1.0)
         return self.team.services["dog1"].assembly.node
 
@@ -84,7 +84,7 @@ class PushedCodeTests(SynchronousTestCase):
         packed = self.team.operator.revoke(node.entangled.identity.public, name, self.team.clock.seconds())
         team = self.team.services["vaio"].assembly.node.team
         assert team is not None
-        told = self.team_told(team.tell(packed))
+        told = self.team_told(team.publish(packed))
         self.assertEqual(told, "revoke")
         self.team.clock.advance(IN_FORCE)
 
@@ -95,7 +95,7 @@ class PushedCodeTests(SynchronousTestCase):
         self.team_told(self.team.services["vaio"].assembly.node.submit(task))
 
     def pose(self) -> tuple[float, ...]:
-        (robot,) = [each for each in self.team.truth()["dogs"] if each["name"] == "dog1"]
+        (robot,) = [each for each in self.team.get_true_state()["dogs"] if each["name"] == "dog1"]
         return tuple(round(robot[key], 4) for key in ("x", "y", "heading"))
 
     def team_told(self, work: object) -> object:
@@ -147,7 +147,7 @@ class PushedCodeTests(SynchronousTestCase):
         self.assertEqual(len(self.shelf.contents), 1)
         sys.modules.pop(CANARY)
         self.revoke(author, "author")
-        self.team.services["dog1"].leave(1.0)
+        self.team.services["dog1"].leave_for(1.0)
         self.team.clock.advance(5.0)
         dog = self.team.services["dog1"].assembly.node
         self.assert_nothing_runs(dog)
@@ -158,8 +158,8 @@ class PushedCodeTests(SynchronousTestCase):
         dog = self.allow(author, second)
         self.push(author)
         self.revoke(author, "author")
-        made("author").unlink()
-        made("second").touch()
+        prepare_path("author").unlink()
+        prepare_path("second").touch()
         self.assertEqual(self.push(second, SOURCE + "# two\n"), 0)
         self.assertEqual(list(dog.deployed), [("strategy", "best")])
 

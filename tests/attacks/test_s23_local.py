@@ -14,9 +14,9 @@ from pathlib import Path
 
 from twisted.trial.unittest import SynchronousTestCase
 
-from middleware.entangled.control.command import asked, check_peer
-from middleware.entangled.control.place import NoControl, check_socket, folder, found, made
-from swarmnode.invitation import invitations
+from middleware.entangled.control.command import check_peer, send_request
+from middleware.entangled.control.socket_path import NoControl, check_socket, find_folder, find_socket, prepare_path
+from swarmnode.page_access import list_pages
 from swarmnode.plugin import Options
 
 SECRET = "the secret of a classroom"
@@ -37,7 +37,7 @@ class ControlSocketTests(SynchronousTestCase):
         self.patch(os, "getuid", lambda: self.me + 1)
 
     def listening(self, name: str) -> Path:
-        path = folder() / f"{name}.control"
+        path = find_folder() / f"{name}.control"
         server = socket.socket(socket.AF_UNIX)
         self.addCleanup(server.close)
         server.bind(str(path))
@@ -46,25 +46,25 @@ class ControlSocketTests(SynchronousTestCase):
 
     def test_folder_of_another(self) -> None:
         """A folder of another user is neither read nor used for a socket."""
-        made("vaio").touch()
-        self.assertEqual(found("vaio").name, "vaio.control")
+        prepare_path("vaio").touch()
+        self.assertEqual(find_socket("vaio").name, "vaio.control")
         self.be_another()
-        for use in (found, made):
+        for use in (find_socket, prepare_path):
             self.assertIn("accessible to other users", str(self.assertRaises(NoControl, use, "vaio")))
 
     def test_page_of_another(self) -> None:
         """A page in another user's note is not opened."""
         note = {"name": "vaio", "url": "http://127.0.0.1:1/", "code": "loud-otter", "pid": os.getpid()}
-        made("vaio").with_suffix(".page").write_text(json.dumps(note))
-        self.assertEqual([each.name for each in invitations()], ["vaio"])
+        prepare_path("vaio").with_suffix(".page").write_text(json.dumps(note))
+        self.assertEqual([each.name for each in list_pages()], ["vaio"])
         self.be_another()
-        self.assertRaises(NoControl, invitations)
+        self.assertRaises(NoControl, list_pages)
 
     def test_folder_that_others_write(self) -> None:
         """A folder that other users can write is refused."""
-        made("vaio").touch()
-        folder().chmod(0o777)
-        for use in (found, made):
+        prepare_path("vaio").touch()
+        find_folder().chmod(0o777)
+        for use in (find_socket, prepare_path):
             self.assertRaises(NoControl, use, "vaio")
 
     def test_folder_that_is_a_link(self) -> None:
@@ -72,34 +72,34 @@ class ControlSocketTests(SynchronousTestCase):
         other = self.runtime / "elsewhere"
         other.mkdir(mode=0o700)
         (other / "vaio.control").touch()
-        folder().symlink_to(other)
-        for use in (found, made):
+        find_folder().symlink_to(other)
+        for use in (find_socket, prepare_path):
             self.assertRaises(NoControl, use, "vaio")
 
     def test_socket_of_another(self) -> None:
         """A socket of another user, and a file that is not a socket, get no request."""
-        made("vaio")
+        prepare_path("vaio")
         path = self.listening("vaio")
-        file = folder() / "file.control"
+        file = find_folder() / "file.control"
         file.touch()
-        link = folder() / "link.control"
+        link = find_folder() / "link.control"
         link.symlink_to(path)
         for each in (file, link):
-            self.assertIn("is no socket", str(self.assertRaises(NoControl, list, asked(each, {}))))
+            self.assertIn("is no socket", str(self.assertRaises(NoControl, list, send_request(each, {}))))
         self.be_another()
-        self.assertIn("accessible to other users", str(self.assertRaises(NoControl, list, asked(path, {}))))
+        self.assertIn("accessible to other users", str(self.assertRaises(NoControl, list, send_request(path, {}))))
 
     def test_service_of_another_user(self) -> None:
         """Root may contact another user's service in a named folder, but not in the shared folder."""
-        made("vaio")
+        prepare_path("vaio")
         path = self.listening("vaio")
-        for each in (folder(), path):
+        for each in (find_folder(), path):
             if self.me == 0:
                 os.chown(each, 12345, 12345)
         self.patch(os, "getuid", lambda: 0)
-        self.assertEqual(found("vaio"), path)
+        self.assertEqual(find_socket("vaio"), path)
         check_socket(path)
-        self.assertRaises(NoControl, made, "vaio")
+        self.assertRaises(NoControl, prepare_path, "vaio")
         del os.environ["XDG_RUNTIME_DIR"]
         self.assertRaises(NoControl, check_socket, path)
 
@@ -108,7 +108,7 @@ class ControlSocketTests(SynchronousTestCase):
         here, there = socket.socketpair(socket.AF_UNIX)
         self.addCleanup(here.close)
         self.addCleanup(there.close)
-        path = made("vaio")
+        path = prepare_path("vaio")
         check_peer(here, path)
 
         class Connection:

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from twisted.trial.unittest import SynchronousTestCase
 
-from middleware.admission.roles import DEVICE, GATEWAY, KINDS, METHODS, VIEWER, kind_of, may_call, may_store
+from middleware.admission.roles import DEVICE, GATEWAY, KINDS, METHODS, VIEWER, classify_slot, may_call, may_store
 from tests.attacks.role_matrix import REVOKED_OPERATOR, list_slots, try_everything
 
 
@@ -40,4 +40,4 @@ class RoleMatrixTests(SynchronousTestCase):
 
     def test_slots_cover_the_table(self) -> None:
         """The tried slots cover every namespace of the table."""
-        self.assertEqual({kind_of(slot) for slot in list_slots(b"o" * 32)}, set(KINDS))
+        self.assertEqual({classify_slot(slot) for slot in list_slots(b"o" * 32)}, set(KINDS))

@@ -7,13 +7,20 @@ from collections.abc import Sequence
 import msgpack
 from twisted.internet.defer import Deferred
 
-from middleware.admission.certificate import Member, chained, member_of, pass_of, proof, renewed
-from middleware.admission.code import Code, read
+from middleware.admission.certificate import (
+    Member,
+    issue_certificate,
+    renew_certificate,
+    sign_join,
+    verify_certificate,
+    wrap_grant,
+)
+from middleware.admission.code import JoinCode, parse_code
 from middleware.admission.membership import Membership
-from middleware.admission.roll import invitation_id, packed_admission
-from middleware.admission.statement import YEAR
+from middleware.admission.membership_list import invitation_id, pack_admission
+from middleware.admission.statement import DEFAULT_LIFE_S
 from middleware.entangled.identity import Identity
-from middleware.entangled.wire.door import EXPIRED, FOREIGN, REVOKED, UNLISTED
+from middleware.entangled.wire.admission_check import EXPIRED, FOREIGN, REVOKED, UNLISTED
 from tests.attacks.siege import SOURCE, SiegeCase
 from tests.middleware.admission.paper import identity
 
@@ -34,40 +41,40 @@ class RenewalCase(SiegeCase):
         self.team.run(2.0)
 
     def grant_of(self, public: bytes) -> bytes:
-        found = self.team.houses[0].team.roll.granted(public)
+        found = self.team.houses[0].team.membership_list.find_grant(public)
         assert found is not None
         return found[1]
 
-    def word(self, roles: Sequence[str] = ("device",), life: float = YEAR, own: Identity = DOG) -> bytes:
+    def word(self, roles: Sequence[str] = ("device",), life: float = DEFAULT_LIFE_S, own: Identity = DOG) -> bytes:
         """Return the certificate of a key with the operator's grant from now on."""
-        return pass_of(self.team.signer.grant(own.public, "dog", roles, self.team.wall(), life))
+        return wrap_grant(self.team.signer.grant(own.public, "dog", roles, self.team.wall(), life))
 
     def read(self, shown: bytes, own: Identity = DOG) -> Member:
-        return member_of(self.team.signer.public, own.public, shown)
+        return verify_certificate(self.team.signer.public, own.public, shown)
 
     def renew(self, shown: bytes, ago: float = 0.0, own: Identity = DOG, by: int = 1) -> bytes:
         """Return ``shown``, renewed by a bootstrap node (the hostile one by default) ``ago`` seconds ago."""
         member, begin = self.read(shown, own), int(self.team.wall() - ago)
-        return renewed(self.keys[by], (self.honest, self.thief)[by], member, shown, begin)
+        return renew_certificate(self.keys[by], (self.honest, self.thief)[by], member, shown, begin)
 
     def said(self, shown: bytes, own: Identity = DOG) -> str:
         """Return the code with which the honest nodes refuse a certificate, or "" if they accept it."""
-        answers = {self.team.houses[place].team.door.admit(own.public, shown) for place in (0, 2)}
+        answers = {self.team.houses[place].team.admission.admit(own.public, shown) for place in (0, 2)}
         self.assertEqual(len(answers), 1, answers)
         return answers.pop()
 
     def end(self, own: Identity = DOG) -> int:
         """Return the expiry of a key's certificate in the list of a plain member."""
-        member = self.judge.team.door.member(own.public)
+        member = self.judge.team.admission.find_member(own.public)
         assert member is not None
         return member.not_after
 
-    def let_in(self, code: Code, name: str, own: Identity = DOG) -> bytes:
+    def let_in(self, code: JoinCode, name: str, own: Identity = DOG) -> bytes:
         """Return the certificate of a key that the hostile node admits with a code."""
-        found = self.judge.team.roll.invited(invitation_id(code.key.public))
+        found = self.judge.team.membership_list.find_invitation(invitation_id(code.key.public))
         assert found is not None
-        came = (own.public, "", proof(code.key, own.public, ""))
-        return chained(self.keys[1], self.thief, (found[1], found[0]), came, name, int(self.team.wall()))
+        came = (own.public, "", sign_join(code.key, own.public, ""))
+        return issue_certificate(self.keys[1], self.thief, (found[1], found[0]), came, name, int(self.team.wall()))
 
     def tell(self, statement: bytes) -> None:
         self.outcome(self.team, self.team.tell(statement))
@@ -117,7 +124,7 @@ class RevokedBootstrapTests(RenewalCase):
     def test_behind_a_void_renewal(self) -> None:
         """A member with a void renewal of a valid grant is admitted by the grant, and is on the list."""
         ghost = identity("ghost")
-        old = pass_of(self.team.signer.grant(ghost.public, "ghost", ("viewer",), self.team.wall()))
+        old = wrap_grant(self.team.signer.grant(ghost.public, "ghost", ("viewer",), self.team.wall()))
         self.tell(self.team.signer.revoke(self.keys[1].public, "boot1", self.team.wall()))
         self.assertEqual(self.said(self.renew(old, own=ghost), ghost), "")
         self.assertEqual([("ghost" in self.team.members(place)) for place in (0, 2)], [True, True])
@@ -133,7 +140,7 @@ class RevokedBootstrapTests(RenewalCase):
 
     def test_laundered_admission(self) -> None:
         """A member admitted by a revoked bootstrap node is revoked with it, even if another node renewed it."""
-        shown = self.let_in(read(self.team.invite("pup")), "pup")
+        shown = self.let_in(parse_code(self.team.invite("pup")), "pup")
         self.team.days = 300
         shown = self.renew(shown, by=0)
         self.assertEqual(self.said(shown), "")
@@ -148,14 +155,14 @@ class SelfRenewalTests(RenewalCase):
         old = self.word(("device", "operator", "gateway"))
         grant = msgpack.unpackb(old)[1]
         self.team.days = 360
-        mine = renewed(DOG, grant, self.read(old), old, int(self.team.wall()))
+        mine = renew_certificate(DOG, grant, self.read(old), old, int(self.team.wall()))
         self.assertEqual(self.said(mine), FOREIGN)
-        forged = renewed(DOG, self.honest, self.read(old), old, int(self.team.wall()))
+        forged = renew_certificate(DOG, self.honest, self.read(old), old, int(self.team.wall()))
         self.assertEqual(self.said(forged), FOREIGN)
 
     def test_a_bootstrap_node_beside_others(self) -> None:
         """A bootstrap node with a lapsed renewal cannot renew itself while there is another bootstrap node."""
-        old, own = pass_of(self.thief), self.keys[1]
+        old, own = wrap_grant(self.thief), self.keys[1]
         self.team.days = 300
         mine = [self.renew(old, ago, own) for ago in (0, 200 * DAY)]
         self.tell_renewal(0)
@@ -164,10 +171,10 @@ class SelfRenewalTests(RenewalCase):
 
     def tell_renewal(self, place: int) -> None:
         """Let the other bootstrap node renew the bootstrap node at ``place``."""
-        shown = pass_of((self.honest, self.thief)[place])
+        shown = wrap_grant((self.honest, self.thief)[place])
         public = self.keys[place].public
         again = self.renew(shown, own=self.keys[place], by=1 - place)
-        self.team.houses[2].team._gossip.add(packed_admission(public, again))
+        self.team.houses[2].team._gossip.add(pack_admission(public, again))
         self.team.run(2.0)
 
     def test_a_short_one_renews_nobody(self) -> None:
@@ -175,7 +182,7 @@ class SelfRenewalTests(RenewalCase):
         own = identity("helper")
         grant = self.team.signer.grant(own.public, "helper", ("bootstrap",), self.team.wall(), 30 * DAY)
         old = self.word()
-        again = renewed(own, grant, self.read(old), old, int(self.team.wall()))
+        again = renew_certificate(own, grant, self.read(old), old, int(self.team.wall()))
         self.assertEqual(self.said(again), FOREIGN)
 
 
@@ -188,7 +195,7 @@ class WideningTests(RenewalCase):
         self.team.days = 2
         again = self.renew(old)
         self.assertEqual(self.said(again), "")
-        self.assertEqual(self.judge.team.door.roles_of(DOG.public), {"viewer"})
+        self.assertEqual(self.judge.team.admission.roles_of(DOG.public), {"viewer"})
 
     def test_when_the_narrower_grant_has_ended(self) -> None:
         """An expired grant still overrides the operator's earlier grants to the same key."""
@@ -207,7 +214,7 @@ class WideningTests(RenewalCase):
         self.team.days = 300
         fields = msgpack.unpackb(self.renew(old))
         wider = msgpack.unpackb(self.word(("operator",)))[1]
-        for place, value in ((1, [wider]), (2, fields[2] + 1), (3, fields[3] + 1), (3, fields[3] + YEAR)):
+        for place, value in ((1, [wider]), (2, fields[2] + 1), (3, fields[3] + 1), (3, fields[3] + DEFAULT_LIFE_S)):
             changed = [*fields[:place], value, *fields[place + 1 :]]
             self.assertEqual(self.said(msgpack.packb(changed)), FOREIGN)
 
@@ -215,17 +222,19 @@ class WideningTests(RenewalCase):
         """A renewal for longer than the lifetime that the operator granted is refused."""
         old = self.word()
         member = self.read(old)
-        long = Member(member.public, "dog", member.roles, 0, 0, since=member.since, life=3 * YEAR)
-        again = renewed(self.keys[1], self.thief, long, old, int(self.team.wall()))
+        long = Member(member.public, "dog", member.roles, 0, 0, since=member.since, life=3 * DEFAULT_LIFE_S)
+        again = renew_certificate(self.keys[1], self.thief, long, old, int(self.team.wall()))
         self.assertEqual(self.said(again), FOREIGN)
 
     def test_a_name_by_a_bootstrap_node(self) -> None:
         """A bootstrap node cannot change the name of a member that joined by code."""
         dog = self.team.welcome("dog")
-        shown, own = dog.kept.membership.shown, dog.kept.membership.identity
+        shown, own = dog.kept.membership.certificate, dog.kept.membership.identity
         fields = msgpack.unpackb(shown)
         fields[4] = "vaio"
-        again = renewed(self.keys[1], self.thief, self.read(shown, own), msgpack.packb(fields), int(self.team.wall()))
+        again = renew_certificate(
+            self.keys[1], self.thief, self.read(shown, own), msgpack.packb(fields), int(self.team.wall())
+        )
         self.assertEqual(self.said(again, own), FOREIGN)
 
     def test_shortened(self) -> None:
@@ -239,7 +248,7 @@ class WideningTests(RenewalCase):
 
     def test_in_the_place_of_a_good_one(self) -> None:
         """A longer renewal of an earlier grant does not displace a renewal of the current grant."""
-        old = self.word(life=3 * YEAR)
+        old = self.word(life=3 * DEFAULT_LIFE_S)
         self.team.days = 1
         new = self.word()
         self.tell(msgpack.unpackb(new)[1])
@@ -251,17 +260,17 @@ class WideningTests(RenewalCase):
     def test_another_origin(self) -> None:
         """A renewal with another name or admitting node than the admission is invalid and displaces none."""
         dog = self.team.move_in(self.successResultOf(self.knocked("pup", 2)))
-        shown, own = dog.kept.membership.shown, dog.kept.membership.identity
+        shown, own = dog.kept.membership.certificate, dog.kept.membership.identity
         self.team.days = 300
         fields = msgpack.unpackb(shown)
         fields[4] = "pup-9"
         other = msgpack.packb(fields)
         member = self.read(shown, own)
-        bad = renewed(self.keys[1], self.thief, member, other, int(self.team.wall()) + 99)
+        bad = renew_certificate(self.keys[1], self.thief, member, other, int(self.team.wall()) + 99)
         self.assertEqual((member.name, self.read(bad, own).name), ("pup-1", "pup-9"))
         for place in (0, 2):
             self.assertIsNone(
-                self.team.houses[place].team.roll.add(packed_admission(own.public, bad), self.team.wall())
+                self.team.houses[place].team.membership_list.add(pack_admission(own.public, bad), self.team.wall())
             )
         good = self.renew(shown, own=own, by=0)
         self.assertEqual((self.said(good, own), self.end(own)), ("", self.read(good, own).not_after))
@@ -287,19 +296,19 @@ class RevivalTests(RenewalCase):
     def test_revoked_member(self) -> None:
         """A revoked member stays rejected, for renewals by any node at any time, and no node offers a renewal."""
         dog = self.team.enlist("dog")
-        shown, own = dog.kept.membership.shown, dog.kept.membership.identity
+        shown, own = dog.kept.membership.certificate, dog.kept.membership.identity
         before = self.renew(shown, own=own, by=0)
         self.assertEqual(self.said(before, own), "")
         self.tell(self.team.signer.revoke(own.public, "dog", self.team.wall()))
         self.team.days = 300
         for again in (before, self.renew(shown, own=own), self.renew(shown, 300 * DAY, own)):
             self.assertEqual(self.said(again, own), REVOKED)
-        due = self.team.houses[0].team._renewer.find_due(self.team.wall())
+        due = self.team.houses[0].team._renewer.find_due_members(self.team.wall())
         self.assertNotIn(own.public, [each.public for each in due])
 
     def test_temporary_guest(self) -> None:
         """A bootstrap node cannot renew a member with a lifetime of less than a year, by grant or by code."""
-        short = self.word(life=YEAR - 1)
+        short = self.word(life=DEFAULT_LIFE_S - 1)
         code, packed, terms = self.team.signer.invite(
             "pup", ("device",), 1, self.team.wall(), 3600.0, self.team.dice, life=float(DAY)
         )
@@ -316,7 +325,7 @@ class RevivalTests(RenewalCase):
 
     def test_more_keys_than_the_code_has(self) -> None:
         """Renewals cannot add more keys for a code than it has uses, even without a known admission."""
-        code = read(self.team.invite("dog", uses=2))
+        code = parse_code(self.team.invite("dog", uses=2))
         answers = []
         for number in range(1, 5):
             own = Identity(bytes([number]) * 32)

@@ -14,7 +14,7 @@ from benchmarks.takeover import __main__ as takeover
 class CommandLineTests(SynchronousTestCase):
     def test_wrong_values_are_named(self) -> None:
         """An invalid number, share or folder ends with code 2 and an error with the valid values, before any trial."""
-        self.patch(takeover, "rehearsed", lambda *_: [])
+        self.patch(takeover, "run_virtual", lambda *_: [])
         blocked = Path(self.mktemp())
         blocked.write_text("a file", encoding="utf-8")
         for words, said in (

@@ -6,8 +6,8 @@ from typing import Any
 
 from twisted.trial.unittest import SynchronousTestCase
 
-from benchmarks.dht.contestant import OURS, OURS_IN_MEMORY
-from benchmarks.dht.target import OPENDHT, TORRENT, verdicts
+from benchmarks.dht.library import OURS, OURS_IN_MEMORY
+from benchmarks.dht.target import OPENDHT, TORRENT, check_targets
 
 
 def measured() -> dict[str, Any]:
@@ -42,7 +42,7 @@ def row() -> dict[str, dict[str, Any]]:
 class TargetTests(SynchronousTestCase):
     def reached(self, results: dict[str, Any], verdict: bool | None) -> list[int]:
         """Return the numbers of the targets with this ``verdict``."""
-        return [one.number for one in verdicts(results) if one.is_reached is verdict]
+        return [one.number for one in check_targets(results) if one.is_met is verdict]
 
     def test_all_are_reached(self) -> None:
         """If all figures are good enough, all fourteen targets are reached."""
@@ -89,5 +89,5 @@ class TargetTests(SynchronousTestCase):
 
     def test_in_words(self) -> None:
         """The text of a limit contains the figure and the required value."""
-        limits = [str(limit) for verdict in verdicts({OURS: measured()})[:3] for limit in verdict.limits]
+        limits = [str(limit) for verdict in check_targets({OURS: measured()})[:3] for limit in verdict.limits]
         self.assertEqual(limits, ["p50 ms 0.50 (at most ?)"] * 2 + ["gets/s 9,000 (at least ?)"])

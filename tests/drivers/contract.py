@@ -11,8 +11,8 @@ from twisted.trial.unittest import SynchronousTestCase
 
 from drivers.driver import Permit
 from drivers.reading import Observation
-from drivers.registry import driver_for
-from sim.robots.emulator.body import MemoryBody
+from drivers.registry import create_driver
+from sim.robots.emulator.simulated_robot import MemoryRobot
 
 
 class KeptLink:
@@ -61,7 +61,7 @@ class RobotCase(SynchronousTestCase):
     def setUp(self) -> None:
         """Create a simulated base and the robot that moves it."""
         self.clock = Clock()
-        self.body = MemoryBody()
+        self.body = MemoryRobot()
         self.drivers: list[Any] = []
         self.build()
 
@@ -80,7 +80,7 @@ class RobotCase(SynchronousTestCase):
 
     def make_driver(self, **options: object) -> Any:
         """Return a new driver, not yet connected, created by the registry."""
-        driver = driver_for(self.kind, {**self.options, **options}, "robot", self.clock, self.connector)
+        driver = create_driver(self.kind, {**self.options, **options}, "robot", self.clock, self.connector)
         self.drivers.append(driver)
         return driver
 
@@ -106,7 +106,7 @@ class RobotCase(SynchronousTestCase):
     def pass_time(self, seconds: float) -> None:
         """Advance the clock and the base."""
         for _ in range(round(seconds / self.STEP_S)):
-            self.body.pass_time(self.STEP_S)
+            self.body.advance(self.STEP_S)
             self.clock.advance(self.STEP_S)
 
     def now(self) -> float:

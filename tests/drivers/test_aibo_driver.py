@@ -11,7 +11,7 @@ from drivers.aibo.driver import AiboDriver
 from drivers.conformance import Conformance
 from drivers.errors import LinkLost, NotEnabled, Unsupported
 from sim.robots.emulator.aibo_dog import AiboEmulator
-from swarmnode.driver.ground import Ear
+from swarmnode.driver.environment import WarningCollector
 from tests.drivers.contract import RobotCase
 from tests.webnode.picture import jpeg
 
@@ -58,9 +58,9 @@ class AiboDriverTests(Conformance, AiboCase):
         self.assertGreater(self.true_speed(), 0.05)
         self.pass_time(1.0)
         self.assertEqual(self.true_speed(), 0.0)
-        self.dog.heard.clear()
+        self.dog.received_commands.clear()
         self.pass_time(2.0)
-        self.assertEqual(self.dog.heard, [])
+        self.assertEqual(self.dog.received_commands, [])
 
     def test_stops_by_the_dogs_own_timer(self) -> None:
         """A dog that receives nothing over open links stops 3 s after the last command."""
@@ -97,7 +97,7 @@ class AiboDriverTests(Conformance, AiboCase):
 
     def test_names_rubbish_once(self) -> None:
         """Invalid data is logged once, and a second time if it starts again after valid data."""
-        ear = Ear()
+        ear = WarningCollector()
         self.addCleanup(ear.close)
         self.ready()
         for lines in (1, 2):
@@ -105,7 +105,7 @@ class AiboDriverTests(Conformance, AiboCase):
             self.dog.stop()
             self.dog.start()
             self.pass_time(60.0)
-            self.assertEqual(len([line for line in ear.heard if "invalid world state" in line]), lines)
+            self.assertEqual(len([line for line in ear.warnings if "invalid world state" in line]), lines)
             del self.dog._send_state
             self.dog.stop()
             self.dog.start()
@@ -150,7 +150,7 @@ class AiboDriverTests(Conformance, AiboCase):
         driver = self.ready()
         driver.act({"base.vx": 0.1}, self.permit(seconds=20.0))
         self.pass_time(0.1)
-        self.dog.press()
+        self.dog.press_back_button()
         self.pass_time(0.1)
         self.assertEqual(self.true_speed(), 0.0)
         self.assertRaises(NotEnabled, driver.act, {"base.vx": 0.1}, self.permit())
@@ -158,7 +158,7 @@ class AiboDriverTests(Conformance, AiboCase):
         self.pass_time(2.0)
         self.assertTrue(self.dog.is_engaged)
         self.assertRaises(NotEnabled, driver.act, {"base.vx": 0.1}, self.permit())
-        self.dog.press()
+        self.dog.press_back_button()
         for _ in range(10):
             self.pass_time(self.STEP_S)
             self.assertRaises(NotEnabled, driver.act, {"base.vx": 0.1}, self.permit())
@@ -169,7 +169,7 @@ class AiboDriverTests(Conformance, AiboCase):
 
     def test_stops_motors_that_another_left_on(self) -> None:
         """Connecting to a dog with running motors stops them."""
-        self.dog.press()
+        self.dog.press_back_button()
         driver = self.make_driver()
         driver.connect()
         self.pass_time(0.3)
@@ -242,14 +242,14 @@ class AiboDriverTests(Conformance, AiboCase):
         self.successResultOf(driver.invoke("yap"))
         self.successResultOf(driver.invoke("play", sound="mew.wav"))
         self.pass_time(0.1)
-        self.assertEqual(self.dog.heard[-1][0], "6")
-        self.assertEqual(self.dog.menu.played, ["MEW.WAV"])
+        self.assertEqual(self.dog.received_commands[-1][0], "6")
+        self.assertEqual(self.dog.menu.played_sounds, ["MEW.WAV"])
         self.failureResultOf(driver.invoke("play", sound='x"\n!reset'), Unsupported)
 
     def test_tries_the_ports_of_a_dog_whose_menu_is_silent(self) -> None:
         """A main control that does not answer does not prevent a connection to servers that run already."""
         self.dog.menu.running = {"estop", "state", "walk", "head"}
-        self.dog.menu.answers = lambda data: b""  # type: ignore[method-assign]
+        self.dog.menu.make_answer = lambda data: b""  # type: ignore[method-assign]
         driver = self.make_driver()
         connected = driver.connect()
         self.pass_time(2.0)
@@ -261,7 +261,7 @@ class AiboDriverTests(Conformance, AiboCase):
         """An unknown model can be driven; only its emergency stop and motion are observed, no sensors."""
         driver = self.ready()
         stranger = WorldState(T4, "ERS-210", 5, 6, (1.0,) * 40, (2.0,) * 8, (0.0,) * 8, (0.5,) * 18)
-        self.drivers[-1]._on_world(stranger)
+        self.drivers[-1]._on_world_state(stranger)
         values = self.newest(driver).values
         self.assertNotIn("range.near", values)
         self.assertIs(values["estop.engaged"], False)
@@ -299,7 +299,7 @@ class Way:
 
     def send(self, data: bytes) -> None:
         self.sent += 1
-        self._dog.datagram(data, self._received)
+        self._dog.on_datagram(data, self._received)
 
     def close(self) -> None:
         """Do nothing, as no resource is open."""
@@ -353,7 +353,7 @@ class AiboCameraTests(AiboCase):
         """A camera server that announces its end is started again, over both transports."""
         for transport in ("tcp", "udp"):
             driver = self.film(transport)
-            self.dog.menu.answers(b'!select "#Raw Cam Server"\n')
+            self.dog.menu.make_answer(b'!select "#Raw Cam Server"\n')
             self.assertNotIn("camera", self.dog.menu.running)
             before = driver.diagnostics()["pictures"]
             self.pass_time(4)

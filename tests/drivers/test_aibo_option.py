@@ -12,11 +12,11 @@ from twisted.python.failure import Failure
 from twisted.trial.unittest import SynchronousTestCase
 
 from drivers.aibo import menu
-from drivers.aibo.link import WAITS, Port
-from drivers.aibo.option import PORTS, checked
+from drivers.aibo.link import RETRY_DELAYS_S, Port
+from drivers.aibo.option import PORTS, parse_options
 from drivers.link import Link, TcpConnector
 from drivers.registry import describe
-from swarmnode.driver.ground import Ear
+from swarmnode.driver.environment import WarningCollector
 
 
 class AiboOptionTests(SynchronousTestCase):
@@ -24,8 +24,8 @@ class AiboOptionTests(SynchronousTestCase):
 
     def test_overrides_what_is_given(self) -> None:
         """A port option replaces only that port; without a camera the description has none."""
-        self.assertEqual(checked({"host": "10.0.0.1", "camera_transport": "udp"}).camera_transport, "udp")
-        self.assertEqual(checked({"host": "dog1", "ports": {"walk": 5}}).ports, {**PORTS, "walk": 5})
+        self.assertEqual(parse_options({"host": "10.0.0.1", "camera_transport": "udp"}).camera_transport, "udp")
+        self.assertEqual(parse_options({"host": "dog1", "ports": {"walk": 5}}).ports, {**PORTS, "walk": 5})
         self.assertIn("camera", describe("aibo", {"host": "dog1"}).capabilities)
         self.assertNotIn("camera", describe("aibo", {"host": "dog1", "camera": False}).capabilities)
         self.assertEqual(describe("aibo", {"host": "d", "speed": [1, 2, 3, 4]}).limits["base.vx"], (-2.0, 1.0))
@@ -36,7 +36,7 @@ class RecipeTests(SynchronousTestCase):
 
     def test_sends_every_name(self) -> None:
         """A server is started and stopped under each of its names, after the settings in both spellings."""
-        lines = menu.started(["walk", "camera"], "tcp", 30.0)
+        lines = menu.make_start_commands(["walk", "camera"], "tcp", 30.0)
         self.assertEqual(
             lines,
             [
@@ -57,19 +57,23 @@ class RecipeTests(SynchronousTestCase):
                 "!hello",
             ],
         )
-        self.assertEqual(menu.stopped(["walk"]), ['!select "#Walk Remote Control"', '!select "#WalkController"'])
-        self.assertEqual(menu.greeting(), ["!hello", "!dump_stack", "!refresh"])
+        self.assertEqual(
+            menu.make_stop_commands(["walk"]), ['!select "#Walk Remote Control"', '!select "#WalkController"']
+        )
+        self.assertEqual(menu.make_greeting(), ["!hello", "!dump_stack", "!refresh"])
 
     def test_size(self) -> None:
         """The requested width appears in the description and selects the layer that the dog sends."""
-        self.assertEqual(menu.sized(208)[:2], ["!set vision.rawcam.y_skip=1", "!set vision.rawcam.uv_skip=2"])
+        self.assertEqual(
+            menu.make_size_commands(208)[:2], ["!set vision.rawcam.y_skip=1", "!set vision.rawcam.uv_skip=2"]
+        )
         camera = describe("aibo", {"host": "d", "camera_width": 208}).capabilities["camera"]
         self.assertEqual((camera["width"], camera["height"]), (208, 160))
 
     def test_waits_between_pictures(self) -> None:
         """Fifteen frames a second need a delay of 50 ms, counted from the end of the previous frame."""
         for fps, wait in ((30.0, 0), (0.0, 0), (15.0, 50), (10.0, 83)):
-            self.assertEqual(menu.paced(fps)[0], f"!set vision.rawcam.interval={wait}")
+            self.assertEqual(menu.make_rate_commands(fps)[0], f"!set vision.rawcam.interval={wait}")
 
 
 class _Caller:
@@ -79,7 +83,7 @@ class _Caller:
     def link_down(self) -> None:
         """Do nothing."""
 
-    def received(self, data: bytes) -> None:
+    def data_received(self, data: bytes) -> None:
         """Ignore the data."""
 
 
@@ -89,7 +93,7 @@ class WaitTests(SynchronousTestCase):
     def test_waits_as_the_dogs_own_clients_do(self) -> None:
         """Delays after refusals are 0.5, 1, 2, 5 and 5 s, and 0.5 s again after an answer."""
         reactor: Any = MemoryReactorClock()
-        line = TcpConnector(reactor, WAITS).call("dog1", 10050, _Caller())
+        line = TcpConnector(reactor, RETRY_DELAYS_S).connect("dog1", 10050, _Caller())
         for wait in (0.5, 1.0, 2.0, 5.0, 5.0):
             self.refuse(reactor)
             self.assertEqual([call.getTime() - reactor.seconds() for call in reactor.getDelayedCalls()], [wait])
@@ -98,14 +102,14 @@ class WaitTests(SynchronousTestCase):
         factory.buildProtocol(None).dataReceived(b"off\n")
         self.lose(reactor)
         self.assertEqual([call.getTime() - reactor.seconds() for call in reactor.getDelayedCalls()], [0.5])
-        line.hang_up()
+        line.disconnect()
         self.assertEqual(reactor.getDelayedCalls(), [])
 
     def test_does_not_pester_what_hangs_up_at_once(self) -> None:
         """Delays grow for a peer that closes each connection at once; a connection that lasts resets them."""
-        for waits, wanted in ((WAITS, [0.5, 1.0, 2.0, 5.0, 5.0]), ((), [0.1, 0.16, 0.256, 0.4096, 0.65536])):
+        for waits, wanted in ((RETRY_DELAYS_S, [0.5, 1.0, 2.0, 5.0, 5.0]), ((), [0.1, 0.16, 0.256, 0.4096, 0.65536])):
             reactor: Any = MemoryReactorClock()
-            line: Any = TcpConnector(reactor, waits).call("dog1", 10050, _Caller())
+            line: Any = TcpConnector(reactor, waits).connect("dog1", 10050, _Caller())
             factory = reactor.tcpClients[0][2]
             found = []
             for _ in wanted:
@@ -123,26 +127,26 @@ class WaitTests(SynchronousTestCase):
             self.assertEqual(line.problem, "")
             (call,) = reactor.getDelayedCalls()
             self.assertAlmostEqual(call.getTime() - reactor.seconds(), wanted[0])
-            line.hang_up()
+            line.disconnect()
             factory.buildProtocol(None).dataReceived(b"x")
             self.lose(reactor)
             self.assertEqual(reactor.getDelayedCalls(), [])
 
     def test_says_once_what_keeps_a_link_from_being_opened(self) -> None:
         """An unreachable robot is logged once after several attempts, if ``says`` is set."""
-        ear = Ear()
+        ear = WarningCollector()
         self.addCleanup(ear.close)
         for says in (False, True):
             reactor: Any = MemoryReactorClock()
-            line = TcpConnector(reactor, says=says).call("dog1", 9090, _Caller())
+            line = TcpConnector(reactor, says=says).connect("dog1", 9090, _Caller())
             for _ in range(4):
                 self.refuse(reactor)
-            self.assertEqual(ear.heard, [])
+            self.assertEqual(ear.warnings, [])
             for _ in range(50):
                 self.refuse(reactor)
-            self.assertEqual(len(ear.heard), int(says))
-            line.hang_up()
-        self.assertIn("dog1:9090: nothing listens at this port", ear.heard[0])
+            self.assertEqual(len(ear.warnings), int(says))
+            line.disconnect()
+        self.assertIn("dog1:9090: nothing listens at this port", ear.warnings[0])
 
     def lose(self, reactor: Any) -> None:
         reactor.tcpClients[0][2].clientConnectionLost(_Retried(), Failure(ConnectionDone()))
@@ -159,14 +163,14 @@ class _Dead:
     def __init__(self) -> None:
         self.hung_up: Deferred[None] = Deferred()
 
-    def call(self, host: str, port: int, caller: Port) -> _Dead:
+    def open_connection(self, host: str, port: int, caller: Port) -> _Dead:
         caller.link_up(self)
         return self
 
     def send(self, data: bytes) -> None:
         """Drop the data."""
 
-    def hang_up(self) -> Deferred[None]:
+    def disconnect(self) -> Deferred[None]:
         """Return a Deferred that fires when all data is sent."""
         return self.hung_up
 

@@ -11,8 +11,8 @@ from twisted.trial.unittest import SynchronousTestCase
 
 from drivers.bittle import codec
 from drivers.bittle.codec import LineReader, ResponseReader
-from drivers.bittle.dialogue import MAX_LINES, Dialogue
-from drivers.bittle.gait import GAITS, REST, STAND, Velocity, chosen
+from drivers.bittle.gait import GAITS, REST, STAND, Velocity, select_gait
+from drivers.bittle.request_table import MAX_ANSWER_LINES, RequestTable
 from drivers.errors import BadFrame, LinkLost, NoReply, RobotError, Unsupported
 from drivers.registry import describe
 
@@ -24,17 +24,19 @@ class CommandTests(SynchronousTestCase):
 
     def test_golden_vectors(self) -> None:
         """Each command has the bytes that the firmware reads."""
-        self.assertEqual(codec.skill("wkF"), bytes.fromhex("6b 77 6b 46 0a"))
-        self.assertEqual(codec.binary("I", (8, -20, 9, -20)), bytes.fromhex("49 08 ec 09 ec 7e"))
-        self.assertEqual(codec.ultrasonic(16, 17), bytes.fromhex("58 55 10 11 7e"))
-        self.assertEqual(codec.binary("L", [0] * 8 + [30] * 8), bytes.fromhex("4c" + "00" * 8 + "1e" * 8 + "7e"))
-        self.assertEqual(codec.text("i", 8, -20.4, 9, 130), b"i8 -20 9 130\n")
+        self.assertEqual(codec.encode_skill("wkF"), bytes.fromhex("6b 77 6b 46 0a"))
+        self.assertEqual(codec.encode_binary_command("I", (8, -20, 9, -20)), bytes.fromhex("49 08 ec 09 ec 7e"))
+        self.assertEqual(codec.encode_ultrasonic(16, 17), bytes.fromhex("58 55 10 11 7e"))
+        self.assertEqual(
+            codec.encode_binary_command("L", [0] * 8 + [30] * 8), bytes.fromhex("4c" + "00" * 8 + "1e" * 8 + "7e")
+        )
+        self.assertEqual(codec.encode_text_command("i", 8, -20.4, 9, 130), b"i8 -20 9 130\n")
 
     def test_refuses_what_would_be_another_command(self) -> None:
         """A skill name with a line feed, or an angle equal to a command's end mark, is refused."""
         for name in ("", "wk\nd", "8", "a" * 17):
-            self.assertRaises(ValueError, codec.skill, name)
-        self.assertRaises(ValueError, codec.binary, "I", (0, 126))
+            self.assertRaises(ValueError, codec.encode_skill, name)
+        self.assertRaises(ValueError, codec.encode_binary_command, "I", (0, 126))
 
 
 class LineTests(SynchronousTestCase):
@@ -62,12 +64,18 @@ class LineTests(SynchronousTestCase):
     def test_takes_any_bytes(self, data: bytes) -> None:
         """For any bytes, readers and parsers raise nothing except ``BadFrame``."""
         lines = list(LineReader().read(data + b"\n"))
-        for parse in (codec.joints, codec.attitude, codec.attitude_old, codec.volts, codec.distance):
+        for parse in (
+            codec.parse_joints,
+            codec.parse_attitude,
+            codec.parse_nyboard_attitude,
+            codec.parse_voltage,
+            codec.parse_distance,
+        ):
             try:
                 parse(lines)
             except BadFrame:
                 continue
-        codec.board_of(lines)
+        codec.parse_board(lines)
 
     @given(st.lists(st.integers(-125, 125), min_size=16, max_size=16))
     @settings(max_examples=50, deadline=None)
@@ -75,46 +83,49 @@ class LineTests(SynchronousTestCase):
         """Joint angles survive the formats of both boards, as radians."""
         row = "".join(f"{angle},\t" for angle in angles)
         wanted = {joint: math.radians(angle) for joint, angle in enumerate(angles)}
-        self.assertEqual(codec.joints(["=", INDICES, row]), wanted)
-        self.assertEqual(codec.joints([f"={INDICES}", row]), wanted)
+        self.assertEqual(codec.parse_joints(["=", INDICES, row]), wanted)
+        self.assertEqual(codec.parse_joints([f"={INDICES}", row]), wanted)
 
     def test_refuses_what_are_no_joints(self) -> None:
         """Too few angles, wrong indices and angles out of range are refused."""
         for lines in ([], ["=", "0\t1", "5,\t"], ["=", "1\t0", "5,\t6,"], ["=", "0", "271,"]):
-            self.assertRaises(BadFrame, codec.joints, lines)
+            self.assertRaises(BadFrame, codec.parse_joints, lines)
 
     def test_attitude_of_both_boards(self) -> None:
         """Columns without a space are separated; the order is yaw, pitch, roll, and pitch first on a NyBoard."""
-        told = codec.attitude(["ICM:   0.1  -0.2   9.8-179.9 -10.0  20.0"])
+        told = codec.parse_attitude(["ICM:   0.1  -0.2   9.8-179.9 -10.0  20.0"])
         self.assertAlmostEqual(told["yaw"], math.radians(-179.9))
         self.assertAlmostEqual(told["pitch"], math.radians(-10.0))
         self.assertAlmostEqual(told["roll"], math.radians(20.0))
-        self.assertEqual(codec.attitude(["ICM: 0 0 9 1 2 3\tMCU: 0 0 9 4 5 6"]), codec.attitude(["MCU: 0 0 9 1 2 3"]))
-        old = codec.attitude_old(["-10.00000\t20.00000\t0.1\t0.2\t9.8"])
+        self.assertEqual(
+            codec.parse_attitude(["ICM: 0 0 9 1 2 3\tMCU: 0 0 9 4 5 6"]), codec.parse_attitude(["MCU: 0 0 9 1 2 3"])
+        )
+        old = codec.parse_nyboard_attitude(["-10.00000\t20.00000\t0.1\t0.2\t9.8"])
         self.assertAlmostEqual(old["pitch"], math.radians(-10.0))
         self.assertAlmostEqual(old["roll"], math.radians(20.0))
         for lines in (["ICM: 1 2 3"], ["hello"], ["ICM: 0 0 9 1 2 999"]):
-            self.assertRaises(BadFrame, codec.attitude, lines)
-        self.assertRaises(BadFrame, codec.attitude_old, ["1.0"])
+            self.assertRaises(BadFrame, codec.parse_attitude, lines)
+        self.assertRaises(BadFrame, codec.parse_nyboard_attitude, ["1.0"])
 
     def test_volts_and_distance(self) -> None:
         """Voltages of two cells and distances in centimetres are converted, 0 is NaN; others are refused."""
-        self.assertEqual(codec.volts(["Voltage: 7.95 V"]), 7.95)
-        self.assertRaises(BadFrame, codec.volts, ["Voltage: 79.5 V"])
-        self.assertRaises(BadFrame, codec.volts, ["7.95"])
-        self.assertEqual(codec.distance(["=", "42"]), 0.42)
-        self.assertTrue(math.isnan(codec.distance(["=", "0"])))
+        self.assertEqual(codec.parse_voltage(["Voltage: 7.95 V"]), 7.95)
+        self.assertRaises(BadFrame, codec.parse_voltage, ["Voltage: 79.5 V"])
+        self.assertRaises(BadFrame, codec.parse_voltage, ["7.95"])
+        self.assertEqual(codec.parse_distance(["=", "42"]), 0.42)
+        self.assertTrue(math.isnan(codec.parse_distance(["=", "0"])))
         for lines in (["="], ["=", "1 2"], ["=", "-5"], ["=", "999"]):
-            self.assertRaises(BadFrame, codec.distance, lines)
+            self.assertRaises(BadFrame, codec.parse_distance, lines)
 
     def test_says_who_it_is(self) -> None:
         """The banner, the board's version, an unknown skill and the end token (in either case) are recognised."""
         self.assertTrue(codec.is_banner("* Start *"))
-        self.assertEqual(codec.board_of(["Bittle", "Software version: B10_250712"]), "biboard")
-        self.assertEqual(codec.board_of(["Bittle", "Software version: N_250224"]), "nyboard")
-        self.assertEqual(codec.board_of(["Bittle"]), "")
+        self.assertEqual(codec.parse_board(["Bittle", "Software version: B10_250712"]), "biboard")
+        self.assertEqual(codec.parse_board(["Bittle", "Software version: N_250224"]), "nyboard")
+        self.assertEqual(codec.parse_board(["Bittle"]), "")
         self.assertEqual(
-            (codec.unknown_of("?fly?"), codec.unknown_of("?"), codec.unknown_of("fly")), ("fly", None, None)
+            (codec.parse_unknown_skill("?fly?"), codec.parse_unknown_skill("?"), codec.parse_unknown_skill("fly")),
+            ("fly", None, None),
         )
         self.assertTrue(codec.is_end("G", "g") and not codec.is_end("gp", "g"))
 
@@ -124,19 +135,19 @@ class HttpTests(SynchronousTestCase):
 
     def test_paths(self) -> None:
         """Commands become URL paths of either board, with escaped bytes and without the line feed."""
-        self.assertEqual(codec.command_path("biboard", b"kwkF\n"), "/cmd?cmd=kwkF")
-        self.assertEqual(codec.command_path("nyboard", b"I\x08\xec~"), "/action?name=I%08%EC~")
-        self.assertEqual(codec.status_path("12"), "/status?taskId=12")
-        self.assertTrue(codec.request("10.0.0.1", "/cmd").startswith(b"GET /cmd HTTP/1.1\r\nHost: 10.0.0.1\r\n"))
+        self.assertEqual(codec.format_command_path("biboard", b"kwkF\n"), "/cmd?cmd=kwkF")
+        self.assertEqual(codec.format_command_path("nyboard", b"I\x08\xec~"), "/action?name=I%08%EC~")
+        self.assertEqual(codec.format_status_path("12"), "/status?taskId=12")
+        self.assertTrue(codec.encode_request("10.0.0.1", "/cmd").startswith(b"GET /cmd HTTP/1.1\r\nHost: 10.0.0.1\r\n"))
 
     def test_tasks(self) -> None:
         """A task has a number; it is running, completed with a text, or failed with the robot's message."""
-        self.assertEqual(codec.task_of(b"TASK_ID:17"), "17")
-        self.assertRaises(BadFrame, codec.task_of, b"busy")
-        self.assertIsNone(codec.result_of(b"pending"))
-        self.assertIsNone(codec.result_of(b"running\nabc"))
-        self.assertEqual(codec.result_of(b"completed\nwkF\r\nk"), b"wkF\r\nk")
-        self.assertIn("time", str(self.assertRaises(BadFrame, codec.result_of, b"error\nERROR: time out")))
+        self.assertEqual(codec.parse_task_id(b"TASK_ID:17"), "17")
+        self.assertRaises(BadFrame, codec.parse_task_id, b"busy")
+        self.assertIsNone(codec.parse_task_result(b"pending"))
+        self.assertIsNone(codec.parse_task_result(b"running\nabc"))
+        self.assertEqual(codec.parse_task_result(b"completed\nwkF\r\nk"), b"wkF\r\nk")
+        self.assertIn("time", str(self.assertRaises(BadFrame, codec.parse_task_result, b"error\nERROR: time out")))
 
     def test_reads_a_response_one_byte_at_a_time(self) -> None:
         """A body ends at its length or at the end of the connection; an incomplete one is refused."""
@@ -146,11 +157,11 @@ class HttpTests(SynchronousTestCase):
         self.assertEqual((set(got[:-1]), got[-1]), ({None}, b"abc"))
         open_end = ResponseReader()
         self.assertIsNone(open_end.read(b"HTTP/1.0 200 OK\r\n\r\nabc"))
-        self.assertEqual(open_end.ended(), b"abc")
+        self.assertEqual(open_end.finish(), b"abc")
         for half in (b"", b"HTTP/1.1 200", said[:-1]):
             reader = ResponseReader()
             reader.read(half)
-            self.assertRaises(BadFrame, reader.ended)
+            self.assertRaises(BadFrame, reader.finish)
 
     @given(st.binary(max_size=200))
     @settings(max_examples=100, deadline=None)
@@ -161,7 +172,7 @@ class HttpTests(SynchronousTestCase):
         reader = ResponseReader()
         try:
             reader.read(data)
-            reader.ended()
+            reader.finish()
         except BadFrame:
             return
 
@@ -182,14 +193,14 @@ class GaitTests(SynchronousTestCase):
             ((0.06, 0.4), "wkL"),
             ((0.06, -0.4), "wkR"),
         ):
-            self.assertEqual(chosen(*wish, GAITS)[0], name)
-        self.assertEqual(chosen(0.0, 0.0, GAITS)[1], REST)
+            self.assertEqual(select_gait(*wish, GAITS)[0], name)
+        self.assertEqual(select_gait(0.0, 0.0, GAITS)[1], REST)
 
     def test_never_goes_where_it_shall_not(self) -> None:
         """A gait never moves against the wish; if none fits, the dog stands; gaits without motion are ignored."""
-        self.assertEqual(chosen(-1.0, 1.0, {"wkF": Velocity(0.1, 0.0), "hlw": REST}), (STAND, REST))
+        self.assertEqual(select_gait(-1.0, 1.0, {"wkF": Velocity(0.1, 0.0), "hlw": REST}), (STAND, REST))
         for wish in ((0.1, 0.0), (-0.1, 0.0), (0.0, 0.15), (0.0, -1.0), (0.03, -0.4), (-0.05, 0.4)):
-            _, real = chosen(*wish, GAITS)
+            _, real = select_gait(*wish, GAITS)
             self.assertNotEqual(real, REST)
             for wished, done in zip(wish, real, strict=True):
                 self.assertGreaterEqual(wished * done, 0.0)
@@ -202,16 +213,16 @@ class DialogueTests(SynchronousTestCase):
     def setUp(self) -> None:
         self.clock = Clock()
         self.sent: list[bytes] = []
-        self.dialogue = Dialogue(self.clock, self.sent.append)
+        self.dialogue = RequestTable(self.clock, self.sent.append)
 
     def hear(self, *lines: str) -> None:
         for line in lines:
-            self.dialogue.heard(line)
+            self.dialogue.process_line(line)
 
     def test_answers_come_in_order(self) -> None:
         """A stop is sent at once after an open request, and both get their answers."""
-        asked = self.dialogue.ask(b"j\n", 1.0)
-        stop = self.dialogue.ask(b"kup\n", 1.0)
+        asked = self.dialogue.request(b"j\n", 1.0)
+        stop = self.dialogue.request(b"kup\n", 1.0)
         self.assertEqual(self.sent, [b"j\n", b"kup\n"])
         self.hear("=", "0", "5,", "j", "up", "k")
         self.assertEqual(self.successResultOf(asked), ["=", "0", "5,"])
@@ -220,7 +231,7 @@ class DialogueTests(SynchronousTestCase):
 
     def test_a_command_too_long_has_failed(self) -> None:
         """A command that exceeds the robot's buffer fails, although its token follows; the next request succeeds."""
-        long, next_one = self.dialogue.ask(b"i8 10 9 10\n", 1.0), self.dialogue.ask(b"j\n", 1.0)
+        long, next_one = self.dialogue.request(b"i8 10 9 10\n", 1.0), self.dialogue.request(b"j\n", 1.0)
         self.hear("OVF", "i", "=", "0", "5,", "j")
         self.failureResultOf(long, RobotError)
         self.assertEqual(self.successResultOf(next_one)[-3:], ["=", "0", "5,"])
@@ -228,18 +239,18 @@ class DialogueTests(SynchronousTestCase):
 
     def test_a_lost_answer_shifts_no_other(self) -> None:
         """If an answer is lost, the next answer still goes to its request, also between skills."""
-        lost, got = self.dialogue.ask(b"gp\n", 1.0), self.dialogue.ask(b"j\n", 1.0)
+        lost, got = self.dialogue.request(b"gp\n", 1.0), self.dialogue.request(b"j\n", 1.0)
         self.hear("j")
         self.failureResultOf(lost, NoReply)
         self.successResultOf(got)
-        lost, got = self.dialogue.ask(b"kwkF\n", 1.0), self.dialogue.ask(b"kup\n", 1.0)
+        lost, got = self.dialogue.request(b"kwkF\n", 1.0), self.dialogue.request(b"kup\n", 1.0)
         self.hear("up", "k")
         self.failureResultOf(lost, NoReply)
         self.successResultOf(got)
 
     def test_a_rest_says_that_the_gyroscope_is_off(self) -> None:
         """The ``g`` before the ``d`` of a rest is not the answer to an attitude request."""
-        rest, attitude = self.dialogue.ask(b"d\n", 1.0), self.dialogue.ask(b"gp\n", 1.0)
+        rest, attitude = self.dialogue.request(b"d\n", 1.0), self.dialogue.request(b"gp\n", 1.0)
         self.hear("g", "d")
         self.successResultOf(rest)
         self.assertNoResult(attitude)
@@ -248,9 +259,9 @@ class DialogueTests(SynchronousTestCase):
 
     def test_may_be_ended_while_it_fails_a_question(self) -> None:
         """An errback may end the dialogue, and no request fails twice."""
-        first, second = self.dialogue.ask(b"gp\n", 1.0), self.dialogue.ask(b"P~", 1.0)
-        third = self.dialogue.ask(b"j\n", 1.0)
-        first.addErrback(lambda _: self.dialogue.end(LinkLost("gone")))
+        first, second = self.dialogue.request(b"gp\n", 1.0), self.dialogue.request(b"P~", 1.0)
+        third = self.dialogue.request(b"j\n", 1.0)
+        first.addErrback(lambda _: self.dialogue.fail_all(LinkLost("gone")))
         self.hear("j")
         self.failureResultOf(second, LinkLost)
         self.failureResultOf(third, LinkLost)
@@ -260,15 +271,15 @@ class DialogueTests(SynchronousTestCase):
     def test_late_unknown_and_ended(self) -> None:
         """A timeout, an unknown skill and the end each fail the request; lines without a request are ignored."""
         self.hear("k")
-        late = self.dialogue.ask(b"j\n", 1.0)
+        late = self.dialogue.request(b"j\n", 1.0)
         self.clock.advance(1.0)
         self.failureResultOf(late, NoReply)
-        unknown = self.dialogue.ask(b"kfly\n", 1.0)
+        unknown = self.dialogue.request(b"kfly\n", 1.0)
         self.hear("?swim?", "?fly?", "k")
         self.failureResultOf(unknown, Unsupported)
-        ended = self.dialogue.ask(b"j\n", 1.0)
-        self.hear(*["chatter"] * (MAX_LINES + 5))
-        self.dialogue.end(LinkLost("gone"))
+        ended = self.dialogue.request(b"j\n", 1.0)
+        self.hear(*["chatter"] * (MAX_ANSWER_LINES + 5))
+        self.dialogue.fail_all(LinkLost("gone"))
         self.failureResultOf(ended, LinkLost)
         self.assertEqual(self.clock.getDelayedCalls(), [])
 

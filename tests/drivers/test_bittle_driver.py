@@ -11,7 +11,7 @@ from drivers.bittle.driver import BittleDriver
 from drivers.conformance import Conformance
 from drivers.errors import LinkLost, NotEnabled, Unsupported
 from drivers.link import MemoryConnector
-from sim.robots.emulator.bittle import BEHAVIOUR_S, NEVER, Bittle
+from sim.robots.emulator.bittle import BEHAVIOUR_S, UNSUPPORTED_TOKENS, Bittle
 from tests.drivers.contract import KeptLink, RobotCase
 
 GAITS = {"wkF": [0.1, 0.0], "trF": [0.15, 0.0], "bk": [-0.05, 0.0], "vtL": [0.0, 0.5], "vtR": [0.0, -0.5]}
@@ -36,7 +36,7 @@ class BittleCase(RobotCase):
     def tearDown(self) -> None:
         """Check that no command was sent that changes the robot permanently."""
         super().tearDown()
-        self.assertEqual([one for one in self.robot.heard if chr(one[0]) in NEVER], [])
+        self.assertEqual([one for one in self.robot.received_commands if chr(one[0]) in UNSUPPORTED_TOKENS], [])
 
 
 class BittleDriverTests(Conformance, BittleCase):
@@ -59,7 +59,7 @@ class BittleDriverTests(Conformance, BittleCase):
         for _ in range(10):
             driver.act({"base.vx": 0.1}, self.permit())
             self.pass_time(0.1)
-        self.assertEqual(self.robot.heard.count(b"kwkF"), 1)
+        self.assertEqual(self.robot.received_commands.count(b"kwkF"), 1)
 
     def test_tells_what_it_feels(self) -> None:
         """Attitude, joints, distance and battery arrive in SI units."""
@@ -129,7 +129,7 @@ class BittleDriverTests(Conformance, BittleCase):
         self.faults.half_open = True
         driver.stop()
         self.pass_time(1.3)
-        self.assertGreaterEqual(self.robot.heard.count(b"kup"), 3)
+        self.assertGreaterEqual(self.robot.received_commands.count(b"kup"), 3)
 
     def test_takes_up_a_rebooted_dog(self) -> None:
         """After a reboot during a walk the driver reads the banner, and the dog stands up, ready and at rest."""
@@ -197,7 +197,7 @@ class BittleDriverTests(Conformance, BittleCase):
         driver = self.ready(gaits={"moonF": [0.1, 0.0]})
         driver.act({"base.vx": 0.1}, self.permit(seconds=3.0))
         self.pass_time(2.0)
-        self.assertEqual(self.robot.heard.count(b"kmoonF"), 1)
+        self.assertEqual(self.robot.received_commands.count(b"kmoonF"), 1)
         self.assertEqual(driver.diagnostics()["refused"], 1)
 
 
@@ -228,7 +228,7 @@ class NyBoardTests(BittleCase):
         self.assertEqual(self.value(driver, "mode"), "nyboard")
         self.near(self.value(driver, "imu.pitch"), -0.3, 0.01)
         self.assertIsNotNone(self.value(driver, "joint.head_pan.pos"))
-        self.assertNotIn(b"P", self.robot.heard)
+        self.assertNotIn(b"P", self.robot.received_commands)
 
 
 class WifiTests(BittleCase):
@@ -264,7 +264,7 @@ class WifiTests(BittleCase):
         """``disconnect`` fires after the last command has reached the dog, or after a timeout if it has failed."""
         for is_dead in (False, True):
             driver = self.walking()
-            self.robot.heard.clear()
+            self.robot.received_commands.clear()
             self.faults.half_open = is_dead
             self.connector.is_open = not is_dead
             left = driver.disconnect()
@@ -272,7 +272,7 @@ class WifiTests(BittleCase):
             while not left.called and self.now() < began + 4.0:
                 self.pass_time(self.STEP_S)
             self.successResultOf(left)
-            self.assertEqual(self.robot.heard[-1:], [] if is_dead else [b"d"])
+            self.assertEqual(self.robot.received_commands[-1:], [] if is_dead else [b"d"])
             self.faults.half_open, self.connector.is_open = False, True
             self.pass_time(3.0)
 
@@ -306,16 +306,16 @@ class WifiTests(BittleCase):
         """An invalid request gets status 400 or a closed connection; the number of stored tasks is limited."""
         for data in (b"\r\n\r\n", b"RUBBISH\r\n\r\n", b"GET http://[ HTTP/1.1\r\n\r\n"):
             link = KeptLink()
-            self.robot.accept_http(link).received(data)
+            self.robot.accept_http(link).data_received(data)
             self.assertTrue(link.said.startswith(b"HTTP/1.1 400 "), data)
         link = KeptLink()
         page = self.robot.accept_http(link)
         for _ in range(100):
-            page.received(bytes(1000))
+            page.data_received(bytes(1000))
         self.assertTrue(link.is_closed)
         path = "/cmd?cmd=j" if self.board == "biboard" else "/action?name=j"
         for _ in range(200):
-            self.robot.accept_http(KeptLink()).received(f"GET {path} HTTP/1.1\r\n\r\n".encode())
+            self.robot.accept_http(KeptLink()).data_received(f"GET {path} HTTP/1.1\r\n\r\n".encode())
             self.pass_time(0.1)
         self.assertLessEqual(len(self.robot.tasks) + len(self.robot.said), 50)
 

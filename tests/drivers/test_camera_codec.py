@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from twisted.trial.unittest import SynchronousTestCase
 
 from drivers.camera import codec
-from drivers.camera.codec import StreamReader, answer, chunk, part
+from drivers.camera.codec import StreamReader, encode_answer_header, encode_chunk, encode_part
 from drivers.errors import BadFrame
 
 FIRST, SECOND = b"\xff\xd8one\r\n--fram\xff\xd9", b"\xff\xd8two--\n\xff\xd9"
@@ -19,7 +19,7 @@ ESP32 = (
     b"HTTP/1.1 200 OK\r\nContent-Type: multipart/x-mixed-replace;boundary=123456789000000000000987654321\r\n"
     b"Transfer-Encoding: chunked\r\nAccess-Control-Allow-Origin: *\r\n\r\n"
     + b"".join(
-        chunk(piece)
+        encode_chunk(piece)
         for picture in (FIRST, SECOND)
         for piece in (
             b"\r\n--123456789000000000000987654321\r\n",
@@ -69,8 +69,10 @@ class StreamReaderTests(SynchronousTestCase):
         """Streams written by the emulator are read, with and without lengths and chunks."""
         for is_chunked in (False, True):
             for has_length in (False, True):
-                said = [part(picture, has_length) for picture in (FIRST, SECOND, FIRST)]
-                data = answer(is_chunked=is_chunked) + b"".join(map(chunk, said) if is_chunked else said)
+                said = [encode_part(picture, has_length) for picture in (FIRST, SECOND, FIRST)]
+                data = encode_answer_header(is_chunked=is_chunked) + b"".join(
+                    map(encode_chunk, said) if is_chunked else said
+                )
                 # Without a length a picture ends at the start of the next one.
                 self.assertEqual(read(data, 5)[0], [FIRST, SECOND, FIRST][: 3 if has_length else 2])
 
@@ -78,10 +80,13 @@ class StreamReaderTests(SynchronousTestCase):
         """A wrong length and a false boundary damage at most two pictures, and the following ones are read."""
         short = b"--frame\r\nContent-Length: 3\r\n\r\n" + FIRST
         strange = b"--frames of a film\r\n--frame" + bytes(90) + b"\r\nContent-Length: x\r\n"
-        found, _ = read(answer() + short + b"\r\n" + strange + part(SECOND) + part(FIRST), 1)
+        found, _ = read(
+            encode_answer_header() + short + b"\r\n" + strange + encode_part(SECOND) + encode_part(FIRST), 1
+        )
         self.assertEqual(found, [FIRST[:3], SECOND, FIRST])
         self.assertEqual(
-            read(answer() + b"--frame\r\nContent-Length: none\r\n\r\n" + FIRST + b"\r\n--frame")[0], [FIRST]
+            read(encode_answer_header() + b"--frame\r\nContent-Length: none\r\n\r\n" + FIRST + b"\r\n--frame")[0],
+            [FIRST],
         )
 
     def test_names_what_is_no_stream(self) -> None:
@@ -103,18 +108,24 @@ class StreamReaderTests(SynchronousTestCase):
             (ok + b"Content-Type: multipart/x-mixed-replace\r\n\r\n", "boundary"),
             (ok + b'Content-Type: multipart/x-mixed-replace; boundary="--"\r\n\r\n', "boundary"),
             (ok + b"Content-Type: multipart/x-mixed-replace; boundary=" + b"b" * 71 + b"\r\n\r\n", "boundary"),
-            (b"x" * (codec.MOST_HEAD + 1), "fields"),
-            (ok + b"A: " + b"x" * codec.MOST_HEAD + b"\r\n\r\n", "fields"),
-            (answer() + b"--frame\r\n" + b"A: b\r\n" * 2000, "fields"),
-            (answer() + b"--frame\r\n" + b"A" * 9000, "fields"),
-            (answer(is_chunked=True) + b"five\r\n", "chunk"),
-            (answer(is_chunked=True) + b"\n\n", "chunk"),
-            (answer(is_chunked=True) + b"x" * 101, "chunk"),
-            (answer() + b"--frame\r\nContent-Length: 1048577\r\n\r\n", "more than 1048576 bytes"),
-            (answer() + b"--frame\r\nContent-Length: %s\r\n\r\n" % (b"9" * 5000), "more than 1048576 bytes"),
-            (answer() + b"--frame\r\n\r\n" + bytes(codec.MOST_BYTES + 100), "more than 1048576 bytes"),
+            (b"x" * (codec.MAX_HEADER_BYTES + 1), "fields"),
+            (ok + b"A: " + b"x" * codec.MAX_HEADER_BYTES + b"\r\n\r\n", "fields"),
+            (encode_answer_header() + b"--frame\r\n" + b"A: b\r\n" * 2000, "fields"),
+            (encode_answer_header() + b"--frame\r\n" + b"A" * 9000, "fields"),
+            (encode_answer_header(is_chunked=True) + b"five\r\n", "chunk"),
+            (encode_answer_header(is_chunked=True) + b"\n\n", "chunk"),
+            (encode_answer_header(is_chunked=True) + b"x" * 101, "chunk"),
+            (encode_answer_header() + b"--frame\r\nContent-Length: 1048577\r\n\r\n", "more than 1048576 bytes"),
             (
-                answer() + b"--frame\r\n\r\n" + bytes(codec.MOST_BYTES + 1) + b"\r\n--frame\r\n",
+                encode_answer_header() + b"--frame\r\nContent-Length: %s\r\n\r\n" % (b"9" * 5000),
+                "more than 1048576 bytes",
+            ),
+            (
+                encode_answer_header() + b"--frame\r\n\r\n" + bytes(codec.MAX_PICTURE_BYTES + 100),
+                "more than 1048576 bytes",
+            ),
+            (
+                encode_answer_header() + b"--frame\r\n\r\n" + bytes(codec.MAX_PICTURE_BYTES + 1) + b"\r\n--frame\r\n",
                 "more than 1048576 bytes",
             ),
         ):
@@ -125,25 +136,25 @@ class StreamReaderTests(SynchronousTestCase):
 
     def test_takes_the_largest(self) -> None:
         """A picture of exactly 1 MiB is accepted, with and without its length."""
-        large = bytes(codec.MOST_BYTES)
+        large = bytes(codec.MAX_PICTURE_BYTES)
         for has_length in (True, False):
-            data = answer() + part(large, has_length) + b"--frame"
+            data = encode_answer_header() + encode_part(large, has_length) + b"--frame"
             self.assertEqual(read(data, 40_000)[0], [large])
 
     def test_keeps_no_more_than_it_needs(self) -> None:
         """Data between pictures is dropped on arrival."""
         reader = StreamReader()
-        reader.read(answer())
+        reader.read(encode_answer_header())
         for _ in range(100):
             self.assertEqual(reader.read(bytes(10_000)), [])
         self.assertLess(len(reader._rest), 20)
-        self.assertEqual(reader.read(part(FIRST)), [FIRST])
+        self.assertEqual(reader.read(encode_part(FIRST)), [FIRST])
 
     @settings(max_examples=300)
     @given(st.lists(st.binary(max_size=60), max_size=6), st.booleans(), st.integers(1, 80))
     def test_any_bytes_as_a_stream(self, pieces: list[bytes], is_chunked: bool, size: int) -> None:
         """Random bytes after a head give pictures, nothing or BadFrame, and no other error."""
-        data = answer(is_chunked=is_chunked) + b"\r\n--frame\r\n".join(pieces)
+        data = encode_answer_header(is_chunked=is_chunked) + b"\r\n--frame\r\n".join(pieces)
         try:
             found, _ = read(data, size)
         except BadFrame:
@@ -170,9 +181,9 @@ class StreamReaderTests(SynchronousTestCase):
 class RequestTests(SynchronousTestCase):
     def test_asks(self) -> None:
         """The request contains host and path, and the credentials only if there are any."""
-        plain = codec.request("cam:81", "/stream?a=1")
+        plain = codec.encode_request("cam:81", "/stream?a=1")
         self.assertTrue(plain.startswith(b"GET /stream?a=1 HTTP/1.1\r\nHost: cam:81\r\n"))
         self.assertTrue(plain.endswith(b"\r\n\r\n"))
         self.assertNotIn(b"Authorization", plain)
         login = base64.b64encode(b"anna:s p")
-        self.assertIn(b"\r\nAuthorization: Basic " + login + b"\r\n", codec.request("cam", "/", "anna:s p"))
+        self.assertIn(b"\r\nAuthorization: Basic " + login + b"\r\n", codec.encode_request("cam", "/", "anna:s p"))

@@ -9,10 +9,10 @@ from typing import Any
 from twisted.internet.task import Clock
 from twisted.trial.unittest import SynchronousTestCase
 
-from drivers.camera.driver import film_of
+from drivers.camera.driver import make_picture_stream
 from drivers.camera.option import Options
-from drivers.camera.shots import CaptureShots, FolderShots, Shot, Shots
-from drivers.camera.thread import ClockFilm, Reel, ThreadFilm
+from drivers.camera.picture_stream import SourceReader, ThreadedStream, TimedStream
+from drivers.camera.source import CaptureSource, FolderSource, JpegPicture, PictureSource
 from drivers.conformance import Conformance
 from drivers.errors import BadFrame, LinkLost, NotEnabled, Unsupported
 from tests.drivers.contract import RobotCase
@@ -119,8 +119,8 @@ class CameraDriverTests(Conformance, RobotCase):
                 call()
 
         for source in (0, "/dev/video1"):
-            self.assertIsInstance(film_of(Options(source), Reactor()), ThreadFilm)
-        self.assertIsInstance(film_of(Options("a.avi"), self.clock), ClockFilm)
+            self.assertIsInstance(make_picture_stream(Options(source), Reactor()), ThreadedStream)
+        self.assertIsInstance(make_picture_stream(Options("a.avi"), self.clock), TimedStream)
 
 
 class Picture:
@@ -170,16 +170,16 @@ class Lens:
 
 
 class ShotsTests(SynchronousTestCase):
-    def capture(self, lens: Lens, **options: Any) -> CaptureShots:
+    def capture(self, lens: Lens, **options: Any) -> CaptureSource:
         with tempfile.NamedTemporaryFile(suffix=".avi", delete=False) as file:
             self.addCleanup(Path(file.name).unlink)
-        return CaptureShots(Options(file.name, **options), lambda: lens)
+        return CaptureSource(Options(file.name, **options), lambda: lens)
 
     def test_reduces_large_pictures(self) -> None:
         """A picture larger than requested is scaled with its aspect ratio; a smaller one is kept."""
         shots = self.capture(Lens(Picture(1280, 720), Picture(100, 50)), width=320, height=240)
         shots.open()
-        first, second = shots.shoot(), shots.shoot()
+        first, second = shots.read_picture(), shots.read_picture()
         self.assertEqual((first.width, first.height), (320, 180))
         self.assertEqual((second.width, second.height), (100, 50))
 
@@ -188,13 +188,13 @@ class ShotsTests(SynchronousTestCase):
         lens = Lens(Picture(10, 10), None, Picture(20, 20))
         shots = self.capture(lens)
         shots.open()
-        self.assertEqual([shots.shoot().width, shots.shoot().width], [10, 20])
+        self.assertEqual([shots.read_picture().width, shots.read_picture().width], [10, 20])
         self.assertEqual(lens.set_to[Lens.CAP_PROP_POS_FRAMES], 0)
-        self.assertRaises(LinkLost, shots.shoot)
+        self.assertRaises(LinkLost, shots.read_picture)
         shots.close()
         shots.close()
         self.assertEqual(lens.released, 1)
-        self.assertRaises(LinkLost, shots.shoot)
+        self.assertRaises(LinkLost, shots.read_picture)
 
     def test_names_why_there_are_no_pictures(self) -> None:
         """A missing OpenCV, camera or file, a busy camera and an invalid picture each raise an error with its cause."""
@@ -202,40 +202,40 @@ class ShotsTests(SynchronousTestCase):
         def missing() -> Any:
             raise ImportError("cv2")
 
-        self.assertIn('"vision"', str(self.assertRaises(LinkLost, CaptureShots(Options(0), missing).open)))
-        none = CaptureShots(Options("/dev/video62"), lambda: Lens())
+        self.assertIn('"vision"', str(self.assertRaises(LinkLost, CaptureSource(Options(0), missing).open)))
+        none = CaptureSource(Options("/dev/video62"), lambda: Lens())
         self.assertIn("plugged", str(self.assertRaises(LinkLost, none.open)))
-        self.assertIn("no such", str(self.assertRaises(LinkLost, CaptureShots(Options("x"), lambda: Lens()).open)))
+        self.assertIn("no such", str(self.assertRaises(LinkLost, CaptureSource(Options("x"), lambda: Lens()).open)))
         busy = self.capture(Lens(is_open=False))
         self.assertIn("else may be using", str(self.assertRaises(LinkLost, busy.open)))
         lens = Lens(Picture(10, 10))
         lens.can_encode = False
         shots = self.capture(lens)
         shots.open()
-        self.assertRaises(BadFrame, shots.shoot)
-        self.assertRaises(LinkLost, FolderShots("/nowhere").open)
-        self.assertRaises(LinkLost, FolderShots("/nowhere").shoot)
+        self.assertRaises(BadFrame, shots.read_picture)
+        self.assertRaises(LinkLost, FolderSource("/nowhere").open)
+        self.assertRaises(LinkLost, FolderSource("/nowhere").read_picture)
 
     def test_reel_outlives_what_opencv_throws(self) -> None:
         """An exception of OpenCV closes the camera and is reported by name; the next round opens it again."""
 
-        class Moody(Shots):
+        class Moody(PictureSource):
             rounds = 0
 
             def open(self) -> None:
                 self.rounds += 1
 
-            def shoot(self) -> Shot:
+            def read_picture(self) -> JpegPicture:
                 if self.rounds == 1:
                     raise RuntimeError("cv2.error: (-215)")
-                return Shot(b"", 1, 1)
+                return JpegPicture(b"", 1, 1)
 
             def close(self) -> None:
                 pass
 
         told: list[tuple[str, Any]] = []
-        reel = Reel(Moody(), lambda what, said: told.append((what, said)))
-        self.assertGreater(reel.turn(), 0.0)
-        self.assertEqual(reel.turn(), 0.0)
+        reel = SourceReader(Moody(), lambda what, said: told.append((what, said)))
+        self.assertGreater(reel.read_picture(), 0.0)
+        self.assertEqual(reel.read_picture(), 0.0)
         self.assertEqual(told[0], ("gone", "RuntimeError: cv2.error: (-215)"))
-        self.assertEqual(told[1], ("shown", Shot(b"", 1, 1)))
+        self.assertEqual(told[1], ("shown", JpegPicture(b"", 1, 1)))

@@ -1,4 +1,4 @@
-"""Tests of ``drivers.camera.stream`` against ``sim.robots.emulator.camera``, connected in memory."""
+"""Tests of ``drivers.camera.mjpeg`` against ``sim.robots.emulator.camera``, connected in memory."""
 
 from __future__ import annotations
 
@@ -7,9 +7,9 @@ import sys
 from pathlib import Path
 
 import drivers
-from drivers.camera.codec import part
-from drivers.camera.option import place_of
-from drivers.camera.stream import SILENCE_S
+from drivers.camera.codec import encode_part
+from drivers.camera.mjpeg import PICTURE_TIMEOUT_S
+from drivers.camera.option import parse_url
 from drivers.conformance import Conformance
 from drivers.driver import Filming
 from drivers.errors import LinkLost, UsageError
@@ -80,7 +80,7 @@ class StreamTests(Conformance, RobotCase):
         driver.connect()
         self.camera.stop()
         self.pass_time(0.1)
-        film = driver._film
+        film = driver._stream
         for moment in (0.0, 0.09, 0.21, 0.29, 0.41, 0.49):
             self.clock.advance(10.0 + moment - self.now() if moment else 10.0 - self.now())
             film._timer.set(100.0, lambda: None)
@@ -131,7 +131,7 @@ class StreamTests(Conformance, RobotCase):
         self.faults.half_open = True
         self.pass_time(1.0)
         self.assertEqual(driver.state, "stale")
-        self.pass_time(SILENCE_S)
+        self.pass_time(PICTURE_TIMEOUT_S)
         self.assertIn("no pictures come", driver.problem)
         self.faults.half_open = False
         self.pass_time(2.0)
@@ -177,7 +177,7 @@ class StreamTests(Conformance, RobotCase):
     def test_says_that_the_pictures_have_another_size(self) -> None:
         """Frames of another size than configured are shown, and the correct settings are logged once."""
         driver = self.make_driver(width=320, height=240)
-        driver._film.log = log = KeptLog()
+        driver._stream.log = log = KeptLog()
         driver.connect()
         self.pass_time(1.0)
         self.assertEqual(log.lines, ["10.0.0.7:81: its pictures are 128 x 96: write width = 128, height = 96"])
@@ -186,21 +186,21 @@ class StreamTests(Conformance, RobotCase):
     def test_hears_no_more_of_a_call_that_is_over(self) -> None:
         """Data and the end of a previous connection have no effect on the new one."""
         driver = self.ready()
-        film = driver._film
+        film = driver._stream
         old = film._attempt
         driver.set_camera_fps(0)
         driver.set_camera_fps(30)
         count = driver.diagnostics()["pictures"]
-        old.received(part(jpeg(2)))
+        old.data_received(encode_part(jpeg(2)))
         old.link_down()
         self.assertEqual((driver.diagnostics()["pictures"], driver.problem, driver.state), (count, "", "ready"))
 
     def test_is_told_where_it_is(self) -> None:
         """A URL contains host, port, path and credentials; an invalid URL is refused without showing it."""
-        place = place_of("http://anna:s%20p@cam.lan/a/b?c=1")
+        place = parse_url("http://anna:s%20p@cam.lan/a/b?c=1")
         self.assertEqual((place.host, place.port, place.path, place.login), ("cam.lan", 80, "/a/b?c=1", "anna:s p"))
-        self.assertEqual((place.name, place_of("http://[::1]:81").name), ("cam.lan:80", "[::1]:81"))
-        self.assertEqual(place_of("http://[::1]:81").path, "/")
+        self.assertEqual((place.name, parse_url("http://[::1]:81").name), ("cam.lan:80", "[::1]:81"))
+        self.assertEqual(parse_url("http://[::1]:81").path, "/")
         body = describe("camera", {"url": URL, "width": 104, "height": 80, "lens": 50})
         self.assertEqual(body.model, "a camera on the network")
         lens = {"fov_h_deg": 50, "ahead": 0.1}

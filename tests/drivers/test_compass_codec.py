@@ -6,7 +6,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from twisted.trial.unittest import SynchronousTestCase
 
-from drivers.compass.codec import Heading, SentenceReader, eastward, heading_in, sentence
+from drivers.compass.codec import Heading, SentenceReader, encode_sentence, format_angle, parse_heading
 from drivers.errors import BadFrame
 
 
@@ -25,16 +25,16 @@ class HeadingTests(SynchronousTestCase):
             (b"$IIHDT,360.0,T", 0.0, True),
             (b" $HEHDT,0.,T \t", 0.0, True),
         ):
-            heading = heading_in(line)
+            heading = parse_heading(line)
             assert heading is not None
             self.assertAlmostEqual(heading.degrees, degrees, 6)
             self.assertIs(heading.is_true, is_true, line)
-        self.assertEqual(heading_in(b"$HEHDT,1,T"), Heading(1.0, True, 3))
+        self.assertEqual(parse_heading(b"$HEHDT,1,T"), Heading(1.0, True, 3))
 
     def test_passes_over_other_sentences(self) -> None:
         """A valid sentence of another type gives None."""
         for line in (b"$GPVTG,45.0,T,40.0,M,5.5,N,10.2,K", b"!AIVDM,1,1,,A,x,0", b"$PHDG,1.0", b"$HCHDGX,1", b"$"):
-            self.assertIsNone(heading_in(line))
+            self.assertIsNone(parse_heading(line))
 
     def test_refuses_what_tells_nothing(self) -> None:
         """Noise, wrong checksums, empty fields and angles out of range are refused."""
@@ -51,21 +51,23 @@ class HeadingTests(SynchronousTestCase):
                 b"$HCHDG,1,,,x,W",
             ),
         ):
-            self.assertRaises(BadFrame, heading_in, line)
+            self.assertRaises(BadFrame, parse_heading, line)
 
     def test_writes_what_it_reads(self) -> None:
         """The encoder produces the same sentences as real compasses."""
-        self.assertEqual(sentence("HCHDG", "98.3", "0.0", "E", *eastward(-12.6)), b"$HCHDG,98.3,0.0,E,12.6,W*57\r\n")
-        self.assertEqual(sentence("GPHDT", "274.07", "T"), b"$GPHDT,274.07,T*03\r\n")
+        self.assertEqual(
+            encode_sentence("HCHDG", "98.3", "0.0", "E", *format_angle(-12.6)), b"$HCHDG,98.3,0.0,E,12.6,W*57\r\n"
+        )
+        self.assertEqual(encode_sentence("GPHDT", "274.07", "T"), b"$GPHDT,274.07,T*03\r\n")
 
 
 class SentenceReaderTests(SynchronousTestCase):
     def test_reads_however_it_is_cut(self) -> None:
         """Headings are read for each division of the bytes; a partial first sentence is no error, noise is counted."""
         stream = (
-            *(b"01.1,M*00\r\n", sentence("HCHDM", "10.0", "M"), b"\r\n", sentence("GPVTG", "45.0", "T")),
-            *(sentence("HCHDM", "20.0", "M").strip() + b"\n", b"$HCHDM,3.0,M\r\n", b"$HCHDM,40.0,M*00\r"),
-            sentence("HCHDT", "50.0", "T"),
+            *(b"01.1,M*00\r\n", encode_sentence("HCHDM", "10.0", "M"), b"\r\n", encode_sentence("GPVTG", "45.0", "T")),
+            *(encode_sentence("HCHDM", "20.0", "M").strip() + b"\n", b"$HCHDM,3.0,M\r\n", b"$HCHDM,40.0,M*00\r"),
+            encode_sentence("HCHDT", "50.0", "T"),
         )
         for size in (1, 2, 5, 1000):
             reader, found = SentenceReader(), list[Heading]()

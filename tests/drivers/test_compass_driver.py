@@ -11,7 +11,7 @@ from drivers.errors import LinkLost
 from drivers.link import MemoryConnector
 from sim.robots.dog import Dog
 from sim.robots.emulator.compass import NmeaCompass
-from sim.robots.scene import Kennel
+from sim.robots.scene import DogPlacement
 from tests.drivers.contract import KeptLink, KeptLog, RobotCase
 
 
@@ -40,7 +40,7 @@ class CompassDriverTests(Conformance, RobotCase):
         driver.connect()
         for degrees in (0.0, 45.0, 90.0, 179.9, -179.9, -90.0, -0.04):
             # The heading of a simulated dog is the value of its compass (sim.robots.sensor).
-            dog = Dog(Kennel("dog1", 0.0, 0.0, math.radians(degrees), 1), 1)
+            dog = Dog(DogPlacement("dog1", 0.0, 0.0, math.radians(degrees), 1), 1)
             self.body.values[HEADING] = dog.heading
             self.pass_time(0.2)
             self.assertTrue(abs(math.remainder(self.heading(driver) - degrees, 360.0)) < 0.06, degrees)
@@ -137,7 +137,7 @@ class CompassDriverTests(Conformance, RobotCase):
         self.connector.is_open = True
         for _ in range(600):
             for client in self.compass.clients:
-                client.outlet.send(b"\x00\xf8\x80\x0d")
+                client.output.send(b"\x00\xf8\x80\x0d")
             self.pass_time(0.1)
         self.assertEqual(driver.problem, "it sends, but no sentences; is 9600 baud right?")
         self.assertGreater(driver.diagnostics()["bad_frames"], 500)
@@ -160,7 +160,7 @@ class CompassDriverTests(Conformance, RobotCase):
         """The emulated compass sends to each client, except one with a full buffer, and ignores received data."""
         slow, quick = KeptLink(), KeptLink()
         one, _ = self.compass.accept(slow), self.compass.accept(quick)
-        one.received(b"$PXYZ,1\r\n")
+        one.data_received(b"$PXYZ,1\r\n")
         slow.is_busy = True
         self.pass_time(1.0)
         self.assertEqual(slow.said, b"")

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any
 from twisted.internet.defer import Deferred, fail, succeed
 from twisted.trial.unittest import SynchronousTestCase
 
-from drivers.conformance import CHECKS, Faulty, MemoryBench, broken
+from drivers.conformance import CHECKS, MemoryRig, SubscriberError, find_violations
 from drivers.driver import Driver, Permit
 from drivers.errors import LinkLost, NotEnabled
 from drivers.reading import Action, Description, Observation, Value
@@ -102,9 +102,9 @@ class Forgetful(Rover):
 class Nostalgic(Rover):
     """Keeps its motion after a stop."""
 
-    def _rest(self) -> None:
-        self._end.cancel()
-        self._gate.close()
+    def _clear_motion(self) -> None:
+        self._deadline_timer.cancel()
+        self._gate.end_motion()
 
     def stop(self) -> Action:
         super().stop()
@@ -124,7 +124,7 @@ class Endless(Rover):
 
     def act(self, action: Action, permit: Permit) -> Action:
         done = dict(super().act(action, permit))
-        self._end.cancel()
+        self._deadline_timer.cancel()
         return done
 
 
@@ -165,7 +165,7 @@ class Deaf(Rover):
     """Reports a stop and moves on."""
 
     def stop(self) -> Action:
-        self._rest()
+        self._clear_motion()
         return dict(self._motion)
 
 
@@ -201,7 +201,7 @@ class Faithless(Rover):
 
     def link_down(self) -> None:
         super().link_down()
-        self._line.hang_up()
+        self._line.disconnect()
 
 
 class Rash(Rover):
@@ -254,12 +254,12 @@ class Clinging(Rover):
 class Frail(Subscribers[Observation]):
     """Drops all subscribers if one raises an exception."""
 
-    def tell(self, newest: Observation) -> None:
+    def notify(self, newest: Observation) -> None:
         try:
-            for each in self._all:
+            for each in self._callbacks:
                 each(newest)
-        except Faulty:
-            self._all = []
+        except SubscriberError:
+            self._callbacks = []
 
 
 class Fragile(Rover):
@@ -267,7 +267,7 @@ class Fragile(Rover):
 
     def __init__(self, *given: Any, **more: Any) -> None:
         super().__init__(*given, **more)
-        self._seen = Frail(self._name, self.log)
+        self._subscribers = Frail(self._name, self.log)
 
 
 class Silent(Rover):
@@ -325,9 +325,9 @@ BREACHES: dict[str, list[Any]] = {
 }
 
 
-def bench(driver: Callable[..., Driver]) -> Callable[[], MemoryBench]:
+def bench(driver: Callable[..., Driver]) -> Callable[[], MemoryRig]:
     """Return a test rig with this driver and a correct robot."""
-    return partial(MemoryBench, driver, EMULATOR, {"host": "rover"})
+    return partial(MemoryRig, driver, EMULATOR, {"host": "rover"})
 
 
 def _is_number(value: object) -> bool:
@@ -341,22 +341,22 @@ def _pairs() -> Iterator[tuple[str, Any]]:
 
 class KitTests(SynchronousTestCase):
     def tearDown(self) -> None:
-        self.flushLoggedErrors(Faulty)
+        self.flushLoggedErrors(SubscriberError)
 
     def test_every_rule_sees_its_breach(self) -> None:
         """A driver that violates a rule fails the check for this rule."""
         self.assertEqual(set(BREACHES), set(CHECKS))
-        found = {each.__name__: broken(bench(each)) for _, each in _pairs()}
+        found = {each.__name__: find_violations(bench(each)) for _, each in _pairs()}
         self.assertEqual([(rule, each.__name__) for rule, each in _pairs() if rule not in found[each.__name__]], [])
 
     def test_only_what_is_broken(self) -> None:
         """A driver that violates one rule passes the other checks."""
         for rule, driver in (("clips", Boastful), ("refuses", Credulous), ("leaves", Haunting), ("times", Backward)):
-            self.assertEqual(list(broken(bench(driver))), [rule], driver.__name__)
+            self.assertEqual(list(find_violations(bench(driver))), [rule], driver.__name__)
 
     def test_template_conforms(self) -> None:
         """The example driver passes all checks, and has fewer than 50 lines of code."""
-        self.assertEqual(broken(bench(Rover)), {})
+        self.assertEqual(find_violations(bench(Rover)), {})
         lines = (FOLDER / "robot.py").read_text(encoding="utf-8").splitlines()
         self.assertLess(len([line for line in lines if line.strip()]), 50)
 
@@ -368,5 +368,5 @@ class KitTests(SynchronousTestCase):
 
     def test_tells_what_is_wrong(self) -> None:
         """A violation names the expected and the actual behaviour; an exception is a violation with its name."""
-        self.assertIn("after its deadline the robot moves at 0.15", broken(bench(Endless))["deadline"])
-        self.assertIn("KeyError", broken(bench(Rude))["invoke"])
+        self.assertIn("after its deadline the robot moves at 0.15", find_violations(bench(Endless))["deadline"])
+        self.assertIn("KeyError", find_violations(bench(Rude))["invoke"])

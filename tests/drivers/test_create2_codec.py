@@ -10,10 +10,18 @@ from hypothesis import strategies as st
 from twisted.trial.unittest import SynchronousTestCase
 
 from drivers.create2 import codec
-from drivers.create2.codec import GROUPS, PACKETS, Command, CommandReader, StreamReader, packed, stream_frame
-from drivers.create2.odometry import MM_PER_COUNT, WHEEL_BASE, Odometry
+from drivers.create2.codec import (
+    GROUPS,
+    PACKETS,
+    Command,
+    CommandReader,
+    StreamReader,
+    encode_packet,
+    encode_stream_frame,
+)
+from drivers.create2.odometry import MM_PER_COUNT, WHEEL_BASE_MM, Odometry
 from drivers.create2.option import Baud
-from drivers.create2.sense import IDS, event_of, seen
+from drivers.create2.sensors import PACKET_IDS, convert_frame, describe_safety_event
 from drivers.errors import UsageError
 from drivers.registry import describe
 
@@ -32,20 +40,25 @@ class CommandTests(SynchronousTestCase):
 
     def test_golden_vectors(self) -> None:
         """Each command has the bytes of the Open Interface specification."""
-        self.assertEqual(codec.drive_direct(200, 200), bytes((145, 0, 200, 0, 200)))
-        self.assertEqual(codec.drive_direct(-100, 100), bytes((145, 255, 156, 0, 100)))
-        self.assertEqual(codec.drive(200, codec.STRAIGHT), bytes((137, 0, 200, 128, 0)))
-        self.assertEqual(codec.drive(150, 1), bytes((137, 0, 150, 0, 1)))
-        self.assertEqual(codec.drive(150, -1), bytes((137, 0, 150, 255, 255)))
-        self.assertEqual(codec.stream((29, 13)), bytes((148, 2, 29, 13)))
-        self.assertEqual(codec.query((29, 13)), bytes((149, 2, 29, 13)))
-        self.assertEqual(codec.pause(False) + codec.pause(True), bytes((150, 0, 150, 1)))
-        self.assertEqual(codec.song(0, [(69, 32)]) + codec.play(0), bytes((140, 0, 1, 69, 32, 141, 0)))
+        self.assertEqual(codec.encode_drive_direct(200, 200), bytes((145, 0, 200, 0, 200)))
+        self.assertEqual(codec.encode_drive_direct(-100, 100), bytes((145, 255, 156, 0, 100)))
+        self.assertEqual(codec.encode_drive(200, codec.STRAIGHT_RADIUS), bytes((137, 0, 200, 128, 0)))
+        self.assertEqual(codec.encode_drive(150, 1), bytes((137, 0, 150, 0, 1)))
+        self.assertEqual(codec.encode_drive(150, -1), bytes((137, 0, 150, 255, 255)))
+        self.assertEqual(codec.encode_stream((29, 13)), bytes((148, 2, 29, 13)))
+        self.assertEqual(codec.encode_query((29, 13)), bytes((149, 2, 29, 13)))
+        self.assertEqual(codec.encode_pause(False) + codec.encode_pause(True), bytes((150, 0, 150, 1)))
+        self.assertEqual(codec.encode_song(0, [(69, 32)]) + codec.encode_play(0), bytes((140, 0, 1, 69, 32, 141, 0)))
 
     def test_robot_hears_each_command_however_it_is_cut(self) -> None:
         """A reader that gets one byte at a time reads the same commands as one that gets all at once."""
-        said = bytes((128, 131)) + codec.drive(-300, 1000) + codec.song(1, [(60, 8), (62, 8)]) + codec.stream(IDS)
-        said += codec.query((100,)) + bytes((142, 7, 139, 1, 2, 3, 255, 173))
+        said = (
+            bytes((128, 131))
+            + codec.encode_drive(-300, 1000)
+            + codec.encode_song(1, [(60, 8), (62, 8)])
+            + codec.encode_stream(PACKET_IDS)
+        )
+        said += codec.encode_query((100,)) + bytes((142, 7, 139, 1, 2, 3, 255, 173))
         whole = CommandReader()
         commands = list(whole.read(said))
         pieces = CommandReader()
@@ -58,7 +71,7 @@ class CommandTests(SynchronousTestCase):
     def test_robot_waits_for_missing_data(self) -> None:
         """An incomplete command takes its data from the next one, as in the real robot; five start bytes end this."""
         reader = CommandReader()
-        self.assertEqual(list(reader.read(codec.drive_direct(100, 100)[:1])), [])
+        self.assertEqual(list(reader.read(codec.encode_drive_direct(100, 100)[:1])), [])
         self.assertEqual([one.opcode for one in reader.read(bytes((128,)) * 5)], [145, 128])
 
     @given(st.binary(max_size=200))
@@ -77,23 +90,23 @@ class StreamTests(SynchronousTestCase):
         """The example frame of the specification decodes to 2 * 256 + 25 = 537 and encodes to the same bytes."""
         reader = StreamReader((29, 13))
         self.assertEqual(list(reader.read(SPECIFIED)), [{"cliff_front_left_signal": 537, "virtual_wall": 0}])
-        self.assertEqual(stream_frame((29, 13), {"cliff_front_left_signal": 537}), SPECIFIED)
+        self.assertEqual(encode_stream_frame((29, 13), {"cliff_front_left_signal": 537}), SPECIFIED)
         self.assertEqual((reader.frames, reader.bad_frames), (1, 0))
 
     def test_sizes_of_packets_and_groups(self) -> None:
         """Groups have the lengths in the specification, so each packet has its size and offset."""
         sizes = {0: 26, 1: 10, 2: 6, 3: 10, 4: 14, 5: 12, 6: 52, 100: 80, 101: 28, 106: 12, 107: 9}
-        self.assertEqual({one: len(packed(one, {})) for one in GROUPS}, sizes)
+        self.assertEqual({one: len(encode_packet(one, {})) for one in GROUPS}, sizes)
         offsets = {7: 0, 17: 10, 19: 12, 22: 17, 27: 26, 34: 39, 35: 40, 43: 52, 46: 57, 52: 69, 58: 79}
         for one, offset in offsets.items():
             self.assertEqual(sum(PACKETS[before].size for before in range(7, one)), offset)
 
-    @given(values_of(IDS), st.integers(1, 90))
+    @given(values_of(PACKET_IDS), st.integers(1, 90))
     @settings(max_examples=100, deadline=None)
     def test_reads_what_is_written(self, values: dict[str, int], size: int) -> None:
         """Each frame survives encoding and decoding, also in pieces and with a byte 19 in its data."""
-        data = stream_frame(IDS, values) * 2
-        reader = StreamReader(IDS)
+        data = encode_stream_frame(PACKET_IDS, values) * 2
+        reader = StreamReader(PACKET_IDS)
         got = [frame for at in range(0, len(data), size) for frame in reader.read(data[at : at + size])]
         self.assertEqual(got, [values, values])
         self.assertEqual(reader.bad_frames, 0)
@@ -101,8 +114,8 @@ class StreamTests(SynchronousTestCase):
     def test_fed_one_byte_at_a_time_with_heads_within(self) -> None:
         """Frames with header bytes in their data are found byte by byte from the middle of a frame."""
         values = {"left_encoder": 19 * 256 + 78, "right_encoder": 19 * 256 + 78, "charge": 19 * 256 + 78}
-        data = stream_frame(IDS, values)
-        reader = StreamReader(IDS)
+        data = encode_stream_frame(PACKET_IDS, values)
+        reader = StreamReader(PACKET_IDS)
         stream = data[30:] + data * 3
         got = [frame for at in range(len(stream)) for frame in reader.read(stream[at : at + 1])]
         self.assertEqual(len(got), 3)
@@ -110,7 +123,7 @@ class StreamTests(SynchronousTestCase):
 
     def test_counts_and_skips_what_is_no_frame(self) -> None:
         """An invalid byte costs one frame, the text of a reboot none; the following frames are read."""
-        data = stream_frame((29, 13), {"virtual_wall": 1})
+        data = encode_stream_frame((29, 13), {"virtual_wall": 1})
         reader = StreamReader((29, 13))
         spoilt = data[:3] + bytes((data[3] ^ 8,)) + data[4:]
         self.assertEqual(len(list(reader.read(data + spoilt + data))), 2)
@@ -121,16 +134,16 @@ class StreamTests(SynchronousTestCase):
     def test_refuses_other_packets_with_a_right_checksum(self) -> None:
         """A frame of equal length with other packets is refused despite a valid checksum."""
         reader = StreamReader((29, 13))
-        self.assertEqual(list(reader.read(stream_frame((28, 13), {}))), [])
+        self.assertEqual(list(reader.read(encode_stream_frame((28, 13), {}))), [])
         self.assertEqual(reader.bad_frames, 1)
 
     def test_refuses_what_no_robot_can_mean(self) -> None:
         """A frame with mode 9 or a battery of 60 V is dropped and counted."""
         reader = StreamReader((35, 22))
         for values in ({"mode": 9}, {"voltage": 60_000}):
-            self.assertEqual(list(reader.read(stream_frame((35, 22), values))), [])
+            self.assertEqual(list(reader.read(encode_stream_frame((35, 22), values))), [])
         self.assertEqual((reader.frames, reader.bad_frames), (0, 2))
-        self.assertEqual(len(list(reader.read(stream_frame((35, 22), {"mode": 2})))), 1)
+        self.assertEqual(len(list(reader.read(encode_stream_frame((35, 22), {"mode": 2})))), 1)
 
     @given(st.lists(st.one_of(st.binary(max_size=40), st.just(SPECIFIED), st.just(SPECIFIED[:5])), max_size=12))
     @settings(max_examples=200, deadline=None)
@@ -146,11 +159,11 @@ class SenseTests(SynchronousTestCase):
     """The meaning of a frame."""
 
     def frame(self, **values: int) -> dict[str, int]:
-        return next(StreamReader(IDS).read(stream_frame(IDS, {"capacity": 2000, **values})))
+        return next(StreamReader(PACKET_IDS).read(encode_stream_frame(PACKET_IDS, {"capacity": 2000, **values})))
 
     def test_each_bit_has_its_side(self) -> None:
         """The bits of bumpers, wheel drops, light and buttons are in the specified order: right before left."""
-        felt = seen(self.frame(bumps=0b0101, light_bumper=0b100001, buttons=0b00000100))
+        felt = convert_frame(self.frame(bumps=0b0101, light_bumper=0b100001, buttons=0b00000100))
         self.assertEqual((felt["bump.right"], felt["bump.left"]), (True, False))
         self.assertEqual((felt["wheeldrop.right"], felt["wheeldrop.left"]), (True, False))
         self.assertEqual((felt["lightbump.left.hit"], felt["lightbump.right.hit"]), (True, True))
@@ -159,17 +172,17 @@ class SenseTests(SynchronousTestCase):
 
     def test_power_in_si_units(self) -> None:
         """Power values are in SI units, a negative current discharges; without a capacity there is no level."""
-        felt = seen(self.frame(voltage=14400, current=-250, temperature=-5, charge=500, charging_state=2))
+        felt = convert_frame(self.frame(voltage=14400, current=-250, temperature=-5, charge=500, charging_state=2))
         self.assertEqual((felt["power.volts"], felt["power.amps"], felt["power.celsius"]), (14.4, -0.25, -5.0))
         self.assertEqual((felt["power.level"], felt["power.charging"]), (0.25, True))
-        self.assertNotIn("power.level", seen(self.frame(capacity=0)))
+        self.assertNotIn("power.level", convert_frame(self.frame(capacity=0)))
 
     def test_names_the_causes_of_a_safety_event(self) -> None:
         """The causes of a safety event are named by the keys of the observation."""
-        felt = seen(self.frame(bumps=8, cliff_left=1))
-        self.assertEqual(event_of(felt), "cliff.left, wheeldrop.left")
-        self.assertEqual(event_of(seen(self.frame(charger=2))), "charger")
-        self.assertEqual(event_of(seen(self.frame())), "mode")
+        felt = convert_frame(self.frame(bumps=8, cliff_left=1))
+        self.assertEqual(describe_safety_event(felt), "cliff.left, wheeldrop.left")
+        self.assertEqual(describe_safety_event(convert_frame(self.frame(charger=2))), "charger")
+        self.assertEqual(describe_safety_event(convert_frame(self.frame())), "mode")
 
 
 class OdometryTests(SynchronousTestCase):
@@ -180,12 +193,12 @@ class OdometryTests(SynchronousTestCase):
         where = Odometry()
         metre = round(1000.0 / MM_PER_COUNT)
         for step in range(101):
-            where.count(metre * step // 100, metre * step // 100, step * 0.03)
+            where.update(metre * step // 100, metre * step // 100, step * 0.03)
         self.assertAlmostEqual(where.x, 1.0, places=3)
         self.assertAlmostEqual(where.vx, 1.0 / 3.0, places=1)
-        quarter = round(math.pi / 4.0 * WHEEL_BASE / MM_PER_COUNT)
+        quarter = round(math.pi / 4.0 * WHEEL_BASE_MM / MM_PER_COUNT)
         for step in range(101):
-            where.count((metre - quarter * step // 100) % 65536, metre + quarter * step // 100, 4.0 + step * 0.03)
+            where.update((metre - quarter * step // 100) % 65536, metre + quarter * step // 100, 4.0 + step * 0.03)
         self.assertAlmostEqual(where.yaw, math.pi / 2.0, places=2)
         self.assertAlmostEqual(where.x, 1.0, places=2)
         self.assertGreater(where.wz, 0.4)
@@ -193,10 +206,10 @@ class OdometryTests(SynchronousTestCase):
     def test_counters_wrap(self) -> None:
         """A counter that wraps, in either direction, gives a small step and no jump."""
         where = Odometry()
-        where.count(65530, 65530, 0.0)
-        where.count(4, 4, 0.1)
+        where.update(65530, 65530, 0.0)
+        where.update(4, 4, 0.1)
         self.assertAlmostEqual(where.x, 10 * MM_PER_COUNT / 1000.0)
-        where.count(65530, 65530, 0.2)
+        where.update(65530, 65530, 0.2)
         self.assertAlmostEqual(where.x, 0.0)
         self.assertEqual(where.jumps, 0)
 
@@ -205,7 +218,7 @@ class OdometryTests(SynchronousTestCase):
         where = Odometry()
         for step in range(33):
             left, right = (math.pi * (1.0 + side * 0.1175) * step / 32 / MM_PER_COUNT * 1000.0 for side in (-1, 1))
-            where.count(round(left), round(right), step * 1.0)
+            where.update(round(left), round(right), step * 1.0)
         self.assertAlmostEqual(where.x, 0.0, places=2)
         self.assertAlmostEqual(where.y, 2.0, places=2)
         self.assertAlmostEqual(abs(where.yaw), math.pi, places=2)
@@ -213,10 +226,10 @@ class OdometryTests(SynchronousTestCase):
     def test_jumps_move_nothing(self) -> None:
         """A counter step beyond the wheel's speed, as after a reboot, is counted as a jump and moves nothing."""
         where = Odometry()
-        where.count(20_000, 20_000, 0.0)
-        where.count(0, 0, 0.015)
+        where.update(20_000, 20_000, 0.0)
+        where.update(0, 0, 0.015)
         self.assertEqual((where.x, where.jumps), (0.0, 1))
-        where.count(10, 10, 0.03)
+        where.update(10, 10, 0.03)
         self.assertAlmostEqual(where.x, 10 * MM_PER_COUNT / 1000.0)
 
 
@@ -225,7 +238,7 @@ class OptionTests(SynchronousTestCase):
 
     def test_every_baud_carries_the_stream(self) -> None:
         """At each permitted baud rate (10 bits per byte) a frame fits into the stream's interval."""
-        size = len(stream_frame(IDS, {}))
+        size = len(encode_stream_frame(PACKET_IDS, {}))
         self.assertEqual(size, 81)
         for baud in get_args(Baud):
             self.assertLess(size * 10 / baud, codec.FRAME_S, str(baud))

@@ -12,8 +12,8 @@ from drivers.conformance import Conformance
 from drivers.create2 import codec
 from drivers.errors import LinkLost, NoReply, NotEnabled, Unsupported, UsageError
 from drivers.link import MemoryConnector
-from sim.robots.emulator.body import MemoryBody
 from sim.robots.emulator.create2 import Create2
+from sim.robots.emulator.simulated_robot import MemoryRobot
 from tests.drivers.contract import RobotCase
 
 
@@ -161,7 +161,7 @@ class Create2DriverTests(Conformance, Create2Case):
         self.pass_time(0.1)
         self.assertAlmostEqual(float(self.successResultOf(driver.invoke("beep", hz=445.0))["beep.hz"]), 440.0)
         self.pass_time(0.05)
-        self.assertEqual(self.robot.played, [0])
+        self.assertEqual(self.robot.played_songs, [0])
         self.failureResultOf(driver.invoke("beep", hz="high"), Unsupported)
         self.failureResultOf(driver.invoke("beep", tune="march"), Unsupported)
         self.failureResultOf(driver.invoke("dock", fast=1.0), Unsupported)
@@ -237,14 +237,14 @@ class EmulatorTests(SynchronousTestCase):
 
     def setUp(self) -> None:
         self.clock = Clock()
-        self.body = MemoryBody()
+        self.body = MemoryRobot()
         self.robot = Create2(self.body, self.clock, Random(1))
         self.said = b""
         self.connector = MemoryConnector(self.clock, self.robot.accept)
-        self.link = self.connector.opened(self)
+        self.link = self.connector.open_pair(self)
         self.addCleanup(self.robot.stop)
 
-    def received(self, data: bytes) -> None:
+    def data_received(self, data: bytes) -> None:
         self.said += data
 
     def link_down(self) -> None:
@@ -262,7 +262,7 @@ class EmulatorTests(SynchronousTestCase):
         """Before a start command the robot ignores all data; after it, it is in passive mode and does not drive."""
         self.assertEqual(self.tell(bytes((142, 35))), b"")
         self.assertEqual(self.tell(bytes((128, 142, 35))), b"\x01")
-        self.tell(codec.drive_direct(100, 100))
+        self.tell(codec.encode_drive_direct(100, 100))
         self.assertEqual(self.body.motion, (0.0, 0.0, 0.0))
         self.assertEqual(self.tell(bytes((131, 142, 35))), b"\x02")
         self.assertEqual(self.tell(bytes((132, 142, 35))), b"\x03")
@@ -271,30 +271,30 @@ class EmulatorTests(SynchronousTestCase):
     def test_answers_groups_and_lists(self) -> None:
         """Group 100 has 80 bytes, a list is answered without ids, and unknown packets are omitted."""
         self.assertEqual(len(self.tell(bytes((128, 142, 100)))), 80)
-        self.assertEqual(len(self.tell(codec.query((35, 22, 200, 43)))), 5)
+        self.assertEqual(len(self.tell(codec.encode_query((35, 22, 200, 43)))), 5)
 
     def test_drives_on_arcs(self) -> None:
         """Straight, spin and arc commands move the robot as specified."""
-        self.tell(bytes((128, 131)) + codec.drive(200, codec.STRAIGHT))
+        self.tell(bytes((128, 131)) + codec.encode_drive(200, codec.STRAIGHT_RADIUS))
         self.assertEqual(self.body.motion, (0.2, 0.0, 0.0))
-        self.tell(codec.drive(235, 1))
+        self.tell(codec.encode_drive(235, 1))
         self.assertEqual(self.body.motion, (0.0, 0.0, 2.0))
-        self.tell(codec.drive(235, -1))
+        self.tell(codec.encode_drive(235, -1))
         self.assertEqual(self.body.motion, (0.0, 0.0, -2.0))
-        self.tell(codec.drive(100, 1000))
+        self.tell(codec.encode_drive(100, 1000))
         self.assertTrue(math.isclose(self.body.motion[2], 0.1, abs_tol=0.01))
 
     def test_a_ledge_stops_it_ahead_only(self) -> None:
         """In safe mode a cliff stops forward motion, and permits backward motion."""
         self.body.values["cliff.left"] = True
-        self.tell(bytes((128, 131)) + codec.drive_direct(-100, -100))
+        self.tell(bytes((128, 131)) + codec.encode_drive_direct(-100, -100))
         self.assertEqual(self.body.motion[0], -0.1)
-        self.tell(codec.drive_direct(100, 100))
+        self.tell(codec.encode_drive_direct(100, 100))
         self.assertEqual((self.body.motion[0], self.robot.mode), (0.0, 1))
 
     def test_reset_says_its_firmware(self) -> None:
         """After a reset the robot sends its boot text, is off, and sends no stream."""
-        self.tell(bytes((128,)) + codec.stream((35,)))
+        self.tell(bytes((128,)) + codec.encode_stream((35,)))
         self.clock.pump([0.015] * 4)
         self.assertIn(b"\x13\x02\x23\x01", self.said)
         self.tell(bytes((7,)))

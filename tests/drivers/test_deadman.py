@@ -14,30 +14,30 @@ from drivers.aibo.driver import AiboDriver
 from drivers.base import BaseDriver
 from drivers.bittle.driver import BittleDriver
 from drivers.bittle.link import HttpConnector
-from drivers.bittle.option import checked as checked_bittle
+from drivers.bittle.option import parse_options as checked_bittle
 from drivers.create2.driver import Create2Driver
-from drivers.create2.option import checked as checked_create2
+from drivers.create2.option import parse_options as checked_create2
 from drivers.deadman.process import (
-    AGAIN_S,
-    CALL,
+    ARM,
+    DISARM,
     GRACE_S,
-    GUARD,
-    HEAD,
-    LEAVE,
-    REST,
-    UNTIL,
-    Ear,
-    Open,
-    Server,
-    Watch,
+    HALT_REPEAT_S,
+    HEADER,
+    LINK_LOST,
+    SET_LINK,
+    SET_SERVER,
+    CommandServer,
+    HaltTimer,
+    MessageParser,
+    SharedLink,
 )
-from drivers.deadman.switch import LastWord, MemoryDeadMan
+from drivers.deadman.switch import HaltCommand, MemoryDeadManSwitch
 from drivers.driver import Permit
 from drivers.errors import StaleCommand
 from drivers.link import MemoryConnector, MemoryLink
 from drivers.reading import Action, Description
-from drivers.registry import driver_for
-from drivers.rosbridge.driver import ASK_S, RosbridgeDriver
+from drivers.registry import create_driver
+from drivers.rosbridge.driver import TYPE_TIMEOUT_S, RosbridgeDriver
 from sim.robots.emulator.aibo_dog import AiboEmulator
 from sim.robots.emulator.bittle import Bittle
 from sim.robots.emulator.create2 import Create2
@@ -46,7 +46,7 @@ from tests.drivers.contract import RobotCase
 from tests.formats.rfc6455 import masked
 
 
-class Way(Open):
+class Way(SharedLink):
     """A channel that records halt messages; with ``is_answered``, each one is confirmed."""
 
     def __init__(self, is_answered: bool = False) -> None:
@@ -55,7 +55,7 @@ class Way(Open):
         self.is_open = True
         self._is_answered = is_answered
 
-    def say(self, halt: bytes) -> bool:
+    def send(self, halt: bytes) -> bool:
         self.said.append(halt)
         return self._is_answered
 
@@ -69,94 +69,94 @@ class WatchTests(SynchronousTestCase):
     def setUp(self) -> None:
         """Guard a robot that may move until 10."""
         self.way = Way()
-        self.watch = Watch()
-        self.watch.guard(self.way, b"halt")
-        self.watch.until(10.0)
+        self.watch = HaltTimer()
+        self.watch.set_halt_command(self.way, b"halt")
+        self.watch.arm(10.0)
 
     def test_halts_when_the_time_is_over(self) -> None:
         """The halt is sent after the deadline plus a grace period, three times at intervals, and counted once."""
-        wait = self.watch.wait(9.0)
+        wait = self.watch.get_timeout(9.0)
         self.assertIsNotNone(wait)
         self.assertAlmostEqual(wait or 0.0, 1.0 + GRACE_S)
-        self.watch.turn(10.0)
+        self.watch.send_due_halts(10.0)
         self.assertEqual(self.way.said, [])
-        self.watch.turn(10.1)
+        self.watch.send_due_halts(10.1)
         self.assertEqual(self.way.said, [b"halt"])
-        self.assertAlmostEqual(self.watch.wait(10.1) or 0.0, AGAIN_S)
+        self.assertAlmostEqual(self.watch.get_timeout(10.1) or 0.0, HALT_REPEAT_S)
         for moment in (10.15, 10.21, 10.32, 10.5, 20.0):
-            self.watch.turn(moment)
+            self.watch.send_due_halts(moment)
         self.assertEqual(self.way.said, [b"halt"] * 3)
         self.assertEqual(self.watch.halts, 1)
-        self.assertIsNone(self.watch.wait(20.0))
+        self.assertIsNone(self.watch.get_timeout(20.0))
 
     def test_heeds_newer_words(self) -> None:
         """A new deadline replaces the old one, rest removes it, and both end the repetition of a halt."""
-        self.watch.until(11.0)
-        self.watch.turn(10.5)
+        self.watch.arm(11.0)
+        self.watch.send_due_halts(10.5)
         self.assertEqual(self.way.said, [])
-        self.watch.rest()
-        self.watch.turn(12.0)
-        self.assertIsNone(self.watch.wait(12.0))
+        self.watch.disarm()
+        self.watch.send_due_halts(12.0)
+        self.assertIsNone(self.watch.get_timeout(12.0))
         self.assertEqual(self.way.said, [])
-        for newer in (self.watch.rest, lambda: self.watch.until(30.0)):
-            self.watch.until(13.0)
-            self.watch.turn(14.0)
+        for newer in (self.watch.disarm, lambda: self.watch.arm(30.0)):
+            self.watch.arm(13.0)
+            self.watch.send_due_halts(14.0)
             newer()
             self.way.said.clear()
-            self.watch.turn(14.5)
+            self.watch.send_due_halts(14.5)
             self.assertEqual(self.way.said, [])
 
     def test_halts_at_once_when_the_node_is_gone(self) -> None:
         """The end of the node halts the robot at once if it may move, and otherwise sends nothing."""
-        self.watch.end(5.0)
-        self.watch.turn(5.001)
+        self.watch.on_node_end(5.0)
+        self.watch.send_due_halts(5.001)
         self.assertEqual(self.way.said, [b"halt"])
-        still = Watch()
-        still.guard(Way(), b"halt")
-        still.end(5.0)
-        self.assertIsNone(still.wait(5.0))
+        still = HaltTimer()
+        still.set_halt_command(Way(), b"halt")
+        still.on_node_end(5.0)
+        self.assertIsNone(still.get_timeout(5.0))
 
     def test_lets_go_of_what_was_guarded(self) -> None:
         """A new channel closes the old one and keeps the deadline; without a channel nothing is sent or counted."""
         other = Way()
-        self.watch.guard(other, b"other")
+        self.watch.set_halt_command(other, b"other")
         self.assertFalse(self.way.is_open)
-        self.watch.turn(10.1)
+        self.watch.send_due_halts(10.1)
         self.assertEqual((self.way.said, other.said), ([], [b"other"]))
-        self.watch.until(11.0)
-        self.watch.leave()
+        self.watch.arm(11.0)
+        self.watch.on_link_lost()
         self.assertFalse(other.is_open)
-        self.watch.until(12.0)
-        self.watch.turn(13.0)
-        self.assertEqual((self.watch.halts, self.watch.wait(13.0)), (1, None))
+        self.watch.arm(12.0)
+        self.watch.send_due_halts(13.0)
+        self.assertEqual((self.watch.halts, self.watch.get_timeout(13.0)), (1, None))
 
     def test_asks_a_server_until_it_answers(self) -> None:
         """A halt that a server confirmed is not repeated."""
         server = Way(is_answered=True)
-        self.watch.guard(server, b"GET")
+        self.watch.set_halt_command(server, b"GET")
         for moment in (10.1, 10.3, 10.5):
-            self.watch.turn(moment)
+            self.watch.send_due_halts(moment)
         self.assertEqual(server.said, [b"GET"])
 
 
-class Told(Watch):
+class Told(HaltTimer):
     """A watch that records its calls."""
 
     def __init__(self) -> None:
         super().__init__()
         self.told: list[Any] = []
 
-    def guard(self, way: Open | Server, halt: bytes) -> None:
-        where = way._descriptor if isinstance(way, Open) else way._address
+    def set_halt_command(self, way: SharedLink | CommandServer, halt: bytes) -> None:
+        where = way._descriptor if isinstance(way, SharedLink) else way._address
         self.told.append((type(way), where, halt))
 
-    def until(self, moment: float) -> None:
+    def arm(self, moment: float) -> None:
         self.told.append(moment)
 
-    def rest(self) -> None:
+    def disarm(self) -> None:
         self.told.append("rest")
 
-    def leave(self) -> None:
+    def on_link_lost(self) -> None:
         self.told.append("leave")
 
 
@@ -165,28 +165,28 @@ class EarTests(SynchronousTestCase):
 
     def test_hears_words_cut_anyhow(self) -> None:
         """Messages are read for each division of the bytes, and each file descriptor belongs to its message."""
-        said = HEAD.pack(GUARD, 0.0, 4) + b"halt" + HEAD.pack(UNTIL, 7.5, 0) + HEAD.pack(REST, 0.0, 0)
-        said += HEAD.pack(LEAVE, 0.0, 0) + HEAD.pack(GUARD, 0.0, 0)
+        said = HEADER.pack(SET_LINK, 0.0, 4) + b"halt" + HEADER.pack(ARM, 7.5, 0) + HEADER.pack(DISARM, 0.0, 0)
+        said += HEADER.pack(LINK_LOST, 0.0, 0) + HEADER.pack(SET_LINK, 0.0, 0)
         call = b"10.0.0.5\x0080\0GET /x\0y"
-        said += HEAD.pack(CALL, 0.0, len(call)) + call
+        said += HEADER.pack(SET_SERVER, 0.0, len(call)) + call
         wanted = [
-            (Open, 5, b"halt"),
+            (SharedLink, 5, b"halt"),
             7.5,
             "rest",
             "leave",
-            (Open, 6, b""),
-            (Server, ("10.0.0.5", 80), b"GET /x\0y"),
+            (SharedLink, 6, b""),
+            (CommandServer, ("10.0.0.5", 80), b"GET /x\0y"),
         ]
         whole, slow = Told(), Told()
-        Ear(whole).heard(said, [5, 6])
-        ear = Ear(slow)
+        MessageParser(whole).feed(said, [5, 6])
+        ear = MessageParser(slow)
         for place in range(len(said)):
-            ear.heard(said[place : place + 1], {0: [5], 30: [6]}.get(place, []))
+            ear.feed(said[place : place + 1], {0: [5], 30: [6]}.get(place, []))
         self.assertEqual(whole.told, wanted)
         self.assertEqual(slow.told, wanted)
 
 
-class OrderedDeadMan(MemoryDeadMan):
+class OrderedDeadMan(MemoryDeadManSwitch):
     """A switch that ends when ``ended`` fires."""
 
     def close(self) -> Deferred[None]:
@@ -201,7 +201,7 @@ class Puppet(BaseDriver):
     def __init__(self, clock: Clock, switch: OrderedDeadMan | None) -> None:
         description = Description("puppet", "puppet", {"base2d": {}}, {"base.vx": (-1.0, 1.0)}, 0.1)
         super().__init__(description, "puppet", clock, switch)
-        self.told = [] if switch is None else switch.told
+        self.told = [] if switch is None else switch.calls
         self.link = MemoryLink(clock, 0.0)
 
     def up(self) -> None:
@@ -227,8 +227,8 @@ class Puppet(BaseDriver):
     def _halt(self) -> None:
         self.told.append("halt")
 
-    def _last_word(self) -> LastWord:
-        return LastWord(b"halt", self.link)
+    def _make_halt_command(self) -> HaltCommand:
+        return HaltCommand(b"halt", self.link)
 
 
 class BaseDriverTests(SynchronousTestCase):
@@ -247,29 +247,29 @@ class BaseDriverTests(SynchronousTestCase):
         self.assertEqual(self.switch.seconds, 0.2)
         self.clock.advance(0.2)
         self.assertIsNone(self.switch.seconds)
-        self.assertEqual(self.switch.told, ["guard", "until", "drive", "rest", "halt"])
+        self.assertEqual(self.switch.calls, ["guard", "until", "drive", "rest", "halt"])
 
     def test_a_refused_command_arms_nothing(self) -> None:
         """A command with an old token or a passed deadline does not set the switch."""
         self.driver.act({"base.vx": 0.1}, Permit(5, 0.2))
         for permit in (Permit(4, 5.0), Permit(6, 0.0)):
             self.assertRaises(StaleCommand, self.driver.act, {"base.vx": 0.1}, permit)
-        self.assertEqual((self.switch.seconds, self.switch.told.count("until")), (0.2, 1))
+        self.assertEqual((self.switch.seconds, self.switch.calls.count("until")), (0.2, 1))
 
     def test_what_is_over_is_over(self) -> None:
         """A late command, before the timer of the previous motion's end, starts from rest."""
         self.driver.act({"base.vx": 0.1}, Permit(1, 0.2))
         self.clock.rightNow = 0.22  # time passes without timer calls
         self.assertEqual(self.driver.act({}, Permit(1, 0.5)), {"base.vx": 0.0})
-        self.assertEqual(self.switch.told[3:], ["rest", "halt", "until", "drive"])
+        self.assertEqual(self.switch.calls[3:], ["rest", "halt", "until", "drive"])
 
     def test_follows_the_link(self) -> None:
         """The switch releases a lost link and guards the next one."""
         self.driver.down()
-        self.assertIsNone(self.switch.word)
+        self.assertIsNone(self.switch.command)
         self.driver.up()
-        self.assertEqual(self.switch.word, LastWord(b"halt", self.driver.link))
-        self.assertEqual(self.switch.told, ["guard", "rest", "leave", "guard"])
+        self.assertEqual(self.switch.command, HaltCommand(b"halt", self.driver.link))
+        self.assertEqual(self.switch.calls, ["guard", "rest", "leave", "guard"])
 
     def test_ends_with_the_driver(self) -> None:
         """``disconnect`` waits for the end of the switch."""
@@ -290,18 +290,18 @@ class LastWordTests(RobotCase):
     """The bytes that halt each kind of robot."""
 
     def build(self) -> None:
-        self.switch = MemoryDeadMan()
+        self.switch = MemoryDeadManSwitch()
 
     def tearDown(self) -> None:
         """Skip the check of the base class, as the robots are still running."""
 
-    def word(self, driver: BaseDriver, settle: float = 1.0) -> LastWord:
+    def word(self, driver: BaseDriver, settle: float = 1.0) -> HaltCommand:
         """Return the halt message of a driver after it has connected."""
         connected = driver.connect()
         self.pass_time(settle)
         self.successResultOf(connected)
-        assert self.switch.word is not None
-        return self.switch.word
+        assert self.switch.command is not None
+        return self.switch.command
 
     def test_aibo(self) -> None:
         """The AIBO gets zero for forward, strafe and rotate, at the walk server only."""
@@ -309,18 +309,18 @@ class LastWordTests(RobotCase):
         dog.start()
         driver = AiboDriver({"host": "dog", "camera": False}, "dog", dog.connector(), self.clock, dead_man=self.switch)
         word = self.word(driver)
-        self.assertEqual(word.halt, b"f\0\0\0\0s\0\0\0\0r\0\0\0\0")
-        dog.heard.clear()
-        word.link.send(word.halt)
+        self.assertEqual(word.data, b"f\0\0\0\0s\0\0\0\0r\0\0\0\0")
+        dog.received_commands.clear()
+        word.link.send(word.data)
         self.pass_time(0.01)
-        self.assertEqual(dog.heard, [("f", 0.0), ("s", 0.0), ("r", 0.0)])
+        self.assertEqual(dog.received_commands, [("f", 0.0), ("s", 0.0), ("r", 0.0)])
 
     def test_create2(self) -> None:
         """The Create 2 gets Drive Direct with both wheels at 0 (OI specification, opcode 145)."""
         robot = Create2(self.body, self.clock, Random(1))
         connector = MemoryConnector(self.clock, robot.accept)
         driver = Create2Driver(checked_create2({"port": "x"}), "robot", connector, self.clock, self.switch)
-        self.assertEqual(self.word(driver).halt, bytes((145, 0, 0, 0, 0)))
+        self.assertEqual(self.word(driver).data, bytes((145, 0, 0, 0, 0)))
 
     def test_bittle(self) -> None:
         """The Bittle gets the skill to stand up with its line feed, or the HTTP request for it."""
@@ -328,15 +328,15 @@ class LastWordTests(RobotCase):
         connector = MemoryConnector(self.clock, robot.accept)
         driver = BittleDriver(checked_bittle({"port": "x"}), "dog", connector, self.clock, self.switch)
         word = self.word(driver)
-        self.assertEqual((word.halt, word.address), (b"kup\n", None))
+        self.assertEqual((word.data, word.address), (b"kup\n", None))
         for board, path in (("biboard", b"/cmd?cmd=kup"), ("nyboard", b"/action?name=kup")):
             robot = Bittle(self.body, self.clock, Random(1), board=board)
             options = checked_bittle({"host": "10.0.0.5", "board": board})
             http = HttpConnector(MemoryConnector(self.clock, robot.accept_http), self.clock, board)
             word = self.word(BittleDriver(options, "dog", http, self.clock, self.switch), 1.5)
             self.assertEqual(word.address, ("10.0.0.5", 80))
-            self.assertTrue(word.halt.startswith(b"GET " + path + b" HTTP/1.1\r\n"))
-            self.assertTrue(word.halt.endswith(b"\r\n\r\n"))
+            self.assertTrue(word.data.startswith(b"GET " + path + b" HTTP/1.1\r\n"))
+            self.assertTrue(word.data.endswith(b"\r\n\r\n"))
 
     def test_rosbridge(self) -> None:
         """A ROS base gets a masked text frame with zero velocity, of the type to which it subscribes."""
@@ -347,24 +347,24 @@ class LastWordTests(RobotCase):
     def test_rosbridge_that_says_its_type_late(self) -> None:
         """If the message type is known only later, the halt message is updated."""
         robot = RosbridgeRobot(self.clock, self.body, Random(1), velocity_type="geometry_msgs/msg/TwistStamped")
-        robot.rosapi_s = ASK_S + 1.0
+        robot.rosapi_s = TYPE_TIMEOUT_S + 1.0
         driver = self.rosbridge(robot)
-        self.assertNotIn("twist", self.published(self.word(driver, ASK_S + 0.5)))
+        self.assertNotIn("twist", self.published(self.word(driver, TYPE_TIMEOUT_S + 0.5)))
         self.pass_time(1.0)
-        assert self.switch.word is not None
-        self.assertIn("twist", self.published(self.switch.word))
+        assert self.switch.command is not None
+        self.assertIn("twist", self.published(self.switch.command))
 
     def rosbridge(self, robot: RosbridgeRobot) -> RosbridgeDriver:
         robot.start()
         connector = MemoryConnector(self.clock, robot.accept)
         return RosbridgeDriver({}, connector, self.clock, "robot", self.switch)
 
-    def published(self, word: LastWord) -> dict[str, Any]:
-        head, size = word.halt[0], word.halt[1]
+    def published(self, word: HaltCommand) -> dict[str, Any]:
+        head, size = word.data[0], word.data[1]
         self.assertEqual(head, 0x81)
         at = 2 if size < 0x80 + 126 else 4
         self.assertGreaterEqual(size, 0x80)
-        said = json.loads(masked(word.halt[at + 4 :], word.halt[at : at + 4]))
+        said = json.loads(masked(word.data[at + 4 :], word.data[at : at + 4]))
         self.assertEqual((said["op"], said["topic"]), ("publish", "/cmd_vel"))
         message: dict[str, Any] = said["msg"]
         velocity = message.get("twist", message)
@@ -375,5 +375,5 @@ class LastWordTests(RobotCase):
         """A driver with links in memory has no switch process."""
         robot = Create2(self.body, self.clock, Random(1))
         connector = MemoryConnector(self.clock, robot.accept)
-        driver = driver_for("create2", {"port": "x"}, "robot", self.clock, connector)
+        driver = create_driver("create2", {"port": "x"}, "robot", self.clock, connector)
         self.assertNotIn("halts", driver.diagnostics())

@@ -10,7 +10,7 @@ from twisted.internet.task import Clock
 from twisted.trial.unittest import SynchronousTestCase
 
 from drivers.errors import UsageError
-from drivers.registry import describe, driver_for, kinds
+from drivers.registry import create_driver, describe, list_kinds
 
 EXAMPLE = Path(__file__).resolve().parents[2] / "examples" / "driver" / "robot.py"
 ENTRIES = """[swarm_node.drivers]
@@ -38,7 +38,7 @@ class ForeignTests(SynchronousTestCase):
     def refused(self, kind: str) -> str:
         """Return the one-line error of a refused kind."""
         lines = {
-            str(self.assertRaises(UsageError, driver_for, kind, {"host": "x"}, "dog1", Clock())),
+            str(self.assertRaises(UsageError, create_driver, kind, {"host": "x"}, "dog1", Clock())),
             str(self.assertRaises(UsageError, describe, kind, {"host": "x"})),
         }
         self.assertEqual(len(lines), 1)
@@ -49,15 +49,15 @@ class ForeignTests(SynchronousTestCase):
 
     def test_kinds_of_others_are_known(self) -> None:
         """An installed entry point is a kind like the built-in ones, and is imported only on use."""
-        self.assertLess({"rover", "torn", "gone", "aibo", "sim"}, set(kinds()))
+        self.assertLess({"rover", "torn", "gone", "aibo", "sim"}, set(list_kinds()))
         self.assertNotIn("rover_of_tests", sys.modules)
-        driver = driver_for("rover", {"host": "rover"}, "dog1", Clock())
+        driver = create_driver("rover", {"host": "rover"}, "dog1", Clock())
         self.assertEqual((driver.state, driver.description.kind), ("idle", "rover"))
         self.assertEqual(describe("rover", {"host": "rover"}), driver.description)
 
     def test_place_is_a_kind(self) -> None:
         """``module:Class`` needs no entry point."""
-        driver = driver_for("rover_of_tests:Rover", {"host": "rover"}, "dog1", Clock())
+        driver = create_driver("rover_of_tests:Rover", {"host": "rover"}, "dog1", Clock())
         self.assertEqual(driver.description, describe("rover_of_tests:Rover", {"host": "rover"}))
 
     def test_broken_ones_are_named_and_harm_nothing(self) -> None:
@@ -72,5 +72,5 @@ class ForeignTests(SynchronousTestCase):
 
     def test_built_in_kinds_stay(self) -> None:
         """An entry point with the name of a built-in kind does not replace it."""
-        self.assertEqual(driver_for("sim", {}, "dog1", Clock()).description.kind, "aibo-ers7")
-        self.assertEqual(kinds().count("sim"), 1)
+        self.assertEqual(create_driver("sim", {}, "dog1", Clock()).description.kind, "aibo-ers7")
+        self.assertEqual(list_kinds().count("sim"), 1)

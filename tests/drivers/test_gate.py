@@ -39,17 +39,17 @@ class GateTests(SynchronousTestCase):
     def test_says_when_to_stop(self) -> None:
         """A motion is over at its deadline, and never if there is none."""
         gate = Gate()
-        self.assertFalse(gate.is_over(5.0))
+        self.assertFalse(gate.is_motion_over(5.0))
         gate.admit(Permit(1, 2.0), now=1.0)
-        self.assertFalse(gate.is_over(1.999))
-        self.assertTrue(gate.is_over(2.0))
+        self.assertFalse(gate.is_motion_over(1.999))
+        self.assertTrue(gate.is_motion_over(2.0))
 
     def test_keeps_fencing_after_it_was_closed(self) -> None:
         """A stop ends the motion, but an old token is still refused."""
         gate = Gate()
         gate.admit(Permit(4, 2.0), now=1.0)
-        gate.close()
-        self.assertFalse(gate.is_over(3.0))
+        gate.end_motion()
+        self.assertFalse(gate.is_motion_over(3.0))
         self.assertRaises(StaleCommand, gate.admit, Permit(3, 9.0), 3.0)
 
     def test_learns_from_a_gate_further_down(self) -> None:

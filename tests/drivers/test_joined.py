@@ -1,4 +1,4 @@
-"""Tests of ``drivers.joined``: a Create 2 with additional sensors as one device."""
+"""Tests of ``drivers.composite``: a Create 2 with additional sensors as one device."""
 
 from __future__ import annotations
 
@@ -10,15 +10,15 @@ from twisted.internet.defer import Deferred, succeed
 from twisted.internet.interfaces import IReactorTime
 
 from drivers.base import BaseDriver
+from drivers.composite import CompositeDriver, combine_descriptions, combine_drivers
 from drivers.conformance import Conformance
 from drivers.create2.driver import Create2Driver
-from drivers.create2.option import checked
+from drivers.create2.option import parse_options
 from drivers.driver import Driver, Filming, Permit
 from drivers.errors import LinkLost, Unsupported, UsageError
-from drivers.joined import Joined, described, joined
-from drivers.link import Caller, Line, MemoryConnector
+from drivers.link import LinkClient, MemoryConnector, Reconnector
 from drivers.reading import Action, Description, Frame, Observation, Value
-from drivers.registry import describe, driver_for
+from drivers.registry import create_driver, describe
 from sim.robots.emulator.camera import MjpegCamera
 from sim.robots.emulator.compass import NmeaCompass
 from tests.drivers.contract import KeptLog
@@ -97,13 +97,13 @@ class JoinedTests(Conformance, Create2Case):
     def make_driver(self, **options: object) -> Driver:
         """Return a Create 2 with a camera, created by the registry."""
         camera = ("camera", {"source": str(self.folder), "fps": 10})
-        driver = driver_for("create2", {"port": "memory"}, "vacuum", self.clock, self.connector, [camera])
+        driver = create_driver("create2", {"port": "memory"}, "vacuum", self.clock, self.connector, [camera])
         self.drivers.append(driver)
         return driver
 
-    def with_parts(self, *parts: Driver) -> Joined:
-        main = Create2Driver(checked({"port": "memory"}), "vacuum", self.connector, self.clock)
-        driver = joined(main, parts, "vacuum")
+    def with_parts(self, *parts: Driver) -> CompositeDriver:
+        main = Create2Driver(parse_options({"port": "memory"}), "vacuum", self.connector, self.clock)
+        driver = combine_drivers(main, parts, "vacuum")
         self.drivers.append(driver)
         return driver
 
@@ -133,12 +133,12 @@ class JoinedTests(Conformance, Create2Case):
         ports = {81: MemoryConnector(self.clock, camera.accept), 10110: MemoryConnector(self.clock, compass.accept)}
 
         class Network:
-            def call(_self, host: str, port: int, caller: Caller) -> Line:  # noqa: N805
-                line: Line = ports.get(port, self.connector).call(host, port, caller)
+            def connect(_self, host: str, port: int, caller: LinkClient) -> Reconnector:  # noqa: N805
+                line: Reconnector = ports.get(port, self.connector).connect(host, port, caller)
                 return line
 
         parts = [("camera", {"url": "http://board:81/stream"}), ("compass", {"host": "board"})]
-        driver = driver_for("create2", {"port": "memory"}, "vacuum", self.clock, Network(), parts)
+        driver = create_driver("create2", {"port": "memory"}, "vacuum", self.clock, Network(), parts)
         self.drivers.append(driver)
         self.assertTrue({"camera", "compass", "bumper"} <= set(driver.description.capabilities))
         connected = driver.connect()
@@ -187,11 +187,11 @@ class JoinedTests(Conformance, Create2Case):
 
     def test_says_why_its_robot_is_not_heard(self) -> None:
         """A problem of the robot is reported as by its driver alone."""
-        main = Create2Driver(checked({"port": "memory"}), "vacuum", self.connector, self.clock)
-        driver = joined(main, [Part(self.clock)], "vacuum")
+        main = Create2Driver(parse_options({"port": "memory"}), "vacuum", self.connector, self.clock)
+        driver = combine_drivers(main, [Part(self.clock)], "vacuum")
         self.connector.is_open = False
         driver.connect().addErrback(lambda _: None)
-        main._name_problem("the cable is out")
+        main._set_problem("the cable is out")
         self.assertEqual((driver.problem, driver.token), ("the cable is out", 0))
         driver.disconnect()
 
@@ -218,7 +218,7 @@ class JoinedTests(Conformance, Create2Case):
     def test_keeps_what_is_the_robots(self) -> None:
         """The robot's keys and capabilities precede a part's; of two equal parts the first that is ready counts."""
         robot, part = Part(self.clock), Part(self.clock)
-        alone = joined(robot, [part], "post")
+        alone = combine_drivers(robot, [part], "post")
         alone.connect()
         robot.tell(compass_heading=1.0)
         part.tell(compass_heading=9.0, hum_hz=50.0)
@@ -293,7 +293,7 @@ class JoinedTests(Conformance, Create2Case):
     def test_leaves_its_parts_with_its_robot(self) -> None:
         """If the connection to the robot fails, the parts are disconnected as well."""
         main, part = Part(self.clock), Part(self.clock)
-        driver = joined(main, [part], "post")
+        driver = combine_drivers(main, [part], "post")
         connected = driver.connect()
         main.refuse()
         self.failureResultOf(connected, Unsupported)
@@ -310,7 +310,7 @@ class JoinedTests(Conformance, Create2Case):
                 return self.gone
 
         part = Slow(self.clock)
-        driver = joined(Part(self.clock), [part], "post")
+        driver = combine_drivers(Part(self.clock), [part], "post")
         connected = driver.connect()
         first, second = driver.disconnect(), driver.disconnect()
         self.failureResultOf(connected, LinkLost)
@@ -324,11 +324,13 @@ class JoinedTests(Conformance, Create2Case):
         """A robot that moves is refused as a part, and the error of an invalid part contains its number."""
         robot = ("bittle", {"port": "/dev/x"})
         compass = describe("camera", {})
-        self.assertIn("part 2", str(self.assertRaises(UsageError, described, compass, [compass, describe(*robot)])))
+        self.assertIn(
+            "part 2", str(self.assertRaises(UsageError, combine_descriptions, compass, [compass, describe(*robot)]))
+        )
         arguments = "create2", {"port": "memory"}, "vacuum"
         for parts, word in (([robot], "only sense"), ([("warp", {})], "warp"), ([("camera", {"fps": 0})], "fps")):
             for ask in (
-                lambda parts=parts: driver_for(*arguments, self.clock, self.connector, parts),
+                lambda parts=parts: create_driver(*arguments, self.clock, self.connector, parts),
                 lambda parts=parts: describe(*arguments, parts),
             ):
                 line = str(self.assertRaises(UsageError, ask))

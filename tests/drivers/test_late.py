@@ -14,17 +14,17 @@ from drivers.driver import Driver
 from drivers.link import MemoryConnector
 from sim.robots.emulator.aibo_dog import AiboEmulator
 from sim.robots.emulator.bittle import Bittle
-from sim.robots.emulator.body import MemoryBody
 from sim.robots.emulator.create2 import Create2
 from sim.robots.emulator.rosbridge import RosbridgeRobot
-from swarmnode.driver.ground import Ear
+from sim.robots.emulator.simulated_robot import MemoryRobot
+from swarmnode.driver.environment import WarningCollector
 from tests.drivers.contract import RobotCase
 
 FROZEN_S = 2.0
 
 
 @dataclass
-class WatchedBody(MemoryBody):
+class WatchedBody(MemoryRobot):
     """A base that records its velocities."""
 
     told: list[tuple[float, float, float]] = field(default_factory=list)
@@ -84,7 +84,7 @@ class LateTests(RobotCase):
 
     def test_silence_of_a_frozen_node_is_not_the_robots(self) -> None:
         """After a pause of the node, a driver does not treat an active robot as silent."""
-        ear = Ear()
+        ear = WarningCollector()
         self.addCleanup(ear.close)
         for phase in range(5):
             self.setUp()
@@ -104,7 +104,7 @@ class LateTests(RobotCase):
                 self.assertEqual(
                     [(one.state, one.diagnostics()["reconnects"]) for one in drivers], [("ready", 0.0)] * 3
                 )
-        self.assertEqual(ear.heard, [])
+        self.assertEqual(ear.warnings, [])
 
     def test_bittle_without_an_answer(self) -> None:
         """A gait without an answer is not requested again after its deadline."""

@@ -7,7 +7,7 @@ import math
 from drivers.conformance import Conformance
 from drivers.errors import LinkLost, NotEnabled
 from drivers.phone.driver import PhoneDriver
-from drivers.registry import describe, driver_for
+from drivers.registry import create_driver, describe
 from tests.drivers.contract import RobotCase
 
 JPEG = b"\xff\xd8 a picture \xff\xd9"
@@ -25,7 +25,7 @@ class PhoneDriverTests(Conformance, RobotCase):
         for _ in range(round(seconds / self.STEP_S)):
             self.clock.advance(self.STEP_S)
             for driver in self.drivers:
-                driver.look(JPEG, 208, 156, {})
+                driver.process_picture(JPEG, 208, 156, {})
 
     def test_says_what_it_has(self) -> None:
         """The capabilities contain the camera, and orientation and position if the browser reports them; no motion."""
@@ -35,20 +35,20 @@ class PhoneDriverTests(Conformance, RobotCase):
         upright = describe("phone", {"width": 120, "height": 208})
         self.assertEqual(list(upright.capabilities), ["camera"])
         self.assertEqual(upright.capabilities["camera"]["fov_v_deg"], 65.0)
-        self.assertIsInstance(driver_for("phone", {}, "anna", self.clock), PhoneDriver)
+        self.assertIsInstance(create_driver("phone", {}, "anna", self.clock), PhoneDriver)
 
     def test_tells_where_it_sees_the_target(self) -> None:
         """The page's measurements are in the observation with the frame; without a target they are NaN."""
         driver = self.make_driver()
-        driver.look(JPEG, 208, 156, {})
+        driver.process_picture(JPEG, 208, 156, {})
         self.assertIsNone(driver.observe(), "nothing is taken before connect")
         driver.connect()
-        driver.look(JPEG, 208, 156, {"target.bearing": 0.1, "target.distance": 0.5, "orientation.yaw": 2.0})
+        driver.process_picture(JPEG, 208, 156, {"target.bearing": 0.1, "target.distance": 0.5, "orientation.yaw": 2.0})
         seen = driver.observe()
         assert seen is not None and seen.frame is not None
         self.assertEqual((seen.values["target.distance"], seen.values["orientation.yaw"]), (0.5, 2.0))
         self.assertEqual((seen.frame.width, seen.frame.height, seen.frame.data), (208, 156, JPEG))
-        driver.look(JPEG, 208, 156, {})
+        driver.process_picture(JPEG, 208, 156, {})
         seen = driver.observe()
         assert seen is not None
         self.assertTrue(math.isnan(float(seen.values["target.bearing"])))

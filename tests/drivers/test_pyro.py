@@ -15,7 +15,7 @@ from drivers.errors import StaleCommand, Unsupported, UsageError
 from drivers.link import MemoryConnector
 from drivers.pyro.brain import Brain, Engine
 from drivers.pyro.camera import Camera
-from drivers.pyro.device import Geometry, Rows, SensorValue, ranger_of
+from drivers.pyro.device import Geometry, SensorArray, SensorValue, make_ranger
 from drivers.pyro.robot import TTL_S, PyroRobot
 from drivers.reading import Frame, Value
 from drivers.registry import describe
@@ -113,12 +113,12 @@ class MotionTests(_Lab):
     def test_pressed_switch_is_no_error_of_the_brain(self) -> None:
         """A pressed emergency stop halts the dog without an exception; it moves again only after ``connect``."""
         self.pyro.move(0.5, 0.0)
-        self.robot.press()
+        self.robot.press_back_button()
         self.pass_time(0.2)
         self.pyro.update()
         self.pyro.move(0.5, 0.0)
         self.assertEqual(self.moved(), (0.0, 0.0, 0.0))
-        self.robot.press()
+        self.robot.press_back_button()
         self.pass_time(0.2)
         self.pyro.update()
         self.pyro.move(0.5, 0.0)
@@ -244,11 +244,11 @@ class DeviceTests(_Lab):
         for n, (data, blob) in enumerate(
             ((picture(70), (70, 32, 85, 47, 256)), (picture(5, (0, 0, 0)), (0, 0, 0, 0, 0)))
         ):
-            camera.see(Frame(900 + n, 104, 80, data, 0.0))
+            camera.process_frame(Frame(900 + n, 104, 80, data, 0.0))
             self.assertEqual(camera.filterResults, [blob[4], [blob]])
         self.assertEqual((camera.width, camera.height, camera.depth, len(camera.data)), (104, 80, 3, 104 * 80 * 3))
         bad = camera.bad_pictures
-        camera.see(Frame(950, 104, 80, b"noise", 0.0))
+        camera.process_frame(Frame(950, 104, 80, b"noise", 0.0))
         self.assertEqual(camera.bad_pictures, bad + 1)
         self.assertRaises(AttributeError, camera.addFilter, "fid")
         camera.clearFilters()
@@ -270,8 +270,8 @@ class FilterTests(SynchronousTestCase):
         image[10:20, 10:20] = (42, 32, 190)
         image[40:60, 40:60] = (250, 0, 0)
         frame = Frame(1, 104, 80, encoded(image), 0.0)
-        camera.see(frame)
-        camera.see(frame)
+        camera.process_frame(frame)
+        camera.process_frame(frame)
         self.assertEqual(camera.pictures, 1)
         self.assertEqual(camera.filterResults, [[(40, 40, 59, 59, 400), (10, 10, 19, 19, 100)]])
 
@@ -305,8 +305,8 @@ class ScanTests(SynchronousTestCase):
         """The sectors of a scan are ordered from the left clockwise, with the groups of Pyro."""
         names = ("front", "front_left", "left", "back", "right", "front_right")
         values: dict[str, Value] = {f"range.{name}": 0.1 * n for n, name in enumerate(names)}
-        scan = ranger_of(describe("rosbridge", {}), values)
-        assert isinstance(scan, Rows)
+        scan = make_ranger(describe("rosbridge", {}), values)
+        assert isinstance(scan, SensorArray)
         scan.update(values, 0.0)
         self.assertEqual((scan.type, len(scan)), ("laser", 6))
         self.assertEqual(scan.angle(), sorted(scan.angle(), key=lambda angle: -(angle or 0.0)))

@@ -14,7 +14,7 @@ from twisted.trial.unittest import SynchronousTestCase
 
 from drivers.pyro.brain import Engine
 from drivers.pyro.robot import PyroRobot
-from sim.robots.scene import FOOTPRINT
+from sim.robots.scene import FOOTPRINT_RADIUS_M
 
 EXAMPLES = Path(__file__).parents[2] / "examples" / "pyro"
 STEP_S = 0.008
@@ -72,7 +72,7 @@ class BrainTests(SynchronousTestCase):
             pen = self.played(self.avoid.INIT, seed, 60.0, watch)
             wide, high = pen.world.scene.width, pen.world.scene.height
             nearest = min(min(x, wide - x, y, high - y) for x, y in places)
-            self.assertGreater(nearest, FOOTPRINT + 0.005, seed)
+            self.assertGreater(nearest, FOOTPRINT_RADIUS_M + 0.005, seed)
             way = sum(math.dist(a, b) for a, b in zip(places, places[1:], strict=False))
             self.assertGreater(way, 3.0, seed)
 

@@ -14,7 +14,7 @@ from twisted.trial.unittest import SynchronousTestCase
 
 import drivers
 from drivers.errors import UsageError
-from drivers.registry import built_in_kinds, describe, driver_for, kinds
+from drivers.registry import create_driver, describe, list_built_in_kinds, list_kinds
 
 NEEDED: dict[str, dict[str, object]] = {
     "aibo": {"host": "dog1"},
@@ -26,7 +26,7 @@ NEEDED: dict[str, dict[str, object]] = {
 """The required options of each kind."""
 NO_NUMBERS = (True, math.nan)
 WRONG: list[tuple[str, str, object]] = [
-    *((kind, "colour", "red") for kind in built_in_kinds()),
+    *((kind, "colour", "red") for kind in list_built_in_kinds()),
     *(("aibo", "host", value) for value in (7, "")),
     *(("aibo", "camera_fps", value) for value in (31, *NO_NUMBERS)),
     *(("aibo", "speed", value) for value in ([1.0], [0.0, 1.0, 1.0, 1.0], "fast")),
@@ -76,16 +76,16 @@ class RegistryTests(SynchronousTestCase):
     def test_makes_a_driver(self) -> None:
         """A new driver of each kind is idle and has the registry's description."""
         connector: Any = object()
-        for kind in built_in_kinds():
+        for kind in list_built_in_kinds():
             options = NEEDED.get(kind, {})
-            driver = driver_for(kind, options, "dog2", Clock(), connector)
+            driver = create_driver(kind, options, "dog2", Clock(), connector)
             self.assertEqual((driver.state, driver.description), ("idle", describe(kind, options, "dog2")), kind)
 
     def test_every_kind_is_complete(self) -> None:
         """Each driver package is found, has a docstring, and has both functions that the registry calls."""
         folder = Path(drivers.__file__).parent
-        self.assertEqual(sorted(built_in_kinds()), sorted(file.parent.name for file in folder.glob("*/driver.py")))
-        for kind in built_in_kinds():
+        self.assertEqual(sorted(list_built_in_kinds()), sorted(file.parent.name for file in folder.glob("*/driver.py")))
+        for kind in list_built_in_kinds():
             module = import_module(f"drivers.{kind}.driver")
             missing = [name for name in ("make_driver", "describe") if not callable(getattr(module, name, None))]
             self.assertEqual((kind, missing), (kind, []))
@@ -93,8 +93,8 @@ class RegistryTests(SynchronousTestCase):
 
     def test_names_the_known_kinds(self) -> None:
         """An unknown kind raises a usage error with the known kinds."""
-        for ask in (lambda: driver_for("warp", {}, "dog1", Clock()), lambda: describe("warp", {})):
-            self.assertIn("known are " + ", ".join(kinds()), str(self.assertRaises(UsageError, ask)))
+        for ask in (lambda: create_driver("warp", {}, "dog1", Clock()), lambda: describe("warp", {})):
+            self.assertIn("known are " + ", ".join(list_kinds()), str(self.assertRaises(UsageError, ask)))
 
     def test_names_the_wrong_option(self) -> None:
         """Each invalid option is refused with one line that names its key and a remedy."""
@@ -118,7 +118,7 @@ class RegistryTests(SynchronousTestCase):
             "import drivers.registry as r; assert 'drivers.sim.driver' not in sys.modules\n"
             "r.describe('sim', {}); r.driver_for('sim', {}, 'dog1', None)\n"
             "for kind in ('create2', 'bittle'): r.driver_for(kind, {'port': '/dev/x'}, 'robot', Clock())\n"
-            "import drivers.sim.operator; unwanted = {'cv2', 'numpy', 'pymunk', 'serial', 'twisted.internet.reactor'}\n"
+            "import drivers.sim.client; unwanted = {'cv2', 'numpy', 'pymunk', 'serial', 'twisted.internet.reactor'}\n"
             "heavy = unwanted & set(sys.modules)\n"
             "assert not heavy, heavy"
         )

@@ -13,7 +13,7 @@ from twisted.trial.unittest import SynchronousTestCase
 
 from drivers.errors import BadFrame
 from drivers.rosbridge import codec
-from drivers.rosbridge.codec import Answered, Published, Status, decoded, encoded
+from drivers.rosbridge.codec import ServiceResponse, Status, TopicMessage, decode_message, encode_operation
 
 JPEG = b"\xff\xd8\xff\xc0\x00\x0b\x08\x00\x60\x00\x80\x01\x11\x00\x00\xff\xd9"
 STILL = {"linear": {"x": 0, "y": 0, "z": 0}, "angular": {"x": 0, "y": 0, "z": 0}}
@@ -59,26 +59,28 @@ class SayingTests(SynchronousTestCase):
         """Advertise, publish, subscribe and call_service are encoded as in ROSBRIDGE_PROTOCOL.md."""
         vectors = (
             (
-                encoded("advertise", topic="/cmd_vel", type="geometry_msgs/Twist"),
+                encode_operation("advertise", topic="/cmd_vel", type="geometry_msgs/Twist"),
                 b'{"op":"advertise","topic":"/cmd_vel","type":"geometry_msgs/Twist"}',
             ),
             (
-                encoded("publish", topic="/cmd_vel", msg=codec.twist(0.1, 0.0, -0.5)),
+                encode_operation("publish", topic="/cmd_vel", msg=codec.make_twist(0.1, 0.0, -0.5)),
                 b'{"op":"publish","topic":"/cmd_vel","msg":{"linear":{"x":0.1,"y":0.0,"z":0.0},'
                 b'"angular":{"x":0.0,"y":0.0,"z":-0.5}}}',
             ),
             (
-                encoded("publish", topic="/cmd_vel", msg=codec.twist_stamped(0.1, 0.0, 0.0)),
+                encode_operation("publish", topic="/cmd_vel", msg=codec.make_twist_stamped(0.1, 0.0, 0.0)),
                 b'{"op":"publish","topic":"/cmd_vel","msg":{"header":{"stamp":{"sec":0,"nanosec":0},'
                 b'"frame_id":"base_link"},"twist":{"linear":{"x":0.1,"y":0.0,"z":0.0},'
                 b'"angular":{"x":0.0,"y":0.0,"z":0.0}}}}',
             ),
             (
-                encoded("subscribe", topic="/odom", type="nav_msgs/Odometry", throttle_rate=50, queue_length=1),
+                encode_operation(
+                    "subscribe", topic="/odom", type="nav_msgs/Odometry", throttle_rate=50, queue_length=1
+                ),
                 b'{"op":"subscribe","topic":"/odom","type":"nav_msgs/Odometry","throttle_rate":50,"queue_length":1}',
             ),
             (
-                encoded("call_service", id="1", service="/rosapi/topic_type", args={"topic": "/cmd_vel"}),
+                encode_operation("call_service", id="1", service="/rosapi/topic_type", args={"topic": "/cmd_vel"}),
                 b'{"op":"call_service","id":"1","service":"/rosapi/topic_type","args":{"topic":"/cmd_vel"}}',
             ),
         )
@@ -87,7 +89,7 @@ class SayingTests(SynchronousTestCase):
 
     def test_never_says_what_is_no_number(self) -> None:
         """NaN, which JSON lacks, raises ValueError."""
-        self.assertRaises(ValueError, encoded, "publish", msg=codec.twist(math.nan, 0.0, 0.0))
+        self.assertRaises(ValueError, encode_operation, "publish", msg=codec.make_twist(math.nan, 0.0, 0.0))
 
 
 class HearingTests(SynchronousTestCase):
@@ -95,14 +97,14 @@ class HearingTests(SynchronousTestCase):
 
     def test_reads_the_operations_of_the_protocol(self) -> None:
         """Publications, service responses of both results, and status messages are decoded."""
-        self.assertEqual(decoded(b'{"op":"publish","topic":"/a","msg":{"b":1}}'), Published("/a", {"b": 1}))
+        self.assertEqual(decode_message(b'{"op":"publish","topic":"/a","msg":{"b":1}}'), TopicMessage("/a", {"b": 1}))
         said = b'{"op":"service_response","id":"7","service":"/s","values":{"type":"x"},"result":true}'
-        self.assertEqual(decoded(said), Answered("7", {"type": "x"}, True))
+        self.assertEqual(decode_message(said), ServiceResponse("7", {"type": "x"}, True))
         said = b'{"op":"service_response","id":"7","values":"no such service","result":false}'
-        self.assertEqual(decoded(said), Answered("7", {"error": "no such service"}, False))
+        self.assertEqual(decode_message(said), ServiceResponse("7", {"error": "no such service"}, False))
         said = b'{"op":"service_response","id":"7"}'
-        self.assertEqual(decoded(said), Answered("7", {"error": "no reason given"}, True))
-        self.assertEqual(decoded(b'{"op":"status","level":"error","msg":"oh"}'), Status("error", "oh"))
+        self.assertEqual(decode_message(said), ServiceResponse("7", {"error": "no reason given"}, True))
+        self.assertEqual(decode_message(b'{"op":"status","level":"error","msg":"oh"}'), Status("error", "oh"))
 
     def test_refuses_what_is_no_operation(self) -> None:
         """Invalid bytes, JSON and operations raise BadFrame, for each depth and size."""
@@ -111,13 +113,13 @@ class HearingTests(SynchronousTestCase):
             *(b'{"op":"publish","topic":1,"msg":{}}', b'{"op":"publish","topic":"/a","msg":[]}'),
             *(b'{"op":"service_response","id":7,"values":{}}', b"[" * 100_000, b'{"op":' + b"9" * 5000 + b"}"),
         ):
-            self.assertRaises(BadFrame, decoded, said)
+            self.assertRaises(BadFrame, decode_message, said)
 
     @given(st.binary(max_size=60))
     def test_any_bytes(self, data: bytes) -> None:
         """Random bytes give a message or BadFrame, and no other exception."""
         try:
-            decoded(data)
+            decode_message(data)
         except BadFrame:
             return
 
@@ -126,7 +128,7 @@ class HearingTests(SynchronousTestCase):
         """Random JSON, with the NaN and Infinity of old versions, gives a message or BadFrame."""
         for whole in (said, {"op": "publish", "topic": "/a", "msg": said}, {"op": "service_response", "id": said}):
             try:
-                decoded(json.dumps(whole).encode())
+                decode_message(json.dumps(whole).encode())
             except BadFrame:
                 continue
 
@@ -136,12 +138,12 @@ class ReadingTests(SynchronousTestCase):
 
     def test_odometry(self) -> None:
         """Odometry gives position, heading and velocity; ``base.moving`` is false below a threshold."""
-        values = codec.odometry(ODOMETRY)
+        values = codec.convert_odometry(ODOMETRY)
         self.assertEqual((values["odom.x"], values["odom.y"], values["base.moving"]), (1.0, -2.5, True))
         self.assertAlmostEqual(abs(float(values["odom.yaw"])), math.pi)
         self.assertEqual((values["base.vx"], values["base.vy"], values["base.wz"]), (0.1, 0.0, -0.5))
         still = spoilt(ODOMETRY, ("twist", "twist"), STILL)
-        self.assertIs(codec.odometry(still)["base.moving"], False)
+        self.assertIs(codec.convert_odometry(still)["base.moving"], False)
 
     def test_absurd_odometry(self) -> None:
         """Null, NaN, infinite, too large and missing values, and a zero quaternion raise BadFrame."""
@@ -152,28 +154,28 @@ class ReadingTests(SynchronousTestCase):
         ):
             values: tuple[Any, ...] = (None, math.nan, math.inf, -math.inf, 1e9, 10**400, True, "1", [], {})
             for value in values:
-                self.assertRaises(BadFrame, codec.odometry, spoilt_python(ODOMETRY, path, value))
+                self.assertRaises(BadFrame, codec.convert_odometry, spoilt_python(ODOMETRY, path, value))
         zero = {"x": 0, "y": 0, "z": 0, "w": 0}
-        self.assertRaises(BadFrame, codec.odometry, spoilt(ODOMETRY, ("pose", "pose", "orientation"), zero))
+        self.assertRaises(BadFrame, codec.convert_odometry, spoilt(ODOMETRY, ("pose", "pose", "orientation"), zero))
 
     def test_scan(self) -> None:
         """Each sector gives its nearest echo; null, 0.0 and values out of range are ignored; an offset turns it."""
-        values = codec.scan(SCAN, SECTORS)
+        values = codec.convert_scan(SCAN, SECTORS)
         self.assertEqual((values["range.right"], values["range.front"]), (1.0, 0.5))
         self.assertTrue(math.isnan(float(values["range.left"])))
-        turned = codec.scan(SCAN, SECTORS, math.pi / 2)
+        turned = codec.convert_scan(SCAN, SECTORS, math.pi / 2)
         self.assertEqual((turned["range.front"], turned["range.left"]), (1.0, 0.5))
         raw = {**SCAN, "ranges": [math.nan, math.inf, -math.inf, 0.7, 0.2]}
-        self.assertEqual([codec.scan(raw, SECTORS)[f"range.{name}"] for name in ("front", "left")], [0.7, 0.2])
+        self.assertEqual([codec.convert_scan(raw, SECTORS)[f"range.{name}"] for name in ("front", "left")], [0.7, 0.2])
 
     def test_absurd_scan(self) -> None:
         """A scan with missing, too many or invalid ranges, or invalid limits, raises BadFrame."""
         for key, value in (
             *(("ranges", None), ("ranges", []), ("ranges", "0.5"), ("ranges", [0.5, "x"]), ("ranges", [True])),
-            *(("ranges", [1.0] * (codec.MOST_READINGS + 1)), ("angle_increment", 0.0), ("angle_min", None)),
+            *(("ranges", [1.0] * (codec.MAX_READINGS + 1)), ("angle_increment", 0.0), ("angle_min", None)),
             *(("range_min", -1.0), ("range_max", 0.05), ("range_max", None)),
         ):
-            self.assertRaises(BadFrame, codec.scan, {**SCAN, key: value}, SECTORS)
+            self.assertRaises(BadFrame, codec.convert_scan, {**SCAN, key: value}, SECTORS)
 
     def test_imu(self) -> None:
         """The acceleration is always given, the attitude unless its covariance marks it as unknown."""
@@ -182,53 +184,53 @@ class ReadingTests(SynchronousTestCase):
             "linear_acceleration": {"x": 0.1, "y": 0, "z": 9.8},
             "orientation": {"x": turn[0], "y": 0, "z": 0, "w": turn[1]},
         }
-        values = codec.imu(said)
+        values = codec.convert_imu(said)
         self.assertEqual((values["imu.ax"], values["imu.az"]), (0.1, 9.8))
         self.assertAlmostEqual(float(values["imu.roll"]), math.pi / 6)
         self.assertAlmostEqual(float(values["imu.pitch"]), 0.0)
-        self.assertNotIn("imu.yaw", codec.imu({**said, "orientation_covariance": [-1, 0, 0]}))
-        self.assertRaises(BadFrame, codec.imu, {"linear_acceleration": {"x": 0, "y": 0, "z": 2000}})
+        self.assertNotIn("imu.yaw", codec.convert_imu({**said, "orientation_covariance": [-1, 0, 0]}))
+        self.assertRaises(BadFrame, codec.convert_imu, {"linear_acceleration": {"x": 0, "y": 0, "z": 2000}})
 
     def test_battery(self) -> None:
         """Known values are given, null and NaN are omitted; a level above full raises BadFrame with the option."""
         said = {"voltage": 11.5, "current": None, "percentage": 0.8, "power_supply_status": 1}
-        self.assertEqual(codec.battery(said), {"power.volts": 11.5, "power.level": 0.8, "power.charging": True})
-        self.assertEqual(codec.battery({"percentage": 80.0}, 100.0)["power.level"], 0.8)
-        self.assertEqual(codec.battery({"percentage": 1.005})["power.level"], 1.0)
-        self.assertIn("battery_full", str(self.assertRaises(BadFrame, codec.battery, {"percentage": 80.0})))
+        self.assertEqual(codec.convert_battery(said), {"power.volts": 11.5, "power.level": 0.8, "power.charging": True})
+        self.assertEqual(codec.convert_battery({"percentage": 80.0}, 100.0)["power.level"], 0.8)
+        self.assertEqual(codec.convert_battery({"percentage": 1.005})["power.level"], 1.0)
+        self.assertIn("battery_full", str(self.assertRaises(BadFrame, codec.convert_battery, {"percentage": 80.0})))
         wrong: tuple[dict[str, Any], ...] = ({}, {"percentage": math.nan}, {"percentage": -1}, {"voltage": 1e9})
         for each in wrong:
-            self.assertRaises(BadFrame, codec.battery, each)
+            self.assertRaises(BadFrame, codec.convert_battery, each)
 
     def test_picture(self) -> None:
         """A complete JPEG is decoded from base64 with its size; other data raises BadFrame with the format."""
         said = {"format": "jpeg", "data": base64.b64encode(JPEG).decode()}
-        self.assertEqual(codec.picture(said), (JPEG, 128, 96))
+        self.assertEqual(codec.decode_picture(said), (JPEG, 128, 96))
         png = base64.b64encode(b"\x89PNG").decode()
-        self.assertIn("png", str(self.assertRaises(BadFrame, codec.picture, {"format": "png", "data": png})))
+        self.assertIn("png", str(self.assertRaises(BadFrame, codec.decode_picture, {"format": "png", "data": png})))
         cut = base64.b64encode(JPEG[:-1]).decode()
         for data in (None, [255, 216], "&&", "\u20ac", "/9j", cut):
-            self.assertRaises(BadFrame, codec.picture, {"format": "jpeg", "data": data})
+            self.assertRaises(BadFrame, codec.decode_picture, {"format": "jpeg", "data": data})
 
     def test_stamp(self) -> None:
         """The stamps of ROS 1 and 2 are read; an invalid one gives None."""
-        self.assertEqual(codec.stamp(ODOMETRY), 12.5)
-        self.assertEqual(codec.stamp({"header": {"stamp": {"secs": 3, "nsecs": 0}}}), 3.0)
+        self.assertEqual(codec.read_stamp(ODOMETRY), 12.5)
+        self.assertEqual(codec.read_stamp({"header": {"stamp": {"secs": 3, "nsecs": 0}}}), 3.0)
         for at in (None, 3, {"sec": 1.5, "nanosec": 0}, {"sec": -1, "nanosec": 0}, {"sec": 1, "nanosec": 10**9}):
-            self.assertIsNone(codec.stamp({"header": {"stamp": at}}))
-        self.assertIsNone(codec.stamp({"header": None}))
+            self.assertIsNone(codec.read_stamp({"header": {"stamp": at}}))
+        self.assertIsNone(codec.read_stamp({"header": None}))
 
     @given(st.data(), ANY)
     def test_any_field(self, data: st.DataObject, value: Any) -> None:
         """A message with any value in any field gives finite numbers, booleans and strings, or BadFrame."""
         readers = (
-            (codec.odometry, ODOMETRY),
-            (lambda said: codec.scan(said, SECTORS), SCAN),
-            (codec.battery, {"voltage": 11.5, "percentage": 0.8, "power_supply_status": 1}),
+            (codec.convert_odometry, ODOMETRY),
+            (lambda said: codec.convert_scan(said, SECTORS), SCAN),
+            (codec.convert_battery, {"voltage": 11.5, "percentage": 0.8, "power_supply_status": 1}),
         )
         read, message = data.draw(st.sampled_from(readers))
         said = spoilt_python(message, data.draw(st.sampled_from(paths(message))), value)
-        codec.stamp(said)
+        codec.read_stamp(said)
         try:
             values = read(said)
         except BadFrame:

@@ -10,8 +10,8 @@ from drivers.conformance import Conformance
 from drivers.errors import LinkLost, NoReply, RobotError, Unsupported
 from drivers.link import Link, MemoryConnector
 from drivers.registry import describe
-from drivers.rosbridge.driver import CALL_S, SOURCE_S, RosbridgeDriver
-from drivers.rosbridge.link import SILENCE_S
+from drivers.rosbridge.driver import MESSAGE_TTL_S, SERVICE_TIMEOUT_S, RosbridgeDriver
+from drivers.rosbridge.link import ANSWER_TIMEOUT_S
 from sim.robots.emulator.rosbridge import RosbridgeRobot
 from tests.drivers.contract import KeptLog, RobotCase
 
@@ -47,7 +47,7 @@ class RosbridgeDriverTests(Conformance, RobotCase):
             driver.act({"base.vx": 0.2, "base.wz": -0.5}, self.permit())
             self.pass_time(0.1)
             self.assertEqual(self.body.motion, (0.2, 0.0, -0.5), kind)
-            self.assertEqual(self.robot.ignored, 0)
+            self.assertEqual(self.robot.ignored_count, 0)
             driver.disconnect()
             self.pass_time(0.1)
 
@@ -107,7 +107,7 @@ class RosbridgeDriverTests(Conformance, RobotCase):
         driver.connect()
         self.pass_time(0.3)
         self.assertIn('velocity_type = "twist"', warnings[0])
-        self.assertGreater(self.robot.ignored, 0)
+        self.assertGreater(self.robot.ignored_count, 0)
 
     def test_says_the_velocity_again_and_zero_at_the_end(self) -> None:
         """The velocity is published ten times a second; at the deadline zero is published once, then nothing."""
@@ -174,7 +174,7 @@ class RosbridgeDriverTests(Conformance, RobotCase):
         driver = self.ready()
         for client in self.robot._clients:
             client._topics.pop("/scan")
-        self.pass_time(SOURCE_S - 0.5)
+        self.pass_time(MESSAGE_TTL_S - 0.5)
         self.assertIn("range.front", self.values(driver))
         self.assertGreater(driver.diagnostics()["age.scan"], 1.0)
         self.pass_time(1.0)
@@ -213,7 +213,7 @@ class RosbridgeDriverTests(Conformance, RobotCase):
         self.pass_time(1.0)
         self.robot.faults.half_open = True
         late = driver.invoke("dock")
-        self.pass_time(SILENCE_S + CALL_S + 1.0)
+        self.pass_time(ANSWER_TIMEOUT_S + SERVICE_TIMEOUT_S + 1.0)
         self.failureResultOf(late, LinkLost)
 
     def test_counts_what_rosbridge_complains_about(self) -> None:
@@ -221,10 +221,10 @@ class RosbridgeDriverTests(Conformance, RobotCase):
         driver = self.ready()
         driver.log = log = KeptLog()
         for _ in range(2):
-            driver.bridge_said(b'{"op":"status","level":"error","msg":"no such type"}')
-            driver.bridge_said(b'{"op":"status","level":"info","msg":"hello"}')
-            driver.bridge_said(b'{"op":"publish","topic":"/rosout","msg":{}}')
-            driver.bridge_said(b'{"op":"service_response","id":"call:99","values":{}}')
+            driver.bridge_received(b'{"op":"status","level":"error","msg":"no such type"}')
+            driver.bridge_received(b'{"op":"status","level":"info","msg":"hello"}')
+            driver.bridge_received(b'{"op":"publish","topic":"/rosout","msg":{}}')
+            driver.bridge_received(b'{"op":"service_response","id":"call:99","values":{}}')
         self.assertEqual((driver.diagnostics()["refused"], driver.diagnostics()["bad_frames"]), (2, 0))
         self.assertEqual(log.lines, ["robot: rosbridge says: no such type"])
 
@@ -236,7 +236,7 @@ class RosbridgeDriverTests(Conformance, RobotCase):
             def __init__(self, link: Link) -> None:
                 self.link = link
 
-            def received(self, data: bytes) -> None:
+            def data_received(self, data: bytes) -> None:
                 calls.append(self_.clock.seconds())
                 self.link.send(b"HTTP/1.1 404 Not Found\r\n\r\n")
                 if is_curt:
@@ -277,7 +277,7 @@ class RosbridgeDriverTests(Conformance, RobotCase):
         self.robot.faults.half_open = True
         self.pass_time(0.7)
         self.assertEqual(driver.state, "stale")
-        self.pass_time(SILENCE_S + 2.0)
+        self.pass_time(ANSWER_TIMEOUT_S + 2.0)
         self.assertGreater(driver.diagnostics()["faults"], 0)
         self.robot.faults.half_open = False
         self.pass_time(9.0)

@@ -5,7 +5,7 @@ from __future__ import annotations
 from twisted.trial.unittest import SynchronousTestCase
 
 from drivers.rosbridge.websocket import WebSocket
-from formats.head import MAX_HEAD
+from formats.head import MAX_HEAD_BYTES
 from tests.formats.rfc6455 import answer_to
 
 
@@ -15,7 +15,7 @@ class GreetingTests(SynchronousTestCase):
         said = WebSocket("server.example.com", "/chat").opening()
         self.assertTrue(said.startswith(b"GET /chat HTTP/1.1\r\nHost: server.example.com\r\n"))
         server = WebSocket()
-        self.assertTrue(server.received(said)[1].startswith(b"HTTP/1.1 101 "))
+        self.assertTrue(server.receive_data(said)[1].startswith(b"HTTP/1.1 101 "))
         self.assertTrue(server.is_open)
 
     def test_names_what_answers_instead(self) -> None:
@@ -24,18 +24,18 @@ class GreetingTests(SynchronousTestCase):
             (b"HTTP/1.1 404 Not Found\r\n\r\n", "404"),
             (b"SSH-2.0-OpenSSH_9\r\n\r\n", "SSH-2.0"),
             (answer_to(WebSocket("x").opening()), "no rosbridge"),
-            (b"HTTP/1.1 1" + b"0" * (MAX_HEAD + 1), "no end"),
+            (b"HTTP/1.1 1" + b"0" * (MAX_HEAD_BYTES + 1), "no end"),
         ):
             one = WebSocket("h")
             answer = answer_to(one.opening())
-            self.assertEqual(one.received(said), ([], b""))
+            self.assertEqual(one.receive_data(said), ([], b""))
             self.assertIn(reason, one.fault)
             self.assertFalse(one.is_open)
-            self.assertEqual(one.received(answer), ([], b""))
+            self.assertEqual(one.receive_data(answer), ([], b""))
 
     def test_turns_a_browser_away(self) -> None:
         """A request without the upgrade or without a key gets status 400."""
         for said in (b"GET / HTTP/1.1\r\nHost: h\r\n\r\n", b"POST / HTTP/1.1\r\nUpgrade: websocket\r\n\r\n"):
             one = WebSocket()
-            self.assertTrue(one.received(said)[1].startswith(b"HTTP/1.1 400"))
+            self.assertTrue(one.receive_data(said)[1].startswith(b"HTTP/1.1 400"))
             self.assertTrue(one.fault)

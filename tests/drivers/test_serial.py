@@ -11,8 +11,8 @@ from twisted.internet.testing import StringTransport
 from twisted.python.failure import Failure
 from twisted.trial.unittest import SynchronousTestCase
 
-from drivers.link import LAST_RETRY_S, Link
-from drivers.serial import BACKLOG, FLUSH_S, SerialConnector, SerialLine, problem_of
+from drivers.link import MAX_RETRY_S, Link
+from drivers.serial import FLUSH_TIMEOUT_S, MAX_BACKLOG_BYTES, SerialConnector, SerialReconnector, describe_problem
 
 
 class Device(StringTransport):
@@ -76,12 +76,12 @@ class SerialTests(SynchronousTestCase):
     def link_down(self) -> None:
         self.downs += 1
 
-    def received(self, data: bytes) -> None:
+    def data_received(self, data: bytes) -> None:
         self.heard.append(data)
 
-    def line(self) -> SerialLine:
-        line = SerialConnector(self.clock, self.opened).call("/dev/robot", 115200, self)
-        assert isinstance(line, SerialLine)
+    def line(self) -> SerialReconnector:
+        line = SerialConnector(self.clock, self.opened).connect("/dev/robot", 115200, self)
+        assert isinstance(line, SerialReconnector)
         return line
 
     def test_carries_bytes_both_ways(self) -> None:
@@ -92,7 +92,7 @@ class SerialTests(SynchronousTestCase):
         self.devices[0].link.dataReceived(b"hello")
         self.links[0].send(b"there")
         self.assertIs(self.links[0].is_busy, False)
-        self.links[0].send(b"." * BACKLOG)
+        self.links[0].send(b"." * MAX_BACKLOG_BYTES)
         self.assertIs(self.links[0].is_busy, True)
         self.devices[0].flush()
         self.assertEqual((self.heard, self.devices[0].value()[:5]), ([b"hello"], b"there"))
@@ -114,21 +114,21 @@ class SerialTests(SynchronousTestCase):
             self.assertNotIn("\n", line.problem)
         times = [at for _, _, at in self.asked]
         self.assertLess(times[1] - times[0], 0.2)
-        self.assertTrue(1.8 < times[-1] - times[-2] <= LAST_RETRY_S + 0.2)
+        self.assertTrue(1.8 < times[-1] - times[-2] <= MAX_RETRY_S + 0.2)
         self.error = None
         self.clock.pump([0.1] * 30)
         self.assertEqual((line.problem, len(self.links)), ("", 1))
 
     def test_names_errors_without_a_number(self) -> None:
         """An unknown error is reported with its text, and one caused by a system error with the system's."""
-        self.assertIn("strange baud", problem_of(ValueError("strange\nbaud")))
+        self.assertIn("strange baud", describe_problem(ValueError("strange\nbaud")))
         try:
             try:
                 raise OSError(errno.EACCES, "no")
             except OSError:
                 raise ValueError("could not open") from None
         except ValueError as error:
-            self.assertIn("no permission", problem_of(error))
+            self.assertIn("no permission", describe_problem(error))
 
     def test_opens_again_after_a_pulled_cable(self) -> None:
         """A lost device is reported and opened again; data sent in between is lost."""
@@ -146,13 +146,13 @@ class SerialTests(SynchronousTestCase):
         line = self.line()
         self.clock.advance(0.0)
         self.links[0].send(b"stop")
-        gone = line.hang_up()
-        line.hang_up()
+        gone = line.disconnect()
+        line.disconnect()
         self.assertNoResult(gone)
         self.devices[0].flush()
         self.successResultOf(gone)
         self.assertEqual((self.devices[0].value(), self.downs), (b"stop", 1))
-        self.successResultOf(line.hang_up())
+        self.successResultOf(line.disconnect())
         self.assertEqual(self.clock.getDelayedCalls(), [])
 
     def test_hangs_up_on_a_device_that_takes_nothing(self) -> None:
@@ -160,9 +160,9 @@ class SerialTests(SynchronousTestCase):
         line = self.line()
         self.clock.advance(0.0)
         self.links[0].send(b"stop")
-        gone = line.hang_up()
-        line.hang_up()
-        self.clock.advance(FLUSH_S)
+        gone = line.disconnect()
+        line.disconnect()
+        self.clock.advance(FLUSH_TIMEOUT_S)
         self.successResultOf(gone)
         self.assertEqual(self.clock.getDelayedCalls(), [])
 
@@ -171,5 +171,5 @@ class SerialTests(SynchronousTestCase):
         self.error = OSError(errno.ENOENT, "none")
         line = self.line()
         self.clock.advance(0.0)
-        self.successResultOf(line.hang_up())
+        self.successResultOf(line.disconnect())
         self.assertEqual((self.clock.getDelayedCalls(), self.links), ([], []))

@@ -9,41 +9,41 @@ from twisted.trial.unittest import SynchronousTestCase
 
 from drivers.errors import BadFrame
 from drivers.sim.codec import (
-    HEADER,
+    HEADER_BYTES,
     MARKER,
-    MAX_PAYLOAD,
-    Alive,
-    Done,
+    MAX_PAYLOAD_BYTES,
+    CommandResult,
     Drive,
     FrameReader,
     Halt,
     Hello,
+    KeepAlive,
     Message,
     Motors,
-    Order,
-    Overlook,
     Picture,
     Refused,
     Sensors,
-    Truth,
-    decoded,
-    encoded,
+    SubscribeWorld,
+    WorldCommand,
+    WorldSnapshot,
+    decode_message,
+    encode_message,
 )
 
 DOG = {"name": "dog1", "x": 1.0, "y": 2.0, "heading": 0.5, "moving": False, "stripes": 1}
 SNAPSHOT = {"t": 1.0, "walls": [3.0, 2.4], "dogs": [DOG], "target": None, "collisions": 0}
 MESSAGES: list[Message] = [
     Hello(1, "dog1", 15.0),
-    Overlook(1, 10.0),
+    SubscribeWorld(1, 10.0),
     Motors(True),
     Drive(0.1, 0.0, -0.5, 7, 0.5, 12.25),
     Halt(),
-    Alive(),
-    Order(3, "move_dog", ("dog1", 1.0, 2.0, 0.0)),
+    KeepAlive(),
+    WorldCommand(3, "move_dog", ("dog1", 1.0, 2.0, 0.0)),
     Sensors(1.5, {"range.near": 0.3, "base.moving": True}, {"imu.ax": (0.1, 0.2, 0.3, 0.4)}, 0),
     Picture(9, 1.5, 208, 160, b"\xff\xd8jpeg"),
-    Truth(SNAPSHOT),
-    Done(3, ""),
+    WorldSnapshot(SNAPSHOT),
+    CommandResult(3, ""),
     Refused("dog1 is taken", False),
 ]
 
@@ -58,7 +58,7 @@ class CodecTests(SynchronousTestCase):
 
     def test_gives_back_every_message(self) -> None:
         """Each message type survives encoding and decoding."""
-        self.assertEqual([decoded(encoded(message)[HEADER:]) for message in MESSAGES], MESSAGES)
+        self.assertEqual([decode_message(encode_message(message)[HEADER_BYTES:]) for message in MESSAGES], MESSAGES)
 
     def test_refuses_wrong_fields(self) -> None:
         """Unknown tags and missing, surplus, ill-typed or too large fields raise BadFrame."""
@@ -88,7 +88,7 @@ class CodecTests(SynchronousTestCase):
             payload("truth", {**SNAPSHOT, "walls": (3.0,)}),
             payload("order", 1, "scatter", [[1]]),
         ):
-            self.assertRaises(BadFrame, decoded, bad)
+            self.assertRaises(BadFrame, decode_message, bad)
 
     def test_is_total(self) -> None:
         """Random bytes give a message or BadFrame."""
@@ -101,7 +101,7 @@ class CodecTests(SynchronousTestCase):
         @example(payload("hello", 1, "dog1", 15.0) + b"more")
         def check(data: bytes) -> None:
             try:
-                message = decoded(data)
+                message = decode_message(data)
             except BadFrame:
                 return
             self.assertIsInstance(message, Message)
@@ -110,14 +110,14 @@ class CodecTests(SynchronousTestCase):
 
     def test_refuses_to_send_what_nobody_would_take(self) -> None:
         """Encoding a message above the maximum frame size raises ValueError."""
-        self.assertRaises(ValueError, encoded, Picture(1, 1.0, 1, 1, bytes(MAX_PAYLOAD)))
+        self.assertRaises(ValueError, encode_message, Picture(1, 1.0, 1, 1, bytes(MAX_PAYLOAD_BYTES)))
 
 
 class FrameReaderTests(SynchronousTestCase):
     """From a stream of bytes to messages."""
 
     def setUp(self) -> None:
-        self.stream = b"".join(encoded(message) for message in MESSAGES)
+        self.stream = b"".join(encode_message(message) for message in MESSAGES)
         self.reader = FrameReader()
 
     def test_reads_whole_and_byte_by_byte(self) -> None:
@@ -148,13 +148,18 @@ class FrameReaderTests(SynchronousTestCase):
         """The buffered size stays limited under endless noise."""
         for _ in range(50):
             self.assertEqual(list(self.reader.read(bytes(10_000))), [])
-        self.assertLessEqual(len(self.reader._rest), MAX_PAYLOAD + HEADER)
+        self.assertLessEqual(len(self.reader._rest), MAX_PAYLOAD_BYTES + HEADER_BYTES)
         self.assertEqual(list(self.reader.read(self.stream)), MESSAGES)
 
     def test_survives_any_stream(self) -> None:
         """Random bytes in random pieces give messages or nothing, and raise no exception."""
 
-        @given(st.lists(st.binary(max_size=60) | st.sampled_from([MARKER, encoded(Halt()), encoded(Alive())[:5]])))
+        @given(
+            st.lists(
+                st.binary(max_size=60)
+                | st.sampled_from([MARKER, encode_message(Halt()), encode_message(KeepAlive())[:5]])
+            )
+        )
         def check(chunks: list[bytes]) -> None:
             reader = FrameReader()
             for chunk in chunks:

@@ -14,11 +14,11 @@ from drivers.conformance import Conformance
 from drivers.driver import Permit
 from drivers.errors import LinkLost, NoReply, NotEnabled, Unsupported, UsageError
 from drivers.link import Link, MemoryConnector, Receiver
-from drivers.sim.codec import Motors, Sensors, encoded
+from drivers.sim.client import SimulatorClient
+from drivers.sim.codec import Motors, Sensors, encode_message
 from drivers.sim.driver import SimDriver
-from drivers.sim.operator import YardOperator
-from sim.robots.scene import loaded
-from sim.robots.yard import Yard
+from sim.robots.scene import load_scene
+from sim.robots.simulator import RobotSimulator
 from tests.drivers.contract import RobotCase
 
 
@@ -35,7 +35,7 @@ class SimDriverTests(Conformance, RobotCase):
     options = {"robot": "dog1", "camera": False}
 
     def build(self) -> None:
-        self.yard = self.robot = Yard(self.clock, Random(1), loaded("three-dogs"))
+        self.yard = self.robot = RobotSimulator(self.clock, Random(1), load_scene("three-dogs"))
         self.yard.start()
         self.connector = self.yard.connector()
 
@@ -132,9 +132,9 @@ class MuteRobot:
         self.tell()
 
     def tell(self) -> None:
-        self.link.send(encoded(Sensors(1.0, {"estop.engaged": True}, {}, 0)))
+        self.link.send(encode_message(Sensors(1.0, {"estop.engaged": True}, {}, 0)))
 
-    def received(self, data: bytes) -> None:
+    def data_received(self, data: bytes) -> None:
         self.heard += data
 
     def link_down(self) -> None:
@@ -164,7 +164,7 @@ class SimDriverAloneTests(SynchronousTestCase):
         self.assertNoResult(enabled)
         pump(self.clock, 0.2)
         self.failureResultOf(enabled, NoReply)
-        self.assertIn(encoded(Motors(True)), self.robots[0].heard)
+        self.assertIn(encode_message(Motors(True)), self.robots[0].heard)
 
     def test_answers_every_switch(self) -> None:
         """A switch that is requested while another one fails gets the result of the last one."""
@@ -178,7 +178,7 @@ class SimDriverAloneTests(SynchronousTestCase):
 
     def test_lives_on_after_bad_bytes(self) -> None:
         """Invalid bytes, and messages that only clients send, are counted and dropped."""
-        self.robots[0].link.send(b"rubbish" + encoded(Motors(True)))
+        self.robots[0].link.send(b"rubbish" + encode_message(Motors(True)))
         self.robots[0].tell()
         pump(self.clock, 0.02)
         self.assertEqual(self.driver.diagnostics()["bad_frames"], 2)
@@ -186,7 +186,7 @@ class SimDriverAloneTests(SynchronousTestCase):
 
     def test_ends_the_motion_on_its_own_side_too(self) -> None:
         """At the deadline the driver sends one halt."""
-        self.robots[0].link.send(encoded(Sensors(1.0, {"estop.engaged": False}, {}, 0)))
+        self.robots[0].link.send(encode_message(Sensors(1.0, {"estop.engaged": False}, {}, 0)))
         pump(self.clock, 0.02)
         self.driver.act({"base.vx": 0.1}, Permit(1, self.clock.seconds() + 0.1))
         before = self.robots[0].heard
@@ -200,10 +200,10 @@ class YardOperatorTests(SynchronousTestCase):
     def setUp(self) -> None:
         """Create a simulator and a connected operator."""
         self.clock = Clock()
-        self.yard = Yard(self.clock, Random(1), loaded("three-dogs"))
+        self.yard = RobotSimulator(self.clock, Random(1), load_scene("three-dogs"))
         self.yard.start()
         self.connector = self.yard.connector()
-        self.operator = YardOperator(self.connector, self.clock)
+        self.operator = SimulatorClient(self.connector, self.clock)
         self.connected = self.operator.connect()
         pump(self.clock, 0.2)
 

@@ -8,7 +8,17 @@ from typing import Annotated, Literal
 from msgspec import Meta
 from twisted.trial.unittest import SynchronousTestCase
 
-from formats.convert import FINITE, LINE, UNIQUE, Invalid, Secret, Then, Unit, convert_field, convert_table
+from formats.convert import (
+    FINITE,
+    PRINTABLE,
+    UNIQUE,
+    ConversionStep,
+    InvalidValue,
+    Secret,
+    Unit,
+    convert_field,
+    convert_table,
+)
 
 
 def _shout(word: str) -> str:
@@ -25,13 +35,13 @@ class _Part:
 
 @dataclass(frozen=True)
 class _Table:
-    name: Annotated[str, Meta(min_length=1, max_length=8, examples=["dog1"]), LINE]
+    name: Annotated[str, Meta(min_length=1, max_length=8, examples=["dog1"]), PRINTABLE]
     port: Annotated[int, Meta(ge=0, le=65535)] = 80
     rate: Annotated[float, Meta(gt=0, le=60), Unit("s")] = 1.0
     mode: Literal["safe", "full"] = "safe"
     sizes: Annotated[tuple[Annotated[int, Meta(ge=0)], ...], Meta(max_length=3), UNIQUE] = ()
     parts: tuple[_Part, ...] = ()
-    word: Annotated[bytes, Meta(description="a loud word"), Then(_shout, raw=str)] = b""
+    word: Annotated[bytes, Meta(description="a loud word"), ConversionStep(_shout, raw=str)] = b""
     key: Annotated[str, Meta(min_length=8), Secret()] = field(default="", repr=False)
     x: Annotated[float, FINITE] = 0.0
     on: bool = False
@@ -40,9 +50,9 @@ class _Table:
 class ConvertTests(SynchronousTestCase):
     """Values are converted to the declared types, or the error names key, problem and remedy."""
 
-    def refused(self, key: str, value: object) -> Invalid:
+    def refused(self, key: str, value: object) -> InvalidValue:
         """Return the error for a wrong value."""
-        error: Invalid = self.assertRaises(Invalid, convert_table, {"name": "a", key: value}, _Table)
+        error: InvalidValue = self.assertRaises(InvalidValue, convert_table, {"name": "a", key: value}, _Table)
         self.assertEqual(error.key, key)
         self.assertTrue(error.problem and error.remedy)
         return error
@@ -84,12 +94,12 @@ class ConvertTests(SynchronousTestCase):
 
     def test_says_what_is_known(self) -> None:
         """The error names the nearest key for an unknown one, and an example for a missing one."""
-        error = self.assertRaises(Invalid, convert_table, {"nam": "a"}, _Table)
+        error = self.assertRaises(InvalidValue, convert_table, {"nam": "a"}, _Table)
         self.assertIn("nearest is name", error.remedy)
-        error = self.assertRaises(Invalid, convert_table, {}, _Table)
+        error = self.assertRaises(InvalidValue, convert_table, {}, _Table)
         self.assertEqual(error.key, "name")
         self.assertIn("dog1", error.remedy)
-        self.assertEqual(self.assertRaises(Invalid, convert_table, [], _Table).key, "")
+        self.assertEqual(self.assertRaises(InvalidValue, convert_table, [], _Table).key, "")
 
     def test_reads_a_command_line(self) -> None:
         """Numbers, booleans and comma-separated lists are parsed from command-line text."""
@@ -97,5 +107,5 @@ class ConvertTests(SynchronousTestCase):
         self.assertEqual(convert_field("1, 2,", _Table, "sizes", is_text=True), (1, 2))
         self.assertIs(convert_field("true", _Table, "on", is_text=True), True)
         for word in ("1", "yes", "True", ""):
-            self.assertRaises(Invalid, convert_field, word, _Table, "on", is_text=True)
-        self.assertRaises(Invalid, convert_field, "many", _Table, "port", is_text=True)
+            self.assertRaises(InvalidValue, convert_field, word, _Table, "on", is_text=True)
+        self.assertRaises(InvalidValue, convert_field, "many", _Table, "port", is_text=True)

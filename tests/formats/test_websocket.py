@@ -7,30 +7,30 @@ from hypothesis import strategies as st
 from twisted.trial.unittest import SynchronousTestCase
 from wsproto.events import AcceptConnection, RejectConnection, Request
 
-from formats.head import MAX_HEAD
-from formats.websocket import MAX_FRAMES, End
+from formats.head import MAX_HEAD_BYTES
+from formats.websocket import MAX_FRAMES, WebSocketEnd
 from tests.formats.rfc6455 import BINARY, CLOSE, CONTINUATION, MASK, PING, PONG, TEXT, answer_to, framed
 
 LONGEST = 1 << 17
 
 
-class Plain(End):
+class Plain(WebSocketEnd):
     """An endpoint that accepts every handshake."""
 
     def __init__(self, is_client: bool = True) -> None:
         super().__init__(LONGEST, Request("server.example.com", "/chat") if is_client else None)
 
-    def _answer(self, request: Request) -> AcceptConnection | RejectConnection:
+    def _make_response(self, request: Request) -> AcceptConnection | RejectConnection:
         return AcceptConnection()
 
-    def _fault_of(self, answer: AcceptConnection | RejectConnection | Exception) -> str:
+    def _find_error(self, answer: AcceptConnection | RejectConnection | Exception) -> str:
         return "" if isinstance(answer, AcceptConnection) else "not so"
 
 
 def client() -> Plain:
     """Return a client after its handshake."""
     one = Plain()
-    one.received(answer_to(one.opening()))
+    one.receive_data(answer_to(one.opening()))
     assert one.is_open
     return one
 
@@ -41,19 +41,19 @@ class GreetingTests(SynchronousTestCase):
         for old, new in ((b"101 Switching", b"200 OK"), (b"Accept: ", b"Accept: x"), (b"e: websocket", b"e: h2c")):
             one = Plain()
             answer = answer_to(one.opening())
-            self.assertEqual(one.received(answer.replace(old, new) + framed(TEXT, b"x", None)), ([], b""))
-            self.assertEqual((one.is_open, one.fault, one.received(answer)), (False, "not so", ([], b"")))
+            self.assertEqual(one.receive_data(answer.replace(old, new) + framed(TEXT, b"x", None)), ([], b""))
+            self.assertEqual((one.is_open, one.fault, one.receive_data(answer)), (False, "not so", ([], b"")))
         for request in (b"GET / HTTP/1.1\r\nHost: h\r\n\r\n", b"GET / HTTP/1.1\r\nHost: \xff\r\n\r\n", b"SSH\r\n\r\n"):
             server = Plain(is_client=False)
-            self.assertTrue(server.received(request)[1].startswith(b"HTTP/1.1 400"), request)
+            self.assertTrue(server.receive_data(request)[1].startswith(b"HTTP/1.1 400"), request)
             self.assertTrue(server.fault and not server.is_open)
 
     def test_endless_greetings(self) -> None:
         """A handshake without an end is rejected at the maximum size."""
         one = Plain(is_client=False)
-        one.received(b"GET /" + b"x" * (MAX_HEAD - 6))
+        one.receive_data(b"GET /" + b"x" * (MAX_HEAD_BYTES - 6))
         self.assertEqual(one.fault, "")
-        one.received(b"x")
+        one.receive_data(b"x")
         self.assertIn("no end", one.fault)
 
 
@@ -62,19 +62,19 @@ class FrameTests(SynchronousTestCase):
         """The two fragments in the RFC give one Hello, and a ping between them is answered."""
         one = client()
         said = bytes.fromhex("010348656c") + bytes.fromhex("890548656c6c6f") + bytes.fromhex("80026c6f")
-        messages, reply = one.received(said)
+        messages, reply = one.receive_data(said)
         self.assertEqual((messages, reply[0] & 0x0F), ([b"Hello"], PONG))
-        self.assertEqual(one.received(bytes.fromhex("0100") + bytes.fromhex("800161"))[0], [b"a"])
-        self.assertEqual(one.received(framed(PONG, b"", None)), ([], b""))
+        self.assertEqual(one.receive_data(bytes.fromhex("0100") + bytes.fromhex("800161"))[0], [b"a"])
+        self.assertEqual(one.receive_data(framed(PONG, b"", None)), ([], b""))
         self.assertEqual((one.fault, one.frames), ("", 6))
 
     def test_answers_a_close(self) -> None:
         """A close is answered once, and nothing is received or sent after it."""
         one = client()
-        messages, reply = one.received(framed(CLOSE, b"\x03\xe8bye", None) + framed(TEXT, b"x", None))
+        messages, reply = one.receive_data(framed(CLOSE, b"\x03\xe8bye", None) + framed(TEXT, b"x", None))
         self.assertEqual((messages, reply[0] & 0x0F), ([], CLOSE))
         self.assertIn("closed the connection", one.fault)
-        self.assertEqual((one.closing(), one.ping(), one.text(b"x")), (b"", b"", b""))
+        self.assertEqual((one.encode_close(), one.encode_ping(), one.encode_text(b"x")), (b"", b"", b""))
 
     def test_refuses_what_the_rfc_forbids(self) -> None:
         """Masks from a server, extensions, unknown opcodes, invalid fragments and excessive sizes are faults."""
@@ -92,17 +92,17 @@ class FrameTests(SynchronousTestCase):
             bytes([BINARY]) + part + bytes([0x80 | CONTINUATION]) + part,
         ):
             one = client()
-            messages, reply = one.received(said)
+            messages, reply = one.receive_data(said)
             self.assertEqual((messages, reply[0] & 0x0F), ([], CLOSE), said[:20])
             self.assertTrue(one.fault)
-            self.assertEqual(one.received(framed(TEXT, b"x", None)), ([], b""))
+            self.assertEqual(one.receive_data(framed(TEXT, b"x", None)), ([], b""))
 
     def test_counts_frames(self) -> None:
         """The number of frames in one read is limited; the next read has the same limit."""
         one = client()
         for _ in range(2):
-            self.assertEqual(len(one.received(framed(TEXT, b"", None) * MAX_FRAMES)[0]), MAX_FRAMES)
-        one.received(framed(PING, b"", None) * (MAX_FRAMES + 1))
+            self.assertEqual(len(one.receive_data(framed(TEXT, b"", None) * MAX_FRAMES)[0]), MAX_FRAMES)
+        one.receive_data(framed(PING, b"", None) * (MAX_FRAMES + 1))
         self.assertIn("frames", one.fault)
 
     @given(st.lists(st.binary(max_size=200), max_size=4))
@@ -111,13 +111,13 @@ class FrameTests(SynchronousTestCase):
         near, far = Plain(), Plain(is_client=False)
         heard: list[bytes] = []
         for place in near.opening():
-            near.received(far.received(bytes([place]))[1])
+            near.receive_data(far.receive_data(bytes([place]))[1])
         self.assertTrue(near.is_open)
         for payload in said:
-            for place in near.framed(payload):
-                heard += far.received(bytes([place]))[0]
-            for place in far.framed(payload):
-                heard += near.received(bytes([place]))[0]
+            for place in near.encode_binary(payload):
+                heard += far.receive_data(bytes([place]))[0]
+            for place in far.encode_binary(payload):
+                heard += near.receive_data(bytes([place]))[0]
         self.assertEqual(heard, [payload for payload in said for _ in "ab"])
         self.assertEqual((near.fault, far.fault), ("", ""))
 
@@ -127,5 +127,5 @@ class FrameTests(SynchronousTestCase):
         for one in (client(), Plain(), Plain(is_client=False)):
             one.opening()
             for piece in pieces:
-                one.received(piece)
-                one.received(b"\r\n\r\n")
+                one.receive_data(piece)
+                one.receive_data(b"\r\n\r\n")

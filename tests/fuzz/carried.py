@@ -7,22 +7,22 @@ without a session changes nothing, and the target sends no more than it received
 
 from __future__ import annotations
 
-from middleware.entangled.identity import node_id
-from middleware.entangled.reach.mirror import IMAGE, MIRROR
-from middleware.entangled.reach.relay import CARRIED, CARRY, MAX_PAIRS
+from middleware.entangled.identity import derive_node_id
+from middleware.entangled.nat.address_query import ADDRESS_REPLY, ADDRESS_REQUEST
+from middleware.entangled.nat.relay import MAX_PAIRS, RELAY_REQUEST, RELAYED_DATAGRAM
 from tests.fuzz.envelope import plaintexts
 from tests.fuzz.ground import Ground, Violation
 from tests.fuzz.runner import Again, main
 
-KINDS = (CARRY, CARRIED, MIRROR, IMAGE)
+KINDS = (RELAY_REQUEST, RELAYED_DATAGRAM, ADDRESS_REQUEST, ADDRESS_REPLY)
 
 
 def plain_of(ground: Ground, data: bytes) -> bytes:
     """Return the plaintext that some bytes encode."""
     first = data[0] if data else 0
     kind = KINDS[first % 4]
-    known = (node_id(ground.identity.public), ground.contact.node_id, bytes(20), data[1:21])
-    to = known[first // 4 % 4] if kind in (CARRY, CARRIED) else b""
+    known = (derive_node_id(ground.identity.public), ground.contact.node_id, bytes(20), data[1:21])
+    to = known[first // 4 % 4] if kind in (RELAY_REQUEST, RELAYED_DATAGRAM) else b""
     inner = data[1:]
     if first >= 128 and ground.recorded:
         inner = ground.recorded[first % len(ground.recorded)]
@@ -37,7 +37,7 @@ def shot(ground: Ground, data: bytes) -> None:
         ground.shoot(session.seal(plain), ground.other.address)
         if sum(len(datagram) for datagram, _ in ground.sent) > 2 * len(plain) + 1600:
             raise Violation("much more was sent than came")
-        if len(ground.node.reach.relay) > MAX_PAIRS:
+        if len(ground.node.nat.relay) > MAX_PAIRS:
             raise Violation("more pairs than there is room for")
     ground.clock.advance(0.05)
 

@@ -11,8 +11,8 @@ import msgpack
 
 from middleware.entangled import contact
 from middleware.entangled.errors import Malformed
-from middleware.entangled.record import unpacked
-from middleware.entangled.wire.message import decoded, encoded, packed_receipt, part_of, receipt_of
+from middleware.entangled.record import parse_record
+from middleware.entangled.wire.message import decode, encode, pack_receipt, parse_fragment, parse_receipt
 from tests.fuzz.ground import Violation
 from tests.fuzz.runner import main
 
@@ -20,16 +20,16 @@ from tests.fuzz.runner import main
 def check(data: bytes) -> None:
     """Decode one input with every decoder; raises ``Violation``."""
     with contextlib.suppress(Malformed):
-        message = decoded(data)
-        again = encoded(message)
-        if encoded(decoded(again)) != again:
+        message = decode(data)
+        again = encode(message)
+        if encode(decode(again)) != again:
             raise Violation("a message that is another one when it is packed and read again")
     with contextlib.suppress(Malformed):
-        part_of(data)
+        parse_fragment(data)
     with contextlib.suppress(Malformed):
-        receipt = receipt_of(data)
-        packed = packed_receipt(receipt.key, receipt.is_done, receipt.room, receipt.cause, receipt.here)
-        if receipt_of(packed) != receipt._replace(next=receipt_of(packed).next):
+        receipt = parse_receipt(data)
+        packed = pack_receipt(receipt.key, receipt.is_done, receipt.room, receipt.cause, receipt.received)
+        if parse_receipt(packed) != receipt._replace(next=parse_receipt(packed).next):
             raise Violation("a receipt that is another one when it is packed and read again")
     with contextlib.suppress(Exception):  # not tested here: it only provides fields for the decoders below
         fields = msgpack.unpackb(data, strict_map_key=False)
@@ -37,10 +37,10 @@ def check(data: bytes) -> None:
 
 
 def _records(fields: object) -> None:
-    record, known = unpacked(fields), contact.unpacked(fields)
-    if record is not None and unpacked(record.packed()) != record:
+    record, known = parse_record(fields), contact.parse_contact(fields)
+    if record is not None and parse_record(record.pack()) != record:
         raise Violation("a record that is another one when it is packed and read again")
-    if known is not None and contact.unpacked(known.packed()) != known:
+    if known is not None and contact.parse_contact(known.pack()) != known:
         raise Violation("a contact that is another one when it is packed and read again")
 
 

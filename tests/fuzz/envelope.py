@@ -41,7 +41,12 @@ def _lasting(ground: Ground) -> str:
     target, node = ground.target, ground.node
     session = next(iter(target._sessions.values()), None)
     half_open = [target._half_open._responses, list(target._half_open._unconfirmed)]
-    calls = [target._courier, target._answerer._ledger, target._answerer._cancelled, target._asker._inquiries]
+    calls = [
+        target._fragmenter,
+        target._dispatcher._history,
+        target._dispatcher._cancelled,
+        target._requester._requests,
+    ]
     timers = sorted(call.getTime() for call in ground.clock.getDelayedCalls())
     return state_of([node.overlay.table, ground.store, half_open, calls, timers], without=session)
 

@@ -23,9 +23,9 @@ from middleware.entangled.identity import Identity
 from middleware.entangled.network.network import Address, Network
 from middleware.entangled.network.switchboard import Switchboard
 from middleware.entangled.node import EntangledNode
-from middleware.entangled.wire.courier import MAX_IN_OF_PEER
-from middleware.entangled.wire.door import OPEN, Door
+from middleware.entangled.wire.admission_check import OPEN_ADMISSION, AdmissionCheck
 from middleware.entangled.wire.endpoint import Endpoint
+from middleware.entangled.wire.fragmenter import MAX_IN_PER_PEER_BYTES
 
 TEAM = b"k" * 32
 STRANGER = Address("10.0.0.9", 999)
@@ -46,8 +46,8 @@ class Ground:
     All datagrams to the target are recorded.
     """
 
-    def __init__(self, door: Door = OPEN) -> None:
-        self.room = door.room
+    def __init__(self, door: AdmissionCheck = OPEN_ADMISSION) -> None:
+        self.room = door.max_pass_bytes
         self.errors: list[str] = []
         self.known = ""  # the hash after the last input, for targets that let no time pass
         self._is_shooting = False
@@ -55,7 +55,7 @@ class Ground:
         self.board = Switchboard(self.clock, random.Random(1))
         self.recorded: list[bytes] = []
         self.sent: list[tuple[bytes, Address]] = []
-        self.network = self.board.network("10.0.0.1", 1)
+        self.network = self.board.make_network("10.0.0.1", 1)
         self.store = MemoryStore(1000)
         self.node = EntangledNode(
             Identity(b"t" * 32),
@@ -75,19 +75,19 @@ class Ground:
         self.contact = Contact(Identity(b"t" * 32).public, self.network.address)
         self.identity = Identity(b"o" * 32)
         self.other = Endpoint(
-            self.identity, TEAM, self.board.network("10.0.0.2", 2), self.clock, random.Random(3), door
+            self.identity, TEAM, self.board.make_network("10.0.0.2", 2), self.clock, random.Random(3), door
         )
         self.other.start()
         self.other.expose("ping", lambda peer: "pong", changes=True)
         for method, value in (("echo", b"1"), ("add", bytes(3000))):
             self.other.ask(self.contact, method, value, changes=method == "add")
             self.clock.advance(0.5)
-        self.other.greet(self.contact.address).addErrback(lambda failure: None)
+        self.other.discover(self.contact.address).addErrback(lambda failure: None)
         self.clock.advance(0.5)
 
     def stop(self) -> None:
         """Stop both nodes, which removes their timers."""
-        self.node.vanish()
+        self.node.stop_silently()
         self.other.stop()
 
     def shoot(self, datagram: bytes, source: Address = STRANGER) -> int:
@@ -104,8 +104,8 @@ class Ground:
             self._is_shooting = False
         if self.errors:
             raise Violation(f"logged: {self.errors}")
-        courier = self.target._courier
-        if courier._bytes_in.total() > MAX_IN_OF_PEER:
+        courier = self.target._fragmenter
+        if courier._bytes_in.total() > MAX_IN_PER_PEER_BYTES:
             raise Violation("more is in assembly than one peer may have")
         return sum(len(datagram) for datagram, to in self.sent if to == source)
 

@@ -12,16 +12,25 @@ import random
 from nacl import bindings
 
 from middleware.entangled.contact import Contact
-from middleware.entangled.identity import Identity, exchange_key
-from middleware.entangled.network.network import MAX_DATAGRAM, Address
-from middleware.entangled.wire.greeting import COOKIE
+from middleware.entangled.identity import Identity, derive_exchange_key
+from middleware.entangled.network.network import MAX_DATAGRAM_BYTES, Address
+from middleware.entangled.wire.discovery import COOKIE
 from middleware.entangled.wire.noise import Initiator, Responder
-from middleware.entangled.wire.session import INIT, MAC, PROLOGUE, RESP, Credentials, _keyed_hash, derived_key, mac_of
+from middleware.entangled.wire.session import (
+    INIT,
+    MAC_BYTES,
+    PROLOGUE,
+    RESP,
+    Credentials,
+    _keyed_hash,
+    derive_key,
+    read_mac,
+)
 from tests.fuzz.ground import STRANGER, TEAM, Ground, Violation
 from tests.fuzz.runner import Again, main
 from tests.middleware.gate import Gate
 
-OWN = Credentials.of(Identity(b"m" * 32), TEAM)
+OWN = Credentials.derive(Identity(b"m" * 32), TEAM)
 AT = Address("10.0.0.3", 3)
 
 
@@ -30,31 +39,31 @@ class ShortPass(Gate):
 
     def __init__(self) -> None:
         super().__init__(shown=b"pass")
-        self.room = 64
+        self.max_pass_bytes = 64
 
 
 def init(ground: Ground, data: bytes) -> bytes:
     """Return an INIT with a payload; the bytes after the first 600 change the finished datagram."""
-    remote = exchange_key(ground.contact.public)
+    remote = derive_exchange_key(ground.contact.public)
     noise = Initiator(OWN.static, remote, random.Random(data[:1]).randbytes(32), PROLOGUE, OWN.psk)
     payload = data[1:] if data[:1] < b"\x80" else data[1:5] + OWN.public + data[5:]
-    bare = bytes([INIT]) + noise.write(payload[: MAX_DATAGRAM - 200].ljust(520 + ground.room, b"\0"))
+    bare = bytes([INIT]) + noise.write(payload[: MAX_DATAGRAM_BYTES - 200].ljust(520 + ground.room, b"\0"))
     bare += _keyed_hash(OWN.mac_key, bare)
-    return bare + (bytes(MAC) if len(data) % 2 else data[-MAC:].ljust(MAC, b"\0"))
+    return bare + (bytes(MAC_BYTES) if len(data) % 2 else data[-MAC_BYTES:].ljust(MAC_BYTES, b"\0"))
 
 
 def resp(ground: Ground, asked: bytes, data: bytes) -> bytes:
     """Return a RESP to the target's INIT, with a payload."""
     noise = Responder(OWN.static, bytes(range(32)), PROLOGUE, OWN.psk)
-    payload, _ = noise.read(asked[1 : -2 * MAC])
+    payload, _ = noise.read(asked[1 : -2 * MAC_BYTES])
     message, _ = noise.write(data[:1300])
     return bytes([RESP]) + payload[:4] + message
 
 
 def cookie(asked: bytes, data: bytes) -> bytes:
     """Return a COOKIE for the target's INIT, with content of any length."""
-    head, nonce = bytes([COOKIE]) + mac_of(asked), bytes(24)
-    key = derived_key(TEAM, b"cookie")
+    head, nonce = bytes([COOKIE]) + read_mac(asked), bytes(24)
+    key = derive_key(TEAM, b"cookie")
     return head + nonce + bindings.crypto_aead_xchacha20poly1305_ietf_encrypt(data[:1300], head, nonce, key)
 
 

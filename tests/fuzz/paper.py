@@ -13,15 +13,15 @@ import random
 
 from twisted.internet.defer import Deferred, succeed
 
-from middleware.admission import knock
-from middleware.admission.certificate import member_of, pass_of
+from middleware.admission import join_codec
+from middleware.admission.certificate import verify_certificate, wrap_grant
 from middleware.admission.code import TermsContent, seal_terms
-from middleware.admission.knock import Knock, Reply, Signer, Welcome, opened_knock, opened_welcome
-from middleware.admission.reception import Reception
-from middleware.admission.roll import Roll, packed_admission
-from middleware.admission.statement import Invite, opened
+from middleware.admission.join_codec import JoinReply, JoinRequest, Signer, VerifiedReply, open_reply, open_request
+from middleware.admission.membership_list import MembershipList, pack_admission
+from middleware.admission.server import AdmissionServer
+from middleware.admission.statement import Invite, open_statement
 from middleware.entangled.errors import Full, RemoteError
-from middleware.entangled.identity import exchange_key
+from middleware.entangled.identity import derive_exchange_key
 from middleware.entangled.network.network import Address
 from tests.fuzz.ground import STRANGER, Violation
 from tests.fuzz.raw import RECORDED
@@ -43,17 +43,22 @@ def lawful() -> dict[str, list[bytes]]:
     """Return valid messages of each kind."""
     grant = granted(SIGNER, "vaio", "bootstrap")
     chain = admitted(SIGNER, "dog")
-    secret = SIGNER.rotate(2, [NEWCOMER.public], NOW, 60, random.Random(2))
+    secret = SIGNER.rotate_secret(2, [NEWCOMER.public], NOW, 60, random.Random(2))
     end = SIGNER.revoke(identity("cat").public, "cat", NOW)
-    knocked = knock.knock(CODE.key, NEWCOMER.public, exchange_key(NEWCOMER.public), "", random.Random(3))
-    given = Welcome(chain, ((1, bytes(32), 0),))
-    heard = Knock(NEWCOMER.public, exchange_key(NEWCOMER.public), "", b"")
-    told = [knock.welcome(INVITE.public, heard, given, ANSWERER, random.Random(4))]
-    told += [knock.refusal(INVITE.public, heard, "used", ANSWERER, random.Random(5)), knock.hint(knock.id_of(knocked))]
-    admission = packed_admission(NEWCOMER.public, chain)
+    knocked = join_codec.make_request(
+        CODE.key, NEWCOMER.public, derive_exchange_key(NEWCOMER.public), "", random.Random(3)
+    )
+    given = JoinReply(chain, ((1, bytes(32), 0),))
+    heard = JoinRequest(NEWCOMER.public, derive_exchange_key(NEWCOMER.public), "", b"")
+    told = [join_codec.make_reply(INVITE.public, heard, given, ANSWERER, random.Random(4))]
+    told += [
+        join_codec.make_refusal(INVITE.public, heard, "used", ANSWERER, random.Random(5)),
+        join_codec.make_unsigned_refusal(join_codec.read_invitation_id(knocked)),
+    ]
+    admission = pack_admission(NEWCOMER.public, chain)
     return {
         "statement": [PACKED, grant, secret, end, admission],
-        "pass": [chain, pass_of(granted(SIGNER, "dog"))],
+        "pass": [chain, wrap_grant(granted(SIGNER, "dog"))],
         "knock": [knocked],
         "welcome": told,
     }
@@ -86,10 +91,10 @@ def check(data: bytes) -> None:
 
 def _statement(whole: bytes) -> None:
     with contextlib.suppress(RemoteError):
-        opened(SIGNER.public, whole)
+        open_statement(SIGNER.public, whole)
         if whole not in GENUINE:
             raise Violation("a statement that nobody signed")
-    roll = Roll(SIGNER.public)
+    roll = MembershipList(SIGNER.public)
     roll.add(LAWFUL["statement"][0], NOW)
     before = (roll.digest, len(roll))
     try:
@@ -104,7 +109,7 @@ def _statement(whole: bytes) -> None:
 
 def _pass(whole: bytes) -> None:
     with contextlib.suppress(RemoteError):
-        member = member_of(SIGNER.public, NEWCOMER.public, whole)
+        member = verify_certificate(SIGNER.public, NEWCOMER.public, whole)
         if whole not in GENUINE:
             raise Violation(f"a pass that nobody signed makes {member.name} a member")
 
@@ -112,7 +117,7 @@ def _pass(whole: bytes) -> None:
 def _knock(whole: bytes) -> None:
     sent: list[tuple[bytes, Address]] = []
     admissions: list[bytes] = []
-    roll = Roll(SIGNER.public)
+    roll = MembershipList(SIGNER.public)
     for each in (PACKED, INVITATION.terms, LAWFUL["statement"][1]):
         roll.add(each, NOW)
 
@@ -122,28 +127,28 @@ def _knock(whole: bytes) -> None:
     def send(datagram: bytes, to: Address) -> None:
         sent.append((datagram, to))
 
-    def given(shown: bytes) -> Welcome:
-        return Welcome(shown, ((1, bytes(32), 0),))
+    def given(shown: bytes) -> JoinReply:
+        return JoinReply(shown, ((1, bytes(32), 0),))
 
     def refused(who: bytes, source: Address, code: str) -> None:
         pass
 
-    bootstrap = Reception(
+    bootstrap = AdmissionServer(
         roll, identity("vaio"), take, admissions.append, given, send, lambda: 1.0, lambda: float(NOW), DICE, refused
     )
-    bootstrap.on_knock(whole, STRANGER)
+    bootstrap.on_request(whole, STRANGER)
     if sum(len(datagram) for datagram, _ in sent) > len(whole):
         raise Violation("a knock was answered with more than it had")
     if admissions and whole not in GENUINE:
         raise Violation("somebody was let in by a knock that was changed")
     with contextlib.suppress(RemoteError):
-        opened_knock(whole, INVITE.public)
+        open_request(whole, INVITE.public)
 
 
 def _welcome(whole: bytes) -> None:
     with contextlib.suppress(RemoteError):
-        found = opened_welcome(whole, CODE, NEWCOMER.public, NEWCOMER.exchange_secret)
-        if isinstance(found, Reply) and whole not in GENUINE:
+        found = open_reply(whole, CODE, NEWCOMER.public, NEWCOMER.exchange_secret)
+        if isinstance(found, VerifiedReply) and whole not in GENUINE:
             raise Violation("a welcome that nobody said")
 
 

@@ -49,8 +49,8 @@ class TargetTests(SynchronousTestCase):
         ground.shoot(handshake.init(ground, b"\x80" + bytes(6)))
         self.assertNotEqual(ground.state(), before)
         send = ground.network.send
-        ground.target.greeter.on_who = lambda datagram, source: send(bytes(500), source)  # type: ignore[method-assign]
-        ground.target._receivers[0x14] = ground.target.greeter.on_who
+        ground.target.discoverer.on_discovery = lambda datagram, source: send(bytes(500), source)  # type: ignore[method-assign]
+        ground.target._receivers[0x14] = ground.target.discoverer.on_discovery
         who = next(number for number, one in enumerate(ground.recorded) if one[0] == 0x14)
         ground.known = ""
         self.assertRaises(Violation, raw.shot, ground, bytes([raw.RECORDED + who]))

@@ -12,8 +12,8 @@ from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 
 from middleware.errors import BadSetting
-from sim.team import logbook
-from sim.team.shrink import Trim
+from sim.team import seed_log
+from sim.team.reduction import Reduction
 from tests.invariants.bug import BUGS, FINDERS
 from tests.invariants.run import ALONE, WORKLOADS, Least, Outcome, hunt_all, least, line, run_all
 
@@ -65,7 +65,7 @@ def main() -> int:
         seeds = range(wanted.seed, wanted.seed + count)
         if wanted.bugs:
             return show_bugs(seeds, wanted.jobs, wanted.scheduler)
-        trim = Trim(numbers(wanted.keep), wanted.calm, only, wanted.seconds)
+        trim = Reduction(numbers(wanted.keep), wanted.calm, only, wanted.seconds)
         return Session(wanted, trim).run(seeds)
     except (BadSetting, OSError, ValueError) as error:
         parser.error(str(error))
@@ -87,7 +87,7 @@ def numbers(told: str | None) -> tuple[int, ...] | None:
 class Session:
     """One call of the command: runs the schedules, prints failures, and writes the logbook."""
 
-    def __init__(self, wanted: argparse.Namespace, trim: Trim) -> None:
+    def __init__(self, wanted: argparse.Namespace, trim: Reduction) -> None:
         self._wanted = wanted
         self._trim = trim
         self._began = time.monotonic()
@@ -142,12 +142,12 @@ class Session:
         """Run the seeds in stretches, and log each one, also if it is interrupted."""
         wanted, what = self._wanted, "+".join(self._trim.only)
         text = Path(wanted.log).read_text(encoding="utf-8") if os.path.exists(wanted.log) else ""
-        logged = logbook.entries(text, wanted.log)
-        left = logbook.missing(seeds, logged, what) if wanted.resume else list(seeds)
+        logged = seed_log.parse_entries(text, wanted.log)
+        left = seed_log.find_missing(seeds, logged, what) if wanted.resume else list(seeds)
         Path(wanted.log).open("ab").close()
         say(f"{len(left)} of {len(seeds)} schedules, from seed {left[0]}" if left else "all are in the logbook")
         commit, outcomes = commit_of(Path(__file__).resolve().parents[2]), self._outcomes(left)
-        for stretch in logbook.stretches(left, STRETCH):
+        for stretch in seed_log.split_ranges(left, STRETCH):
             began, failures, ran = time.monotonic(), [], 0
             try:
                 for _ in stretch:
@@ -159,8 +159,8 @@ class Session:
                 if ran:
                     date = time.strftime("%Y-%m-%dT%H:%M:%SZ", time.gmtime())
                     seconds = round(time.monotonic() - began, 1)
-                    entry = logbook.Entry(date, commit, what, stretch[0], ran, tuple(failures), seconds)
-                    logbook.append(wanted.log, entry)
+                    entry = seed_log.SeedRun(date, commit, what, stretch[0], ran, tuple(failures), seconds)
+                    seed_log.append_entry(wanted.log, entry)
                     say(f"{self._ran} of {len(left)} schedules, {self._failed} failed; up to seed {stretch[ran - 1]}")
 
 

@@ -39,7 +39,7 @@ class Deciders(Workload):
         if str(Nearest().find(view).assigned_agent) not in assigned:
             self._found.append(f"C2: a cost of {bad.cost} makes {Nearest().find(view).assigned_agent} win")
 
-    def settled(self) -> None:
+    def make_final_requests(self) -> None:
         """Let a large team decide once, and a line of bidders bid until all have stopped."""
         far = [Report(f"agent-{n:03d}", 300.0 - n) for n in range(300)]
         found = Nearest().find(far).assigned_agent
@@ -48,7 +48,7 @@ class Deciders(Workload):
         mission = Mission(LINE, LINE, self._dice.randrange(10**6))
         self._found += [f"C4: {' and '.join(o)} own {t}" for t, o in stopped(mission).items() if len(o) > 1]
 
-    def verdict(self) -> list[str]:
+    def find_violations(self) -> list[str]:
         """Return the violations found so far."""
         return self._found
 
@@ -61,7 +61,7 @@ def stopped(mission: Mission) -> dict[str, list[str]]:
     for name in names:
         worth = {task: 5000.0 - cost * 1e-6 for task, cost in mission.costs[name].items()}
         score: bidder.Score = lambda bundle, task, worth=worth: worth[task]  # type: ignore[misc]  # noqa: E731
-        bidders[name] = bidder.Bidder(name, mission.places, score, 1, near[name])
+        bidders[name] = bidder.Bidder(name, mission.task_positions, score, 1, near[name])
     quiet = dict.fromkeys(names, 0)
     talking, rounds = list(names), 0
     while talking:
@@ -71,10 +71,10 @@ def stopped(mission: Mission) -> dict[str, list[str]]:
             before = bidders[name].bundle
             for a, to, news in said:
                 if to == name:
-                    bidders[name].hear(a, news)
+                    bidders[name].receive(a, news)
             is_same = bidders[name].is_quiet and bidders[name].bundle == before
             quiet[name] = quiet[name] + 1 if is_same else 0
-        talking = [n for n in talking if not bidder.is_over(rounds, quiet[n], len(mission.places), len(names))]
+        talking = [n for n in talking if not bidder.is_final(rounds, quiet[n], len(mission.task_positions), len(names))]
     owners: dict[str, list[str]] = {}
     for name, one in bidders.items():
         for task in one.bundle:

@@ -14,10 +14,10 @@ from typing import Any
 
 from twisted.internet.defer import Deferred, fail, succeed
 
-from middleware.consensus.deployed import Deployed
-from middleware.consensus.guard import Guard
-from middleware.consensus.lease.lessee import Lease
-from middleware.consensus.selection import Strategies
+from middleware.consensus.deployed_modules import DeployedModules
+from middleware.consensus.guarded_strategy import GuardedStrategy
+from middleware.consensus.lease.lease_client import Lease
+from middleware.consensus.strategy_registry import StrategyRegistry
 from middleware.entangled.clock import HeapClock
 from middleware.entangled.errors import Unavailable
 from middleware.entangled.record import Record
@@ -36,7 +36,7 @@ class Weather:
 
     delay: float = 0.02
     loss: float = 0.0
-    double: float = 0.0
+    duplicate: float = 0.0
 
 
 @dataclass
@@ -71,7 +71,7 @@ class Ether:
 
     def send(self, source: int, target: int, deliver: Callable[[], None]) -> None:
         """Send a message through the present weather."""
-        for _ in range(1 + (self.rng.random() < self.weather.double)):
+        for _ in range(1 + (self.rng.random() < self.weather.duplicate)):
             lost = self.rng.random() < self.weather.loss or not self.reaches(source, target)
             if not lost:
                 self.clock.callLater(self.weather.delay * self.rng.uniform(0.2, 3.0), deliver)
@@ -128,7 +128,7 @@ class Ether:
         """Return the outcomes that the node of a place knows, as records."""
         known = self.replicas[place].results.get(task_id, {})
         return [
-            Record(group_key(task_id), RESULT, bytes(32), 1, "team", 1.0, result.packed(), bytes(64))
+            Record(group_key(task_id), RESULT, bytes(32), 1, "team", 1.0, result.pack(), bytes(64))
             for _, result in sorted(known.items())
         ]
 
@@ -149,7 +149,7 @@ class Ether:
         for heard, ordered in list(node.groups.get(task_id, [])):
             heard([member for member, _ in members.values()], self.outcome(place, task_id))
             order = self.replicas[place].orders.get(task_id)
-            packed = [] if order is None else [order.packed()]
+            packed = [] if order is None else [order.pack()]
             ordered([Record(group_key(task_id), ORDER, bytes(32), 1, "team", 1.0, one, bytes(64)) for one in packed])
 
     def listed(self, place: int) -> None:
@@ -159,7 +159,7 @@ class Ether:
             tasks = self.replicas[place].tasks
             node.on_tasks(
                 [
-                    Record(TASKS, name, bytes(32), 1, "team", 1.0, task.packed(), bytes(64))
+                    Record(TASKS, name, bytes(32), 1, "team", 1.0, task.pack(), bytes(64))
                     for name, task in sorted(tasks.items())
                 ]
             )
@@ -214,10 +214,10 @@ class Ether:
 class Council:
     """A council of the operator's node alone, without changes."""
 
-    def learn(self, packed: bytes) -> None:
+    def learn_charter(self, packed: bytes) -> None:
         """Ignore the record."""
 
-    def visit(self) -> None:
+    def ping_members(self) -> None:
         """Do nothing, as the member is always present."""
 
 
@@ -225,7 +225,7 @@ class Lessee:
     """The lease client for a council at the operator's node."""
 
     TTL = 1.5
-    council = Council()
+    proposer = Council()
 
     def __init__(self, ether: Ether, place: int, task_id: str, changed: Callable[[], None], floor: int) -> None:
         self._ether, self._place, self._task_id, self._changed, self._floor = ether, place, task_id, changed, floor
@@ -240,20 +240,20 @@ class Lessee:
         is_held = self.token and self._ether.clock.seconds() < self._deadline
         return Lease(self._task_id, self.token, self._deadline) if is_held else None
 
-    def outrank(self, token: int) -> None:
+    def on_higher_token(self, token: int) -> None:
         """Use higher tokens than this one from now on."""
         self._floor = max(self._floor, token)
 
-    def want(self) -> None:
+    def claim(self) -> None:
         """Claim the lease, and renew it."""
         if not self._wanted:
             self._wanted = True
             self._ether.clock.callLater(0.02, self._claim, self._life)
 
-    def suspect(self) -> None:
+    def suspect_holder(self) -> None:
         """Do nothing: claims are repeated often enough."""
 
-    def end(self, token: int) -> Deferred[bytes]:
+    def close_task(self, token: int) -> Deferred[bytes]:
         """Permit the end of the task."""
         return succeed(b"")
 
@@ -308,28 +308,28 @@ class Node:
             device=SimpleNamespace(name=f"dog{place}"), say=lambda *_: None, change=lambda **_: None
         )
         self.entangled = SimpleNamespace(get=self._get)
-        self.reached = lambda uuids: ()
-        self.councils = SimpleNamespace(of=lambda task: Council(), has_vacancy=lambda task, council: False)
-        self.halt = SimpleNamespace(watch=lambda obey: None, learn=lambda: None, is_on=False, is_known=True)
-        self.deployed: Deployed = {}
-        self.strategies = Strategies()
+        self.find_contacts = lambda uuids: ()
+        self.council_manager = SimpleNamespace(of=lambda task: Council(), has_vacancy=lambda task, council: False)
+        self.stop_state = SimpleNamespace(watch=lambda obey: None, learn=lambda: None, is_on=False, is_known=True)
+        self.deployed: DeployedModules = {}
+        self.strategies = StrategyRegistry()
         self.groups: dict[str, list[tuple[Any, Any]]] = {}
         self.reports: dict[str, Member] = {}
         self.on_tasks: Callable[[list[Record]], None] | None = None
 
-    def justify(self, verdict: object) -> None:
+    def publish_decision_record(self, verdict: object) -> None:
         """Ignore the decision record."""
 
-    def strategy(self, name: str) -> Guard:
+    def get_strategy(self, name: str) -> GuardedStrategy:
         """Return the strategy of this name."""
-        return self.strategies.named(name, self.deployed)
+        return self.strategies.get(name, self.deployed)
 
     def watch_tasks(self, changed: Callable[[list[Record]], None]) -> None:
         """Watch the tasks."""
         self.on_tasks = changed
         self.ether.listed(self.place)
 
-    def group(self, task: Task, heard: Any, ordered: Any, panel: Any = None) -> Any:
+    def join_group(self, task: Task, heard: Any, ordered: Any, panel: Any = None) -> Any:
         """Return a membership in the group of a task; all members write reports."""
         task_id = task.task_id
         followers = self.groups.setdefault(task_id, [])
@@ -352,7 +352,7 @@ class Node:
             conclude=lambda result, proof: ether.conclude(place, task_id, result),
         )
 
-    def lessee(self, task: Task, changed: Callable[[], None], floor: int) -> Lessee:
+    def make_lease_client(self, task: Task, changed: Callable[[], None], floor: int) -> Lessee:
         """Return the lease client of a task."""
         return Lessee(self.ether, self.place, task.task_id, changed, floor)
 

@@ -12,15 +12,15 @@ from typing import Any
 
 from twisted.internet.defer import Deferred
 
-from middleware.consensus.lease.lessee import STAGGER
+from middleware.consensus.lease.lease_client import STAGGER_S
 from middleware.entangled.contact import Contact
 from middleware.entangled.errors import EntangledError
-from sim.team.clients import follow
-from sim.team.event import Awaited
+from sim.team.clients import record_outcome
+from sim.team.event import CommandExpected
 from sim.team.faults.timeline import TimedFault, Timeline
-from sim.team.leases.radio import CALM, Air
+from sim.team.leases.radio_link import DEFAULT_QUALITY, LinkQuality
 from sim.team.leases.team import LeaseTeam
-from sim.team.shrink import WHOLE, Trim
+from sim.team.reduction import NO_REDUCTION, Reduction
 
 TTL = 1.5
 SLACK = 0.8
@@ -57,7 +57,7 @@ def draw_faults(dice: random.Random, n: int, agents: Sequence[int], has_stores: 
 class Leases(LeaseTeam):
     """The run of ``seed``, which determines everything."""
 
-    def __init__(self, seed: int, trim: Trim = WHOLE, ttl: float = TTL) -> None:
+    def __init__(self, seed: int, trim: Reduction = NO_REDUCTION, ttl: float = TTL) -> None:
         dice = self._dice = random.Random(f"leases/{seed}")
         n = dice.choice([4, 5, 5, 6, 7])
         agents = dice.choice([2, 3, 3, 4])
@@ -68,7 +68,7 @@ class Leases(LeaseTeam):
         # Without stores a restarted member loses all state: then councils do not change, and tokens may decrease.
         has_stores = dice.random() < 0.7
         super().__init__(f"leases/{seed}", rates, agents, ttl, stop_time, drift, has_stores)
-        self.air = Air(
+        self.air = LinkQuality(
             dice.choice([0.001, 0.005, 0.02, 0.05, 0.2]),
             dice.choice([0.0, 0.01, 0.05]),
             dice.choice([0.0, 0.05, 0.1, 0.2, 0.3, 0.5]),
@@ -76,7 +76,7 @@ class Leases(LeaseTeam):
             dice.choice([1.0, 1.0, 5.0]),
         )
         if trim.calm:
-            self.air = Air(self.air.delay)
+            self.air = LinkQuality(self.air.delay)
         self.faults = draw_faults(dice, n, self.agents, has_stores)
         self._trim = trim
         self.seconds = 0.0
@@ -90,7 +90,7 @@ class Leases(LeaseTeam):
     @property
     def digest(self) -> str:
         """The hash of all messages that arrived, with their times."""
-        return self.board.digest()
+        return self.switchboard.digest()
 
     def __str__(self) -> str:
         """Describe the schedule."""
@@ -102,48 +102,48 @@ class Leases(LeaseTeam):
     def run(self) -> list[str]:  # type: ignore[override]
         """Run the faults, then the healthy phase; return one line per violation."""
         self.clock.advance(self.ttl + 0.1)
-        self.radio.air = self.air
-        self.referee.agree()
+        self.radio.quality = self.air
+        self.recorder.record_assumptions()
         timeline = Timeline(self.faults, self._trim)
-        self.seconds = end = self._trim.within(self._dice.choice([8.0, 12.0, 16.0]))
+        self.seconds = end = self._trim.limit_duration(self._dice.choice([8.0, 12.0, 16.0]))
         began = self.clock.seconds()
         while self.clock.seconds() - began < end:
-            for fault, is_end in timeline.due(self.clock.seconds() - began):
+            for fault, is_end in timeline.pop_due(self.clock.seconds() - began):
                 (self._end if is_end else self._begin)(fault)
             self._choose()
             self.clock.advance(0.25)
         self._heal()
-        for task_id in self.councils:
+        for task_id in self.charters:
             self._verify_health(task_id)
-        return self.referee.found
+        return self.recorder.violations
 
     def _choose(self) -> None:
         """Randomly let agents claim, stand by, leave or suspect."""
-        for task_id in self.councils:
+        for task_id in self.charters:
             for place in self.agents:
-                bidder = self.bidders[place]
-                if bidder.machine.is_still or not bidder.machine.is_alive or self._dice.random() > 0.25:
+                bidder = self.nodes[place]
+                if bidder.machine.is_frozen or not bidder.machine.is_alive or self._dice.random() > 0.25:
                     continue
                 fate = self._dice.random()
                 if fate < 0.35:
-                    bidder.lessee(task_id).want()
+                    bidder.get_lease_client(task_id).claim()
                 elif fate < 0.75:
-                    bidder.lessee(task_id).stand_by(self._dice.choice([1, 1, 2, 3]))
+                    bidder.get_lease_client(task_id).stand_by(self._dice.choice([1, 1, 2, 3]))
                 elif fate < 0.85:
                     bidder.leave(task_id)
                 elif fate < 0.9:
-                    bidder.lessee(task_id).suspect()
+                    bidder.get_lease_client(task_id).suspect_holder()
 
     def _heal(self) -> None:
         self._is_well = True
         self.radio.cut.clear()
-        self.referee.look_at_cuts()
-        self.radio.air = CALM
-        for place, bidder in enumerate(self.bidders):
-            if bidder.machine.is_still:
+        self.recorder.record_reachability()
+        self.radio.quality = DEFAULT_QUALITY
+        for place, bidder in enumerate(self.nodes):
+            if bidder.machine.is_frozen:
                 bidder.machine.thaw()
             if not bidder.machine.is_alive:
-                self.bidders[place] = self.born(place)
+                self.nodes[place] = self.start_life(place)
 
     def _verify_health(self, task_id: str) -> None:
         """Check E3, the graceful leave and E5 while all is healthy and one agent after the other leaves."""
@@ -151,82 +151,82 @@ class Leases(LeaseTeam):
             # A lease that no member remembers must end first, as the next one may have its token.
             self.clock.advance(self.ttl)
         for rank, place in enumerate(self._dice.sample(self.agents, len(self.agents))):
-            lessee = self.bidders[place].lessee(task_id)
+            lessee = self.nodes[place].get_lease_client(task_id)
             if rank:
                 lessee.stand_by(rank)
             else:
-                lessee.want()
+                lessee.claim()
         # A restarted member is silent for one TTL, and a device may have to report its token first.
         since, most = self.clock.seconds(), 2 * self.ttl + SLACK + 1.0
         if not self._wait_for_command(task_id, f"all is well with {task_id}", 0, since, most, most):
             return
         self.clock.advance(self._dice.uniform(0.7, 1.3) * self.ttl)
-        _, token, holder = self.referee.accepted[task_id][-1]
+        _, token, holder = self.recorder.accepted[task_id][-1]
         self._depart_politely(task_id, token, holder)
         self.clock.advance(self._dice.uniform(0.7, 1.3) * self.ttl)
-        _, token, holder = self.referee.accepted[task_id][-1]
+        _, token, holder = self.recorder.accepted[task_id][-1]
         self._depart_suddenly(task_id, token, holder)
         self._conclude(task_id)
 
     def _depart_politely(self, task_id: str, token: int, holder: int) -> None:
         left_at = self.clock.seconds()
-        self.bidders[holder].leave(task_id)
+        self.nodes[holder].leave(task_id)
         within = self.stop_time + LEAVE + 0.1 + 0.1 * len(self.agents)
         self._wait_for_command(task_id, f"{holder} gives {task_id} back", token, left_at, within, 2 * self.ttl + SLACK)
-        self.bidders[holder].lessee(task_id).stand_by(len(self.agents))
+        self.nodes[holder].get_lease_client(task_id).stand_by(len(self.agents))
 
     def _depart_suddenly(self, task_id: str, token: int, holder: int) -> None:
         """Kill, freeze or disconnect the executor, with one member of the council."""
         gone_at, dice = self.clock.seconds(), self._dice
-        members = [self.place_of(member) for member in self.councils[task_id].members]
+        members = [self.get_place(member) for member in self.charters[task_id].members]
         spare = [place for place in members if place not in self.agents]
         also = [dice.choice(spare)] if spare and holder not in members else []
         how = dice.choice(["kill", "freeze", "suspend", "cut"])
         self._begin(TimedFault(0, 0, how, (holder, *also)))
         others = [place for place in self.agents if place != holder]
-        within = self.ttl / (1.0 - self.drift) + SLACK + STAGGER * (len(self.agents) - 1)
+        within = self.ttl / (1.0 - self.drift) + SLACK + STAGGER_S * (len(self.agents) - 1)
         if len(others) > 1 and dice.random() < 0.75:
             # The strategy assigns one agent when the lease ends, then another.
             fickle = dice.choice(others)
-            self.bidders[fickle].leave(task_id)
+            self.nodes[fickle].leave(task_id)
             self.clock.advance(dice.uniform(0.8, 1.0) * self.ttl)
-            self.bidders[fickle].lessee(task_id).want()
-            while self.clock.seconds() < gone_at + 1.1 * self.ttl and self.referee.accepted[task_id][-1][1] <= token:
+            self.nodes[fickle].get_lease_client(task_id).claim()
+            while self.clock.seconds() < gone_at + 1.1 * self.ttl and self.recorder.accepted[task_id][-1][1] <= token:
                 self.clock.advance(dice.choice([0.004, 0.011, 0.017]))
                 if dice.random() < 0.2:
                     break
             # A robot that this agent has moved must stop first.
-            within += self.stop_time if self.bidders[fickle].holds(task_id) else 0.0
-            self.bidders[fickle].leave(task_id)
+            within += self.stop_time if self.nodes[fickle].has_lease(task_id) else 0.0
+            self.nodes[fickle].leave(task_id)
         why = f"{holder} of {task_id} is gone ({how})"
         self._wait_for_command(task_id, why, token, gone_at, within, 3 * self.ttl + SLACK)
         self._heal()
 
     def _conclude(self, task_id: str) -> None:
         """Complete the task by its executor, or cancel it: after the acknowledgement no robot moves."""
-        _, token, holder = self.referee.accepted[task_id][-1]
+        _, token, holder = self.recorder.accepted[task_id][-1]
         place = self._dice.choice([holder, self.n - 1])
         if place == holder:
-            self.referee.stop(holder, task_id)
-        history = self.referee.history
-        asked = history.asked(place, "close", task_id)
-        lessee = self.bidders[place].lessee(task_id)
-        closing: Deferred[Any] = lessee.end(token) if place == holder else lessee.council.close()
+            self.recorder.stop_robot(holder, task_id)
+        history = self.recorder.history
+        asked = history.record_request(place, "close", task_id)
+        lessee = self.nodes[place].get_lease_client(task_id)
+        closing: Deferred[Any] = lessee.close_task(token) if place == holder else lessee.proposer.close()
 
         def ended(_: object) -> None:
             lessee.release()
 
-        follow(history, asked, closing.addCallback(ended))
+        record_outcome(history, asked, closing.addCallback(ended))
         self.clock.advance(2 * self.ttl)
         for agent in self.agents:
-            self.bidders[agent].lessee(task_id).want()
+            self.nodes[agent].get_lease_client(task_id).claim()
         self.clock.advance(2 * self.ttl)
 
     def _wait_for_command(self, task_id: str, why: str, above: int, since: float, within: float, most: float) -> bool:
         """Wait up to ``most`` s for a command with a token above ``above``, due ``within`` s of ``since``."""
         began = self.clock.seconds()
-        self.referee.history.note(Awaited, task_id, why, above, since, within)
-        accepted = self.referee.accepted[task_id]
+        self.recorder.history.record(CommandExpected, task_id, why, above, since, within)
+        accepted = self.recorder.accepted[task_id]
         while self.clock.seconds() - began < most:
             if accepted and accepted[-1][1] > above and accepted[-1][0] >= began:
                 return True
@@ -250,19 +250,19 @@ class Leases(LeaseTeam):
                     self.kill(place)
             case "freeze" | "suspend":
                 for place in fault.places:
-                    if self.bidders[place].machine.is_alive and not self.bidders[place].machine.is_still:
-                        self.bidders[place].machine.freeze(fault.kind == "suspend")
+                    if self.nodes[place].machine.is_alive and not self.nodes[place].machine.is_frozen:
+                        self.nodes[place].machine.freeze(fault.kind == "suspend")
             case "change":
                 self._change(fault.places[0])
             case "torn change":
                 self._change(fault.places[0], is_torn=True)
             case "leave":
-                for task_id in self.councils:
+                for task_id in self.charters:
                     if self.is_up(fault.places[0]):
-                        self.bidders[fault.places[0]].leave(task_id)
+                        self.nodes[fault.places[0]].leave(task_id)
             case "air":
-                self.radio.air = Air(self.air.delay, self.air.jitter, 0.5, 0.3, 5.0)
-        self.referee.look_at_cuts()
+                self.radio.quality = LinkQuality(self.air.delay, self.air.jitter, 0.5, 0.3, 5.0)
+        self.recorder.record_reachability()
 
     def _end(self, fault: TimedFault) -> None:
         match fault.kind:
@@ -270,21 +270,21 @@ class Leases(LeaseTeam):
                 self.radio.cut.clear()
             case "kill" | "wipe":
                 for place in fault.places:
-                    if not self.bidders[place].machine.is_alive:
-                        self.bidders[place] = self.born(place)
+                    if not self.nodes[place].machine.is_alive:
+                        self.nodes[place] = self.start_life(place)
             case "freeze" | "suspend":
                 for place in fault.places:
-                    if self.bidders[place].machine.is_still:
-                        self.bidders[place].machine.thaw()
+                    if self.nodes[place].machine.is_frozen:
+                        self.nodes[place].machine.thaw()
             case "air":
-                self.radio.air = self.air
-        self.referee.look_at_cuts()
+                self.radio.quality = self.air
+        self.recorder.record_reachability()
 
     def _clog(self, *places: int) -> None:
         """Disconnect these places, unless the healthy phase has begun."""
         if not self._is_well:
             self._part(places)
-            self.referee.look_at_cuts()
+            self.recorder.record_reachability()
 
     def _part(self, places: Sequence[int]) -> None:
         rest = [place for place in range(self.n) if place not in places]
@@ -297,14 +297,14 @@ class Leases(LeaseTeam):
         """
         if not self.is_up(place) or not self.has_stores:
             return
-        for task_id in self.councils:
+        for task_id in self.charters:
             if self._dice.random() < 0.7:
                 for agent in self.agents:
                     if self.is_up(agent) and self._dice.random() < 0.9:
-                        self.bidders[agent].leave(task_id)
+                        self.nodes[agent].leave(task_id)
             chosen = sorted(self._dice.sample(range(self.n), 3))
             if is_torn:
-                sitting = [self.place_of(member) for member in self.councils[task_id].members]
+                sitting = [self.get_place(member) for member in self.charters[task_id].members]
                 chosen = sorted(range(self.n), key=lambda n: n in sitting)[:3]
                 self.clock.callLater(0.4 + self.stop_time, self._clog, place, *chosen)
             members = [self.contacts[n] for n in chosen]
@@ -312,6 +312,6 @@ class Leases(LeaseTeam):
 
     def _change_now(self, place: int, task_id: str, members: Sequence[Contact]) -> None:
         if self.is_up(place):
-            self.referee.stop(place, task_id)
-            changing: Deferred[None] = self.bidders[place].lessee(task_id).move(members)
+            self.recorder.stop_robot(place, task_id)
+            changing: Deferred[None] = self.nodes[place].get_lease_client(task_id).change_council(members)
             changing.addErrback(lambda failure: failure.trap(EntangledError))

@@ -11,14 +11,14 @@ from middleware.entangled.errors import EntangledError
 from middleware.entangled.identity import Identity
 from middleware.entangled.kademlia.overlay import K
 from middleware.entangled.node import EntangledNode
-from middleware.entangled.record import Record, hashed_key
-from sim.team.clients import REMOVE, Clients, follow
-from sim.team.event import Counted, Met, Stored
+from middleware.entangled.record import Record, hash_key
+from sim.team.clients import REMOVE, Clients, record_outcome
+from sim.team.event import ContactKnown, MembersListed, Stored
 from sim.team.invariant.durability import Slot
 from sim.team.schedule import Schedule
 from sim.team.workload import Workload
 
-KEYS = [hashed_key(f"key {number}") for number in range(4)]
+KEYS = [hash_key(f"key {number}") for number in range(4)]
 NAMES = ("a", "b")
 
 
@@ -33,9 +33,9 @@ class Records(Workload):
         self._held: dict[tuple[int, int, Slot], tuple[int, bytes]] = {}
         self._met: dict[int, set[Contact]] = {}
         self._old: list[Record] = []
-        schedule.fleet.attend(lambda place, node: self._met.update({place: set()}), lambda place, node: None)
-        if schedule.liar is not None:
-            self._let_lie(schedule.node(schedule.liar))
+        schedule.team.watch_lives(lambda place, node: self._met.update({place: set()}), lambda place, node: None)
+        if schedule.lying_place is not None:
+            self._let_lie(schedule.node(schedule.lying_place))
 
     def step(self) -> None:
         """Perform a few operations at random nodes, and inspect each store and routing table."""
@@ -46,7 +46,7 @@ class Records(Workload):
                 act(self._rng.choice(alive))
         self._look()
 
-    def settled(self) -> None:
+    def make_final_requests(self) -> None:
         """Let all nodes read all keys, and look up a few ids."""
         self._look()
         for place in self._schedule.alive():
@@ -56,11 +56,11 @@ class Records(Workload):
             for target in KEYS[:2]:
                 self._find(place, target)
 
-    def verdict(self) -> list[str]:
+    def find_violations(self) -> list[str]:
         """Record the present tables."""
         for place in self._schedule.alive():
-            known = self._schedule.node(place).overlay.roster.live()
-            self._history.note(Counted, place, tuple(contact.node_id for contact in known))
+            known = self._schedule.node(place).overlay.members.list_live()
+            self._history.record(MembersListed, place, tuple(contact.node_id for contact in known))
         return []
 
     # -- operations of clients --------------------------------------------------------------------------------------
@@ -72,7 +72,7 @@ class Records(Workload):
 
     def _remove(self, place: int) -> None:
         node = self._schedule.node(place)
-        mine = self._clients.slots(node.identity.public)
+        mine = self._clients.list_slots(node.identity.public)
         if mine:
             slot = self._rng.choice(mine)
             self._clients.write(place, node, slot.key, slot.name, act=REMOVE)
@@ -81,16 +81,16 @@ class Records(Workload):
         self._get(place, self._rng.choice(KEYS), self._rng.choice(["majority", "majority", "fast"]))
 
     def _get(self, place: int, key: bytes, concern: Any) -> None:
-        life = self._schedule.fleet.life[place]
+        life = self._schedule.team.life_numbers[place]
         self._clients.read(place, life, self._schedule.node(place), key, concern).addCallback(self._keep)
 
     def _keep(self, records: list[Record]) -> None:
         self._old += [record for record in records if len(self._old) < 50]
 
     def _find(self, place: int, target: bytes) -> None:
-        asked = self._history.asked(place, "look up", target, K)
+        asked = self._history.record_request(place, "look up", target, K)
         looking = self._schedule.node(place).find_node(target)
-        follow(self._history, asked, looking, lambda found: tuple(contact.node_id for contact in found))
+        record_outcome(self._history, asked, looking, lambda found: tuple(contact.node_id for contact in found))
 
     def _meddle(self, place: int) -> None:
         """Let a member send an old record of another member, and a forged one."""
@@ -99,12 +99,12 @@ class Records(Workload):
         node = self._schedule.node(place)
         old = self._rng.choice(self._old)
         made_up = Record(old.key, old.name, old.owner, old.sequence + 99, "team", 60.0, b"77777", old.signature)
-        for contact in node.overlay.responsible(old.key):
+        for contact in node.overlay.find_responsible(old.key):
             if contact.node_id != node.identity.node_id:
-                asked = node.endpoint.ask(contact, "store", [old.packed()], [old.ttl], changes=True)
+                asked = node.endpoint.ask(contact, "store", [old.pack()], [old.ttl], changes=True)
                 asked.addErrback(_weather)
                 if contact.public != old.owner and node.identity.public != old.owner:
-                    forged = node.endpoint.ask(contact, "store", [made_up.packed()], [60.0], changes=True)
+                    forged = node.endpoint.ask(contact, "store", [made_up.pack()], [60.0], changes=True)
                     forged.addErrback(_weather)
 
     def _let_lie(self, node: EntangledNode) -> None:
@@ -117,21 +117,21 @@ class Records(Workload):
     # -- observations -----------------------------------------------------------------------------------------------
 
     def _look(self) -> None:
-        fleet = self._schedule.fleet
+        fleet = self._schedule.team
         for place in self._schedule.alive():
             met = self._met[place]
             for contact in self._schedule.node(place).overlay.contacts():
                 if contact not in met:
                     met.add(contact)
-                    self._history.note(Met, place, contact.public, str(contact.address))
-            memory = fleet.memory(place)
+                    self._history.record(ContactKnown, place, contact.public, str(contact.address))
+            memory = fleet.get_store_number(place)
             for record in fleet.stores[place].records():
                 at, mark = (place, memory, Slot(*record.slot)), (record.sequence, record.signature)
                 if mark != self._held.get(at):
                     self._held[at] = mark
                     is_lasting = record.lifetime == "team"
                     is_genuine = not is_lasting or record.is_genuine()
-                    self._history.note(Stored, place, memory, at[2], record.name, *mark, is_lasting, is_genuine)
+                    self._history.record(Stored, place, memory, at[2], record.name, *mark, is_lasting, is_genuine)
 
 
 def _weather(failure: Failure) -> None:

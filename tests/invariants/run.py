@@ -8,12 +8,12 @@ from dataclasses import dataclass, replace
 from functools import partial
 from typing import Protocol
 
-from sim.team.files import DiskFleet
+from sim.team.reduction import NO_REDUCTION, Reduction, reduce_run
 from sim.team.schedule import Schedule
-from sim.team.shrink import WHOLE, Trim, shrunk
-from sim.team.sweep import sweep
+from sim.team.simulation import EntangledTeam
+from sim.team.sqlite_files import SqliteTeam
+from sim.team.sweep import run_seeds
 from sim.team.workload import Workload
-from sim.team.world import Fleet
 from tests.invariants.bug import BUGS, FINDERS, seeded
 from tests.invariants.deciders import Deciders
 from tests.invariants.leases import Leases
@@ -49,7 +49,7 @@ WORKLOADS: dict[str, Callable[[Schedule], Workload]] = {
     "deciders": Deciders,
 }
 """The workloads that share a world, in the order in which they act."""
-ALONE: dict[str, Callable[[int, Trim], Alone]] = {"tasks": Tasks, "leases": Leases, "groups": Groups}
+ALONE: dict[str, Callable[[int, Reduction], Alone]] = {"tasks": Tasks, "leases": Leases, "groups": Groups}
 """The workloads with separate worlds and faults."""
 SHARES = {"records": 0.15, "tuples": 0.06, "stores": 0.06, "wire": 0.06, "deciders": 0.06, "groups": 0.06}
 """The share of schedules with each workload, unless it is requested; the others are in all schedules."""
@@ -88,7 +88,7 @@ def drawn(seed: int) -> list[str]:
     ]
 
 
-def run(seed: int, only: tuple[str, ...] = (), bug: str | None = None, trim: Trim = WHOLE) -> Outcome:
+def run(seed: int, only: tuple[str, ...] = (), bug: str | None = None, trim: Reduction = NO_REDUCTION) -> Outcome:
     """Run the schedule of ``seed``, with the workloads ``only`` if given, and with a seeded bug.
 
     ``trim`` is the part of the schedule that remains; its workloads have precedence over ``only``.
@@ -99,12 +99,12 @@ def run(seed: int, only: tuple[str, ...] = (), bug: str | None = None, trim: Tri
         found = [line for world in alone for line in world.run()]
         worlds: list[Alone | Schedule] = [*alone]
         if len(names) > len(alone):
-            schedule = Schedule(seed, DiskFleet if "stores" in names else Fleet, trim)
+            schedule = Schedule(seed, SqliteTeam if "stores" in names else EntangledTeam, trim)
             found += schedule.run([WORKLOADS[name](schedule) for name in WORKLOADS if name in names])
             worlds.append(schedule)
             faults = "; ".join(map(str, schedule.faults))
-            title = f"n={schedule.n} {'+'.join(names)} {schedule.weather} faults: {faults}"
-            digest = schedule.fleet.board.digest()
+            title = f"n={schedule.n} {'+'.join(names)} {schedule.conditions} faults: {faults}"
+            digest = schedule.team.switchboard.digest()
         else:
             title, digest = "; ".join(map(str, alone)), " ".join(world.digest for world in alone)
     most = max(len(world.faults) for world in worlds)
@@ -116,11 +116,11 @@ def run_all(
     jobs: int,
     only: tuple[str, ...] = (),
     bug: str | None = None,
-    trim: Trim = WHOLE,
+    trim: Reduction = NO_REDUCTION,
     scheduler: str = "",
 ) -> Iterator[Outcome]:
     """Run many schedules, ``jobs`` in parallel or on the workers of a ``scheduler``; yield outcomes in order."""
-    return sweep(seeds, partial(run, only=only, bug=bug, trim=trim), jobs, scheduler)
+    return run_seeds(seeds, partial(run, only=only, bug=bug, trim=trim), jobs, scheduler)
 
 
 Hunted = tuple[str, tuple[str, ...], int, Outcome | None]
@@ -140,20 +140,23 @@ def hunt(number: int, seeds: Sequence[int]) -> Hunted:
 
 def hunt_all(seeds: Sequence[int], jobs: int, scheduler: str = "") -> Iterator[Hunted]:
     """Look for all bugs in parallel; yield the results in the order of the bugs."""
-    return sweep(range(len(BUGS)), partial(hunt, seeds=seeds), jobs, scheduler)
+    return run_seeds(range(len(BUGS)), partial(hunt, seeds=seeds), jobs, scheduler)
 
 
 @dataclass(frozen=True)
 class Least:
     """The smallest failing ``trim``, its outcome, and the number of ``runs`` to find it."""
 
-    trim: Trim
+    trim: Reduction
     outcome: Outcome
     runs: int
 
 
 def least(
-    outcome: Outcome, bug: str | None = None, is_over: Callable[[], bool] = lambda: False, whole: Trim = WHOLE
+    outcome: Outcome,
+    bug: str | None = None,
+    is_over: Callable[[], bool] = lambda: False,
+    whole: Reduction = NO_REDUCTION,
 ) -> Least:
     """Shrink a failed schedule while it violates the same invariant, until ``is_over`` returns true.
 
@@ -162,7 +165,7 @@ def least(
     invariant = outcome.found[0].partition(":")[0]
     best, runs = Least(replace(whole, only=outcome.names), outcome, 0), 0
 
-    def fails(trim: Trim) -> bool:
+    def fails(trim: Reduction) -> bool:
         nonlocal best, runs
         if is_over():
             return False
@@ -178,11 +181,11 @@ def least(
         # The worlds are independent, so one of them fails alone.
         any(fails(replace(whole, only=world)) for world in worlds)
     left = best.outcome
-    shrunk(best.trim, left.faults, left.names if len(left.worlds) == 1 else (), left.seconds, fails)
+    reduce_run(best.trim, left.faults, left.names if len(left.worlds) == 1 else (), left.seconds, fails)
     return replace(best, runs=runs)
 
 
-def line(seed: int, trim: Trim, bug: str | None = None) -> str:
+def line(seed: int, trim: Reduction, bug: str | None = None) -> str:
     """Return the command that replays the schedule."""
     words = ["python -m tests.invariants --schedules 1", f"--seed {seed}"]
     if trim.only:

@@ -30,8 +30,17 @@ from middleware.entangled.errors import EntangledError, NoAnswer, Refused, Unava
 from middleware.entangled.identity import Identity
 from middleware.entangled.network.network import Address
 from middleware.entangled.record import Record, Slot
-from middleware.stop.halt import HALT, METHOD, NOTE, SLOT, STANDS, UNSAVED, Halt, answer_halt
-from middleware.stop.stop_set import ID_BYTES, MAX_NAMED, MAX_RELEASED, statement_of
+from middleware.stop.stop_set import ID_BYTES, MAX_RELEASED, MAX_STOPS, parse_statement
+from middleware.stop.stop_state import (
+    METHOD,
+    NOT_SAVED,
+    NOTE_NAME,
+    SLOT,
+    STANDS_STILL,
+    STOPS_KEY,
+    StopState,
+    expose_stops,
+)
 
 STEPS = 60
 TEAM = {
@@ -64,15 +73,15 @@ class Disk(MemoryStore):
         self.safe: bytes | None = None
         self.waiting: list[tuple[bytes | None, Deferred[None]]] = []
 
-    def written(self) -> Deferred[None]:
+    def wait_for_write(self) -> Deferred[None]:
         """Return a Deferred that fires when the disk has written the note."""
         done: Deferred[None] = Deferred()
-        self.waiting.append((self.noted(NOTE), done))
+        self.waiting.append((self.get_note(NOTE_NAME), done))
         return done
 
     def commit(self) -> None:
         """Write the pending note."""
-        self.safe = self.noted(NOTE)
+        self.safe = self.get_note(NOTE_NAME)
         waiting, self.waiting = self.waiting, []
         for _, done in waiting:
             done.callback(None)
@@ -80,9 +89,9 @@ class Disk(MemoryStore):
     def crash(self) -> None:
         """Lose the unwritten note."""
         self.waiting.clear()
-        self._notes.pop(NOTE, None)
+        self._notes.pop(NOTE_NAME, None)
         if self.safe is not None:
-            self.note(NOTE, self.safe)
+            self.set_note(NOTE_NAME, self.safe)
 
 
 @dataclass
@@ -91,7 +100,7 @@ class Life:
 
     net: Net
     name: str
-    halt: Halt = field(init=False)
+    halt: StopState = field(init=False)
     is_over: bool = False
     changed: Callable[[list[Record]], None] | None = None
     answer: Callable[..., Any] = field(init=False)
@@ -101,15 +110,15 @@ class Life:
         self.store = self.net.disks[self.name]
         self.endpoint = self.replica = self.door = self
         self.records: list[Record] = []
-        self.halt = answer_halt(self, self.net.dice, self.later, lambda stops, words: None)  # type: ignore[arg-type]
+        self.halt = expose_stops(self, self.net.dice, self.later, lambda stops, words: None)  # type: ignore[arg-type]
         if self.name in ROBOTS:
-            self.halt.watch(self.obey)
+            self.halt.subscribe(self.obey)
 
     def obey(self) -> str:
         """Obey the halt as an agent does."""
         if not self.halt.is_known:
-            self.halt.learn()
-        return STANDS if self.halt.is_on else "goes on"
+            self.halt.request_stops()
+        return STANDS_STILL if self.halt.is_motion_forbidden else "goes on"
 
     def expose(self, name: str, answer: Callable[..., Any], changes: bool, idempotent: bool) -> None:
         """Store the handler of the calls."""
@@ -201,7 +210,7 @@ class Net:
         best: dict[bytes, Record] = {}
         for name in names:
             for owner, record in self.replicas[name].items():
-                if record.beats(best.get(owner)):
+                if record.supersedes(best.get(owner)):
                     best[owner] = record
         return [best[owner] for owner in sorted(best)]
 
@@ -209,7 +218,7 @@ class Net:
         """Write a new record of an owner to its replica, or to a random one if the owner is no node."""
         own = self.identities[name].public
         known = [r.sequence for r in (*self.old, *self.newest(list(NODES))) if r.owner == own]
-        record = Record(HALT, SLOT, own, max(known, default=0) + 1, "team", 600.0, value, self.dice.randbytes(64))
+        record = Record(STOPS_KEY, SLOT, own, max(known, default=0) + 1, "team", 600.0, value, self.dice.randbytes(64))
         self.old.append(record)
         self.hold(name if name in NODES else self.dice.choice(NODES), record)
 
@@ -218,7 +227,7 @@ class Net:
         owner = self.names.get(record.owner)
         if owner is not None and not self.may(record.owner):
             return
-        if record.beats(self.replicas[name].get(record.owner)):
+        if record.supersedes(self.replicas[name].get(record.owner)):
             self.replicas[name][record.owner] = record
             if name in self.lives:
                 self.lives[name].look()
@@ -231,7 +240,7 @@ class Net:
 
     def released(self, name: str, fields: object) -> None:
         """Remove the released stops from the stops that the robot must obey."""
-        statement = statement_of(fields)
+        statement = parse_statement(fields)
         if statement is not None:
             self.owed[name] -= set(statement.released)
 
@@ -263,7 +272,7 @@ class Net:
 
         def acknowledged(answer: list[Any]) -> list[Any]:
             said, obeyed = answer
-            if to in ROBOTS and life is self.lives.get(to) and not said.endswith(UNSAVED):
+            if to in ROBOTS and life is self.lives.get(to) and not said.endswith(NOT_SAVED):
                 ids = {stop for stop, _ in obeyed} & self.tracked
                 # A release may have arrived between the order and the end of the write.
                 fresh = {stop for stop, _ in arguments[0]} & ids & set(life.halt.stops)
@@ -278,7 +287,7 @@ class Net:
     def begin(self, name: str) -> None:
         """Start a node."""
         life = self.lives[name] = Life(self, name)
-        life.halt.learn() if name in ROBOTS else life.halt.follow()
+        life.halt.request_stops() if name in ROBOTS else life.halt.follow()
 
     def contacts(self) -> list[Contact]:
         """Return the contacts of all nodes."""
@@ -390,9 +399,9 @@ class Net:
                     [self.dice.randbytes(ID_BYTES) for _ in range(self.dice.choice((1, MAX_RELEASED)))],
                     sender,
                 ),
-                lambda: ([[self.dice.randbytes(ID_BYTES), sender] for _ in range(MAX_NAMED)], [], sender),
+                lambda: ([[self.dice.randbytes(ID_BYTES), sender] for _ in range(MAX_STOPS)], [], sender),
                 lambda: ([], known[:MAX_RELEASED], sender),
-                lambda: ([[stop, sender] for stop in known[:MAX_NAMED]], [], sender),
+                lambda: ([[stop, sender] for stop in known[:MAX_STOPS]], [], sender),
                 lambda: ([[b"", 0]], [2**53, [], {}], "x" * 100),
                 lambda: ([], [b"x" * 16] * (MAX_RELEASED + 1), sender),
             ]
@@ -410,7 +419,7 @@ class Net:
         """Check that no robot with an unreleased stop may move."""
         for name in ROBOTS:
             life = self.lives.get(name)
-            if life is not None and self.owed[name] and not life.halt.is_on:
+            if life is not None and self.owed[name] and not life.halt.is_motion_forbidden:
                 raise Violation(f"after {what} {name} may move, though {len(self.owed[name])} stops are not released")
 
     def step(self) -> None:
@@ -439,8 +448,8 @@ class Net:
         """Let time pass, and let the agents refresh their halts."""
         self.clock.advance(seconds)
         for name in ROBOTS:
-            if name in self.lives and self.lives[name].halt.is_on:
-                self.lives[name].halt.refresh()
+            if name in self.lives and self.lives[name].halt.is_motion_forbidden:
+                self.lives[name].halt.recheck()
 
     def end(self) -> None:
         """Restart all nodes, end the attacks, and let an operator release all stops that the devices name."""
@@ -460,7 +469,7 @@ class Net:
             if operator and named:
                 self.lives[operator].halt.release(sorted(named), operator, self.contacts()).addErrback(_expected)
             self.check("the end")
-        standing = [name for name in ROBOTS if self.lives[name].halt.is_on]
+        standing = [name for name in ROBOTS if self.lives[name].halt.is_motion_forbidden]
         if standing:
             raise Violation(f"no release lets {', '.join(standing)} go on")
 

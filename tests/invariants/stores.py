@@ -9,13 +9,13 @@ from twisted.python.failure import Failure
 
 from middleware.entangled.errors import EntangledError, Unwritable
 from middleware.entangled.node import EntangledNode
-from middleware.entangled.record import Record, hashed_key
-from sim.team.files import DiskFleet, DiskStore
+from middleware.entangled.record import Record, hash_key
 from sim.team.schedule import Schedule
+from sim.team.sqlite_files import CheckedStore, SqliteTeam
 from sim.team.workload import Workload
 from tests.invariants.records import KEYS
 
-PROBE = hashed_key("probe of a full disk")
+PROBE = hash_key("probe of a full disk")
 FULL = "database or disk is full"
 EARLY = (0.05, 0.1, 0.2, 0.5, 1.0, 2.0)
 """The times in seconds at which a node with a corrupt store is read."""
@@ -27,21 +27,21 @@ class Stores(Workload):
     """Fills the disk of one node after the other for some time, and corrupts one store."""
 
     def __init__(self, schedule: Schedule) -> None:
-        assert isinstance(schedule.fleet, DiskFleet)
+        assert isinstance(schedule.team, SqliteTeam)
         self._schedule = schedule
-        self._fleet = schedule.fleet
+        self._fleet = schedule.team
         self._rng = random.Random(f"stores/{schedule.seed}")
         self._found: list[str] = []
-        self._full: tuple[int, DiskStore] | None = None
+        self._full: tuple[int, CheckedStore] | None = None
         self._number = 0
-        schedule.fleet.attend(self._born, lambda place, node: None)
+        schedule.team.watch_lives(self._born, lambda place, node: None)
         voters = min(schedule.n, 8)
         deaths = sum(len(fault.places) for fault in schedule.faults if fault.kind == "die")
         # A corrupt store is one replica less; the invariants hold only while a majority remains.
         if deaths + 1 <= voters // 2:
             killed = [place for fault in schedule.faults if fault.kind.startswith("kill") for place in fault.places]
             if killed:
-                schedule.fleet.decay[self._rng.choice(killed)] = self._rng.choice(["row", "file"])
+                schedule.team.planned_corruption[self._rng.choice(killed)] = self._rng.choice(["row", "file"])
 
     def step(self) -> None:
         """Fill a disk, probe a full one, or free space."""
@@ -49,35 +49,35 @@ class Stores(Workload):
             alive = self._schedule.alive()
             if alive and self._rng.random() < 0.1:
                 place = self._rng.choice(alive)
-                self._full = (place, self._fleet.disk(place))
+                self._full = (place, self._fleet.get_store(place))
                 self._full[1].writer.fault = FULL
                 # It may last longer than the other faults, but not longer than the repair interval.
                 self._fleet.clock.callLater(self._rng.choice([1.0, 4.0, 8.0]), self._make_room)
             return
         place, store = self._full
-        if store.trouble and not store.writer.is_closed:
+        if store.write_error and not store.writer.is_closed:
             self._probe(place, store)
 
-    def settled(self) -> None:
+    def make_final_requests(self) -> None:
         """Check that all data is written by now."""
         for place in self._schedule.alive():
-            store = self._fleet.disk(place)
-            if store.trouble:
-                self._say("S-c", f"node {place} does not write again: {store.trouble}")
-            written = store.written()
+            store = self._fleet.get_store(place)
+            if store.write_error:
+                self._say("S-c", f"node {place} does not write again: {store.write_error}")
+            written = store.wait_for_write()
             written.addErrback(self._unwritten, place)
 
-    def verdict(self) -> list[str]:
+    def find_violations(self) -> list[str]:
         """Return the violations, after a comparison of memory and files."""
         for line in self._fleet.lost:
             self._say("S-a", line)
-        for line in self._fleet.overlooked:
+        for line in self._fleet.undetected:
             self._say("S-b", line)
         for place in self._schedule.alive():
-            store = self._fleet.disk(place)
-            while len(store.writer._owed) and not store.trouble:
-                store.writer.turn()
-            for line in self._fleet.differing(place):
+            store = self._fleet.get_store(place)
+            while len(store.writer._pending) and not store.write_error:
+                store.writer.commit_pending()
+            for line in self._fleet.compare_content(place):
                 self._say("S-a", line)
         return self._found
 
@@ -87,7 +87,7 @@ class Stores(Workload):
     # -- a corrupt store --------------------------------------------------------------------------------------------
 
     def _born(self, place: int, node: EntangledNode) -> None:
-        if self._fleet.decayed and self._fleet.decayed[-1] == place:
+        if self._fleet.corrupted and self._fleet.corrupted[-1] == place:
             for moment in EARLY:
                 self._fleet.clock.callLater(moment, self._read_early, place, node)
 
@@ -104,7 +104,7 @@ class Stores(Workload):
             self._say("S-b", f"node {place}, whose store has rotted, finds nothing under {key.hex()[:6]}")
 
     def _is_held(self, key: bytes) -> bool:
-        holders = [place for place in self._schedule.alive() if self._fleet.disk(place).get(key)]
+        holders = [place for place in self._schedule.alive() if self._fleet.get_store(place).get(key)]
         return 2 * len(holders) > min(self._schedule.n, 8) + 1
 
     # -- a full disk ------------------------------------------------------------------------------------------------
@@ -116,11 +116,11 @@ class Stores(Workload):
             self._full = None
             self._fleet.clock.callLater(RECOVERY, self._recovered, place, store)
 
-    def _recovered(self, place: int, store: DiskStore) -> None:
-        if store.trouble and not store.writer.is_closed and not store.writer.fault:
-            self._say("S-c", f"node {place} does not write {RECOVERY:.0f} s after there was room: {store.trouble}")
+    def _recovered(self, place: int, store: CheckedStore) -> None:
+        if store.write_error and not store.writer.is_closed and not store.writer.fault:
+            self._say("S-c", f"node {place} does not write {RECOVERY:.0f} s after there was room: {store.write_error}")
 
-    def _probe(self, place: int, store: DiskStore) -> None:
+    def _probe(self, place: int, store: CheckedStore) -> None:
         """Write to the node with the full disk locally and from another node."""
         self._number += 1
         node = self._schedule.node(place)
@@ -136,10 +136,10 @@ class Stores(Workload):
         others = [other for other in self._schedule.alive() if other != place]
         if others:
             asker = self._schedule.node(self._rng.choice(others))
-            asked = asker.endpoint.ask(node.contact, "store", [self._record(asker).packed()], [60.0], changes=True)
+            asked = asker.endpoint.ask(node.contact, "store", [self._record(asker).pack()], [60.0], changes=True)
             asked.addCallbacks(self._taken, self._refused, (place, store), {}, (place,))
 
-    def _taken(self, answer: Any, place: int, store: DiskStore) -> None:
+    def _taken(self, answer: Any, place: int, store: CheckedStore) -> None:
         if store.writer.fault and answer == [0]:
             self._say("S-c", f"node {place} acknowledges a record while its disk is full")
 
@@ -150,7 +150,7 @@ class Stores(Workload):
 
     def _record(self, node: EntangledNode) -> Record:
         name = f"probe {self._number}"
-        return Record(PROBE, name, node.identity.public, 1, "team", 60.0, b"1").signed(node.identity)
+        return Record(PROBE, name, node.identity.public, 1, "team", 60.0, b"1").sign(node.identity)
 
     def _say(self, invariant: str, text: str) -> None:
         line = f"{invariant}: {text}"

@@ -21,10 +21,10 @@ from middleware.consensus.strategy import ConsensusAlgorithm
 from middleware.entangled.clock import HeapClock
 from middleware.tasks.order import PAUSE, RESUME, Order
 from middleware.tasks.task import CANCELLED, Member, Result, Task
-from sim.team.checker import check
-from sim.team.event import Born, Calm, Concluded, Decided, Died, Engaged, Expired, Open, Report
+from sim.team.checker import find_violations
+from sim.team.event import ActiveTasks, Born, Decided, Died, FaultFree, OpenTask, OutcomeExpired, OutcomeStored, Report
 from sim.team.history import History
-from sim.team.shrink import WHOLE, Trim
+from sim.team.reduction import NO_REDUCTION, Reduction
 from tests.invariants.ether import OPERATOR, Ether, Lessee, Node, Weather
 from tests.invariants.walk import Robot, restarted
 
@@ -38,7 +38,7 @@ HEARD = 3.0
 class Tasks:
     """One schedule: agents, tasks and faults from ``seed``."""
 
-    def __init__(self, seed: int, trim: Trim = WHOLE) -> None:
+    def __init__(self, seed: int, trim: Reduction = NO_REDUCTION) -> None:
         self.rng = random.Random(f"tasks/{seed}")
         self.clock = HeapClock()
         self.n = self.rng.choice([2, 3, 3, 4, 5])
@@ -50,12 +50,12 @@ class Tasks:
         self.is_calm = self.rng.random() < 0.3
         self.trace: list[str] = []
         self.faults: list[str] = []
-        self.seconds = trim.within(FAULTS_S)
+        self.seconds = trim.limit_duration(FAULTS_S)
         self._trim = trim
         self._acting: dict[str, tuple[int, int]] = {}
         self._acknowledged: dict[str, tuple[Result, float]] = {}
         if self.is_calm:
-            self.history.note(Calm, HEARD + Lessee.TTL)
+            self.history.record(FaultFree, HEARD + Lessee.TTL)
         for place in range(1, self.n + 1):
             self.birth(place)
 
@@ -78,7 +78,7 @@ class Tasks:
             self.late()
             self.live(2.0)
         self.verdict()
-        return check(self.history)
+        return find_violations(self.history)
 
     def __str__(self) -> str:
         """Describe the schedule."""
@@ -94,7 +94,7 @@ class Tasks:
 
     def birth(self, place: int) -> None:
         """Start an agent."""
-        self.history.note(Born, place)
+        self.history.record(Born, place)
         self.robots[place] = restarted(self.robots[place], self.clock)
         node: Any = Node(self.ether, place)
         self.ether.nodes[place] = node
@@ -104,7 +104,7 @@ class Tasks:
 
     def death(self, place: int) -> None:
         """End an agent without notice."""
-        self.history.note(Died, place)
+        self.history.record(Died, place)
         del self.ether.nodes[place]
         self.agents.pop(place).stopService()
 
@@ -152,7 +152,7 @@ class Tasks:
     def enter(self, task: Task) -> None:
         """Add ``task`` to the schedule."""
         self.tasks[task.task_id] = task
-        self.history.asked("operator", "submit", task.task_id)
+        self.history.record_request("operator", "submit", task.task_id)
         self.ether.submit(task)
 
     def any_task(self) -> Task:
@@ -185,14 +185,14 @@ class Tasks:
         """Return whether all agents and the operator know the outcome of each task."""
         if any(self.ether.outcome(OPERATOR, name) is None for name in self.tasks):
             return False
-        dockets = [agent._docket for agent in self.agents.values()]
-        return not any(docket.open or any(map(docket.is_new, self.tasks)) for docket in dockets)
+        dockets = [agent._task_queue for agent in self.agents.values()]
+        return not any(docket.open_ids or any(map(docket.is_new, self.tasks)) for docket in dockets)
 
     def late(self) -> None:
         """Expire the outcome's record while the task is still listed."""
         for name in self.tasks:
             if self.ether.outcome(OPERATOR, name) is not None:
-                self.history.note(Expired, name)
+                self.history.record(OutcomeExpired, name)
                 self.ether.forget(name)
 
     def live(self, seconds: float) -> None:
@@ -210,14 +210,18 @@ class Tasks:
         for name, known in self.ether.acknowledged.items():
             if self._acknowledged.get(name) is not known:
                 self._acknowledged[name] = known
-                self.history.note(Concluded, name, known[0].outcome)
+                self.history.record(OutcomeStored, name, known[0].outcome)
         for place, agent in sorted(self.agents.items()):
-            acting = [name for name, part in agent._parts.items() if part.engagement.course.state is State.EXECUTING]
+            acting = [
+                name
+                for name, part in agent._participations.items()
+                if part.engagement.state_machine.state is State.EXECUTING
+            ]
             holding = self.holding(agent)
             if acting or len(holding) > 1:
-                self.history.note(Engaged, place, tuple(acting), holding)
+                self.history.record(ActiveTasks, place, tuple(acting), holding)
             for name in acting:
-                token = agent._parts[name].engagement.me.token
+                token = agent._participations[name].engagement.me.token
                 before = self._acting.get(name)
                 if before is None or before[1] < token:
                     self._acting[name] = place, token
@@ -230,7 +234,7 @@ class Tasks:
     @contextmanager
     def _recorded(self) -> Iterator[None]:
         """Record each decision of each agent."""
-        place: Any = import_module("agents.conference")
+        place: Any = import_module("agents.decider")
         genuine = place.decide
 
         def decide(
@@ -262,20 +266,22 @@ class Tasks:
         holders = decision.basis[2]
         holder = holders[0][1] if isinstance(holders, tuple) and holders else None
         place = int(me.uuid, 16)
-        self.history.note(Decided, place, group, reports, decision.basis, decision.assigned, holder, hysteresis)
+        self.history.record(Decided, place, group, reports, decision.basis, decision.assigned, holder, hysteresis)
 
     def _title(self, me: Member) -> str:
         agent = self.agents[int(me.uuid, 16)]
-        return next(name for name, part in agent._parts.items() if part.engagement.me is me)
+        return next(name for name, part in agent._participations.items() if part.engagement.me is me)
 
     def verdict(self) -> None:
         """Record the tasks that are still open at each agent."""
         for place, agent in self.agents.items():
             for name in self.tasks:
-                state = str(agent._parts[name].engagement.course) if name in agent._parts else ""
-                is_docketed = name in agent._docket.open
+                state = (
+                    str(agent._participations[name].engagement.state_machine) if name in agent._participations else ""
+                )
+                is_docketed = name in agent._task_queue.open_ids
                 if state or is_docketed:
-                    self.history.note(Open, name, place, state, is_docketed)
+                    self.history.record(OpenTask, name, place, state, is_docketed)
 
 
 class Groups(Tasks):
@@ -291,7 +297,7 @@ class Groups(Tasks):
 
     def holding(self, agent: Agent) -> tuple[str, ...]:
         """Return the tasks for which an agent holds the lease."""
-        lessees = {name: part.engagement.lessee for name, part in agent._parts.items()}
+        lessees = {name: part.engagement.lease_client for name, part in agent._participations.items()}
         return tuple(name for name, lessee in lessees.items() if lessee is not None and lessee.lease is not None)
 
 

@@ -12,16 +12,16 @@ from twisted.python.failure import Failure
 from middleware.entangled.errors import EntangledError
 from middleware.entangled.node import EntangledNode
 from middleware.entangled.quorum.acceptor import Event
-from middleware.entangled.space.posting import Posted
 from middleware.entangled.space.take_codec import unpack_reply
 from middleware.entangled.space.taker import Claim
 from middleware.entangled.space.template import ANY, Field, Tuple
+from middleware.entangled.space.tuple_record import StoredTuple
 from middleware.entangled.space.tuplespace import TupleSpace
 from sim.team import event
-from sim.team.clients import follow
-from sim.team.invariant.taking import PUT, RING, SURVEY, TAKE, WAIT
+from sim.team.clients import record_outcome
+from sim.team.invariant.tuple_space import PUT, RING, SURVEY, TAKE, WAIT
 from sim.team.schedule import Schedule
-from sim.team.takers.witness import Witness
+from sim.team.takers.vote_recorder import VoteRecorder
 from sim.team.workload import Workload
 
 JOB = ("job", int, ANY)
@@ -42,29 +42,29 @@ class Tuples(Workload):
 
     def __init__(self, schedule: Schedule) -> None:
         self._schedule = schedule
-        self._clock = schedule.fleet.clock
+        self._clock = schedule.team.clock
         self._rng = random.Random(f"tuples/{schedule.seed}")
         self._history = schedule.history
-        self._witness = Witness(schedule.history)
+        self._witness = VoteRecorder(schedule.history)
         self._spaces: dict[int, TupleSpace] = {}
         self._lives = 0
         self._number = 0
         self._acknowledged: dict[Tuple, None] = {}
         self._waiting: dict[int, int] = {}
-        schedule.fleet.attend(self._born, self._died)
+        schedule.team.watch_lives(self._born, self._died)
 
     def step(self) -> None:
         """Perform a few operations at random nodes."""
         if not self._spaces:
             return
-        if self._rng.random() < 0.4 and len(self._witness.open()) < MOST_WAITING:
+        if self._rng.random() < 0.4 and len(self._witness.list_undecided()) < MOST_WAITING:
             self._put()
         if self._rng.random() < 0.6:
             place = self._rng.choice(sorted(self._spaces))
             act = self._rng.choice([self._take, self._take, self._take_some, self._claim, self._look, self._again])
             act(place, self._spaces[place])
 
-    def settled(self) -> None:
+    def make_final_requests(self) -> None:
         """Let all nodes read all tuples, then put the bell and take the remaining tuples, at last one by one."""
         for place, space in sorted(self._spaces.items()):
             self._survey(place, space)
@@ -73,7 +73,7 @@ class Tuples(Workload):
         self._clock.callLater(SWEEP, self._sweep)
         self._clock.callLater(FETCH, self._fetch)
 
-    def verdict(self) -> list[str]:
+    def find_violations(self) -> list[str]:
         """Record the members that can still decide."""
         self._seats()
         for space in self._spaces.values():
@@ -84,10 +84,10 @@ class Tuples(Workload):
 
     def _born(self, place: int, node: EntangledNode) -> None:
         self._lives += 1
-        node.replica.on_record.add(self._witness.stored)
+        node.replica.on_record.add(self._witness.record_tuple)
         rng = random.Random(f"tuples/{self._schedule.seed}/{place}/{self._lives}")
         space = self._spaces[place] = TupleSpace(node, self._clock, rng)
-        self._witness.attend(node.seat, node.endpoint.expose, node.identity.public)
+        self._witness.wrap_member(node.take_acceptor, node.endpoint.expose, node.identity.public)
         if place < 2:
             # Later, as the node may not have started yet.
             self._clock.callLater(0.1, self._wait, place, space)
@@ -95,19 +95,19 @@ class Tuples(Workload):
     def _died(self, place: int, node: EntangledNode) -> None:
         self._spaces.pop(place).stop()
         if place in self._waiting:
-            self._history.unanswered(self._waiting.pop(place), "it died")
+            self._history.record_failure(self._waiting.pop(place), "it died")
 
     def _wait(self, place: int, space: TupleSpace) -> None:
         if self._spaces.get(place) is space:
             self._waiting[place] = self._listen(f"node {place}, which waits through it all", space)
 
-    def _left(self) -> list[Posted]:
+    def _left(self) -> list[StoredTuple]:
         """Return the acknowledged tuples that were not taken and must still be takeable."""
-        return [p for p in self._witness.open() if p.fields in self._acknowledged and self._can_decide(p)]
+        return [p for p in self._witness.list_undecided() if p.fields in self._acknowledged and self._can_decide(p)]
 
-    def _can_decide(self, posted: Posted) -> bool:
+    def _can_decide(self, posted: StoredTuple) -> bool:
         """Return whether a majority of the council is online with its state."""
-        seats = {node.identity.public: node.seat for node in map(self._schedule.node, self._schedule.alive())}
+        seats = {node.identity.public: node.take_acceptor for node in map(self._schedule.node, self._schedule.alive())}
         there = [m for m in posted.council if m.contact.public in seats]
         able = [m for m in there if seats[m.contact.public].incarnation == m.incarnation]
         return 2 * len(able) > len(posted.council)
@@ -118,12 +118,12 @@ class Tuples(Workload):
         fields = ("job", self._number, self._number / 2)
         self._number += 1
         putting = self._spaces[self._rng.choice(sorted(self._spaces))].put(fields)
-        asked = self._history.asked("somebody", PUT, fields)
+        asked = self._history.record_request("somebody", PUT, fields)
 
         def acknowledged(_: object) -> None:
             self._acknowledged[fields] = None
 
-        follow(self._history, asked, putting.addCallback(acknowledged))
+        record_outcome(self._history, asked, putting.addCallback(acknowledged))
 
     def _take(self, place: int, space: TupleSpace) -> None:
         self._get(JOB, place, space, timeout=self._rng.choice([0.3, 2.0, 5.0]))
@@ -136,7 +136,7 @@ class Tuples(Workload):
 
     def _taking(self, taking: Deferred[list[Tuple]], place: int) -> None:
         """Record a client's take."""
-        follow(self._history, self._history.asked(place, TAKE, "job"), taking, tuple)
+        record_outcome(self._history, self._history.record_request(place, TAKE, "job"), taking, tuple)
 
     def _claim(self, place: int, space: TupleSpace) -> None:
         claiming = space.claim(JOB, lease=1.5, timeout=3.0)
@@ -159,48 +159,48 @@ class Tuples(Workload):
 
     def _again(self, place: int, space: TupleSpace) -> None:
         """Ask members again to confirm a decided take: each member that accepted it must repeat its answer."""
-        decided = [one for one in self._witness.posted.values() if self._witness.takers(one.place)]
+        decided = [one for one in self._witness.tuples.values() if self._witness.find_takers(one.tuple_id)]
         if not decided:
             return
         posted = self._rng.choice(decided)
         node = self._schedule.node(place)
-        for (counter, taker, value), members in sorted(self._witness.bids[posted.place].items()):
+        for (counter, taker, value), members in sorted(self._witness.votes[posted.tuple_id].items()):
             if 2 * len(members) <= len(posted.council):
                 continue
             for member in posted.council:
                 if member.contact.public in members - {node.identity.public}:
-                    places = [posted.place.packed()]
-                    question = (posted.place.key, places, member.incarnation, counter, taker, value)
+                    places = [posted.tuple_id.pack()]
+                    question = (posted.tuple_id.key, places, member.incarnation, counter, taker, value)
                     asked = node.endpoint.ask(member.contact, "decree.confirm", *question, changes=True)
                     asked.addCallbacks(self._said_again, _weather, (posted, value))
 
-    def _said_again(self, answer: Any, posted: Posted, value: bytes) -> None:
+    def _said_again(self, answer: Any, posted: StoredTuple, value: bytes) -> None:
         reply = unpack_reply(answer[0], Event.ACCEPT) if isinstance(answer, list) and answer else None
-        self._history.note(event.Repeated, posted.fields, value, reply.value if reply is not None else None)
+        self._history.record(event.AnswerRepeated, posted.fields, value, reply.value if reply is not None else None)
 
     # -- the end ----------------------------------------------------------------------------------------------------
 
     def _listen(self, who: str, space: TupleSpace) -> int:
-        asked = self._history.asked(who, WAIT, who)
-        space.read(BELL).addCallbacks(lambda _: self._history.answered(asked), _weather)
+        asked = self._history.record_request(who, WAIT, who)
+        space.read(BELL).addCallbacks(lambda _: self._history.record_answer(asked), _weather)
         return asked
 
     def _ring(self) -> None:
         place = self._rng.choice(sorted(self._spaces))
-        asked = self._history.asked(place, RING, "bell")
-        follow(self._history, asked, self._spaces[place].put(("bell", 1)))
+        asked = self._history.record_request(place, RING, "bell")
+        record_outcome(self._history, asked, self._spaces[place].put(("bell", 1)))
 
     def _survey(self, place: int, space: TupleSpace) -> None:
-        asked = self._history.asked(place, SURVEY, "job")
+        asked = self._history.record_request(place, SURVEY, "job")
 
         def seen(found: list[Tuple]) -> tuple[Tuple, ...]:
             self._seats()
             return tuple(found)
 
-        follow(self._history, asked, space.read_all(JOB), seen)
+        record_outcome(self._history, asked, space.read_all(JOB), seen)
 
     def _seats(self) -> None:
-        self._witness.seated(map(self._schedule.node, self._schedule.alive()))
+        self._witness.record_members(map(self._schedule.node, self._schedule.alive()))
 
     def _sweep(self) -> None:
         place = self._rng.choice(sorted(self._spaces))

@@ -108,7 +108,7 @@ class Robot:
     def _live(self) -> None:
         if self._is_on:
             self._clock.callLater(0.1, self._live)
-            if self._gate.is_over(self._clock.seconds()):
+            if self._gate.is_motion_over(self._clock.seconds()):
                 self._speed = 0.0
             self.place += 0.1 * self._speed
             now = self._clock.seconds()

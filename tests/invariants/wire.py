@@ -13,31 +13,31 @@ from typing import Any
 from twisted.logger import ILogObserver, LogLevel, globalLogPublisher
 from zope.interface import implementer
 
-from middleware.entangled.identity import Identity, exchange_key
+from middleware.entangled.identity import Identity, derive_exchange_key
 from middleware.entangled.kademlia.overlay import MAX_FOUND, K
+from middleware.entangled.nat.known_peers import MAX_KNOWN
+from middleware.entangled.nat.path_tracker import MAX_PORTS
+from middleware.entangled.nat.relay import MAX_PAIRS
 from middleware.entangled.network.network import Address
 from middleware.entangled.node import EntangledNode
-from middleware.entangled.reach.known import MAX_KNOWN
-from middleware.entangled.reach.relay import MAX_PAIRS
-from middleware.entangled.reach.way import MAX_FRESH
-from middleware.entangled.wire.answerer import MAX_CANCELLED
-from middleware.entangled.wire.greeting import TOKEN_BYTES, who
+from middleware.entangled.wire.discovery import TOKEN_BYTES, pack_discovery
+from middleware.entangled.wire.dispatcher import MAX_CANCELLED
 from middleware.entangled.wire.method import MAX_ENTRIES
-from middleware.entangled.wire.peer import MAX_OPENINGS, MAX_PEERS, MAX_SESSIONS
+from middleware.entangled.wire.peer import MAX_HANDSHAKES, MAX_PEERS, MAX_SESSIONS
 from middleware.entangled.wire.session import (
     INIT,
     MAX_RESPONSES,
     MAX_UNCONFIRMED,
     RESPONSES_S,
     Credentials,
-    Invitation,
-    derived_key,
+    InitiatorHandshake,
+    derive_key,
 )
-from sim.team.clients import follow
-from sim.team.event import Ran, Shot, Size, Strange
+from sim.team.clients import record_outcome
+from sim.team.event import InvalidDatagram, RequestExecuted, TableSize, UnvalidatedTraffic
 from sim.team.schedule import Schedule
+from sim.team.simulation import TEAM_KEY
 from sim.team.workload import Workload
-from sim.team.world import TEAM
 from tests.fuzz.ground import state_of
 
 KINDS = ("replayed", "replayed", "forged", "forged", "truncated", "misdirected", "malformed", "greeting")
@@ -66,7 +66,7 @@ class Wire(Workload):
 
     def __init__(self, schedule: Schedule) -> None:
         self._schedule = schedule
-        self._board: Any = schedule.fleet.board
+        self._board: Any = schedule.team.switchboard
         self._rng = random.Random(f"wire/{schedule.seed}")
         self._history = schedule.history
         self._heard: dict[Address, dict[int, deque[tuple[float, Address, bytes]]]] = {}
@@ -92,12 +92,12 @@ class Wire(Workload):
             if self._board.counters["delivered"] > before:
                 known = self._heard.setdefault(to, {})
                 known.setdefault(datagram[0], deque(maxlen=REMEMBERED)).append(
-                    (schedule.fleet.clock.seconds(), source, datagram)
+                    (schedule.team.clock.seconds(), source, datagram)
                 )
 
         vars(self._board).update(_transmit=tapped_carry, _deliver=tapped_deliver)
         # Stored datagrams are kept after the end of a node, and injected into its next run.
-        schedule.fleet.attend(self._born, lambda place, node: None)
+        schedule.team.watch_lives(self._born, lambda place, node: None)
 
     def step(self) -> None:
         """Inject one or two datagrams, and send a request that must run at most once."""
@@ -110,26 +110,26 @@ class Wire(Workload):
             asker, answerer = self._rng.sample(alive, 2)
             self._ask(asker, answerer)
 
-    def settled(self) -> None:
+    def make_final_requests(self) -> None:
         """Inject a last datagram at each node, and flood one with handshakes."""
         alive = self._schedule.alive()
         for place in alive:
             self._shoot(place)
         self._flood(self._rng.choice(alive))
 
-    def verdict(self) -> list[str]:
+    def find_violations(self) -> list[str]:
         """Record the bytes to and from the unknown address, and the sizes of the tables."""
-        self._history.note(Strange, self._sent_to_stranger, self._got_from_stranger)
+        self._history.record(UnvalidatedTraffic, self._sent_to_stranger, self._got_from_stranger)
         for place in self._schedule.alive():
             for what, size, cap in self._tables(self._schedule.node(place)):
-                self._history.note(Size, place, what, size, cap)
+                self._history.record(TableSize, place, what, size, cap)
         return []
 
     # -- injected datagrams (R1, R3) --------------------------------------------------------------------------------
 
     def _shoot(self, place: int) -> None:
         """Inject a datagram that the node must drop, and compare the node's state before and after."""
-        own = self._schedule.fleet.address(place)
+        own = self._schedule.team.address(place)
         shot = self._made(own)
         if shot is None:
             return
@@ -148,14 +148,14 @@ class Wire(Workload):
         answered, self._answered = self._answered, None
         logged = self._ear.heard.pop() if self._ear.heard else ""
         answers = tuple((to == source, len(answer)) for to, answer in answered)
-        self._history.note(Shot, place, kind, datagram, before, self._state(node), raised, logged, answers)
+        self._history.record(InvalidDatagram, place, kind, datagram, before, self._state(node), raised, logged, answers)
 
     def _made(self, own: Address) -> tuple[str, Address, bytes] | None:
         """Return a datagram for the node at ``own``: its kind, source and bytes."""
-        rng, now = self._rng, self._schedule.fleet.clock.seconds()
+        rng, now = self._rng, self._schedule.team.clock.seconds()
         kind = rng.choice(KINDS)
         if kind == "greeting":  # valid, from an address that is not yet proven
-            return kind, STRANGER, who(derived_key(TEAM, b"greet"), rng.randbytes(TOKEN_BYTES), rng)
+            return kind, STRANGER, pack_discovery(derive_key(TEAM_KEY, b"greet"), rng.randbytes(TOKEN_BYTES), rng)
         source = rng.choice([STRANGER, None])
         place = own
         if kind == "misdirected":
@@ -185,63 +185,63 @@ class Wire(Workload):
 
     def _state(self, node: EntangledNode) -> str:
         """Return a name for the state of a node: equal states have equal names, in each process."""
-        clock = self._schedule.fleet.clock
+        clock = self._schedule.team.clock
         calls = sorted((time, order) for time, order, call in clock._heap if call.active())
         return self._states.setdefault(state_of([node, node.store, calls]), f"state {len(self._states)}")
 
     def _flood(self, place: int) -> None:
         """Start more handshakes at once than a node answers, from unknown members."""
         node = self._schedule.node(place)
-        static = exchange_key(node.identity.public)
+        static = derive_exchange_key(node.identity.public)
         dice = random.Random(f"flood/{self._schedule.seed}")
-        own = Credentials.of(Identity(dice.randbytes(32)), TEAM)
+        own = Credentials.derive(Identity(dice.randbytes(32)), TEAM_KEY)
         for number in range(FLOOD):
-            datagram = Invitation(own, static, dice.randbytes(32), number, b"").datagram()
+            datagram = InitiatorHandshake(own, static, dice.randbytes(32), number, b"").make_init()
             self._got_from_stranger += len(datagram)
             node._network.receiver(datagram, STRANGER)  # type: ignore[attr-defined]
         half_open = len(node.endpoint._half_open._unconfirmed)
-        self._history.note(Size, place, "handshakes with who showed no cookie", half_open, FLOOD * 4 // 5)
+        self._history.record(TableSize, place, "handshakes with who showed no cookie", half_open, FLOOD * 4 // 5)
 
     # -- requests (R2) ----------------------------------------------------------------------------------------------
 
     def _born(self, place: int, node: EntangledNode) -> None:
-        self._born_at[self._schedule.fleet.address(place)] = self._schedule.fleet.clock.seconds()
-        life = self._schedule.fleet.life[place]
+        self._born_at[self._schedule.team.address(place)] = self._schedule.team.clock.seconds()
+        life = self._schedule.team.life_numbers[place]
 
         def run(peer: object, number: int) -> int:
-            self._history.note(Ran, place, life, number)
+            self._history.record(RequestExecuted, place, life, number)
             return number
 
         node.endpoint.expose("run", run, changes=True)
 
     def _ask(self, asker: int, answerer: int) -> None:
         self._number += 1
-        number, life = self._number, self._schedule.fleet.life[answerer]
+        number, life = self._number, self._schedule.team.life_numbers[answerer]
         contact = self._schedule.node(answerer).contact
-        asked = self._history.asked(asker, "run", number)
+        asked = self._history.record_request(asker, "run", number)
 
         def shown(answer: object) -> object:
-            return answer, answerer, life, self._schedule.fleet.life[answerer]
+            return answer, answerer, life, self._schedule.team.life_numbers[answerer]
 
         asking = self._schedule.node(asker).endpoint.ask(contact, "run", number, changes=True)
-        follow(self._history, asked, asking, shown)
+        record_outcome(self._history, asked, asking, shown)
 
     # -- tables (R4) ------------------------------------------------------------------------------------------------
 
     def _tables(self, node: EntangledNode) -> list[tuple[str, int, int]]:
         """Return all tables that peers can fill, with their sizes and limits."""
         endpoint: Any = node.endpoint
-        peers, answerer = endpoint._peers, endpoint._answerer
+        peers, answerer = endpoint._peers, endpoint._dispatcher
         usage = node.store.usage
         return [
             ("peers", len(peers._peers), MAX_PEERS),
-            ("handshakes of its own", len(peers._openings), MAX_OPENINGS),
+            ("handshakes of its own", len(peers._handshakes), MAX_HANDSHAKES),
             ("sessions", len(peers.sessions), MAX_SESSIONS * len(peers._peers) + MAX_UNCONFIRMED),
             ("sessions that nobody confirmed", len(endpoint._half_open._unconfirmed), MAX_UNCONFIRMED),
             ("answers to handshakes", len(endpoint._half_open._responses), MAX_RESPONSES),
-            ("questions", len(answerer._ledger), MAX_ENTRIES),
+            ("questions", len(answerer._history), MAX_ENTRIES),
             ("cancelled questions", len(answerer._cancelled), MAX_CANCELLED),
-            ("found keys", len(node.overlay._found), MAX_FOUND),
+            ("found keys", len(node.overlay._lookup_results), MAX_FOUND),
             *_ways(node),
             ("rows", usage.rows, usage.max_rows),
             ("bytes", usage.bytes, usage.max_bytes),
@@ -255,14 +255,14 @@ def _buckets(node: EntangledNode) -> list[Any]:
 
 
 def _ways(node: EntangledNode) -> list[tuple[str, int, int]]:
-    reach: Any = node.reach
+    reach: Any = node.nat
     tables = ("acquaintances", "_carriers", "_upgrades", "_allowance")
     return [
         ("peers by their ids", len(reach._known), MAX_PEERS),
         ("pairs that are carried for", len(reach.relay), MAX_PAIRS),
-        ("fresh ports", len(reach._ports), MAX_FRESH),
+        ("fresh ports", len(reach._ports), MAX_PORTS),
         *((f"ways ({name})", len(getattr(reach, name)), MAX_KNOWN) for name in tables),
-        ("holes in its router", len(reach.ways._holes), MAX_KNOWN),
+        ("holes in its router", len(reach.paths._mapped_peers), MAX_KNOWN),
         ("where it is seen", len(reach.outside._seen), MAX_KNOWN),
         ("who was told where it is seen", len(reach.outside._notified_at), MAX_KNOWN),
     ]

@@ -15,7 +15,7 @@ from typing import Any
 
 from twisted.trial.unittest import SynchronousTestCase
 
-from benchmarks.demo import family
+from benchmarks.demo import list_descendants
 from tests.live.page import BrowserCase
 
 PATIENCE_MS = 120_000
@@ -78,7 +78,7 @@ class Demonstration:
 
     def send_signal(self, name: str, how: signal.Signals) -> int:
         """Send a signal to the process of the node ``name``; return its process id."""
-        pid = next(pid for pid, each in family(self.pid).items() if each == name)
+        pid = next(pid for pid, each in list_descendants(self.pid).items() if each == name)
         os.kill(pid, how)
         return pid
 

@@ -12,7 +12,7 @@ from functools import cache
 from twisted.trial.unittest import SkipTest, SynchronousTestCase
 
 from sim.namespaces.internet import Internet, Site
-from sim.namespaces.room import refusal
+from sim.namespaces.namespace import find_unavailable_reason
 
 
 class NamespaceCase(SynchronousTestCase):
@@ -37,7 +37,7 @@ class NamespaceCase(SynchronousTestCase):
 @cache
 def refused() -> str:
     """Return the reason why namespaces are unavailable, printed once, or an empty string."""
-    why = refusal()
+    why = find_unavailable_reason()
     if why:
         stream = sys.__stderr__ or sys.stderr
         stream.write(f"\n!!!\n!!! THE TESTS IN NETWORK NAMESPACES ARE SKIPPED: {why}\n!!!\n")

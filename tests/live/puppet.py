@@ -14,9 +14,9 @@ from twisted.internet.defer import Deferred
 from twisted.protocols.basic import LineReceiver
 
 from drivers.base import BaseDriver
-from drivers.deadman.keeper import Keeper
+from drivers.deadman.supervisor import Supervisor
 from drivers.driver import Permit
-from drivers.registry import driver_for
+from drivers.registry import create_driver
 from middleware.entangled.clock import use_monotonic_time
 
 REACTOR: Any = reactor
@@ -45,7 +45,7 @@ class Puppet(LineReceiver):
 def pid_of(driver: BaseDriver) -> int:
     """Return the process id of the dead man's switch, or 0 without one."""
     keeper = driver._dead_man
-    return keeper.pid or 0 if isinstance(keeper, Keeper) else 0
+    return keeper.pid or 0 if isinstance(keeper, Supervisor) else 0
 
 
 def say(*words: object) -> None:
@@ -54,7 +54,7 @@ def say(*words: object) -> None:
 
 
 async def run(kind: str, options: dict[str, Any]) -> None:
-    driver = driver_for(kind, options, "puppet", REACTOR)
+    driver = create_driver(kind, options, "puppet", REACTOR)
     assert isinstance(driver, BaseDriver)
     REACTOR.addSystemEventTrigger("before", "shutdown", driver.disconnect)
     await driver.connect()

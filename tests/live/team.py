@@ -32,24 +32,24 @@ from twisted.internet.threads import deferToThread
 from twisted.protocols.basic import LineReceiver
 
 from middleware.faults.kinds import KINDS
-from swarmnode.gateway import sides
+from swarmnode.gateway import check_picture
 from tests.live.keys import GATEWAYS, key_of
 from tests.webnode.memory import MemoryDesk, MemoryFaults, MemoryHalts, MemoryPhones, MemorySurvey
-from webnode.audit import Audit
-from webnode.board import Board
+from webnode.audit import AuditLog
+from webnode.auth import Token, User
 from webnode.camera import OnFrame
-from webnode.chronicle import TeamChronicle
+from webnode.event_log import EventLog
 from webnode.fallback import Fallbacks, Page
-from webnode.invite import TeamInvites
+from webnode.invite import Invites
 from webnode.limits import AddressLimits
-from webnode.password import hashed, is_password
+from webnode.password import hash_password, verify_password
 from webnode.server import WebService
-from webnode.session import NOBODY, SignedSessions
-from webnode.state import Departed, State, state_of
-from webnode.visitor import Token, Visitor
+from webnode.services import Services
+from webnode.session import ANONYMOUS, SignedSessions
+from webnode.state import DepartedDevices, State, format_state
 
 reactor: Any = _reactor
-PASSWORD = hashed("correct horse", bytes(16), 4)
+PASSWORD = hash_password("correct horse", bytes(16), 4)
 FPS = 5
 """Pictures of a camera per second: enough for the page to show that they move."""
 HUES = {"dog1": (70, 90, 150), "dog2": (70, 150, 90), "dog3": (150, 100, 70)}
@@ -130,7 +130,7 @@ class Team:
         self.batch = 0
         self.version = 0
         self._made: tuple[object, State] = (None, {})
-        self._departed = Departed()
+        self._departed = DepartedDevices()
         self.tasks = [
             {
                 "id": "t1",
@@ -176,8 +176,8 @@ class Team:
             for each in here
             if each["task"]
         ]
-        gone = self._departed.of(here, time.time())
-        state = state_of(here, self.tasks, {str(task): members}, departed=gone, node=self.node)
+        gone = self._departed.update(here, time.time())
+        state = format_state(here, self.tasks, {str(task): members}, departed=gone, node=self.node)
         return {**state, "halted": self.halts.is_halted()}
 
     def be_strange(self, words: list[str]) -> None:
@@ -209,7 +209,7 @@ class Team:
             }
             self.tasks.append({**task, "note": said, "strategy": said, "why": told, "requirements": {said: {}}})
         self.yard["dogs"] = [{**YARD["dogs"][0], "name": said} for said in words[:20]]
-        self._departed = Departed()
+        self._departed = DepartedDevices()
 
     def be_many(self, count: int) -> None:
         """Add idle dogs up to ``count``."""
@@ -300,13 +300,13 @@ class Orders(LineReceiver):
         pages = Fallbacks()
         self._pages = pages.pages
         served = replace(board(team), fallbacks=pages)
-        assert isinstance(served.sessions, SignedSessions) and isinstance(served.desk, MemoryDesk)
-        self._sessions, self._desk = served.sessions, served.desk
+        assert isinstance(served.sessions, SignedSessions) and isinstance(served.control, MemoryDesk)
+        self._sessions, self._desk = served.sessions, served.control
         self._web = WebService(reactor, "127.0.0.1", port, team.read, served, time.time, ("vaio.local",))
         pages_here = ["http://192.168.0.7:8080", "https://192.168.0.7:8443", f"http://127.0.0.1:{port}"]
-        served.invites = TeamInvites(lambda: pages_here, b"PEM", "AB:CD:" * 10, reactor, reactor.getThreadPool())
+        served.invites = Invites(lambda: pages_here, b"PEM", "AB:CD:" * 10, reactor, reactor.getThreadPool())
         self._web.startService()
-        token = self._sessions.token(NOBODY, "operator", "operator", time.time(), 3600.0)
+        token = self._sessions.issue_guest_token(ANONYMOUS, "operator", "operator", time.time(), 3600.0)
         self.sendLine(f"{self._web.port} {self._sessions.code} {token.text} {token.ticket}".encode())
 
     def _change(self, verb: str, rest: list[str]) -> None:
@@ -331,7 +331,7 @@ class Orders(LineReceiver):
         elif verb == "outdoors":
             self._desk.ground = None
         elif verb == "session":
-            self._sessions.signed_s = float(rest[0])
+            self._sessions.session_s = float(rest[0])
         elif verb == "strange":
             self._team.be_strange(json.loads(Path(rest[0]).read_text(encoding="utf-8")))
 
@@ -341,7 +341,7 @@ class Orders(LineReceiver):
             reactor.stop()
 
 
-def board(team: Team) -> Board:
+def board(team: Team) -> Services:
     """Return the page's services: fakes in memory that accept each order."""
     desk = MemoryDesk(CATALOGUE, team.yard)
     able = [{"uuid": f"{n:02x}" * 16, "name": f"dog{n}", "busy": "Patrol the yard" * (n == 2)} for n in (1, 2)]
@@ -352,23 +352,23 @@ def board(team: Team) -> Board:
     sessions = TeamSessions(key_of(team.node), gateways.__contains__, "quiet-otter", PASSWORD, random.Random(), checked)
     desk.settings[able[0]["uuid"]] = KNOBS
     survey = MemorySurvey(network(), {f"0{n}" * 16: inventory() for n in (1, 2)}, links(), membership())
-    parts: dict[str, Any] = {"halts": team.halts, "survey": survey, "chronicle": TeamChronicle()}
-    parts["faults"], parts["phones"] = MemoryFaults(*KINDS), MemoryPhones(check=sides)
-    return Board(desk, sessions, Audit(wall=time.time), limits=AddressLimits(), **parts)
+    parts: dict[str, Any] = {"halts": team.halts, "survey": survey, "chronicle": EventLog()}
+    parts["faults"], parts["phones"] = MemoryFaults(*KINDS), MemoryPhones(check=check_picture)
+    return Services(desk, sessions, AuditLog(wall=time.time), limits=AddressLimits(), **parts)
 
 
 class TeamSessions(SignedSessions):
     """Sessions with tokens for gateways only."""
 
-    def passes(self, who: Visitor, nodes: Iterable[str], now: float) -> dict[str, Token]:
+    def issue_peer_tokens(self, who: User, nodes: Iterable[str], now: float) -> dict[str, Token]:
         """Return the tokens for gateways."""
         gateways = {key_of(name).node_id.hex() for name in GATEWAYS}
-        return super().passes(who, [node for node in nodes if node in gateways], now)
+        return super().issue_peer_tokens(who, [node for node in nodes if node in gateways], now)
 
 
 def checked(text: str, password: str) -> Deferred[Any]:
     """Check a password on a thread."""
-    return deferToThread(is_password, text, password)
+    return deferToThread(verify_password, text, password)
 
 
 def network() -> Any:

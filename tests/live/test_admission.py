@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 from typing import Any
 
-from sim.demo.port import free
+from sim.demo.free_ports import find_free_ports
 from tests.live.node import PATIENCE_S, NodeCase
 
 
@@ -18,7 +18,7 @@ class ClosedTeamTests(NodeCase):
 
     def test_made_joined_and_left(self) -> None:
         """Four commands create a team of two; a used code and a revoked member are refused with the reason."""
-        [port] = free("udp", "127.0.0.1", 1)
+        [port] = find_free_ports("udp", "127.0.0.1", 1)
         team = self.told("init", "yard", "--first", "vaio", "--at", f"127.0.0.1:{port}")
         self.node("--config", team["settings"]).says("vaio joined")
         invited = self.told("invite", "dog9")

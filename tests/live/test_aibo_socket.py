@@ -10,18 +10,18 @@ from twisted.trial.unittest import TestCase
 
 from drivers.aibo.driver import AiboDriver
 from drivers.driver import Permit
-from drivers.registry import driver_for
-from sim.demo.port import free
+from drivers.registry import create_driver
+from sim.demo.free_ports import find_free_ports
 from sim.robots.emulator.aibo import AiboServer
-from sim.robots.emulator.aibo_dog import EMULATED, AiboEmulator
-from sim.robots.emulator.body import MemoryBody
+from sim.robots.emulator.aibo_dog import EMULATED_PORTS, AiboEmulator
+from sim.robots.emulator.simulated_robot import MemoryRobot
 from tests.live.waiting import wait
 from tests.webnode.picture import jpeg
 
 
 def free_ports() -> dict[str, int]:
     """Return an unused port number for each of the dog's ports."""
-    return dict(zip(EMULATED, free("tcp", "127.0.0.1", len(EMULATED)), strict=True))
+    return dict(zip(EMULATED_PORTS, find_free_ports("tcp", "127.0.0.1", len(EMULATED_PORTS)), strict=True))
 
 
 class AiboSocketTests(TestCase):
@@ -36,14 +36,14 @@ class AiboSocketTests(TestCase):
 
     async def _drive(self, transport: str) -> None:
         clock = IReactorTime(reactor)
-        body = MemoryBody(jpeg=jpeg())
+        body = MemoryRobot(jpeg=jpeg())
         ports = free_ports()
         dog = AiboEmulator(clock, body, random.Random(1), ports=ports)
         server = AiboServer(reactor, dog)
         server.start()
         named = {service: number for service, number in ports.items() if service != "gains"}
         options = {"host": "127.0.0.1", "ports": named, "camera_transport": transport, "camera_fps": 30}
-        driver = driver_for("aibo", options, "dog1", clock)
+        driver = create_driver("aibo", options, "dog1", clock)
         assert isinstance(driver, AiboDriver)
         await driver.connect()
         self.assertTrue(await driver.enable())

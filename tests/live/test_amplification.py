@@ -9,9 +9,9 @@ from random import Random
 
 from benchmarks.nat.hosts import Hosts
 from benchmarks.nat.matrix import Pair, Trial
-from sim.namespaces.capture import Capture, datagrams
-from sim.namespaces.internet import PUB, PUBS, Internet, Site
-from sim.namespaces.kind import Kind
+from sim.namespaces.capture import Capture, read_datagrams
+from sim.namespaces.internet import PUBLIC_ADDRESSES, PUBLIC_HOST, Internet, Site
+from sim.namespaces.nat import NatKind
 from tests.live.namespaces import NamespaceCase
 
 STRANGER = """
@@ -33,26 +33,28 @@ class AmplificationTests(NamespaceCase):
         """Recorded datagrams from another address, and random ones with each first byte, cause fewer bytes back."""
         folder = Path(self.mktemp()).absolute()
         folder.mkdir(parents=True)
-        with Internet([Site("a", Kind.PORT), Site("b", Kind.PORT), Site("stranger", Kind.NONE)]) as net:
+        with Internet([Site("a", NatKind.PORT), Site("b", NatKind.PORT), Site("stranger", NatKind.NONE)]) as net:
             port = asyncio.run(self._attacked(net, folder))
             self.assertGreater(port, 0)
 
     async def _attacked(self, net: Internet, folder: Path) -> int:
-        async with Hosts(net, [PUB, "a1", "b1"], folder) as fleet:
+        async with Hosts(net, [PUBLIC_HOST, "a1", "b1"], folder) as fleet:
             trial = Trial(fleet, Pair("plain", "port", "port", "a1", "b1"), 1, Random(1))
-            net.record(folder / "join.pcap")
+            net.record_frames(folder / "join.pcap")
             await trial.run(5.0, 5.0)
-            net.record(None)
+            net.record_frames(None)
             self.assertEqual(trial.outcome.trouble, "")
-            heard = list(datagrams(folder / "join.pcap"))
-            asked = [(int(to.rpartition(":")[2]), held) for _, to, held in heard if to.startswith(PUBS[0] + ":")]
+            heard = list(read_datagrams(folder / "join.pcap"))
+            asked = [
+                (int(to.rpartition(":")[2]), held) for _, to, held in heard if to.startswith(PUBLIC_ADDRESSES[0] + ":")
+            ]
             port = asked[0][0]
             rng = Random(2)
             noise = [bytes([first]) + rng.randbytes(rng.choice((0, 7, 40, 200, 900, 1399))) for first in range(256)]
             sent = [held for _, held in asked] + noise + [held for _, held in asked]
-            with Capture(net, PUB, folder / "attack.pcap") as seen:
+            with Capture(net, PUBLIC_HOST, folder / "attack.pcap") as seen:
                 process = net.start(
-                    "stranger1", [sys.executable, "-c", STRANGER, PUBS[0], str(port), str(PAUSE_S)], **IN
+                    "stranger1", [sys.executable, "-c", STRANGER, PUBLIC_ADDRESSES[0], str(port), str(PAUSE_S)], **IN
                 )
                 assert process.stdin is not None
                 process.stdin.write("".join(held.hex() + "\n" for held in sent))

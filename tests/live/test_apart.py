@@ -9,7 +9,7 @@ from typing import Any
 
 from twisted.trial.unittest import SynchronousTestCase
 
-from sim.team.scale.apart import apart
+from sim.team.scale.fork import run_in_fork
 
 
 class Ended(Exception):
@@ -30,15 +30,15 @@ class ApartTests(SynchronousTestCase):
             changed.append(os.getpid())
             return changed[0]
 
-        self.assertNotEqual(apart(call), os.getpid())
+        self.assertNotEqual(run_in_fork(call), os.getpid())
         self.assertEqual(changed, [])
         with self.assertRaisesRegex(ValueError, "none"):
-            apart(lambda: int("none"), ValueError)
+            run_in_fork(lambda: int("none"), ValueError)
 
     def test_ends_without_a_word(self) -> None:
         """A child process that ends without an answer raises an error with its exit code."""
         with self.assertRaisesRegex(RuntimeError, "exit code 7"):
-            apart(lambda: os._exit(7))
+            run_in_fork(lambda: os._exit(7))
 
     def test_ended_with_who_waits_for_it(self) -> None:
         """If the waiting parent is interrupted, the call is ended as well, and its exception arrives."""
@@ -52,4 +52,4 @@ class ApartTests(SynchronousTestCase):
             signal.pause()
 
         with self.assertRaises(Ended):
-            apart(call, Ended, is_stopped=lambda: bool(select([ready], [], [], 0.0)[0]))
+            run_in_fork(call, Ended, is_stopped=lambda: bool(select([ready], [], [], 0.0)[0]))

@@ -10,10 +10,10 @@ from twisted.internet import reactor as running
 from twisted.internet.task import Clock
 from twisted.trial.unittest import TestCase
 
-from drivers.camera.driver import CameraDriver, film_of
-from drivers.camera.option import checked
-from drivers.camera.shots import Shot
-from drivers.camera.thread import ThreadFilm
+from drivers.camera.driver import CameraDriver, make_picture_stream
+from drivers.camera.option import parse_options
+from drivers.camera.picture_stream import ThreadedStream
+from drivers.camera.source import JpegPicture
 from drivers.errors import LinkLost
 from tests.live.waiting import until, wait
 
@@ -31,13 +31,13 @@ class SlowLens:
     def open(self) -> None:
         self.opened += 1
 
-    def shoot(self) -> Shot:
+    def read_picture(self) -> JpegPicture:
         self.threads.add(threading.current_thread().name)
         self.taken += 1
         if self.taken == 5:
             raise LinkLost("it was unplugged")
         self.gate.wait(5.0)
-        return Shot(b"\xff\xd8%d\xff\xd9" % self.taken, 4, 3)
+        return JpegPicture(b"\xff\xd8%d\xff\xd9" % self.taken, 4, 3)
 
     def close(self) -> None:
         self.closed += 1
@@ -51,8 +51,8 @@ class LiveCameraTests(TestCase):
     async def test_camera_never_holds_the_reactor_up(self) -> None:
         """A blocking camera blocks only its thread, a lost one is opened again, and ``disconnect`` ends the thread."""
         lens = SlowLens()
-        film = ThreadFilm(lens, reactor.callFromThread)
-        driver = CameraDriver(checked({"fps": 30}), film, reactor, "cam")
+        film = ThreadedStream(lens, reactor.callFromThread)
+        driver = CameraDriver(parse_options({"fps": 30}), film, reactor, "cam")
         connected = driver.connect()
         await wait(0.1)
         self.assertNoResult(connected)
@@ -80,8 +80,8 @@ class LiveCameraTests(TestCase):
             video.write(numpy.full((48, 64, 3), shade, numpy.uint8))
         video.release()
         clock, shades = Clock(), list[int]()
-        wanted = checked({"source": path, "fps": 10, "width": 32, "height": 24})
-        driver = CameraDriver(wanted, film_of(wanted, clock), clock, "cam")
+        wanted = parse_options({"source": path, "fps": 10, "width": 32, "height": 24})
+        driver = CameraDriver(wanted, make_picture_stream(wanted, clock), clock, "cam")
         sizes = set()
 
         def look(seen: Any) -> None:

@@ -20,17 +20,17 @@ from typing import Any
 from twisted.internet import reactor
 from twisted.trial.unittest import SkipTest, TestCase
 
-from drivers.deadman.keeper import Keeper
 from drivers.deadman.process import now
-from drivers.deadman.switch import LastWord
+from drivers.deadman.supervisor import Supervisor
+from drivers.deadman.switch import HaltCommand
 from drivers.link import TcpLinkFactory
 from sim.robots.emulator.aibo import AiboServer
 from sim.robots.emulator.aibo_dog import AiboEmulator
 from sim.robots.emulator.bittle import Bittle
-from sim.robots.emulator.body import MemoryBody
 from sim.robots.emulator.create2 import Create2
 from sim.robots.emulator.pty import PtyPort
 from sim.robots.emulator.rosbridge import RosbridgeRobot
+from sim.robots.emulator.simulated_robot import MemoryRobot
 from tests.drivers.contract import KeptLog
 from tests.live.test_aibo_socket import free_ports
 from tests.live.waiting import CLOCK, until, wait
@@ -46,7 +46,7 @@ LATE_S = 0.4
 
 
 @dataclass
-class TimedBody(MemoryBody):
+class TimedBody(MemoryRobot):
     """A base that records its motions with their times."""
 
     told: list[tuple[float, tuple[float, float, float]]] = field(default_factory=list)
@@ -217,7 +217,7 @@ class KeeperTests(TestCase):
 
     def setUp(self) -> None:
         self.wire = Wire()
-        self.keeper = Keeper("robot", reactor)
+        self.keeper = Supervisor("robot", reactor)
         self.addCleanup(self.leave)
 
     async def leave(self) -> None:
@@ -226,8 +226,8 @@ class KeeperTests(TestCase):
 
     async def test_halts_and_counts(self) -> None:
         """At the deadline the switch sends the halt three times, and the keeper counts one halt."""
-        self.keeper.guard(LastWord(b"halt", self.wire))
-        self.keeper.until(0.2)
+        self.keeper.set_halt_command(HaltCommand(b"halt", self.wire))
+        self.keeper.arm(0.2)
         await wait(0.15)
         self.assertEqual(self.wire.heard(), b"")
         await wait(0.6)
@@ -236,41 +236,41 @@ class KeeperTests(TestCase):
 
     async def test_stays_armed_until_the_halt_has_left(self) -> None:
         """``rest`` disarms the switch only after the link has sent the driver's halt."""
-        self.keeper.guard(LastWord(b"halt", self.wire))
-        self.keeper.until(0.2)
-        self.keeper.rest()
+        self.keeper.set_halt_command(HaltCommand(b"halt", self.wire))
+        self.keeper.arm(0.2)
+        self.keeper.disarm()
         await wait(0.4)
         self.assertEqual(self.wire.heard(), b"")
         self.wire.is_busy = True
-        self.keeper.until(0.2)
-        self.keeper.rest()
+        self.keeper.arm(0.2)
+        self.keeper.disarm()
         await wait(0.5)
         self.assertEqual(self.wire.heard(), b"halt" * 3)
         self.wire.is_busy = False
 
     async def test_lets_go_of_the_link(self) -> None:
         """A link that the driver has released and closed is also closed at the robot's end."""
-        self.keeper.guard(LastWord(b"halt", self.wire))
+        self.keeper.set_halt_command(HaltCommand(b"halt", self.wire))
         await wait(0.1)
         self.wire.near.close()
         self.assertEqual(self.wire.heard(), b"")
-        self.keeper.leave()
+        self.keeper.on_link_lost()
         await until(lambda: self.wire.heard() is None, 1.0)
 
     async def test_leaves_no_timer_once_closed(self) -> None:
         """The loss of a link after ``close`` starts no timer."""
-        self.keeper.guard(LastWord(b"halt", self.wire))
-        self.keeper.until(1.0)
+        self.keeper.set_halt_command(HaltCommand(b"halt", self.wire))
+        self.keeper.arm(1.0)
         await self.keeper.close()
-        self.keeper.rest()
-        self.keeper.leave()
+        self.keeper.disarm()
+        self.keeper.on_link_lost()
 
     async def test_finishes_a_halt_that_left_in_part(self) -> None:
         """A halt that was sent in part is completed before it is repeated."""
         self.wire.near.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, 4608)
         halt = bytes(range(250)) * 40
-        self.keeper.guard(LastWord(halt, self.wire))
-        self.keeper.until(0.05)
+        self.keeper.set_halt_command(HaltCommand(halt, self.wire))
+        self.keeper.arm(0.05)
         await until(lambda: self.keeper.halts == 1)
         said = self.wire.heard() or b""
         self.assertLess(len(said), len(halt))
@@ -281,17 +281,17 @@ class KeeperTests(TestCase):
 
     async def test_replaces_one_that_does_not_listen(self) -> None:
         """A stopped process with a full socket is killed and replaced, without a wait of the keeper."""
-        self.keeper.guard(LastWord(b"halt", self.wire))
+        self.keeper.set_halt_command(HaltCommand(b"halt", self.wire))
         first = self.keeper.pid
         assert first is not None
         os.kill(first, signal.SIGSTOP)
         began = now()
         for _ in range(50_000):
-            self.keeper.until(5.0)
+            self.keeper.arm(5.0)
         self.assertLess(now() - began, 5.0)
         await until(lambda: self.keeper.pid not in (None, first), 3.0)
         self.assertFalse(Path(f"/proc/{first}").exists())
-        self.keeper.until(0.1)
+        self.keeper.arm(0.1)
         await until(lambda: self.wire.heard() == b"halt", 1.0)
 
     async def test_names_what_cannot_be_started(self) -> None:
@@ -300,19 +300,19 @@ class KeeperTests(TestCase):
             ("/nowhere/python", "no dead man's switch yet"),
             ("/bin/false", "starting another one"),
         ):
-            self.keeper = Keeper("robot", reactor)
+            self.keeper = Supervisor("robot", reactor)
             self.keeper.log = log = KeptLog()  # type: ignore[assignment]
             good, sys.executable = sys.executable, program
             try:
-                self.keeper.guard(LastWord(b"halt", self.wire))
-                self.keeper.until(5.0)
+                self.keeper.set_halt_command(HaltCommand(b"halt", self.wire))
+                self.keeper.arm(5.0)
                 await wait(0.5)
             finally:
                 sys.executable = good
             self.assertEqual(len(log.lines), 1)
             self.assertIn(words, log.lines[0])
             await wait(1.0)
-            self.keeper.until(0.1)
+            self.keeper.arm(0.1)
             await until(lambda: self.wire.heard() == b"halt", 1.0)
             await self.keeper.close()
             await wait(0.05)
@@ -321,10 +321,10 @@ class KeeperTests(TestCase):
     async def test_ends_at_any_moment(self) -> None:
         """A keeper that is closed before, during or after a start, once or twice, leaves no process."""
         for stage in range(4):
-            keeper = Keeper("robot", reactor)
+            keeper = Supervisor("robot", reactor)
             if stage:
-                keeper.guard(LastWord(b"halt", self.wire))
-                keeper.until(5.0)
+                keeper.set_halt_command(HaltCommand(b"halt", self.wire))
+                keeper.arm(5.0)
             pid = keeper.pid
             if stage == 2:
                 os.kill(pid or 0, signal.SIGKILL)

@@ -10,9 +10,9 @@ import tempfile
 from collections.abc import Iterable, Iterator
 from pathlib import Path
 
-from sim.namespaces.internet import PUB, Internet, Site
-from sim.namespaces.kind import Kind
-from sim.namespaces.room import environment
+from sim.namespaces.internet import PUBLIC_HOST, Internet, Site
+from sim.namespaces.namespace import make_environment
+from sim.namespaces.nat import NatKind
 from tests.live.namespaces import NamespaceCase
 from tests.live.until import until
 
@@ -71,7 +71,7 @@ class DeployTests(NamespaceCase):
     def surroundings(self, name: str) -> dict[str, str]:
         """Return the environment of a user at a computer."""
         home = self.home(name)
-        inherited = {key: value for key, value in environment().items() if not key.startswith(("SWARM_", "XDG_"))}
+        inherited = {key: value for key, value in make_environment().items() if not key.startswith(("SWARM_", "XDG_"))}
         here = {"HOME": str(home), "XDG_RUNTIME_DIR": str(home), "PYTHONPATH": str(ROOT), "PYTHONUNBUFFERED": "1"}
         return {**inherited, **here, "PATH": f"{self.programs}:{inherited['PATH']}"}
 
@@ -101,7 +101,7 @@ class DeployTests(NamespaceCase):
             line = CODE.sub(self.codes[name], line)
         if "w1" in net.hosts:
             line = line.replace(AT_HOME, net.address("w1"))
-        return line.replace(RENTED, net.address(PUB))
+        return line.replace(RENTED, net.address(PUBLIC_HOST))
 
     def run_line(self, net: Internet, host: str, name: str, line: str) -> str:
         """Run a line, which must succeed, and return its output."""
@@ -130,7 +130,7 @@ class DeployTests(NamespaceCase):
 
     def test_three_laptops(self) -> None:
         """The page's lines make a team of three laptops behind one router, and its web page opens on another laptop."""
-        with Internet([Site("w", Kind.PORT, hosts=3)]) as net:
+        with Internet([Site("w", NatKind.PORT, hosts=3)]) as net:
             places = {"vaio": "w1", "dog1": "w2", "dog2": "w3"}
             said = self.follow(net, places, self.blocks("Three laptops on one Wi-Fi", "Over the internet"))
             members = said["vaio: swarm members"]
@@ -142,10 +142,10 @@ class DeployTests(NamespaceCase):
 
     def test_over_the_internet(self) -> None:
         """The page's lines work for a rented computer with a firewall and laptops behind routers, one without UDP."""
-        sites = [Site("o", Kind.PORT), Site("h", Kind.PORT), Site("u", Kind.NOUDP)]
+        sites = [Site("o", NatKind.PORT), Site("h", NatKind.PORT), Site("u", NatKind.NOUDP)]
         with Internet(sites) as net:
-            net.room(PUB).run(f"nft -f - <<'END'\n{FIREWALL}\nEND\n")
-            places = {"boss": "o1", "host1": PUB, "cam1": "h1", "cam2": "u1"}
+            net.get_namespace(PUBLIC_HOST).run(f"nft -f - <<'END'\n{FIREWALL}\nEND\n")
+            places = {"boss": "o1", "host1": PUBLIC_HOST, "cam1": "h1", "cam2": "u1"}
             making, *rest = self.blocks("Over the internet", "")
             self.follow(net, places, [making])
             for ending in ("toml", "membership"):  # with scp in the page
@@ -156,5 +156,5 @@ class DeployTests(NamespaceCase):
             members = said["boss: swarm members"]
             self.assertRegex(members, r"cam2 +revoked")
             self.assertRegex(members, r"cam1 .*bootstrap")
-            self.assertRegex(members, rf"host1 .*{re.escape(net.address(PUB))}:8484")
+            self.assertRegex(members, rf"host1 .*{re.escape(net.address(PUBLIC_HOST))}:8484")
             self.assertFalse((self.home("host1") / ".config").exists(), "the operator's key is on no other computer")

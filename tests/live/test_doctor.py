@@ -9,8 +9,8 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from sim.namespaces.internet import PUBS, Internet, Site
-from sim.namespaces.kind import Kind
+from sim.namespaces.internet import PUBLIC_ADDRESSES, Internet, Site
+from sim.namespaces.nat import NatKind
 from tests.live.namespaces import NamespaceCase
 from tests.live.until import until
 
@@ -28,7 +28,7 @@ sys.exit(main(sys.argv[2:], measure=partial(measured, wall=lambda: time.time() -
 OTHER_VERSION = """
 import socket, sys
 from middleware.entangled.network.network import Address
-from middleware.entangled.wire.hail import echo
+from middleware.entangled.wire.probe import echo
 own = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
 own.bind((sys.argv[1], int(sys.argv[2])))
 print("ready", flush=True)
@@ -106,10 +106,14 @@ class WayTests(DoctorCase):
     def test_routers_and_firewalls(self) -> None:
         """Each kind of router and a firewall against UDP are named by the nodes behind them, a cut as no bootstrap."""
         net = self.net = self.internet(
-            Site("c", Kind.PORT), Site("s", Kind.SYM), Site("n", Kind.NOUDP), Site("o", Kind.NONE), Site("x", Kind.PORT)
+            Site("c", NatKind.PORT),
+            Site("s", NatKind.SYM),
+            Site("n", NatKind.NOUDP),
+            Site("o", NatKind.NONE),
+            Site("x", NatKind.PORT),
         )
-        known = [f"{address}:8484" for address in PUBS]
-        for number, address in enumerate(PUBS):
+        known = [f"{address}:8484" for address in PUBLIC_ADDRESSES]
+        for number, address in enumerate(PUBLIC_ADDRESSES):
             self.node("pub", self.settings(f"pub{number}", address, known[:number]))
         for host, causes in (("c1", ["nat-cone"]), ("s1", ["nat-symmetric"]), ("n1", ["udp-blocked"]), ("o1", [])):
             settings = self.settings(host, net.address(host), known, lan=False)
@@ -124,7 +128,7 @@ class LanTests(DoctorCase):
 
     def setUp(self) -> None:
         super().setUp()
-        net = self.net = self.internet(Site("a", Kind.PORT, hosts=2))
+        net = self.net = self.internet(Site("a", NatKind.PORT, hosts=2))
         self.other = f"{net.address('a2')}:8484"
         self.node("a2", self.settings("other", net.address("a2")))
         self.own = self.settings("own", net.address("a1"), [self.other])
@@ -148,26 +152,26 @@ class LanTests(DoctorCase):
         """A LAN without multicast is named, although the node is reachable by its address."""
         self.assertEqual(self.causes("a1", self.own), [])
         for port in ("h1", "h2"):
-            self.net.room("a-gw").run(f"ip link set {port} type bridge_slave mcast_flood off mcast_router 0\n")
-        self.net.room("a-gw").run("ip link set lan type bridge mcast_snooping 0\n")
+            self.net.get_namespace("a-gw").run(f"ip link set {port} type bridge_slave mcast_flood off mcast_router 0\n")
+        self.net.get_namespace("a-gw").run("ip link set lan type bridge mcast_snooping 0\n")
         self.assertEqual(self.causes("a1", self.own), ["multicast-blocked"])
 
     def test_firewall_of_this_machine(self) -> None:
         """A local firewall that blocks multicast is named as this machine's."""
-        self.net.room("a1").run(_DROP.format(port=8483))
+        self.net.get_namespace("a1").run(_DROP.format(port=8483))
         said = self.asked("a1", self.own)["findings"]
         self.assertEqual([finding["cause"] for finding in said], ["multicast-blocked"])
         self.assertIn("This machine", said[0]["what"])
 
     def test_firewall_of_the_other(self) -> None:
         """A neighbour's firewall that blocks its port is named as the neighbour's."""
-        self.net.room("a2").run(_DROP.format(port=8484))
+        self.net.get_namespace("a2").run(_DROP.format(port=8484))
         self.assertIn("peer-firewall", self.causes("a1", self.own))
 
     def test_client_isolation(self) -> None:
         """Client isolation at the access point is named."""
         for port in ("h1", "h2"):
-            self.net.room("a-gw").run(f"ip link set {port} type bridge_slave isolated on\n")
+            self.net.get_namespace("a-gw").run(f"ip link set {port} type bridge_slave isolated on\n")
         self.assertEqual(self.causes("a1", self.own), ["client-isolation"])
 
     def test_settings_and_clock(self) -> None:

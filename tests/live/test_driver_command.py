@@ -21,7 +21,7 @@ from twisted.trial.unittest import TestCase
 
 from sim.robots.emulator.aibo import AiboServer
 from sim.robots.emulator.aibo_dog import AiboEmulator
-from sim.robots.emulator.body import MemoryBody
+from sim.robots.emulator.simulated_robot import MemoryRobot
 from tests.live.test_aibo_socket import free_ports
 from tests.live.waiting import wait
 from tests.webnode.picture import jpeg
@@ -39,7 +39,7 @@ class DriverCommandTests(TestCase):
     def setUp(self) -> None:
         """Start a dog on ports of this machine."""
         clock = IReactorTime(reactor)
-        self.body = MemoryBody(jpeg=JPEG, values={"power.level": 0.8})
+        self.body = MemoryRobot(jpeg=JPEG, values={"power.level": 0.8})
         ports = free_ports()
         self.dog = AiboEmulator(clock, self.body, random.Random(1), ports=ports)
         server = AiboServer(reactor, self.dog)

@@ -16,15 +16,15 @@ from twisted.internet.task import deferLater
 from twisted.trial.unittest import SkipTest, TestCase
 
 from middleware.admission.membership import Membership, MemoryMembership
-from middleware.admission.operator import drawn
+from middleware.admission.operator import create_operator
 from middleware.admission.team import Team
 from middleware.entangled.data.memory import MemoryStore
-from middleware.entangled.identity import node_id
+from middleware.entangled.identity import derive_node_id
 from middleware.entangled.network.network import Address
 from middleware.entangled.network.udp import UdpNetwork
 from middleware.entangled.node import EntangledNode
-from middleware.entangled.record import hashed_key
-from sim.namespaces.capture import payload, readable
+from middleware.entangled.record import hash_key
+from sim.namespaces.capture import find_words, parse_datagram
 
 reactor: Any = _reactor
 EVERYTHING = 0x0003
@@ -60,7 +60,7 @@ class EavesdroppingTests(TestCase):
         team = Team(MemoryMembership(paper), store, time.time, dice)
         network = UdpNetwork(reactor, "127.0.0.1", 0)
         node = EntangledNode(
-            *(team.identity, team.secret, network, store, reactor, dice), wall=time.time, door=team.door
+            *(team.identity, team.secret, network, store, reactor, dice), wall=time.time, door=team.admission
         )
         team.attach(node, reactor)
         node.endpoint.expose("device.message", lambda peer, text: text)
@@ -84,7 +84,7 @@ class EavesdroppingTests(TestCase):
                 frame = self.ear.recv(65_535)
             except BlockingIOError:
                 return found
-            held = payload(frame)
+            held = parse_datagram(frame)
             if held is not None and {int(end.rpartition(":")[2]) for end in held[:2]} & ports:
                 found.append(held[2])
 
@@ -92,13 +92,15 @@ class EavesdroppingTests(TestCase):
     def test_nothing_is_readable(self) -> Generator[Deferred[Any], Any, None]:
         """No name, task, position, message, key, certificate or secret is readable; public data is."""
         dice = random.SystemRandom()
-        signer = drawn("kennel", dice)
-        first = signer.founded("hedgehog", ("device", "bootstrap", "gateway"), time.time(), dice)
-        second = signer.founded("rosa-kennel-17", ("device", "operator"), time.time(), dice, first.secrets[0][1])
+        signer = create_operator("kennel", dice)
+        first = signer.create_membership("hedgehog", ("device", "bootstrap", "gateway"), time.time(), dice)
+        second = signer.create_membership(
+            "rosa-kennel-17", ("device", "operator"), time.time(), dice, first.secrets[0][1]
+        )
         one, _ = self.node(first, [])
         two, joined = self.node(second, [one.contact.address])
         yield joined
-        key = hashed_key("task/crimson")
+        key = hash_key("task/crimson")
         two.watch(key, lambda records: None)
         yield two.put(key, "hedgehog", b"fetch the crimson ball", concern="one")
         yield one.put(key, "task/crimson", PLACE * 300, concern="one")
@@ -110,14 +112,14 @@ class EavesdroppingTests(TestCase):
         whole = b"\0\0\0\0".join(heard)
         self.assertGreater(len(heard), 20)
         self.assertGreater(len(whole), 10_000)
-        self.assertEqual(readable(whole, [*NAMES, PLACE, b"12.345678", b"-7.891011"]), [])
+        self.assertEqual(find_words(whole, [*NAMES, PLACE, b"12.345678", b"-7.891011"]), [])
         secret = [first.secrets[0][1], signer.seed, signer.public, key]
         for paper in self.papers:
             public = paper.identity.public
-            secret += [paper.seed, public, node_id(public), paper.shown[:40], paper.shown[-40:]]
+            secret += [paper.seed, public, derive_node_id(public), paper.certificate[:40], paper.certificate[-40:]]
         self.assertEqual([each for each in secret if each in whole or each.hex().encode() in whole], [])
         # The capture works: a discovery reply contains the team's fingerprint unencrypted.
-        yield two.endpoint.hail(one.contact.address)
+        yield two.endpoint.probe(one.contact.address)
         yield deferLater(reactor, 0.1, lambda: None)
-        fingerprint = one.endpoint.door.fingerprint
+        fingerprint = one.endpoint.admission.fingerprint
         self.assertTrue(any(fingerprint in each for each in self.heard({one.contact.address.port})))

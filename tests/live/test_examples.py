@@ -11,7 +11,7 @@ from pathlib import Path
 
 from twisted.trial.unittest import TestCase
 
-from sim.demo.port import free
+from sim.demo.free_ports import find_free_ports
 
 ROOT = Path(__file__).resolve().parent.parent.parent
 PATIENCE = 30.0
@@ -19,7 +19,7 @@ PATIENCE = 30.0
 
 def free_port() -> int:
     """Return an unused UDP port."""
-    return free("udp", "127.0.0.1", 1)[0]
+    return find_free_ports("udp", "127.0.0.1", 1)[0]
 
 
 class ExamplesTests(TestCase):

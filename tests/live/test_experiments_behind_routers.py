@@ -7,8 +7,8 @@ import subprocess
 import sys
 from pathlib import Path
 
-from sim.namespaces.capture import datagrams as datagrams_of
-from sim.namespaces.capture import readable
+from sim.namespaces.capture import find_words
+from sim.namespaces.capture import read_datagrams as datagrams_of
 from sim.namespaces.internet import ROOT
 from tests.live.namespaces import NamespaceCase
 
@@ -34,7 +34,7 @@ class ExperimentsBehindRoutersTests(NamespaceCase):
         self.assertIn("takeover", json.dumps(verdicts))
         self.assertEqual(ran.stdout.count("PASS"), 2, ran.stdout)
         # The page was requested without TLS, which shows that plain text would be found.
-        self.assertEqual(readable(record.read_bytes(), WORDS), list(WORDS))
+        self.assertEqual(find_words(record.read_bytes(), WORDS), list(WORDS))
         datagrams = [held for _, _, held in datagrams_of(record)]
         self.assertGreater(len(datagrams), 500)
-        self.assertEqual(readable(b"\n".join(datagrams), WORDS), [])
+        self.assertEqual(find_words(b"\n".join(datagrams), WORDS), [])

@@ -13,7 +13,7 @@ from importlib.util import find_spec
 from itertools import chain, repeat
 from typing import Any
 
-from sim.demo import port
+from sim.demo import free_ports
 from tests.live.node import NodeCase
 from tests.live.until import takes, until
 
@@ -27,8 +27,8 @@ class SecureNode:
     """A web node in a child process, with the page at ``plain`` and ``secure``."""
 
     def __init__(self, test: NodeCase, name: str, known: str = "") -> None:
-        http, https = port.free("tcp", "127.0.0.1", 2)
-        (udp,) = port.free("udp", "127.0.0.1", 1)
+        http, https = free_ports.find_free_ports("tcp", "127.0.0.1", 2)
+        (udp,) = free_ports.find_free_ports("udp", "127.0.0.1", 1)
         path = test.file(
             f'[node]\nname = "{name}"\nport = {udp}\nroles = ["web"]\nstore = "{name}.sqlite"\nteam_key = "t"\n'
             f"known_nodes = {json.dumps([known] if known else [])}\n"

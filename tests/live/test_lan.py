@@ -11,7 +11,7 @@ from twisted.internet.protocol import DatagramProtocol
 from twisted.internet.task import deferLater
 from twisted.trial.unittest import TestCase
 
-from middleware.entangled.network.interface import Interface, interfaces
+from middleware.entangled.network.interface import Interface, list_interfaces
 from middleware.entangled.network.lan import LanMulticast
 from middleware.entangled.network.network import Address
 
@@ -22,7 +22,7 @@ class LoopbackTests(TestCase):
     """Two members of the group on loopback."""
 
     def group(
-        self, host: str = "127.0.0.1", look: Any = interfaces, moved: Callable[[], None] = lambda: None
+        self, host: str = "127.0.0.1", look: Any = list_interfaces, moved: Callable[[], None] = lambda: None
     ) -> tuple[LanMulticast, list[tuple[bytes, Address]]]:
         """Return a member of the group, and the list of datagrams that it receives."""
         heard: list[tuple[bytes, Address]] = []
@@ -74,7 +74,7 @@ class LoopbackTests(TestCase):
 
     def test_the_loopback_is_an_interface(self) -> None:
         """The machine's interfaces are listed, including loopback with its address."""
-        loopback = [each for each in interfaces() if each.is_loopback]
+        loopback = [each for each in list_interfaces() if each.is_loopback]
         self.assertIn("127.0.0.1", loopback[0].addresses)
 
     async def test_no_interface_is_no_error(self) -> None:

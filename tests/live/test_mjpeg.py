@@ -13,9 +13,9 @@ from twisted.trial.unittest import TestCase
 
 from drivers.driver import Driver
 from drivers.link import TcpLinkFactory
-from drivers.registry import driver_for
-from sim.robots.emulator.body import MemoryBody
+from drivers.registry import create_driver
 from sim.robots.emulator.camera import MjpegCamera
+from sim.robots.emulator.simulated_robot import MemoryRobot
 from tests.drivers.test_camera_driver import jpeg
 from tests.live.waiting import until, wait
 
@@ -28,7 +28,7 @@ class LiveMjpegTests(TestCase):
     timeout = 60
 
     def setUp(self) -> None:
-        self.body = MemoryBody(jpeg=jpeg(1))
+        self.body = MemoryRobot(jpeg=jpeg(1))
         self.camera = MjpegCamera(reactor, self.body, 30.0)
         self.camera.start()
         self.port = reactor.listenTCP(0, TcpLinkFactory(self.camera.accept), interface="127.0.0.1")
@@ -45,7 +45,7 @@ class LiveMjpegTests(TestCase):
     def driver(self, port: int, **options: object) -> Driver:
         """Return a driver of the camera at ``port``."""
         url = f"http://127.0.0.1:{port}/stream"
-        return driver_for("camera", {"url": url, "width": 128, "height": 96, "fps": 30, **options}, "cam", reactor)
+        return create_driver("camera", {"url": url, "width": 128, "height": 96, "fps": 30, **options}, "cam", reactor)
 
     async def test_watches_a_server_of_others(self) -> None:
         """A stream of Python's HTTP server, in HTTP/1.0 and without lengths, is read."""

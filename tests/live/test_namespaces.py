@@ -9,14 +9,14 @@ import sys
 from pathlib import Path
 
 from sim.namespaces.capture import Capture
-from sim.namespaces.internet import PUBS, ROOT, Internet, Site
-from sim.namespaces.kind import Kind
+from sim.namespaces.internet import PUBLIC_ADDRESSES, ROOT, Internet, Site
+from sim.namespaces.nat import NatKind
 from tests.live.namespaces import NamespaceCase
 from tests.live.test_processes import is_alive
 from tests.live.until import until
 
 LIMIT_S = 60.0
-TARGETS = (f"{PUBS[0]}:4000", f"{PUBS[0]}:4001", f"{PUBS[1]}:4000")
+TARGETS = (f"{PUBLIC_ADDRESSES[0]}:4000", f"{PUBLIC_ADDRESSES[0]}:4001", f"{PUBLIC_ADDRESSES[1]}:4000")
 """Two ports of one address, and another address."""
 ECHO = """
 import select, socket, sys
@@ -65,27 +65,27 @@ class InternetTests(NamespaceCase):
 
     def test_mappings_are_of_their_kind(self) -> None:
         """Each kind of router maps to one outside port for all peers, to one per peer, or to none."""
-        kinds = list(Kind)
+        kinds = list(NatKind)
         net = self.internet(*(Site(kind.value, kind) for kind in kinds))
         self.echo(net)
         for kind in kinds:
             seen = self.seen(net, f"{kind.value}1")
-            if kind is Kind.NOUDP:
+            if kind is NatKind.NOUDP:
                 self.assertEqual(seen, [None] * 3)
                 continue
-            outside = net.address("none1") if kind is Kind.NONE else net.outside(kind.value)
+            outside = net.address("none1") if kind is NatKind.NONE else net.get_external_address(kind.value)
             self.assertEqual({each[0] for each in seen if each is not None}, {outside}, kind)
             ports = {each[1] for each in seen if each is not None}
-            self.assertEqual(len(ports), 3 if kind is Kind.SYM else 1, (kind, seen))
+            self.assertEqual(len(ports), 3 if kind is NatKind.SYM else 1, (kind, seen))
 
     def test_lines_lose_what_is_said(self) -> None:
         """A cut blocks all datagrams in one direction, losses are counted, and a healed link passes all datagrams."""
-        net = self.internet(Site("a", Kind.PORT))
+        net = self.internet(Site("a", NatKind.PORT))
         self.echo(net)
         self.assertNotIn(None, self.seen(net, "a1"))
         net.cut("a", "in")
         self.assertEqual(self.seen(net, "a1"), [None] * 3)
-        counts = net.counted()["a-gw"]
+        counts = net.read_counts()["a-gw"]
         self.assertEqual((counts["up"]["lost"], counts["down"]["lost"]), (0, 3))
         self.assertEqual(counts["up"]["passed"], 6)
         net.heal("a")
@@ -93,35 +93,35 @@ class InternetTests(NamespaceCase):
 
     def test_routers_get_another_address(self) -> None:
         """A renumbered site is seen only at its new address, and a moved host at its new router's."""
-        net = self.internet(Site("a", Kind.PORT), Site("b", Kind.FULL))
+        net = self.internet(Site("a", NatKind.PORT), Site("b", NatKind.FULL))
         self.echo(net)
-        before, new = net.outside("a"), net.renumber("a")
+        before, new = net.get_external_address("a"), net.renumber("a")
         self.assertNotEqual(before, new)
         self.assertEqual({each[0] for each in self.seen(net, "a1") if each}, {new})
         net.move("a1", "b")
-        self.assertEqual({each[0] for each in self.seen(net, "a1") if each}, {net.outside("b")})
+        self.assertEqual({each[0] for each in self.seen(net, "a1") if each}, {net.get_external_address("b")})
 
     def test_captures_hold_and_count(self) -> None:
         """A capture counts datagrams and bytes per peer, and finds words that were sent unencrypted."""
-        net = self.internet(Site("a", Kind.PORT))
+        net = self.internet(Site("a", NatKind.PORT))
         self.echo(net)
         file, whole = Path(self.mktemp()), Path(self.mktemp())
-        net.record(whole)
+        net.record_frames(whole)
         with Capture(net, "pub", file) as seen:
             self.seen(net, "a1")
-        net.record(None)
-        traffic = seen.from_host(net.outside("a"))
+        net.record_frames(None)
+        traffic = seen.from_host(net.get_external_address("a"))
         self.assertEqual((traffic.received, traffic.sent), (3, 3))
         self.assertEqual(traffic.received_bytes, 3 * len("who am I"))
         self.assertGreater(traffic.amplification, 1.0)
-        self.assertEqual(seen.found([b"who am I", b"red target"]), [b"who am I"])
+        self.assertEqual(seen.find_plain_text([b"who am I", b"red target"]), [b"who am I"])
         self.assertIn(b"who am I", whole.read_bytes())
 
     def test_nothing_is_left(self) -> None:
         """After an exception or a kill of the creating process, no process of an internet is left."""
         program = (
             "import os, signal, sys\n"
-            "from sim.namespaces.internet import Internet, Site\nfrom sim.namespaces.kind import Kind\n"
+            "from sim.namespaces.internet import Internet, Site\nfrom sim.namespaces.nat import Kind\n"
             "with Internet([Site('a', Kind.PORT)]) as net:\n"
             "    started = net.start('a1', ['sleep', '600'])\n"
             "    print(started.pid, *[net.room(name).pid for name in ('', 'a1', 'a-gw')], flush=True)\n"

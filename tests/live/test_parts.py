@@ -15,13 +15,13 @@ from twisted.trial.unittest import TestCase
 from drivers.driver import Permit
 from drivers.link import TcpLinkFactory
 from drivers.reading import Observation
-from drivers.registry import driver_for
+from drivers.registry import create_driver
 from middleware.config.settings import Settings
-from sim.robots.emulator.body import MemoryBody
 from sim.robots.emulator.camera import MjpegCamera
 from sim.robots.emulator.compass import NmeaCompass
 from sim.robots.emulator.create2 import Create2
 from sim.robots.emulator.pty import PtyPort
+from sim.robots.emulator.simulated_robot import MemoryRobot
 from tests.drivers.test_camera_driver import jpeg
 
 reactor: Any = running
@@ -37,7 +37,7 @@ class LivePartsTests(TestCase):
     @inlineCallbacks
     def test_is_one_device(self) -> Generator[Deferred[Any], Any, None]:
         """Each part has its kind of link; the camera is lost and reconnects while the robot drives."""
-        body = MemoryBody(jpeg=jpeg(5), values={"compass.heading": 0.5})
+        body = MemoryRobot(jpeg=jpeg(5), values={"compass.heading": 0.5})
         robot, camera, compass = (
             Create2(body, reactor, Random(1)),
             MjpegCamera(reactor, body),
@@ -54,7 +54,7 @@ class LivePartsTests(TestCase):
         ]
         table = {"kind": "create2", "options": {"port": cable.path}, "parts": parts}
         wanted = Settings.from_mapping({"node": NODE, "driver": table}, "vacuum.toml").driver
-        driver = driver_for(wanted.kind, wanted.options, "vacuum", reactor, parts=wanted.parts)
+        driver = create_driver(wanted.kind, wanted.options, "vacuum", reactor, parts=wanted.parts)
 
         def newest() -> Observation:
             seen = driver.observe()

@@ -111,20 +111,20 @@ class PhoneViewTests(BrowserCase, TeamCase):
         """In simulated camera frames the page finds the target at the same place as the robots."""
         import base64
 
-        from agents.vision import Size, find_target
+        from agents.vision import TargetSize, find_target
         from tests.agents.test_search import Walk
 
         pictures = []
         for x, y in ((0.75, 1.2), (0.9, 1.3), (1.2, 1.1), (1.6, 1.5), (2.0, 0.9), (2.4, 1.3), (1.0, 1.48), (0.2, 0.2)):
             walk = Walk()
             walk.world.place_target(x, y)
-            pictures.append(walk.camera.jpeg(walk.dog))
-        pictures.append(Walk().camera.jpeg(Walk().dog))
+            pictures.append(walk.camera.render_jpeg(walk.dog))
+        pictures.append(Walk().camera.render_jpeg(Walk().dog))
         page = self.opened()
         found = page.evaluate(SIGHTS, [base64.b64encode(picture).decode() for picture in pictures])
         count = 0
         for picture, here in zip(pictures, found, strict=True):
-            there = find_target(picture, Size(0.08, 0.22))
+            there = find_target(picture, TargetSize(0.08, 0.22))
             self.assertEqual(here is None, there is None)
             if there is not None:
                 count += 1

@@ -13,14 +13,14 @@ from pathlib import Path
 from twisted.trial.unittest import SkipTest, SynchronousTestCase
 
 from agents.behaviour import STAND
-from agents.guarded import Guarded
+from agents.behaviour_proxy import BehaviourProxy
 from drivers.reading import Frame, Observation
-from middleware.consensus.deployed import BEHAVIOUR, STRATEGY
-from middleware.consensus.guard import STRIKES, Guard, NoOpinion
+from middleware.consensus.deployed_modules import BEHAVIOUR, STRATEGY
+from middleware.consensus.guarded_strategy import MAX_LOSSES, GuardedStrategy, StrategyError
 from middleware.consensus.strategy import Report
-from middleware.deployment.manifest import pushed
-from middleware.deployment.process import ProcessChannel
-from middleware.deployment.runner import PATIENCE_S, PushedStrategy, Runner, State
+from middleware.deployment.manifest import make_next_manifest
+from middleware.deployment.process_channel import ProcessChannel
+from middleware.deployment.runner import REPLY_TIMEOUT_S, PushedStrategy, Runner, State
 from tests.live.until import until
 
 TEAM = [Report("a", 3.0), Report("b", 1.0), Report("c", 2.0)]
@@ -70,7 +70,7 @@ class PushedCodeTests(SynchronousTestCase):
     def runner(self, source: str, kind: str = STRATEGY) -> Runner:
         """Return a runner of this module, when it is ready or refused."""
         data = source.encode()
-        runner = Runner(pushed("best", kind, data, None), data, ProcessChannel, time.monotonic)
+        runner = Runner(make_next_manifest("best", kind, data, None), data, ProcessChannel, time.monotonic)
         self.addCleanup(runner.stop, "the test is over")
         runner.start()
         until(lambda: self.looked(runner).state is not State.STARTING)
@@ -78,14 +78,14 @@ class PushedCodeTests(SynchronousTestCase):
 
     def looked(self, runner: Runner) -> Runner:
         """Update the runner's state and return it."""
-        runner.look()
+        runner.poll()
         return runner
 
     def asked(self, source: str) -> list[str]:
         """Return the results of the module's attempts; raise if there is no answer."""
         runner = self.runner(BASE + source)
         self.assertIs(runner.state, State.READY, runner.why)
-        return [told[CHOICE] for told in runner.wait_for(*ATTEMPT)]
+        return [told[CHOICE] for told in runner.call(*ATTEMPT)]
 
     def test_confined(self) -> None:
         """On Linux all limits that the machine supports are in force, including seccomp."""
@@ -142,10 +142,10 @@ def ATTEMPT(what):
         losses = 0
         while runner.state is not State.OUT:
             until(lambda: self.looked(runner).state is not State.STARTING)
-            self.assertRaises(NoOpinion, runner.wait_for, *ATTEMPT)
+            self.assertRaises(StrategyError, runner.call, *ATTEMPT)
             losses += runner.state in (State.LOST, State.OUT)
-        self.assertEqual(losses, STRIKES)
-        guard = Guard(PushedStrategy(runner), twice=True)
+        self.assertEqual(losses, MAX_LOSSES)
+        guard = GuardedStrategy(PushedStrategy(runner), twice=True)
         self.assertIn("no opinion", guard.find(TEAM).reason)
         self.flushLoggedErrors()
 
@@ -153,9 +153,9 @@ def ATTEMPT(what):
         """A module that writes to the pipe directly, or returns too large an answer, is killed or refused."""
         flood = "def ATTEMPT(what):\n    for fd in range(3, 9):\n        try: os.write(fd, b'\\xff' * 100)\n"
         runner = self.runner(BASE + flood + "        except OSError: pass\n")
-        self.assertRaises(NoOpinion, runner.wait_for, *ATTEMPT)
+        self.assertRaises(StrategyError, runner.call, *ATTEMPT)
         self.assertIs(runner.state, State.LOST)
-        self.assertRaises(NoOpinion, self.asked, "def ATTEMPT(what): return ['x' * 1000000]\n")
+        self.assertRaises(StrategyError, self.asked, "def ATTEMPT(what): return ['x' * 1000000]\n")
 
     def test_ends_with_its_node(self) -> None:
         """The process ends when its runner stops."""
@@ -183,8 +183,8 @@ def ATTEMPT(what):
         self.assertIs(runner.state, State.READY, runner.why)
         frame = Frame(1, 640, 480, b"j" * 200_000, 0.0)
         seen = Observation(0.0, 0.0, {"range.near": 1.0}, {}, frame)
-        behaviour = Guarded(runner.create({"hangs_at": 4}, random.Random(1)), STAND)
-        other = Guarded(runner.create({"hangs_at": 10**9}, random.Random(1)), STAND)
+        behaviour = BehaviourProxy(runner.create({"hangs_at": 4}, random.Random(1)), STAND)
+        other = BehaviourProxy(runner.create({"hangs_at": 10**9}, random.Random(1)), STAND)
         until(lambda: behaviour.cost == 1.0)
         until(lambda: behaviour.search(time.monotonic()) == {"base.wz": 0.5})
         behaviour.look(seen, 0.0)
@@ -202,10 +202,10 @@ def ATTEMPT(what):
 
         until(has_failed)
         self.assertEqual((action, behaviour.search(0.0), behaviour.cost), (STAND, STAND, None))
-        self.assertLess(slowest, PATIENCE_S)
+        self.assertLess(slowest, REPLY_TIMEOUT_S)
         self.assertTrue(other.has_failed)
         self.assertIs(runner.state, State.LOST)
-        third = Guarded(runner.create({"hangs_at": 10**9}, random.Random(1)), STAND)
+        third = BehaviourProxy(runner.create({"hangs_at": 10**9}, random.Random(1)), STAND)
         until(lambda: third.cost == 1.0)
         third.close()
         self.assertEqual(runner.instances, set())

@@ -16,9 +16,9 @@ from twisted.internet.threads import blockingCallFromThread, deferToThread
 from twisted.trial.unittest import SynchronousTestCase, TestCase
 
 from drivers.pyro.robot import PyroRobot
-from drivers.registry import driver_for
+from drivers.registry import create_driver
 from sim.robots.emulator.aibo_dog import AiboEmulator
-from sim.robots.emulator.body import MemoryBody
+from sim.robots.emulator.simulated_robot import MemoryRobot
 from tests.live.until import until
 
 ROOT = Path(__file__).parents[2]
@@ -30,10 +30,10 @@ class ThreadTests(TestCase):
 
     def test_brain_on_a_thread_of_its_own(self) -> Deferred[None]:
         """A plain script on another thread connects, drives, reads and disconnects with blocking calls."""
-        body = MemoryBody()
+        body = MemoryRobot()
         dog = AiboEmulator(reactor, body, Random(1))
         dog.start()
-        driver = driver_for("aibo", {"host": "dog", "camera": False}, "dog", reactor, dog.connector())
+        driver = create_driver("aibo", {"host": "dog", "camera": False}, "dog", reactor, dog.connector())
         robot = PyroRobot(driver, reactor, partial(blockingCallFromThread, reactor))
 
         def moves() -> bool:

@@ -16,8 +16,8 @@ from twisted.trial.unittest import TestCase
 from drivers.driver import Permit
 from drivers.link import TcpConnector, TcpLinkFactory
 from drivers.rosbridge.driver import RosbridgeDriver
-from sim.robots.emulator.body import MemoryBody
 from sim.robots.emulator.rosbridge import RosbridgeRobot
+from sim.robots.emulator.simulated_robot import MemoryRobot
 from tests.live.waiting import until
 
 reactor: Any = running
@@ -57,7 +57,7 @@ class LiveRosbridgeTests(TestCase):
 
     def setUp(self) -> None:
         """Start a robot that listens on a free port."""
-        self.body = MemoryBody(values={"power.level": 0.8, "range.near": 0.5})
+        self.body = MemoryRobot(values={"power.level": 0.8, "range.near": 0.5})
         self.robot = RosbridgeRobot(reactor, self.body, Random(1))
         self.robot.start()
         port = reactor.listenTCP(0, TcpLinkFactory(self.robot.accept), interface="127.0.0.1")
@@ -92,7 +92,7 @@ class LiveRosbridgeTests(TestCase):
         said = json.loads(done.stdout.splitlines()[-1])
         self.assertEqual((said["kind"], said["speed"]), ("geometry_msgs/msg/Twist", 0.125))
         self.assertIn("does not exist", said["missing"])
-        self.assertEqual(self.robot.ignored, 0)
+        self.assertEqual(self.robot.ignored_count, 0)
 
     async def test_other_server_takes_it_for_a_client(self) -> None:
         """The driver communicates with autobahn's WebSocket server in small, medium and large messages."""

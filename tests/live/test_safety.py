@@ -14,12 +14,12 @@ from typing import Any, get_args
 
 from tests.live.keys import key_of
 from tests.live.page import TeamCase
+from webnode.auth import Role
 from webnode.guard import HEADERS
-from webnode.route import ALLOWED, Route
-from webnode.routes.phones import BOUND
-from webnode.routes.table import TABLE
+from webnode.route import ALLOWED_ROLES, Route
+from webnode.routes.phones import PHONE_PREFIX
+from webnode.routes.registry import TABLE
 from webnode.token import Claim
-from webnode.visitor import Role
 
 MISSING = [name for name in ("flask", "cv2") if find_spec(name) is None]
 NAMES = {"uuid": "01" * 16, "task_id": "t1", "file": "page.js"}
@@ -48,7 +48,7 @@ class SafetyTests(TeamCase):
             return ""
         self._number += 1
         claim = Claim(f"{self._number:016x}", name or role, role, int(time.time()) + 600)
-        return self._key.token(claim.ticket if ticket else claim)
+        return self._key.sign_token(claim.ticket if ticket else claim)
 
     def asked(self, method: str, path: str, body: bytes | None = None, **headers: str) -> Answer:
         """Send one request on a new connection; of a stream, read only the headers."""
@@ -75,12 +75,12 @@ class SafetyTests(TeamCase):
         wrong: list[object] = []
         for route in TABLE:
             # Requests of a phone need a token that is bound to this phone.
-            name = f"{BOUND}{NAMES['uuid']}" if route.role == "phone" else ""
+            name = f"{PHONE_PREFIX}{NAMES['uuid']}" if route.role == "phone" else ""
             for role in get_args(Role):
                 body = None if route.method == "GET" else b"{}"
                 status, headers, _ = self.asked(route.method, path_of(route), body, **self.bearer(role, name))
                 wrong += self.lax(f"{route.name} {role}", headers)
-                wanted = 200 if role in ALLOWED[route.role] else 401 if role == "anyone" else 403
+                wanted = 200 if role in ALLOWED_ROLES[route.role] else 401 if role == "anyone" else 403
                 if (status if status in (401, 403) else 200) != wanted:
                     wrong.append((route.name, role, status))
         self.assertEqual(wrong, [])

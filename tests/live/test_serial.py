@@ -9,14 +9,14 @@ from twisted.internet import reactor
 from twisted.trial.unittest import SkipTest, TestCase
 
 from drivers.create2.driver import Create2Driver
-from drivers.create2.option import checked
+from drivers.create2.option import parse_options
 from drivers.driver import Driver, Permit
 from drivers.errors import NotEnabled
-from drivers.registry import driver_for
+from drivers.registry import create_driver
 from drivers.serial import SerialConnector
-from sim.robots.emulator.body import MemoryBody
 from sim.robots.emulator.create2 import Create2
 from sim.robots.emulator.pty import PtyPort
+from sim.robots.emulator.simulated_robot import MemoryRobot
 from tests.live.waiting import CLOCK, until
 
 try:
@@ -31,7 +31,7 @@ class Create2PtyTests(TestCase):
     timeout = 30
 
     def setUp(self) -> None:
-        self.body = MemoryBody()
+        self.body = MemoryRobot()
         self.robot = Create2(self.body, CLOCK, Random(1))
         self.path = self.mktemp()
         self.port = PtyPort(reactor, self.robot.accept, self.path)
@@ -45,7 +45,7 @@ class Create2PtyTests(TestCase):
         self.robot.stop()
 
     def driver(self) -> Create2Driver:
-        driver = driver_for("create2", {"port": self.path}, "vacuum", CLOCK)
+        driver = create_driver("create2", {"port": self.path}, "vacuum", CLOCK)
         self.drivers.append(driver)
         assert isinstance(driver, Create2Driver)
         return driver
@@ -92,7 +92,7 @@ class Create2PtyTests(TestCase):
 
     async def named(self, path: str, words: str) -> None:
         """Wait until a driver of this path reports these words."""
-        driver = Create2Driver(checked({"port": path}), "vacuum", SerialConnector(), CLOCK)
+        driver = Create2Driver(parse_options({"port": path}), "vacuum", SerialConnector(), CLOCK)
         driver.connect().addErrback(lambda _: None)
         self.drivers.append(driver)
         await until(lambda: words in driver.problem)

@@ -8,7 +8,7 @@ from pathlib import Path
 
 from twisted.trial.unittest import SynchronousTestCase
 
-from benchmarks.store import killed
+from benchmarks.store import run_kills
 
 ROOT = Path(__file__).resolve().parents[2]
 FAILING_DISK = """
@@ -47,7 +47,7 @@ print(number)
 class KillTest(SynchronousTestCase):
     def test_a_handful_of_kills(self) -> None:
         """A writer that is killed at any moment loses no acknowledged row, and corrupts nothing."""
-        seen = killed(str(Path(self.mktemp()).resolve()), 6, seed=1)
+        seen = run_kills(str(Path(self.mktemp()).resolve()), 6, seed=1)
         self.assertEqual((seen.lost, seen.damaged, seen.kills), ([], [], 6))
         self.assertGreater(seen.acknowledged, 0)
 

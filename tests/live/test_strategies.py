@@ -9,12 +9,12 @@ from pathlib import Path
 from twisted.internet.defer import Deferred
 from twisted.trial.unittest import SynchronousTestCase
 
-from middleware.consensus.selection import Strategies
+from middleware.consensus.process_strategy import ProcessStrategy
 from middleware.consensus.strategy import Report
-from middleware.consensus.worker import Worker
+from middleware.consensus.strategy_registry import StrategyRegistry
 from middleware.errors import UnknownStrategy
 from middleware.tasks.task import Task
-from swarmnode.rehearsal import VirtualTeam
+from swarmnode.simulated_team import SimulatedTeam
 
 ROOT = str(Path(__file__).resolve().parents[2])
 MODULE = "from middleware.consensus.strategies.nearest import Nearest\n\n\nclass Spare(Nearest):\n    name = 'spare'\n"
@@ -25,16 +25,16 @@ class StrategiesTests(SynchronousTestCase):
     def setUp(self) -> None:
         self.installed()
         self.processes: list[subprocess.Popen[bytes]] = []
-        start = Worker._start
+        start = ProcessStrategy._start
 
-        def started(worker: Worker) -> None:
+        def started(worker: ProcessStrategy) -> None:
             start(worker)
             assert worker._process is not None
             self.processes.append(worker._process)
             self.addCleanup(worker._process.wait)
             self.addCleanup(worker._process.kill)
 
-        self.patch(Worker, "_start", started)
+        self.patch(ProcessStrategy, "_start", started)
 
     def installed(self) -> None:
         """Put the entry point "spare" on this process's path, as pip does."""
@@ -45,7 +45,7 @@ class StrategiesTests(SynchronousTestCase):
         (folder / "spare-1.dist-info" / "entry_points.txt").write_text(ENTRY)
         self.patch(sys, "path", [str(folder), ROOT, *sys.path])
 
-    def submit(self, team: VirtualTeam, task_id: str) -> None:
+    def submit(self, team: SimulatedTeam, task_id: str) -> None:
         """Submit a task with the strategy "spare", and check its completion."""
         task = Task(task_id, "turn-around", "Odd", strategy="spare", created=team.clock.seconds())
         submitted = Deferred.fromCoroutine(team.services["vaio"].assembly.node.submit(task))
@@ -61,7 +61,7 @@ class StrategiesTests(SynchronousTestCase):
 
     def test_node_has_one_process_and_ends_it(self) -> None:
         """Each node has one process for all tasks of a strategy, which ends with the node, also after a crash."""
-        team = VirtualTeam(11, dogs=("dog1", "dog2"))
+        team = SimulatedTeam(11, dogs=("dog1", "dog2"))
         self.addCleanup(self.flushLoggedErrors)  # a strategy that is still loading is logged
         self.addCleanup(team.stop)
         self.submit(team, "t1")
@@ -77,13 +77,13 @@ class StrategiesTests(SynchronousTestCase):
 
     def test_nothing_begins_after_the_end(self) -> None:
         """After the end of a node, a strategy from another distribution is refused or replaced by the fallback."""
-        early, late = Strategies(), Strategies()
-        guard = early.named("spare", {})
-        self.assertIs(early.named("spare", {}), guard)
+        early, late = StrategyRegistry(), StrategyRegistry()
+        guard = early.get("spare", {})
+        self.assertIs(early.get("spare", {}), guard)
         early.stop()
         late.stop()
-        self.assertIn("it was stopped", early.named("spare", {}).find([Report("a", 1.0)]).reason)
-        error = self.assertRaises(UnknownStrategy, late.named, "spare", {})
+        self.assertIn("it was stopped", early.get("spare", {}).find([Report("a", 1.0)]).reason)
+        error = self.assertRaises(UnknownStrategy, late.get, "spare", {})
         self.assertIn("the node has stopped", str(error))
         self.assertEqual((len(self.processes), self.alive), (1, 0))
         self.flushLoggedErrors()

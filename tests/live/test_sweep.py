@@ -10,7 +10,7 @@ from pathlib import Path
 
 from twisted.trial.unittest import SkipTest, TestCase
 
-from sim.team import logbook
+from sim.team import seed_log
 from tests.invariants.run import run, run_all
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -32,12 +32,12 @@ class InterruptTests(TestCase):
             child.send_signal(signal.SIGINT)
             told, _ = child.communicate(timeout=60)
             self.assertEqual(child.returncode, 130, told)
-        (first,) = logbook.entries(Path(book).read_text(), book)
+        (first,) = seed_log.parse_entries(Path(book).read_text(), book)
         self.assertGreater(first.count, 0)
         with self.command(first.count + 3, book) as child:
             told, _ = child.communicate(timeout=120)
             self.assertEqual(child.returncode, 0, told)
-        second = logbook.entries(Path(book).read_text(), book)[1]
+        second = seed_log.parse_entries(Path(book).read_text(), book)[1]
         self.assertEqual((second.first, second.count, second.failures), (first.count + 1, 3, ()))
 
 

@@ -20,11 +20,11 @@ from twisted.trial.unittest import TestCase
 from middleware.entangled.contact import Contact
 from middleware.entangled.errors import TunnelPortInUse
 from middleware.entangled.identity import Identity
-from middleware.entangled.network.tcp import TcpCarrier
-from middleware.entangled.network.tunnel import MAX_BEGUN, MAX_OF_HOST, TunnelNetwork
+from middleware.entangled.network.tcp import TcpTransport
+from middleware.entangled.network.tunnel import MAX_HANDSHAKES, MAX_PER_HOST, TunnelNetwork
 from middleware.entangled.network.url import Url
 from middleware.entangled.wire.endpoint import Endpoint
-from sim.demo import port
+from sim.demo import free_ports
 from tests.live.node import PATIENCE_S, NodeCase
 from tests.live.until import takes, until
 
@@ -55,9 +55,9 @@ class TunnelTests(TestCase):
         self.ports: list[Any] = []
         Forwarder.is_stuck = False
 
-    def made(self, *urls: Url) -> tuple[TunnelNetwork, TcpCarrier]:
+    def made(self, *urls: Url) -> tuple[TunnelNetwork, TcpTransport]:
         """Return a tunnel; without URLs it listens on a free port."""
-        carrier = TcpCarrier(reactor, HOST, 0)
+        carrier = TcpTransport(reactor, HOST, 0)
         tunnel = TunnelNetwork(carrier, REACTOR, random.SystemRandom(), urls, not urls)
 
         def close() -> Deferred[Any]:
@@ -71,7 +71,7 @@ class TunnelTests(TestCase):
         """Return an endpoint behind a tunnel, the tunnel, and its URL."""
         tunnel, carrier = self.made()
         end = self.endpoint(1, tunnel)
-        return end, tunnel, Url("wss", HOST, carrier.number)
+        return end, tunnel, Url("wss", HOST, carrier.port)
 
     def endpoint(self, seed: int, tunnel: TunnelNetwork) -> Endpoint:
         """Return a started endpoint of the team."""
@@ -103,7 +103,7 @@ class TunnelTests(TestCase):
         """Return an endpoint that has connected to ``url``, the other endpoint's contact, and its tunnel."""
         tunnel, _ = self.made(url)
         client = self.endpoint(2, tunnel)
-        contact = await client.greet(url.address, 4.0)
+        contact = await client.discover(url.address, 4.0)
         return client, contact, tunnel
 
     async def greet(self, url: Url) -> ssl.SSLSocket:
@@ -170,13 +170,13 @@ class TunnelTests(TestCase):
             asked = time.monotonic()
             await client.ask(contact, "echo", 1)
             slowest = max(slowest, time.monotonic() - asked)
-            most = max(most, len(tunnel._links))
+            most = max(most, len(tunnel._connections))
             await task.deferLater(REACTOR, 0.1)
         selector.close()
         self.assertEqual(len(crowd), 0)
         self.assertLess(time.monotonic() - began, 15.0)
         self.assertLess(slowest, 0.5)
-        self.assertLessEqual(most, MAX_BEGUN + 2)
+        self.assertLessEqual(most, MAX_HANDSHAKES + 2)
 
     async def test_bear_one_address(self) -> None:
         """The number of clients per address is limited, and further ones are closed at once."""
@@ -184,8 +184,8 @@ class TunnelTests(TestCase):
         crowd = [socket.create_connection((url.host, url.port), 5.0) for _ in range(100)]
         for each in crowd:
             self.addCleanup(each.close)
-        await self.until(lambda: tunnel.counters["crowded"] >= 100 - MAX_OF_HOST)
-        self.assertEqual(tunnel.counters["crowded"], 100 - MAX_OF_HOST)
+        await self.until(lambda: tunnel.counters["crowded"] >= 100 - MAX_PER_HOST)
+        self.assertEqual(tunnel.counters["crowded"], 100 - MAX_PER_HOST)
 
     async def test_garbage(self) -> None:
         """Invalid TLS, handshake or frame data ends only its link, and raises nothing."""
@@ -199,8 +199,8 @@ class TunnelTests(TestCase):
         for _ in range(10):
             greeted = await self.greet(url)
             greeted.send(dice.randbytes(dice.randrange(20, 3000)))
-        await self.until(lambda: len(tunnel._links) == 1)
-        self.assertEqual(len(tunnel._links), 1)
+        await self.until(lambda: len(tunnel._connections) == 1)
+        self.assertEqual(len(tunnel._connections), 1)
         answer = await client.ask(contact, "echo", 1)
         self.assertEqual(answer, 1)
 
@@ -219,9 +219,9 @@ class TunnelTests(TestCase):
             asked = time.monotonic()
             await client.ask(contact, "echo", 1)
             slowest = max(slowest, time.monotonic() - asked)
-        (link,) = (each for each in tunnel._links if each.address == slow)
+        (link,) = (each for each in tunnel._connections if each.address == slow)
         transport: Any = link.transport
-        held = link.waiting + len(transport.dataBuffer) + transport._tempDataLen - transport.offset
+        held = link.queued_bytes + len(transport.dataBuffer) + transport._tempDataLen - transport.offset
         self.assertLess(held, 64 * 1024)
         self.assertGreater(link.dropped, 4000)
         self.assertLess(slowest, 0.3)
@@ -233,24 +233,24 @@ class TunnelTests(TestCase):
         server, tunnel, url = self.served()
         client_tunnel, carrier = self.made(url)
         client = self.endpoint(2, client_tunnel)
-        contact = await client.greet(url.address, 4.0)
+        contact = await client.discover(url.address, 4.0)
         await client.ask(contact, "echo", 1)
         await task.deferLater(REACTOR, 0.3)
-        (link,) = client_tunnel._links
-        strain = carrier.strain(link.transport)
+        (link,) = client_tunnel._connections
+        strain = carrier.read_state(link.transport)
         assert strain is not None
-        self.assertEqual((strain.held, strain.repeated), (0, 0))
+        self.assertEqual((strain.unacked, strain.retransmissions), (0, 0))
         self.assertGreater(strain.acked, 1000)
         await self.greet(url)
-        (deaf,) = (each for each in tunnel._links if each.address != tunnel.peers[0])
+        (deaf,) = (each for each in tunnel._connections if each.address != tunnel.peers[0])
         for _ in range(400):
             tunnel.send(bytes(1400), deaf.address)
             await task.deferLater(REACTOR, 0.001)
-        strain = carrier.strain(deaf.transport)
+        strain = carrier.read_state(deaf.transport)
         assert strain is not None
-        self.assertGreater(strain.held, 8192)
-        deaf.end("the test is over", is_rude=True)
-        self.assertIsNone(carrier.strain(None))
+        self.assertGreater(strain.unacked, 8192)
+        deaf.close("the test is over", is_rude=True)
+        self.assertIsNone(carrier.read_state(None))
         server.stop()
 
     async def test_dead_end(self) -> None:
@@ -273,7 +273,7 @@ class TunnelTests(TestCase):
         calls.stop()
         self.assertLess(took, 12.0)
         await task.deferLater(REACTOR, 1.0)
-        again = await client.greet(through.address, 4.0)
+        again = await client.discover(through.address, 4.0)
         self.assertEqual(again.public, contact.public)
         client.stop()
         server.stop()
@@ -284,7 +284,7 @@ class TunnelTests(TestCase):
         with socket.socket() as taken:
             taken.bind((HOST, 0))
             taken.listen()
-            carrier = TcpCarrier(reactor, HOST, taken.getsockname()[1])
+            carrier = TcpTransport(reactor, HOST, taken.getsockname()[1])
             error = self.assertRaises(TunnelPortInUse, carrier.listen, lambda host: None)
         self.assertIn("choose another port", str(error))
         self.assertNotIn("\n", str(error))
@@ -301,7 +301,7 @@ class NodeTests(NodeCase):
 
     def test_enter_without_udp(self) -> None:
         """A real node whose known node does not answer over UDP joins over TLS."""
-        (number,) = port.free("tcp", HOST, 1)
+        (number,) = free_ports.find_free_ports("tcp", HOST, 1)
         with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as silent:
             silent.bind((HOST, 0))
             known = f'known_nodes = ["{HOST}:{silent.getsockname()[1]}"]\n'

@@ -12,7 +12,7 @@ from twisted.trial.unittest import TestCase
 
 from middleware.entangled.errors import PortInUse
 from middleware.entangled.identity import Identity
-from middleware.entangled.network.network import MAX_CARRIED, Address
+from middleware.entangled.network.network import MAX_RELAYED_BYTES, Address
 from middleware.entangled.network.udp import UdpNetwork
 from middleware.entangled.wire.endpoint import Endpoint
 
@@ -41,7 +41,7 @@ class UdpTests(TestCase):
             self.addCleanup(end.stop)
             ends.append(end)
         ends[1].expose("twice", lambda peer, number: 2 * number, changes=True)
-        contact = yield ends[0].greet(ends[1].address)
+        contact = yield ends[0].discover(ends[1].address)
         self.assertEqual(contact.public, Identity(b"\x02" * 32).public)
         answer = yield ends[0].ask(contact, "twice", 21, changes=True)
         self.assertEqual(answer, 42)
@@ -67,7 +67,7 @@ class UdpTests(TestCase):
         network.listen(lambda datagram, source: None)
         for address in [Address("a name", 9), Address("::1", 9), Address("127.0.0.1", 99999), Address("127.0.0.1", -1)]:
             network.send(b"x", address)
-        network.send(bytes(MAX_CARRIED + 1), Address("127.0.0.1", 9))
+        network.send(bytes(MAX_RELAYED_BYTES + 1), Address("127.0.0.1", 9))
         self.assertEqual((network.counters["unsent"], network.counters["oversized"]), (5, 1))
         network.close()
         network.close()
@@ -101,10 +101,10 @@ class UdpTests(TestCase):
         other.listen(hear)
         one.listen(lambda datagram, source: one.send(datagram, source))
         port = one.open_port()
-        self.assertEqual(one.lead(other.address, port), 0)
+        self.assertEqual(one.assign_port(other.address, port), 0)
         one.send(b"1", other.address)
-        self.assertEqual(one.local(other.address), Address("127.0.0.1", port))
-        self.assertEqual(one.lead(other.address, 0), port)
+        self.assertEqual(one.source_address(other.address), Address("127.0.0.1", port))
+        self.assertEqual(one.assign_port(other.address, 0), port)
         one.send(b"2", other.address)
         stranger = self.network()
         answered: Deferred[Address] = Deferred()
@@ -112,7 +112,7 @@ class UdpTests(TestCase):
         stranger.send(b"x", Address("127.0.0.1", port))
         source = yield answered.addTimeout(5.0, reactor)
         self.assertEqual(source.port, port)
-        one.shut_port(port)
+        one.close_port(port)
         one.send(b"3", other.address)
         yield arrived.addTimeout(5.0, reactor)
         self.assertEqual([address.port for address in heard], [port, one.address.port, one.address.port])

@@ -18,10 +18,10 @@ from twisted.web.http_headers import Headers
 
 from tests.webnode.memory import MemoryDesk
 from tests.webnode.picture import jpeg
-from webnode.board import Board
+from webnode.auth import OpenSessions
 from webnode.server import WORKERS, WebService
-from webnode.state import State, state_of
-from webnode.visitor import OpenSessions
+from webnode.services import Services
+from webnode.state import State, format_state
 
 reactor: Any = _reactor
 
@@ -78,7 +78,7 @@ class WebServiceTests(TestCase):
         await deferLater(reactor, 0.05)
 
     def service(self, port: int) -> WebService:
-        board = Board(self.desk, OpenSessions())
+        board = Services(self.desk, OpenSessions())
         return WebService(reactor, "127.0.0.1", port, self.read, board, lambda: 1e9)
 
     def read(self) -> State:
@@ -86,7 +86,7 @@ class WebServiceTests(TestCase):
             self.held.set()
             if not self.gate.wait(5):
                 raise SystemExit  # end the worker without output
-        return state_of(self.devices, [], {}, node="vaio")
+        return format_state(self.devices, [], {}, node="vaio")
 
     def asked(self, path: str, method: bytes = b"GET") -> Deferred[Any]:
         url = f"http://127.0.0.1:{self.web.port}{path}".encode()
@@ -162,7 +162,7 @@ class WebServiceTests(TestCase):
             opened.append(reactor.listenTCP(0, site, interface="127.0.0.1"))
             return opened[0]
 
-        board = Board(self.desk, OpenSessions())
+        board = Services(self.desk, OpenSessions())
         web = WebService(reactor, "127.0.0.1", 0, self.read, board, lambda: 1e9, doors=[door])
         web.startService()
         url = f"http://127.0.0.1:{opened[0].getHost().port}".encode()

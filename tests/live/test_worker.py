@@ -10,13 +10,13 @@ from pathlib import Path
 
 from twisted.trial.unittest import SynchronousTestCase
 
-from middleware.consensus.guard import STRIKES, Guard
-from middleware.consensus.item import Item
-from middleware.consensus.selection import guarded
+from middleware.consensus.assignment import Item
+from middleware.consensus.guarded_strategy import MAX_LOSSES, GuardedStrategy
+from middleware.consensus.process_strategy import DEADLINE_S, ProcessStrategy
 from middleware.consensus.strategies.cbba import Cbba
 from middleware.consensus.strategies.nearest import Nearest
 from middleware.consensus.strategy import Consensus, Report
-from middleware.consensus.worker import DEADLINE_S, Worker
+from middleware.consensus.strategy_registry import load_guarded_strategy
 
 ROOT = str(Path(__file__).resolve().parents[2])
 TEAM = [Report("a", 3.0, value=(1.0, 2.0)), Report("b", 1.0), Report("c", 2.0)]
@@ -78,15 +78,15 @@ class Raising(Nearest):
 
 
 class WorkerTests(SynchronousTestCase):
-    def guard(self, name: str, deadline: float = PATIENCE) -> Guard:
+    def guard(self, name: str, deadline: float = PATIENCE) -> GuardedStrategy:
         """Return a guard around a class of this module in a loaded child process."""
-        worker = Worker(name, f"{__name__}:{name}", deadline, path=(ROOT,))
+        worker = ProcessStrategy(name, f"{__name__}:{name}", deadline, path=(ROOT,))
         self.addCleanup(worker.stop)
-        guard = Guard(worker, twice=True)
+        guard = GuardedStrategy(worker, twice=True)
         self.loaded(guard)
         return guard
 
-    def loaded(self, guard: Guard) -> Consensus:
+    def loaded(self, guard: GuardedStrategy) -> Consensus:
         """Return the result as soon as the process has loaded the strategy."""
         end = time.monotonic() + PATIENCE
         while "still loading" in (found := guard.find(TEAM)).reason and time.monotonic() < end:
@@ -120,8 +120,8 @@ class WorkerTests(SynchronousTestCase):
             began = time.monotonic()
             self.assertEqual(guard.find(TEAM).assigned_agent, "b")
             worst = max(worst, time.monotonic() - began)
-        self.assertIn(f"no result {STRIKES} times", guard.find(TEAM).reason)
-        self.assertLess(worst, PATIENCE / STRIKES)
+        self.assertIn(f"no result {MAX_LOSSES} times", guard.find(TEAM).reason)
+        self.assertLess(worst, PATIENCE / MAX_LOSSES)
         self.assertIsNone(guard.strategy._process)  # type: ignore[attr-defined]
         self.flushLoggedErrors()
 
@@ -146,7 +146,7 @@ class WorkerTests(SynchronousTestCase):
         """A stopped strategy is skipped and starts no process; if its process died, the next call starts a new one."""
         guard = self.guard("Good")
         worker = guard.strategy
-        assert isinstance(worker, Worker) and worker._process is not None
+        assert isinstance(worker, ProcessStrategy) and worker._process is not None
         lost = worker._process
         lost.kill()
         lost.wait()
@@ -161,6 +161,6 @@ class WorkerTests(SynchronousTestCase):
 
     def test_foreign_by_name(self) -> None:
         """A strategy named by module and class runs in a separate process."""
-        guard = guarded(f"{__name__}:Good", dotted=True)
+        guard = load_guarded_strategy(f"{__name__}:Good", dotted=True)
         self.addCleanup(guard.stop)
-        self.assertIsInstance(guard.strategy, Worker)
+        self.assertIsInstance(guard.strategy, ProcessStrategy)

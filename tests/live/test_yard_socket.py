@@ -16,8 +16,8 @@ import sim
 from drivers.driver import Permit
 from drivers.errors import UsageError
 from drivers.link import TcpConnector
-from drivers.registry import driver_for
-from drivers.sim.operator import YardOperator
+from drivers.registry import create_driver
+from drivers.sim.client import SimulatorClient
 from tests.live.waiting import wait
 
 ROOT = Path(sim.__file__).parents[1]
@@ -53,8 +53,8 @@ class YardSocketTests(TestCase):
         """Over TCP a dog connects, senses, walks and stops; the operator moves the target; both disconnect."""
         clock = IReactorTime(reactor)
         async with running_yard() as (_, port):
-            driver = driver_for("sim", {"port": port, "camera_fps": 30}, "dog1", clock)
-            operator = YardOperator(TcpConnector(), clock, port=port)
+            driver = create_driver("sim", {"port": port, "camera_fps": 30}, "dog1", clock)
+            operator = SimulatorClient(TcpConnector(), clock, port=port)
             await driver.connect()
             before = await operator.connect()
             await driver.enable()
@@ -78,7 +78,7 @@ class YardSocketTests(TestCase):
         """If the simulator is killed, the driver is stale at once; it reconnects to a new one at the same port."""
         clock = IReactorTime(reactor)
         async with running_yard() as (process, port):
-            driver = driver_for("sim", {"port": port, "camera": False}, "dog2", clock)
+            driver = create_driver("sim", {"port": port, "camera": False}, "dog2", clock)
             await driver.connect()
             process.kill()
             process.wait()

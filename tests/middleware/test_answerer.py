@@ -8,7 +8,7 @@ from twisted.internet.defer import CancelledError, Deferred
 
 from middleware.entangled.contact import Contact
 from middleware.entangled.errors import NoAnswer, Refused
-from middleware.entangled.wire.message import NO_LIMIT_MS, Cancel, Question, aged, decoded, encoded
+from middleware.entangled.wire.message import NO_LIMIT_MS, Cancel, Request, decode, encode, set_remaining_time
 from tests.middleware.test_endpoint import DELAY, EndpointCase
 
 
@@ -69,14 +69,14 @@ class CallTests(EndpointCase):
             self.clock.advance(DELAY)
             self.assertEqual(self.ended.pop(), how)
         self.clock.advance(70)
-        self.assertEqual([account.running for account in self.b._answerer._ledger._accounts.values()], [{}])
+        self.assertEqual([account.running for account in self.b._dispatcher._history._peers.values()], [{}])
 
     def test_cancel_overtakes_its_question(self) -> None:
         """A request that arrives after its cancellation does not run."""
         session = next(iter(self.a._sessions.values()))
-        late = session.seal(encoded(Question(5, "add", (1,))))
+        late = session.seal(encode(Request(5, "add", (1,))))
         receive = self.taps[self.to_b.address].receiver
-        receive(session.seal(encoded(Cancel(5))), self.to_a.address)
+        receive(session.seal(encode(Cancel(5))), self.to_a.address)
         receive(late, self.to_a.address)
         self.assertEqual((self.runs, self.b.counters["cancelled"]), ([], 1))
 
@@ -86,8 +86,8 @@ class CallTests(EndpointCase):
         c, _ = self.endpoint(3)
         self.got(c.ask(self.to_b, "echo", 1))
         session = next(iter(c._sessions.values()))
-        number = next(iter(self.a._asker._inquiries))
-        self.taps[self.to_b.address].receiver(session.seal(encoded(Cancel(number))), c.address)
+        number = next(iter(self.a._requester._requests))
+        self.taps[self.to_b.address].receiver(session.seal(encode(Cancel(number))), c.address)
         self.assertEqual(self.ended, [])
         self.works[0].callback("done")
         self.assertEqual(self.got(asked), "done")
@@ -95,8 +95,8 @@ class CallTests(EndpointCase):
     def test_deadline_is_carried(self) -> None:
         """A method gets the caller's remaining time, less the network delay, in milliseconds as 32 bits."""
         for seconds, milliseconds in ((1.5, 1500), (-1.0, 0), (1e9, NO_LIMIT_MS)):
-            aged_one = decoded(aged(encoded(Question(1, "m", (), 7)), seconds))
-            self.assertEqual(aged_one, Question(1, "m", (), milliseconds))
+            aged_one = decode(set_remaining_time(encode(Request(1, "m", (), 7)), seconds))
+            self.assertEqual(aged_one, Request(1, "m", (), milliseconds))
         for timeout, least, most in ((None, 1.4, 1.5), (9.0, 8.9, 9.0)):
             left = self.got(self.a.ask(self.to_b, "when", timeout=timeout))
             self.assertTrue(least <= left <= most, left)
@@ -108,7 +108,7 @@ class CallTests(EndpointCase):
         self.assertEqual(self.ended, [])
         self.failed(asked, NoAnswer)
         self.assertEqual(self.ended, ["CancelledError"])
-        late = aged(encoded(Question(9, "add", (1,))), 0.0)
+        late = set_remaining_time(encode(Request(9, "add", (1,))), 0.0)
         session = next(iter(self.a._sessions.values()))
         self.taps[self.to_b.address].receiver(session.seal(late), self.to_a.address)
         self.assertEqual((self.runs, self.b.counters["late"]), ([], 2))

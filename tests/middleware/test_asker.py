@@ -8,11 +8,11 @@ from twisted.internet.defer import CancelledError, Deferred
 
 from middleware.entangled.contact import Contact
 from middleware.entangled.errors import Crowded, NoAnswer
-from middleware.entangled.network.switchboard import Weather
-from middleware.entangled.wire import asker
-from middleware.entangled.wire.asker import MAX_IN_FLIGHT
-from middleware.entangled.wire.congestion import FIRST_GUESS
-from middleware.entangled.wire.peer import DOUBTS
+from middleware.entangled.network.switchboard import LinkConditions
+from middleware.entangled.wire import requester
+from middleware.entangled.wire.congestion import INITIAL_TIMEOUT_S
+from middleware.entangled.wire.peer import MIN_CHECK_TRIES
+from middleware.entangled.wire.requester import MAX_IN_FLIGHT
 from middleware.entangled.wire.session import INIT
 from tests.middleware.test_endpoint import DELAY, EndpointCase
 
@@ -95,7 +95,7 @@ class TurnTests(EndpointCase):
 
     def test_the_queue_is_bounded(self) -> None:
         """A request fails at once if the queue is full."""
-        self.patch(asker, "MAX_QUEUED", 3)
+        self.patch(requester, "MAX_QUEUED", 3)
         asked = self.flood(MAX_IN_FLIGHT + 5)
         for one in asked[-2:]:
             self.failureResultOf(one, Crowded)
@@ -126,9 +126,9 @@ class TurnTests(EndpointCase):
 
     def places(self) -> tuple[int, int, int]:
         """Return the number of requests in flight, in the peer's queue and in all queues."""
-        at = self.a._peers.known(self.to_b.public)
+        at = self.a._peers.get(self.to_b.public)
         assert at is not None
-        return at.in_flight, len(at.queue), self.a._asker._queued
+        return at.in_flight, len(at.queue), self.a._requester._queued
 
 
 class GivenUpTests(EndpointCase):
@@ -146,36 +146,36 @@ class GivenUpTests(EndpointCase):
         """After all its requests ended, a handshake is not retransmitted, and is soon removed."""
         self.board.kill(self.to_b.address)
         sent = self.board.counters["sent"]
-        self.give_up(FIRST_GUESS / 2)
+        self.give_up(INITIAL_TIMEOUT_S / 2)
         self.clock.advance(5.0)
         self.assertEqual(self.board.counters["sent"] - sent, 1)
-        self.assertEqual(self.a.peers.peer(self.to_b).opening, None)
+        self.assertEqual(self.a.peers.get_or_create(self.to_b).handshake, None)
 
     def test_a_late_answer_opens_the_session(self) -> None:
         """A late handshake reply still opens the session for the next request."""
-        self.board.weather = Weather(0.3)
+        self.board.conditions = LinkConditions(0.3)
         self.give_up(0.2)
         self.clock.advance(1.0)
-        self.assertTrue(self.a.is_met(self.to_b))
+        self.assertTrue(self.a.has_session(self.to_b))
 
     def test_who_asks_meanwhile_need_not_wait(self) -> None:
         """A new request during a paused handshake retransmits it at once."""
-        self.board.weather = Weather(DELAY, loss=1.0)
-        self.give_up(FIRST_GUESS / 2)
-        self.clock.advance(FIRST_GUESS)
-        self.board.weather = Weather(DELAY)
+        self.board.conditions = LinkConditions(DELAY, loss=1.0)
+        self.give_up(INITIAL_TIMEOUT_S / 2)
+        self.clock.advance(INITIAL_TIMEOUT_S)
+        self.board.conditions = LinkConditions(DELAY)
         self.assertEqual(self.got(self.a.ask(self.to_b, "echo", 2), 5 * DELAY), 2)
         self.assertEqual(self.inits(), 1)
 
     def test_two_handshakes_in_doubt(self) -> None:
         """A silent peer with a session gets at most ``DOUBTS`` INITs, for any number of requests."""
         self.assertEqual(self.got(self.a.ask(self.to_b, "echo", 1), 5 * DELAY), 1)
-        self.board.weather = Weather(DELAY, loss=1.0)
+        self.board.conditions = LinkConditions(DELAY, loss=1.0)
         sent: list[int] = []
         self.patch(self.a._network, "send", lambda datagram, to: sent.append(datagram[0]))
         asked = [self.a.ask(self.to_b, "echo", number) for number in range(3)]
         for _ in range(30):
             self.clock.advance(0.1)
-        self.assertEqual(sent.count(INIT), DOUBTS)
+        self.assertEqual(sent.count(INIT), MIN_CHECK_TRIES)
         for one in asked:
             self.failureResultOf(one, NoAnswer)

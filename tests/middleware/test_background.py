@@ -5,7 +5,7 @@ from __future__ import annotations
 from twisted.internet.defer import Deferred, fail
 from twisted.trial.unittest import SynchronousTestCase
 
-from middleware.entangled.background import Background, first
+from middleware.entangled.background import Background, gather_first
 from middleware.entangled.clock import HeapClock
 from middleware.entangled.errors import NoAnswer, Refused
 
@@ -70,7 +70,7 @@ class FirstTests(SynchronousTestCase):
         self.asked: list[Deferred[int]] = [Deferred() for _ in range(3)]
 
     def begin(self, needed: int) -> Deferred[list[int]]:
-        return Deferred.fromCoroutine(first(needed, [wait(d) for d in self.asked]))
+        return Deferred.fromCoroutine(gather_first(needed, [wait(d) for d in self.asked]))
 
     def test_enough(self) -> None:
         """``first`` returns the needed number of results in the order of arrival and ignores later results."""
@@ -91,4 +91,4 @@ class FirstTests(SynchronousTestCase):
         self.asked[2].errback(Refused("x"))
         self.assertEqual(self.successResultOf(result), [1])
         for needed, work in ((0, [wait(Deferred())]), (2, [])):
-            self.assertEqual(self.successResultOf(Deferred.fromCoroutine(first(needed, work))), [])
+            self.assertEqual(self.successResultOf(Deferred.fromCoroutine(gather_first(needed, work))), [])

@@ -1,18 +1,27 @@
-"""Tests of ``middleware.entangled.network.bundle``, tunnels over several connections, in virtual time."""
+"""Tests of ``middleware.entangled.network.tunnel_connections``, tunnels over several connections, in virtual time."""
 
 from __future__ import annotations
 
 import random
 
-from middleware.entangled.network.bundle import AT_ONCE, DEAD_S, HARD, HELD, MOST, OPENING_S, ROUGH_S, STILL_S
 from middleware.entangled.network.network import Address
 from middleware.entangled.network.pipes import Pipe
-from middleware.entangled.network.tunnel import MAX_LINKS, MAX_OF_HOST, TunnelNetwork
-from middleware.entangled.network.websocket import TOKEN
+from middleware.entangled.network.tunnel import MAX_PER_HOST, MAX_TOTAL_CONNECTIONS, TunnelNetwork
+from middleware.entangled.network.tunnel_connections import (
+    COPIES,
+    DIAL_NEXT_S,
+    LOSSY_RETRANSMISSIONS,
+    MAX_CONNECTIONS,
+    MAX_STALLED_BYTES,
+    REDUNDANCY_S,
+    REPLACE_STALLED_S,
+    STALLED_S,
+)
+from middleware.entangled.network.websocket import TOKEN_HEADER
 from tests.middleware.test_tunnel import GREETING, HOST, PLAIN, URL, Heard, TunnelCase
 
 STEP = 0.1
-WHOLE = GREETING.replace(b"\r\n\r\n", b"\r\n" + TOKEN.encode() + b": %s\r\n\r\n")
+WHOLE = GREETING.replace(b"\r\n\r\n", b"\r\n" + TOKEN_HEADER.encode() + b": %s\r\n\r\n")
 
 
 class BundleTests(TunnelCase):
@@ -36,13 +45,13 @@ class BundleTests(TunnelCase):
         """Return two ends with three connections, after a stall of the first one, and that connection."""
         client, came, server, served = self.pair()
         (first,) = self.pipes.streams
-        first.is_still = True
+        first.is_stalled = True
         self.talk(client, served, 1.0)
-        first.is_still = False
+        first.is_stalled = False
         self.talk(client, served, 0.5)
         came.clear()
         served.clear()
-        self.assertEqual(len(self.pipes.streams), MOST)
+        self.assertEqual(len(self.pipes.streams), MAX_CONNECTIONS)
         return client, came, server, served, first
 
     def test_one_while_all_is_well(self) -> None:
@@ -58,11 +67,11 @@ class BundleTests(TunnelCase):
         (only,) = self.pipes.streams
         for _ in range(5):  # a short wait for one retransmission after an idle period needs no other connection
             self.clock.advance(5.0)
-            only.is_still = True
+            only.is_stalled = True
             client.send(b"x", PLAIN.address)
             self.clock.advance(0.25)
             client.send(b"x", PLAIN.address)
-            only.is_still = False
+            only.is_stalled = False
         self.assertEqual(len(self.pipes.dialled), 1)
 
     def test_stream_that_stands_still(self) -> None:
@@ -71,26 +80,26 @@ class BundleTests(TunnelCase):
 
         (address,) = server.peers
         (first,) = self.pipes.streams
-        first.is_still = True
+        first.is_stalled = True
         _, gap = self.talk(client, served, 1.0)
-        self.assertLess(gap, STILL_S + 0.25)
-        self.assertEqual(len(self.pipes.streams), MOST)
+        self.assertLess(gap, STALLED_S + 0.25)
+        self.assertEqual(len(self.pipes.streams), MAX_CONNECTIONS)
         times, gap = self.talk(client, served, 20.0)
         self.assertLess(gap, 2 * STEP)
-        self.assertEqual(set(times), {float(AT_ONCE)})
+        self.assertEqual(set(times), {float(COPIES)})
         self.assertEqual((server.peers, client.peers), ([address], [PLAIN.address]))
 
     def test_dial_the_dead_anew(self) -> None:
         """A connection that stalls while another works is soon replaced; a stall of all connections replaces none."""
         client, _, server, served = self.pair()
         (first,) = self.pipes.streams
-        first.is_still = True
-        self.talk(client, served, DEAD_S + 1.5)
+        first.is_stalled = True
+        self.talk(client, served, REPLACE_STALLED_S + 1.5)
         self.assertTrue(first.is_lost)
-        self.assertEqual(len(self.pipes.streams), MOST)
+        self.assertEqual(len(self.pipes.streams), MAX_CONNECTIONS)
         dialled = len(self.pipes.dialled)
         for stream in self.pipes.streams:
-            stream.is_still = True
+            stream.is_stalled = True
         self.talk(client, served, 4.0)
         self.assertEqual(len(self.pipes.dialled), dialled)
 
@@ -98,7 +107,7 @@ class BundleTests(TunnelCase):
         """The server, too, sends over two connections and avoids a stalled one."""
         client, came, server, served, first = self.three()
         (address,) = server.peers
-        first.other.is_still = True
+        first.other.is_stalled = True
         for number in range(100):
             server.send(bytes([number]), address)
             self.clock.advance(STEP)
@@ -108,10 +117,10 @@ class BundleTests(TunnelCase):
     def test_one_again(self) -> None:
         """Half a minute after the last stall both ends use one connection again."""
         client, _, server, served, _ = self.three()
-        self.talk(client, served, ROUGH_S - 4.0)
-        self.assertEqual(len(self.pipes.streams), MOST)
+        self.talk(client, served, REDUNDANCY_S - 4.0)
+        self.assertEqual(len(self.pipes.streams), MAX_CONNECTIONS)
         self.talk(client, served, 6.0)
-        self.assertEqual((len(self.pipes.streams), len(server._links)), (1, 1))
+        self.assertEqual((len(self.pipes.streams), len(server._connections)), (1, 1))
         times, _ = self.talk(client, served, 5.0)
         self.assertEqual((set(times), len(times)), ({1.0}, 50))
 
@@ -120,9 +129,9 @@ class BundleTests(TunnelCase):
         client, _, _, served = self.pair()
         (only,) = self.pipes.streams
         self.pipes.cut(HOST)
-        only.is_still = True
+        only.is_stalled = True
         self.talk(client, served, 4.0, 1000)
-        self.assertLess(only.held, 2 * HELD)
+        self.assertLess(only.unacked, 2 * MAX_STALLED_BYTES)
         self.assertGreater(client.counters["dropped"], 20)
 
     def test_open_by_another(self) -> None:
@@ -131,10 +140,10 @@ class BundleTests(TunnelCase):
         client, _ = self.made("10.0.0.2", PLAIN)
         self.pipes.cut(HOST)
         client.send(b"x", PLAIN.address)
-        self.clock.advance(OPENING_S / 2)
+        self.clock.advance(DIAL_NEXT_S / 2)
         self.pipes.heal()
         _, gap = self.talk(client, served, 3.0)
-        self.assertLess(gap, OPENING_S + 1.5)
+        self.assertLess(gap, DIAL_NEXT_S + 1.5)
         self.clock.advance(5.0)
         self.assertEqual(len(self.pipes.streams), 1)
 
@@ -142,15 +151,17 @@ class BundleTests(TunnelCase):
         """A client with a retransmitted greeting uses three connections from the start."""
         self.made(is_plain=True)
         client, _ = self.made("10.0.0.2", PLAIN)
-        measured = client._carrier.strain
-        client._carrier.strain = lambda transport: (  # type: ignore[method-assign]
-            None if (seen := measured(transport)) is None else type(seen)(seen.held, seen.acked, HARD)
+        measured = client._transport.read_state
+        client._transport.read_state = lambda transport: (  # type: ignore[method-assign]
+            None
+            if (seen := measured(transport)) is None
+            else type(seen)(seen.unacked, seen.acked, LOSSY_RETRANSMISSIONS)
         )
         client.send(b"x", PLAIN.address)
         self.clock.advance(0.1)
         client.send(b"x", PLAIN.address)
         self.clock.advance(0.1)
-        self.assertEqual(len(self.pipes.streams), MOST)
+        self.assertEqual(len(self.pipes.streams), MAX_CONNECTIONS)
 
     def test_tokens(self) -> None:
         """Up to three connections with the same token are one peer; those without a token are separate peers."""
@@ -158,26 +169,26 @@ class BundleTests(TunnelCase):
         one, other = b"a" * 32, b"b" * 32
         crowd = [self.dribble(WHOLE % (1, token)) for token in (one, one, other, b"", b"", b"a" * 31)]
         self.clock.advance(0.1)
-        self.assertEqual((len(server.peers), len(server._links)), (5, 6))
+        self.assertEqual((len(server.peers), len(server._connections)), (5, 6))
         crowd += [self.dribble(WHOLE % (1, one)) for _ in range(5)]
         self.clock.advance(0.1)
-        self.assertEqual((len(server.peers), len(server._links)), (5, 4 + MOST))
+        self.assertEqual((len(server.peers), len(server._connections)), (5, 4 + MAX_CONNECTIONS))
         self.assertFalse(crowd[-1].is_lost)
 
     def test_caps_allow_for_it(self) -> None:
         """A team behind one address has three connections per member; they are reduced before a new one is rejected."""
         server, served = self.made()
-        members = [self.member(server, served, "10.0.0.2") for _ in range(MAX_OF_HOST)]
+        members = [self.member(server, served, "10.0.0.2") for _ in range(MAX_PER_HOST)]
         for member in members:
-            member._bundles[URL.address]._rough_until = 1e9
+            member._tunnels[URL.address]._redundant_until = 1e9
             member.send(b"m", URL.address)
             self.clock.advance(0.01)
-        self.assertEqual((len(server.peers), len(server._links)), (MAX_OF_HOST, MOST * MAX_OF_HOST))
+        self.assertEqual((len(server.peers), len(server._connections)), (MAX_PER_HOST, MAX_CONNECTIONS * MAX_PER_HOST))
         self.assertTrue(self.dribble(host="10.0.0.2").is_lost)
-        for number in range(MAX_LINKS - MOST * MAX_OF_HOST + 10):
+        for number in range(MAX_TOTAL_CONNECTIONS - MAX_CONNECTIONS * MAX_PER_HOST + 10):
             self.member(server, served, f"10.2.{number // 250}.{number % 250}")
-        self.assertEqual(len(server._links), MAX_LINKS)
-        self.assertEqual(len(server.peers), MAX_LINKS - (MOST - 1) * MAX_OF_HOST + 10)
+        self.assertEqual(len(server._connections), MAX_TOTAL_CONNECTIONS)
+        self.assertEqual(len(server.peers), MAX_TOTAL_CONNECTIONS - (MAX_CONNECTIONS - 1) * MAX_PER_HOST + 10)
 
     def member(self, server: TunnelNetwork, served: Heard, host: str) -> TunnelNetwork:
         """Create a member and let the server answer it."""

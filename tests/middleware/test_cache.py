@@ -7,9 +7,9 @@ from twisted.trial.unittest import SynchronousTestCase
 from middleware.entangled.data.memory import MemoryStore
 from middleware.entangled.errors import NotRunning
 from middleware.entangled.identity import Identity
-from middleware.entangled.record import Record, Slot, hashed_key
-from middleware.entangled.replication.cache import MAX_AGE, MAX_BYTES, MAX_KEYS, PathCache
-from middleware.entangled.replication.keepsake import Keepsakes
+from middleware.entangled.record import Record, Slot, hash_key
+from middleware.entangled.replication.cache import MAX_AGE_S, MAX_BYTES, MAX_KEYS, PathCache
+from middleware.entangled.replication.watched_copy import WatchedCopies
 
 
 def copied(key: bytes, size: int = 1) -> list[Record]:
@@ -20,11 +20,11 @@ def copied(key: bytes, size: int = 1) -> list[Record]:
 class PathCacheTests(SynchronousTestCase):
     def setUp(self) -> None:
         self.cache = PathCache()
-        self.key = hashed_key("a")
+        self.key = hash_key("a")
 
     def test_a_copy_runs_out(self) -> None:
         """A copy expires after its TTL, which is at most ``MAX_AGE``."""
-        for ttl, lives in ((5.0, 5.0), (1e9, MAX_AGE)):
+        for ttl, lives in ((5.0, 5.0), (1e9, MAX_AGE_S)):
             self.cache.put(self.key, copied(self.key), ttl, 0.0)
             self.assertEqual(self.cache.get(self.key, lives - 0.1), copied(self.key))
             self.assertIsNone(self.cache.get(self.key, lives))
@@ -38,7 +38,7 @@ class PathCacheTests(SynchronousTestCase):
 
     def test_keys_are_bounded(self) -> None:
         """The number of keys is bounded; the least recently read key is evicted first."""
-        keys = [hashed_key(str(number)) for number in range(MAX_KEYS + 1)]
+        keys = [hash_key(str(number)) for number in range(MAX_KEYS + 1)]
         for key in keys[:-1]:
             self.cache.put(key, copied(key), 9.0, 0.0)
         self.cache.get(keys[0], 0.0)
@@ -48,7 +48,7 @@ class PathCacheTests(SynchronousTestCase):
     def test_bytes_are_counted(self) -> None:
         """The cache is limited in bytes: it evicts the least recently read copy, and a removed copy frees its bytes."""
         half = MAX_BYTES // 2 - copied(self.key, 0)[0].message_bytes
-        keys = [hashed_key(str(number)) for number in range(4)]
+        keys = [hash_key(str(number)) for number in range(4)]
         for key in (keys[0], keys[1], keys[1]):
             self.cache.put(key, copied(key, half), 9.0, 0.0)
         self.assertEqual(self.held(keys), [0, 1])
@@ -70,7 +70,7 @@ class PathCacheTests(SynchronousTestCase):
 
 
 DOG = Identity(b"\1" * 32)
-KEY = hashed_key("devices")
+KEY = hash_key("devices")
 
 
 def record(name: str, sequence: int = 1) -> Record:
@@ -88,28 +88,28 @@ class ClosedStore(MemoryStore):
 class KeepsakeTests(SynchronousTestCase):
     def setUp(self) -> None:
         self.store = MemoryStore(3)
-        self.copies = Keepsakes(self.store)
+        self.copies = WatchedCopies(self.store)
 
     def test_what_is_held_is_left_alone(self) -> None:
         """A slot that the node holds as a replica is neither copied nor released."""
         self.store.put(record("a"), 5.0)
-        self.copies.keep(KEY, [record("a", 2)], 0.0)
-        self.copies.keep(KEY, [], 0.0)
-        self.copies.release(record("a").slot)
+        self.copies.replace(KEY, [record("a", 2)], 0.0)
+        self.copies.replace(KEY, [], 0.0)
+        self.copies.remove(record("a").slot)
         self.assertEqual(self.store.get(KEY), [record("a")])
         self.assertEqual(self.store.expire(5.0), [record("a")])
 
     def test_full_store(self) -> None:
         """A full store limits the number of copies; the records of a replica are kept."""
         self.store.put(record("z"), 5.0)
-        self.copies.keep(KEY, [record(name) for name in "abc"], 0.0)
+        self.copies.replace(KEY, [record(name) for name in "abc"], 0.0)
         self.assertEqual([r.name for r in self.store.get(KEY)], ["a", "b", "z"])
         self.copies.clear()
         self.assertEqual([r.name for r in self.store.get(KEY)], ["z"])
 
     def test_closed_store(self) -> None:
         """A closed store raises no error while the copies are cleared."""
-        copies = Keepsakes(ClosedStore())
-        copies.keep(KEY, [record("a")], 0.0)
+        copies = WatchedCopies(ClosedStore())
+        copies.replace(KEY, [record("a")], 0.0)
         copies.clear()
         self.assertNotIn(record("a").slot, copies)

@@ -12,23 +12,23 @@ from middleware.entangled.contact import Contact
 from middleware.entangled.errors import NoAnswer
 from middleware.entangled.identity import Identity
 from middleware.entangled.network.network import Address
-from middleware.entangled.replication.certificates import MAX_OWNERS, MAX_UNASKED, UNASKED_S, Certificates
-from middleware.entangled.wire.door import FOREIGN, Authority, OpenDoor
+from middleware.entangled.replication.certificates import MAX_FAILED_PEERS, MAX_OWNERS, RETRY_AFTER_S, Certificates
+from middleware.entangled.wire.admission_check import FOREIGN, Authority, OpenAdmission
 
 
-class KnownDoor(OpenDoor):
+class KnownDoor(OpenAdmission):
     """An admission check that accepts learned owners; in these tests a valid certificate equals the owner's key."""
 
     def __init__(self) -> None:
         self.known: set[bytes] = set()
 
-    def authority(self, owner: bytes) -> Authority:
+    def find_authority(self, owner: bytes) -> Authority:
         return Authority("" if owner in self.known else FOREIGN)
 
-    def certificate(self, owner: bytes) -> bytes:
+    def find_certificate(self, owner: bytes) -> bytes:
         return owner if owner in self.known else b""
 
-    def learn(self, owner: bytes, certificate: bytes) -> bool:
+    def add_certificate(self, owner: bytes, certificate: bytes) -> bool:
         if owner == certificate:
             self.known.add(owner)
         return owner == certificate
@@ -71,7 +71,7 @@ class CertificateTests(SynchronousTestCase):
         self.door = self.endpoint.door
 
     def learn(self, which: list[bytes], peer: int = 1) -> None:
-        self.successResultOf(Deferred.fromCoroutine(self.certificates.learn(contact(peer), which)))
+        self.successResultOf(Deferred.fromCoroutine(self.certificates.fetch_missing(contact(peer), which)))
 
     def test_asked_once_for_each(self) -> None:
         """Each unknown owner is requested once, several in one request."""
@@ -96,9 +96,9 @@ class CertificateTests(SynchronousTestCase):
             self.learn(owners(2), peer)
             self.learn(owners(2), peer)
             self.assertEqual(len(self.endpoint.asked) - before, 1)
-            self.assertEqual(self.certificates.lacking(contact(peer), owners(2)), [])
+            self.assertEqual(self.certificates.find_missing(contact(peer), owners(2)), [])
         self.endpoint.answer = lambda asked: succeed(asked)
-        self.clock.advance(UNASKED_S)
+        self.clock.advance(RETRY_AFTER_S)
         self.learn(owners(2), 1)
         self.assertEqual(self.door.known, set(owners(2)))
 
@@ -111,9 +111,9 @@ class CertificateTests(SynchronousTestCase):
     def test_bounded(self) -> None:
         """The table of peers that replied with invalid certificates is bounded."""
         self.endpoint.answer = lambda asked: succeed(None)
-        for peer in range(MAX_UNASKED + 10):
+        for peer in range(MAX_FAILED_PEERS + 10):
             self.learn(owners(1), peer)
-        self.assertEqual(len(self.certificates._unasked), MAX_UNASKED)
+        self.assertEqual(len(self.certificates._retry_at), MAX_FAILED_PEERS)
 
     def test_answer(self) -> None:
         """A node returns known certificates for up to ``MAX_OWNERS`` owners, and an empty entry for an invalid key."""

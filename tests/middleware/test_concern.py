@@ -9,48 +9,48 @@ from twisted.internet.defer import Deferred
 from middleware.entangled.data.memory import MemoryStore
 from middleware.entangled.errors import Conflict, NotAcknowledged, Unavailable
 from middleware.entangled.identity import Identity
-from middleware.entangled.kademlia.distance import closest
+from middleware.entangled.kademlia.distance import select_closest
+from middleware.entangled.kademlia.member_table import ABSENT_WITH_MAJORITY_S, MAX_ABSENT_S
 from middleware.entangled.kademlia.overlay import K
-from middleware.entangled.kademlia.roster import COUNTED_S, STRUCK_S
-from middleware.entangled.network.switchboard import Weather
+from middleware.entangled.network.switchboard import LinkConditions
 from middleware.entangled.node import EntangledNode
-from middleware.entangled.record import TOLERATED_ABSENCE, TOMBSTONE_TTL, Record, hashed_key
-from middleware.entangled.replication.owner import Concern, Stored
-from middleware.entangled.replication.replica import CACHED, SURE
+from middleware.entangled.record import TOLERATED_ABSENCE_S, TOMBSTONE_TTL_S, Record, hash_key
+from middleware.entangled.replication.owner import ConsistencyLevel, Stored
+from middleware.entangled.replication.replica import CACHED_REPLY, SYNCED_REPLY
 from middleware.entangled.replication.store_reply import Outcome
-from tests.fleet import TEAM, Fleet, FleetCase
+from tests.fleet import TEAM_KEY, EntangledTeam, FleetCase
 
-KEY = hashed_key("task")
+KEY = hash_key("task")
 
 
 class ConcernCase(FleetCase):
     """Helpers of these tests."""
 
-    def cut(self, fleet: Fleet, *places: int) -> None:
-        fleet.board.partition([fleet.address(place) for place in places])
+    def cut(self, fleet: EntangledTeam, *places: int) -> None:
+        fleet.switchboard.partition([fleet.address(place) for place in places])
 
-    def failure(self, fleet: Fleet, work: Any, kind: type[Exception], within: float = 3.0) -> Any:
+    def failure(self, fleet: EntangledTeam, work: Any, kind: type[Exception], within: float = 3.0) -> Any:
         fleet.run(within)
         return self.failureResultOf(work, kind).value
 
-    def outcome(self, fleet: Fleet, work: Deferred[Any], within: float = 5.0) -> Any:
+    def outcome(self, fleet: EntangledTeam, work: Deferred[Any], within: float = 5.0) -> Any:
         """Return the result or the exception of ``work``."""
         results: list[Any] = []
         work.addErrback(lambda failure: failure.value).addCallback(results.append)
         fleet.run(within)
         return results[0] if results else None
 
-    def values(self, fleet: Fleet, place: int, concern: Any = "majority") -> Any:
+    def values(self, fleet: EntangledTeam, place: int, concern: Any = "majority") -> Any:
         """Return the values of a read at a node, or the type of its error."""
         found = self.outcome(fleet, fleet.nodes[place].get(KEY, concern))
         return [record.value for record in found] if isinstance(found, list) else type(found)
 
-    def joined(self, fleet: Fleet, count: int, known: int) -> None:
+    def joined(self, fleet: EntangledTeam, count: int, known: int) -> None:
         """Let new nodes join through one node."""
         for _ in range(count):
             place = len(fleet.nodes)
-            fleet.nodes.append(fleet.made(place))
-            fleet.enter(fleet.nodes[place], [fleet.address(known)])
+            fleet.nodes.append(fleet.make_node(place))
+            fleet.start_node(fleet.nodes[place], [fleet.address(known)])
             fleet.run(0.3)
 
 
@@ -58,7 +58,7 @@ class WriteConcernTests(ConcernCase):
     def test_how_many_have_it(self) -> None:
         """A write at each consistency level is acknowledged by at least the required number of replicas."""
         fleet = self.fleet(5)
-        concerns: tuple[tuple[Concern, int], ...] = (("one", 1), ("majority", 3), ("all", 5))
+        concerns: tuple[tuple[ConsistencyLevel, int], ...] = (("one", 1), ("majority", 3), ("all", 5))
         for concern, least in concerns:
             stored = self.done(fleet, fleet.nodes[0].put(KEY, "state", b"x", "team", concern))
             self.assertGreaterEqual(stored, least)
@@ -77,7 +77,7 @@ class WriteConcernTests(ConcernCase):
         """A majority continues after failures, one after the other, until two of five nodes are left and can write."""
         fleet = self.fleet(5)
         for place in (4, 3, 2):
-            fleet.nodes[place].vanish()
+            fleet.nodes[place].stop_silently()
             fleet.run(50.0)
         self.assertEqual(self.done(fleet, fleet.nodes[0].put(KEY, "a", b"x")), 2)
 
@@ -107,7 +107,7 @@ class CompareAndSetTests(ConcernCase):
         """A node that lost its store does not overwrite its earlier records by compare-and-set."""
         fleet = self.fleet(3)
         old = self.done(fleet, fleet.nodes[2].put(KEY, "a", b"old"))
-        fleet.nodes[2].vanish()
+        fleet.nodes[2].stop_silently()
         fleet.stores.pop(2)
         fleet.restart(2)
         fleet.run(1.0)
@@ -121,12 +121,12 @@ class ReadConcernTests(ConcernCase):
     def setUp(self) -> None:
         super().setUp()
         self.world = self.fleet(14, seed=4)
-        nodes = closest([node.contact for node in self.world.nodes], KEY, 14)
+        nodes = select_closest([node.contact for node in self.world.nodes], KEY, 14)
         self.order = [contact.address.port - 7000 for contact in nodes]
         self.reader: EntangledNode = self.world.nodes[self.order[-1]]
 
     def sent(self) -> int:
-        return self.world.board.counters["sent"]
+        return self.world.switchboard.counters["sent"]
 
     def test_fast_costs_two_datagrams(self) -> None:
         """If all members are known, a fast read is one request and one reply, a write eight of each."""
@@ -147,7 +147,7 @@ class ReadConcernTests(ConcernCase):
         """Reads are hedged: with half of the holders dead, a fast read is answered within 60 ms."""
         self.done(self.world, self.reader.put(KEY, "a", b"x", "team", "all"))
         for place in self.order[:4]:
-            self.world.nodes[place].vanish()
+            self.world.nodes[place].stop_silently()
         for _ in range(10):
             read = self.reader.get(KEY, "fast")
             self.world.run(0.06)
@@ -157,8 +157,8 @@ class ReadConcernTests(ConcernCase):
     def test_read_repair(self) -> None:
         """A majority read stores its result at a majority, even if a single replica had the record before."""
         writer = self.world.nodes[self.order[0]]
-        made = Record(KEY, "a", writer.identity.public, 7, "team", 6000.0, b"x").signed(writer.identity)
-        self.world.nodes[self.order[1]].replica.keep(made)
+        made = Record(KEY, "a", writer.identity.public, 7, "team", 6000.0, b"x").sign(writer.identity)
+        self.world.nodes[self.order[1]].replica.store_locally(made)
         while not self.done(self.world, self.reader.get(KEY), 0.01):
             pass
         holding = [place for place in self.order[:K] if self.world.stores[place].get(KEY)]
@@ -168,7 +168,7 @@ class ReadConcernTests(ConcernCase):
         """Only a majority can confirm that a key is empty; without a majority the read fails."""
         self.assertEqual(self.values(self.world, self.order[-1], "fast"), [])
         for place in self.order[:5]:
-            self.world.nodes[place].vanish()
+            self.world.nodes[place].stop_silently()
         error = self.failure(self.world, self.reader.get(KEY, "fast"), Unavailable)
         self.assertEqual((error.answered, error.needed), (3, 5))
 
@@ -177,9 +177,9 @@ class NewcomerTests(ConcernCase):
     def test_second_node_reads_as_soon_as_it_has_joined(self) -> None:
         """In a team of two a node can read with certainty as soon as it has joined."""
 
-        async def joined_and_read(fleet: Fleet) -> list[Record]:
-            fleet.nodes.append(fleet.made(1))
-            await fleet.enter(fleet.nodes[1], [fleet.address(0)])
+        async def joined_and_read(fleet: EntangledTeam) -> list[Record]:
+            fleet.nodes.append(fleet.make_node(1))
+            await fleet.start_node(fleet.nodes[1], [fleet.address(0)])
             return await fleet.nodes[1].get(KEY)
 
         for seed in range(4):
@@ -194,12 +194,12 @@ class AbsenceTests(ConcernCase):
         """A node that was offline during a deletion does not restore the record."""
         fleet = self.fleet(5)
         self.done(fleet, fleet.nodes[0].put(KEY, "a", b"x", "team", "all"))
-        fleet.nodes[3].vanish()
+        fleet.nodes[3].stop_silently()
         self.cut(fleet, 4)
         self.done(fleet, fleet.nodes[0].remove(KEY, "a"))
-        fleet.nodes[0].vanish()
+        fleet.nodes[0].stop_silently()
         fleet.run(40.0)
-        fleet.board.heal()
+        fleet.switchboard.heal()
         fleet.restart(3, [1])
         fleet.run(30.0)
         for place in (1, 2, 3, 4):
@@ -208,8 +208,8 @@ class AbsenceTests(ConcernCase):
 
     def test_long_absence_means_empty(self) -> None:
         """A node that was offline longer than the TTL of tombstones rejoins empty; a shorter absence loses nothing."""
-        self.assertGreater(TOMBSTONE_TTL, TOLERATED_ABSENCE)
-        for away, kept in ((TOLERATED_ABSENCE - 60.0, 1), (TOLERATED_ABSENCE + 60.0, 0)):
+        self.assertGreater(TOMBSTONE_TTL_S, TOLERATED_ABSENCE_S)
+        for away, kept in ((TOLERATED_ABSENCE_S - 60.0, 1), (TOLERATED_ABSENCE_S + 60.0, 0)):
             fleet = self.fleet(1)
             moment = [1000.0]
             fleet.nodes[0].stop()
@@ -221,11 +221,17 @@ class AbsenceTests(ConcernCase):
                 node.stop()
                 moment[0] += away
 
-    def life(self, fleet: Fleet, moment: list[float]) -> EntangledNode:
+    def life(self, fleet: EntangledTeam, moment: list[float]) -> EntangledNode:
         """Run the node of place 0 once, with a wall clock."""
-        network = fleet.board.network(*fleet.address(0))
+        network = fleet.switchboard.make_network(*fleet.address(0))
         node = EntangledNode(
-            fleet.identity(0), TEAM, network, fleet.store(0), fleet.clock, fleet.rng(0), wall=lambda: moment[0]
+            fleet.identity(0),
+            TEAM_KEY,
+            network,
+            fleet.store(0),
+            fleet.clock,
+            fleet.make_life_rng(0),
+            wall=lambda: moment[0],
         )
         fleet.nodes[0] = node
         node.start()
@@ -242,15 +248,15 @@ class WatchNumberTests(ConcernCase):
         watch = fleet.nodes[1].watch(KEY, lambda records: told.append([r.value for r in records]))
         fleet.run(0.5)
         owner, pusher = fleet.identity(0), fleet.nodes[0].replica.pusher
-        missed = Record(KEY, "a", owner.public, 1, "team", 60.0, b"missed").signed(owner)
+        missed = Record(KEY, "a", owner.public, 1, "team", 60.0, b"missed").sign(owner)
         fleet.stores[0].put(missed, fleet.clock.seconds() + 60.0)
         watcher = pusher._watchers[KEY][fleet.nodes[1].identity.node_id]
         watcher.number += 1
-        seen = Record(KEY, "b", owner.public, 2, "team", 60.0, b"seen").signed(owner)
-        fleet.nodes[0].replica.keep(seen)
+        seen = Record(KEY, "b", owner.public, 2, "team", 60.0, b"seen").sign(owner)
+        fleet.nodes[0].replica.store_locally(seen)
         fleet.run(0.1)
         self.assertEqual(told[-1], [b"missed", b"seen"])
-        self.assertEqual(watch.pushed[fleet.nodes[0].identity.node_id], 2)
+        self.assertEqual(watch.push_numbers[fleet.nodes[0].identity.node_id], 2)
 
 
 class SecondHandTests(ConcernCase):
@@ -260,9 +266,9 @@ class SecondHandTests(ConcernCase):
         owner, other = fleet.identity(1), fleet.nodes[2]
         unsigned = Record(KEY, "x", owner.public, 9, "team", 60.0, b"x", bytes(64))
         held = fleet.nodes[0].replica
-        self.assertTrue(held.is_lawful(unsigned, fleet.nodes[1].contact))
-        self.assertFalse(held.is_lawful(unsigned, other.contact))
-        self.assertTrue(held.is_lawful(unsigned.signed(owner), other.contact))
+        self.assertTrue(held.may_accept(unsigned, fleet.nodes[1].contact))
+        self.assertFalse(held.may_accept(unsigned, other.contact))
+        self.assertTrue(held.may_accept(unsigned.sign(owner), other.contact))
         fleet.stores[0].put(unsigned, fleet.clock.seconds() + 60.0)
         fleet.run(40.0)
         self.assertEqual([len(fleet.stores[place].get(KEY)) for place in range(3)], [1, 0, 0])
@@ -275,23 +281,23 @@ class WalkTests(ConcernCase):
         self.done(fleet, fleet.nodes[0].put(KEY, "a", b"x"))
         for node in fleet.nodes:
             node._membership._large_until = 1e9
-            node.overlay.is_whole = False
-            for member in node.overlay.roster.live():
-                node.overlay.roster.left(member.node_id)
-        order = closest([node.contact for node in fleet.nodes], KEY, 30)
+            node.overlay.has_all_members = False
+            for member in node.overlay.members.list_live():
+                node.overlay.members.remove(member.node_id)
+        order = select_closest([node.contact for node in fleet.nodes], KEY, 30)
         far = fleet.nodes[order[-1].address.port - 7000]
         for holder in order[:K]:
             far.overlay.table.remove(holder)
-            far.overlay.roster.left(holder.node_id)
+            far.overlay.members.remove(holder.node_id)
         read = far.get(KEY, "fast")
         fleet.run(0.01)
         self.assertEqual([r.value for r in self.successResultOf(read)], [b"x"])
         copies = [node for node in fleet.nodes if node.replica.cache.get(KEY, fleet.clock.seconds())]
         for node in copies:
-            self.assertEqual(node.replica.held(KEY), [])
+            self.assertEqual(node.replica.get_held(KEY), [])
             peer = fleet.nodes[0].contact
-            self.assertEqual(node.replica.answer_find_value(peer, KEY, None)[2], CACHED)
-            self.assertEqual(node.replica.answer_find_value(peer, KEY, None, True)[:3], [[], None, SURE])
+            self.assertEqual(node.replica.answer_find_value(peer, KEY, None)[2], CACHED_REPLY)
+            self.assertEqual(node.replica.answer_find_value(peer, KEY, None, True)[:3], [[], None, SYNCED_REPLY])
         self.assertGreater(len(copies), 0)
         fleet.run(61.0)
         self.assertEqual([n for n in fleet.nodes if n.replica.cache.get(KEY, fleet.clock.seconds())], [])
@@ -320,15 +326,15 @@ class CutTests(ConcernCase):
             stored = self.outcome(fleet, fleet.nodes[0].put(KEY, "a", b"x"))
             self.assertEqual(type(stored) is NotAcknowledged, not has_majority)
             self.joined(fleet, newcomers, small[0])
-            for _ in range(int((STRUCK_S + 20.0) / 11.0)):
+            for _ in range(int((ABSENT_WITH_MAJORITY_S + 20.0) / 11.0)):
                 self.assertIs(self.values(fleet, small[0]), Unavailable)
                 self.assertIs(self.values(fleet, len(fleet.nodes) - 1), Unavailable)
                 fleet.run(1.0)
             written = self.outcome(fleet, fleet.nodes[-1].put(KEY, "b", b"y"))
             self.assertIs(type(written), NotAcknowledged)
-            fleet.board.heal()
+            fleet.switchboard.heal()
             fleet.run(20.0)
-            self.assertEqual([node.replica.is_sure() for node in fleet.nodes], [True] * (count + newcomers))
+            self.assertEqual([node.replica.is_synced() for node in fleet.nodes], [True] * (count + newcomers))
             self.assertEqual(sorted(self.values(fleet, len(fleet.nodes) - 1)), [b"x", b"y"])
 
     def test_a_lost_memory_was_a_vote(self) -> None:
@@ -336,9 +342,9 @@ class CutTests(ConcernCase):
         fleet = self.fleet(3)
         self.cut(fleet, 2)
         self.outcome(fleet, fleet.nodes[0].put(KEY, "a", b"x"))
-        fleet.board.heal()
+        fleet.switchboard.heal()
         self.cut(fleet, 0)
-        fleet.nodes[1].vanish()
+        fleet.nodes[1].stop_silently()
         for _ in range(2):  # the same after another restart
             former = fleet.stores[1]
             assert isinstance(former, MemoryStore)
@@ -346,10 +352,10 @@ class CutTests(ConcernCase):
             fleet.restart(1, [2])
             for place in (1, 2):
                 self.assertIs(self.values(fleet, place), Unavailable)
-            fleet.nodes[1].vanish()
+            fleet.nodes[1].stop_silently()
             fleet.stores[1].origin = "kept"
         fleet.restart(1, [2])
-        fleet.board.heal()
+        fleet.switchboard.heal()
         fleet.run(10.0)
         self.assertEqual([self.values(fleet, place) for place in range(3)], [[b"x"]] * 3)
 
@@ -357,44 +363,44 @@ class CutTests(ConcernCase):
         """A new node that joins through a node with a lost store learns the members from it and is not ``SURE``."""
         fleet = self.fleet(3)
         self.cut(fleet, 2, 3)
-        fleet.nodes[2].vanish()
+        fleet.nodes[2].stop_silently()
         former = fleet.stores[2]
         assert isinstance(former, MemoryStore)
         fleet.stores[2] = Replaced(former)
         fleet.restart(2, [0])
         self.joined(fleet, 1, 2)
         fleet.run(5.0)
-        self.assertEqual([node.replica.is_sure() for node in fleet.nodes], [True, True, False, False])
+        self.assertEqual([node.replica.is_synced() for node in fleet.nodes], [True, True, False, False])
 
     def test_a_door_that_shuts(self) -> None:
         """A new node waits for its only known peer if that peer failed before it sent the member list."""
         fleet = self.fleet(3)
         self.cut(fleet, 2, 3)
         self.joined(fleet, 1, 2)
-        fleet.nodes[2].vanish()
+        fleet.nodes[2].stop_silently()
         fleet.run(8.0)
         fleet.restart(2, [0])
         fleet.run(8.0)
-        self.assertEqual([node.replica.is_sure() for node in fleet.nodes], [True, True, False, False])
-        fleet.board.heal()
+        self.assertEqual([node.replica.is_synced() for node in fleet.nodes], [True, True, False, False])
+        fleet.switchboard.heal()
         fleet.run(10.0)
-        self.assertEqual([node.replica.is_sure() for node in fleet.nodes], [True] * 4)
+        self.assertEqual([node.replica.is_synced() for node in fleet.nodes], [True] * 4)
 
     def test_the_unsure_hold_without_a_vote(self) -> None:
         """A replica that is not ``SURE`` stores records without a vote; the writer waits briefly for its vote."""
         fleet = self.fleet(2)
         unsure = fleet.nodes[1].replica
-        genuine, unsure.is_sure = unsure.is_sure, lambda: False
+        genuine, unsure.is_synced = unsure.is_synced, lambda: False
         owner = fleet.identity(0)
-        record = Record(KEY, "a", owner.public, 2**40, "team", 60.0, b"x").signed(owner)
-        self.assertEqual(unsure.answer_store(fleet.nodes[0].contact, [record.packed()]), [Outcome.UNSYNCED.value])
-        self.assertEqual(unsure.held(KEY), [record])
+        record = Record(KEY, "a", owner.public, 2**40, "team", 60.0, b"x").sign(owner)
+        self.assertEqual(unsure.answer_store(fleet.nodes[0].contact, [record.pack()]), [Outcome.UNSYNCED.value])
+        self.assertEqual(unsure.get_held(KEY), [record])
         stored = fleet.nodes[0].put(KEY, "b", b"x")
         fleet.run(0.5)
         self.assertNoResult(stored)
-        unsure.is_sure = genuine
+        unsure.is_synced = genuine
         self.assertEqual(self.done(fleet, stored, 1.0), 2)
-        unsure.is_sure = lambda: False
+        unsure.is_synced = lambda: False
         self.assertEqual(self.done(fleet, fleet.nodes[0].put(KEY, "b", b"y", concern="one"), 0.1), 1)
         refused = self.outcome(fleet, fleet.nodes[0].put(KEY, "b", b"z"))
         self.assertIsInstance(refused, NotAcknowledged)
@@ -403,7 +409,7 @@ class CutTests(ConcernCase):
     def test_a_later_record_at_the_unsure(self) -> None:
         """A later record at a replica without a vote does not acknowledge an earlier write."""
         fleet = self.fleet(2)
-        fleet.nodes[1].replica.is_sure = lambda: False
+        fleet.nodes[1].replica.is_synced = lambda: False
         first = fleet.nodes[0].put(KEY, "a", b"x")
         fleet.run(0.1)
         second = fleet.nodes[0].put(KEY, "a", b"y")
@@ -413,7 +419,7 @@ class CutTests(ConcernCase):
     def test_a_later_record_at_the_sure(self) -> None:
         """A write is acknowledged if a majority has the next one."""
         fleet = self.fleet(3)
-        fleet.board.weather = Weather(delay_s=0.02, jitter_s=0.02, reorder=0.5)
+        fleet.switchboard.conditions = LinkConditions(delay_s=0.02, jitter_s=0.02, reorder=0.5)
         for _ in range(10):
             puts = [fleet.nodes[0].put(KEY, "a", b"%d" % number) for number in range(3)]
             self.assertEqual([type(self.outcome(fleet, put, 0.5)) for put in puts], [Stored] * 3)
@@ -423,7 +429,7 @@ class CutTests(ConcernCase):
         fleet = self.fleet(3)
         self.cut(fleet, 2)
         self.assertEqual(self.outcome(fleet, fleet.nodes[0].put(KEY, "a", b"x")), 2)
-        fleet.nodes[1].vanish()
+        fleet.nodes[1].stop_silently()
         self.cut(fleet, 1, 2)
         fleet.restart(1, [2])
         self.assertIs(type(self.outcome(fleet, fleet.nodes[1].get(KEY, "fast"))), Unavailable)
@@ -437,30 +443,30 @@ class StartTests(ConcernCase):
         fleet.nodes[1].endpoint.expose("known", lambda peer: ghosts)
         self.joined(fleet, 1, 1)
         fleet.run(3.0)
-        self.assertEqual(fleet.nodes[3].overlay.roster.absent(), [])
-        self.assertTrue(fleet.nodes[3].replica.is_sure())
+        self.assertEqual(fleet.nodes[3].overlay.members.list_absent(), [])
+        self.assertTrue(fleet.nodes[3].replica.is_synced())
 
     def test_a_new_team_all_at_once(self) -> None:
         """Nodes that start at the same time and know all addresses are ``SURE`` within four seconds."""
         fleet = self.fleet(0)
         for place in range(5):
-            fleet.nodes.append(fleet.made(place))
+            fleet.nodes.append(fleet.make_node(place))
         for node in fleet.nodes:
-            fleet.enter(node, [fleet.address(place) for place in range(5)])
+            fleet.start_node(node, [fleet.address(place) for place in range(5)])
         fleet.run(4.0)
-        self.assertEqual([node.replica.is_sure() for node in fleet.nodes], [True] * 5)
+        self.assertEqual([node.replica.is_synced() for node in fleet.nodes], [True] * 5)
 
     def test_a_power_cut(self) -> None:
         """After a restart from disk of all members but one the team is ``SURE`` and writes within seconds."""
         fleet = self.fleet(5)
         self.outcome(fleet, fleet.nodes[0].put(KEY, "a", b"x"))
         for node in fleet.nodes:
-            node.vanish()
+            node.stop_silently()
         fleet.run(1.0)
         for place in range(4):
             fleet.restart(place, [(place + 1) % 4])
         fleet.run(5.0)
-        self.assertEqual([node.replica.is_sure() for node in fleet.nodes[:4]], [True] * 4)
+        self.assertEqual([node.replica.is_synced() for node in fleet.nodes[:4]], [True] * 4)
         self.assertEqual(self.values(fleet, 3), [b"x"])
         self.assertGreaterEqual(self.outcome(fleet, fleet.nodes[1].put(KEY, "a", b"y")), 3)
         fleet.nodes[4].stop()
@@ -468,8 +474,8 @@ class StartTests(ConcernCase):
     def test_after_the_longest_cut(self) -> None:
         """Half of a team continues alone after the maximum duration of a partition, not before."""
         fleet = self.fleet(2)
-        fleet.nodes[1].vanish()
-        fleet.run(COUNTED_S - 10.0)
+        fleet.nodes[1].stop_silently()
+        fleet.run(MAX_ABSENT_S - 10.0)
         self.assertIs(self.values(fleet, 0), Unavailable)
         fleet.run(30.0)
         self.assertEqual(self.values(fleet, 0), [])

@@ -6,15 +6,15 @@ import random
 
 from twisted.trial.unittest import SynchronousTestCase
 
-from middleware.entangled.network.switchboard import Weather
+from middleware.entangled.network.switchboard import LinkConditions
 from middleware.entangled.wire.congestion import (
-    BACK_OFF,
-    FIRST_GUESS,
-    LONGEST,
-    MOST_AT_ONCE,
-    MOST_TRIES,
-    RARE,
-    Loss,
+    BACKOFF_FACTOR,
+    INITIAL_TIMEOUT_S,
+    MAX_GAP_LOSSES,
+    MAX_TIMEOUT_S,
+    MAX_TRIES_AT_LOSS,
+    TOLERATED_FAILURES,
+    LossRate,
     RoundTrip,
 )
 from middleware.entangled.wire.peer import MAX_TRIES
@@ -30,15 +30,15 @@ class RoundTripTests(SynchronousTestCase):
 
     def test_an_answer_to_the_second_try(self) -> None:
         """A reply after a retransmission is ambiguous: it is not measured, and the timeout grows within limits."""
-        for seconds, wait in ((0.0, FIRST_GUESS * BACK_OFF), (0.4, 0.4), (60.0, LONGEST)):
+        for seconds, wait in ((0.0, INITIAL_TIMEOUT_S * BACKOFF_FACTOR), (0.4, 0.4), (60.0, MAX_TIMEOUT_S)):
             unknown = RoundTrip()
-            unknown.ambiguous(seconds)
-            self.assertEqual((unknown.wait, unknown.is_measured), (wait, False))
+            unknown.lengthen(seconds)
+            self.assertEqual((unknown.timeout, unknown.is_measured), (wait, False))
         known = RoundTrip()
-        known.measured(0.02)
-        wait = known.wait
-        known.ambiguous(0.4)
-        self.assertEqual(known.wait, wait * BACK_OFF)
+        known.add_sample(0.02)
+        wait = known.timeout
+        known.lengthen(0.4)
+        self.assertEqual(known.timeout, wait * BACKOFF_FACTOR)
 
 
 class LongWayTests(EndpointCase):
@@ -48,7 +48,7 @@ class LongWayTests(EndpointCase):
         """Set a long delay between the two endpoints."""
         super().setUp()
         self.equip(self.a)
-        self.board.weather = Weather(FAR)
+        self.board.conditions = LinkConditions(FAR)
 
     def test_one_handshake_is_enough(self) -> None:
         """Concurrent requests in both directions wait for one handshake; no second one is started."""
@@ -67,14 +67,14 @@ class LongWayTests(EndpointCase):
         self.assertEqual(self.board.counters["sent"] - sent, 2)
 
 
-def heard(share: float, count: int, rng: random.Random) -> Loss:
+def heard(share: float, count: int, rng: random.Random) -> LossRate:
     """Simulate ``count`` datagrams with this loss rate and return the estimate."""
-    loss, ahead = Loss(), 1
+    loss, ahead = LossRate(), 1
     for _ in range(count):
         if rng.random() < share:
             ahead += 1
         else:
-            loss.arrived(ahead)
+            loss.record_arrival(ahead)
             ahead = 1
     return loss
 
@@ -85,40 +85,40 @@ class LossTests(SynchronousTestCase):
     def test_the_share_is_what_gets_lost(self) -> None:
         """After 500 datagrams the mean estimate over 100 receivers is within 0.02 of the loss rate."""
         for share in (0.0, 0.1, 0.3):
-            shares = [heard(share, 500, random.Random(seed)).share for seed in range(100)]
+            shares = [heard(share, 500, random.Random(seed)).rate for seed in range(100)]
             self.assertLess(abs(sum(shares) / 100 - share), 0.02)
 
     def test_as_many_tries_as_it_takes(self) -> None:
         """The number of tries limits the probability that all of them fail to ``RARE``."""
         for share in (0.02, 0.1, 0.2):
-            loss = Loss()
-            loss.share = share
+            loss = LossRate()
+            loss.rate = share
             fails = 1 - (1 - share) ** 2
-            self.assertLessEqual(fails**loss.tries, RARE)
-            self.assertGreater(fails ** (loss.tries - 1), RARE)
+            self.assertLessEqual(fails**loss.tries, TOLERATED_FAILURES)
+            self.assertGreater(fails ** (loss.tries - 1), TOLERATED_FAILURES)
 
     def test_none_where_nothing_is_lost_and_bounded_where_all_is(self) -> None:
         """Without loss one try is enough; with high loss the number of tries is bounded."""
-        loss = Loss()
+        loss = LossRate()
         self.assertEqual(loss.tries, 1)
-        loss.share = 0.95
-        self.assertEqual(loss.tries, MOST_TRIES)
+        loss.rate = 0.95
+        self.assertEqual(loss.tries, MAX_TRIES_AT_LOSS)
 
     def test_what_was_overtaken_is_not_lost(self) -> None:
         """Reordered datagrams raise the loss estimate only slightly."""
-        loss = Loss()
+        loss = LossRate()
         for _ in range(100):
-            loss.arrived(2)
-            loss.arrived(-1)
-        self.assertLess(loss.share, 0.06)
+            loss.record_arrival(2)
+            loss.record_arrival(-1)
+        self.assertLess(loss.rate, 0.06)
 
     def test_a_leap_counts_once(self) -> None:
         """A long gap in the sequence numbers counts as at most ``MOST_AT_ONCE`` lost datagrams."""
-        one, other = Loss(), Loss()
-        one.arrived(2**40)
-        other.arrived(MOST_AT_ONCE + 1)
-        self.assertEqual(one.share, other.share)
-        self.assertLess(one.share, 0.25)
+        one, other = LossRate(), LossRate()
+        one.record_arrival(2**40)
+        other.record_arrival(MAX_GAP_LOSSES + 1)
+        self.assertEqual(one.rate, other.rate)
+        self.assertLess(one.rate, 0.25)
 
 
 class RoughWeatherTests(EndpointCase):
@@ -136,7 +136,7 @@ class RoughWeatherTests(EndpointCase):
 
     def test_at_30_percent_lost_hardly_any_question_fails(self) -> None:
         """At 30 % loss a request gets more tries within its timeout than the usual four, and hardly any fails."""
-        self.board.weather = Weather(DELAY, loss=0.3)
+        self.board.conditions = LinkConditions(DELAY, loss=0.3)
         self.answered(100, 1.0)
         self.assertGreater(self.a.peers.tries, MAX_TRIES)
         self.assertGreaterEqual(self.answered(500, 1.0), 498)  # with four tries about 466
@@ -146,7 +146,7 @@ class RoughWeatherTests(EndpointCase):
         strangers = [self.endpoint(seed) for seed in range(3, 103)]
         for stranger, _ in strangers:
             self.equip(stranger)
-        self.board.weather = Weather(DELAY, loss=0.3)
+        self.board.conditions = LinkConditions(DELAY, loss=0.3)
         self.answered(100, 1.0)
         asked = [self.a.ask(to, "echo", 1) for _, to in strangers]
         self.clock.advance(3.0)
@@ -157,9 +157,9 @@ class RoughWeatherTests(EndpointCase):
         """With variable round-trip times at most one reply in eight arrives after the next retransmission."""
         dice, path = random.Random(1), RoundTrip()
         took = [0.04 + dice.expovariate(100.0) + dice.expovariate(100.0) for _ in range(400)]
-        self.a.peers.loss.share = 0.5
+        self.a.peers.loss.rate = 0.5
         late = 0
         for seconds in took:
-            late += path.is_measured and seconds > self.a.peers.spacing(path, 1, 0.4)
-            path.measured(seconds)
+            late += path.is_measured and seconds > self.a.peers.retry_interval(path, 1, 0.4)
+            path.add_sample(seconds)
         self.assertTrue(0 < late < 50, late)

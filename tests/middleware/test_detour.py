@@ -1,4 +1,4 @@
-"""Tests of ``middleware.entangled.kademlia.detour``: nodes with blocked UDP join through tunnels, and return to UDP."""
+"""Tests of ``middleware.entangled.kademlia.alternate_path``: nodes with blocked UDP join through tunnels, and return to UDP."""
 
 from __future__ import annotations
 
@@ -7,16 +7,16 @@ import random
 from twisted.internet.defer import Deferred
 from twisted.trial.unittest import SynchronousTestCase
 
-from middleware.entangled.contact import Contact, unpacked
+from middleware.entangled.contact import Contact, parse_contact
 from middleware.entangled.identity import Identity
 from middleware.entangled.network.joint import JointNetwork
-from middleware.entangled.network.network import Address, relayed
-from middleware.entangled.network.pipes import Pipes
+from middleware.entangled.network.network import Address, relayed_address
+from middleware.entangled.network.pipes import PipeNetwork
 from middleware.entangled.network.tunnel import TunnelNetwork
 from middleware.entangled.network.url import Url
 from middleware.entangled.node import EntangledNode
 from middleware.faults.network import FaultyNetwork
-from tests.fleet import TEAM, World
+from tests.fleet import TEAM_KEY, Simulation
 
 BOOTSTRAP = 0
 
@@ -25,27 +25,27 @@ class Site:
     """A node with its UDP network and its tunnel."""
 
     def __init__(self, world: TunnelWorld, place: int, urls: list[Url], is_served: bool = False) -> None:
-        rng = world.rng(place)
-        udp = world.board.network(*world.address(place))
+        rng = world.make_life_rng(place)
+        udp = world.switchboard.make_network(*world.address(place))
         self.udp = FaultyNetwork(udp, world.clock, random.Random(place))
-        carrier = world.pipes.carrier(f"10.2.0.{place}", 443)
+        carrier = world.pipes.make_transport(f"10.2.0.{place}", 443)
         self.tunnel = TunnelNetwork(carrier, world.clock, rng, urls, is_served)
         network = JointNetwork(self.udp, self.tunnel)
         identity, store = world.identity(place), world.store(place)
-        self.node = EntangledNode(identity, TEAM, network, store, world.clock, rng, 1.0)
+        self.node = EntangledNode(identity, TEAM_KEY, network, store, world.clock, rng, 1.0)
         self.node.endpoint.expose("who", lambda peer: place)
 
     def block(self, is_blocked: bool = True) -> None:
         """Block all UDP, like a firewall."""
-        self.udp.is_deaf = self.udp.is_mute = is_blocked
+        self.udp.is_receive_blocked = self.udp.is_send_blocked = is_blocked
 
 
-class TunnelWorld(World):
+class TunnelWorld(Simulation):
     """A bootstrap node that serves tunnels, and other nodes."""
 
     def __init__(self) -> None:
         super().__init__(1)
-        self.pipes = Pipes(self.clock, 0.025)
+        self.pipes = PipeNetwork(self.clock, 0.025)
         self.sites: list[Site] = []
 
     def address(self, place: int) -> Address:
@@ -119,14 +119,14 @@ class DetourTests(SynchronousTestCase):
         self.world.run(4.0)
         asked = other.node.call(Contact(self.bootstrap.node.identity.public, self.world.address(0)), "members", b"")
         self.world.run(0.5)
-        named = [unpacked(fields) for fields in self.successResultOf(asked)]
-        self.assertIn(Contact(site.node.identity.public, relayed(site.node.identity.node_id)), named)
+        named = [parse_contact(fields) for fields in self.successResultOf(asked)]
+        self.assertIn(Contact(site.node.identity.public, relayed_address(site.node.identity.node_id)), named)
         public = Identity(b"z" * 32).public
         for host in ("~wss-aabbccddeeff", "~" + "0" * 40, "~"):
-            told = unpacked([public, host, 443])
+            told = parse_contact([public, host, 443])
             assert told is not None
-            self.assertEqual(told.address, relayed(told.node_id))
-            self.assertEqual(Contact(public, Address(host, 1)).packed(), [public, *relayed(told.node_id)])
+            self.assertEqual(told.address, relayed_address(told.node_id))
+            self.assertEqual(Contact(public, Address(host, 1)).pack(), [public, *relayed_address(told.node_id)])
 
     def test_everybody_reaches_everybody(self) -> None:
         """Two blocked members and two others all reach each other 4 s after the last one started to join."""
@@ -173,7 +173,7 @@ class DetourTests(SynchronousTestCase):
         """A restarted bootstrap node does not wait for tunnelled members; they and new nodes join within 15 s."""
         site, _ = self.world.add(1, is_blocked=True)
         self.world.run(40.0)
-        self.bootstrap.node.vanish()
+        self.bootstrap.node.stop_silently()
         newcomer, waiting = self.world.add(2, is_blocked=True)
         self.world.run(20.0)
         self.assertNoResult(waiting)

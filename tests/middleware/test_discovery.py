@@ -4,33 +4,35 @@ from __future__ import annotations
 
 import random
 
-from middleware.entangled.kademlia.discovery import ANSWERS, LISTEN
-from middleware.entangled.network.multicast import Segment, SegmentMulticast
+from middleware.entangled.kademlia.lan_discovery import LISTEN_S, TARGET_REPLIES
+from middleware.entangled.network.multicast import SimulatedLan, SimulatedMulticast
 from middleware.entangled.network.network import Address
 from middleware.entangled.node import EntangledNode
-from middleware.entangled.wire.greeting import HERE, WHO
-from middleware.entangled.wire.hail import HAIL
+from middleware.entangled.wire.discovery import DISCOVERY, DISCOVERY_REPLY
+from middleware.entangled.wire.probe import PROBE
 from middleware.entangled.wire.session import INIT
-from tests.fleet import TEAM, Fleet, FleetCase
+from tests.fleet import TEAM_KEY, EntangledTeam, FleetCase
 
 
-class Lan(Fleet):
+class Lan(EntangledTeam):
     """Nodes without known addresses on one LAN segment."""
 
     def __init__(self) -> None:
         super().__init__(0)
-        self.segment = Segment(self.board)
-        self.groups: list[SegmentMulticast] = []
+        self.segment = SimulatedLan(self.switchboard)
+        self.groups: list[SimulatedMulticast] = []
 
-    def on(self, place: int, *known: Address, segment: Segment | None = None, team: bytes = TEAM) -> EntangledNode:
+    def on(
+        self, place: int, *known: Address, segment: SimulatedLan | None = None, team: bytes = TEAM_KEY
+    ) -> EntangledNode:
         """Create and start the node of this number on ``segment``."""
-        group = (segment or self.segment).group()
-        network = self.board.network(*self.address(place))
-        identity, store, rng = self.identity(place), self.store(place), self.rng(place)
+        group = (segment or self.segment).join()
+        network = self.switchboard.make_network(*self.address(place))
+        identity, store, rng = self.identity(place), self.store(place), self.make_life_rng(place)
         node = EntangledNode(identity, team, network, store, self.clock, rng, lan=group)
         self.groups.append(group)
         self.nodes.append(node)
-        self.enter(node, list(known))
+        self.start_node(node, list(known))
         return node
 
     def traffic(self) -> dict[str, int]:
@@ -55,7 +57,7 @@ class DiscoveryTests(FleetCase):
         lan.run(0.5)
         self.assertEqual(a.overlay.contacts(), [b.contact])
         self.assertEqual(b.overlay.contacts(), [a.contact])
-        b.vanish()
+        b.stop_silently()
         lan.run(30.0)
         c = lan.on(2)
         lan.run(1.0)
@@ -70,22 +72,22 @@ class DiscoveryTests(FleetCase):
         newcomer = lan.on(6)
         while not newcomer.overlay.contacts():
             lan.run(0.001)
-        self.assertFalse(newcomer.overlay.is_whole)
-        while not newcomer.overlay.is_whole:
+        self.assertFalse(newcomer.overlay.has_all_members)
+        while not newcomer.overlay.has_all_members:
             lan.run(0.001)
         self.assertEqual(len(newcomer.overlay.contacts()), 6)
 
     def test_first_of_a_network_waits_a_moment(self) -> None:
         """A node without replies starts a team as its first node after ``LISTEN`` seconds, not before."""
         lan = self.lan()
-        lan.nodes.append(node := lan.made(0))
+        lan.nodes.append(node := lan.make_node(0))
         node.stop()
         alone = lan.on(1)
         joined = alone.join([])
-        lan.run(LISTEN - 0.05)
+        lan.run(LISTEN_S - 0.05)
         self.assertFalse(joined.called)
         self.done(lan, joined, 0.1)
-        self.assertTrue(alone.overlay.is_whole)
+        self.assertTrue(alone.overlay.has_all_members)
 
     def test_storm_of_a_hundred_stays_small(self) -> None:
         """A hundred nodes that start at the same time form one network, with few replies to each query."""
@@ -94,12 +96,12 @@ class DiscoveryTests(FleetCase):
             lan.on(place)
         lan.run(20.0)
         self.assertGreaterEqual(min(len(node.overlay.contacts()) for node in lan.nodes), 8)
-        self.assertEqual({(node.overlay.is_whole, node.overlay.is_large) for node in lan.nodes}, {(False, True)})
+        self.assertEqual({(node.overlay.has_all_members, node.overlay.is_large) for node in lan.nodes}, {(False, True)})
         last, first = lan.nodes[-1], lan.nodes[0]
         self.assertEqual(self.done(lan, last.find_node(first.identity.node_id))[0], first.contact)
         traffic = lan.traffic()
         self.assertLess(traffic["calls"], 120)
-        self.assertLess(traffic["answered"], 2 * ANSWERS * traffic["calls"])
+        self.assertLess(traffic["answered"], 2 * TARGET_REPLIES * traffic["calls"])
         self.assertLess(traffic["greeted"], 350)
 
     def test_team_in_company_is_quiet(self) -> None:
@@ -115,7 +117,7 @@ class DiscoveryTests(FleetCase):
     def test_two_halves_become_one(self) -> None:
         """Two separate networks of one team merge soon after their LANs are connected."""
         lan = self.lan()
-        other = Segment(lan.board)
+        other = SimulatedLan(lan.switchboard)
         for place in range(3):
             lan.on(place)
             lan.on(place + 3, segment=other)
@@ -134,7 +136,7 @@ class DiscoveryTests(FleetCase):
         lan.run(60.0)
         self.assertEqual(a.overlay.contacts(), [])
         lan.segment.is_blocked = False
-        lan.groups[0].moved()
+        lan.groups[0].on_moved()
         lan.run(0.3)
         self.assertEqual(a.overlay.contacts(), [b.contact])
 
@@ -147,16 +149,16 @@ class DiscoveryTests(FleetCase):
         self.assertEqual([*a.overlay.contacts(), *b.overlay.contacts()], [])
         self.assertGreater(a.discovery.counters["foreign"], 0)
         self.assertEqual(a.discovery.counters["answered"], 0)
-        call, noise = a.endpoint.greeter.call(), random.Random(5)
-        thief = lan.segment.group()
+        call, noise = a.endpoint.discoverer.make_multicast(), random.Random(5)
+        thief = lan.segment.join()
         got: list[bytes] = []
         thief.listen(lambda datagram, source: got.append(datagram), lambda: None)
         for _ in range(50):
             thief.send(call)
             lan.run(0.2)
-        self.assertEqual(len([datagram for datagram in got if datagram[0] == HERE]), 1)
+        self.assertEqual(len([datagram for datagram in got if datagram[0] == DISCOVERY_REPLY]), 1)
         a.discovery.counters.clear()
-        for kind in (0, INIT, WHO, HERE, HAIL):
+        for kind in (0, INIT, DISCOVERY, DISCOVERY_REPLY, PROBE):
             for size in (0, 1, 88, 89, 400):
                 thief.send((bytes([kind]) + noise.randbytes(size))[:size])
         lan.run(5.0)

@@ -12,30 +12,38 @@ from zope.interface import implementer
 
 from middleware.entangled.contact import Contact
 from middleware.entangled.errors import NoAnswer, NotAdmitted, Refused
-from middleware.entangled.identity import Identity, exchange_key
-from middleware.entangled.network.network import Address, address_of, packed_address
+from middleware.entangled.identity import Identity, derive_exchange_key
+from middleware.entangled.network.network import Address, pack_address, parse_address
 from middleware.entangled.node import EntangledNode
-from middleware.entangled.record import hashed_key
-from middleware.entangled.wire import door
-from middleware.entangled.wire.door import (
+from middleware.entangled.record import hash_key
+from middleware.entangled.wire import admission_check
+from middleware.entangled.wire.admission_check import (
     DOUBLED,
     EXPIRED,
     FOREIGN,
-    LINES,
+    LOG_BURST,
     REVOKED,
     ROLE,
     SUPERSEDED,
-    Life,
-    Lives,
-    Noted,
-    meaning,
-    next_life,
+    Incarnation,
+    Incarnations,
+    LogLimiter,
+    explain,
+    next_incarnation,
 )
 from middleware.entangled.wire.endpoint import Endpoint
-from middleware.entangled.wire.rebuff import HOUR, MAX_REBUFFS, Rebuffs
-from middleware.entangled.wire.session import ANSWER_ROOM, DATA, INIT, RESP, Credentials, Hello, Invitation
-from tests.fleet import TEAM as FLEET_TEAM
-from tests.fleet import Fleet, FleetCase
+from middleware.entangled.wire.rejection import HOUR_S, MAX_REJECTIONS, Rejections
+from middleware.entangled.wire.session import (
+    DATA,
+    INIT,
+    MIN_ANSWER_BYTES,
+    RESP,
+    Credentials,
+    HandshakeFields,
+    InitiatorHandshake,
+)
+from tests.fleet import TEAM_KEY as FLEET_TEAM
+from tests.fleet import EntangledTeam, FleetCase
 from tests.middleware.gate import ROOM, Gate
 from tests.middleware.test_endpoint import DELAY, TEAM, EndpointCase, Tap
 
@@ -70,7 +78,7 @@ class ClosedCase(EndpointCase, LogCase):
         self, seed: int, team: bytes = TEAM, port: int = 0, identity: int | None = None, gate: Gate | None = None
     ) -> tuple[Endpoint, Contact]:
         own = Identity(bytes([identity or seed]) * 32)
-        tap = Tap(self.board.network("127.0.0.1", port))
+        tap = Tap(self.board.make_network("127.0.0.1", port))
         self.gates.append(gate or Gate())
         endpoint = Endpoint(own, team, tap, self.clock, random.Random(seed), self.gates[-1])
         endpoint.start()
@@ -90,7 +98,7 @@ class PassTests(ClosedCase):
 
     def test_first_answer_still_takes_one_round_trip(self) -> None:
         """With passes of maximum size the first request fits into the INIT; the reply has the INIT's source."""
-        answer = bytes(ANSWER_ROOM - 20)
+        answer = bytes(MIN_ANSWER_BYTES - 20)
         seen: list[tuple[Contact, Address]] = []
         self.a.on_seen.add(lambda contact, address: seen.append((contact, address)))
         asked = self.a.ask(self.to_b, "echo", answer)
@@ -104,7 +112,7 @@ class PassTests(ClosedCase):
         self.at_b.refused[self.to_a.public] = EXPIRED
         self.b.expose("look", lambda peer: self.runs.append(peer), early=True)
         text = self.refused(self.a.ask(self.to_b, "look"), EXPIRED, 2 * DELAY)
-        self.assertIn(meaning(EXPIRED), text)
+        self.assertIn(explain(EXPIRED), text)
         self.assertEqual((self.runs, self.a._sessions, self.b._sessions), ([], {}, {}))
 
     def test_refused_by_the_initiator(self) -> None:
@@ -114,7 +122,7 @@ class PassTests(ClosedCase):
         refusals: list[tuple[Contact, str]] = []
         self.a.on_contact.add(met.append)
         self.b.on_contact.add(met.append)
-        self.b.on_refused.add(lambda contact, code: refusals.append((contact, code)))
+        self.b.on_rejected.add(lambda contact, code: refusals.append((contact, code)))
         self.refused(self.a.ask(self.to_b, "echo", 1), REVOKED)
         self.assertEqual((met, refusals), ([], [(self.to_a, REVOKED)]))
         self.assertEqual((self.a._sessions, self.b._sessions), ({}, {}))
@@ -127,13 +135,13 @@ class PassTests(ClosedCase):
             for _ in range(5):
                 self.refused(self.a.ask(self.to_b, "echo", 1), code)
             self.assertEqual((len(self.kept(self.to_b, INIT)), len(self.log)), (5 * count, 2 * count))
-            self.assertTrue(all(meaning(code) in line for line in self.log[-2:]), self.log)
+            self.assertTrue(all(explain(code) in line for line in self.log[-2:]), self.log)
         del self.at_b.refused[self.to_a.public]
         self.assertEqual(self.got(self.a.ask(self.to_b, "echo", 2)), 2)
 
     def test_foreign_passes(self) -> None:
         """A missing pass and an oversized one are rejected as foreign, the oversized one without a check."""
-        self.at_a.shown += b"!"
+        self.at_a.own_pass += b"!"
         self.refused(self.a.ask(self.to_b, "echo", 1), FOREIGN)
         self.assertEqual(self.at_b.judged, [])
         stranger, _ = self.endpoint(9, gate=Gate(shown=b""))
@@ -152,9 +160,14 @@ class PassTests(ClosedCase):
 
     def test_a_forged_init_reaches_no_door(self) -> None:
         """An INIT with a wrong team secret, or without room for a pass, is dropped before the check."""
-        for secret, hello in ((b"x" * 32, Hello(self.at_a.life, self.at_a.shown, ROOM)), (TEAM, Hello())):
-            own = Credentials.of(Identity(b"m" * 32), secret)
-            init = Invitation(own, exchange_key(self.to_b.public), bytes(range(32)), 5, b"", hello).datagram()
+        for secret, hello in (
+            (b"x" * 32, HandshakeFields(self.at_a.incarnation, self.at_a.own_pass, ROOM)),
+            (TEAM, HandshakeFields()),
+        ):
+            own = Credentials.derive(Identity(b"m" * 32), secret)
+            init = InitiatorHandshake(
+                own, derive_exchange_key(self.to_b.public), bytes(range(32)), 5, b"", hello
+            ).make_init()
             self.taps[self.to_b.address].receiver(init, self.to_a.address)
         self.clock.advance(1)
         self.assertEqual((self.at_b.judged, self.b.counters["forged"], self.kept(self.to_a, RESP)), ([], 2, []))
@@ -199,8 +212,8 @@ class EvictionTests(ClosedCase):
         self.b.evict(self.to_a.public)
         self.refused(asked, REVOKED)
         for end in (self.a, self.b):
-            self.assertEqual((end._courier._assemblies, dict(end._courier._bytes_in)), ({}, {}))
-            self.assertEqual(dict(end._courier._bytes_out), {})
+            self.assertEqual((end._fragmenter._incoming, dict(end._fragmenter._bytes_in)), ({}, {}))
+            self.assertEqual(dict(end._fragmenter._bytes_out), {})
 
     def test_evicted_before_it_confirmed(self) -> None:
         """An eviction also removes an unconfirmed session; the eviction of an unknown node has no effect."""
@@ -232,11 +245,11 @@ class LifeTests(ClosedCase):
         self.refused(self.a.ask(self.to_b, "echo", 3), SUPERSEDED)
         self.assertEqual(self.got(later.ask(self.to_b, "echo", 4)), 4)
         self.assertEqual(len(self.log), 2)
-        self.assertTrue(all(meaning(SUPERSEDED) in line for line in self.log))
+        self.assertTrue(all(explain(SUPERSEDED) in line for line in self.log))
 
     def test_a_copy_is_doubled(self) -> None:
         """An incarnation with the same number but another nonce, or with a lower number, is rejected as doubled."""
-        self.at_a.life = Life(5, self.at_a.life.nonce)
+        self.at_a.incarnation = Incarnation(5, self.at_a.incarnation.nonce)
         self.got(self.a.ask(self.to_b, "echo", 1))
         for number, nonce in ((5, 2), (4, 3)):
             copy, _ = self.life(number, nonce)
@@ -248,12 +261,12 @@ class LifeTests(ClosedCase):
         self.equip(self.a)
         self.got(self.a.ask(self.to_b, "echo", 1))
         copy, to_copy = self.life(1, 2)
-        session = self.b._peers.known(self.to_a.public).session  # type: ignore[union-attr]
+        session = self.b._peers.get(self.to_a.public).session  # type: ignore[union-attr]
         assert session is not None
-        self.b._peers.open(self.b._peers.peer(to_copy), to_copy.address)
+        self.b._peers.open(self.b._peers.get_or_create(to_copy), to_copy.address)
         self.clock.advance(1)
         self.assertEqual(copy._sessions, {})
-        self.assertIs(self.b._peers.known(self.to_a.public).session, session)  # type: ignore[union-attr]
+        self.assertIs(self.b._peers.get(self.to_a.public).session, session)  # type: ignore[union-attr]
         self.assertEqual(self.got(self.b.ask(self.to_a, "echo", 2)), 2)
         self.assertEqual(len(self.log), 2)
 
@@ -280,37 +293,40 @@ class LifeTests(ClosedCase):
 
     def test_lives(self) -> None:
         """The latest incarnation is valid, the previous one superseded, others doubled; number 0 is always valid."""
-        lives, one, two = Lives(), Life(1, b"1" * 8), Life(2, b"2" * 8)
-        self.assertFalse(lives.met(b"a", one))
-        self.assertEqual(lives.judge(b"a", two), "")
-        self.assertTrue(lives.met(b"a", two))
-        answers = [lives.judge(b"a", life) for life in (one, two, Life(2, b"3" * 8), Life(1, b"3" * 8), Life())]
+        lives, one, two = Incarnations(), Incarnation(1, b"1" * 8), Incarnation(2, b"2" * 8)
+        self.assertFalse(lives.record(b"a", one))
+        self.assertEqual(lives.find_refusal(b"a", two), "")
+        self.assertTrue(lives.record(b"a", two))
+        answers = [
+            lives.find_refusal(b"a", life)
+            for life in (one, two, Incarnation(2, b"3" * 8), Incarnation(1, b"3" * 8), Incarnation())
+        ]
         self.assertEqual(answers, [SUPERSEDED, "", DOUBLED, DOUBLED, ""])
-        self.assertEqual(lives.judge(b"b", one), "")
+        self.assertEqual(lives.find_refusal(b"b", one), "")
         lives.forget(b"a")
-        self.assertEqual(lives.judge(b"a", one), "")
+        self.assertEqual(lives.find_refusal(b"a", one), "")
 
     def test_tables_are_bounded(self) -> None:
         """The tables of incarnations and of logged rejections are bounded; the oldest entries are removed first."""
-        self.patch(door, "MAX_LIVES", 3)
-        self.patch(door, "MAX_NOTED", 3)
-        lives, noted = Lives(), Noted()
+        self.patch(admission_check, "MAX_IDENTITIES", 3)
+        self.patch(admission_check, "MAX_LOGGED", 3)
+        lives, noted = Incarnations(), LogLimiter()
         for number in range(10):
-            lives.met(bytes([number]), Life(1, b"1" * 8))
-            self.assertTrue(noted.is_new(0.0, bytes([number]), EXPIRED))
+            lives.record(bytes([number]), Incarnation(1, b"1" * 8))
+            self.assertTrue(noted.should_log(0.0, bytes([number]), EXPIRED))
         self.assertEqual(len(lives), 3)
-        self.assertFalse(noted.is_new(0.0, b"\x09", EXPIRED))
-        self.assertTrue(noted.is_new(0.0, b"\x00", EXPIRED))
+        self.assertFalse(noted.should_log(0.0, b"\x09", EXPIRED))
+        self.assertTrue(noted.should_log(0.0, b"\x00", EXPIRED))
 
     def test_the_log_is_no_target(self) -> None:
         """Rejections of invented keys are logged at a limited rate; skipped ones are logged later."""
-        noted = Noted()
-        self.assertEqual(sum(noted.is_new(0.0, number, FOREIGN) for number in range(1000)), LINES)
-        self.assertEqual(sum(noted.is_new(3.0, number, FOREIGN) for number in range(1000)), 3)
+        noted = LogLimiter()
+        self.assertEqual(sum(noted.should_log(0.0, number, FOREIGN) for number in range(1000)), LOG_BURST)
+        self.assertEqual(sum(noted.should_log(3.0, number, FOREIGN) for number in range(1000)), 3)
 
     def test_next_life(self) -> None:
         """An incarnation number exceeds the last one and is at least the Unix time of the start."""
-        self.assertEqual([next_life(0, 0.0), next_life(7, 5.0), next_life(7, 1e9)], [1, 8, 10**9])
+        self.assertEqual([next_incarnation(0, 0.0), next_incarnation(7, 5.0), next_incarnation(7, 1e9)], [1, 8, 10**9])
 
 
 class SecretTests(ClosedCase):
@@ -320,8 +336,8 @@ class SecretTests(ClosedCase):
 
     def test_both_are_good_for_a_while(self) -> None:
         """While the old secret is valid, nodes with the old and the new secret reach each other."""
-        self.assertRaises(ValueError, self.b.rekey, b"short")
-        self.b.rekey(self.NEW, TEAM)
+        self.assertRaises(ValueError, self.b.replace_secrets, b"short")
+        self.b.replace_secrets(self.NEW, TEAM)
         self.assertEqual(self.got(self.a.ask(self.to_b, "echo", 1), 4 * DELAY), 1)
         old, to_old = self.endpoint(7)
         self.equip(old)
@@ -333,7 +349,7 @@ class SecretTests(ClosedCase):
 
     def test_cookies_under_each_secret(self) -> None:
         """Under load a member can read its cookie with only the old or only the new secret."""
-        self.b.rekey(self.NEW, TEAM)
+        self.b.replace_secrets(self.NEW, TEAM)
         new, _ = self.endpoint(8, team=self.NEW)
         for asker in (self.a, new):
             self.b._cookies._limit._tokens = -1e6
@@ -342,12 +358,12 @@ class SecretTests(ClosedCase):
     def test_nobody_is_remembered_by_an_old_one(self) -> None:
         """A peer is contacted under the secret of its last handshake, and under the new one when only that is valid."""
         self.equip(self.a)
-        self.b.rekey(self.NEW, TEAM)
-        self.assertEqual(self.got(self.b.greet(self.to_a.address), 1.0), self.to_a)
+        self.b.replace_secrets(self.NEW, TEAM)
+        self.assertEqual(self.got(self.b.discover(self.to_a.address), 1.0), self.to_a)
         self.assertEqual(self.got(self.b.ask(self.to_a, "echo", 1), 2 * DELAY), 1)
-        self.a.rekey(self.NEW)
-        self.b.rekey(self.NEW)
-        self.b._peers.evict(self.b._peers.peer(self.to_a))
+        self.a.replace_secrets(self.NEW)
+        self.b.replace_secrets(self.NEW)
+        self.b._peers.evict(self.b._peers.get_or_create(self.to_a))
         self.assertEqual(self.got(self.b.ask(self.to_a, "echo", 2), 2 * DELAY), 2)
 
 
@@ -366,10 +382,10 @@ class RoleTests(ClosedCase):
         ):
             self.clock.advance(3)
             self.assertEqual(self.failureResultOf(asked, Refused).value.code, ROLE)
-        self.a.tell(self.to_b, "told")
+        self.a.notify(self.to_b, "told")
         self.assertEqual(self.got(self.a.ask(self.to_b, "echo", 1)), 1)
         self.assertEqual((self.runs, len(self.log)), ([], 1))
-        self.assertIn(meaning(ROLE), self.log[0])
+        self.assertIn(explain(ROLE), self.log[0])
 
 
 class RouteTests(EndpointCase):
@@ -379,13 +395,13 @@ class RouteTests(EndpointCase):
         """Datagrams of a routed kind go to their receiver; a kind in use cannot be routed."""
         got: list[tuple[bytes, Address]] = []
         self.b.route(0x17, lambda datagram, source: got.append((datagram, source)))
-        self.a.post(b"\x17 knock", self.to_b.address)
+        self.a.send_datagram(b"\x17 knock", self.to_b.address)
         self.clock.advance(1)
         self.assertEqual(got, [(b"\x17 knock", self.to_a.address)])
         for kind in (0x17, INIT):
             self.assertRaises(ValueError, self.b.route, kind, print)
         self.a.stop()
-        self.a.post(b"\x17 knock", self.to_b.address)
+        self.a.send_datagram(b"\x17 knock", self.to_b.address)
         self.assertEqual(self.board.counters["sent"], 1)
 
 
@@ -395,8 +411,8 @@ class AddressTests(SynchronousTestCase):
     def test_there_and_back(self) -> None:
         """IPv4 and IPv6 addresses survive encoding and decoding; the zone of a link-local address is dropped."""
         for address in (Address("10.0.0.1", 8470), Address("255.255.255.255", 65535), Address("2001:db8::1", 1)):
-            self.assertEqual(address_of(packed_address(address)), address)
-        self.assertEqual(address_of(packed_address(Address("fe80::1%eth0", 7))), Address("fe80::1", 7))
+            self.assertEqual(parse_address(pack_address(address)), address)
+        self.assertEqual(parse_address(pack_address(Address("fe80::1%eth0", 7))), Address("fe80::1", 7))
 
     def test_what_is_no_address(self) -> None:
         """Host names and invalid input are encoded as no address, and truncated bytes decode to None."""
@@ -408,22 +424,22 @@ class AddressTests(SynchronousTestCase):
             ("::x", 1),
             ("1.2.3.4", -1),
         ):
-            packed = packed_address(Address(host, port))
-            self.assertEqual((len(packed), address_of(packed)), (18, None))
-        self.assertIsNone(address_of(bytes([1]) * 17))
+            packed = pack_address(Address(host, port))
+            self.assertEqual((len(packed), parse_address(packed)), (18, None))
+        self.assertIsNone(parse_address(bytes([1]) * 17))
 
 
-class GatedFleet(Fleet):
+class GatedFleet(EntangledTeam):
     """A simulated closed team; ``gates`` are its admission checks by node number."""
 
     def __init__(self, n: int) -> None:
         self.gates: dict[int, Gate] = {}
         super().__init__(n)
 
-    def made(self, place: int, lease: float = 1.0) -> EntangledNode:
-        gate = self.gates[place] = Gate(self.lives + 1, place + 1)
-        network = self.board.network(*self.address(place))
-        identity, store, dice = self.identity(place), self.store(place), self.rng(place)
+    def make_node(self, place: int, lease: float = 1.0) -> EntangledNode:
+        gate = self.gates[place] = Gate(self.life_count + 1, place + 1)
+        network = self.switchboard.make_network(*self.address(place))
+        identity, store, dice = self.identity(place), self.store(place), self.make_life_rng(place)
         return EntangledNode(identity, FLEET_TEAM, network, store, self.clock, dice, lease, self.clock.seconds, gate)
 
     def evict(self, place: int, by: tuple[int, ...]) -> None:
@@ -434,7 +450,7 @@ class GatedFleet(Fleet):
             self.nodes[other].evict(public)
 
 
-KEY = hashed_key("somewhere")
+KEY = hash_key("somewhere")
 
 
 class MemberTests(FleetCase, LogCase):
@@ -452,22 +468,22 @@ class MemberTests(FleetCase, LogCase):
         fleet.evict(1, by=(0,))
         fleet.kill(1)
         fleet.run(3.0)  # until pending traffic has ended
-        sent = fleet.board.counters["sent"]
+        sent = fleet.switchboard.counters["sent"]
         fleet.run(30.0)
-        self.assertEqual(fleet.board.counters["sent"], sent)
+        self.assertEqual(fleet.switchboard.counters["sent"], sent)
 
     def test_a_copy_of_a_member(self) -> None:
         """A copy that is rejected, or that replaces the first node, does not remove the member at others."""
         for number, is_in in ((0, False), (99, True)):
             fleet = self.gated(3)
-            public, life = fleet.identity(2).public, fleet.gates[2].life
+            public, life = fleet.identity(2).public, fleet.gates[2].incarnation
             gate = Gate(number or life.number, 77)
-            network = fleet.board.network("10.0.0.3", 3)
+            network = fleet.switchboard.make_network("10.0.0.3", 3)
             copy = Endpoint(fleet.identity(2), FLEET_TEAM, network, fleet.clock, random.Random(5), gate)
             copy.start()
             self.addCleanup(copy.stop)
             node = fleet.nodes[0]
-            peer = node.endpoint._peers.known(public)
+            peer = node.endpoint._peers.get(public)
             assert peer is not None
             node.endpoint._peers.open(peer, network.address)
             for _ in range(200):
@@ -479,16 +495,16 @@ class MemberTests(FleetCase, LogCase):
         """A write that the node's role forbids is rejected at once, and nothing is sent."""
         fleet = self.gated(2)
         fleet.gates[1].unwritable.add((fleet.identity(1).public, "order"))
-        sent = fleet.board.counters["sent"]
+        sent = fleet.switchboard.counters["sent"]
         error = self.failureResultOf(fleet.nodes[1].put(KEY, "order", b"x"), Refused).value
-        self.assertEqual((error.code, fleet.board.counters["sent"]), (ROLE, sent))
+        self.assertEqual((error.code, fleet.switchboard.counters["sent"]), (ROLE, sent))
 
     def test_the_evicted_one_is_no_majority_by_itself(self) -> None:
         """A node that all members reject counts them as absent, and has no majority alone."""
         fleet = self.gated(4)
         fleet.evict(3, by=(0, 1, 2))
         fleet.run(5.0)
-        self.assertEqual(len(fleet.nodes[3].overlay.roster.absent()), 3)
+        self.assertEqual(len(fleet.nodes[3].overlay.members.list_absent()), 3)
         stored = fleet.nodes[3].put(KEY, "alone", b"1")
         fleet.run(5.0)
         self.failureResultOf(stored, NoAnswer)
@@ -501,7 +517,7 @@ class MemberTests(FleetCase, LogCase):
         public = fleet.identity(2).public
         fleet.run(60.0)
         fleet.gates[0].refused[public] = EXPIRED
-        stranger = fleet.board.network("10.0.0.9", 9)
+        stranger = fleet.switchboard.make_network("10.0.0.9", 9)
         stranger.listen(lambda datagram, source: None)
         stranger.send(init, fleet.address(0))
         lost: list[Contact] = []
@@ -515,7 +531,7 @@ class MemberTests(FleetCase, LogCase):
         sent: list[tuple[bytes, Address]] = []
         fleet.kill(place)
         fleet.run(3.0)
-        node = fleet.nodes[place] = fleet.made(place)
+        node = fleet.nodes[place] = fleet.make_node(place)
         network: Any = node._network
         send = network.send
 
@@ -524,7 +540,7 @@ class MemberTests(FleetCase, LogCase):
             send(datagram, to)
 
         network.send = noted
-        fleet.enter(node, [fleet.address(0)])
+        fleet.start_node(node, [fleet.address(0)])
         fleet.run(2.0)
         return [one for one in sent if one[1] == fleet.address(0)]
 
@@ -533,29 +549,29 @@ class RebuffTests(SynchronousTestCase):
     """Tests of ``Rebuffs``."""
 
     def setUp(self) -> None:
-        self.rebuffs = Rebuffs()
+        self.rebuffs = Rejections()
 
     def met(self, who: bytes, now: float, code: str = "revoked") -> None:
         """Record a rejection."""
-        self.rebuffs.met(who, "10.0.0.1:7000", "we", code, "why; what to do", now)
+        self.rebuffs.record(who, "10.0.0.1:7000", "we", code, "why; what to do", now)
 
     def test_count_what_happens_again(self) -> None:
         """Equal rejections of one key are merged, with the first and last time; another code is a separate entry."""
         for now in (1.0, 2.0, 5.0):
             self.met(b"a", now)
         self.met(b"a", 6.0, "expired")
-        found = [(each.code, each.first_at, each.last_at, each.count) for each in self.rebuffs.newest(6.0)]
+        found = [(each.code, each.first_at, each.last_at, each.count) for each in self.rebuffs.list_recent(6.0)]
         self.assertEqual(found, [("expired", 6.0, 6.0, 1), ("revoked", 1.0, 5.0, 3)])
 
     def test_forget_after_an_hour(self) -> None:
         """A rejection older than an hour is not returned, and a later one starts at one again."""
         self.met(b"a", 0.0)
-        self.assertEqual(self.rebuffs.newest(HOUR + 1.0), [])
-        self.met(b"a", HOUR + 1.0)
-        self.assertEqual([each.count for each in self.rebuffs.newest(HOUR + 1.0)], [1])
+        self.assertEqual(self.rebuffs.list_recent(HOUR_S + 1.0), [])
+        self.met(b"a", HOUR_S + 1.0)
+        self.assertEqual([each.count for each in self.rebuffs.list_recent(HOUR_S + 1.0)], [1])
 
     def test_invented_keys_take_no_room(self) -> None:
         """Only the latest rejections are stored, for any number of invented keys."""
-        for number in range(10 * MAX_REBUFFS):
+        for number in range(10 * MAX_REJECTIONS):
             self.met(number.to_bytes(32), float(number))
-        self.assertEqual((len(self.rebuffs), self.rebuffs.newest(700.0)[0].last_at), (MAX_REBUFFS, 639.0))
+        self.assertEqual((len(self.rebuffs), self.rebuffs.list_recent(700.0)[0].last_at), (MAX_REJECTIONS, 639.0))

@@ -12,14 +12,14 @@ from twisted.trial.unittest import SynchronousTestCase
 from middleware.entangled.clock import HeapClock
 from middleware.entangled.contact import Contact
 from middleware.entangled.errors import NoAnswer, NotRunning, Refused, TooLarge
-from middleware.entangled.identity import Identity, exchange_key
+from middleware.entangled.identity import Identity, derive_exchange_key
 from middleware.entangled.network.network import Address
-from middleware.entangled.network.switchboard import Switchboard, SwitchboardNetwork, Weather
+from middleware.entangled.network.switchboard import LinkConditions, Switchboard, SwitchboardNetwork
 from middleware.entangled.wire import method, peer
 from middleware.entangled.wire.endpoint import Endpoint
-from middleware.entangled.wire.message import MAX_MESSAGE
-from middleware.entangled.wire.peer import IN_TOUCH, SESSION_END_S
-from middleware.entangled.wire.session import DATA, INIT, MAX_PLAIN, RESP, Invitation
+from middleware.entangled.wire.message import MAX_MESSAGE_BYTES
+from middleware.entangled.wire.peer import SESSION_END_S, SESSION_SILENCE_S
+from middleware.entangled.wire.session import DATA, INIT, MAX_PLAIN_BYTES, RESP, InitiatorHandshake
 
 TEAM = b"k" * 32
 DELAY = 1 / 64  # a power of two, so sums are exact
@@ -63,7 +63,7 @@ class EndpointCase(SynchronousTestCase):
         """Start both endpoints."""
         self.clock = HeapClock()
         self.rng = random.Random(11)
-        self.board = Switchboard(self.clock, self.rng, Weather(DELAY))
+        self.board = Switchboard(self.clock, self.rng, LinkConditions(DELAY))
         self.taps: dict[Address, Tap] = {}
         self.runs: list[object] = []
         self.a, self.to_a = self.endpoint(1)
@@ -95,7 +95,7 @@ class EndpointCase(SynchronousTestCase):
     ) -> tuple[Endpoint, Contact]:
         """Return a started endpoint and its contact."""
         own = Identity(bytes([identity or seed]) * 32)
-        tap = Tap(self.board.network("127.0.0.1", port))
+        tap = Tap(self.board.make_network("127.0.0.1", port))
         endpoint = Endpoint(own, team, tap, self.clock, random.Random(seed))
         endpoint.start()
         self.taps[tap.address] = tap
@@ -135,7 +135,7 @@ class AskTests(EndpointCase):
         self.assertEqual(len(self.got(self.a.ask(self.to_b, "echo", bytes(1330)))), 1330)
 
         self.failureResultOf(self.a.ask(self.to_b, "echo", object()), TypeError)
-        self.assertRaises(TooLarge, self.a.tell, self.to_b, "echo", bytes(MAX_PLAIN))
+        self.assertRaises(TooLarge, self.a.notify, self.to_b, "echo", bytes(MAX_PLAIN_BYTES))
 
     def test_refusals(self) -> None:
         """A rejection, an unknown method, invalid arguments and an oversized result give an error message."""
@@ -147,7 +147,7 @@ class AskTests(EndpointCase):
         self.assertIn("takes 1 to 2 arguments", self.failed(ask(self.to_b, "whole"), Refused))
         self.assertIn("argument 1 must be int, not str", self.failed(ask(self.to_b, "whole", "x"), Refused))
         self.assertIn("argument 2 must be str or None", self.failed(ask(self.to_b, "whole", 1, b"x"), Refused))
-        self.assertIn("request less", self.failed(ask(self.to_b, "fill", MAX_MESSAGE), Refused))
+        self.assertIn("request less", self.failed(ask(self.to_b, "fill", MAX_MESSAGE_BYTES), Refused))
         self.assertEqual(self.got(ask(self.to_b, "whole", 1, None)), [1, None])
 
     def test_foreign_exceptions_stay_inside(self) -> None:
@@ -229,13 +229,13 @@ class TellTests(EndpointCase):
 
     def test_tells_open_a_session_and_arrive_once(self) -> None:
         """One-way messages sent before the session arrive in order after the handshake, each once."""
-        self.board.weather = Weather(DELAY, duplicate=1.0)
+        self.board.conditions = LinkConditions(DELAY, duplicate=1.0)
         for number in range(5):
-            self.a.tell(self.to_b, "add", number)
+            self.a.notify(self.to_b, "add", number)
         self.clock.advance(1)
-        self.a.tell(self.to_b, "add", 5)
-        self.a.tell(self.to_b, "nothing")
-        self.a.tell(self.to_b, "refuse")
+        self.a.notify(self.to_b, "add", 5)
+        self.a.notify(self.to_b, "nothing")
+        self.a.notify(self.to_b, "refuse")
         self.clock.advance(1)
         self.assertEqual(self.runs, [0, 1, 2, 3, 4, 5])
         self.assertEqual((self.b.counters["unknown method"], self.b.counters["refused"]), (1, 1))
@@ -243,28 +243,28 @@ class TellTests(EndpointCase):
     def test_tells_that_cannot_arrive_are_counted(self) -> None:
         """One-way messages to an unreachable peer are dropped and counted, and their queue is bounded."""
         for number in range(100):
-            self.a.tell(Contact(self.to_b.public, Address("127.0.0.1", 9)), "add", number)
+            self.a.notify(Contact(self.to_b.public, Address("127.0.0.1", 9)), "add", number)
         self.clock.advance(5)
         self.assertEqual(self.a.counters["untold"], 100)
         self.assertEqual(self.clock.getDelayedCalls(), [])
 
     def test_greeting(self) -> None:
         """``greet`` learns the key at an address, also under loss; the reply is no larger than the request."""
-        self.board.weather = Weather(DELAY, loss=0.3)
-        self.assertEqual(self.got(self.a.greet(self.to_b.address)), self.to_b)
+        self.board.conditions = LinkConditions(DELAY, loss=0.3)
+        self.assertEqual(self.got(self.a.discover(self.to_b.address)), self.to_b)
         sizes = {len(datagram) for tap in self.taps.values() for datagram, _ in tap.kept}
         self.assertEqual(len(sizes), 1)
-        self.failed(self.a.greet(Address("127.0.0.1", 9)), NoAnswer)
+        self.failed(self.a.discover(Address("127.0.0.1", 9)), NoAnswer)
 
     def test_stopped_endpoint_fails_everything(self) -> None:
         """A stop fails pending and later calls and leaves no timer; the endpoint can start again."""
-        pending = [self.a.ask(self.to_b, "echo", 1), self.a.greet(Address("127.0.0.1", 9))]
+        pending = [self.a.ask(self.to_b, "echo", 1), self.a.discover(Address("127.0.0.1", 9))]
         self.a.stop()
         self.a.stop()
-        pending += [self.a.ask(self.to_b, "echo", 1), self.a.greet(self.to_b.address)]
+        pending += [self.a.ask(self.to_b, "echo", 1), self.a.discover(self.to_b.address)]
         for one in pending:
             self.failureResultOf(one, NotRunning)
-        self.assertRaises(NotRunning, self.a.tell, self.to_b, "echo", 1)
+        self.assertRaises(NotRunning, self.a.notify, self.to_b, "echo", 1)
         self.assertEqual([call.getTime() for call in self.clock.getDelayedCalls()], [DELAY, DELAY])  # in transit
         self.a.start()
         self.assertEqual(self.got(self.a.ask(self.to_b, "echo", 2)), 2)
@@ -289,7 +289,7 @@ class WeatherTests(EndpointCase):
         self.b, self.to_b = self.endpoint(6, port=self.to_b.address.port, identity=2)
         self.equip(self.b)
         for number in range(10):  # one-way messages reveal a restart, too
-            self.a.tell(self.to_b, "add", 10 + number)
+            self.a.notify(self.to_b, "add", 10 + number)
             self.clock.advance(1)
         self.assertIn(19, self.runs)
 
@@ -297,7 +297,7 @@ class WeatherTests(EndpointCase):
         """Replies go to the source of a peer's newest datagram; a replayed datagram does not change the address."""
         self.got(self.a.ask(self.to_b, "echo", 1))
         old = self.taps[self.to_a.address]
-        moved = self.board.network("127.0.0.1", 40000)
+        moved = self.board.make_network("127.0.0.1", 40000)
         moved.listen(old.receiver)
         old.network = moved
         seen: list[Contact] = []
@@ -311,28 +311,28 @@ class WeatherTests(EndpointCase):
 
     def test_nobody_is_asked_on_a_session_that_may_be_gone(self) -> None:
         """In a wide network a request after a long silence takes one round trip, even if the peer's session ended."""
-        self.a.peers.is_wide = self.b.peers.is_wide = True
+        self.a.peers.is_large = self.b.peers.is_large = True
         self.got(self.a.ask(self.to_b, "echo", 1))
-        self.clock.advance(IN_TOUCH - 3.5)
+        self.clock.advance(SESSION_SILENCE_S - 3.5)
         self.assertEqual(self.got(self.a.ask(self.to_b, "echo", 2), 2 * DELAY), 2)
         self.assertEqual(len(self.kept(self.to_b, INIT)), 1)
-        self.clock.advance(IN_TOUCH + 1)
-        self.b.let_go(IN_TOUCH)
-        self.assertFalse(self.a.is_met(self.to_b))
+        self.clock.advance(SESSION_SILENCE_S + 1)
+        self.b.forget_silent(SESSION_SILENCE_S)
+        self.assertFalse(self.a.has_session(self.to_b))
         self.assertEqual(self.got(self.a.ask(self.to_b, "echo", 3), 2 * DELAY), 3)
-        self.assertTrue(self.a.is_met(self.to_b))
+        self.assertTrue(self.a.has_session(self.to_b))
 
     def test_keys_of_an_idle_session_are_forgotten(self) -> None:
         """An idle session sends nothing; at its end both sides delete its keys, and a request opens a new session."""
         self.got(self.a.ask(self.to_b, "echo", 1))
         sent = self.board.counters["sent"]
         self.clock.advance(SESSION_END_S - 4.0)
-        self.assertTrue(self.a.is_met(self.to_b))
+        self.assertTrue(self.a.has_session(self.to_b))
         self.clock.advance(2.0)
         self.assertEqual([len(end._sessions) for end in (self.a, self.b)], [0, 0])
         self.assertEqual(self.clock.getDelayedCalls(), [])
         self.assertEqual(self.board.counters["sent"], sent)
-        self.assertFalse(self.a.is_met(self.to_b))
+        self.assertFalse(self.a.has_session(self.to_b))
         self.assertEqual(self.got(self.a.ask(self.to_b, "echo", 2), 2 * DELAY), 2)
         self.assertEqual(len(self.kept(self.to_b, INIT)), 2)
 
@@ -340,7 +340,7 @@ class WeatherTests(EndpointCase):
         """A used session is renewed every 120 s by one handshake, and each reply still takes one round trip."""
         for seconds in range(600):
             asker, to = (self.a, self.to_b) if seconds % 2 else (self.b, self.to_a)
-            asker.tell(to, "echo", seconds)
+            asker.notify(to, "echo", seconds)
             asked = self.a.ask(self.to_b, "echo", seconds)
             self.clock.advance(2 * DELAY)
             self.assertEqual(self.successResultOf(asked), seconds)
@@ -358,9 +358,9 @@ class WeatherTests(EndpointCase):
             self.got(self.a.ask(self.to_b, "echo", 1))
             self.board.cut(self.to_a.address, self.to_b.address)
             for _ in range(tells):
-                self.a.tell(self.to_b, "echo", 1)
+                self.a.notify(self.to_b, "echo", 1)
                 self.clock.advance(seconds)
-            self.assertEqual(self.a._peers.known(self.to_b.public).sessions, ())  # type: ignore[union-attr]
+            self.assertEqual(self.a._peers.get(self.to_b.public).sessions, ())  # type: ignore[union-attr]
             self.patch(peer, "SESSION_DATAGRAMS", 5)
             self.board.heal()
             self.clock.advance(10.0)
@@ -415,8 +415,10 @@ class AttackTests(EndpointCase):
         session = next(iter(self.a._sessions.values()))
         for rubbish in (b"\xc1", b"\x93\x01", b"\x90", self.rng.randbytes(300)):
             self.assertEqual(self.send_raw(session.seal(rubbish), self.to_a.address), 0)
-        invitation = Invitation(self.a._credentials, exchange_key(self.to_b.public), bytes(range(32)), 5, b"\xc1")
-        self.assertEqual(self.send_raw(invitation.datagram()), 0)
+        invitation = InitiatorHandshake(
+            self.a._credentials, derive_exchange_key(self.to_b.public), bytes(range(32)), 5, b"\xc1"
+        )
+        self.assertEqual(self.send_raw(invitation.make_init()), 0)
         self.assertEqual(self.b.counters, {"malformed": 5})
         self.assertEqual(self.got(self.a.ask(self.to_b, "echo", 2)), 2)
 
@@ -424,8 +426,8 @@ class AttackTests(EndpointCase):
         """An INIT with the public key of another member gets no reply and creates no session."""
         thief = replace(self.a._credentials, public=Identity(b"v" * 32).public)
         for own in (thief, replace(self.a._credentials, public=b"\xff" * 32)):
-            invitation = Invitation(own, exchange_key(self.to_b.public), self.rng.randbytes(32), 5, b"")
-            self.assertEqual(self.send_raw(invitation.datagram()), 0)
+            invitation = InitiatorHandshake(own, derive_exchange_key(self.to_b.public), self.rng.randbytes(32), 5, b"")
+            self.assertEqual(self.send_raw(invitation.make_init()), 0)
         self.assertEqual((self.b.counters, self.b._sessions), ({"forged": 2}, {}))
 
     def test_peers_stay_bounded(self) -> None:

@@ -5,11 +5,26 @@ from __future__ import annotations
 import random
 
 from middleware.entangled.errors import Malformed, NoAnswer, NotRunning
-from middleware.entangled.identity import Identity, exchange_key
+from middleware.entangled.identity import Identity, derive_exchange_key
 from middleware.entangled.network.network import Address
-from middleware.entangled.wire.greeting import COOKIE, COOKIE_BYTES, MOST_RATE, QUIET_RATE, Cookies
-from middleware.entangled.wire.hail import ECHO, HAIL, VERSION, Echo, Hailer, echo, echo_of, hail
-from middleware.entangled.wire.session import INIT_LEAST, RESP, Credentials, Invitation
+from middleware.entangled.wire.discovery import (
+    COOKIE,
+    COOKIE_BYTES,
+    MAX_COOKIE_HANDSHAKES_PER_S,
+    MAX_HANDSHAKES_PER_S,
+    CookieCheck,
+)
+from middleware.entangled.wire.probe import (
+    PROBE,
+    PROBE_REPLY,
+    VERSION,
+    Prober,
+    ProbeReply,
+    pack_probe,
+    pack_reply,
+    parse_reply,
+)
+from middleware.entangled.wire.session import MIN_INIT_BYTES, RESP, Credentials, InitiatorHandshake
 from tests.middleware.gate import Gate
 from tests.middleware.test_endpoint import DELAY, TEAM, EndpointCase
 
@@ -21,14 +36,14 @@ class CookieTests(EndpointCase):
 
     def invitation(self, number: int, cookie: bytes = b"") -> bytes:
         """Return an INIT datagram of a member."""
-        own = Credentials.of(Identity(b"m" * 32), TEAM)
+        own = Credentials.derive(Identity(b"m" * 32), TEAM)
         ephemeral = (number << 64).to_bytes(32, "big")
-        return Invitation(own, exchange_key(self.to_b.public), ephemeral, number, b"").datagram(cookie)
+        return InitiatorHandshake(own, derive_exchange_key(self.to_b.public), ephemeral, number, b"").make_init(cookie)
 
     def flood(self, count: int) -> list[bytes]:
         """Send ``count`` INITs to ``b`` from one address and return its replies."""
         answers: list[bytes] = []
-        deaf = self.board.network("10.0.0.1", 1)
+        deaf = self.board.make_network("10.0.0.1", 1)
         deaf.listen(lambda datagram, source: answers.append(datagram))
         for number in range(count):
             self.taps[self.to_b.address].receiver(self.invitation(number), HOME)
@@ -40,23 +55,23 @@ class CookieTests(EndpointCase):
         """Up to the rate limit INITs get a RESP, above it a cookie that creates no session."""
         answers = self.flood(300)
         kinds = [answer[0] for answer in answers]
-        self.assertEqual(kinds, [RESP] * int(QUIET_RATE) + [COOKIE] * (300 - int(QUIET_RATE)))
-        self.assertEqual(len(self.b._sessions), int(QUIET_RATE))
-        self.assertTrue(all(len(answer) <= INIT_LEAST for answer in answers))
+        self.assertEqual(kinds, [RESP] * int(MAX_HANDSHAKES_PER_S) + [COOKIE] * (300 - int(MAX_HANDSHAKES_PER_S)))
+        self.assertEqual(len(self.b._sessions), int(MAX_HANDSHAKES_PER_S))
+        self.assertTrue(all(len(answer) <= MIN_INIT_BYTES for answer in answers))
         self.assertEqual({len(answer) for answer in answers if answer[0] == COOKIE}, {COOKIE_BYTES})
 
     def test_a_cookie_is_bound_to_its_address_and_time(self) -> None:
         """A cookie is valid from its address for at most four minutes, and at a limited rate of handshakes."""
-        cookies = Cookies(b"c" * 32, random.Random(1))
-        cookie = cookies._cookie(HOME, int(1000 / 120))
+        cookies = CookieCheck(b"c" * 32, random.Random(1))
+        cookie = cookies._make_cookie(HOME, int(1000 / 120))
         paid = self.invitation(1, cookie)
-        self.assertTrue(cookies.is_lawful(paid, HOME, 1000.0))
-        self.assertTrue(cookies.is_lawful(paid, HOME, 1100.0))
-        self.assertFalse(cookies.is_lawful(paid, HOME, 1400.0))
-        self.assertFalse(cookies.is_lawful(paid, ELSEWHERE, 1000.0))
-        self.assertTrue(cookies.is_lawful(self.invitation(1), ELSEWHERE, 1000.0))
-        admitted = sum(cookies.admits(paid, HOME, 1000.0) for _ in range(2 * int(MOST_RATE)))
-        self.assertEqual(admitted, int(MOST_RATE))
+        self.assertTrue(cookies.is_valid(paid, HOME, 1000.0))
+        self.assertTrue(cookies.is_valid(paid, HOME, 1100.0))
+        self.assertFalse(cookies.is_valid(paid, HOME, 1400.0))
+        self.assertFalse(cookies.is_valid(paid, ELSEWHERE, 1000.0))
+        self.assertTrue(cookies.is_valid(self.invitation(1), ELSEWHERE, 1000.0))
+        admitted = sum(cookies.admits(paid, HOME, 1000.0) for _ in range(2 * int(MAX_COOKIE_HANDSHAKES_PER_S)))
+        self.assertEqual(admitted, int(MAX_COOKIE_HANDSHAKES_PER_S))
 
     def test_forged_cookies(self) -> None:
         """A COOKIE from another address, for an unknown INIT or with a wrong tag is counted and has no effect."""
@@ -73,7 +88,7 @@ class CookieTests(EndpointCase):
         genuine(cookie[:1] + bytes(16) + cookie[17:], source)
         counted = [self.a.counters[name] for name in ("misdirected", "forged", "stale")]
         self.assertEqual(counted, [1, 2, 1])
-        self.assertEqual(next(iter(self.a._peers._openings.values())).doors, {self.to_b.address: b""})
+        self.assertEqual(next(iter(self.a._peers._handshakes.values())).cookies, {self.to_b.address: b""})
 
 
 TOKEN = b"0123456789abcdef"
@@ -84,44 +99,49 @@ class HailTests(EndpointCase):
 
     def test_who_is_there(self) -> None:
         """A reply, also of another team, contains fingerprint, version and clock, and the address of the prober."""
-        self.b.echoer.wall = lambda: 1_700_000_000.25
-        self.b.echoer._fingerprint = lambda: Gate.fingerprint
-        found = self.got(self.a.hail(self.to_b.address), 2 * DELAY)
-        self.assertEqual(found[1:], Echo(b"", VERSION, b"the team", 1_700_000_000.25, self.to_a.address)[1:])
+        self.b.probe_responder.unix_time = lambda: 1_700_000_000.25
+        self.b.probe_responder._fingerprint = lambda: Gate.fingerprint
+        found = self.got(self.a.probe(self.to_b.address), 2 * DELAY)
+        self.assertEqual(found[1:], ProbeReply(b"", VERSION, b"the team", 1_700_000_000.25, self.to_a.address)[1:])
 
         _, to_other = self.endpoint(3, team=b"o" * 32)
 
-        found = self.got(self.a.hail(to_other.address))
+        found = self.got(self.a.probe(to_other.address))
         self.assertEqual((found.fingerprint, found.wall), (bytes(8), 0.0))
 
     def test_nobody_is_there(self) -> None:
         """A probe without a reply fails after its timeout, and a cancelled probe leaves no state."""
-        self.failed(self.a.hail(HOME, 1.0), NoAnswer, 1.0)
-        self.a.hail(HOME, 1.0).addErrback(lambda failure: None).cancel()
-        self.assertEqual(self.a.hailer._pending, {})
-        pending = self.a.hail(HOME)
+        self.failed(self.a.probe(HOME, 1.0), NoAnswer, 1.0)
+        self.a.probe(HOME, 1.0).addErrback(lambda failure: None).cancel()
+        self.assertEqual(self.a.prober._pending, {})
+        pending = self.a.probe(HOME)
         self.a.stop()
         self.failureResultOf(pending, NotRunning)
-        self.failureResultOf(self.a.hail(HOME), NotRunning)
+        self.failureResultOf(self.a.probe(HOME), NotRunning)
 
     def test_what_is_none(self) -> None:
         """Probes and replies of wrong length, and replies without a probe, are counted and not answered."""
         receiver = self.taps[self.to_b.address].receiver
         before = self.board.counters["sent"]
-        for datagram in (hail(TOKEN)[:-1], hail(TOKEN) + b"x", bytes([HAIL]), bytes([ECHO]) + bytes(7)):
+        for datagram in (
+            pack_probe(TOKEN)[:-1],
+            pack_probe(TOKEN) + b"x",
+            bytes([PROBE]),
+            bytes([PROBE_REPLY]) + bytes(7),
+        ):
             receiver(datagram, HOME)
-        receiver(echo(hail(TOKEN), bytes(8), 0.0, HOME), HOME)
+        receiver(pack_reply(pack_probe(TOKEN), bytes(8), 0.0, HOME), HOME)
         self.assertEqual(self.b.counters, {"malformed": 4, "unasked": 1})
         self.assertEqual(self.board.counters["sent"], before)
-        self.assertRaises(Malformed, echo, b"", bytes(8), 0.0, HOME)
-        self.assertRaises(Malformed, echo_of, hail(TOKEN))
+        self.assertRaises(Malformed, pack_reply, b"", bytes(8), 0.0, HOME)
+        self.assertRaises(Malformed, parse_reply, pack_probe(TOKEN))
 
     def test_an_echo_from_elsewhere(self) -> None:
         """A reply from another address than the probed one is ignored."""
         sent: list[bytes] = []
-        hailer = Hailer(lambda datagram, to: sent.append(datagram), self.clock, random.Random(1))
-        asked = hailer.hail(HOME)
-        hailer.on_echo(echo(sent[0], bytes(8), 0.0, ELSEWHERE), ELSEWHERE)
+        hailer = Prober(lambda datagram, to: sent.append(datagram), self.clock, random.Random(1))
+        asked = hailer.probe(HOME)
+        hailer.on_reply(pack_reply(sent[0], bytes(8), 0.0, ELSEWHERE), ELSEWHERE)
         self.assertNoResult(asked)
-        hailer.on_echo(echo(sent[0], bytes(8), 0.0, ELSEWHERE), HOME)
-        self.assertEqual(self.successResultOf(asked).seen, ELSEWHERE)
+        hailer.on_reply(pack_reply(sent[0], bytes(8), 0.0, ELSEWHERE), HOME)
+        self.assertEqual(self.successResultOf(asked).observed_address, ELSEWHERE)

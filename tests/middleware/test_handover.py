@@ -7,14 +7,14 @@ from typing import Any
 
 from twisted.internet.defer import Deferred, succeed
 
-from middleware.entangled.background import paced
+from middleware.entangled.background import run_limited
 from middleware.entangled.errors import NoAnswer, Refused
 from middleware.entangled.node import EntangledNode
-from middleware.entangled.record import TEAM_TTL, Record, hashed_key
-from middleware.entangled.replication.overlap import BITS, GROUPS, LISTED_S, PLACES
-from tests.fleet import Fleet, FleetCase
+from middleware.entangled.record import TEAM_TTL_S, Record, hash_key
+from middleware.entangled.replication.comparison import GROUPS, PAGE_RECORDS, SIGNATURE_BITS, SNAPSHOT_S
+from tests.fleet import EntangledTeam, FleetCase
 
-KEY = hashed_key("colour")
+KEY = hash_key("colour")
 MANY = 2000
 HOUR = 3600.0
 
@@ -36,66 +36,66 @@ def counted(node: EntangledNode) -> Counter[str]:
 class LifeTests(FleetCase):
     """The remaining TTL of records that other nodes than their owner forwarded."""
 
-    def left(self, fleet: Fleet, place: int, name: str = "a") -> float:
+    def left(self, fleet: EntangledTeam, place: int, name: str = "a") -> float:
         """Return the remaining seconds of a record of node 0 at another node."""
         slot = Record(KEY, name, fleet.identity(0).public, 1, "team", 1.0, b"").slot
-        expiry = fleet.stores[place].expiry(slot)
+        expiry = fleet.stores[place].find_expiry(slot)
         return 0.0 if expiry is None else expiry - fleet.clock.seconds()
 
-    def newcomer_that_meets_a_liar(self, told: float) -> Fleet:
+    def newcomer_that_meets_a_liar(self, told: float) -> EntangledTeam:
         """Return five nodes; the last joined through node 1 alone, which forwards records with a TTL of ``told``."""
         fleet = self.fleet(4)
         for number in range(40):
             fleet.nodes[0].put(KEY, "a" if not number else f"other {number}", b"x", "team", "all")
         fleet.run(1.0)
-        fleet.nodes[1].replica.left = lambda record: told  # type: ignore[method-assign]
-        fleet.board.partition([fleet.address(place) for place in (1, 4)])
-        fleet.nodes.append(fleet.made(4))
-        fleet.enter(fleet.nodes[4], [fleet.address(1)])
+        fleet.nodes[1].replica.remaining_lifetime = lambda record: told  # type: ignore[method-assign]
+        fleet.switchboard.partition([fleet.address(place) for place in (1, 4)])
+        fleet.nodes.append(fleet.make_node(4))
+        fleet.start_node(fleet.nodes[4], [fleet.address(1)])
         fleet.run(2.5)
         self.assertLess(abs(self.left(fleet, 4) - told), 3.0)
-        fleet.board.heal()
+        fleet.switchboard.heal()
         return fleet
 
     def test_a_liar_shortens_no_life(self) -> None:
         """A new node that received a record with a false, short TTL learns the longer one from an honest replica."""
         fleet = self.newcomer_that_meets_a_liar(2 * HOUR)
         fleet.run(30.0)
-        self.assertGreater(self.left(fleet, 4), TEAM_TTL - 60.0)
+        self.assertGreater(self.left(fleet, 4), TEAM_TTL_S - 60.0)
 
     def test_nor_behind_records_of_its_own(self) -> None:
         """Records of the malicious node with long TTLs do not hide the TTLs that it shortened."""
         fleet = self.newcomer_that_meets_a_liar(2 * HOUR)
         liar = fleet.identity(1)
         for number in range(60):
-            made = Record(KEY, f"mask {number}", liar.public, 1, "team", 20 * TEAM_TTL, b"x").signed(liar)
+            made = Record(KEY, f"mask {number}", liar.public, 1, "team", 20 * TEAM_TTL_S, b"x").sign(liar)
             for place in range(5):
-                fleet.nodes[place].replica.keep(made, None if place == 4 else HOUR)
+                fleet.nodes[place].replica.store_locally(made, None if place == 4 else HOUR)
         fleet.run(60.0)
-        self.assertGreater(self.left(fleet, 4), TEAM_TTL - 120.0)
-        self.assertLessEqual(self.left(fleet, 4), TEAM_TTL)
+        self.assertGreater(self.left(fleet, 4), TEAM_TTL_S - 120.0)
+        self.assertLessEqual(self.left(fleet, 4), TEAM_TTL_S)
 
     def test_lives_do_not_creep(self) -> None:
         """Repeated reconciliation extends no TTL: a record expires at most one TTL after its owner failed."""
         fleet = self.fleet(4)
         self.done(fleet, fleet.nodes[0].put(KEY, "a", b"x", "team", "all"), 1.0)
-        fleet.nodes[0].vanish()
+        fleet.nodes[0].stop_silently()
         began = fleet.clock.seconds()
         fleet.run(600.0)
         for place in (1, 2, 3):
-            self.assertLess(self.left(fleet, place) + fleet.clock.seconds() - began, TEAM_TTL + 1.0)
+            self.assertLess(self.left(fleet, place) + fleet.clock.seconds() - began, TEAM_TTL_S + 1.0)
 
     def test_a_life_names_the_very_record(self) -> None:
         """A TTL for another record of the slot is ignored, and one beyond the record's TTL is reduced to it."""
         fleet = self.fleet(2)
         self.done(fleet, fleet.nodes[0].put(KEY, "a", b"x", "team", "all"), 1.0)
         handover: Any = fleet.nodes[1]._handover
-        [record] = fleet.nodes[1].replica.held(KEY)
+        [record] = fleet.nodes[1].replica.get_held(KEY)
         fleet.clock.advance(100.0)
-        handover._extend_life(record.slot, (record.sequence, b"anothers"), TEAM_TTL)
-        self.assertLess(self.left(fleet, 1), TEAM_TTL - 90.0)
+        handover._extend_life(record.slot, (record.sequence, b"anothers"), TEAM_TTL_S)
+        self.assertLess(self.left(fleet, 1), TEAM_TTL_S - 90.0)
         handover._extend_life(record.slot, (record.sequence, record.signature[:8]), 9e9)
-        self.assertLess(abs(self.left(fleet, 1) - TEAM_TTL), 1.0)
+        self.assertLess(abs(self.left(fleet, 1) - TEAM_TTL_S), 1.0)
 
 
 class GivingTests(FleetCase):
@@ -105,33 +105,31 @@ class GivingTests(FleetCase):
         """A node hands over only missing records, each once, and then sends no more."""
         fleet = self.fleet(12)
         stranger = fleet.identity(99)
-        made = [
-            Record(hashed_key(str(n)), "a", stranger.public, 1, "team", HOUR, b"x").signed(stranger) for n in range(60)
-        ]
+        made = [Record(hash_key(str(n)), "a", stranger.public, 1, "team", HOUR, b"x").sign(stranger) for n in range(60)]
         giver = fleet.nodes[0]
-        extra = [r for r in made if not giver.overlay.belongs(r.key, giver.contact)]
+        extra = [r for r in made if not giver.overlay.is_replica(r.key, giver.contact)]
         self.assertGreater(len(extra), 10)
         for record in extra:
-            giver.replica.keep(record)
+            giver.replica.store_locally(record)
         fleet.run(120.0)
         peer = next(
-            node for node in fleet.nodes[1:] if sum(node.overlay.belongs(r.key, node.contact) for r in extra) > 5
+            node for node in fleet.nodes[1:] if sum(node.overlay.is_replica(r.key, node.contact) for r in extra) > 5
         )
-        there = [r for r in extra if peer.overlay.belongs(r.key, peer.contact)]
-        self.assertEqual([r for r in there if not peer.replica.held(r.key)], [])
+        there = [r for r in extra if peer.overlay.is_replica(r.key, peer.contact)]
+        self.assertEqual([r for r in there if not peer.replica.get_held(r.key)], [])
         handover: Any = giver._handover
         self.reconcile(fleet, handover, peer)
         seen = counted(giver)
         self.reconcile(fleet, handover, peer)
         self.assertEqual((seen["records"], seen["lacking"]), (0, 0))
         # An additional record is handed over alone.
-        more = Record(there[0].key, "b", stranger.public, 1, "team", HOUR, b"x").signed(stranger)
-        giver.replica.keep(more)
+        more = Record(there[0].key, "b", stranger.public, 1, "team", HOUR, b"x").sign(stranger)
+        giver.replica.store_locally(more)
         self.reconcile(fleet, handover, peer)
         self.assertEqual(seen["records"], 1)
-        self.assertEqual([r.name for r in peer.replica.held(more.key)], ["a", "b"])
+        self.assertEqual([r.name for r in peer.replica.get_held(more.key)], ["a", "b"])
 
-    def reconcile(self, fleet: Fleet, handover: Any, peer: EntangledNode) -> None:
+    def reconcile(self, fleet: EntangledTeam, handover: Any, peer: EntangledNode) -> None:
         fleet.run(0.5)
         self.done(fleet, Deferred.fromCoroutine(handover._reconcile(peer.contact)), 0.5)
 
@@ -147,15 +145,15 @@ class ManyTests(FleetCase):
         fleet.run(3.0)
 
         def cost(expected: int) -> int:
-            before = fleet.board.counters["sent"]
+            before = fleet.switchboard.counters["sent"]
             self.assertEqual(len(self.done(fleet, fleet.nodes[1].get(KEY), 0.2)), expected)
-            return fleet.board.counters["sent"] - before
+            return fleet.switchboard.counters["sent"] - before
 
         self.assertLess(cost(300), 25)
         owner = fleet.identity(0)
-        newer = Record(KEY, "newer", owner.public, 2**40, "team", 60.0, b"y").signed(owner)
+        newer = Record(KEY, "newer", owner.public, 2**40, "team", 60.0, b"y").sign(owner)
         for place in (0, 2, 3, 4):
-            fleet.nodes[place].replica.keep(newer)
+            fleet.nodes[place].replica.store_locally(newer)
         self.assertGreater(cost(301), 60)
         fleet.run(40.0)  # the replicas reconcile in this time
         self.assertLess(cost(301), 25)
@@ -167,27 +165,27 @@ class ManyTests(FleetCase):
         for number in range(MANY):
             owner.put(KEY, str(number), b"x", "leased")
         fleet.run(0.5)
-        self.assertEqual(len(owner.replica.held(KEY)), MANY)
+        self.assertEqual(len(owner.replica.get_held(KEY)), MANY)
         for place in (1, 2, 3):
-            fleet.nodes.append(fleet.made(place))
-            fleet.enter(fleet.nodes[place], [fleet.address(0)])
+            fleet.nodes.append(fleet.make_node(place))
+            fleet.start_node(fleet.nodes[place], [fleet.address(0)])
         fleet.run(6.0)
-        self.assertEqual([len(node.replica.held(KEY)) for node in fleet.nodes], [MANY] * 4)
+        self.assertEqual([len(node.replica.get_held(KEY)) for node in fleet.nodes], [MANY] * 4)
         self.assertEqual(owner.endpoint.counters["crowded"], 0)
 
     def test_what_is_owed_is_paced(self) -> None:
         """Two thousand records that were written during a partition are replicated soon after it heals."""
         fleet = self.fleet(3)
         owner = fleet.nodes[0]
-        fleet.board.partition([fleet.address(0)])
+        fleet.switchboard.partition([fleet.address(0)])
         fleet.run(15.0)
         for number in range(MANY):
             owner.put(KEY, str(number), b"x", "team").addErrback(lambda failure: failure.trap(NoAnswer))
         fleet.run(4.0)
-        fleet.board.heal()
-        self.assertEqual([len(node.replica.held(KEY)) for node in fleet.nodes], [MANY, 0, 0])
+        fleet.switchboard.heal()
+        self.assertEqual([len(node.replica.get_held(KEY)) for node in fleet.nodes], [MANY, 0, 0])
         fleet.run(25.0)
-        self.assertEqual([len(node.replica.held(KEY)) for node in fleet.nodes], [MANY] * 3)
+        self.assertEqual([len(node.replica.get_held(KEY)) for node in fleet.nodes], [MANY] * 3)
         self.assertEqual(owner.endpoint.counters["crowded"], 0)
 
     def test_paced(self) -> None:
@@ -201,7 +199,7 @@ class ManyTests(FleetCase):
                 raise NoAnswer("nobody there")
             await (succeed(None) if number == 3 else waiting.setdefault(number, Deferred()))
 
-        done = Deferred.fromCoroutine(paced(2, (work(number) for number in range(6))))
+        done = Deferred.fromCoroutine(run_limited(2, (work(number) for number in range(6))))
         self.assertEqual(begun, [0, 1])
         waiting[1].callback(None)
         self.assertEqual(begun, [0, 1, 2, 3, 4])
@@ -219,10 +217,10 @@ COUNT = 40
 class OverlapTests(FleetCase):
     def setUp(self) -> None:
         super().setUp()
-        self.whole: Fleet = self.fleet(3)
+        self.whole: EntangledTeam = self.fleet(3)
         for number in range(COUNT):
-            self.whole.nodes[0].put(hashed_key(str(number)), "state", b"%d" % number)
-            self.whole.nodes[0].put(hashed_key("0"), f"{number}", b"so that a part has several pages")
+            self.whole.nodes[0].put(hash_key(str(number)), "state", b"%d" % number)
+            self.whole.nodes[0].put(hash_key("0"), f"{number}", b"so that a part has several pages")
         self.whole.run(1.0)
 
     def ask(self, method: str, *arguments: object) -> Any:
@@ -235,7 +233,7 @@ class OverlapTests(FleetCase):
         while True:
             page = self.ask("places", group, found[-1][:3] if found else [])
             found += page
-            if len(page) < PLACES:
+            if len(page) < PAGE_RECORDS:
                 return found
 
     def test_every_place_is_listed_once(self) -> None:
@@ -245,24 +243,24 @@ class OverlapTests(FleetCase):
         for part in found:
             self.assertEqual(part, sorted(part))
             self.assertEqual(len(part), len({tuple(place[:3]) for place in part}))
-        self.assertEqual({place[0] for part in found for place in part}, {hashed_key(str(n)) for n in range(COUNT)})
+        self.assertEqual({place[0] for part in found for place in part}, {hash_key(str(n)) for n in range(COUNT)})
         self.assertEqual(self.places(-1), [])
 
     def test_who_pages_sees_one_moment(self) -> None:
         """Records stored after a digest request are listed after the next request, or when the list is old."""
-        late = hashed_key("late")
+        late = hash_key("late")
         group = late[0] * GROUPS >> 8
         self.ask("digests", 7, 2)
         self.whole.nodes[0].put(late, "state", b"x")
         self.whole.run(0.1)
         self.assertNotIn(late, [place[0] for place in self.places(group)])
-        self.whole.run(LISTED_S)
+        self.whole.run(SNAPSHOT_S)
         self.assertIn(late, [place[0] for place in self.places(group)])
 
     def test_records_come_in_pages(self) -> None:
         """A page contains records up to its size limit, at least one, and None for each missing record."""
         node = self.whole.nodes[0]
-        large = hashed_key("large")
+        large = hash_key("large")
         for name in "abc":
             node.put(large, name, b"x" * 9000)
         self.whole.run(1.0)
@@ -270,14 +268,14 @@ class OverlapTests(FleetCase):
         self.assertEqual([fields[0][1] for fields in self.ask("fetch", slots)], ["a"])
         missing: list[object] = [[large, node.identity.public, "z"]]
         self.assertEqual(self.ask("fetch", missing * 3), [None] * 3)
-        self.assertEqual(len(self.ask("fetch", [*missing * 20, *slots])), PLACES)
+        self.assertEqual(len(self.ask("fetch", [*missing * 20, *slots])), PAGE_RECORDS)
         self.assertEqual(self.ask("fetch", []), [])
 
     def test_wrong_questions(self) -> None:
         """Invalid groups, cursors and slots are rejected."""
         to, asker = self.whole.nodes[2].contact, self.whole.nodes[1].endpoint
         wrong: list[tuple[object, ...]] = [
-            ("digests", BITS, 2),
+            ("digests", SIGNATURE_BITS, 2),
             ("places", GROUPS, []),
             ("places", 0, [b"", b""]),
             ("fetch", [[b"", b""]]),
@@ -298,45 +296,45 @@ class JoinTests(FleetCase):
     def test_a_newcomer_reads_at_once(self) -> None:
         """In a team of 20 the first read of a new node needs few datagrams, for any bootstrap node."""
         fleet = self.fleet(20)
-        keys = [hashed_key(str(number)) for number in range(6)]
+        keys = [hash_key(str(number)) for number in range(6)]
         for key in keys:
             fleet.nodes[3].put(key, "state", b"old")
         fleet.run(2.0)
         for key in keys:
-            newcomer = fleet.made(len(fleet.nodes))
+            newcomer = fleet.make_node(len(fleet.nodes))
             fleet.nodes.append(newcomer)
             fleet.run(1.0)
-            before = fleet.board.counters["sent"]
-            joined: Any = fleet.enter(newcomer, [fleet.address(0)])
+            before = fleet.switchboard.counters["sent"]
+            joined: Any = fleet.start_node(newcomer, [fleet.address(0)])
             read = joined.addCallback(lambda _, newcomer=newcomer, key=key: newcomer.get(key, "fast"))
             fleet.run(0.002)
             self.assertEqual([record.value for record in self.successResultOf(read)], [b"old"])
-            self.assertLess(fleet.board.counters["sent"] - before, 60)
+            self.assertLess(fleet.switchboard.counters["sent"] - before, 60)
             fleet.run(3.0)
 
     def test_a_newcomer_takes_over(self) -> None:
         """Within a second a new node knows all members, is ``SURE`` and holds its records."""
         fleet = self.fleet(10)
-        keys = [hashed_key(str(number)) for number in range(60)]
+        keys = [hash_key(str(number)) for number in range(60)]
         for key in keys:
             fleet.nodes[3].put(key, "state", b"old")
         fleet.run(2.0)
         newcomer = fleet.add()
         fleet.run(1.0)
         self.assertTrue(newcomer.overlay.is_complete)
-        self.assertTrue(newcomer.replica.is_sure())
-        belongs = [key for key in keys if newcomer.overlay.belongs(key, newcomer.contact)]
+        self.assertTrue(newcomer.replica.is_synced())
+        belongs = [key for key in keys if newcomer.overlay.is_replica(key, newcomer.contact)]
         self.assertGreater(len(belongs), 20)
-        self.assertEqual([key for key in keys if newcomer.replica.held(key)], belongs)
+        self.assertEqual([key for key in keys if newcomer.replica.get_held(key)], belongs)
 
     def test_a_newcomer_writes_to_the_right_nodes(self) -> None:
         """A majority write directly after joining is found by a majority read at another node."""
         fleet = self.fleet(20)
         for number in range(6):
-            newcomer = fleet.made(len(fleet.nodes))
+            newcomer = fleet.make_node(len(fleet.nodes))
             fleet.nodes.append(newcomer)
-            key = hashed_key(f"new {number}")
-            stored: Any = fleet.enter(newcomer, [fleet.address(0)])
+            key = hash_key(f"new {number}")
+            stored: Any = fleet.start_node(newcomer, [fleet.address(0)])
             stored.addCallback(lambda _, newcomer=newcomer, key=key: newcomer.put(key, "state", b"new"))
             fleet.run(1.0)
             self.assertGreaterEqual(self.successResultOf(stored), 5)

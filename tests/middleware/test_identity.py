@@ -5,7 +5,7 @@ from __future__ import annotations
 from nacl import bindings
 from twisted.trial.unittest import SynchronousTestCase
 
-from middleware.entangled.identity import ID_BYTES, Identity, exchange_key, node_id, verified
+from middleware.entangled.identity import ID_BYTES, Identity, derive_exchange_key, derive_node_id, is_signature_valid
 
 DOG = Identity(b"\1" * 32)
 CAT = Identity(b"\2" * 32)
@@ -26,30 +26,30 @@ class IdentityTest(SynchronousTestCase):
 
     def test_id_follows_from_the_key(self) -> None:
         """The node id is the 160-bit hash of the public key; a node cannot choose it or use another node's id."""
-        self.assertEqual(DOG.node_id, node_id(DOG.public))
+        self.assertEqual(DOG.node_id, derive_node_id(DOG.public))
         self.assertEqual(len(DOG.node_id), ID_BYTES)
         self.assertNotEqual(DOG.node_id, CAT.node_id)
 
     def test_signatures(self) -> None:
         """A signature is valid for one message of one node; other input of any length is rejected."""
         signature = DOG.sign(b"sit")
-        self.assertTrue(verified(DOG.public, b"sit", signature))
-        self.assertFalse(verified(DOG.public, b"run", signature))
-        self.assertFalse(verified(CAT.public, b"sit", signature))
-        self.assertFalse(verified(DOG.public, b"sit", bytes(64)))
-        self.assertFalse(verified(DOG.public, b"sit", b""))
-        self.assertFalse(verified(b"short", b"sit", signature))
+        self.assertTrue(is_signature_valid(DOG.public, b"sit", signature))
+        self.assertFalse(is_signature_valid(DOG.public, b"run", signature))
+        self.assertFalse(is_signature_valid(CAT.public, b"sit", signature))
+        self.assertFalse(is_signature_valid(DOG.public, b"sit", bytes(64)))
+        self.assertFalse(is_signature_valid(DOG.public, b"sit", b""))
+        self.assertFalse(is_signature_valid(b"short", b"sit", signature))
 
     def test_both_ends_of_an_exchange_agree(self) -> None:
         """The exchange keys of two nodes yield the same shared secret at both nodes."""
-        here = bindings.crypto_scalarmult(DOG.exchange_secret, exchange_key(CAT.public))
-        there = bindings.crypto_scalarmult(CAT.exchange_secret, exchange_key(DOG.public))
+        here = bindings.crypto_scalarmult(DOG.exchange_secret, derive_exchange_key(CAT.public))
+        there = bindings.crypto_scalarmult(CAT.exchange_secret, derive_exchange_key(DOG.public))
         self.assertEqual(here, there)
 
     def test_no_key(self) -> None:
         """``exchange_key`` raises ``ValueError`` for bytes that are not a valid public key."""
         for public in (b"", bytes(32), b"\xff" * 32, b"\1" * 31):
-            self.assertRaises(ValueError, exchange_key, public)
+            self.assertRaises(ValueError, derive_exchange_key, public)
 
     def test_secrets_are_not_shown(self) -> None:
         """The ``repr`` of an identity, which may be logged, contains neither the seed nor the secrets."""

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from twisted.trial.unittest import SynchronousTestCase
 
-from sim.team.files import DiskFleet
+from sim.team.reduction import Reduction
 from sim.team.schedule import Schedule
-from sim.team.shrink import Trim
+from sim.team.sqlite_files import SqliteTeam
 from tests.invariants.bug import FINDERS, seeded
 from tests.invariants.leases import Leases
 from tests.invariants.records import Records
@@ -29,12 +29,12 @@ DIGEST = "from tests.middleware.test_invariants import digests; print(digests())
 
 def digests() -> list[str]:
     """Return the digests of all datagrams and events of one run of every workload, of tasks and of leases."""
-    schedule, tasks, leases = Schedule(1, DiskFleet), Tasks(3), Leases(3)
+    schedule, tasks, leases = Schedule(1, SqliteTeam), Tasks(3), Leases(3)
     schedule.run([workload(schedule) for workload in WORKLOADS.values()])
     tasks.run()
     leases.run()
-    histories = [schedule.history, tasks.history, leases.referee.history]
-    return [schedule.fleet.board.digest(), *(history.digest() for history in histories)]
+    histories = [schedule.history, tasks.history, leases.recorder.history]
+    return [schedule.team.switchboard.digest(), *(history.digest() for history in histories)]
 
 
 class InvariantTests(SynchronousTestCase):
@@ -95,7 +95,7 @@ class InvariantTests(SynchronousTestCase):
         self.assertEqual(run(SHRUNK, (), bug, left.trim), left.outcome)
         self.assertTrue(any(violation.startswith("T4: ") for violation in left.outcome.found))
         for number in left.trim.keep:
-            fewer = Trim(tuple(one for one in left.trim.keep if one != number), only=("tuples",))
+            fewer = Reduction(tuple(one for one in left.trim.keep if one != number), only=("tuples",))
             self.assertFalse(any(violation.startswith("T4: ") for violation in run(SHRUNK, (), bug, fewer).found))
         self.assertIn(
             f"--seed {SHRUNK} --only tuples --keep {','.join(map(str, left.trim.keep))} --calm", line(SHRUNK, left.trim)

@@ -11,18 +11,26 @@ from twisted.trial.unittest import SynchronousTestCase
 
 from middleware.entangled.contact import Contact
 from middleware.entangled.identity import ID_BYTES
-from middleware.entangled.kademlia import membership, overlay, roster
-from middleware.entangled.kademlia.distance import closest
-from middleware.entangled.kademlia.membership import LARGE_FOR
-from middleware.entangled.kademlia.overlay import MOST_HEDGE, K
-from middleware.entangled.kademlia.sounding import FIRST, GONE, LEAST, MOST, NEAR_SILENCE, SESSION_S, Pace
+from middleware.entangled.kademlia import member_table, membership, overlay
+from middleware.entangled.kademlia.distance import select_closest
+from middleware.entangled.kademlia.liveness_probe import (
+    INITIAL_SILENCE_S,
+    MAX_SILENCE_S,
+    MIN_SILENCE_S,
+    NEIGHBOUR_SILENCE_S,
+    SESSION_S,
+    TARGET_FAILURES,
+    ProbeInterval,
+)
+from middleware.entangled.kademlia.membership import LARGE_REPORT_S
+from middleware.entangled.kademlia.overlay import MAX_HEDGE_S, K
 from middleware.entangled.network.network import Address
-from middleware.entangled.network.switchboard import CALM, SwitchboardNetwork, Weather
+from middleware.entangled.network.switchboard import PERFECT, LinkConditions, SwitchboardNetwork
 from middleware.entangled.node import EntangledNode
-from middleware.entangled.record import Record, hashed_key
-from middleware.entangled.wire.congestion import FIRST_GUESS
+from middleware.entangled.record import Record, hash_key
+from middleware.entangled.wire.congestion import INITIAL_TIMEOUT_S
 from middleware.entangled.wire.session import INIT
-from tests.fleet import Fleet, FleetCase
+from tests.fleet import EntangledTeam, FleetCase
 
 MANY = 12
 
@@ -30,10 +38,10 @@ MANY = 12
 class LargeTests(FleetCase):
     def setUp(self) -> None:
         super().setUp()
-        for module in (membership, overlay, roster):
+        for module in (membership, overlay, member_table):
             self.patch(module, "MAX_MEMBERS", MANY)
 
-    def large(self, n: int = 24, weather: Weather = CALM) -> Fleet:
+    def large(self, n: int = 24, weather: LinkConditions = PERFECT) -> EntangledTeam:
         fleet = self.fleet(n, seed=3, weather=weather)
         fleet.run(20.0)
         self.assertTrue(all(node.overlay.is_large for node in fleet.nodes))
@@ -42,7 +50,7 @@ class LargeTests(FleetCase):
     def pings(self, node: EntangledNode) -> Counter[bytes]:
         """Return a counter of the later pings of a node by target."""
         asked: Counter[bytes] = Counter()
-        ask, greet = node.overlay.ask, node.endpoint.greet
+        ask, greet = node.overlay.ask, node.endpoint.discover
 
         def counted(contact: Contact, method: str, *arguments: object, **how: Any) -> Any:
             asked[contact.node_id] += method == "ping"
@@ -53,58 +61,58 @@ class LargeTests(FleetCase):
             return greet(address, *arguments)
 
         self.patch(node.overlay, "ask", counted)
-        self.patch(node.endpoint, "greet", greeted)
+        self.patch(node.endpoint, "discover", greeted)
         return asked
 
     def far(self, node: EntangledNode) -> Contact:
         """Return a contact of the node that is not one of its neighbours."""
-        near = node.overlay.neighbours()
+        near = node.overlay.find_neighbours()
         return next(c for c in reversed(node.overlay.contacts()) if c not in near)
 
-    def found(self, fleet: Fleet, node: EntangledNode, target: bytes) -> list[Contact]:
+    def found(self, fleet: EntangledTeam, node: EntangledNode, target: bytes) -> list[Contact]:
         """Return the contacts that a node finds closest to an id."""
         return self.done(fleet, node.find_node(target), 2.0)
 
     def test_a_lookup_finds_who_let_go_of_the_session(self) -> None:
         """Lookups over slow paths are exact, also if some nodes have closed sessions that their peers still have."""
-        fleet = self.large(weather=Weather(0.08))
+        fleet = self.large(weather=LinkConditions(0.08))
         node, target = fleet.nodes[0], self.far(fleet.nodes[0]).node_id
         others = [other.contact for other in fleet.nodes[1:]]
-        self.assertEqual(self.found(fleet, node, target), closest(others, target, K))
-        self.patch(node.endpoint, "let_go", lambda seconds: None)  # prevents the periodic cleanup by this node
+        self.assertEqual(self.found(fleet, node, target), select_closest(others, target, K))
+        self.patch(node.endpoint, "forget_silent", lambda seconds: None)  # prevents the periodic cleanup by this node
         fleet.run(SESSION_S)
         for other in fleet.nodes[1:]:
-            other.endpoint.let_go(SESSION_S)
-        self.assertEqual(self.found(fleet, node, target), closest(others, target, K))
+            other.endpoint.forget_silent(SESSION_S)
+        self.assertEqual(self.found(fleet, node, target), select_closest(others, target, K))
 
-    def far_from(self, fleet: Fleet, key: bytes) -> tuple[EntangledNode, EntangledNode]:
+    def far_from(self, fleet: EntangledTeam, key: bytes) -> tuple[EntangledNode, EntangledNode]:
         """Return the node farthest from a key, with no holder as a contact, and the contact that it queries first."""
-        order = closest([node.contact for node in fleet.nodes], key, len(fleet.nodes))
+        order = select_closest([node.contact for node in fleet.nodes], key, len(fleet.nodes))
         reader, first = (fleet.nodes[contact.address.port - 7000] for contact in (order[-1], order[K]))
         for contact in order[:K]:
             reader.overlay.table.remove(contact)
-            reader.overlay.roster.left(contact.node_id)
-        self.assertEqual(reader.overlay.nearest(key)[0], first.contact)
+            reader.overlay.members.remove(contact.node_id)
+        self.assertEqual(reader.overlay.find_nearest(key)[0], first.contact)
         return reader, first
 
     def test_a_fast_read_goes_past_who_wrote(self) -> None:
         """A fast read of a key with many writers is complete although the first queried node has one old record."""
         fleet = self.large()
-        key = hashed_key("all write here")
+        key = hash_key("all write here")
         for node in fleet.nodes:
             self.done(fleet, node.put(key, "x", b"here", "leased", lease=30.0))
         reader, first = self.far_from(fleet, key)
-        own = Record(key, "x", first.identity.public, 1, "leased", 30.0, b"here").signed(first.identity)
-        first.replica.keep(own)  # from a time when the node was one of the closest
+        own = Record(key, "x", first.identity.public, 1, "leased", 30.0, b"here").sign(first.identity)
+        first.replica.store_locally(own)  # from a time when the node was one of the closest
         self.assertEqual(len(self.done(fleet, reader.get(key, "fast"))), len(fleet.nodes))
 
     def test_a_fast_read_takes_what_is_left(self) -> None:
         """A fast read returns a record that only a node outside the k closest still has."""
         fleet = self.large()
-        key = hashed_key("left behind")
+        key = hash_key("left behind")
         reader, first = self.far_from(fleet, key)
-        record = Record(key, "x", first.identity.public, 1, "team", 60.0, b"old").signed(first.identity)
-        first.replica.keep(record)
+        record = Record(key, "x", first.identity.public, 1, "team", 60.0, b"old").sign(first.identity)
+        first.replica.store_locally(record)
         self.assertEqual(self.done(fleet, reader.get(key, "fast")), [record])
 
     def test_many_lookups_that_meet_the_same_strangers(self) -> None:
@@ -113,36 +121,36 @@ class LargeTests(FleetCase):
         node, dice = fleet.nodes[0], random.Random(4)
         others = [other.contact for other in fleet.nodes[1:]]
         for other in others[::3]:  # a request has time for one such round trip, not for two
-            fleet.board.set_weather(node.contact.address, other.address, Weather(0.13))
+            fleet.switchboard.set_conditions(node.contact.address, other.address, LinkConditions(0.13))
         for each in fleet.nodes:
-            each.endpoint.let_go(0.0)
+            each.endpoint.forget_silent(0.0)
         targets = [dice.randbytes(ID_BYTES) for _ in range(12)]
         looked = [Deferred.fromCoroutine(node.overlay.lookup(target)) for target in targets]
         fleet.run(5.0)
         for target, one in zip(targets, looked, strict=True):
-            self.assertEqual(self.successResultOf(one), closest(others, target, K))
+            self.assertEqual(self.successResultOf(one), select_closest(others, target, K))
 
     def test_neighbours_are_asked_often_and_others_rarely(self) -> None:
         """Neighbours are pinged at least about every twelve seconds, other contacts rarely."""
         fleet = self.large()
         node = fleet.nodes[0]
-        near = {contact.node_id for contact in node.overlay.neighbours()}
+        near = {contact.node_id for contact in node.overlay.find_neighbours()}
         asked = self.pings(node)
-        fleet.run(FIRST / 2)
+        fleet.run(INITIAL_SILENCE_S / 2)
         self.assertGreater(sum(asked[node_id] for node_id in near), K)
         self.assertEqual(sum(asked.values()), sum(asked[node_id] for node_id in near))
-        silent = max(node.overlay.silence(contact) for contact in node.overlay.neighbours())
-        self.assertLess(silent, NEAR_SILENCE + 1.5)
+        silent = max(node.overlay.silence(contact) for contact in node.overlay.find_neighbours())
+        self.assertLess(silent, NEIGHBOUR_SILENCE_S + 1.5)
         asked.clear()
-        fleet.run(5 * FIRST)
+        fleet.run(5 * INITIAL_SILENCE_S)
         far = [contact.node_id for contact in node.overlay.contacts() if contact.node_id not in near]
         self.assertTrue(far and all(asked[node_id] <= 5 for node_id in far), asked)
         self.assertGreater(sum(asked[node_id] for node_id in far), 0)
         self.assertFalse(any(each.overlay.is_complete for each in fleet.nodes))  # the contacts are not the team
         routed = self.far(node)
-        node._membership.sounding.needs_use = lambda contact: contact == routed
+        node._membership.prober.needs_keep_alive = lambda contact: contact == routed
         asked.clear()
-        fleet.run(FIRST)
+        fleet.run(INITIAL_SILENCE_S)
         self.assertGreater(asked[routed.node_id], 1)  # a path through a NAT stays open only while it is used
 
     def test_the_dead_cost_no_handshakes(self) -> None:
@@ -150,7 +158,7 @@ class LargeTests(FleetCase):
         fleet = self.large()
         node = fleet.nodes[0]
         far = self.far(node)
-        next(other for other in fleet.nodes if other.contact == far).vanish()
+        next(other for other in fleet.nodes if other.contact == far).stop_silently()
         knocked: list[Address] = []
         send = SwitchboardNetwork.send
 
@@ -159,7 +167,7 @@ class LargeTests(FleetCase):
             send(network, datagram, to)
 
         self.patch(SwitchboardNetwork, "send", sent)
-        fleet.run(4 * FIRST)
+        fleet.run(4 * INITIAL_SILENCE_S)
         self.assertNotIn(far.node_id, [contact.node_id for contact in node.overlay.contacts()])
         self.assertNotIn(far.address, knocked)
 
@@ -167,31 +175,31 @@ class LargeTests(FleetCase):
         """A node that hears no other node keeps its contacts, because it counts as disconnected."""
         fleet = self.large()
         before = len(fleet.nodes[5].overlay.contacts())
-        fleet.nodes[5]._membership.sounding.pace.wait = 1.0
-        fleet.board.partition([fleet.address(5)])
+        fleet.nodes[5]._membership.prober.interval.silence_s = 1.0
+        fleet.switchboard.partition([fleet.address(5)])
         fleet.run(6.0)
         self.assertGreater(len(fleet.nodes[5].overlay.contacts()), before - K)
-        fleet.board.heal()
+        fleet.switchboard.heal()
         fleet.run(20.0)
         target = fleet.nodes[7].identity.node_id
         others = [other.contact for other in fleet.nodes if other is not fleet.nodes[5]]
-        self.assertEqual(self.found(fleet, fleet.nodes[5], target), closest(others, target, K))
+        self.assertEqual(self.found(fleet, fleet.nodes[5], target), select_closest(others, target, K))
 
     def test_silent_sessions_are_let_go_and_come_back(self) -> None:
         """A session without traffic for a long time is closed; the next request opens a new one and is answered."""
         fleet = self.large()
         node = fleet.nodes[0]
-        fleet.run(FIRST)
+        fleet.run(INITIAL_SILENCE_S)
         far = self.far(node)
-        node._membership.sounding.pace.wait = 10 * SESSION_S
+        node._membership.prober.interval.silence_s = 10 * SESSION_S
         other = next(other for other in fleet.nodes if other.contact == far)
-        other._membership.sounding.pace.wait = 10 * SESSION_S
+        other._membership.prober.interval.silence_s = 10 * SESSION_S
         fleet.run(SESSION_S + 60.0)
-        self.assertFalse(node.endpoint.is_met(far))
+        self.assertFalse(node.endpoint.has_session(far))
         self.assertIn(far, node.overlay.contacts())
-        self.assertTrue(node.endpoint.is_met(node.overlay.neighbours()[0]))
+        self.assertTrue(node.endpoint.has_session(node.overlay.find_neighbours()[0]))
         self.done(fleet, node.call(far, "ping", b"", changes=True), 1.0)
-        self.assertTrue(node.endpoint.is_met(far))
+        self.assertTrue(node.endpoint.has_session(far))
 
     def test_a_stranger_without_a_place_is_let_be(self) -> None:
         """A node does not ping a stranger that would find no place in the routing table."""
@@ -199,11 +207,11 @@ class LargeTests(FleetCase):
         node = fleet.nodes[0]
         asked = self.pings(node)
         stranger = Contact(bytes([9]) * 32, Address("10.0.0.9", 9))
-        self.patch(node.overlay.table, "has_place", lambda node_id: False)
-        node.overlay.heard(stranger)
+        self.patch(node.overlay.table, "has_room", lambda node_id: False)
+        node.overlay.process_message(stranger)
         self.assertNotIn(stranger.node_id, asked)
-        self.patch(node.overlay.table, "has_place", lambda node_id: True)
-        node.overlay.heard(stranger)
+        self.patch(node.overlay.table, "has_room", lambda node_id: True)
+        node.overlay.process_message(stranger)
         self.assertIn(stranger.node_id, asked)
 
     def test_a_newcomer_says_what_it_was_told(self) -> None:
@@ -216,11 +224,11 @@ class LargeTests(FleetCase):
         node._membership._large_until = fleet.clock.seconds() + 7.5
         self.assertEqual(answer(fleet.nodes[0].contact, b""), 7)
 
-        newcomer = fleet.made(30)
+        newcomer = fleet.make_node(30)
         fleet.nodes.append(newcomer)
-        fleet.enter(newcomer, [fleet.address(2)])
+        fleet.start_node(newcomer, [fleet.address(2)])
         fleet.run(0.01)
-        self.assertEqual((newcomer.overlay.is_large, newcomer.overlay.is_placed), (True, False))
+        self.assertEqual((newcomer.overlay.is_large, newcomer.overlay.has_found_neighbours), (True, False))
 
     def test_who_failed_a_lookup_is_asked_at_once(self) -> None:
         """A far contact that failed in a lookup is excluded, and included again as soon as it answers."""
@@ -228,11 +236,11 @@ class LargeTests(FleetCase):
         node = fleet.nodes[0]
         far = self.far(node)
         for bucket in node.overlay.table._buckets:
-            bucket.waiting.clear()  # otherwise a waiting contact would replace it
-        node.overlay.missed(far)
+            bucket.replacements.clear()  # otherwise a waiting contact would replace it
+        node.overlay.record_miss(far)
         self.assertNotIn(far, node.overlay.table.closest(far.node_id))
         fleet.run(3.0)
-        self.assertFalse(node.overlay.is_doubted(far))
+        self.assertFalse(node.overlay.is_suspect(far))
         self.assertIn(far, node.overlay.table.closest(far.node_id))
 
     def test_strangers_are_given_the_time_that_others_take(self) -> None:
@@ -240,25 +248,25 @@ class LargeTests(FleetCase):
         fleet = self.large()
         node, stranger = fleet.nodes[0], Contact(fleet.identity(99).public, Address("10.0.0.9", 9))
         for _ in range(9):
-            node.endpoint.peers.usual.measured(0.3)
-        self.assertGreaterEqual(node.endpoint.peers.peer(stranger).round_trip.wait, 0.3)
-        self.assertGreaterEqual(node.overlay.hedge(), MOST_HEDGE)
-        self.assertGreater(node.overlay.patience_of_lookups or 0.0, 0.6)
-        node.overlay.shrank()
+            node.endpoint.peers.overall_round_trip.add_sample(0.3)
+        self.assertGreaterEqual(node.endpoint.peers.get_or_create(stranger).round_trip.timeout, 0.3)
+        self.assertGreaterEqual(node.overlay.hedge_delay(), MAX_HEDGE_S)
+        self.assertGreater(node.overlay.lookup_timeout or 0.0, 0.6)
+        node.overlay.leave_large_mode()
         other = Contact(fleet.identity(98).public, Address("10.0.0.9", 8))
-        self.assertEqual(node.endpoint.peers.peer(other).round_trip.wait, FIRST_GUESS)
-        self.assertIsNone(node.overlay.patience_of_lookups)
+        self.assertEqual(node.endpoint.peers.get_or_create(other).round_trip.timeout, INITIAL_TIMEOUT_S)
+        self.assertIsNone(node.overlay.lookup_timeout)
 
     def test_a_network_that_shrank_is_known_whole_again(self) -> None:
         """Two minutes after the network shrank below the limit, each node starts to learn all members."""
         fleet = self.large(16)
         for place in range(8, 16):
             fleet.nodes[place].stop()
-        fleet.run(2 * LARGE_FOR)
+        fleet.run(2 * LARGE_REPORT_S)
         self.assertFalse(any(node.overlay.is_complete for node in fleet.nodes[:8]))
-        fleet.run(2 * LARGE_FOR)
+        fleet.run(2 * LARGE_REPORT_S)
         self.assertTrue(all(node.overlay.is_complete for node in fleet.nodes[:8]))
-        self.assertEqual({len(node.overlay.roster) for node in fleet.nodes[:8]}, {7})
+        self.assertEqual({len(node.overlay.members) for node in fleet.nodes[:8]}, {7})
 
     def test_values_are_kept(self) -> None:
         """After a quarter of the nodes failed, a stored record is readable and held by the new closest nodes."""
@@ -266,12 +274,12 @@ class LargeTests(FleetCase):
         key = fleet.nodes[2].identity.node_id
         self.assertGreaterEqual(self.done(fleet, fleet.nodes[1].put(key, "a", b"1"), 2.0), 5)
         for place in (4, 8, 12, 16, 20, 23):
-            fleet.nodes[place].vanish()
+            fleet.nodes[place].stop_silently()
         fleet.run(60.0)
         [record] = self.done(fleet, fleet.nodes[6].get(key), 3.0)
         self.assertEqual(record.value, b"1")
         live = [n for n in fleet.nodes if n._running]
-        holders = closest([node.contact for node in live], key, K)
+        holders = select_closest([node.contact for node in live], key, K)
         held = sum(bool(n.store.get(key)) for n in live if n.contact in holders)
         self.assertGreaterEqual(held, K - 1)
         self.assertIsInstance(fleet.nodes[6].find_node(key), Deferred)
@@ -279,17 +287,17 @@ class LargeTests(FleetCase):
 
 class PaceTests(SynchronousTestCase):
     def setUp(self) -> None:
-        self.pace = Pace()
+        self.pace = ProbeInterval()
 
     def test_within_bounds(self) -> None:
         """Without failures the ping interval grows up to its maximum, with only failures it falls to its minimum."""
-        self.assertEqual(self.pace.wait, FIRST)
+        self.assertEqual(self.pace.silence_s, INITIAL_SILENCE_S)
         for _ in range(100):
-            self.pace.answered()
-        self.assertEqual(self.pace.wait, MOST)
+            self.pace.record_answer()
+        self.assertEqual(self.pace.silence_s, MAX_SILENCE_S)
         for _ in range(100):
-            self.pace.lost()
-        self.assertEqual(self.pace.wait, LEAST)
+            self.pace.record_loss()
+        self.assertEqual(self.pace.silence_s, MIN_SILENCE_S)
 
     def test_it_follows_what_is_seen(self) -> None:
         """For usual session lengths the interval adapts until about one in twenty pinged contacts is gone."""
@@ -297,10 +305,10 @@ class PaceTests(SynchronousTestCase):
         for stay in (600.0, 1500.0, 4000.0):
             gone = asked = 0
             for _ in range(20_000):
-                if dice.random() < 1 - 2.718 ** (-self.pace.wait / stay):
-                    self.pace.lost()
+                if dice.random() < 1 - 2.718 ** (-self.pace.silence_s / stay):
+                    self.pace.record_loss()
                     gone += 1
                 else:
-                    self.pace.answered()
+                    self.pace.record_answer()
                 asked += 1
-            self.assertApproximates(gone / asked, GONE, 0.02)
+            self.assertApproximates(gone / asked, TARGET_FAILURES, 0.02)

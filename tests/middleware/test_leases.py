@@ -2,18 +2,18 @@
 
 from __future__ import annotations
 
-from middleware.entangled.record import hashed_key
-from tests.fleet import Fleet, FleetCase
+from middleware.entangled.record import hash_key
+from tests.fleet import EntangledTeam, FleetCase
 
-KEY = hashed_key("leases")
-OTHER = hashed_key("others")
+KEY = hash_key("leases")
+OTHER = hash_key("others")
 
 
 class LeaseTests(FleetCase):
-    def names(self, fleet: Fleet, key: bytes = KEY, place: int = 0) -> list[str]:
+    def names(self, fleet: EntangledTeam, key: bytes = KEY, place: int = 0) -> list[str]:
         return [record.name for record in fleet.nodes[place].store.get(key, tombstones=True)]
 
-    def told(self, fleet: Fleet, place: int, seconds: float) -> list[float]:
+    def told(self, fleet: EntangledTeam, place: int, seconds: float) -> list[float]:
         """Return the TTLs of the renewals that the node at ``place`` receives in this time."""
         told: list[float] = []
         replica = fleet.nodes[place].replica
@@ -34,8 +34,8 @@ class LeaseTests(FleetCase):
         fleet.nodes[1].put(KEY, "long", b"x", "leased", lease=12.0)
         fleet.run(30.0)
         self.assertEqual(sorted(self.names(fleet)), ["long", "short"])
-        fleet.nodes[1].vanish()
-        fleet.nodes[2].vanish()
+        fleet.nodes[1].stop_silently()
+        fleet.nodes[2].stop_silently()
         fleet.run(1.2)
         self.assertEqual(self.names(fleet), ["long"])
         fleet.run(6.7)
@@ -66,10 +66,13 @@ class LeaseTests(FleetCase):
         fleet = self.fleet(10)
         fleet.run(3.0)
         owner = fleet.nodes[1]
-        others = (hashed_key(f"other {n}") for n in range(100))
-        places = [n for n in range(10) if n != 1 and owner.overlay.belongs(KEY, fleet.nodes[n].contact)]
+        others = (hash_key(f"other {n}") for n in range(100))
+        places = [n for n in range(10) if n != 1 and owner.overlay.is_replica(KEY, fleet.nodes[n].contact)]
         key, place = next(
-            (other, n) for other in others for n in places if not owner.overlay.belongs(other, fleet.nodes[n].contact)
+            (other, n)
+            for other in others
+            for n in places
+            if not owner.overlay.is_replica(other, fleet.nodes[n].contact)
         )
         owner.put(KEY, "long", b"x", "leased", lease=60.0)
         owner.put(key, "short", b"x", "leased")

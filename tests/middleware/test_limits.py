@@ -11,21 +11,37 @@ from typing import Any
 
 from middleware.entangled.identity import Identity
 from middleware.entangled.kademlia import overlay
-from middleware.entangled.reach import acquaintance, carrier, introducer, known, outside, upgrade, way
-from middleware.entangled.record import Record, hashed_key
-from middleware.entangled.replication import overlap, replica
-from middleware.entangled.wire import answerer, door, method, peer
+from middleware.entangled.nat import (
+    external_address,
+    introducer,
+    introducer_selector,
+    known_peers,
+    path_tracker,
+    relay_client,
+    upgrade,
+)
+from middleware.entangled.record import Record, hash_key
+from middleware.entangled.replication import comparison, replica
+from middleware.entangled.wire import admission_check, dispatcher, method, peer
 from middleware.entangled.wire.endpoint import Endpoint
-from tests.fleet import TEAM, FleetCase
+from tests.fleet import TEAM_KEY, FleetCase
 
 PAGE = Path(__file__).resolve().parents[2] / "docs" / "reference" / "limits.md"
 ROW = re.compile(r"([\d]+)[^`\d]*`([\w/]+\.py)::([A-Z_]+)`")
 SMALL = 24
 CROWD = 60
 PATCHED = (
-    *((answerer, "MAX_ASKING"), (method, "MAX_ACCOUNTS"), (overlay, "MAX_HEARD"), (overlap, "MAX_ASKED")),
-    *((replica, "MAX_DOUBTFUL"), (known, "MAX_PEERS"), (door, "MAX_LIVES"), (peer, "MAX_PEERS")),
-    *((module, "MAX_KNOWN") for module in (acquaintance, carrier, introducer, outside, upgrade, way)),
+    *((dispatcher, "MAX_REQUESTERS"), (method, "MAX_REQUESTERS"), (overlay, "MAX_RECORDED"), (comparison, "MAX_PEERS")),
+    *(
+        (replica, "MAX_MISMATCHED"),
+        (known_peers, "MAX_PEERS"),
+        (admission_check, "MAX_IDENTITIES"),
+        (peer, "MAX_PEERS"),
+    ),
+    *(
+        (module, "MAX_KNOWN")
+        for module in (introducer_selector, relay_client, introducer, external_address, upgrade, path_tracker)
+    ),
 )
 
 # These tables have separate limits, larger than ``CROWD``.
@@ -53,7 +69,7 @@ class CrowdTests(FleetCase):
             self.patch(module, name, SMALL)
         team = self.swarm(1)
         node = team.nodes[0]
-        _ = node.entangled.seat, node.councils, node.dissemination
+        _ = node.entangled.take_acceptor, node.council_manager, node.auction_service
         for number in range(CROWD):
             self.visit(team, node, number)
         team.run(5.0)
@@ -70,15 +86,15 @@ class CrowdTests(FleetCase):
     def visit(self, team: Any, node: Any, number: int) -> None:
         """Send each type of request once from an invented identity, then stop it."""
         own = Identity(random.Random(f"crowd {number}").randbytes(32))
-        network = team.board.network(f"10.9.{number}.1", 7)
-        crowd = Endpoint(own, TEAM, network, team.clock, random.Random(number))
+        network = team.switchboard.network(f"10.9.{number}.1", 7)
+        crowd = Endpoint(own, TEAM_KEY, network, team.clock, random.Random(number))
         crowd.start()
         crowd.expose("ping", lambda peer, digest: bytes(8), changes=True)
-        key = hashed_key(f"{number}")
-        record = Record(key, "x", own.public, 1, "leased", 60.0, b"v").signed(own)
+        key = hash_key(f"{number}")
+        record = Record(key, "x", own.public, 1, "leased", 60.0, b"v").sign(own)
         questions: tuple[tuple[Any, ...], ...] = (
             ("ping", bytes(8)),
-            ("store", [record.packed()]),
+            ("store", [record.pack()]),
             ("watch", key, bytes(8)),
             ("alive", 60.0, bytes(8)),
             ("digests", 3, 1),

@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from twisted.trial.unittest import SynchronousTestCase
 
 from middleware.entangled.errors import Malformed
-from middleware.entangled.wire.message import Answer, Cancel, Failure, Message, Question, Told, decoded, encoded
+from middleware.entangled.wire.message import Answer, Cancel, Failure, Message, Notification, Request, decode, encode
 
 _PLAIN = (
     st.none() | st.booleans() | st.integers(-(2**63), 2**64 - 1) | st.floats(allow_nan=False) | st.text(max_size=20)
@@ -30,14 +30,14 @@ def by_the_table(kind: object, fields: list[Any]) -> Message | None:
         case [0, int(id_), int(behind), str(method), list(arguments), int(left)]:
             numbers = not any(isinstance(number, bool) for number in (id_, behind, left))
             if numbers and 0 <= behind <= id_ < 2**64 and 0 <= left < 2**32 and 0 < len(method) <= 64:
-                return Question(id_, method, tuple(arguments), left, behind)
+                return Request(id_, method, tuple(arguments), left, behind)
         case [1, int(id_), value] if not isinstance(id_, bool) and 0 <= id_ < 2**64:
             return Answer(id_, value)
         case [2, int(id_), str(code), str(text)] if not isinstance(id_, bool) and 0 <= id_ < 2**64:
             if 0 < len(code) <= 64 and code.isascii() and code.isprintable() and len(text) <= 300:
                 return Failure(id_, code, text)
         case [3, str(method), list(arguments)] if 0 < len(method) <= 64:
-            return Told(method, tuple(arguments))
+            return Notification(method, tuple(arguments))
         case [4, int(id_)] if not isinstance(id_, bool) and 0 <= id_ < 2**64:
             return Cancel(id_)
     return None
@@ -57,14 +57,14 @@ class MessageTests(SynchronousTestCase):
     def test_round_trip(self, number: int, value: Any) -> None:
         """Every kind of message survives encoding and decoding."""
         messages: list[Message] = [
-            Question(number, "find", (value, 1)),
-            Question(number, "find", (value, 1), 5, number // 2),
+            Request(number, "find", (value, 1)),
+            Request(number, "find", (value, 1), 5, number // 2),
             Answer(number, value),
             Failure(number, "odd", "no"),
-            Told("say", (value,)),
+            Notification("say", (value,)),
         ]
         for message in messages:
-            self.assertEqual(decoded(encoded(message)), message)
+            self.assertEqual(decode(encode(message)), message)
 
     @settings(max_examples=400)
     @given(
@@ -78,7 +78,7 @@ class MessageTests(SynchronousTestCase):
     def test_decoded_reads_as_the_table_says(self, kind: Any, fields: list[Any]) -> None:
         """``decoded`` accepts exactly the messages of the table in ``docs/reference/wire-protocol.md``."""
         try:
-            found: Message | None = decoded(msgpack.packb([kind, *fields]))
+            found: Message | None = decode(msgpack.packb([kind, *fields]))
         except Malformed:
             found = None
         self.assertEqual(found, by_the_table(kind, fields))
@@ -103,17 +103,17 @@ class MessageTests(SynchronousTestCase):
             [1, 1, {1: 2}],
         ]
         for shape in shapes:
-            self.assertRaises(Malformed, decoded, msgpack.packb(shape))
+            self.assertRaises(Malformed, decode, msgpack.packb(shape))
         for data in [
             b"",
             b"\xdd\xff\xff\xff\xff",
             b"\x93\x01\x01\xa1\xff",
             b"\x91" * 1400,
-            encoded(Answer(1, 2)) + b"\0",
+            encode(Answer(1, 2)) + b"\0",
         ]:
-            self.assertRaises(Malformed, decoded, data)
+            self.assertRaises(Malformed, decode, data)
 
     def test_encoded_refuses_what_cannot_be_packed(self) -> None:
         """``encoded`` raises ``TypeError`` for an object and ``OverflowError`` for a number beyond 64 bits."""
-        self.assertRaises(TypeError, encoded, Answer(1, object()))
-        self.assertRaises(OverflowError, encoded, Answer(1, 2**64))
+        self.assertRaises(TypeError, encode, Answer(1, object()))
+        self.assertRaises(OverflowError, encode, Answer(1, 2**64))

@@ -10,10 +10,10 @@ from twisted.trial.unittest import SynchronousTestCase
 from middleware.entangled.contact import Contact
 from middleware.entangled.errors import NoAnswer, Refused
 from middleware.entangled.network.network import Address
-from middleware.entangled.network.switchboard import Weather
+from middleware.entangled.network.switchboard import LinkConditions
 from middleware.entangled.wire import method
-from middleware.entangled.wire.message import Question, encoded
-from middleware.entangled.wire.method import KEPT_S, MAX_LIVES, BadArguments, Ledger, Method
+from middleware.entangled.wire.message import Request, encode
+from middleware.entangled.wire.method import KEEP_ANSWER_S, MAX_INCARNATIONS, BadArguments, Method, RequestHistory
 from tests.middleware.test_endpoint import DELAY, EndpointCase
 
 ANN, BOB = b"a" * 32, b"b" * 32
@@ -51,13 +51,13 @@ class LedgerTests(SynchronousTestCase):
 
     def setUp(self) -> None:
         """Create an empty ledger."""
-        self.ledger = Ledger()
+        self.ledger = RequestHistory()
 
     def run_one(self, public: bytes, number: int, oldest: int, now: float) -> None:
         """Begin and end a request at once."""
-        self.ledger.settle(public, oldest, now)
+        self.ledger.forget_before(public, oldest, now)
         self.assertIsNotNone(self.ledger.begin(public, number, None, now, False))
-        self.ledger.end(public, number, b"done", now)
+        self.ledger.finish(public, number, b"done", now)
 
     def test_what_the_asker_has_is_forgotten(self) -> None:
         """Finished requests older than the caller's oldest open one are removed at once; later ones stay."""
@@ -65,24 +65,24 @@ class LedgerTests(SynchronousTestCase):
             self.run_one(ANN, number, 0, 1.0)
         self.run_one(BOB, 3, 3, 1.0)
         self.run_one(ANN, 10, 7, 1.0)
-        self.assertEqual([n for n in range(12) if self.ledger.entry(ANN, n)], [7, 8, 9, 10])
+        self.assertEqual([n for n in range(12) if self.ledger.get(ANN, n)], [7, 8, 9, 10])
         self.assertEqual([n for n in range(12) if self.ledger.is_settled(ANN, n)], [0, 1, 2, 3, 4, 5, 6])
-        self.assertIsNotNone(self.ledger.entry(BOB, 3))
+        self.assertIsNotNone(self.ledger.get(BOB, 3))
         self.assertEqual(len(self.ledger), 5)
 
     def test_word_that_was_overtaken(self) -> None:
         """A late message with a lower number of the oldest open request does not reopen settled requests."""
-        self.ledger.settle(ANN, 7, 1.0)
-        self.ledger.settle(ANN, 4, 1.0)
+        self.ledger.forget_before(ANN, 7, 1.0)
+        self.ledger.forget_before(ANN, 4, 1.0)
         self.assertTrue(self.ledger.is_settled(ANN, 5))
 
     def test_runs_on_though_given_up(self) -> None:
         """A running request that its caller gave up is removed when it ends."""
         self.ledger.begin(ANN, 1, None, 1.0, False)
-        self.ledger.settle(ANN, 5, 1.0)
-        self.assertIsNotNone(self.ledger.entry(ANN, 1))
-        self.ledger.end(ANN, 1, b"late", 2.0)
-        self.assertEqual((self.ledger.entry(ANN, 1), len(self.ledger)), (None, 0))
+        self.ledger.forget_before(ANN, 5, 1.0)
+        self.assertIsNotNone(self.ledger.get(ANN, 1))
+        self.ledger.finish(ANN, 1, b"late", 2.0)
+        self.assertEqual((self.ledger.get(ANN, 1), len(self.ledger)), (None, 0))
 
     def test_another_life(self) -> None:
         """A restarted caller may use lower request numbers; its earlier settled requests stay settled."""
@@ -90,14 +90,14 @@ class LedgerTests(SynchronousTestCase):
         self.run_one(ANN, 2 * LIFE + 1, 2 * LIFE, 2.0)
         self.assertFalse(self.ledger.is_settled(ANN, 2 * LIFE + 1))
         self.assertTrue(self.ledger.is_settled(ANN, 9 * LIFE + 4))
-        self.assertIsNotNone(self.ledger.entry(ANN, 9 * LIFE + 5))
+        self.assertIsNotNone(self.ledger.get(ANN, 9 * LIFE + 5))
 
     def test_lives_are_bounded(self) -> None:
         """The ledger remembers a bounded number of restarts per caller."""
         for life in range(100):
-            self.ledger.settle(ANN, life * LIFE + 7, 1.0)
+            self.ledger.forget_before(ANN, life * LIFE + 7, 1.0)
         known = [life for life in range(100) if self.ledger.is_settled(ANN, life * LIFE)]
-        self.assertEqual(known, list(range(100 - MAX_LIVES, 100)))
+        self.assertEqual(known, list(range(100 - MAX_INCARNATIONS, 100)))
 
     def test_nothing_is_kept_for_ever(self) -> None:
         """Entries of silent peers are removed step by step with each request, except those with running requests."""
@@ -106,9 +106,9 @@ class LedgerTests(SynchronousTestCase):
             self.run_one(rng.randbytes(32), 1, 1, 1.0)
         self.ledger.begin(BOB, 1, None, 1.0, False)
         for number in range(120):
-            self.run_one(ANN, number, number, 2.0 + KEPT_S)
-        self.assertEqual((len(self.ledger), len(self.ledger._accounts)), (2, 2))
-        self.assertIsNotNone(self.ledger.entry(BOB, 1))
+            self.run_one(ANN, number, number, 2.0 + KEEP_ANSWER_S)
+        self.assertEqual((len(self.ledger), len(self.ledger._peers)), (2, 2))
+        self.assertIsNotNone(self.ledger.get(BOB, 1))
 
 
 class OnceTests(EndpointCase):
@@ -134,33 +134,33 @@ class OnceTests(EndpointCase):
     def test_honest_traffic_is_never_busy(self) -> None:
         """Thousands of changes within seconds are all answered, and the ledger stays small."""
         self.patch(method, "MAX_PER_PEER", 100)
-        self.board.weather = Weather(DELAY / 4)
+        self.board.conditions = LinkConditions(DELAY / 4)
         self.assertEqual(self.flood("add", 3000), 3000)
         self.assertEqual(self.b.counters["busy"], 0)
-        self.assertLess(len(self.b._answerer._ledger), 20)
+        self.assertLess(len(self.b._dispatcher._history), 20)
         self.assertEqual(sorted(self.runs), list(range(3000)))
 
     def test_what_may_run_again_is_not_kept(self) -> None:
         """An idempotent change needs no ledger entry, and may run again after a retransmission."""
-        self.board.weather = Weather(DELAY / 4, loss=0.3)
+        self.board.conditions = LinkConditions(DELAY / 4, loss=0.3)
         answered = self.flood("note", 500)
         self.assertGreater(answered, 450)
-        self.assertEqual(len(self.b._answerer._ledger), 0)
+        self.assertEqual(len(self.b._dispatcher._history), 0)
         self.assertGreater(len(self.runs), len(set(self.runs)))
-        self.assertFalse(any(self.a._asker._inquiries))
+        self.assertFalse(any(self.a._requester._requests))
 
     def test_a_question_that_was_given_up_does_not_run(self) -> None:
         """A retransmitted change that arrives after its caller has the reply is dropped."""
         self.assertEqual([self.got(self.a.ask(self.to_b, "add", n, changes=True)) for n in (1, 2)], [1, 2])
-        session = self.a._peers.known(self.to_b.public).session  # type: ignore[union-attr]
+        session = self.a._peers.get(self.to_b.public).session  # type: ignore[union-attr]
         assert session is not None
-        first = self.a._asker._next_number - 2
-        self.a._send(session, encoded(Question(first, "add", (1,))))
+        first = self.a._requester._next_number - 2
+        self.a._send(session, encode(Request(first, "add", (1,))))
         self.clock.advance(1)
         self.assertEqual((self.runs, self.b.counters["late"]), ([1, 2], 1))
 
     def test_in_rough_weather_still_once(self) -> None:
         """Under loss, duplication and reordering no change runs twice."""
-        self.board.weather = Weather(DELAY, DELAY, loss=0.2, duplicate=0.3, reorder=0.4)
+        self.board.conditions = LinkConditions(DELAY, DELAY, loss=0.2, duplicate=0.3, reorder=0.4)
         self.assertGreater(self.flood("add", 800), 700)
         self.assertEqual(len(self.runs), len(set(self.runs)))

@@ -9,22 +9,22 @@ import msgpack
 
 from middleware.entangled.contact import Contact
 from middleware.entangled.errors import NoAnswer, NotRunning, Refused, TooLarge
-from middleware.entangled.kademlia.distance import closest
+from middleware.entangled.kademlia.distance import select_closest
 from middleware.entangled.kademlia.overlay import K
-from middleware.entangled.network.switchboard import Weather
-from middleware.entangled.node import CONTACTS, EntangledNode
-from middleware.entangled.record import MAX_NAME, MAX_VALUE, Record, hashed_key
-from middleware.entangled.replication.replica import SWEEP
-from tests.fleet import Fleet, FleetCase
+from middleware.entangled.network.switchboard import LinkConditions
+from middleware.entangled.node import CONTACTS_NOTE, EntangledNode
+from middleware.entangled.record import MAX_NAME_BYTES, MAX_VALUE_BYTES, Record, hash_key
+from middleware.entangled.replication.replica import SWEEP_INTERVAL_S
+from tests.fleet import EntangledTeam, FleetCase
 
-KEY = hashed_key("devices")
-ROUGH = Weather(delay_s=0.01, jitter_s=0.01, loss=0.3, duplicate=0.05, reorder=0.1)
+KEY = hash_key("devices")
+ROUGH = LinkConditions(delay_s=0.01, jitter_s=0.01, loss=0.3, duplicate=0.05, reorder=0.1)
 
 
 class NodeCase(FleetCase):
     """Helpers of these tests."""
 
-    def values(self, fleet: Fleet, place: int, key: bytes = KEY, within: float = 3.0) -> list[bytes | None]:
+    def values(self, fleet: EntangledTeam, place: int, key: bytes = KEY, within: float = 3.0) -> list[bytes | None]:
         return [record.value for record in self.done(fleet, fleet.nodes[place].get(key), within)]
 
     def watched(self, node: EntangledNode, **options: Any) -> list[list[bytes | None]]:
@@ -62,8 +62,8 @@ class VerbTests(NodeCase):
         """An invalid record raises at once, and a stopped node raises ``NotRunning``."""
         fleet = self.fleet(1)
         node = fleet.nodes[0]
-        self.assertRaises(TooLarge, node.put, KEY, "state", bytes(MAX_VALUE + 1))
-        self.assertRaises(TooLarge, node.put, KEY, "ä" * MAX_NAME, b"")
+        self.assertRaises(TooLarge, node.put, KEY, "state", bytes(MAX_VALUE_BYTES + 1))
+        self.assertRaises(TooLarge, node.put, KEY, "ä" * MAX_NAME_BYTES, b"")
         for call in (lambda: node.put(b"x", "s", b""), lambda: node.get(b"x"), lambda: node.watch(b"x", print)):
             self.assertRaises(ValueError, call)
         node.stop()
@@ -77,8 +77,8 @@ class VerbTests(NodeCase):
         """Records of maximum size with the longest names are read in pages, together with many small ones."""
         fleet = self.fleet(2)
         for place in range(12):
-            name = f"{place:02}" + "ä" * (MAX_NAME // 2 - 1)
-            fleet.nodes[0].put(KEY, name, bytes([place]) * (MAX_VALUE if place < 3 else 1))
+            name = f"{place:02}" + "ä" * (MAX_NAME_BYTES // 2 - 1)
+            fleet.nodes[0].put(KEY, name, bytes([place]) * (MAX_VALUE_BYTES if place < 3 else 1))
         fleet.run(1.0)
         self.assertEqual(len(self.values(fleet, 1)), 12)
 
@@ -88,7 +88,7 @@ class VerbTests(NodeCase):
             fleet = self.fleet(3, seed=writes)
             for number in range(writes):
                 self.done(fleet, fleet.nodes[2].put(KEY, "state", b"old %d" % number))
-            fleet.nodes[2].vanish()
+            fleet.nodes[2].stop_silently()
             fleet.stores.pop(2)
             node = fleet.restart(2)
             fleet.run(1.0)
@@ -108,10 +108,10 @@ class LeaseTests(NodeCase):
         told = self.watched(fleet.nodes[1])
         fleet.run(2.5)
         self.assertEqual(told, [[b"here"]])
-        fleet.nodes[3].vanish()
+        fleet.nodes[3].stop_silently()
         fleet.run(0.6)
         self.assertEqual(told, [[b"here"]])
-        fleet.run(1.0 - 0.6 + 2 * SWEEP)
+        fleet.run(1.0 - 0.6 + 2 * SWEEP_INTERVAL_S)
         self.assertEqual(told, [[b"here"], []])
         self.assertEqual(self.values(fleet, 0), [])
 
@@ -123,8 +123,8 @@ class LeaseTests(NodeCase):
         told = self.watched(fleet.nodes[0])
         fleet.run(5.0)
         for node in fleet.nodes[2:]:
-            node.vanish()
-        fleet.run(1.0 + 2 * SWEEP)
+            node.stop_silently()
+        fleet.run(1.0 + 2 * SWEEP_INTERVAL_S)
         self.assertEqual(told[-1], [])
 
     def test_goodbye(self) -> None:
@@ -152,9 +152,9 @@ class LeaseTests(NodeCase):
     def test_replica_lets_go_of_what_it_holds_in_vain(self) -> None:
         """A replica removes a leased record that its owner no longer knows within a few renewals."""
         fleet = self.fleet(3)
-        old = Record(KEY, "old", fleet.nodes[2].identity.public, 1, "leased", 1.0, b"old").signed(fleet.identity(2))
+        old = Record(KEY, "old", fleet.nodes[2].identity.public, 1, "leased", 1.0, b"old").sign(fleet.identity(2))
         fleet.nodes[2].put(KEY, "state", b"here", "leased")
-        fleet.nodes[0].replica.keep(old)
+        fleet.nodes[0].replica.store_locally(old)
         fleet.run(3.0)
         self.assertEqual([r.value for r in fleet.stores[0].get(KEY)], [b"here"])
 
@@ -165,9 +165,9 @@ class LeaseTests(NodeCase):
         told = self.watched(fleet.nodes[0])
         fleet.run(2.0)
         for seconds, expected in ((0.5, [[b"here"]]), (3.0, [[b"here"], []])):
-            fleet.board.partition([fleet.address(2)])
+            fleet.switchboard.partition([fleet.address(2)])
             fleet.run(seconds)
-            fleet.board.heal()
+            fleet.switchboard.heal()
             self.assertEqual(told, expected)
             fleet.run(5.0)
         self.assertEqual(told, [[b"here"], [], [b"here"]])
@@ -181,10 +181,10 @@ class TeamRecordTests(NodeCase):
         self.done(fleet, fleet.nodes[0].put(KEY, "gone", b"no"))
         self.done(fleet, fleet.nodes[0].remove(KEY, "gone"))
         for place in range(3):
-            fleet.nodes.append(fleet.made(3 + place))
-            fleet.enter(fleet.nodes[-1], [fleet.address(place)])
+            fleet.nodes.append(fleet.make_node(3 + place))
+            fleet.start_node(fleet.nodes[-1], [fleet.address(place)])
             fleet.run(2.0)
-            fleet.nodes[place].vanish()
+            fleet.nodes[place].stop_silently()
             fleet.run(40.0)  # until the other nodes remove it from the roster
         self.assertEqual(self.values(fleet, 5), [b"do it"])
         self.assertEqual(len(fleet.stores[5].get(KEY, tombstones=True)), 2)
@@ -229,17 +229,17 @@ class WatchTests(NodeCase):
         told = self.watched(fleet.nodes[2])
         fleet.run(0.5)
         pusher, target = fleet.nodes[0].endpoint, fleet.nodes[2].contact
-        genuine = Record(KEY, "x", fleet.nodes[0].identity.public, 9, "team", 1.0, b"x").signed(fleet.identity(0))
+        genuine = Record(KEY, "x", fleet.nodes[0].identity.public, 9, "team", 1.0, b"x").sign(fleet.identity(0))
         forged = Record(KEY, "x", fleet.nodes[1].identity.public, 9, "team", 1.0, b"x", bytes(64))
         bad: list[list[list[Any]]] = [
-            [[forged.packed()], []],
+            [[forged.pack()], []],
             [[5, None, []], [5, [], [1, 2], [[], "x"], [b"", "x", 1]]],
         ]
         for records, gone in bad:
             self.done(fleet, pusher.ask(target, "push", KEY, 1, records, gone, changes=True), 0.5)
         self.assertEqual(told, [])
-        fleet.nodes[2]._subscriber._watches[0].asked.clear()
-        self.done(fleet, pusher.ask(target, "push", KEY, 1, [genuine.packed()], [], changes=True), 0.01)
+        fleet.nodes[2]._subscriber._watches[0].requested.clear()
+        self.done(fleet, pusher.ask(target, "push", KEY, 1, [genuine.pack()], [], changes=True), 0.01)
         self.assertEqual(told, [])
 
     def test_rough_weather(self) -> None:
@@ -263,7 +263,7 @@ class WatchTests(NodeCase):
                 fleet.run(0.1)
             for told in tellings:
                 self.assertEqual(sorted(told[-1], key=repr), sorted(everybody, key=repr), seed)
-            fleet.nodes[1].vanish()
+            fleet.nodes[1].stop_silently()
             fleet.run(8.0)
             others = [told for place, told in enumerate(tellings) if place != 1]
             for told in others:
@@ -327,8 +327,8 @@ class KeepTests(NodeCase):
         self.dog.put(KEY, "state", b"there", "leased")
         self.world.run(0.5)
         self.assertEqual([r.value for r in store.get(KEY)], [b"there"])
-        self.dog.vanish()
-        self.world.run(1.0 + 3 * SWEEP)
+        self.dog.stop_silently()
+        self.world.run(1.0 + 3 * SWEEP_INTERVAL_S)
         self.assertEqual(store.get(KEY), [])
         self.order[0].put(KEY, "task", b"do it")
         self.world.run(1.0)
@@ -344,7 +344,7 @@ class KeepTests(NodeCase):
         self.assertEqual(len(self.page.store.get(KEY)), 1)
         asked = self.order[0].endpoint.ask(self.page.contact, "find_value", KEY, None)
         self.assertEqual(self.done(self.world, asked, 1.0)[:2], [[], None])
-        self.page.vanish()
+        self.page.stop_silently()
         self.assertEqual(self.page.store.get(KEY), [])
 
     def test_copy_that_comes_to_be_held(self) -> None:
@@ -353,9 +353,9 @@ class KeepTests(NodeCase):
         self.page.watch(KEY, lambda records: None, keep=True)
         self.world.run(3.0)
         record = self.page.store.get(KEY)[0]
-        self.assertTrue(self.page.replica.keep(record).is_stored)
-        self.assertEqual(self.page.replica.held(KEY), [record])
-        self.dog.vanish()
+        self.assertTrue(self.page.replica.store_locally(record).is_stored)
+        self.assertEqual(self.page.replica.get_held(KEY), [record])
+        self.dog.stop_silently()
         self.world.run(2.0)
         self.assertEqual(self.page.store.get(KEY), [])
 
@@ -363,22 +363,22 @@ class KeepTests(NodeCase):
 class LargeFleetTests(NodeCase):
     def test_more_nodes_than_replicas(self) -> None:
         """In a team of 20 all nodes find each value, and leased records expire only with their owners."""
-        fleet = self.fleet(20, seed=3, weather=Weather(delay_s=0.002))
+        fleet = self.fleet(20, seed=3, weather=LinkConditions(delay_s=0.002))
         for place in (0, 7, 13, 19):
             fleet.nodes[place].put(KEY, "state", bytes([place]), "leased")
-            fleet.nodes[place].put(hashed_key(f"task {place}"), "task", b"do it")
+            fleet.nodes[place].put(hash_key(f"task {place}"), "task", b"do it")
         told = self.watched(fleet.nodes[5])
         fleet.run(25.0)
         self.assertEqual(sorted(told[-1], key=repr), sorted((bytes([p]) for p in (0, 7, 13, 19)), key=repr))
         settled = len(told)
         fleet.run(25.0)
         self.assertEqual(len(told), settled, "the team flickers")
-        fleet.nodes[13].vanish()
-        fleet.run(1.0 + 3 * SWEEP)
+        fleet.nodes[13].stop_silently()
+        fleet.run(1.0 + 3 * SWEEP_INTERVAL_S)
         self.assertEqual(len(told[-1]), 3)
         for place in range(20):
             if place != 13:
-                self.assertEqual(self.values(fleet, place, hashed_key("task 13")), [b"do it"])
+                self.assertEqual(self.values(fleet, place, hash_key("task 13")), [b"do it"])
 
     def test_no_chatter_about_leases(self) -> None:
         """When all records are at their holders, no replica reports missing leases."""
@@ -386,7 +386,7 @@ class LargeFleetTests(NodeCase):
         complaints: list[str] = []
         for node in fleet.nodes:
             node.put(KEY, "state", b"here", "leased")
-            node.put(hashed_key(node.contact.address.__str__()), "own", b"here", "leased")
+            node.put(hash_key(node.contact.address.__str__()), "own", b"here", "leased")
         fleet.run(15.0)
         for node in fleet.nodes:
             node.endpoint.expose("missing", lambda peer, marks: complaints.append(str(peer.address)))
@@ -397,9 +397,9 @@ class LargeFleetTests(NodeCase):
         """When a holder leaves, the next closest node receives its records at once."""
         fleet = self.fleet(14, seed=7)
         self.done(fleet, fleet.nodes[13].put(KEY, "task", b"do it"))
-        fleet.nodes[13].vanish()
+        fleet.nodes[13].stop_silently()
         fleet.run(25.0)
-        order = closest([node.contact for node in fleet.nodes[:13]], KEY, 13)
+        order = select_closest([node.contact for node in fleet.nodes[:13]], KEY, 13)
         leaver, heir = (fleet.nodes[order[n].address.port - 7000] for n in (1, K))
         self.assertEqual(heir.store.get(KEY), [])
         leaver.stop()
@@ -415,7 +415,7 @@ class LargeFleetTests(NodeCase):
         for _ in range(10):
             fleet.add()
         fleet.run(5.0)
-        holders = {c.node_id for c in closest([node.contact for node in fleet.nodes], KEY, K)}
+        holders = {c.node_id for c in select_closest([node.contact for node in fleet.nodes], KEY, K)}
         replicas = set(fleet.nodes[0]._subscriber._watches[0].view.replicas())
         self.assertLessEqual(replicas - {fleet.nodes[0].identity.node_id}, holders)
         self.assertEqual(told, [[b"do it"]])
@@ -425,10 +425,10 @@ class JoinTests(NodeCase):
     def test_bootstrap_comes_later(self) -> None:
         """A node retries to join until its bootstrap node is available."""
         fleet = self.fleet(1)
-        fleet.nodes[0].vanish()
-        node = fleet.made(1)
+        fleet.nodes[0].stop_silently()
+        node = fleet.make_node(1)
         fleet.nodes.append(node)
-        joined = fleet.enter(node, [fleet.address(0)])
+        joined = fleet.start_node(node, [fleet.address(0)])
         fleet.run(20.0)
         self.assertNoResult(joined)
         fleet.restart(0)
@@ -439,17 +439,17 @@ class JoinTests(NodeCase):
     def test_known_to_oneself_only(self) -> None:
         """A bootstrap node with its own address as the known node is the first node of its network."""
         fleet = self.fleet(1)
-        node = fleet.made(1)
+        node = fleet.make_node(1)
         fleet.nodes.append(node)
-        self.done(fleet, fleet.enter(node, [fleet.address(1)]))
+        self.done(fleet, fleet.start_node(node, [fleet.address(1)]))
 
     def test_stopped_while_joining(self) -> None:
         """A node that stops while it joins leaves no state."""
         for seconds in (0.1, 3.0):
             fleet = self.fleet(1)
-            node = fleet.made(1)
+            node = fleet.make_node(1)
             fleet.nodes.append(node)
-            joined = fleet.enter(node, [fleet.address(9)])
+            joined = fleet.start_node(node, [fleet.address(9)])
             fleet.run(seconds)
             self.assertNoResult(joined)
             node.stop()
@@ -459,32 +459,32 @@ class JoinTests(NodeCase):
         """A restarted node rejoins through stored contacts if its bootstrap node is dead."""
         fleet = self.fleet(4)
         fleet.run(31.0)
-        fleet.nodes[3].vanish()
-        fleet.nodes[0].vanish()
+        fleet.nodes[3].stop_silently()
+        fleet.nodes[0].stop_silently()
         fleet.run(1.0)
         node = fleet.restart(3)
         fleet.run(3.0)
         self.assertEqual(
-            {c.address for c in node.overlay.table.contacts()} >= {fleet.address(1), fleet.address(2)}, True
+            {c.address for c in node.overlay.table.list_contacts()} >= {fleet.address(1), fleet.address(2)}, True
         )
 
     def test_first_node_does_not_wait_for_the_dead(self) -> None:
         """A bootstrap node with only dead stored contacts starts without them."""
         fleet = self.fleet(2)
         fleet.nodes[0].stop()
-        fleet.nodes[1].vanish()
-        fleet.nodes[0] = fleet.made(0)
-        self.done(fleet, fleet.enter(fleet.nodes[0], []), 4.0)
+        fleet.nodes[1].stop_silently()
+        fleet.nodes[0] = fleet.make_node(0)
+        self.done(fleet, fleet.start_node(fleet.nodes[0], []), 4.0)
 
     def test_rotten_memory(self) -> None:
         """A node starts with any stored contacts, including invalid ones."""
         for rotten in (b"", b"\xc1", msgpack.packb(5), msgpack.packb([5, [b"x", "y", 1]]), b"\x91" * 2000):
             fleet = self.fleet(1)
             fleet.nodes[0].stop()
-            fleet.stores[0].note(CONTACTS, rotten)
-            node = fleet.made(0)
+            fleet.stores[0].set_note(CONTACTS_NOTE, rotten)
+            node = fleet.make_node(0)
             fleet.nodes[0] = node
-            self.done(fleet, fleet.enter(node, []))
+            self.done(fleet, fleet.start_node(node, []))
 
 
 class WireTests(NodeCase):
@@ -495,7 +495,7 @@ class WireTests(NodeCase):
         fleet = self.fleet(3)
         self.done(fleet, fleet.nodes[0].put(KEY, "state", b"one"))
         rng = random.Random(5)
-        good = fleet.stores[0].get(KEY)[0].packed()
+        good = fleet.stores[0].get(KEY)[0].pack()
         pieces: list[Any] = [None, 5, -1.5, "x", b"x", KEY, [], [5], [[]], {}]
         pieces += [[good[:7]], [good, 5], [None, "x"], [1, 2]]
         before = [store.records() for store in fleet.stores.values()]
@@ -513,8 +513,8 @@ class WireTests(NodeCase):
         """If one of several records is invalid, none of them is stored."""
         fleet = self.fleet(2)
         owner = fleet.nodes[1].identity
-        genuine = Record(KEY, "y", owner.public, 9, "team", 60.0, b"y").signed(owner)
-        asked = fleet.nodes[1].endpoint.ask(fleet.nodes[0].contact, "store", [genuine.packed(), 5], changes=True)
+        genuine = Record(KEY, "y", owner.public, 9, "team", 60.0, b"y").sign(owner)
+        asked = fleet.nodes[1].endpoint.ask(fleet.nodes[0].contact, "store", [genuine.pack(), 5], changes=True)
         fleet.run(1.0)
         self.failureResultOf(asked, Refused)
         self.assertEqual(fleet.stores[0].get(KEY), [])

@@ -9,7 +9,7 @@ from typing import Any
 from twisted.trial.unittest import SynchronousTestCase
 
 from middleware.entangled.errors import Forged
-from middleware.entangled.wire.noise import Initiator, Responder, key_pair, opened, sealed
+from middleware.entangled.wire.noise import Initiator, Responder, make_key_pair, open_sealed, seal
 
 VECTORS = Path(__file__).with_name("vectors") / "noise.json"
 
@@ -19,13 +19,13 @@ def _sides(vector: dict[str, Any], psk: bytes | None) -> tuple[Initiator, Respon
         return bytes.fromhex(vector[name])
 
     initiator = Initiator(
-        key_pair(field("init_static")),
+        make_key_pair(field("init_static")),
         field("init_remote_static"),
         field("init_ephemeral"),
         field("init_prologue"),
         psk,
     )
-    responder = Responder(key_pair(field("resp_static")), field("resp_ephemeral"), field("resp_prologue"), psk)
+    responder = Responder(make_key_pair(field("resp_static")), field("resp_ephemeral"), field("resp_prologue"), psk)
     return initiator, responder
 
 
@@ -49,7 +49,9 @@ class NoiseTests(SynchronousTestCase):
             first = initiator.write(payloads[0])
             self.assertEqual(first, expected[0])
             payload, static = responder.read(first)
-            self.assertEqual((payload, static), (payloads[0], key_pair(bytes.fromhex(vector["init_static"])).public))
+            self.assertEqual(
+                (payload, static), (payloads[0], make_key_pair(bytes.fromhex(vector["init_static"])).public)
+            )
             second, theirs = responder.write(payloads[1])
             self.assertEqual(second, expected[1])
             payload, ours = initiator.read(second)
@@ -58,8 +60,8 @@ class NoiseTests(SynchronousTestCase):
             self.assertEqual((ours.sending, ours.receiving), (theirs.receiving, theirs.sending))
             for number, (payload, ciphertext) in enumerate(zip(payloads[2:], expected[2:], strict=True)):
                 key = ours.sending if number % 2 == 0 else theirs.sending
-                self.assertEqual(sealed(key, number // 2, payload, b""), ciphertext)
-                self.assertEqual(opened(key, number // 2, ciphertext, b""), payload)
+                self.assertEqual(seal(key, number // 2, payload, b""), ciphertext)
+                self.assertEqual(open_sealed(key, number // 2, ciphertext, b""), payload)
 
     def test_wrong_psk_opens_nothing(self) -> None:
         """A responder with another pre-shared key cannot decrypt the first payload."""

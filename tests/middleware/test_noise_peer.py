@@ -9,7 +9,15 @@ from noise.connection import Keypair, NoiseConnection
 from twisted.trial import util
 from twisted.trial.unittest import SynchronousTestCase
 
-from middleware.entangled.wire.noise import Initiator, KeyPair, Responder, TransportKeys, key_pair, opened, sealed
+from middleware.entangled.wire.noise import (
+    Initiator,
+    KeyPair,
+    Responder,
+    TransportKeys,
+    make_key_pair,
+    open_sealed,
+    seal,
+)
 
 RUNS = 100
 """Of each protocol in each role; also the seeds."""
@@ -22,7 +30,7 @@ class Run:
 
     def __init__(self, seed: int, has_psk: bool) -> None:
         rng = random.Random(seed)
-        self.statics = [key_pair(rng.randbytes(32)) for _ in range(2)]
+        self.statics = [make_key_pair(rng.randbytes(32)) for _ in range(2)]
         self.ephemerals = [rng.randbytes(32) for _ in range(2)]
         self.prologue = rng.randbytes(rng.randrange(40))
         self.psk = rng.randbytes(32) if has_psk else None
@@ -66,8 +74,8 @@ class DifferentialTests(SynchronousTestCase):
         """Check that both sides have the same handshake hash and decrypt each other's messages."""
         self.assertEqual(keys.handshake_hash, other.get_handshake_hash())
         for counter, payload in enumerate(run.payloads[2:]):
-            self.assertEqual(other.decrypt(sealed(keys.sending, counter, payload, b"")), payload)
-            self.assertEqual(opened(keys.receiving, counter, other.encrypt(payload), b""), payload)
+            self.assertEqual(other.decrypt(seal(keys.sending, counter, payload, b"")), payload)
+            self.assertEqual(open_sealed(keys.receiving, counter, other.encrypt(payload), b""), payload)
 
     def initiate(self, run: Run) -> None:
         """Run our initiator against the reference responder."""

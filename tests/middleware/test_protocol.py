@@ -13,7 +13,7 @@ from middleware.entangled.clock import HeapClock
 from middleware.entangled.contact import Contact
 from middleware.entangled.identity import Identity
 from middleware.entangled.network.network import Address
-from middleware.entangled.network.switchboard import Switchboard, Weather
+from middleware.entangled.network.switchboard import LinkConditions, Switchboard
 from middleware.entangled.wire.endpoint import Endpoint
 from middleware.entangled.wire.session import Session
 from tests.middleware.gate import Gate
@@ -51,13 +51,13 @@ class Doorway(Gate):
 
     def __init__(self, name: str, seed: int) -> None:
         super().__init__(seed, seed, f"pass of {name}".encode())
-        self.room = 16
+        self.max_pass_bytes = 16
 
 
 def exchange() -> dict[str, Any]:
     """Run ``alice`` and ``bob`` through a probe, a handshake and four calls, one of them under load."""
     clock = HeapClock()
-    board = Switchboard(clock, random.Random(0), Weather(0.01))
+    board = Switchboard(clock, random.Random(0), LinkConditions(0.01))
     team = bytes(range(32))
     said: list[dict[str, str]] = []
     plains: list[tuple[bytes, bytes]] = []
@@ -70,7 +70,7 @@ def exchange() -> dict[str, Any]:
 
     ends, dice = {}, {}
     for name, seed, port in (("alice", 0x11, 1), ("bob", 0x22, 2)):
-        network = board.network("10.0.0.1", port)
+        network = board.make_network("10.0.0.1", port)
         identity = Identity(bytes([seed]) * 32)
         send = network.send
 
@@ -88,10 +88,10 @@ def exchange() -> dict[str, Any]:
     bob.expose("add", lambda peer, one, two: one + two, changes=True)
     Session.seal = noted  # type: ignore[method-assign, assignment]
     try:
-        bob.echoer.wall = lambda: 1_700_000_000.0
-        alice.hail(to_bob.address)
+        bob.probe_responder.unix_time = lambda: 1_700_000_000.0
+        alice.probe(to_bob.address)
         clock.advance(1)
-        alice.greet(to_bob.address)
+        alice.discover(to_bob.address)
         clock.advance(1)
         bob._cookies._limit._tokens = -1000.0
         for method, arguments, changes in (("echo", (1,), False), ("add", (2, 3), True), ("echo", (LARGE,), False)):

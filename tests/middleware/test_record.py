@@ -11,14 +11,14 @@ from twisted.trial.unittest import SynchronousTestCase
 
 from middleware.entangled import record as records
 from middleware.entangled.record import (
-    MAX_NAME,
-    MAX_TTL,
-    MAX_VALUE,
+    MAX_NAME_BYTES,
+    MAX_TTL_S,
+    MAX_VALUE_BYTES,
     Record,
-    Signed,
-    hashed_key,
-    slot_unpacked,
-    unpacked,
+    SignatureCache,
+    hash_key,
+    parse_record,
+    parse_slot,
 )
 from tests.middleware.test_store import CAT, DOG, KEY, record
 
@@ -32,17 +32,17 @@ class RecordTest(SynchronousTestCase):
     def test_which_holds(self) -> None:
         """The higher sequence number wins; for equal numbers all replicas choose the same record."""
         one, other = record(value=b"1"), record(value=b"2")
-        self.assertTrue(record(sequence=2).beats(one))
-        self.assertFalse(one.beats(record(sequence=2)))
-        self.assertNotEqual(one.beats(other), other.beats(one))
-        self.assertFalse(one.beats(one))
-        self.assertTrue(one.beats(None))
+        self.assertTrue(record(sequence=2).supersedes(one))
+        self.assertFalse(one.supersedes(record(sequence=2)))
+        self.assertNotEqual(one.supersedes(other), other.supersedes(one))
+        self.assertFalse(one.supersedes(one))
+        self.assertTrue(one.supersedes(None))
 
     def test_signature_covers_all(self) -> None:
         """A record with any field changed after signing has no valid signature."""
         self.assertTrue(record().is_genuine())
         changes: list[dict[str, object]] = [
-            {"key": hashed_key("tasks")},
+            {"key": hash_key("tasks")},
             {"name": "else"},
             {"owner": CAT.public},
             {"sequence": 2},
@@ -58,7 +58,7 @@ class RecordTest(SynchronousTestCase):
 
     def test_good_signatures_are_remembered(self) -> None:
         """A valid signature is verified once; a changed record is verified separately."""
-        signed = Signed()
+        signed = SignatureCache()
         self.assertTrue(signed.is_genuine(record()))
         for change in ({"value": b"there"}, {"sequence": 2}, {"signature": bytes(64)}, {"owner": CAT.public}):
             self.assertFalse(signed.is_genuine(replace(record(), **change)), change)
@@ -68,8 +68,8 @@ class RecordTest(SynchronousTestCase):
 
     def test_remembered_signatures_are_bounded(self) -> None:
         """The cache of valid signatures is bounded and keeps the most recently used ones."""
-        self.patch(records, "MAX_SIGNED", 3)
-        signed = Signed()
+        self.patch(records, "MAX_CACHED", 3)
+        signed = SignatureCache()
         for sequence in (1, 2, 3, 1, 4):
             self.assertTrue(signed.is_genuine(record(sequence=sequence)))
         self.patch(records, "verified", lambda *_: False)
@@ -77,44 +77,44 @@ class RecordTest(SynchronousTestCase):
 
     def test_there_and_back(self) -> None:
         """A record survives packing and unpacking."""
-        for one in (record(), record(value=None, lifetime="leased"), record("", value=bytes(MAX_VALUE))):
-            self.assertEqual(unpacked(msgpack.unpackb(msgpack.packb(one.packed()))), one)
+        for one in (record(), record(value=None, lifetime="leased"), record("", value=bytes(MAX_VALUE_BYTES))):
+            self.assertEqual(parse_record(msgpack.unpackb(msgpack.packb(one.pack()))), one)
 
     def test_message_bytes(self) -> None:
         """``message_bytes`` is an upper bound of the packed size, by less than 40 bytes."""
         for one in (record(), record(value=None), record("ä" * 64, sequence=2**63 - 1), record(value=bytes(20_000))):
-            taken = len(msgpack.packb(one.packed()))
+            taken = len(msgpack.packb(one.pack()))
             self.assertTrue(taken <= one.message_bytes < taken + 40, (taken, one.message_bytes))
 
     def test_limits(self) -> None:
         """A field with a value out of range or of another type makes the record invalid."""
         bad: dict[int, list[object]] = {
             0: [KEY[:-1], KEY + b"\0", "key", None],
-            1: ["n" * (MAX_NAME + 1), b"name", None],
+            1: ["n" * (MAX_NAME_BYTES + 1), b"name", None],
             2: [DOG.public[:-1], DOG.public + b"\0", "owner"],
             3: [-1, 2**63, 1.0, True, None],
             4: ["forever", "", None, []],
-            5: [0.0, -1.0, MAX_TTL + 1.0, float("nan"), float("inf"), 60, None],
-            6: [bytes(MAX_VALUE + 1), "value", 1],
+            5: [0.0, -1.0, MAX_TTL_S + 1.0, float("nan"), float("inf"), 60, None],
+            6: [bytes(MAX_VALUE_BYTES + 1), "value", 1],
             7: [bytes(63), bytes(65), None, "s" * 64],
         }
         for place, values in bad.items():
             for value in values:
-                fields = record().packed()
+                fields = record().pack()
                 fields[place] = value
-                self.assertIsNone(unpacked(fields), (place, value))
-        others: list[object] = [record().packed()[:-1], [*record().packed(), 1], tuple(record().packed()), None, {}]
+                self.assertIsNone(parse_record(fields), (place, value))
+        others: list[object] = [record().pack()[:-1], [*record().pack(), 1], tuple(record().pack()), None, {}]
         for other in others:
-            self.assertIsNone(unpacked(other))
+            self.assertIsNone(parse_record(other))
 
     @given(ANYTHING | st.lists(ANYTHING, min_size=8, max_size=8))
     def test_total(self, fields: object) -> None:
         """Any input decodes to a record or None, without an exception."""
-        self.assertTrue(unpacked(fields) is None or isinstance(unpacked(fields), Record))
+        self.assertTrue(parse_record(fields) is None or isinstance(parse_record(fields), Record))
 
     def test_slots(self) -> None:
         """A slot survives packing as a list; anything but a list of key, owner and name is rejected."""
-        self.assertEqual(slot_unpacked(list(record().slot)), record().slot)
+        self.assertEqual(parse_slot(list(record().slot)), record().slot)
         wrong: list[object] = [
             [],
             [KEY, DOG.public],
@@ -124,9 +124,9 @@ class RecordTest(SynchronousTestCase):
             None,
         ]
         for fields in wrong:
-            self.assertIsNone(slot_unpacked(fields), fields)
+            self.assertIsNone(parse_slot(fields), fields)
 
     def test_keys_of_texts(self) -> None:
         """The key of a text has 160 bits, is the same on every node, and differs from the keys of other texts."""
-        self.assertEqual(hashed_key("devices").hex(), "880ce22f2953aafc3ac777bc4930bb783fb05bfa")
-        self.assertNotEqual(hashed_key("devices"), hashed_key("device"))
+        self.assertEqual(hash_key("devices").hex(), "880ce22f2953aafc3ac777bc4930bb783fb05bfa")
+        self.assertNotEqual(hash_key("devices"), hash_key("device"))

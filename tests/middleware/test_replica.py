@@ -18,15 +18,15 @@ from middleware.entangled.errors import Refused, Unwritable
 from middleware.entangled.identity import Identity
 from middleware.entangled.network.network import Address
 from middleware.entangled.network.switchboard import Switchboard
-from middleware.entangled.record import Lifetime, Record, hashed_key, unpacked
-from middleware.entangled.replication.pusher import WATCH_TTL
-from middleware.entangled.replication.replica import PAGE_BYTES, SURE, SWEEP, Replica, pages_of
+from middleware.entangled.record import Lifetime, Record, hash_key, parse_record
+from middleware.entangled.replication.pusher import WATCH_TTL_S
+from middleware.entangled.replication.replica import PAGE_BYTES, SWEEP_INTERVAL_S, SYNCED_REPLY, Replica, split_pages
 from middleware.entangled.replication.store_reply import MAX_SEQUENCE, Outcome, StoreReply, decode_reply
 from middleware.entangled.replication.watch import digest_of
 from middleware.entangled.wire.endpoint import Endpoint
 
 DOG, CAT, ME = (Identity(bytes([n]) * 32) for n in (1, 2, 3))
-KEY = hashed_key("devices")
+KEY = hash_key("devices")
 TEAM = b"t" * 32
 
 
@@ -37,15 +37,15 @@ def record(
     owner: Identity = DOG,
     lifetime: Lifetime = "team",
 ) -> Record:
-    return Record(KEY, name, owner.public, sequence, lifetime, 1.0, value).signed(owner)
+    return Record(KEY, name, owner.public, sequence, lifetime, 1.0, value).sign(owner)
 
 
 class Alone:
     """The overlay of a node that knows no other node."""
 
     is_responsible = staticmethod(lambda key: True)
-    nearest = staticmethod(lambda target: list[Contact]())
-    heard = left = staticmethod(lambda contact: None)
+    find_nearest = staticmethod(lambda target: list[Contact]())
+    process_message = remove = staticmethod(lambda contact: None)
 
 
 class ReplicaTests(SynchronousTestCase):
@@ -61,7 +61,7 @@ class ReplicaTests(SynchronousTestCase):
         self.told: list[tuple[object, ...]] = []
         self.replica.on_record.add(lambda r: self.told.append(("record", r.name)))
         self.replica.on_gone.add(lambda r: self.told.append(("gone", r.name)))
-        self.replica.on_silent.add(lambda owner: self.told.append(("silent", owner)))
+        self.replica.on_owner_expired.add(lambda owner: self.told.append(("silent", owner)))
         self.dog = Contact(DOG.public, Address("10.0.0.1", 2))
         self.cat = Contact(CAT.public, Address("10.0.0.1", 3))
         self.heard: list[tuple[object, ...]] = []
@@ -71,7 +71,7 @@ class ReplicaTests(SynchronousTestCase):
         self.owner.expose("missing", lambda peer, marks: self.heard.append(("missing", marks)))
 
     def opened(self, identity: Identity, port: int) -> Endpoint:
-        network = self.board.network("10.0.0.1", port)
+        network = self.board.make_network("10.0.0.1", port)
         endpoint = Endpoint(identity, TEAM, network, self.clock, random.Random(port))
         endpoint.start()
         return endpoint
@@ -82,7 +82,7 @@ class ReplicaTests(SynchronousTestCase):
             endpoint.stop()
 
     def stored(self, *records: Record, peer: Contact | None = None) -> list[int]:
-        answers = self.replica.answer_store(peer or self.dog, [r.packed() for r in records])
+        answers = self.replica.answer_store(peer or self.dog, [r.pack() for r in records])
         assert isinstance(answers, list)
         return answers
 
@@ -103,10 +103,10 @@ class ReplicaTests(SynchronousTestCase):
         self.assertFalse(self.replica.holds(record(sequence=4)))
         self.replica.cache.put(KEY, [record("cached")], 60.0, 0.0)
         self.assertFalse(self.replica.holds(record("cached")))
-        self.replica.keepsakes.keep(KEY, [record("kept")], 0.0)
-        self.assertIsNotNone(self.store.slot(record("kept").slot))
+        self.replica.watched_copies.replace(KEY, [record("kept")], 0.0)
+        self.assertIsNotNone(self.store.get_slot(record("kept").slot))
         self.assertFalse(self.replica.holds(record("kept")))
-        self.assertEqual([held.name for held in self.replica.held(KEY)], [record(sequence=5).name])
+        self.assertEqual([held.name for held in self.replica.get_held(KEY)], [record(sequence=5).name])
 
     def test_who_may_store(self) -> None:
         """A leased record is accepted from its owner only; a record from another node needs a valid signature."""
@@ -117,10 +117,10 @@ class ReplicaTests(SynchronousTestCase):
     def test_acknowledged_once_written(self) -> None:
         """A store request is answered after the record is written, and is rejected with the reason if that fails."""
         writing: list[Deferred[None]] = []
-        self.store.written = lambda: writing.append(Deferred()) or writing[-1]  # type: ignore[method-assign,func-returns-value]
+        self.store.wait_for_write = lambda: writing.append(Deferred()) or writing[-1]  # type: ignore[method-assign,func-returns-value]
         peer = Contact(ME.public, Address("10.0.0.1", 1))
         for name in ("a", "b"):
-            answer = self.owner.ask(peer, "store", [record(name).packed()], changes=True)
+            answer = self.owner.ask(peer, "store", [record(name).pack()], changes=True)
             self.clock.advance(0.01)
             self.assertNoResult(answer)
             self.assertEqual(len(self.store.get(KEY)), len(writing))
@@ -140,7 +140,7 @@ class ReplicaTests(SynchronousTestCase):
         self.replica.answer_alive(self.dog, 1.0, digest_of([record(lifetime="leased")]))
         self.clock.advance(0.3)
         self.assertEqual(self.told, [("record", "state"), ("record", "t"), ("gone", "t")])
-        self.clock.advance(0.7 + SWEEP)
+        self.clock.advance(0.7 + SWEEP_INTERVAL_S)
         self.assertEqual(self.told[3:], [("gone", "state"), ("silent", DOG.public)])
 
     def test_strange_leases(self) -> None:
@@ -198,20 +198,20 @@ class ReplicaTests(SynchronousTestCase):
             page = self.replica.answer_find_value(self.dog, KEY, page[1])
             pages += 1
         seen += page[0]
-        self.assertEqual([unpacked(fields) for fields in seen], records)
+        self.assertEqual([parse_record(fields) for fields in seen], records)
         self.assertGreaterEqual(pages, 2)
 
     def test_pages_are_full(self) -> None:
         """Each page is filled up to its size limit; an oversized record gets a separate page."""
         records = [record(f"{n}", value=b"v" * 1500) for n in range(30)]
-        pages = list(pages_of(records))
+        pages = list(split_pages(records))
         self.assertEqual([one for page in pages for one in page], records)
         self.assertGreater(len(pages), 3)
         self.assertEqual({len(page) for page in pages[:-1]}, {PAGE_BYTES // records[0].message_bytes})
         large = record("large", value=b"v" * (PAGE_BYTES + 1))
-        self.assertEqual([len(page) for page in pages_of([large, *records[:2], large, *records[:2]])], [1, 2, 1, 2])
-        self.assertEqual([len(page) for page in pages_of(records[:5], 2)], [2, 2, 1])
-        self.assertEqual(list(pages_of([])), [])
+        self.assertEqual([len(page) for page in split_pages([large, *records[:2], large, *records[:2]])], [1, 2, 1, 2])
+        self.assertEqual([len(page) for page in split_pages(records[:5], 2)], [2, 2, 1])
+        self.assertEqual(list(split_pages([])), [])
 
     def test_bad_cursors_and_keys(self) -> None:
         """An invalid cursor and a key of wrong length are rejected."""
@@ -220,20 +220,20 @@ class ReplicaTests(SynchronousTestCase):
             self.assertRaises(Refused, self.replica.answer_find_value, self.dog, KEY, after)
         self.assertRaises(Refused, self.replica.answer_find_value, self.dog, b"short")
         self.assertRaises(Refused, self.replica.answer_watch, self.dog, b"short", b"")
-        self.assertEqual(self.replica.answer_find_value(self.dog, KEY, [b"\xff" * 32, ""]), [[], None, SURE])
+        self.assertEqual(self.replica.answer_find_value(self.dog, KEY, [b"\xff" * 32, ""]), [[], None, SYNCED_REPLY])
 
     def test_watch(self) -> None:
         """A watcher with an old digest gets the first page, and then each change until its watch expires."""
         self.stored(record())
         page = self.replica.answer_watch(self.cat, KEY, b"")
-        self.assertEqual(page, [0, [[record().packed()], None]])
+        self.assertEqual(page, [0, [[record().pack()], None]])
         self.assertEqual(self.replica.answer_watch(self.cat, KEY, digest_of([record()])), [0, None])
         self.stored(record(sequence=2))
         self.clock.advance(0.5)
-        self.assertEqual(self.heard, [(KEY, 1, [record(sequence=2).packed()], [])])
+        self.assertEqual(self.heard, [(KEY, 1, [record(sequence=2).pack()], [])])
         self.clock.advance(0.6)
         self.assertEqual(self.heard[1:], [(KEY, 2, [], [[DOG.public, "state"]])])
-        self.clock.advance(2 * WATCH_TTL)
+        self.clock.advance(2 * WATCH_TTL_S)
         self.stored(record(sequence=3))
         self.clock.advance(0.5)
         self.assertEqual(len(self.heard), 2)

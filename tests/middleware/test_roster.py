@@ -6,8 +6,8 @@ from twisted.trial.unittest import SynchronousTestCase
 
 from middleware.entangled.contact import Contact
 from middleware.entangled.identity import Identity
-from middleware.entangled.kademlia.distance import closest
-from middleware.entangled.kademlia.roster import COUNTED_S, MAX_MEMBERS, STRUCK_S, Roster
+from middleware.entangled.kademlia.distance import select_closest
+from middleware.entangled.kademlia.member_table import ABSENT_WITH_MAJORITY_S, MAX_ABSENT_S, MAX_MEMBERS, MemberTable
 from middleware.entangled.network.network import Address
 
 ME = Contact(Identity(bytes(32)).public, Address("10.0.0.1", 1))
@@ -20,65 +20,65 @@ def contact(number: int) -> Contact:
 
 class RosterTests(SynchronousTestCase):
     def setUp(self) -> None:
-        self.roster = Roster(ME.node_id)
+        self.roster = MemberTable(ME.node_id)
 
     def fill(self, count: int) -> None:
         for number in range(1, 1 + count):
-            self.assertTrue(self.roster.heard(contact(number), 0.0))
+            self.assertTrue(self.roster.mark_alive(contact(number), 0.0))
 
     def test_closest_with_oneself(self) -> None:
         """The closest members include the node itself and are sorted by distance."""
         self.fill(6)
         everybody = [ME, *map(contact, range(1, 7))]
         for key in (ME.node_id, contact(3).node_id):
-            self.assertEqual(self.roster.closest(key, 4, ME), closest(everybody, key, 4))
+            self.assertEqual(self.roster.closest(key, 4, ME), select_closest(everybody, key, 4))
 
     def test_coming_and_going(self) -> None:
         """A lost member is absent until it is heard, a member that left is removed; the digest covers the members."""
         self.fill(3)
         before = self.roster.digest()
-        self.assertTrue(self.roster.lost(contact(2).node_id, 1.0))
-        self.assertFalse(self.roster.lost(contact(2).node_id, 1.0))
-        self.assertEqual(self.roster.absent(), [contact(2)])
+        self.assertTrue(self.roster.mark_absent(contact(2).node_id, 1.0))
+        self.assertFalse(self.roster.mark_absent(contact(2).node_id, 1.0))
+        self.assertEqual(self.roster.list_absent(), [contact(2)])
         self.assertNotEqual(self.roster.digest(), before)
-        self.assertTrue(self.roster.heard(contact(2), 2.0))
-        self.assertFalse(self.roster.heard(contact(2), 3.0))
+        self.assertTrue(self.roster.mark_alive(contact(2), 2.0))
+        self.assertFalse(self.roster.mark_alive(contact(2), 3.0))
         self.assertEqual(self.roster.digest(), before)
-        self.roster.left(contact(2).node_id)
-        self.assertEqual((len(self.roster), self.roster.absent()), (2, []))
+        self.roster.remove(contact(2).node_id)
+        self.assertEqual((len(self.roster), self.roster.list_absent()), (2, []))
 
     def test_a_majority_strikes_soon(self) -> None:
         """Absent members are removed early if a majority is in touch, and in a minority only after ``COUNTED_S``."""
-        for lost, wait in ((2, STRUCK_S), (3, COUNTED_S)):
-            self.roster = Roster(ME.node_id)
+        for lost, wait in ((2, ABSENT_WITH_MAJORITY_S), (3, MAX_ABSENT_S)):
+            self.roster = MemberTable(ME.node_id)
             self.fill(4)
             for number in range(1, 1 + lost):
-                self.roster.lost(contact(number).node_id, 10.0)
-            self.assertEqual(self.roster.strike(10.0 + wait), [])
-            self.assertEqual(len(self.roster.strike(10.1 + wait)), lost)
-            self.assertEqual(self.roster.absent(), [])
+                self.roster.mark_absent(contact(number).node_id, 10.0)
+            self.assertEqual(self.roster.remove_expired(10.0 + wait), [])
+            self.assertEqual(len(self.roster.remove_expired(10.1 + wait)), lost)
+            self.assertEqual(self.roster.list_absent(), [])
 
     def test_in_touch(self) -> None:
         """A node is in touch if it recently heard a majority of all members, including the absent ones."""
-        self.assertTrue(self.roster.in_touch(0.0, 10.0))
+        self.assertTrue(self.roster.is_majority_alive(0.0, 10.0))
         self.fill(4)
-        self.assertTrue(self.roster.in_touch(10.0, 10.0))
-        self.assertFalse(self.roster.in_touch(11.0, 10.0))
+        self.assertTrue(self.roster.is_majority_alive(10.0, 10.0))
+        self.assertFalse(self.roster.is_majority_alive(11.0, 10.0))
         for number in (1, 2):
-            self.roster.heard(contact(number), 11.0)
-        self.assertTrue(self.roster.in_touch(11.0, 10.0))
+            self.roster.mark_alive(contact(number), 11.0)
+        self.assertTrue(self.roster.is_majority_alive(11.0, 10.0))
 
     def test_full(self) -> None:
         """A full roster accepts a new member only if it can remove an absent one."""
         self.fill(MAX_MEMBERS)
         self.assertTrue(self.roster.is_full)
-        self.assertFalse(self.roster.heard(contact(1000), 0.0))
-        self.roster.lost(contact(1).node_id, 0.0)
-        self.assertTrue(self.roster.heard(contact(1000), 0.0))
-        self.assertEqual(self.roster.absent(), [])
+        self.assertFalse(self.roster.mark_alive(contact(1000), 0.0))
+        self.roster.mark_absent(contact(1).node_id, 0.0)
+        self.assertTrue(self.roster.mark_alive(contact(1000), 0.0))
+        self.assertEqual(self.roster.list_absent(), [])
 
     def test_remembered(self) -> None:
         """A member restored from an earlier run counts as absent until it is heard."""
-        self.roster.remembered(contact(1), 0.0)
-        self.assertEqual((len(self.roster), self.roster.absent()), (0, [contact(1)]))
-        self.assertFalse(self.roster.in_touch(0.0, 10.0))
+        self.roster.add_absent(contact(1), 0.0)
+        self.assertEqual((len(self.roster), self.roster.list_absent()), (0, [contact(1)]))
+        self.assertFalse(self.roster.is_majority_alive(0.0, 10.0))

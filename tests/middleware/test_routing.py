@@ -9,8 +9,8 @@ from hypothesis import strategies as st
 from twisted.trial.unittest import SynchronousTestCase
 
 from middleware.entangled.contact import Contact
-from middleware.entangled.kademlia.distance import bucket_index, closest
-from middleware.entangled.kademlia.routing import DROPPED_AFTER, PATIENCE, STALE_AFTER, RoutingTable
+from middleware.entangled.kademlia.distance import bucket_index, select_closest
+from middleware.entangled.kademlia.routing import DROPPED_AFTER, PING_INTERVAL_S, STALE_AFTER, RoutingTable
 from middleware.entangled.network.network import Address
 
 OWN = Contact(b"\xee" * 32, Address("10.0.0.1", 7000))
@@ -41,59 +41,59 @@ class RoutingTableTest(SynchronousTestCase):
     def fill(self) -> None:
         """Fill a bucket with far contacts, and add k nearer ones, which are the neighbours of the node."""
         for near in self.near:
-            self.table.saw(near, 0.0)
+            self.table.record_contact(near, 0.0)
         for moment, known in enumerate(self.old[:4]):
-            self.assertIsNone(self.table.saw(known, float(moment)))
+            self.assertIsNone(self.table.record_contact(known, float(moment)))
 
     def far(self) -> list[Contact]:
         """Return the far contacts in the table."""
-        return [known for known in self.table.contacts() if known in self.old]
+        return [known for known in self.table.list_contacts() if known in self.old]
 
     def miss(self, missing: Contact, times: int) -> None:
         for _ in range(times):
-            self.table.failed(missing, 100.0)
+            self.table.record_miss(missing, 100.0)
 
     def test_never_oneself(self) -> None:
         """A node is never a contact of itself."""
-        self.assertIsNone(self.table.saw(OWN, 0.0))
-        self.table.failed(OWN, 0.0)
+        self.assertIsNone(self.table.record_contact(OWN, 0.0))
+        self.table.record_miss(OWN, 0.0)
         self.table.remove(OWN)
-        self.table.searched(OWN.node_id, 0.0)
-        self.assertEqual((len(self.table), self.table.stale_buckets(1000.0, 60.0)), (0, []))
+        self.table.record_lookup(OWN.node_id, 0.0)
+        self.assertEqual((len(self.table), self.table.find_stale(1000.0, 60.0)), (0, []))
         self.assertIsNone(self.table.get(OWN.node_id))
 
     def test_address_moves(self) -> None:
         """A contact with a verified new address is listed once, at that address, and its failures are cleared."""
-        self.table.saw(contact(1), 0.0)
-        self.table.saw(contact(1, port=7001), 1.0)
+        self.table.record_contact(contact(1), 0.0)
+        self.table.record_contact(contact(1, port=7001), 1.0)
         self.miss(contact(1), DROPPED_AFTER)
-        self.assertEqual((len(self.table), self.table.contacts()), (1, [contact(1, port=7001)]))
+        self.assertEqual((len(self.table), self.table.list_contacts()), (1, [contact(1, port=7001)]))
 
     def test_full_bucket_keeps_the_old(self) -> None:
         """A new contact does not displace one of a full bucket; the least recently seen one is returned for a ping."""
         self.fill()
-        self.assertEqual(self.table.saw(self.new[0], 10.0), self.old[0])
+        self.assertEqual(self.table.record_contact(self.new[0], 10.0), self.old[0])
         self.assertEqual(self.far(), self.old[:4])
         self.assertIsNone(self.table.get(self.new[0].node_id))
-        self.table.saw(self.old[1], 15.0)
-        self.assertEqual(self.table.saw(self.new[0], 20.0), self.old[0])
-        self.table.saw(self.old[0], 25.0)
-        self.assertEqual(self.table.saw(self.new[0], 30.0), self.old[2])
+        self.table.record_contact(self.old[1], 15.0)
+        self.assertEqual(self.table.record_contact(self.new[0], 20.0), self.old[0])
+        self.table.record_contact(self.old[0], 25.0)
+        self.assertEqual(self.table.record_contact(self.new[0], 30.0), self.old[2])
 
     def test_no_flood_of_pings(self) -> None:
         """For many new contacts the old contact is returned for a ping only once per ``PATIENCE``."""
         self.fill()
-        asked = [self.table.saw(newcomer, 10.0) for newcomer in self.new]
+        asked = [self.table.record_contact(newcomer, 10.0) for newcomer in self.new]
         self.assertEqual(asked, [self.old[0]] + [None] * 7)
-        self.assertEqual(self.table.saw(self.new[0], 10.0 + PATIENCE), self.old[0])
+        self.assertEqual(self.table.record_contact(self.new[0], 10.0 + PING_INTERVAL_S), self.old[0])
 
     def test_replaced_from_the_cache(self) -> None:
         """After ``STALE_AFTER`` failures in a row the most recent waiting contact replaces the old one."""
         self.fill()
         for newcomer in self.new[:2]:
-            self.table.saw(newcomer, 10.0)
+            self.table.record_contact(newcomer, 10.0)
         self.miss(self.old[1], STALE_AFTER - 1)
-        self.assertIn(self.old[1], self.table.contacts())
+        self.assertIn(self.old[1], self.table.list_contacts())
         self.miss(self.old[1], 1)
         self.assertEqual(self.far(), [self.old[0], self.old[2], self.old[3], self.new[1]])
         self.assertEqual(len(self.table), 8)
@@ -102,7 +102,7 @@ class RoutingTableTest(SynchronousTestCase):
         """At most k contacts wait; the least recently seen ones leave the queue."""
         self.fill()
         for newcomer in self.new:
-            self.table.saw(newcomer, 10.0)
+            self.table.record_contact(newcomer, 10.0)
         for known in self.old[:4]:
             self.miss(known, STALE_AFTER)
         self.assertEqual(sorted(self.far(), key=self.old.index), self.new[4:])
@@ -110,36 +110,36 @@ class RoutingTableTest(SynchronousTestCase):
     def test_silent_newcomer_leaves_the_cache(self) -> None:
         """A waiting contact that fails is removed from the queue."""
         self.fill()
-        self.table.saw(self.new[0], 10.0)
-        self.table.failed(self.new[0], 11.0)
+        self.table.record_contact(self.new[0], 10.0)
+        self.table.record_miss(self.new[0], 11.0)
         self.miss(self.old[0], STALE_AFTER)
-        self.assertIn(self.old[0], self.table.contacts())
+        self.assertIn(self.old[0], self.table.list_contacts())
 
     def test_stale_gives_way_at_once(self) -> None:
         """A stale contact stays until a new contact needs its place."""
         self.fill()
         self.miss(self.old[2], STALE_AFTER)
-        self.assertIn(self.old[2], self.table.contacts())
-        self.assertIsNone(self.table.saw(self.new[0], 10.0))
+        self.assertIn(self.old[2], self.table.list_contacts())
+        self.assertIsNone(self.table.record_contact(self.new[0], 10.0))
         self.assertEqual(self.far(), [self.old[0], self.old[1], self.old[3], self.new[0]])
         self.assertEqual(len(self.table), 8)
 
     def test_dropped_after_five(self) -> None:
         """A contact is dropped after five failures in a row; a message from it resets the count."""
         for moment in (0.0, 200.0):
-            self.table.saw(contact(1), moment)
+            self.table.record_contact(contact(1), moment)
             self.miss(contact(1), DROPPED_AFTER - 1)
         self.miss(contact(2), DROPPED_AFTER)
-        self.assertEqual(self.table.contacts(), [contact(1)])
+        self.assertEqual(self.table.list_contacts(), [contact(1)])
         self.miss(contact(1), 1)
-        self.assertEqual(self.table.contacts(), [])
+        self.assertEqual(self.table.list_contacts(), [])
         self.assertEqual(len(self.table), 0)
 
     def test_goodbye(self) -> None:
         """A contact that says goodbye is removed at once, and a waiting contact replaces it."""
         self.fill()
-        self.table.saw(self.new[0], 10.0)
-        self.table.saw(self.new[1], 10.0)
+        self.table.record_contact(self.new[0], 10.0)
+        self.table.record_contact(self.new[1], 10.0)
         self.table.remove(self.new[1])
         self.table.remove(self.old[0])
         self.assertEqual(self.far(), [*self.old[1:4], self.new[0]])
@@ -149,8 +149,8 @@ class RoutingTableTest(SynchronousTestCase):
     def test_closest_passes_over_the_stale(self) -> None:
         """``closest`` returns stale contacts only if there are too few others, then in the order of distance."""
         for known in self.old[:4]:
-            self.table.saw(known, 0.0)
-        nearest = closest(self.old[:4], self.old[0].node_id, 4)
+            self.table.record_contact(known, 0.0)
+        nearest = select_closest(self.old[:4], self.old[0].node_id, 4)
         self.assertEqual(self.table.closest(self.old[0].node_id, 2), nearest[:2])
         self.miss(self.old[0], STALE_AFTER)
         self.assertEqual(self.table.closest(self.old[0].node_id, 3), nearest[1:])
@@ -159,26 +159,26 @@ class RoutingTableTest(SynchronousTestCase):
     def test_the_neighbourhood_is_known_whole(self) -> None:
         """The k contacts closest to the node are always in the table and listed first."""
         for moment, known in enumerate([*self.old[:4], *self.near]):
-            self.table.saw(known, float(moment))
-        self.assertEqual(self.table.contacts(), [*self.near, *self.old[:4]])
+            self.table.record_contact(known, float(moment))
+        self.assertEqual(self.table.list_contacts(), [*self.near, *self.old[:4]])
         self.setUp()
 
         crowd = of_bucket(158, 40)
         for moment, known in enumerate(crowd):
-            self.table.saw(known, float(moment))
-        nearest = closest(crowd, OWN.node_id, 4)
-        self.assertLessEqual(set(nearest), set(self.table.contacts()))
+            self.table.record_contact(known, float(moment))
+        nearest = select_closest(crowd, OWN.node_id, 4)
+        self.assertLessEqual(set(nearest), set(self.table.list_contacts()))
         self.assertLess(len(self.table), 40)
 
     def test_buckets_to_refresh(self) -> None:
         """``stale_buckets`` returns buckets without a recent lookup, also empty ones beyond the nearest contact."""
-        self.table.saw(of_bucket(156, 1)[0], 0.0)
-        self.table.saw(self.old[0], 50.0)
-        self.assertEqual(self.table.stale_buckets(60.0, 60.0), [156, 157, 158])
+        self.table.record_contact(of_bucket(156, 1)[0], 0.0)
+        self.table.record_contact(self.old[0], 50.0)
+        self.assertEqual(self.table.find_stale(60.0, 60.0), [156, 157, 158])
         rng = random.Random(1)
         for index in (156, 157):
-            self.table.searched(self.table.refresh_target(index, rng), 60.0)
-        self.assertEqual(self.table.stale_buckets(60.0, 60.0), [158])
+            self.table.record_lookup(self.table.refresh_target(index, rng), 60.0)
+        self.assertEqual(self.table.find_stale(60.0, 60.0), [158])
 
     @given(st.integers(0, 159), st.integers())
     def test_refresh_target_lies_in_its_bucket(self, index: int, seed: int) -> None:
@@ -195,7 +195,7 @@ class RoutingTableTest(SynchronousTestCase):
         table = RoutingTable(OWN.node_id, k=3)
         for moment, (event, number) in enumerate(events):
             getattr(table, event)(contact(number), float(moment))
-            contacts = table.contacts()
+            contacts = table.list_contacts()
             self.assertEqual(len(table), len(contacts))
             self.assertEqual(len({c.node_id for c in contacts}), len(contacts))
             self.assertTrue(all(len(bucket.entries) <= 3 for bucket in table._buckets))

@@ -13,8 +13,8 @@ from twisted.logger import ILogObserver, LogEvent, formatEvent, globalLogPublish
 from twisted.trial.unittest import SynchronousTestCase
 from zope.interface import implementer
 
-from middleware.entangled.data.salvage import set_aside
-from middleware.entangled.data.schema import APPLICATION_ID, SCHEMA_VERSION, make
+from middleware.entangled.data.recovery import set_aside
+from middleware.entangled.data.schema import APPLICATION_ID, SCHEMA_VERSION, create_tables
 from middleware.entangled.data.sqlite import SqliteStore
 from tests.middleware.test_store import DOG, FOREVER, KEY, record
 
@@ -36,7 +36,7 @@ class RottenFileTest(SynchronousTestCase):
         self.path = self.mktemp()
         store = SqliteStore.open(self.path, 0.0)
         self.epoch = store.epoch
-        store.note("identity", DOG.seed)
+        store.set_note("identity", DOG.seed)
         for number in range(200):
             store.put(record(str(number), value=bytes(500)), FOREVER)
         store.close()
@@ -92,7 +92,7 @@ class RottenFileTest(SynchronousTestCase):
             store = self.opened_anew()
             self.assertIn(said, self.lines[-1])
             if said:
-                self.assertEqual(store.noted("identity"), DOG.seed if said == saved else None)
+                self.assertEqual(store.get_note("identity"), DOG.seed if said == saved else None)
 
     def test_again(self) -> None:
         """A second corrupted file gets another name than the first one, and the notes are kept."""
@@ -100,7 +100,7 @@ class RottenFileTest(SynchronousTestCase):
         self.opened_anew().close()
         self.overwrite(68, b"\1\2\3\4")
         store = self.opened_anew(2)
-        self.assertEqual(store.noted("identity"), DOG.seed)
+        self.assertEqual(store.get_note("identity"), DOG.seed)
         store.close()
         with closing(SqliteStore.open(self.path, 0.0)) as kept:
             self.assertEqual(kept.origin, "kept")
@@ -116,7 +116,7 @@ class RottenFileTest(SynchronousTestCase):
             Path(self.path + part).write_bytes(whole)
         self.overwrite(4096 * 12, bytes(4096 * 20))
         with closing(SqliteStore.open(self.path, 0.0)) as store:
-            self.assertEqual((store.origin, len(store), store.noted("identity")), ("replaced", 0, DOG.seed))
+            self.assertEqual((store.origin, len(store), store.get_note("identity")), ("replaced", 0, DOG.seed))
         self.assertTrue(Path(self.path + ".rotten-1").exists())
         with closing(SqliteStore.open(self.path, 0.0)) as store:
             self.assertEqual((store.origin, len(store)), ("kept", 0))
@@ -146,11 +146,13 @@ class RottenFileTest(SynchronousTestCase):
             with closing(SqliteStore.open(self.path, 0.0)) as store:
                 self.assertLessEqual({r.slot for r in store.records()}, put)
                 self.assertEqual([r for r in store.records() if r.value != bytes(500)], [])
-                self.assertIn(store.noted("identity"), (DOG.seed, None))
-                seen.add(f"{store.origin}, {store.rotten > 0}")
+                self.assertIn(store.get_note("identity"), (DOG.seed, None))
+                seen.add(f"{store.origin}, {store.corrupt_rows > 0}")
                 # A record that is lost without a report would look as if it had never been written.
                 lost = 200 - len(store)
-                self.assertTrue(not lost or store.origin == "replaced" or store.rotten >= lost, (lost, store.rotten))
+                self.assertTrue(
+                    not lost or store.origin == "replaced" or store.corrupt_rows >= lost, (lost, store.corrupt_rows)
+                )
         self.assertEqual(seen, {"kept, False", "kept, True", "replaced, False"})
 
 
@@ -181,7 +183,7 @@ class OldSchemaTest(SynchronousTestCase):
         for _ in range(2):
             with closing(SqliteStore.open(self.path, 0.0)) as store:
                 self.assertEqual(store.get(KEY, tombstones=True), self.kept)
-                self.assertEqual((store.noted("identity"), store.origin, store.rotten), (DOG.seed, "kept", 0))
+                self.assertEqual((store.get_note("identity"), store.origin, store.corrupt_rows), (DOG.seed, "kept", 0))
                 self.assertNotEqual(store.epoch, bytes(8))
                 store.put(record("a"), FOREVER)
         with closing(sqlite3.connect(self.path)) as connection:
@@ -195,7 +197,7 @@ class OldSchemaTest(SynchronousTestCase):
         with closing(sqlite3.connect(self.path, isolation_level=None)) as connection:
             connection.text_factory = bytes
             connection.execute("PRAGMA max_page_count = 1")
-            error = self.assertRaises(sqlite3.OperationalError, make, connection, 1)
+            error = self.assertRaises(sqlite3.OperationalError, create_tables, connection, 1)
             self.assertIn("full", str(error))
             self.assertFalse(connection.in_transaction)
         self.test_migrates()

@@ -9,9 +9,9 @@ from twisted.trial.unittest import SynchronousTestCase
 from middleware.entangled.contact import Contact
 from middleware.entangled.errors import Forged
 from middleware.entangled.identity import Identity
-from middleware.entangled.network.network import MAX_DATAGRAM, Address
+from middleware.entangled.network.network import MAX_DATAGRAM_BYTES, Address
 from middleware.entangled.wire.noise import TransportKeys
-from middleware.entangled.wire.session import MAX_PLAIN, OVERHEAD, WINDOW, Session, index_of
+from middleware.entangled.wire.session import MAX_PLAIN_BYTES, OVERHEAD_BYTES, WINDOW, Session, read_index
 
 
 class SessionTests(SynchronousTestCase):
@@ -29,9 +29,9 @@ class SessionTests(SynchronousTestCase):
         datagram = self.a.seal(b"hello")
         self.assertEqual(self.b.open(datagram), (b"hello", 1))
         self.assertEqual(self.a.open(self.b.seal(b"")), (b"", 1))
-        self.assertEqual((index_of(datagram), len(datagram) - 5), (8, OVERHEAD))
-        self.assertLessEqual(OVERHEAD, 36)
-        self.assertEqual(len(self.a.seal(bytes(MAX_PLAIN))), MAX_DATAGRAM)
+        self.assertEqual((read_index(datagram), len(datagram) - 5), (8, OVERHEAD_BYTES))
+        self.assertLessEqual(OVERHEAD_BYTES, 36)
+        self.assertEqual(len(self.a.seal(bytes(MAX_PLAIN_BYTES))), MAX_DATAGRAM_BYTES)
 
     def test_opens_each_once_in_any_order(self) -> None:
         """Datagrams within the replay window decrypt exactly once, in any order."""
@@ -68,5 +68,5 @@ class SessionTests(SynchronousTestCase):
             damaged = bytearray(datagram)
             damaged[place] ^= 0x80
             self.assertRaises(Forged, self.b.open, bytes(damaged))
-        self.assertRaises(Forged, self.b.open, datagram[: OVERHEAD - 1])
+        self.assertRaises(Forged, self.b.open, datagram[: OVERHEAD_BYTES - 1])
         self.assertEqual(self.b.open(datagram), (b"hello", 1))

@@ -9,29 +9,29 @@ from twisted.internet.defer import Deferred
 from middleware.entangled.contact import Contact
 from middleware.entangled.errors import EntangledError, Refused
 from middleware.entangled.identity import Identity
-from middleware.entangled.record import TEAM_TTL, Record, hashed_key
+from middleware.entangled.record import TEAM_TTL_S, Record, hash_key
+from middleware.entangled.replication.batcher import MAX_LOAD_BYTES, RecordBatcher
 from middleware.entangled.replication.replica import Replica
-from middleware.entangled.replication.shipper import ROOM, Shipper
 from middleware.entangled.replication.store_reply import StoreReply
-from middleware.entangled.wire.asker import PATIENCE
-from tests.fleet import Fleet, FleetCase
+from middleware.entangled.wire.requester import TIMEOUT_S
+from tests.fleet import EntangledTeam, FleetCase
 
-KEY = hashed_key("flood")
+KEY = hash_key("flood")
 FLOOD = 40
 
 
 class ShipperTests(FleetCase):
     def setUp(self) -> None:
         super().setUp()
-        self.world: Fleet = self.fleet(2)
+        self.world: EntangledTeam = self.fleet(2)
         self.asked: list[int] = []
         writer = self.world.nodes[0]
-        self.shipper = Shipper(writer.overlay, writer._chores)
+        self.shipper = RecordBatcher(writer.overlay, writer._background)
         self.there: Contact = self.world.nodes[1].contact
 
     def record(self, number: int, size: int = 50) -> Record:
         identity: Identity = self.world.nodes[0].identity
-        return Record(KEY, f"{number}", identity.public, number + 1, "team", TEAM_TTL, b"x" * size).signed(identity)
+        return Record(KEY, f"{number}", identity.public, number + 1, "team", TEAM_TTL_S, b"x" * size).sign(identity)
 
     def stored(self, *records: Record) -> list[Deferred[object]]:
         return [Deferred.fromCoroutine(self.shipper.store(self.there, record)) for record in records]
@@ -51,7 +51,7 @@ class ShipperTests(FleetCase):
         verdicts = self.stored(*[self.record(number) for number in range(FLOOD)])
         self.world.run(0.1)
         self.assertEqual([self.successResultOf(verdict) for verdict in verdicts], [0] * FLOOD)
-        self.assertEqual(self.asked, [1] + [ROOM // self.record(1).message_bytes] * 6 + [3])
+        self.assertEqual(self.asked, [1] + [MAX_LOAD_BYTES // self.record(1).message_bytes] * 6 + [3])
         self.assertEqual(len(self.world.nodes[1].store.get(KEY)), FLOOD)
         self.assertEqual(self.shipper._waiting, {})
 
@@ -59,25 +59,25 @@ class ShipperTests(FleetCase):
         """A forwarded record keeps the remaining TTL of its sender; the node's own record gets the full TTL."""
         self.count_questions()
         replica, stranger = self.world.nodes[1].replica, Identity(bytes([9]) * 32)
-        own, others = self.record(0), Record(KEY, "s", stranger.public, 1, "team", TEAM_TTL, b"x").signed(stranger)
+        own, others = self.record(0), Record(KEY, "s", stranger.public, 1, "team", TEAM_TTL_S, b"x").sign(stranger)
         (first,) = self.stored(own)
         handed = Deferred.fromCoroutine(self.shipper.store(self.there, others, 700.0))
         self.world.run(1.0)
         self.assertEqual([self.successResultOf(first), self.successResultOf(handed)], [0, 0])
         self.assertEqual(self.asked, [1, 1])
-        self.assertAlmostEqual(replica.left(others), 699.0, delta=0.1)
-        self.assertAlmostEqual(replica.left(own), TEAM_TTL - 1.0, delta=0.1)
+        self.assertAlmostEqual(replica.remaining_lifetime(others), 699.0, delta=0.1)
+        self.assertAlmostEqual(replica.remaining_lifetime(own), TEAM_TTL_S - 1.0, delta=0.1)
 
     def test_one_that_is_refused_goes_alone(self) -> None:
         """If a replica rejects one record of a batch, it stores the other records."""
-        replica, keep = self.world.nodes[1].replica, Replica.keep
+        replica, keep = self.world.nodes[1].replica, Replica.store_locally
 
         def picky(record: Record, left: float | None = None) -> StoreReply:
             if record.name == "3":
                 raise Refused("not this one")
             return keep(replica, record, left)
 
-        self.patch(replica, "keep", picky)
+        self.patch(replica, "store_locally", picky)
         verdicts = self.stored(*[self.record(number) for number in range(6)])
         self.world.run(0.1)
         self.failureResultOf(verdicts.pop(3), Refused)
@@ -87,7 +87,7 @@ class ShipperTests(FleetCase):
         """If the first request gets no reply, all waiting records are sent at once and fail at the same time."""
         self.world.kill(1)
         verdicts = self.stored(*[self.record(number) for number in range(FLOOD)])
-        self.world.run(2 * PATIENCE + 0.1)
+        self.world.run(2 * TIMEOUT_S + 0.1)
         for verdict in verdicts:
             self.failureResultOf(verdict, EntangledError)
         self.assertEqual(self.shipper._waiting, {})

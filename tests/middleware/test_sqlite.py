@@ -17,11 +17,11 @@ from twisted.trial.unittest import SynchronousTestCase
 from zope.interface import implementer
 
 from middleware.entangled.data import writer
-from middleware.entangled.data.schema import MAX_ROTTEN, SCHEMA_VERSION
+from middleware.entangled.data.schema import MAX_CORRUPT_ROWS, SCHEMA_VERSION
 from middleware.entangled.data.sqlite import SqliteStore, read_records
-from middleware.entangled.data.store import MAX_BYTES, Durable, Store, weight
+from middleware.entangled.data.store import MAX_BYTES, Durability, Store, count_bytes
 from middleware.entangled.errors import BadStore, NotRunning, Unwritable
-from middleware.entangled.record import MAX_VALUE, Record, hashed_key
+from middleware.entangled.record import MAX_VALUE_BYTES, Record, hash_key
 from tests.middleware.test_store import CAT, DOG, FOREVER, KEY, StoreContract, record
 
 
@@ -39,8 +39,8 @@ class SqliteStoreTest(StoreContract, SynchronousTestCase):
         """A closed store rejects puts and notes."""
         self.store.close()
         self.assertRaises(NotRunning, self.store.put, record(), FOREVER)
-        self.assertRaises(NotRunning, self.store.note, "seed", b"")
-        self.failureResultOf(self.store.written(), NotRunning)
+        self.assertRaises(NotRunning, self.store.set_note, "seed", b"")
+        self.failureResultOf(self.store.wait_for_write(), NotRunning)
 
 
 class ReopenTest(SynchronousTestCase):
@@ -57,7 +57,7 @@ class ReopenTest(SynchronousTestCase):
         self.store.close()
         return self.reopened(now)
 
-    def after_a_kill(self, durable: Durable, late: str = "") -> SqliteStore:
+    def after_a_kill(self, durable: Durability, late: str = "") -> SqliteStore:
         """Return the store of a process that was killed after it flushed 300 records and ran ``late``."""
         self.store.close()
         child = (
@@ -80,12 +80,12 @@ class ReopenTest(SynchronousTestCase):
         for one in kept:
             self.store.put(one, 1.0)
         self.store.put(record("d", lifetime="leased"), FOREVER)
-        self.store.note("seed", DOG.seed)
+        self.store.set_note("seed", DOG.seed)
         store = self.after_restart(now=100.0)
         store.flush()
         self.assertEqual(store.get(KEY, tombstones=True), kept)
         self.assertEqual(read_records(self.path, KEY), [kept[0], kept[2]])
-        self.assertEqual(store.noted("seed"), DOG.seed)
+        self.assertEqual(store.get_note("seed"), DOG.seed)
         self.assertEqual(store.expire(159.0), [])
         self.assertEqual(store.expire(160.0), kept)
 
@@ -128,35 +128,37 @@ class ReopenTest(SynchronousTestCase):
         whole = record(f"r{len(changes)}")
         self.assertEqual(read_records(self.path, KEY), [whole])
         store = self.reopened(0.0)
-        self.assertEqual((store.rotten, store.records()), (len(changes), [whole]))
-        self.assertEqual(store.usage.bytes, weight(whole))
+        self.assertEqual((store.corrupt_rows, store.records()), (len(changes), [whole]))
+        self.assertEqual(store.usage.bytes, count_bytes(whole))
         store.put(record("r0"), FOREVER)
         store.close()
         with closing(sqlite3.connect(self.path)) as connection:
             self.assertEqual(connection.execute("SELECT count(*) FROM rotten").fetchone(), (len(changes),))
         store = self.reopened(0.0)
-        self.assertEqual((store.rotten, store.records()), (0, [whole, record("r0")]))
+        self.assertEqual((store.corrupt_rows, store.records()), (0, [whole, record("r0")]))
 
     def test_rotten_rows_do_not_pile_up(self) -> None:
         """The table of corrupted rows is bounded and keeps the last ones."""
-        for number in range(MAX_ROTTEN + 5):
+        for number in range(MAX_CORRUPT_ROWS + 5):
             self.store.put(record(str(number)), FOREVER)
         self.store.close()
         with closing(sqlite3.connect(self.path)) as connection, connection:
             connection.execute("UPDATE records SET ttl = 1.0")
         self.reopened(0.0).close()
         with closing(sqlite3.connect(self.path)) as connection:
-            self.assertEqual(connection.execute("SELECT count(*) FROM rotten").fetchone(), (MAX_ROTTEN,))
+            self.assertEqual(connection.execute("SELECT count(*) FROM rotten").fetchone(), (MAX_CORRUPT_ROWS,))
 
     def test_rotten_note(self) -> None:
         """A corrupted note is counted and not returned, even if it is the identity."""
-        self.store.note("identity", DOG.seed)
-        self.store.note("contacts", b"some")
+        self.store.set_note("identity", DOG.seed)
+        self.store.set_note("contacts", b"some")
         self.store.close()
         with closing(sqlite3.connect(self.path)) as connection, connection:
             connection.execute("UPDATE notes SET value = zeroblob(32) WHERE name = 'identity'")
         store = self.reopened(0.0)
-        self.assertEqual((store.noted("identity"), store.noted("contacts"), store.rotten), (None, b"some", 1))
+        self.assertEqual(
+            (store.get_note("identity"), store.get_note("contacts"), store.corrupt_rows), (None, b"some", 1)
+        )
 
     def test_epoch(self) -> None:
         """The epoch of a file is constant and differs from the epoch of another file."""
@@ -171,24 +173,24 @@ class ReopenTest(SynchronousTestCase):
     def test_large_values(self) -> None:
         """Values of the maximum size survive a restart, and their bytes are counted."""
         owners = (DOG, DOG, CAT, CAT)
-        kept = [record(str(n), value=bytes([n]) * MAX_VALUE, owner=owner) for n, owner in enumerate(owners)]
+        kept = [record(str(n), value=bytes([n]) * MAX_VALUE_BYTES, owner=owner) for n, owner in enumerate(owners)]
         for one in kept:
             self.store.put(one, FOREVER)
         store = self.after_restart()
         self.assertEqual(store.records(), kept)
-        self.assertEqual(store.usage.bytes, sum(map(weight, kept)))
+        self.assertEqual(store.usage.bytes, sum(map(count_bytes, kept)))
 
     def test_killed_in_the_middle(self) -> None:
         """Flushed records survive a kill during later writes, at each durability level."""
         late = "for number in range(300): store.put(record('late' + str(number), value=None), 9e9)\n"
-        levels: tuple[Durable, ...] = ("power", "crash")
+        levels: tuple[Durability, ...] = ("power", "crash")
         for durable in levels:
             with closing(self.after_a_kill(durable, late)) as store:
                 self.assertLessEqual({str(number) for number in range(300)}, {r.name for r in store.records()})
 
     def test_how_durable(self) -> None:
         """The store waits for the disk at each commit, except at the durability level ``crash``."""
-        asked: dict[Durable, str] = {"power": "2", "crash": "1"}
+        asked: dict[Durability, str] = {"power": "2", "crash": "1"}
         for durable, synchronous in asked.items():
             with closing(SqliteStore.open(self.mktemp(), 0.0, durable=durable)) as store:
                 found = store._connection.execute("PRAGMA synchronous").fetchone()
@@ -216,7 +218,7 @@ class ReopenTest(SynchronousTestCase):
 class FullDiskTest(SynchronousTestCase):
     def setUp(self) -> None:
         # Only a flush commits, which prevents a commit between two changes.
-        self.patch(writer, "COMMIT_AFTER", 60.0)
+        self.patch(writer, "COMMIT_AFTER_S", 60.0)
         self.store = SqliteStore.open(self.mktemp(), 0.0)
         self.addCleanup(self.store.close)
         self.store.put(record("a"), FOREVER)
@@ -231,7 +233,7 @@ class FullDiskTest(SynchronousTestCase):
         """Flush until a commit fails."""
         for _ in range(100):
             self.assertRaises(BadStore, self.store.flush, 0.1)
-            if self.store.trouble:
+            if self.store.write_error:
                 return
         self.fail("no commit failed")
 
@@ -249,20 +251,20 @@ class FullDiskTest(SynchronousTestCase):
 
     def test_who_waits_is_told(self) -> None:
         """A pending acknowledgement fails with the first failed commit, and new ones fail until a commit succeeds."""
-        self.failureResultOf(self.store.written(), Unwritable)
+        self.failureResultOf(self.store.wait_for_write(), Unwritable)
         self.limit(10_000)
         self.store.flush()
         self.limit(1)
         for number in range(20):
             self.store.put(record(f"x{number}", value=bytes(900)), FOREVER)
-        waiting = self.store.written()
+        waiting = self.store.wait_for_write()
         self.fail_to_flush()
         self.assertIn("full", str(self.failureResultOf(waiting, Unwritable).value))
-        self.assertIn("full", self.store.trouble)
+        self.assertIn("full", self.store.write_error)
         self.limit(10_000)
         self.store.flush()
-        self.assertEqual(self.store.trouble, "")
-        self.successResultOf(self.store.written())
+        self.assertEqual(self.store.write_error, "")
+        self.successResultOf(self.store.wait_for_write())
         self.assertEqual(len(read_records(self.store._path, KEY)), 61)  # including the pending changes
 
     def test_read_only(self) -> None:
@@ -341,7 +343,7 @@ class ReadRecordsTest(SynchronousTestCase):
         store = SqliteStore.open(path, 0.0)
         self.addCleanup(store.close)
         live = [record("a"), record("b", lifetime="leased"), record("a", owner=CAT)]
-        others: list[Record] = [record("c", value=None), record("a", key=hashed_key("tasks"))]
+        others: list[Record] = [record("c", value=None), record("a", key=hash_key("tasks"))]
         for one in live + others:
             store.put(one, FOREVER)
         store.flush()
@@ -370,12 +372,12 @@ class SlowDiskTest(SynchronousTestCase):
     def test_nobody_waits_for_a_commit(self) -> None:
         """During a blocked commit reads, puts and expiry work, but nothing is acknowledged before its end."""
         self.store.put(record("a"), FOREVER)
-        first = self.store.written()
+        first = self.store.wait_for_write()
         for number in range(500):
             self.store.put(record(str(number), value=None), 5.0)
         self.store.expire(5.0)
-        self.store.note("seed", b"seed")
-        later = self.store.written()
+        self.store.set_note("seed", b"seed")
+        later = self.store.wait_for_write()
         self.assertEqual(self.store.get(KEY), [record("a")])
         self.assertNoResult(first)
         self.assertNoResult(later)
@@ -387,11 +389,11 @@ class SlowDiskTest(SynchronousTestCase):
     def test_news_are_delivered(self) -> None:
         """An acknowledgement fires in the caller's thread, through ``deliver``."""
         self.store.put(record("a"), FOREVER)
-        waiting = self.store.written()
+        waiting = self.store.wait_for_write()
         self.other.execute("COMMIT")
         writer = self.store._writer
-        with writer._turn:
-            self.assertTrue(writer._turn.wait_for(lambda: not writer._owed and not writer._writing, 5.0))
+        with writer._condition:
+            self.assertTrue(writer._condition.wait_for(lambda: not writer._pending and not writer._is_writing, 5.0))
         self.assertNoResult(waiting)
         self.store.close()
         self.successResultOf(waiting)
@@ -402,7 +404,7 @@ class SlowDiskTest(SynchronousTestCase):
     def test_who_stops_waiting(self) -> None:
         """Cancelling one acknowledgement does not affect others."""
         self.store.put(record("a"), FOREVER)
-        one, other = self.store.written(), self.store.written()
+        one, other = self.store.wait_for_write(), self.store.wait_for_write()
         one.cancel()
         self.failureResultOf(one, CancelledError)
         self.other.execute("COMMIT")

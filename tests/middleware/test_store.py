@@ -10,10 +10,10 @@ from hypothesis import strategies as st
 from twisted.trial.unittest import SynchronousTestCase
 
 from middleware.entangled.data.memory import MemoryStore
-from middleware.entangled.data.store import MAX_BYTES, Store, weight
+from middleware.entangled.data.store import MAX_BYTES, Store, count_bytes
 from middleware.entangled.errors import OWNER_FULL, Full, Refused
 from middleware.entangled.identity import Identity
-from middleware.entangled.record import Lifetime, Record, Slot, hashed_key
+from middleware.entangled.record import Lifetime, Record, Slot, hash_key
 
 if TYPE_CHECKING:
     _Case = SynchronousTestCase
@@ -22,7 +22,7 @@ else:
 
 DOG = Identity(b"\1" * 32)
 CAT = Identity(b"\2" * 32)
-KEY = hashed_key("devices")
+KEY = hash_key("devices")
 FOREVER = 1e9
 
 
@@ -34,7 +34,7 @@ def record(
     key: bytes = KEY,
     lifetime: Lifetime = "team",
 ) -> Record:
-    return Record(key, name, owner.public, sequence, lifetime, 60.0, value).signed(owner)
+    return Record(key, name, owner.public, sequence, lifetime, 60.0, value).sign(owner)
 
 
 class StoreContract(_Case):
@@ -54,16 +54,16 @@ class StoreContract(_Case):
 
     def test_empty(self) -> None:
         """A new store reports that it is new and is empty."""
-        self.assertEqual((self.store.origin, self.store.rotten, len(self.store.epoch)), ("new", 0, 8))
+        self.assertEqual((self.store.origin, self.store.corrupt_rows, len(self.store.epoch)), ("new", 0, 8))
         self.assertEqual(len(self.store), 0)
         self.assertEqual(self.store.get(KEY), [])
-        self.assertIsNone(self.store.slot(Slot(KEY, DOG.public, "state")))
-        self.assertEqual(self.store.owned(DOG.public), [])
-        self.assertEqual(self.store.extend(DOG.public, FOREVER), 0)
+        self.assertIsNone(self.store.get_slot(Slot(KEY, DOG.public, "state")))
+        self.assertEqual(self.store.find_owned(DOG.public), [])
+        self.assertEqual(self.store.extend_leases(DOG.public, FOREVER), 0)
         self.assertEqual(self.store.expire(FOREVER), [])
         self.assertEqual(self.store.drop_leased(DOG.public), [])
         self.assertEqual(self.store.records(), [])
-        self.assertIsNone(self.store.noted("seed"))
+        self.assertIsNone(self.store.get_note("seed"))
 
     def test_order_of_a_key(self) -> None:
         """The records of a key are sorted by owner and name."""
@@ -72,7 +72,7 @@ class StoreContract(_Case):
             self.store.put(one, FOREVER)
         self.assertEqual(self.store.get(KEY), sorted(records, key=lambda r: (r.owner, r.name)))
         self.assertEqual(self.store.records(), records)
-        self.assertEqual(self.store.owned(DOG.public), [record("a"), record("b")])
+        self.assertEqual(self.store.find_owned(DOG.public), [record("a"), record("b")])
 
     def test_put_and_remove(self) -> None:
         """A record is found by its key and slot; a tombstone hides it from readers and wins over older records.
@@ -83,12 +83,12 @@ class StoreContract(_Case):
         self.store.get(KEY, tombstones=True).clear()
         self.store.get(KEY).clear()
         self.assertEqual(self.store.get(KEY), [record()])
-        self.assertEqual(self.store.get(hashed_key("tasks")), [])
+        self.assertEqual(self.store.get(hash_key("tasks")), [])
         gone = record(sequence=2, value=None)
         self.assertTrue(self.store.put(gone, FOREVER))
         self.assertEqual(self.store.get(KEY), [])
         self.assertEqual(self.store.get(KEY, tombstones=True), [gone])
-        self.assertEqual(self.store.slot(gone.slot), gone)
+        self.assertEqual(self.store.get_slot(gone.slot), gone)
         self.assertFalse(self.store.put(record(), FOREVER))
 
     def test_loser_extends_nothing(self) -> None:
@@ -134,11 +134,11 @@ class StoreContract(_Case):
         held = [record("a", value=bytes(1000)), record("ä" * 3, value=None), record("c", value=b"", owner=CAT)]
         for one in held:
             self.store.put(one, FOREVER)
-        self.assertEqual(weight(held[0]), 20 + 32 + 1 + 1000 + 64 + 17)
-        self.assertEqual(weight(held[1]), 20 + 32 + 6 + 64 + 17)
-        self.assertEqual(self.store.usage.bytes, sum(map(weight, held)))
+        self.assertEqual(count_bytes(held[0]), 20 + 32 + 1 + 1000 + 64 + 17)
+        self.assertEqual(count_bytes(held[1]), 20 + 32 + 6 + 64 + 17)
+        self.assertEqual(self.store.usage.bytes, sum(map(count_bytes, held)))
         self.store.put(record("a", 2, value=b"1"), FOREVER)
-        self.assertEqual(self.store.usage.bytes, sum(map(weight, held)) - 999)
+        self.assertEqual(self.store.usage.bytes, sum(map(count_bytes, held)) - 999)
         self.store.put(record("d"), FOREVER)
         self.store.discard(record("d").slot)
         self.store.expire(FOREVER)
@@ -147,7 +147,7 @@ class StoreContract(_Case):
     def test_full_of_bytes(self) -> None:
         """The byte quota is exact for new and growing records; a shrinking record always fits."""
         small, large = record("b", value=b""), record("a", value=bytes(500))
-        store = self.make(100, weight(large) + weight(small))
+        store = self.make(100, count_bytes(large) + count_bytes(small))
         store.put(large, FOREVER)
         self.assertRaises(Full, store.put, record("b", value=b"1"), FOREVER)
         self.assertTrue(store.put(small, FOREVER))
@@ -177,8 +177,8 @@ class StoreContract(_Case):
         self.assertRaises(Full, store.put, record("x"), FOREVER)
         store.expire(31.0)
         self.assertTrue(store.put(record("x"), FOREVER))
-        self.assertIsNone(store.slot(record("0").slot))
-        self.assertIsNotNone(store.slot(record("old", owner=CAT).slot))
+        self.assertIsNone(store.get_slot(record("0").slot))
+        self.assertIsNotNone(store.get_slot(record("old", owner=CAT).slot))
         store.discard(record("x").slot)
         self.assertTrue(store.put(record("y"), FOREVER))
 
@@ -204,7 +204,7 @@ class StoreContract(_Case):
         store.expire(31.0)
         for number in range(2):
             store.put(record(f"new{number}"), FOREVER)
-            left = {name for name in names if store.slot(Slot(KEY, DOG.public, name)) is not None}
+            left = {name for name in names if store.get_slot(Slot(KEY, DOG.public, name)) is not None}
             gone += sorted(names - left)
             names = left
         self.assertEqual(gone, ["older", "old"])
@@ -223,33 +223,33 @@ class StoreContract(_Case):
 
     def test_refusal_changes_nothing(self) -> None:
         """If eviction would not free enough space, nothing is evicted."""
-        store = self.make(100, 3 * weight(record("a")))
+        store = self.make(100, 3 * count_bytes(record("a")))
         store.put(record("a"), FOREVER)
         store.put(record("b", value=None), 60.0)
         before = store.usage
         store.expire(59.0)
         self.assertRaises(Full, store.put, record("c", value=bytes(400)), FOREVER)
-        grown = record("b", 2, value=bytes(weight(record("a")) + 5))  # one byte too large
+        grown = record("b", 2, value=bytes(count_bytes(record("a")) + 5))  # one byte too large
         self.assertRaises(Full, store.put, grown, FOREVER)
         self.assertEqual(store.usage, before)
-        self.assertEqual(store.slot(record("b").slot), record("b", value=None))
+        self.assertEqual(store.get_slot(record("b").slot), record("b", value=None))
 
     def test_written(self) -> None:
         """A put is acknowledged after the write, and at once if nothing is pending."""
         self.store.put(record(), FOREVER)
-        acknowledged = self.store.written()
+        acknowledged = self.store.wait_for_write()
         self.settle(self.store)
         self.successResultOf(acknowledged)
-        self.successResultOf(self.store.written())
-        self.assertEqual(self.store.trouble, "")
+        self.successResultOf(self.store.wait_for_write())
+        self.assertEqual(self.store.write_error, "")
 
     def test_notes(self) -> None:
         """The last value of a note is returned; a store can be closed twice."""
         for value in (b"one", b"two", b"two"):
-            self.store.note("seed", value)
-        self.store.note("contacts", b"")
+            self.store.set_note("seed", value)
+        self.store.set_note("contacts", b"")
         for _ in range(2):
-            self.assertEqual((self.store.noted("seed"), self.store.noted("contacts")), (b"two", b""))
+            self.assertEqual((self.store.get_note("seed"), self.store.get_note("contacts")), (b"two", b""))
             self.store.close()
 
 
@@ -284,7 +284,7 @@ class MemoryStoreTest(StoreContract, SynchronousTestCase):
                 elif old[0] == one:
                     plain[one.slot] = (one, max(old[1], moment))
             elif verb == "e":
-                self.assertEqual(store.extend(DOG.public, moment), len(leased))
+                self.assertEqual(store.extend_leases(DOG.public, moment), len(leased))
                 plain |= {slot: (held, max(until, moment)) for slot, (held, until) in leased.items()}
             elif verb == "g":
                 self.assertEqual([r.slot for r in store.drop_leased(DOG.public)], sorted(leased))
@@ -298,7 +298,7 @@ class MemoryStoreTest(StoreContract, SynchronousTestCase):
                     del plain[slot]
             self.assertEqual(store.get(KEY), [plain[slot][0] for slot in sorted(plain)])
             self.assertEqual(len(store), len(plain))
-            self.assertEqual(store.usage.bytes, sum(weight(held) for held, _ in plain.values()))
+            self.assertEqual(store.usage.bytes, sum(count_bytes(held) for held, _ in plain.values()))
 
     @settings(max_examples=60)
     @given(
@@ -324,7 +324,7 @@ class MemoryStoreTest(StoreContract, SynchronousTestCase):
             held = {r.slot: r for r in store.records()}
             self.assertEqual({slot for slot in before if slot not in held} - gone, set())
             everything = store.get(KEY, tombstones=True)
-            self.assertEqual(store.usage.bytes, sum(map(weight, everything)))
+            self.assertEqual(store.usage.bytes, sum(map(count_bytes, everything)))
             self.assertLessEqual(sum(r.value is not None for r in everything), 5)
-            self.assertLessEqual(sum(weight(r) for r in everything if r.value is not None), 1200)
+            self.assertLessEqual(sum(count_bytes(r) for r in everything if r.value is not None), 1200)
             self.assertLessEqual(len(everything), 10)

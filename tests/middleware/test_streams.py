@@ -7,7 +7,7 @@ import random
 from middleware.entangled.contact import Contact
 from middleware.entangled.errors import Refused
 from middleware.entangled.network.network import Address
-from middleware.entangled.streams import MAX_PARTS, MAX_VIEWERS, OPEN_TTL, PART_BYTES, Streams
+from middleware.entangled.streams import MAX_PARTS, MAX_VIEWERS, PART_BYTES, SUBSCRIPTION_TTL_S, Streams
 from tests.middleware.test_endpoint import DELAY, EndpointCase
 
 CAMERA = "camera"
@@ -37,30 +37,30 @@ class StreamsTests(EndpointCase):
     def test_frames_arrive_whole(self) -> None:
         """A frame of many fragments arrives intact at every viewer until it stops; no timer is left."""
         others: list[int] = []
-        stop = self.viewer.look(self.to_publisher, CAMERA, self.see)
-        stop_other = self.viewer.look(self.to_publisher, CAMERA, lambda sequence, frame, age: others.append(sequence))
+        stop = self.viewer.view(self.to_publisher, CAMERA, self.see)
+        stop_other = self.viewer.view(self.to_publisher, CAMERA, lambda sequence, frame, age: others.append(sequence))
         self.clock.advance(0.1)
         frame = random.Random(1).randbytes(5 * PART_BYTES + 7)
-        self.publisher.offer(CAMERA, 1, frame)
+        self.publisher.publish(CAMERA, 1, frame)
         self.clock.advance(0.1)
         stop()
         stop()
-        self.publisher.offer(CAMERA, 2, b"x")
+        self.publisher.publish(CAMERA, 2, b"x")
         self.clock.advance(0.1)
         stop_other()
         self.assertEqual((self.frames, others), ([(1, frame)], [1, 2]))
-        self.viewer.look(self.to_publisher, CAMERA, self.see)
+        self.viewer.view(self.to_publisher, CAMERA, self.see)
         self.clock.advance(0.1)
         self.tearDown()
-        self.publisher.offer(CAMERA, 3, b"x")
+        self.publisher.publish(CAMERA, 3, b"x")
         self.clock.advance(0.1)
         self.assertEqual(self.clock.getDelayedCalls(), [])
 
     def test_age_counts_from_the_camera(self) -> None:
         """The age of a frame is its age when sent plus its transfer time, without synchronized clocks."""
-        self.viewer.look(self.to_publisher, CAMERA, self.see)
+        self.viewer.view(self.to_publisher, CAMERA, self.see)
         self.clock.advance(0.1)
-        self.publisher.offer(CAMERA, 1, bytes(2 * PART_BYTES), 0.25)
+        self.publisher.publish(CAMERA, 1, bytes(2 * PART_BYTES), 0.25)
         self.clock.advance(0.1)
         (age,) = self.ages
         self.assertLess(abs(age - 0.25 - DELAY), 0.0005)
@@ -71,23 +71,23 @@ class StreamsTests(EndpointCase):
 
     def test_nothing_is_sent_unseen(self) -> None:
         """A publisher sends nothing without viewers, or soon after the last one, and no empty or oversized frames."""
-        self.assertFalse(self.publisher.is_wanted(CAMERA))
-        stop = self.viewer.look(self.to_publisher, CAMERA, self.see)
+        self.assertFalse(self.publisher.has_viewers(CAMERA))
+        stop = self.viewer.view(self.to_publisher, CAMERA, self.see)
         self.clock.advance(10.0)
-        self.assertTrue(self.publisher.is_wanted(CAMERA))
+        self.assertTrue(self.publisher.has_viewers(CAMERA))
         for frame in (bytes(MAX_PARTS * PART_BYTES + 1), b""):
-            self.publisher.offer(CAMERA, 1, frame)
+            self.publisher.publish(CAMERA, 1, frame)
         self.clock.advance(0.1)
         self.assertEqual(self.frames, [])
         stop()
-        self.clock.advance(OPEN_TTL + 0.1)
+        self.clock.advance(SUBSCRIPTION_TTL_S + 0.1)
         sent = self.board.counters["sent"]
-        self.publisher.offer(CAMERA, 1, b"x")
+        self.publisher.publish(CAMERA, 1, b"x")
         self.assertEqual(self.board.counters["sent"], sent)
 
     def test_lost_part_drops_the_frame(self) -> None:
         """A frame with a lost fragment is dropped, as is a late older frame; no frame is shown twice."""
-        self.viewer.look(self.to_publisher, CAMERA, self.see)
+        self.viewer.view(self.to_publisher, CAMERA, self.see)
         self.part(1, 0, 2, b"a")
         self.part(2, 1, 2, b"d")
         self.part(1, 1, 2, b"b")
@@ -97,7 +97,7 @@ class StreamsTests(EndpointCase):
 
     def test_publisher_begins_anew(self) -> None:
         """After a camera restarts its sequence numbers, its frames are accepted within about a second."""
-        self.viewer.look(self.to_publisher, CAMERA, self.see)
+        self.viewer.view(self.to_publisher, CAMERA, self.see)
         self.part(500, 0, 1, b"old")
         self.part(1, 0, 1, b"too soon")
         self.clock.advance(1.1)
@@ -107,7 +107,7 @@ class StreamsTests(EndpointCase):
 
     def test_crafted_parts(self) -> None:
         """Inconsistent, oversized or unexpected fragments are ignored without an exception."""
-        self.viewer.look(self.to_publisher, CAMERA, self.see)
+        self.viewer.view(self.to_publisher, CAMERA, self.see)
         self.part(1, 5, 6, b"x")
         self.part(1, 0, 2, b"x")
         for number, count in ((0, 0), (-1, 1), (1, 1), (0, MAX_PARTS + 1)):
@@ -127,6 +127,6 @@ class StreamsTests(EndpointCase):
         self.assertRaises(Refused, self.publisher._answer_open, peers[-1], CAMERA)
         self.assertTrue(self.publisher._answer_open(peers[0], "channel 0"))
         self.assertRaises(Refused, self.publisher._answer_open, peers[0], "x" * 33)
-        self.clock.advance(OPEN_TTL + 0.1)
+        self.clock.advance(SUBSCRIPTION_TTL_S + 0.1)
         self.assertTrue(self.publisher._answer_open(peers[-1], CAMERA))
-        self.assertTrue(self.publisher.is_wanted(CAMERA))
+        self.assertTrue(self.publisher.has_viewers(CAMERA))

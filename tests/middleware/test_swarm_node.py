@@ -7,28 +7,38 @@ from typing import Any
 
 from twisted.internet.defer import Deferred
 
-from middleware.directory.presence import DEVICES, Device, devices_of
+from middleware.directory.presence import DEVICES, Device, parse_devices
 from middleware.entangled.errors import NoAnswer, Refused
-from middleware.entangled.network.switchboard import Weather
+from middleware.entangled.network.switchboard import LinkConditions
 from middleware.entangled.record import Record
 from middleware.node import SwarmNode
-from middleware.tasks.task import COMPLETED, TASKS, Member, Result, Task, group_key, member_of, outcome_of, task_of
-from tests.fleet import FleetCase, SwarmFleet
+from middleware.tasks.task import (
+    COMPLETED,
+    TASKS,
+    Member,
+    Result,
+    Task,
+    find_outcome,
+    group_key,
+    parse_member,
+    parse_task,
+)
+from tests.fleet import FleetCase, SwarmTeam
 
 TASK = Task("t1", "search", "Find it")
-ROUGH = Weather(delay_s=0.01, jitter_s=0.01, loss=0.3)
+ROUGH = LinkConditions(delay_s=0.01, jitter_s=0.01, loss=0.3)
 
 
 class SwarmNodeTests(FleetCase):
-    def names(self, fleet: SwarmFleet, place: int = 0) -> list[tuple[str, int]]:
+    def names(self, fleet: SwarmTeam, place: int = 0) -> list[tuple[str, int]]:
         """Return the names and numbers of the devices as seen by one node."""
         records = self.done(fleet, fleet.nodes[place].entangled.get(DEVICES), 2.0)
-        return [(device.name, device.joined) for device, _ in devices_of(records)]
+        return [(device.name, device.joined) for device, _ in parse_devices(records)]
 
-    def submitted(self, fleet: SwarmFleet, task: Task = TASK) -> Task:
+    def submitted(self, fleet: SwarmTeam, task: Task = TASK) -> Task:
         return self.done(fleet, Deferred.fromCoroutine(fleet.nodes[0].submit(task)), 5.0)
 
-    def asked(self, fleet: SwarmFleet, method: str, *arguments: object) -> Deferred[Any]:
+    def asked(self, fleet: SwarmTeam, method: str, *arguments: object) -> Deferred[Any]:
         to = fleet.nodes[0].entangled.contact
         return fleet.nodes[1].entangled.endpoint.ask(to, method, *arguments, changes=True)
 
@@ -42,10 +52,10 @@ class SwarmNodeTests(FleetCase):
     def test_joining_at_the_same_moment(self) -> None:
         """Devices that join at the same time get different numbers, also under loss."""
         for n, seed, weather, seconds in (
-            (21, 1, Weather(0.005), 1.0),
-            (5, 2, Weather(0.005, 0.005), 20.0),
+            (21, 1, LinkConditions(0.005), 1.0),
+            (5, 2, LinkConditions(0.005, 0.005), 20.0),
             (5, 3, ROUGH, 20.0),
-            (3, 4, Weather(delay_s=0.01, loss=0.5), 40.0),
+            (3, 4, LinkConditions(delay_s=0.01, loss=0.5), 40.0),
         ):
             fleet = self.swarm(n, seed, weather, pause=0.0)
             fleet.run(seconds)
@@ -55,10 +65,10 @@ class SwarmNodeTests(FleetCase):
     def test_place_is_kept(self) -> None:
         """A device that changes its presence keeps its number, and its messages reach all nodes."""
         fleet = self.swarm(2)
-        fleet.nodes[1].presence.say(5.0, "hello")
+        fleet.nodes[1].presence.add_message(5.0, "hello")
         fleet.run(1.0)
         records = self.done(fleet, fleet.nodes[0].entangled.get(DEVICES), 1.0)
-        device = devices_of(records)[1][0]
+        device = parse_devices(records)[1][0]
         self.assertEqual((device.joined, device.messages, device.address), (2, ((5.0, "hello"),), "10.0.0.1:7001"))
 
     def test_vanish_and_leave(self) -> None:
@@ -70,7 +80,7 @@ class SwarmNodeTests(FleetCase):
         fleet.nodes[3].stopService()
         fleet.run(0.05)
         self.assertEqual(len(told[-1]), 3)
-        fleet.nodes[2].vanish()
+        fleet.nodes[2].stop_silently()
         fleet.run(1.25)
         self.assertEqual(len(told[-1]), 2)
 
@@ -80,33 +90,35 @@ class SwarmNodeTests(FleetCase):
         task = self.submitted(fleet)
         self.assertEqual(len(task.council), 3)
         seen: list[Task | None] = []
-        fleet.nodes[3].watch_tasks(lambda records: seen.extend(map(task_of, records)))
+        fleet.nodes[3].watch_tasks(lambda records: seen.extend(map(parse_task, records)))
         group: list[list[Record]] = []
         fleet.nodes[3].watch_group("t1", group.append, keep=True)
         heard: list[tuple[list[str], Result | None]] = []
-        places = [node.group(task, lambda *news: None) for node in fleet.nodes[1:3]]
-        places.append(fleet.nodes[3].group(task, lambda members, end: heard.append(([m.name for m in members], end))))
+        places = [node.join_group(task, lambda *news: None) for node in fleet.nodes[1:3]]
+        places.append(
+            fleet.nodes[3].join_group(task, lambda members, end: heard.append(([m.name for m in members], end)))
+        )
         for node, place in zip(fleet.nodes[1:3], places, strict=False):
             place.report(Member(node.uuid, node.presence.device.name, "WAITING", 1.0))
         fleet.run(1.0)
         self.assertEqual(seen, [task])
         self.assertEqual(
-            [member.name for r in group[-1] if (member := member_of(r))],
+            [member.name for r in group[-1] if (member := parse_member(r))],
             ["dog1", "dog2"]
             if fleet.nodes[1].entangled.identity.public < fleet.nodes[2].entangled.identity.public
             else ["dog2", "dog1"],
         )
         self.assertEqual((sorted(heard[-1][0]), heard[-1][1]), (["dog1", "dog2"], None))
         places[0].withdraw()
-        lessee = fleet.nodes[2].lessee(task, lambda: None, 0)
-        lessee.want()
+        lessee = fleet.nodes[2].make_lease_client(task, lambda: None, 0)
+        lessee.claim()
         fleet.run(2.0)
-        proof = self.done(fleet, lessee.end(0), 1.0)
+        proof = self.done(fleet, lessee.close_task(0), 1.0)
         lessee.release()
         self.done(fleet, places[1].conclude(Result(COMPLETED, "dog2", 3.0, 1), proof), 1.0)
-        fleet.nodes[2].vanish()
+        fleet.nodes[2].stop_silently()
         fleet.run(2.0)
-        self.assertEqual(outcome_of(task, group[-1]), Result(COMPLETED, "dog2", 3.0, 1))
+        self.assertEqual(find_outcome(task, group[-1]), Result(COMPLETED, "dog2", 3.0, 1))
         self.assertEqual(heard[-1], ([], Result(COMPLETED, "dog2", 3.0, 1)))
         self.assertEqual(len(group[-1]), 1)
         self.assertEqual(fleet.nodes[3].store.get(group_key("t1")), group[-1])
@@ -118,8 +130,8 @@ class SwarmNodeTests(FleetCase):
         task = self.submitted(fleet)
         for strange in (replace(task, lease_ttl=999.0), replace(task, lease_ttl=1), replace(task, council=())):
             for node in fleet.nodes:
-                lessee = node.lessee(strange, lambda: None, 0)
-                lessee.want()
+                lessee = node.make_lease_client(strange, lambda: None, 0)
+                lessee.claim()
                 fleet.run(0.3)
                 lessee.release()
                 fleet.run(1.0)
@@ -179,7 +191,7 @@ class SwarmNodeTests(FleetCase):
         gone: list[float] = []
         fleet.nodes[0].on_disconnect(gone.append)
         self.asked(fleet, "device.disconnect", 5)
-        fleet.nodes[0].presence.say(1.0, "late")
+        fleet.nodes[0].presence.add_message(1.0, "late")
         fleet.run(0.02)
         fleet.nodes[0].stopService()
         fleet.run(1.0)
@@ -199,10 +211,10 @@ class SwarmNodeTests(FleetCase):
             "h:²": False,
         }
         for address, is_contact in rows.items():
-            value = Device(node.uuid, "dog", address=address).packed()
+            value = Device(node.uuid, "dog", address=address).pack()
             record = Record(DEVICES, "dog", node.entangled.identity.public, 1, "leased", 1.0, value, bytes(64))
-            self.assertEqual(node.contact_of(record) is not None, is_contact, address)
-        self.assertIsNone(node.contact_of(replace(record, value=b"?")))
+            self.assertEqual(node.find_contact(record) is not None, is_contact, address)
+        self.assertIsNone(node.find_contact(replace(record, value=b"?")))
 
     def test_too_much_to_say(self) -> None:
         """A presence that exceeds a record is logged as an error, and the node continues to run."""
@@ -210,5 +222,5 @@ class SwarmNodeTests(FleetCase):
         fleet.nodes[0].presence.change(capabilities={"arm": {"kind": "x" * 2000}})
         fleet.run(1.0)
         self.assertEqual(len(self.flushLoggedErrors()), 1)
-        asked = fleet.nodes[0].conclude("t", Result(COMPLETED, "dog0"))
+        asked = fleet.nodes[0].record_result("t", Result(COMPLETED, "dog0"))
         asked.addErrback(lambda failure: failure.trap(NoAnswer))

@@ -8,8 +8,8 @@ from twisted.trial.unittest import SynchronousTestCase
 
 from middleware.entangled.clock import HeapClock
 from middleware.entangled.errors import PortInUse
-from middleware.entangled.network.network import MAX_CARRIED, Address, Network
-from middleware.entangled.network.switchboard import Switchboard, Weather
+from middleware.entangled.network.network import MAX_RELAYED_BYTES, Address, Network
+from middleware.entangled.network.switchboard import LinkConditions, Switchboard
 
 
 class _Far:
@@ -18,7 +18,7 @@ class _Far:
     def __init__(self) -> None:
         self.asked: list[tuple[Address, Address, int, float]] = []
 
-    def delays(self, source: Address, to: Address, size: int, now: float, rng: random.Random) -> list[float]:
+    def draw_delays(self, source: Address, to: Address, size: int, now: float, rng: random.Random) -> list[float]:
         self.asked.append((source, to, size, now))
         return [2.0, 2.0]
 
@@ -31,8 +31,8 @@ class SwitchboardTests(SynchronousTestCase):
         self.clock = HeapClock()
         self.board = Switchboard(self.clock, random.Random(3))
         self.got: list[tuple[float, bytes]] = []
-        self.a = self.board.network()
-        self.b = self.board.network()
+        self.a = self.board.make_network()
+        self.b = self.board.make_network()
         self.a.listen(self._receive)
         self.b.listen(self._receive)
 
@@ -47,7 +47,7 @@ class SwitchboardTests(SynchronousTestCase):
     def test_delivers_later_and_in_order(self) -> None:
         """Datagrams arrive asynchronously and in order; an oversized one, and one to an unused address, are dropped."""
         network: Network = self.a
-        self.a.send(bytes(MAX_CARRIED + 1), self.b.address)
+        self.a.send(bytes(MAX_RELAYED_BYTES + 1), self.b.address)
         self.a.send(b"x", Address("127.0.0.1", 9))
         network.send(b"x", self.b.address)
         self.assertEqual(self.got, [])
@@ -57,7 +57,7 @@ class SwitchboardTests(SynchronousTestCase):
 
     def test_loses_doubles_and_delays(self) -> None:
         """Loss, duplication, delay and jitter match the configured ``Weather``."""
-        self.board.weather = Weather(delay_s=0.1, jitter_s=0.02, loss=0.2, duplicate=0.1, reorder=0.1)
+        self.board.conditions = LinkConditions(delay_s=0.1, jitter_s=0.02, loss=0.2, duplicate=0.1, reorder=0.1)
         self._send(5000)
         self.assertApproximates(self.board.counters["lost"] / 5000, 0.2, 0.02)
         self.assertApproximates(self.board.counters["duplicated"] / 4000, 0.1, 0.02)
@@ -73,7 +73,7 @@ class SwitchboardTests(SynchronousTestCase):
             lambda: self.board.barriers.append(lambda source, to: source == self.a.address),
         ):
             self.setUp()
-            self.board.weather = Weather(delay_s=0.1)
+            self.board.conditions = LinkConditions(delay_s=0.1)
             self.a.send(b"on its way", self.b.address)
             close()
             self.b.send(b"back", self.a.address)
@@ -86,7 +86,7 @@ class SwitchboardTests(SynchronousTestCase):
 
     def test_partition(self) -> None:
         """Groups are isolated from each other; addresses without a group form another group."""
-        c = self.board.network()
+        c = self.board.make_network()
         c.listen(self._receive)
         self.board.partition([self.a.address], [self.b.address])
         self._send(1)
@@ -104,14 +104,14 @@ class SwitchboardTests(SynchronousTestCase):
         self.b.send(b"ghost", self.a.address)
         self.clock.advance(1)
         self.assertEqual(self.got, [])
-        reborn = self.board.network(*self.b.address)
+        reborn = self.board.make_network(*self.b.address)
         reborn.listen(self._receive)
         self._send(1)
         self.assertEqual(len(self.got), 1)
 
     def test_port_is_held_once(self) -> None:
         """A second network on an address in use is rejected; after ``close``, which can be repeated, it can listen."""
-        twin = self.board.network(*self.b.address)
+        twin = self.board.make_network(*self.b.address)
         self.assertRaises(PortInUse, twin.listen, self._receive)
         self.b.close()
         self.b.close()
@@ -119,31 +119,31 @@ class SwitchboardTests(SynchronousTestCase):
 
     def test_link_says_how_long_everything_takes(self) -> None:
         """A link sets the delay of each datagram, except in a direction that has a separate ``Weather``."""
-        link = self.board.link = _Far()
+        link = self.board.link_model = _Far()
         self.clock.advance(5)
         self.a.send(b"far", self.b.address)
         self.assertEqual(link.asked, [(self.a.address, self.b.address, 3, 5.0)])
-        self.board.set_weather(self.a.address, self.b.address, Weather(delay_s=0.5), one_way=True)
+        self.board.set_conditions(self.a.address, self.b.address, LinkConditions(delay_s=0.5), one_way=True)
         self.a.send(b"near", self.b.address)
         self.clock.advance(3)
         self.assertEqual(self.got, [(5.5, b"near"), (7.0, b"far"), (7.0, b"far")])
         self.assertEqual((len(link.asked), self.board.counters["duplicated"]), (1, 1))
         self.b.send(b"back", self.a.address)
-        self.board.set_weather(self.a.address, self.b.address, None)
+        self.board.set_conditions(self.a.address, self.b.address, None)
         self.a.send(b"far", self.b.address)
         self.assertEqual(len(link.asked), 3)
 
     def test_traffic_goes_on_in_the_next_life(self) -> None:
         """Datagrams and bytes are counted at both ends, and a later network can continue the counters."""
-        self.board.weather = Weather(loss=1.0)
+        self.board.conditions = LinkConditions(loss=1.0)
         self.a.send(b"lost", self.b.address)
-        self.board.weather = Weather()
+        self.board.conditions = LinkConditions()
         self._send(3)
         sent, received = self.a.traffic, self.b.traffic
         self.assertEqual((sent.sent, sent.sent_bytes, sent.received, sent.received_bytes), (4, 7, 0, 0))
         self.assertEqual((received.sent, received.received, received.received_bytes), (0, 3, 3))
         self.a.close()
-        self.a = self.board.network(*self.a.address, traffic=sent)
+        self.a = self.board.make_network(*self.a.address, traffic=sent)
         self.a.listen(self._receive)
         self._send(1)
         self.assertEqual((self.a.traffic.sent, self.a.traffic.sent_bytes), (5, 8))
@@ -153,8 +153,8 @@ class SwitchboardTests(SynchronousTestCase):
 
         def run(seed: int, is_asked_often: bool) -> str:
             clock = HeapClock()
-            board = Switchboard(clock, random.Random(seed), Weather(loss=0.1, duplicate=0.1))
-            a, b = board.network(), board.network()
+            board = Switchboard(clock, random.Random(seed), LinkConditions(loss=0.1, duplicate=0.1))
+            a, b = board.make_network(), board.make_network()
             b.listen(lambda datagram, source: b.send(datagram + b"!", source))
             a.listen(lambda datagram, source: None)
             for number in range(700):

@@ -33,10 +33,10 @@ class TokenBucketTests(SynchronousTestCase):
         """Returned tokens can be taken again, up to the capacity."""
         bucket = TokenBucket(1.0, 2.0)
         self.assertTrue(bucket.take(0.0, 2.0))
-        bucket.give()
+        bucket.refund()
         self.assertEqual([bucket.take(0.0), bucket.take(0.0)], [True, False])
         for _ in range(9):
-            bucket.give()
+            bucket.refund()
         self.assertEqual([bucket.take(0.0, 2.0), bucket.take(0.0)], [True, False])
 
     def test_full(self) -> None:

@@ -12,23 +12,23 @@ from twisted.trial.unittest import SynchronousTestCase
 from middleware.entangled.clock import HeapClock
 from middleware.entangled.errors import PortInUse
 from middleware.entangled.network.joint import JointNetwork
-from middleware.entangled.network.layer import Proxied, Tls, client_context, server_context
-from middleware.entangled.network.link import MAX_SENDING, MAX_WAITING
+from middleware.entangled.network.layer import ProxyLayer, TlsLayer, make_client_context, make_server_context
 from middleware.entangled.network.network import Address
-from middleware.entangled.network.pipes import Pipes
-from middleware.entangled.network.selfsigned import selfsigned
+from middleware.entangled.network.pipes import PipeNetwork
+from middleware.entangled.network.selfsigned import make_certificate
 from middleware.entangled.network.switchboard import Switchboard
 from middleware.entangled.network.tunnel import (
-    FIRST_HOLD_S,
-    HEAD_S,
-    LAST_HOLD_S,
-    MAX_BEGUN,
-    MAX_LINKS,
-    MAX_OF_HOST,
-    UNANSWERED_S,
-    UNUSED_S,
+    ACCEPT_TIMEOUT_S,
+    IDLE_TIMEOUT_S,
+    MAX_HANDSHAKES,
+    MAX_PER_HOST,
+    MAX_REDIAL_S,
+    MAX_TOTAL_CONNECTIONS,
+    MIN_REDIAL_S,
+    UNANSWERED_TIMEOUT_S,
     TunnelNetwork,
 )
+from middleware.entangled.network.tunnel_connection import MAX_QUEUED_BYTES, MAX_SEND_BUFFER_BYTES
 from middleware.entangled.network.url import Proxy, Url
 
 HOST = "10.0.0.1"
@@ -67,7 +67,7 @@ class Dribbler(Protocol):
 class Relay(Protocol):
     """An HTTP proxy that accepts one CONNECT request and forwards the bytes after it."""
 
-    def __init__(self, pipes: Pipes, answer: bytes = b"HTTP/1.1 200 Connection established\r\n\r\n") -> None:
+    def __init__(self, pipes: PipeNetwork, answer: bytes = b"HTTP/1.1 200 Connection established\r\n\r\n") -> None:
         self.pipes = pipes
         self.answer = answer
         self.asked = b""
@@ -85,13 +85,13 @@ class Relay(Protocol):
             transport.write(self.answer)
             self.far = Protocol()
             self.far.dataReceived = transport.write  # type: ignore[method-assign]
-            self.pipes.carrier("10.0.0.250").dial(Address(HOST, 443), self.far, lambda why: None)
+            self.pipes.make_transport("10.0.0.250").dial(Address(HOST, 443), self.far, lambda why: None)
 
 
 class TunnelCase(SynchronousTestCase):
     def setUp(self) -> None:
         self.clock = HeapClock()
-        self.pipes = Pipes(self.clock)
+        self.pipes = PipeNetwork(self.clock)
         self.ends: list[TunnelNetwork] = []
         self.addCleanup(self.end)
 
@@ -105,7 +105,7 @@ class TunnelCase(SynchronousTestCase):
     def made(self, host: str = HOST, *urls: Url, port: int = 443, **options: Any) -> tuple[TunnelNetwork, Heard]:
         """Create an end, which is a server if it has no URL, and the list of datagrams that it receives."""
         heard: Heard = []
-        carrier = self.pipes.carrier(host, port)
+        carrier = self.pipes.make_transport(host, port)
         tunnel = TunnelNetwork(carrier, self.clock, random.Random(host), urls, not urls, **options)
         tunnel.listen(lambda datagram, source: heard.append((datagram, source)))
         self.ends.append(tunnel)
@@ -128,7 +128,7 @@ class TunnelCase(SynchronousTestCase):
     def dribble(self, words: bytes = b"", host: str = "10.6.6.6") -> Dribbler:
         """Connect a peer that sends these bytes and then nothing."""
         dribbler = Dribbler(words)
-        self.pipes.carrier(host).dial(Address(HOST, 443), dribbler, lambda why: None)
+        self.pipes.make_transport(host).dial(Address(HOST, 443), dribbler, lambda why: None)
         self.clock.advance(0.0)
         self.clock.advance(0.0)
         return dribbler
@@ -176,9 +176,9 @@ class TunnelTests(TunnelCase):
                 moments.append(self.clock.seconds())
             self.clock.advance(0.05)
         gaps = [b - a for a, b in zip(moments, moments[1:], strict=False)]
-        self.assertLess(gaps[0], 1.25 * FIRST_HOLD_S + 0.1)
-        self.assertLess(max(gaps), 1.25 * LAST_HOLD_S + 0.1)
-        self.assertGreater(gaps[-1], 0.75 * LAST_HOLD_S - 0.1)
+        self.assertLess(gaps[0], 1.25 * MIN_REDIAL_S + 0.1)
+        self.assertLess(max(gaps), 1.25 * MAX_REDIAL_S + 0.1)
+        self.assertGreater(gaps[-1], 0.75 * MAX_REDIAL_S - 0.1)
         self.assertLess(len(moments), 15)
 
     def test_reconnect(self) -> None:
@@ -201,7 +201,7 @@ class TunnelTests(TunnelCase):
             self.clock.advance(20.0)
             client.send(b"x", PLAIN.address)
         self.assertEqual(len(client.peers), 1)
-        self.clock.advance(UNUSED_S - 2.0)
+        self.clock.advance(IDLE_TIMEOUT_S - 2.0)
         self.assertEqual((len(client.peers), len(server.peers)), (1, 1))
         self.clock.advance(4.0)
         self.assertEqual((client.peers, server.peers), ([], []))
@@ -223,10 +223,10 @@ class TunnelTests(TunnelCase):
     def test_port_in_use(self) -> None:
         """A port in use raises ``PortInUse``, and a joint network then opens neither of its networks."""
         self.made()
-        carrier = self.pipes.carrier(HOST, 443)
+        carrier = self.pipes.make_transport(HOST, 443)
         other = TunnelNetwork(carrier, self.clock, random.Random(1), is_served=True)
         self.assertRaises(PortInUse, other.listen, lambda datagram, source: None)
-        udp = Switchboard(self.clock, random.Random(1)).network(HOST, 7000)
+        udp = Switchboard(self.clock, random.Random(1)).make_network(HOST, 7000)
         self.assertRaises(PortInUse, JointNetwork(udp, other).listen, lambda datagram, source: None)
         self.assertIsNone(udp.receiver)
 
@@ -234,7 +234,7 @@ class TunnelTests(TunnelCase):
         """With an HTTP proxy the tunnel uses CONNECT and the login of the proxy."""
         _, served = self.made()
         relay = Relay(self.pipes)
-        self.pipes.carrier("10.0.0.200", 3128).listen(lambda host: relay)
+        self.pipes.make_transport("10.0.0.200", 3128).listen(lambda host: relay)
         client, _ = self.made("10.0.0.2", URL, proxy_for=lambda url: Proxy("10.0.0.200", 3128, "me:secret"))
         client.send(b"through", URL.address)
         self.clock.advance(0.1)
@@ -250,11 +250,11 @@ class TunnelTests(TunnelCase):
             b"\r\n\r\n",
             b"x" * 9000,
         ):
-            layer = Proxied("a:443")
-            layer.received(answer)
+            layer = ProxyLayer("a:443")
+            layer.decode(answer)
             self.assertTrue(layer.fault and not layer.is_open)
-        layer = Proxied("a:443")
-        self.assertEqual(layer.received(b"HTTP/1.1 200 OK\r\n\r\nrest"), (b"rest", b""))
+        layer = ProxyLayer("a:443")
+        self.assertEqual(layer.decode(b"HTTP/1.1 200 OK\r\n\r\nrest"), (b"rest", b""))
 
 
 class BurdenTests(TunnelCase):
@@ -265,14 +265,14 @@ class BurdenTests(TunnelCase):
         client, came, server, _ = self.pair()
         (address,) = server.peers
         reader = self.pipes.streams[0]
-        reader.is_read = False
+        reader.is_reading = False
         for number in range(500):
             server.send(number.to_bytes(2, "big") * 700, address)
-        (link,) = server._links
-        self.assertLess(link.waiting + len(reader.other.buffer), 64 * 1024)
-        self.assertLessEqual(link.waiting, MAX_WAITING)
+        (link,) = server._connections
+        self.assertLess(link.queued_bytes + len(reader.other.buffer), 64 * 1024)
+        self.assertLessEqual(link.queued_bytes, MAX_QUEUED_BYTES)
         self.assertGreater(server.counters["dropped"], 450)
-        reader.is_read = True
+        reader.is_reading = True
         reader.other.pump()
         self.clock.advance(1.0)
         numbers = [int.from_bytes(datagram[:2], "big") for datagram, _ in came]
@@ -284,7 +284,7 @@ class BurdenTests(TunnelCase):
         server, served = self.made(is_plain=True)
         talker = self.dribble(GREETING % 1, "127.0.0.1")
         self.clock.advance(0.1)
-        self.pipes.streams[0].is_read = False
+        self.pipes.streams[0].is_reading = False
         (address,) = server.peers
         for second in range(40):
             for _ in range(1 if second else 20):
@@ -314,14 +314,14 @@ class BurdenTests(TunnelCase):
             self.clock.advance(0.1)
         self.clock.advance(2.0)
         self.assertEqual(len(late), 100)
-        self.assertLess(max(late), (MAX_SENDING + 8192) / 50_000.0)
+        self.assertLess(max(late), (MAX_SEND_BUFFER_BYTES + 8192) / 50_000.0)
         self.assertGreater(client.counters["dropped"], 500)
 
     def test_garbage_is_let_go(self) -> None:
         """A peer without TLS or WebSocket is disconnected at once; an incomplete handshake ends by a timeout."""
         server, _ = self.made()
         idle, half = self.dribble(), self.dribble(b"\x16\x03\x01")
-        self.clock.advance(HEAD_S - 1.0)
+        self.clock.advance(ACCEPT_TIMEOUT_S - 1.0)
         self.assertFalse(idle.is_lost or half.is_lost)
         self.clock.advance(2.1)
         self.assertTrue(idle.is_lost and half.is_lost)
@@ -342,7 +342,7 @@ class BurdenTests(TunnelCase):
         server, _ = self.made()
         crowd = [self.dribble() for _ in range(100)]
         self.clock.advance(0.1)
-        self.assertEqual(sum(not one.is_lost for one in crowd), MAX_OF_HOST)
+        self.assertEqual(sum(not one.is_lost for one in crowd), MAX_PER_HOST)
         client, _ = self.made("10.0.0.2", URL)
         client.send(b"x", URL.address)
         self.clock.advance(0.1)
@@ -352,14 +352,14 @@ class BurdenTests(TunnelCase):
         """The number of incomplete handshakes is bounded for all addresses; a member still connects."""
         server, served = self.made()
         crowd = [self.dribble(host=f"10.7.{n // 250}.{n % 250}") for n in range(500)]
-        self.assertEqual(sum(not one.is_lost for one in crowd), MAX_BEGUN)
+        self.assertEqual(sum(not one.is_lost for one in crowd), MAX_HANDSHAKES)
         client, _ = self.made("10.0.0.2", URL)
         client.send(b"x", URL.address)
         self.clock.advance(0.1)
         self.assertEqual([datagram for datagram, _ in served], [b"x"])
-        self.clock.advance(HEAD_S + 2.0)
+        self.clock.advance(ACCEPT_TIMEOUT_S + 2.0)
         self.assertTrue(all(one.is_lost for one in crowd))
-        self.assertEqual(len(server._links), 1)
+        self.assertEqual(len(server._connections), 1)
 
     def test_behind_a_reverse_proxy(self) -> None:
         """Behind a reverse proxy connections are counted by the forwarded address."""
@@ -367,15 +367,15 @@ class BurdenTests(TunnelCase):
         one = [self.dribble(GREETING % 1, "127.0.0.1") for _ in range(40)]
         others = [self.dribble(GREETING % n, "127.0.0.1") for n in range(2, 12)]
         self.clock.advance(0.5)
-        self.assertEqual(sum(not each.is_lost for each in one), MAX_OF_HOST)
+        self.assertEqual(sum(not each.is_lost for each in one), MAX_PER_HOST)
         self.assertFalse(any(each.is_lost for each in others))
 
     def test_strangers_are_let_go(self) -> None:
         """A peer that the node never answers is disconnected; an answered one stays."""
         client, _, server, served = self.pair()
         stranger, _ = self.made("10.0.0.3", PLAIN)
-        for second in range(int(UNANSWERED_S) + 2):
-            if second < UNANSWERED_S:
+        for second in range(int(UNANSWERED_TIMEOUT_S) + 2):
+            if second < UNANSWERED_TIMEOUT_S:
                 stranger.send(b"garbage", PLAIN.address)
             client.send(b"x", PLAIN.address)
             self.clock.advance(1.0)
@@ -386,7 +386,7 @@ class BurdenTests(TunnelCase):
         """When all places are taken, a new connection replaces a stranger and never a member."""
         server, served = self.made(is_plain=True)
         members = []
-        for n in range(MAX_LINKS - 1):
+        for n in range(MAX_TOTAL_CONNECTIONS - 1):
             member, _ = self.made(f"10.1.{n // 250}.{n % 250}", PLAIN)
             member.send(b"m", PLAIN.address)
             self.clock.advance(0.0)
@@ -413,11 +413,11 @@ class JointTests(TunnelCase):
         """A joint network sends to tunnel addresses by tunnel and to others by UDP, with one receiver for both."""
         board = Switchboard(self.clock, random.Random(1))
         server, served = self.made()
-        plain = board.network("10.0.0.9", 7000)
+        plain = board.make_network("10.0.0.9", 7000)
         by_udp: Heard = []
         plain.listen(lambda datagram, source: by_udp.append((datagram, source)))
-        tunnel = TunnelNetwork(self.pipes.carrier("10.0.0.2"), self.clock, random.Random(2), [URL])
-        joint = JointNetwork(board.network("10.0.0.2", 7000), tunnel)
+        tunnel = TunnelNetwork(self.pipes.make_transport("10.0.0.2"), self.clock, random.Random(2), [URL])
+        joint = JointNetwork(board.make_network("10.0.0.2", 7000), tunnel)
         heard: Heard = []
         joint.listen(lambda datagram, source: heard.append((datagram, source)))
         self.addCleanup(joint.close)
@@ -435,7 +435,7 @@ class JointTests(TunnelCase):
         joint.close()
 
 
-PEM = selfsigned(b"s" * 32, b"number 1", "node.example")
+PEM = make_certificate(b"s" * 32, b"number 1", "node.example")
 
 
 class CertificateTests(SynchronousTestCase):
@@ -460,36 +460,36 @@ class CertificateTests(SynchronousTestCase):
 
 class TlsTests(SynchronousTestCase):
     def setUp(self) -> None:
-        self.client = Tls(client_context(), "node.example")
-        self.server = Tls(server_context(PEM), is_server=True)
+        self.client = TlsLayer(make_client_context(), "node.example")
+        self.server = TlsLayer(make_server_context(PEM), is_server=True)
 
     def shake(self) -> None:
         """Complete the handshake."""
         said = self.client.opening()
         while not (self.client.is_open and self.server.is_open):
-            _, answer = self.server.received(said)
-            _, said = self.client.received(answer)
+            _, answer = self.server.decode(said)
+            _, said = self.client.decode(answer)
             self.assertEqual((self.client.fault, self.server.fault), ("", ""))
-        self.server.received(said)
+        self.server.decode(said)
 
     def test_carry(self) -> None:
         """After the handshake bytes arrive unchanged in any segmentation, and are encrypted in transit."""
         self.shake()
         for source, sink in ((self.client, self.server), (self.server, self.client)):
-            wrapped = source.wrapped(b"in the clear" * 3000)
+            wrapped = source.encode(b"in the clear" * 3000)
             self.assertNotIn(b"clear", wrapped)
-            came = b"".join(sink.received(wrapped[at : at + 997])[0] for at in range(0, len(wrapped), 997))
+            came = b"".join(sink.decode(wrapped[at : at + 997])[0] for at in range(0, len(wrapped), 997))
             self.assertEqual(came, b"in the clear" * 3000)
 
     def test_fault(self) -> None:
         """Input other than TLS, and a modified record, set a fault and raise no exception."""
-        self.server.received(b"GET / HTTP/1.1\r\n\r\n")
+        self.server.decode(b"GET / HTTP/1.1\r\n\r\n")
         self.assertIn("TLS", self.server.fault)
-        self.assertEqual(self.server.received(b"more")[0], b"")
+        self.assertEqual(self.server.decode(b"more")[0], b"")
         self.setUp()
         self.shake()
-        wrapped = bytearray(self.client.wrapped(b"x" * 100))
+        wrapped = bytearray(self.client.encode(b"x" * 100))
         wrapped[-1] ^= 1
-        self.assertEqual(self.server.received(bytes(wrapped))[0], b"")
+        self.assertEqual(self.server.decode(bytes(wrapped))[0], b"")
         self.assertIn("TLS", self.server.fault)
-        self.assertEqual(self.server.wrapped(b"late")[:0], b"")
+        self.assertEqual(self.server.encode(b"late")[:0], b"")

@@ -8,10 +8,10 @@ from twisted.trial.unittest import SynchronousTestCase
 
 from middleware.entangled.network.network import Address
 from middleware.entangled.network.url import Proxy, Url
-from middleware.entangled.network.websocket import MAX_PAYLOAD, WebSocket
+from middleware.entangled.network.websocket import MAX_PAYLOAD_BYTES, WebSocket
 from tests.formats.rfc6455 import CLOSE
 
-URL = Url.of("wss://node.example:443/swarm")
+URL = Url.parse("wss://node.example:443/swarm")
 
 
 class WebSocketTests(SynchronousTestCase):
@@ -21,21 +21,21 @@ class WebSocketTests(SynchronousTestCase):
 
     def greet(self) -> None:
         """Open both ends."""
-        _, answer = self.server.received(self.client.opening())
-        self.client.received(answer)
+        _, answer = self.server.receive_data(self.client.opening())
+        self.client.receive_data(answer)
         self.assertTrue(self.client.is_open and self.server.is_open, (self.client.fault, self.server.fault))
 
     def test_carry_datagrams_cut_anyhow(self) -> None:
         """Datagrams of every length arrive in order in both directions, for any segmentation of the byte stream."""
-        sizes = [0, 1, 125, 126, 127, 1399, 1400, 1452, MAX_PAYLOAD]
+        sizes = [0, 1, 125, 126, 127, 1399, 1400, 1452, MAX_PAYLOAD_BYTES]
         sent = [random.Random(size).randbytes(size) for size in sizes]
         for is_cut in (True, False):
             self.setUp()
             self.greet()
             for source, sink in ((self.client, self.server), (self.server, self.client)):
-                stream = b"".join(source.framed(datagram) for datagram in sent)
+                stream = b"".join(source.encode_binary(datagram) for datagram in sent)
                 pieces = [stream[i : i + 1] for i in range(len(stream))] if is_cut else [stream]
-                came = [datagram for piece in pieces for datagram in sink.received(piece)[0]]
+                came = [datagram for piece in pieces for datagram in sink.receive_data(piece)[0]]
                 self.assertEqual(came, sent)
                 self.assertEqual(sink.fault, "")
 
@@ -44,17 +44,20 @@ class WebSocketTests(SynchronousTestCase):
         masked = bytes(4)
         garbage = {
             "text": b"\x81\x80" + masked,
-            "too long": b"\x82\xfe" + (MAX_PAYLOAD + 1).to_bytes(2, "big") + masked + bytes(MAX_PAYLOAD + 1),
+            "too long": b"\x82\xfe"
+            + (MAX_PAYLOAD_BYTES + 1).to_bytes(2, "big")
+            + masked
+            + bytes(MAX_PAYLOAD_BYTES + 1),
             "too long in parts": (b"\x02\xfe\x04\x01" + masked + bytes(0x401))
             + (b"\x00\xfe\x04\x01" + masked + bytes(0x401)),
         }
         for name, stream in garbage.items():
             self.setUp()
             self.greet()
-            datagrams, reply = self.server.received(stream)
+            datagrams, reply = self.server.receive_data(stream)
             self.assertTrue(self.server.fault, name)
             self.assertEqual((datagrams, reply[0] & 0x0F), ([], CLOSE), name)
-            self.assertEqual(self.server.received(self.client.framed(b"x")), ([], b""), name)
+            self.assertEqual(self.server.receive_data(self.client.encode_binary(b"x")), ([], b""), name)
 
     def test_refuse_other_requests(self) -> None:
         """A request for another path, version or subprotocol gets an HTTP error and closes the connection."""
@@ -65,7 +68,7 @@ class WebSocketTests(SynchronousTestCase):
             (lawful.replace(b"swarm-tunnel-1", b"chat"), b"426"),
         ):
             server = WebSocket()
-            _, reply = server.received(stream)
+            _, reply = server.receive_data(stream)
             self.assertTrue(server.fault and not server.is_open, stream)
             self.assertEqual(reply.split(b" ")[1], status)
 
@@ -78,16 +81,16 @@ class WebSocketTests(SynchronousTestCase):
             (b"Accept: ", b"Accept: x", "token"),
         ):
             client = WebSocket(URL)
-            _, lawful = WebSocket().received(client.opening())
+            _, lawful = WebSocket().receive_data(client.opening())
             self.assertIn(old, lawful)
-            client.received(lawful.replace(old, new))
+            client.receive_data(lawful.replace(old, new))
             self.assertIn(why, client.fault)
             self.assertFalse(client.is_open)
 
     def test_hear_for_whom_a_proxy_speaks(self) -> None:
         """The last address in X-Forwarded-For is used, as the proxy itself adds it."""
         head = self.client.opening().replace(b"Upgrade: w", b"X-Forwarded-For: 6.6.6.6, 10.0.0.9\r\nUpgrade: w")
-        self.server.received(head)
+        self.server.receive_data(head)
         self.assertEqual(self.server.forwarded, "10.0.0.9")
 
 
@@ -99,7 +102,7 @@ class UrlTests(SynchronousTestCase):
             ("ws://127.0.0.1:8000/x", ("ws", "127.0.0.1", 8000, "/x"), "ws://127.0.0.1:8000/x"),
             ("wss://[fe80::1]:8443/swarm", ("wss", "fe80::1", 8443, "/swarm"), "wss://[fe80::1]:8443/swarm"),
         ):
-            self.assertEqual((tuple(Url.of(text)), str(Url.of(text))), (parts, again))
+            self.assertEqual((tuple(Url.parse(text)), str(Url.parse(text))), (parts, again))
         for text in (
             "",
             "https://a",
@@ -110,11 +113,11 @@ class UrlTests(SynchronousTestCase):
             "wss://a/\r\nx",
             "wss://a:x",
         ):
-            self.assertRaises(ValueError, Url.of, text)
+            self.assertRaises(ValueError, Url.parse, text)
 
     def test_address(self) -> None:
         """Each URL has a distinct, stable virtual address."""
-        addresses = {Url.of(text).address for text in ("wss://a", "wss://a:443/swarm", "wss://b", "wss://a:444")}
+        addresses = {Url.parse(text).address for text in ("wss://a", "wss://a:443/swarm", "wss://b", "wss://a:444")}
         self.assertEqual(len(addresses), 3)
         for address in addresses:
             self.assertRegex(address.host, "^~wss-[0-9a-f]{12}$")
@@ -128,6 +131,6 @@ class UrlTests(SynchronousTestCase):
             ("http://me:p%40ss@proxy:80/", ("proxy", 80, "me:p@ss")),
             ("http://[fe80::1]:80", ("fe80::1", 80, "")),
         ):
-            self.assertEqual(tuple(Proxy.of(text)), parts)
+            self.assertEqual(tuple(Proxy.parse(text)), parts)
         for text in ("", "socks5://me:secret@a:1", "http://a:99999", "https://a"):
-            self.assertNotIn("secret", str(self.assertRaises(ValueError, Proxy.of, text)))
+            self.assertNotIn("secret", str(self.assertRaises(ValueError, Proxy.parse, text)))

@@ -9,14 +9,14 @@ from twisted.trial.unittest import SynchronousTestCase
 from middleware.entangled.contact import Contact
 from middleware.entangled.identity import Identity
 from middleware.entangled.network.network import Address
-from middleware.entangled.record import Lifetime, Record, hashed_key
-from middleware.entangled.replication.pusher import FEW, MAX_TTL, MAX_WATCHERS
-from middleware.entangled.replication.subscriber import ASKED, LARGE_TTL
+from middleware.entangled.record import Lifetime, Record, hash_key
+from middleware.entangled.replication.pusher import MAX_IMMEDIATE, MAX_WATCH_TTL_S, MAX_WATCHERS
+from middleware.entangled.replication.subscriber import LARGE_TTL_S, MAX_PUSHERS
 from middleware.entangled.replication.watch import View, Watch, digest_of
-from tests.fleet import Fleet, FleetCase
+from tests.fleet import EntangledTeam, FleetCase
 
 DOG, CAT, ME = (Identity(bytes([n]) * 32) for n in (1, 2, 3))
-KEY = hashed_key("devices")
+KEY = hash_key("devices")
 
 
 def record(owner: Identity, sequence: int = 1, value: bytes | None = b"v", lifetime: Lifetime = "leased") -> Record:
@@ -33,9 +33,9 @@ class ViewTests(SynchronousTestCase):
         self.view.replace(CAT.node_id, [record(DOG)])
         self.view.add(ME.node_id, record(DOG))
         self.view.remove(CAT.node_id, record(DOG).slot)
-        self.assertEqual(self.view.merged(), [record(DOG)])
+        self.assertEqual(self.view.merge(), [record(DOG)])
         self.view.forget(ME.node_id)
-        self.assertEqual(self.view.merged(), [])
+        self.assertEqual(self.view.merge(), [])
 
     def test_the_stronger_record_holds(self) -> None:
         """The record with the higher sequence wins in any order of arrival; a replica never returns to a lower one."""
@@ -43,23 +43,23 @@ class ViewTests(SynchronousTestCase):
             view = View()
             for replica, sequence in zip((CAT, ME), order, strict=True):
                 view.add(replica.node_id, record(DOG, sequence))
-            self.assertEqual(view.merged(), [record(DOG, 2)])
+            self.assertEqual(view.merge(), [record(DOG, 2)])
         self.view.add(CAT.node_id, record(DOG, 2))
         self.view.add(CAT.node_id, record(DOG, 1))
-        self.assertEqual(self.view.merged(), [record(DOG, 2)])
+        self.assertEqual(self.view.merge(), [record(DOG, 2)])
 
     def test_tombstone_hides(self) -> None:
         """A newer tombstone at one replica hides an older record at other replicas."""
         self.view.replace(CAT.node_id, [record(DOG)])
         self.view.replace(ME.node_id, [record(DOG, 2, None, "team")])
-        self.assertEqual(self.view.merged(), [])
+        self.assertEqual(self.view.merge(), [])
 
     def test_nobody_testifies_for_its_own_lease(self) -> None:
         """The report of an owner does not count for its leased record, but counts for its team record."""
         self.view.replace(DOG.node_id, [record(DOG)])
-        self.assertEqual(self.view.merged(), [])
+        self.assertEqual(self.view.merge(), [])
         self.view.replace(DOG.node_id, [record(DOG, lifetime="team")])
-        self.assertEqual(len(self.view.merged()), 1)
+        self.assertEqual(len(self.view.merge()), 1)
 
     def test_digest(self) -> None:
         """Equal sets of records have the same digest in any order; different sets have different digests."""
@@ -79,21 +79,21 @@ class WatchTests(SynchronousTestCase):
 
     def test_tell_changes_only(self) -> None:
         """The subscriber receives each change once."""
-        self.watch.settle()
+        self.watch.update()
         self.watch.view.replace(CAT.node_id, [record(DOG)])
-        self.watch.settle()
+        self.watch.update()
         self.watch.view.replace(ME.node_id, [record(DOG)])
-        self.watch.settle()
+        self.watch.update()
         self.watch.forget(CAT.node_id)
         self.watch.forget(ME.node_id)
-        self.watch.settle()
+        self.watch.update()
         self.assertEqual(self.told, [[record(DOG)], []])
 
     def test_stop(self) -> None:
         """After a stop the subscriber receives no change, and the end is reported once."""
         self.watch.stop()
         self.watch.view.replace(CAT.node_id, [record(DOG)])
-        self.watch.settle()
+        self.watch.update()
         self.assertEqual((self.told, self.ended), ([], [self.watch]))
 
 
@@ -101,7 +101,7 @@ COUNT = 10
 
 
 class SubscriberTests(FleetCase):
-    def asked(self, fleet: Fleet) -> list[tuple[int, float | None]]:
+    def asked(self, fleet: EntangledTeam) -> list[tuple[int, float | None]]:
         """Return a list that receives the holder and the optional TTL of each later watch request."""
         asked: list[tuple[int, float | None]] = []
         for place, node in enumerate(fleet.nodes):
@@ -113,7 +113,7 @@ class SubscriberTests(FleetCase):
             node.endpoint.expose("watch", answer, changes=True, idempotent=True)
         return asked
 
-    def large(self, fleet: Fleet, seconds: float) -> None:
+    def large(self, fleet: EntangledTeam, seconds: float) -> None:
         """Advance the clock with all nodes set to a large network."""
         for _ in range(round(seconds / 0.5)):
             for node in fleet.nodes:
@@ -140,9 +140,9 @@ class SubscriberTests(FleetCase):
         for node, mine in zip(fleet.nodes, told, strict=True):
             node.watch(KEY, mine.append)
         self.large(fleet, 61.0)
-        self.assertLessEqual(len(asked), COUNT * ASKED * 4)
-        self.assertEqual({ttl for _, ttl in asked}, {LARGE_TTL})
-        self.assertGreater(len({place for place, _ in asked}), ASKED)
+        self.assertLessEqual(len(asked), COUNT * MAX_PUSHERS * 4)
+        self.assertEqual({ttl for _, ttl in asked}, {LARGE_TTL_S})
+        self.assertGreater(len({place for place, _ in asked}), MAX_PUSHERS)
         fleet.nodes[4].put(KEY, "news", b"x")
         self.large(fleet, 0.5)
         self.assertEqual([mine[-1][0].value for mine in told if mine], [b"x"] * COUNT)
@@ -156,7 +156,7 @@ class SubscriberTests(FleetCase):
         fleet.nodes[0].watch(KEY, told.append)
         self.large(fleet, 3.0)
         for place in {place for place, _ in asked}:
-            fleet.nodes[place].vanish()
+            fleet.nodes[place].stop_silently()
         self.large(fleet, 40.0)
         fleet.nodes[0].put(KEY, "news", b"x", concern="one")
         writer = next(node for node in fleet.nodes[1:] if node._running)
@@ -172,8 +172,8 @@ class SubscriberTests(FleetCase):
         crowd = [Contact(dice.randbytes(32), Address("10.0.0.9", 9)) for _ in range(MAX_WATCHERS)]
         for node in fleet.nodes:
             for contact in crowd:
-                node.replica.pusher.watched(KEY, contact, MAX_TTL)
-        outsider = next(n for n in fleet.nodes if not n.overlay.belongs(KEY, n.contact))
+                node.replica.pusher.add_watcher(KEY, contact, MAX_WATCH_TTL_S)
+        outsider = next(n for n in fleet.nodes if not n.overlay.is_replica(KEY, n.contact))
         told: list[list[Record]] = []
         outsider.watch(KEY, told.append)
         self.done(fleet, next(n for n in fleet.nodes if n is not outsider).put(KEY, "news", b"x"), 1.0)
@@ -185,10 +185,10 @@ class SubscriberTests(FleetCase):
         fleet = self.fleet(3)
         fleet.run(3.0)
         dice = random.Random(1)
-        for _ in range(FEW + 1):
+        for _ in range(MAX_IMMEDIATE + 1):
             contact = Contact(dice.randbytes(32), Address("10.0.0.9", 9))
             for node in fleet.nodes:
-                node.replica.pusher.watched(KEY, contact, MAX_TTL)
+                node.replica.pusher.add_watcher(KEY, contact, MAX_WATCH_TTL_S)
         told: list[list[Record]] = []
         fleet.nodes[2].watch(KEY, told.append)
         fleet.run(1.0)

@@ -10,9 +10,9 @@ import numpy as np
 from twisted.trial.unittest import SynchronousTestCase
 
 from sim.robots.camera import Camera
-from sim.robots.lens import FOCAL_X, HEIGHT, WIDTH, Image
-from sim.robots.scene import loaded
-from sim.robots.sensor import NOSE
+from sim.robots.rendering import FOCAL_X_PIXELS, HEIGHT, WIDTH, Image
+from sim.robots.scene import load_scene
+from sim.robots.sensor import NOSE_M
 from sim.robots.world import World
 
 
@@ -33,7 +33,7 @@ class CameraTests(SynchronousTestCase):
 
     def setUp(self) -> None:
         """Place the other dogs behind dog1."""
-        self.world = World(Random(1), loaded("three-dogs"))
+        self.world = World(Random(1), load_scene("three-dogs"))
         self.world.move_dog("dog1", 0.5, 1.2, 0.0)
         self.world.move_dog("dog2", 0.3, 0.3, 0.0)
         self.world.move_dog("dog3", 0.3, 2.1, 0.0)
@@ -42,36 +42,36 @@ class CameraTests(SynchronousTestCase):
 
     def mask(self) -> Image:
         """Return the red mask of a new picture."""
-        return red(self.camera.image(self.dog))
+        return red(self.camera.render_image(self.dog))
 
     def test_sees_no_red_without_a_target(self) -> None:
         """Walls, floor, dogs and noise contain no target red, also nose to nose, in corners and at walls."""
         for seed in range(20):
             self.world.scatter(seed, clearance=0.25, from_walls=0.12)
             for dog in self.world.dogs.values():
-                image = self.camera.image(dog)
+                image = self.camera.render_image(dog)
                 self.assertEqual((image.shape, image.dtype), ((HEIGHT, WIDTH, 3), np.uint8))
                 self.assertGreater(float(image.std()), 1.0)
                 self.assertEqual(int(red(image).sum()), 0)
             self.world.move_dog("dog1", 0.12, 0.12, Random(seed).uniform(-3.0, 3.0))
-            self.camera.image(self.dog)
+            self.camera.render_image(self.dog)
 
     def test_shows_the_target_where_and_as_large_as_it_is(self) -> None:
         """Bearing and width of the red area match the geometry within 1.6 pixels, near and far."""
         for x, y in ((1.0, 1.2), (1.5, 1.35), (2.0, 0.9), (2.8, 1.2), (2.8, 1.9)):
             self.world.place_target(x, y)
             left, right = columns(self.mask())
-            ahead, aside = x - 0.5 - NOSE, y - 1.2
+            ahead, aside = x - 0.5 - NOSE_M, y - 1.2
             bearing = math.atan2(aside, ahead)
             half = math.asin(0.08 / math.hypot(ahead, aside))
-            self.assertLess(abs(left - (WIDTH / 2 - FOCAL_X * math.tan(bearing + half))), 1.6)
-            self.assertLess(abs(right + 1 - (WIDTH / 2 - FOCAL_X * math.tan(bearing - half))), 1.6)
+            self.assertLess(abs(left - (WIDTH / 2 - FOCAL_X_PIXELS * math.tan(bearing + half))), 1.6)
+            self.assertLess(abs(right + 1 - (WIDTH / 2 - FOCAL_X_PIXELS * math.tan(bearing - half))), 1.6)
 
     def test_sees_the_target_across_the_yard(self) -> None:
         """At the far end of the map, and after JPEG compression, the target is at least nine pixels wide."""
         self.world.move_dog("dog1", 0.14, 1.2, 0.0)
         self.world.place_target(2.9, 1.2)
-        picture = cv2.imdecode(np.frombuffer(self.camera.jpeg(self.dog), np.uint8), cv2.IMREAD_COLOR)
+        picture = cv2.imdecode(np.frombuffer(self.camera.render_jpeg(self.dog), np.uint8), cv2.IMREAD_COLOR)
         left, right = columns(red(np.asarray(picture, dtype=np.uint8)))
         self.assertGreaterEqual(right - left + 1, 9)
 
@@ -100,7 +100,7 @@ class CameraTests(SynchronousTestCase):
         self.camera = Camera(Random(2), self.world)
         for name, stripes in (("dog2", 2), ("dog3", 3)):
             self.world.move_dog(name, 1.1, 1.2, 0.0)
-            picture = self.camera.image(self.dog)
+            picture = self.camera.render_image(self.dog)
             blue, green, ruby = (picture[:, :, i].astype(int) for i in range(3))
             yellow = (ruby > 150) & (green > 120) & (blue < 110)
             row = yellow[yellow.sum(axis=1).argmax()]

@@ -12,11 +12,11 @@ from twisted.internet.error import CannotListenError
 from twisted.internet.task import Clock
 from twisted.trial.unittest import SynchronousTestCase
 
-from drivers.aibo.codec import T2, command
+from drivers.aibo.codec import T2, encode_command
 from drivers.link import Link
 from sim.robots.emulator.aibo import RETRY_S, AiboServer
 from sim.robots.emulator.aibo_dog import AiboEmulator
-from sim.robots.emulator.body import MemoryBody
+from sim.robots.emulator.simulated_robot import MemoryRobot
 from tests.drivers.contract import KeptLink
 
 MAIN, STATE, WALK, HEAD, ESTOP, CAMERA, GAINS = 10020, 10031, 10050, 10052, 10053, 10011, 10032
@@ -35,7 +35,7 @@ class Client:
     def link_down(self) -> None:
         self.link = None
 
-    def received(self, data: bytes) -> None:
+    def data_received(self, data: bytes) -> None:
         self.heard += data
 
 
@@ -45,7 +45,7 @@ class AiboEmulatorTests(SynchronousTestCase):
     def setUp(self) -> None:
         """Create an emulated Aibo that was just switched on."""
         self.clock = Clock()
-        self.body = MemoryBody()
+        self.body = MemoryRobot()
         self.dog = self.made()
 
     def made(self, dialect: str = "T4") -> AiboEmulator:
@@ -58,8 +58,8 @@ class AiboEmulatorTests(SynchronousTestCase):
     def called(self, port: int) -> Client:
         """Return a client of the port, connected if the port listens."""
         client = Client()
-        line = self.connector.call("dog", port, client)
-        self.addCleanup(line.hang_up)
+        line = self.connector.connect("dog", port, client)
+        self.addCleanup(line.disconnect)
         self.pass_time(0.01)
         return client
 
@@ -95,7 +95,7 @@ class AiboEmulatorTests(SynchronousTestCase):
         assert walk.link is not None
         walk.link.close()
         self.pass_time(0.01)
-        self.assertTrue(self.dog.listens(WALK))
+        self.assertTrue(self.dog.is_listening(WALK))
 
     def test_shows_in_the_menu_what_runs(self) -> None:
         """A running server is listed as #name: selecting name again has no effect, and #name stops it."""
@@ -105,7 +105,7 @@ class AiboEmulatorTests(SynchronousTestCase):
         self.assertTrue(again.startswith(b"refresh\n"))
         self.assertIn(b"\n#Walk Remote Control\n", again)
         self.assertTrue(self.say(main, b'!select "#Walk Remote Control"\n').startswith(b"close\nWalkGUI\nrefresh\n"))
-        self.assertFalse(self.dog.listens(WALK))
+        self.assertFalse(self.dog.is_listening(WALK))
 
     def test_answers_every_line(self) -> None:
         """Known commands are answered with their result, and invalid lines with a status."""
@@ -122,36 +122,36 @@ class AiboEmulatorTests(SynchronousTestCase):
         self.assertEqual(estop.heard, b"")
         for said, answer in ((b"refresh\n", b"on\n"), (b"stop\n", b""), (b"start\n", b"off\n"), (b"warp\n", b"")):
             self.assertEqual(self.say(estop, said), answer)
-        self.dog.press()
+        self.dog.press_back_button()
         self.pass_time(0.01)
         self.assertEqual(estop.heard, b"on\n")
 
     def test_walks_while_its_motors_are_on(self) -> None:
         """Each motion component holds until it changes; a stopped dog ignores commands and restarts at rest."""
         _, walk = self.released()
-        self.say(walk, command("f", 0.5) + command("r", -0.25))
+        self.say(walk, encode_command("f", 0.5) + encode_command("r", -0.25))
         self.assertEqual(self.body.motion, (0.08, 0.0, -0.5075))
-        self.say(walk, command("f", -1.0) + command("s", 1.0))
+        self.say(walk, encode_command("f", -1.0) + encode_command("s", 1.0))
         self.assertEqual(self.body.motion, (-0.156, 0.103, -0.5075))
-        self.dog.press()
+        self.dog.press_back_button()
         self.assertEqual(self.body.motion, (0.0, 0.0, 0.0))
-        self.say(walk, command("f", 0.5))
-        self.dog.press()
+        self.say(walk, encode_command("f", 0.5))
+        self.dog.press_back_button()
         self.assertEqual(self.body.motion, (0.0, 0.0, 0.0))
 
     def test_walks_no_nan(self) -> None:
         """A component that is not finite counts as zero; the others are obeyed."""
         _, walk = self.released()
         for value in (math.nan, math.inf, -math.inf):
-            self.say(walk, command("f", 0.5) + command("r", value))
+            self.say(walk, encode_command("f", 0.5) + encode_command("r", value))
             self.assertEqual(self.body.motion, (0.08, 0.0, 0.0))
 
     def test_stops_three_seconds_after_the_last_command(self) -> None:
         """The walk stops 3 s after the last command, which may be a command without effect."""
         _, walk = self.released()
-        self.say(walk, command("f", 0.5))
+        self.say(walk, encode_command("f", 0.5))
         self.pass_time(2.5)
-        self.say(walk, command("0", 0.0))
+        self.say(walk, encode_command("0", 0.0))
         self.pass_time(2.5)
         self.assertGreater(self.body.motion[0], 0.0)
         self.pass_time(0.6)
@@ -160,7 +160,7 @@ class AiboEmulatorTests(SynchronousTestCase):
     def test_stops_when_its_walk_server_stops(self) -> None:
         """Stopping the walk server stops the walk and closes its connection."""
         main, walk = self.released()
-        self.say(walk, command("f", 0.5))
+        self.say(walk, encode_command("f", 0.5))
         self.say(main, b'!select "#Walk Remote Control"\n')
         self.assertEqual((self.body.motion, walk.link), ((0.0, 0.0, 0.0), None))
 
@@ -182,7 +182,7 @@ class AiboEmulatorTests(SynchronousTestCase):
         main = self.called(MAIN)
         self.say(main, b'!select "Head Remote Control"\n!select "World State Serializer"\n')
         head, state = self.called(HEAD), self.called(STATE)
-        self.say(head, command("p", 0.5) + command("t", -9.0) + command("x", 1.0))
+        self.say(head, encode_command("p", 0.5) + encode_command("t", -9.0) + encode_command("x", 1.0))
         state.heard = b""
         self.pass_time(0.032)
         tilt, pan = struct.unpack_from("<2f", state.heard, 18 + 12 * 4)
@@ -194,12 +194,12 @@ class AiboEmulatorTests(SynchronousTestCase):
         main = self.called(MAIN)
         heard = self.say(main, b'!select "Raw Cam Server"\n')
         self.assertIn(b'10011\n"raw" "10011" "udp"\n', heard)
-        self.assertFalse(self.dog.listens(CAMERA))
+        self.assertFalse(self.dog.is_listening(CAMERA))
         packets: list[bytes] = []
-        self.dog.datagram(b"hello", packets.append)
+        self.dog.on_datagram(b"hello", packets.append)
         self.pass_time(0.1)
         self.assertEqual(packets, [])
-        self.dog.datagram(b"connection request", packets.append)
+        self.dog.on_datagram(b"connection request", packets.append)
         self.pass_time(1.0)
         self.assertIn(len(packets), (29, 30, 31))
         self.say(main, b'!select "#Raw Cam Server"\n')
@@ -215,11 +215,11 @@ class AiboEmulatorTests(SynchronousTestCase):
     def test_begins_anew_after_a_reboot(self) -> None:
         """A reboot closes all links, stops servers and motors, and allows new connections."""
         main, walk = self.released()
-        self.say(walk, command("f", 0.5))
+        self.say(walk, encode_command("f", 0.5))
         self.dog.reboot()
         self.assertTrue(self.dog.is_engaged)
         self.assertEqual(self.body.motion, (0.0, 0.0, 0.0))
-        self.assertFalse(self.dog.listens(WALK))
+        self.assertFalse(self.dog.is_listening(WALK))
         self.pass_time(0.2)
         self.assertIsNotNone(main.link)
         self.assertIsNone(walk.link)
@@ -262,7 +262,7 @@ class AiboServerTests(SynchronousTestCase):
 
     def setUp(self) -> None:
         self.reactor = Ports()
-        self.dog = AiboEmulator(self.reactor, MemoryBody(), random.Random(1))
+        self.dog = AiboEmulator(self.reactor, MemoryRobot(), random.Random(1))
         self.server = AiboServer(self.reactor, self.dog)
         self.server.start()
 

@@ -5,9 +5,9 @@ from __future__ import annotations
 from twisted.internet.task import Clock
 from twisted.trial.unittest import SynchronousTestCase
 
-from drivers.camera.codec import StreamReader, request
-from sim.robots.emulator.body import MemoryBody
+from drivers.camera.codec import StreamReader, encode_request
 from sim.robots.emulator.camera import MjpegCamera
+from sim.robots.emulator.simulated_robot import MemoryRobot
 from tests.drivers.contract import KeptLink
 
 
@@ -15,7 +15,7 @@ class MjpegCameraTests(SynchronousTestCase):
     def setUp(self) -> None:
         """Start a camera with 8 pictures a second."""
         self.clock = Clock()
-        self.body = MemoryBody(jpeg=b"\xff\xd8a\xff\xd9")
+        self.body = MemoryRobot(jpeg=b"\xff\xd8a\xff\xd9")
         self.camera = MjpegCamera(self.clock, self.body, 8.0)
         self.camera.start()
         self.camera.start()
@@ -33,11 +33,11 @@ class MjpegCameraTests(SynchronousTestCase):
         """Each client gets every picture after its request, for any path, until it leaves."""
         first, second = KeptLink(), KeptLink()
         asks = self.camera.accept(first)
-        for byte in request("cam", "/stream"):
-            asks.received(bytes([byte]))
+        for byte in encode_request("cam", "/stream"):
+            asks.data_received(bytes([byte]))
         self.clock.pump([0.0625] * 16)
-        self.camera.accept(second).received(request("cam", "/any?thing=1"))
-        asks.received(b"what comes later is not heard")
+        self.camera.accept(second).data_received(encode_request("cam", "/any?thing=1"))
+        asks.data_received(b"what comes later is not heard")
         self.clock.pump([0.0625] * 16)
         self.assertEqual((len(self.pictures(first)), len(self.pictures(second))), (16, 8))
         asks.link_down()
@@ -49,7 +49,7 @@ class MjpegCameraTests(SynchronousTestCase):
         """Pictures for a busy client are dropped whole, and other clients lose none."""
         slow, quick = KeptLink(), KeptLink()
         for wire in (slow, quick):
-            self.camera.accept(wire).received(request("cam", "/"))
+            self.camera.accept(wire).data_received(encode_request("cam", "/"))
         slow.is_busy = True
         self.clock.pump([0.0625] * 16)
         slow.is_busy = False
@@ -59,10 +59,10 @@ class MjpegCameraTests(SynchronousTestCase):
     def test_turns_away(self) -> None:
         """Another method, an endless request, and a request while the camera is out of order get no pictures."""
         posts, endless, late = KeptLink(), KeptLink(), KeptLink()
-        self.camera.accept(posts).received(b"POST / HTTP/1.1\r\n\r\n")
-        self.camera.accept(endless).received(bytes(10_000))
+        self.camera.accept(posts).data_received(b"POST / HTTP/1.1\r\n\r\n")
+        self.camera.accept(endless).data_received(bytes(10_000))
         self.camera.status = "503 Busy"
-        self.camera.accept(late).received(request("cam", "/"))
+        self.camera.accept(late).data_received(encode_request("cam", "/"))
         self.clock.pump([0.0625] * 16)
         self.assertTrue(posts.said.startswith(b"HTTP/1.1 405 ") and late.said.startswith(b"HTTP/1.1 503 "))
         self.assertEqual((endless.said, endless.is_closed), (b"", True))

@@ -12,40 +12,40 @@ from middleware.consensus.lease.acceptor import LeaseAcceptor
 from middleware.entangled.clock import HeapClock
 from middleware.entangled.kademlia.distance import distance
 from middleware.entangled.node import EntangledNode
-from middleware.entangled.quorum.register import Kind, Reply
+from middleware.entangled.quorum.register import Reply, ReplyKind
 from middleware.entangled.record import Record
-from sim.team.figure import Figure
 from sim.team.load.catalogue import LOADS
-from sim.team.load.residents import Census, Pace
+from sim.team.load.client_workload import NodeIdIndex, Pacer
 from sim.team.load.values import NAME
+from sim.team.metric import Metric
 from sim.team.run import Outcome, Run
-from sim.team.scenario import scenario_of
+from sim.team.scenario import parse_scenario
 
 
-def played(text: str, seed: int = 1) -> tuple[Outcome, dict[str, Figure]]:
+def played(text: str, seed: int = 1) -> tuple[Outcome, dict[str, Metric]]:
     """Run a scenario and return the outcome and its figures by name."""
     settings = {name: kind.settings for name, kind in LOADS.items()}
-    outcome = Run(scenario_of(text, "test", "test", settings), seed, LOADS).go()
-    return outcome, {figure.name: figure for figure in outcome.figures}
+    outcome = Run(parse_scenario(text, "test", "test", settings), seed, LOADS).run()
+    return outcome, {figure.name: figure for figure in outcome.metrics}
 
 
 class CensusTests(SynchronousTestCase):
     def test_closest(self) -> None:
         """``closest`` matches a search of all living nodes after random joins and deaths."""
-        dice, census, living = random.Random(1), Census(), set()
+        dice, census, living = random.Random(1), NodeIdIndex(), set()
         for _ in range(300):
             born = dice.randbytes(20)
-            census.born(born)
+            census.add(born)
             living.add(born)
             if dice.random() < 0.4:
                 gone = dice.choice(sorted(living))
-                census.died(gone)
+                census.remove(gone)
                 living.remove(gone)
             key, without = dice.randbytes(20), dice.choice([*sorted(living), b"\0" * 20])
             if dice.random() < 0.3:
                 key = dice.choice([*sorted(living), key])
             wanted = sorted(living - {without}, key=lambda each: distance(each, key))[:8]
-            self.assertEqual(census.closest(key, 8, without), wanted)
+            self.assertEqual(census.find_closest(key, 8, without), wanted)
         self.assertEqual(len(census), len(living))
 
 
@@ -53,11 +53,11 @@ class PaceTests(SynchronousTestCase):
     def test_due(self) -> None:
         """The due count follows the rate at any polling interval, up to the total count."""
         clock = HeapClock()
-        pace = Pace(clock, 2.5, 12)
-        due = [pace.due()]
+        pace = Pacer(clock, 2.5, 12)
+        due = [pace.take_due()]
         for seconds in (0.5, 0.5, 1.0, 2.0, 10.0):
             clock.advance(seconds)
-            due.append(pace.due())
+            due.append(pace.take_due())
         self.assertEqual(due, [0, 1, 1, 3, 5, 2])
         self.assertTrue(pace.is_over)
 
@@ -188,9 +188,13 @@ class WrongTests(SynchronousTestCase):
 
     def test_two_holders(self) -> None:
         """Acceptors that grant every request cause two holders of a lease, which violates E2."""
-        self.patch(LeaseAcceptor, "prepare", lambda acceptor, task, number, ballot, *_: Reply(Kind.GRANTED, ballot))
         self.patch(
-            LeaseAcceptor, "lease", lambda acceptor, task, number, ballot, token, *_: Reply(Kind.GRANTED, ballot, token)
+            LeaseAcceptor, "prepare", lambda acceptor, task, number, ballot, *_: Reply(ReplyKind.GRANTED, ballot)
+        )
+        self.patch(
+            LeaseAcceptor,
+            "lease",
+            lambda acceptor, task, number, ballot, token, *_: Reply(ReplyKind.GRANTED, ballot, token),
         )
         outcome, _ = played(TASKS)
         self.assertTrue(any(line.startswith("E2") for line in outcome.violations), outcome.violations)

@@ -9,8 +9,8 @@ import cv2
 import numpy as np
 from twisted.trial.unittest import SynchronousTestCase
 
-from sim.robots.picture import HEIGHT, WIDTH, overhead
-from sim.robots.scene import loaded
+from sim.robots.picture import HEIGHT, WIDTH, draw_map
+from sim.robots.scene import load_scene
 from sim.robots.world import World
 
 
@@ -19,12 +19,12 @@ class PictureTests(SynchronousTestCase):
 
     def setUp(self) -> None:
         """Place a target at the right, above the middle of the map."""
-        self.world = World(Random(1), loaded("three-dogs"))
+        self.world = World(Random(1), load_scene("three-dogs"))
         self.world.place_target(2.2, 1.7)
 
     def drawn(self, caption: str = "", **changes: object) -> Any:
         """Return the blue, green and red channels of the picture of a snapshot with ``changes``."""
-        data = overhead({**self.world.snapshot(), **changes}, caption)
+        data = draw_map({**self.world.snapshot(), **changes}, caption)
         image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR)
         assert image is not None
         self.assertEqual(image.shape, (HEIGHT, WIDTH, 3))

@@ -1,4 +1,4 @@
-"""Tests of ``sim.robots.table`` and ``emulator.dog``: simulated dogs that emulate other kinds of robots."""
+"""Tests of ``sim.robots.emulated_robots`` and ``emulator.dog``: simulated dogs that emulate other kinds of robots."""
 
 from __future__ import annotations
 
@@ -14,16 +14,16 @@ from twisted.trial.unittest import SynchronousTestCase
 
 from drivers.errors import UsageError
 from drivers.registry import describe
-from formats.jpeg import size_of
+from formats.jpeg import read_size
 from sim.robots.dog import LIMITS
+from sim.robots.emulated_robots import EmulatedRobots
 from sim.robots.emulator.bittle import Bittle
-from sim.robots.emulator.body import MemoryBody
-from sim.robots.emulator.dog import DogBody
+from sim.robots.emulator.dog import SimulatedDog
 from sim.robots.emulator.pty import PtyPort
-from sim.robots.scene import loaded
-from sim.robots.table import Robots
-from sim.robots.world import TICK
-from sim.robots.yard import Yard
+from sim.robots.emulator.simulated_robot import MemoryRobot
+from sim.robots.scene import load_scene
+from sim.robots.simulator import RobotSimulator
+from sim.robots.world import TICK_S
 
 
 class YardCase(SynchronousTestCase):
@@ -31,21 +31,21 @@ class YardCase(SynchronousTestCase):
 
     def setUp(self) -> None:
         self.clock = Clock()
-        self.yard = Yard(self.clock, Random(1), loaded("three-dogs"))
+        self.yard = RobotSimulator(self.clock, Random(1), load_scene("three-dogs"))
         self.yard.start()
 
     def pass_time(self, seconds: float) -> None:
         """Advance the clock, one tick of the simulator at a time."""
-        for _ in range(round(seconds / TICK)):
-            self.clock.advance(TICK)
+        for _ in range(round(seconds / TICK_S)):
+            self.clock.advance(TICK_S)
 
 
 class DogBodyTests(YardCase):
     """``DogBody`` moves a lent dog and reads its sensors."""
 
-    def lent(self, limits: Any = LIMITS) -> DogBody:
+    def lent(self, limits: Any = LIMITS) -> SimulatedDog:
         """Return the body of dog1, which faces the middle of the map."""
-        return self.yard.lend("dog1", limits)
+        return self.yard.reserve_for_emulator("dog1", limits)
 
     def test_moves_as_fast_as_its_kind(self) -> None:
         """The body obeys the limits with which it is lent, and stops when it is halted."""
@@ -84,8 +84,8 @@ class DogBodyTests(YardCase):
             self.pass_time(1.5)
             sensed = body.sense()
             self.assertEqual((sensed["bump.left"], sensed["bump.right"]), wanted, str(heading))
-        self.assertEqual(size_of(body.picture() or b""), (208, 160))
-        self.assertEqual(size_of(body.picture(True) or b""), (104, 80))
+        self.assertEqual(read_size(body.picture() or b""), (208, 160))
+        self.assertEqual(read_size(body.picture(True) or b""), (104, 80))
 
 
 class RobotsTests(YardCase):
@@ -95,7 +95,7 @@ class RobotsTests(YardCase):
         """A driver of simulated dogs is rejected by a dog that is lent to an emulator."""
         from drivers.sim.driver import SimDriver
 
-        self.yard.lend("dog1", describe("create2", {"port": "x"}).limits)
+        self.yard.reserve_for_emulator("dog1", describe("create2", {"port": "x"}).limits)
         driver = SimDriver({"robot": "dog1"}, self.yard.connector(), self.clock)
         failed = driver.connect()
         self.pass_time(0.5)
@@ -119,7 +119,7 @@ class RobotsTests(YardCase):
         ]
         for table, problem in cases:
             with self.assertRaisesRegex(UsageError, problem):
-                Robots(self.clock, Random(1), self.yard, table)
+                EmulatedRobots(self.clock, Random(1), self.yard, table)
 
     def test_replaces_no_file(self) -> None:
         """A file at the path of the serial port is kept and reported; only a leftover link is replaced."""
@@ -128,14 +128,14 @@ class RobotsTests(YardCase):
         path = folder / "ttyUSB0"
         table = {"dog1": {"kind": "create2", "options": {"port": str(path)}}}
         path.write_text("a device, or somebody's notes")
-        robots = Robots(MemoryReactorClock(), Random(1), self.yard, table)
+        robots = EmulatedRobots(MemoryReactorClock(), Random(1), self.yard, table)
         with self.assertRaisesRegex(UsageError, r"\[dog1\] .*ttyUSB0 is there already"):
             robots.start()
         robots.stop()
         self.assertEqual(path.read_text(), "a device, or somebody's notes")
         path.unlink()
         path.symlink_to("/dev/pts/99999")
-        port = PtyPort(MemoryReactorClock(), Bittle(MemoryBody(), self.clock, Random(1)).accept, str(path))
+        port = PtyPort(MemoryReactorClock(), Bittle(MemoryRobot(), self.clock, Random(1)).accept, str(path))
         self.assertNotEqual(str(path.readlink()), "/dev/pts/99999")
         # A link that another program put at the path stays.
         path.unlink()
@@ -147,7 +147,7 @@ class RobotsTests(YardCase):
         """A robot that cannot be served is reported with the reason, and no file stays open."""
         before = len(os.listdir("/dev/fd"))
         table = {"dog2": {"kind": "create2", "options": {"port": "/nowhere/at/all"}}}
-        robots = Robots(MemoryReactorClock(), Random(1), self.yard, table)
+        robots = EmulatedRobots(MemoryReactorClock(), Random(1), self.yard, table)
         with self.assertRaisesRegex(UsageError, r"\[dog2\] it cannot be served: .*/nowhere/at/all"):
             robots.start()
         robots.stop()

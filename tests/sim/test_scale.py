@@ -13,14 +13,14 @@ from twisted.trial.unittest import SynchronousTestCase
 
 from middleware.errors import BadSetting
 from sim.team.command import Environment
-from sim.team.figure import Figure
+from sim.team.metric import Metric
 from sim.team.scale import theory
-from sim.team.scale.command import scale
+from sim.team.scale.command import run_scale
 from sim.team.scale.curve import CURVES
-from sim.team.scale.drawing import drawn
-from sim.team.scale.page import led, page
-from sim.team.scale.record import Record
-from sim.team.scale.survey import Ended, Sized, SurveySettings, Watcher, surveyed
+from sim.team.scale.drawing import draw_svg
+from sim.team.scale.markdown import extrapolate, format_markdown
+from sim.team.scale.measurement import MeasurementStopped, ProgressCallbacks, SizeResult, SurveySettings, measure_size
+from sim.team.scale.measurement_file import MeasurementFile
 
 
 def world() -> Environment:
@@ -31,10 +31,12 @@ def world() -> Environment:
     )
 
 
-def sized(nodes: int) -> Sized:
+def sized(nodes: int) -> SizeResult:
     """Return results for a size: hops equal the number of nodes, all other values are 1."""
-    figures = [Figure(curve.figure, 1.0, curve.unit) for curve in CURVES if curve.figure != "lookups.hops.mean"]
-    return Sized(nodes, [*figures, Figure("lookups.hops.mean", float(nodes), "hops").against(None)], [], "h", 1.0)
+    figures = [Metric(curve.metric, 1.0, curve.unit) for curve in CURVES if curve.metric != "lookups.hops.mean"]
+    return SizeResult(
+        nodes, [*figures, Metric("lookups.hops.mean", float(nodes), "hops").with_target(None)], [], "h", 1.0
+    )
 
 
 class TheoryTests(SynchronousTestCase):
@@ -54,16 +56,16 @@ class RecordTests(SynchronousTestCase):
         out = self.mktemp()
         asked: list[int] = []
 
-        def measured(nodes: int, settings: SurveySettings, watcher: Watcher) -> Sized:
+        def measured(nodes: int, settings: SurveySettings, watcher: ProgressCallbacks) -> SizeResult:
             asked.append(nodes)
             return sized(nodes)
 
-        scale(["--nodes", "3,10", "--out", out], world(), measured)
-        scale(["--nodes", "3,10,30", "--out", out], world(), measured)
+        run_scale(["--nodes", "3,10", "--out", out], world(), measured)
+        run_scale(["--nodes", "3,10,30", "--out", out], world(), measured)
         self.assertEqual(asked, [3, 10, 30])
         before = Path(out, "scale.json").read_text()
         with self.assertRaisesRegex(BadSetting, "other settings.*'seed': 1"):
-            scale(["--nodes", "3", "--out", out, "--seed", "2"], world(), measured)
+            run_scale(["--nodes", "3", "--out", out, "--seed", "2"], world(), measured)
         self.assertEqual(asked, [3, 10, 30])
         self.assertEqual(Path(out, "scale.json").read_text(), before)
 
@@ -72,41 +74,45 @@ class RecordTests(SynchronousTestCase):
         out, here, wishes = self.mktemp(), world(), list[int]()
         here.is_stopped = lambda: bool(wishes)
 
-        def measured(nodes: int, settings: SurveySettings, watcher: Watcher) -> Sized:
+        def measured(nodes: int, settings: SurveySettings, watcher: ProgressCallbacks) -> SizeResult:
             if nodes == 3:
                 return sized(nodes)
             wishes.append(nodes)
-            return surveyed(nodes, settings, watcher)
+            return measure_size(nodes, settings, watcher)
 
-        self.assertEqual(scale(["--nodes", "3,10", "--out", out], here, measured), 130)
+        self.assertEqual(run_scale(["--nodes", "3,10", "--out", out], here, measured), 130)
         self.assertEqual(list(json.loads(Path(out, "scale.json").read_text())["sizes"]), ["3"])
 
     def test_bad_input(self) -> None:
         """Invalid sizes, an invalid file, and a folder that cannot be written are rejected by name."""
         for text in ("", "many", "2", "3,1000000"):
             with self.assertRaisesRegex(BadSetting, "--nodes"):
-                scale(["--nodes", text, "--out", self.mktemp()], world())
+                run_scale(["--nodes", text, "--out", self.mktemp()], world())
         for key, text in (("--takeovers", "-1"), ("--swarm-most", "-1")):
             with self.assertRaisesRegex(BadSetting, key):
-                scale(["--nodes", "3", key, text, "--out", self.mktemp()], world())
+                run_scale(["--nodes", "3", key, text, "--out", self.mktemp()], world())
         torn = json.dumps({"digest": SurveySettings().digest(), "sizes": {"x": 1}})
         for text in ("{", "[]", torn):
             path = Path(self.mktemp())
             path.write_text(text)
             with self.assertRaisesRegex(BadSetting, "cannot be used"):
-                Record(path, SurveySettings()).read()
+                MeasurementFile(path, SurveySettings()).read()
 
         file, full = Path(self.mktemp()), Path(self.mktemp())
         file.touch()
         (full / "scale.new").mkdir(parents=True)
         for out in (file, file / "below", full):
             with self.assertRaisesRegex(BadSetting, "--out: cannot write"):
-                scale(["--nodes", "3", "--out", str(out)], world(), lambda nodes, settings, watcher: self.fail("late"))
+                run_scale(
+                    ["--nodes", "3", "--out", str(out)], world(), lambda nodes, settings, watcher: self.fail("late")
+                )
 
     def test_missed_targets_show(self) -> None:
         """A figure beyond its target is marked in the table and sets exit code 1."""
         here = world()
-        code = scale(["--nodes", "1000", "--out", self.mktemp()], here, lambda nodes, settings, watcher: sized(nodes))
+        code = run_scale(
+            ["--nodes", "1000", "--out", self.mktemp()], here, lambda nodes, settings, watcher: sized(nodes)
+        )
         self.assertEqual(code, 1)
         assert isinstance(here.out, io.StringIO)
         self.assertRegex(here.out.getvalue(), r"traffic.cpu +1 ms a second +<= 0.5 +NO")
@@ -117,8 +123,8 @@ class DrawingTests(SynchronousTestCase):
     def test_svg(self) -> None:
         """Each curve with points has its own chart, and the drawing is valid XML for any values."""
         for values in ([1.0, 1.0], [0.0, 0.0], [0.001, 5e6], [3.0, 4.0]):
-            points = {curve.figure: [(3, values[0]), (1000, values[1])] for curve in CURVES[:5]}
-            root = ElementTree.fromstring(drawn(CURVES, points, "a & b"))
+            points = {curve.metric: [(3, values[0]), (1000, values[1])] for curve in CURVES[:5]}
+            root = ElementTree.fromstring(draw_svg(CURVES, points, "a & b"))
             titles = [text.text for text in root.iter("{http://www.w3.org/2000/svg}text")]
             for curve in CURVES:
                 self.assertEqual(curve.title in titles, curve in CURVES[:5], curve.title)
@@ -128,12 +134,12 @@ class PageTests(SynchronousTestCase):
     def test_table(self) -> None:
         """A value beyond its target is bold, and the last column extrapolates over the logarithm of the size."""
         hops = [(n, 1.0 + 0.3 * math.log2(n)) for n in (3, 100, 300, 1000)]
-        shown = page(CURVES, {"lookups.hops.mean": hops, "traffic.cpu": [(100, 1.0), (1000, 1.0)]})
+        shown = format_markdown(CURVES, {"lookups.hops.mean": hops, "traffic.cpu": [(100, 1.0), (1000, 1.0)]})
         self.assertRegex(shown, r"Hops of a lookup \| hops \|.*\| 6.979 \|")
         self.assertRegex(shown, r"Processor of a node.* \| - \| 1 \| - \| \*\*1\*\* \| <= 0.5 \|  \|")
-        self.assertIsNone(led(hops[:3]))
+        self.assertIsNone(extrapolate(hops[:3]))
         # If smaller teams have other targets, the table shows them.
-        shown = page(CURVES, {"auctions.agree.p95": [(n, 0.7) for n in (3, 100, 1000, 10_000)]})
+        shown = format_markdown(CURVES, {"auctions.agree.p95": [(n, 0.7) for n in (3, 100, 1000, 10_000)]})
         self.assertIn("| 0.7 | **0.7** | 0.7 | 0.7 | <= 1; <= 0.6 at 100, <= 0.8 at 1,000 |", shown)
 
 
@@ -146,16 +152,16 @@ class SurveyTests(SynchronousTestCase):
             looks.append(1)
             return len(looks) == 5
 
-        with self.assertRaises(Ended):
-            surveyed(3, SurveySettings(), Watcher(is_stopped=is_stopped))
+        with self.assertRaises(MeasurementStopped):
+            measure_size(3, SurveySettings(), ProgressCallbacks(is_stopped=is_stopped))
         self.assertEqual(len(looks), 5)
 
     def test_small_team(self) -> None:
         """A survey of five nodes measures every figure without violations, and its digest is reproducible."""
         settings = SurveySettings(settle=5.0, quiet=5.0, lookups=2.0, exact=5, auctions=1, takeovers=1, swarm_most=5)
-        one, same = surveyed(5, settings), surveyed(5, settings)
+        one, same = measure_size(5, settings), measure_size(5, settings)
         self.assertEqual(one.violations, [])
         self.assertEqual(one.hash, same.hash)
-        figures = {figure.name: figure.value for figure in one.figures}
-        self.assertEqual([curve.figure for curve in CURVES if figures.get(curve.figure) is None], [])
+        figures = {figure.name: figure.value for figure in one.metrics}
+        self.assertEqual([curve.metric for curve in CURVES if figures.get(curve.metric) is None], [])
         self.assertEqual((figures["lookups.success"], figures["auctions.right"]), (1.0, 1.0))

@@ -8,7 +8,7 @@ from pathlib import Path
 
 from twisted.trial.unittest import SynchronousTestCase
 
-from sim.robots.scene import SceneError, loaded, parsed, scene_names
+from sim.robots.scene import SceneError, list_scenes, load_scene, parse_scene
 
 
 class SceneTests(SynchronousTestCase):
@@ -30,27 +30,27 @@ class SceneTests(SynchronousTestCase):
 
     def refusal(self) -> str:
         """Return the error message for the changed scene."""
-        return str(self.assertRaises(SceneError, parsed, json.dumps(self.fields), "two.json"))
+        return str(self.assertRaises(SceneError, parse_scene, json.dumps(self.fields), "two.json"))
 
     def test_loads_the_three_dogs_of_the_thesis(self) -> None:
         """The installed scene has dogs with one, two and three stripes in a walled enclosure, as in the thesis."""
-        self.assertIn("three-dogs", scene_names())
-        scene = loaded("three-dogs")
-        self.assertEqual([(one.name, one.stripes) for one in scene.kennels], [("dog1", 1), ("dog2", 2), ("dog3", 3)])
+        self.assertIn("three-dogs", list_scenes())
+        scene = load_scene("three-dogs")
+        self.assertEqual([(one.name, one.stripes) for one in scene.dogs], [("dog1", 1), ("dog2", 2), ("dog3", 3)])
         self.assertEqual((scene.width, scene.height), (3.0, 2.4))
 
     def test_reads_a_file(self) -> None:
         """A name that ends in .json is a path, and degrees become radians; unknown names and paths are rejected."""
         path = Path(self.mktemp() + ".json")
         path.write_text(json.dumps(self.fields))
-        self.assertEqual(loaded(str(path)).kennels[0].heading, math.pi / 2)
-        self.assertIn("known are three-dogs", str(self.assertRaises(SceneError, loaded, "four-cats")))
-        self.assertIn("nowhere.json", str(self.assertRaises(SceneError, loaded, "nowhere.json")))
+        self.assertEqual(load_scene(str(path)).dogs[0].heading, math.pi / 2)
+        self.assertIn("known are three-dogs", str(self.assertRaises(SceneError, load_scene, "four-cats")))
+        self.assertIn("nowhere.json", str(self.assertRaises(SceneError, load_scene, "nowhere.json")))
 
     def test_refuses_what_is_no_scene(self) -> None:
         """Text that is not a JSON object is rejected with the name of its source."""
         for text in ("", "{", "[]", "7", "null", "[" * 100_000):
-            self.assertIn("two.json", str(self.assertRaises(SceneError, parsed, text, "two.json")))
+            self.assertIn("two.json", str(self.assertRaises(SceneError, parse_scene, text, "two.json")))
 
     def test_names_the_wrong_key(self) -> None:
         """A missing or invalid field, and dogs in a wall, overlapping or with equal names are rejected with the key."""

@@ -8,9 +8,9 @@ from random import Random
 
 from twisted.trial.unittest import SynchronousTestCase
 
-from sim.robots.scene import loaded
-from sim.robots.sensor import NOSE, Sensors
-from sim.robots.world import SUBSTEP, World
+from sim.robots.scene import load_scene
+from sim.robots.sensor import NOSE_M, Sensors
+from sim.robots.world import SUBSTEP_S, World
 
 
 class SensorsTests(SynchronousTestCase):
@@ -18,7 +18,7 @@ class SensorsTests(SynchronousTestCase):
 
     def setUp(self) -> None:
         """Place dog1 in the middle, facing right, and dog2 out of its way."""
-        self.world = World(Random(1), loaded("three-dogs"))
+        self.world = World(Random(1), load_scene("three-dogs"))
         self.world.move_dog("dog2", 2.6, 2.1, 0.0)
         self.world.move_dog("dog1", 1.0, 1.0, 0.0)
         self.sensors = Sensors(Random(2), self.world, self.world.dogs["dog1"])
@@ -26,18 +26,18 @@ class SensorsTests(SynchronousTestCase):
     def run_for(self, seconds: float) -> dict[str, list[float]]:
         """Run for some seconds and return all samples."""
         rows: dict[str, list[float]] = {}
-        for _ in range(round(seconds / SUBSTEP / 4)):
+        for _ in range(round(seconds / SUBSTEP_S / 4)):
             for _ in range(4):
                 self.world.step()
                 self.sensors.sample()
-            for key, row in self.sensors.taken_samples().items():
+            for key, row in self.sensors.pop_samples().items():
                 self.assertEqual(len(row), 4)
                 rows.setdefault(key, []).extend(row)
         return rows
 
     def mean_range(self, key: str, gap: float) -> float:
         """Return the mean of a ranger with the target ``gap`` metres before the nose, NaN if all samples are."""
-        self.world.place_target(1.0 + NOSE + gap + 0.08, 1.0)
+        self.world.place_target(1.0 + NOSE_M + gap + 0.08, 1.0)
         row = self.run_for(0.4)[key]
         self.assertTrue(all(math.isnan(x) for x in row) or not any(math.isnan(x) for x in row))
         return statistics.fmean(row)

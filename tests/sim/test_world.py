@@ -7,18 +7,18 @@ from random import Random
 
 from twisted.trial.unittest import SynchronousTestCase
 
-from sim.robots.scene import FOOTPRINT, loaded
-from sim.robots.world import SUBSTEP, NotPossible, World
+from sim.robots.scene import FOOTPRINT_RADIUS_M, load_scene
+from sim.robots.world import SUBSTEP_S, NotPossible, World
 
 
 def make_world(seed: int = 1) -> World:
     """Return a world with the three dogs far apart."""
-    return World(Random(seed), loaded("three-dogs"))
+    return World(Random(seed), load_scene("three-dogs"))
 
 
 def run(world: World, seconds: float) -> None:
     """Run the physics for some seconds."""
-    for _ in range(round(seconds / SUBSTEP)):
+    for _ in range(round(seconds / SUBSTEP_S)):
         world.step()
 
 
@@ -65,11 +65,11 @@ class WorldTests(SynchronousTestCase):
         """A minute of walking against walls and into corners never moves a dog more than 3 mm into them."""
         for name, turn in (("dog1", 0.0), ("dog2", 0.3), ("dog3", -0.2)):
             self.world.drive(name, 0.16, 0.05, turn)
-        for _ in range(round(60 / SUBSTEP)):
+        for _ in range(round(60 / SUBSTEP_S)):
             self.world.step()
             for dog in self.world.dogs.values():
-                self.assertTrue(FOOTPRINT - 0.003 < dog.x < 3.0 - FOOTPRINT + 0.003, dog.x)
-                self.assertTrue(FOOTPRINT - 0.003 < dog.y < 2.4 - FOOTPRINT + 0.003, dog.y)
+                self.assertTrue(FOOTPRINT_RADIUS_M - 0.003 < dog.x < 3.0 - FOOTPRINT_RADIUS_M + 0.003, dog.x)
+                self.assertTrue(FOOTPRINT_RADIUS_M - 0.003 < dog.y < 2.4 - FOOTPRINT_RADIUS_M + 0.003, dog.y)
         self.assertGreater(self.world.collisions, 0)
 
     def test_pushes_another_dog_but_not_the_target(self) -> None:
@@ -78,13 +78,13 @@ class WorldTests(SynchronousTestCase):
         self.world.drive("dog1", 0.16, 0.0, 0.0)
         run(self.world, 4.0)
         other = self.world.dogs["dog2"]
-        self.assertGreater(math.hypot(other.x - self.dog.x, other.y - self.dog.y), 2 * FOOTPRINT - 0.005)
+        self.assertGreater(math.hypot(other.x - self.dog.x, other.y - self.dog.y), 2 * FOOTPRINT_RADIUS_M - 0.005)
         self.assertGreaterEqual(self.world.collisions, 1)
         self.world.move_dog("dog2", 2.7, 0.3, 0.0)
         self.world.move_dog("dog1", 1.4, 1.0, 0.0)
         self.world.place_target(1.8, 1.0)
         run(self.world, 4.0)
-        self.assertLess(self.dog.x, 1.8 - 0.08 - FOOTPRINT + 0.005)
+        self.assertLess(self.dog.x, 1.8 - 0.08 - FOOTPRINT_RADIUS_M + 0.005)
         assert self.world.target is not None
         self.assertEqual((self.world.target.x, self.world.target.y), (1.8, 1.0))
 

@@ -1,4 +1,4 @@
-"""Tests of ``sim.robots.yard`` and ``sim.robots.reception`` on the level of messages."""
+"""Tests of ``sim.robots.simulator`` and ``sim.robots.paced_simulator`` on the level of messages."""
 
 from __future__ import annotations
 
@@ -10,32 +10,32 @@ from twisted.trial.unittest import SynchronousTestCase
 
 from drivers.sim.codec import (
     VERSION,
-    Alive,
-    Done,
+    CommandResult,
     Drive,
     FrameReader,
     Halt,
     Hello,
+    KeepAlive,
     Message,
     Motors,
-    Order,
-    Overlook,
     Picture,
     Refused,
     Sensors,
-    Truth,
-    encoded,
+    SubscribeWorld,
+    WorldCommand,
+    WorldSnapshot,
+    encode_message,
 )
-from sim.robots.reception import SILENT_S, Beat, Session
-from sim.robots.scene import loaded
-from sim.robots.world import TICK
-from sim.robots.yard import Yard
+from sim.robots.paced_simulator import SILENCE_LIMIT_S, PeriodicTimer, Session
+from sim.robots.scene import load_scene
+from sim.robots.simulator import RobotSimulator
+from sim.robots.world import TICK_S
 
 
 class Client:
     """A client with a link to the simulator that stores the received messages."""
 
-    def __init__(self, yard: Yard) -> None:
+    def __init__(self, yard: RobotSimulator) -> None:
         self.is_busy = False
         self.is_open = True
         self.heard: list[Message] = []
@@ -57,7 +57,7 @@ class Client:
     def say(self, *messages: Message) -> None:
         """Send messages to the simulator."""
         assert self.session is not None
-        self.session.received(b"".join(encoded(message) for message in messages))
+        self.session.data_received(b"".join(encode_message(message) for message in messages))
 
     def of(self, kind: type[Message]) -> list[Message]:
         """Return the received messages of one kind."""
@@ -70,7 +70,7 @@ class YardTests(SynchronousTestCase):
     def setUp(self) -> None:
         """Start a simulator in virtual time, with a driver for dog1."""
         self.clock = Clock()
-        self.yard = Yard(self.clock, Random(1), loaded("three-dogs"))
+        self.yard = RobotSimulator(self.clock, Random(1), load_scene("three-dogs"))
         self.yard.start()
         self.client = Client(self.yard)
         self.client.say(Hello(VERSION, "dog1", 0.0), Motors(True))
@@ -78,7 +78,7 @@ class YardTests(SynchronousTestCase):
     def ticks(self, count: int) -> None:
         """Advance by whole ticks."""
         for _ in range(count):
-            self.clock.advance(TICK)
+            self.clock.advance(TICK_S)
 
     def drive(self, token: int = 1, ttl: float = 0.5, sent: float | None = None, vx: float = 0.16) -> None:
         """Send a command as dog1's driver."""
@@ -92,10 +92,10 @@ class YardTests(SynchronousTestCase):
         """After ten seconds 312 frames have arrived, with timestamps 32 ms apart and without drift."""
         for _ in range(1000):
             self.clock.advance(0.01)
-            self.client.say(Alive())
+            self.client.say(KeepAlive())
         stamps = [message.t for message in self.client.of(Sensors) if isinstance(message, Sensors)]
         self.assertEqual(len(stamps), 312)
-        self.assertAlmostEqual(stamps[-1], 312 * TICK, 9)
+        self.assertAlmostEqual(stamps[-1], 312 * TICK_S, 9)
 
     def test_catches_up_on_physics_but_not_on_pictures(self) -> None:
         """After a delay of half a second all missed sensor frames are sent, but only one picture."""
@@ -185,7 +185,7 @@ class YardTests(SynchronousTestCase):
         self.drive(token=8, ttl=0.0)
         self.ticks(10)
         self.assertGreater(self.yard.world.dogs["dog1"].motion.vx, 0.1)
-        dogs: Any = self.yard.truth()["dogs"]
+        dogs: Any = self.yard.get_true_state()["dogs"]
         told = [(dog["name"], dog["token"], dog["accepted"], dog["refused"]) for dog in dogs]
         self.assertEqual(told, [("dog1", 7, 2, 2), ("dog2", 0, 0, 0), ("dog3", 0, 0, 0)])
 
@@ -193,11 +193,11 @@ class YardTests(SynchronousTestCase):
         """A driver that falls silent and a client that never sends hello are disconnected after ``SILENT_S``."""
         stranger = Client(self.yard)
         lively = Client(self.yard)
-        for _ in range(round(SILENT_S / TICK) + 3):
-            lively.say(Alive())
+        for _ in range(round(SILENCE_LIMIT_S / TICK_S) + 3):
+            lively.say(KeepAlive())
             self.ticks(1)
         self.assertEqual((self.client.is_open, stranger.is_open, lively.is_open), (False, False, True))
-        self.assertEqual(self.yard.holders, [])
+        self.assertEqual(self.yard.driven_robots, [])
 
     def test_refuses_drivers(self) -> None:
         """A taken robot is refused temporarily; an unknown robot, another version or a second robot permanently."""
@@ -208,10 +208,10 @@ class YardTests(SynchronousTestCase):
             (refusal,) = client.heard
             assert isinstance(refusal, Refused)
             self.assertEqual((refusal.lasting, client.is_open), (is_lasting, False))
-        self.assertEqual(self.yard.holders, ["dog1"])
+        self.assertEqual(self.yard.driven_robots, ["dog1"])
         self.client.say(Hello(VERSION, "dog2", 0.0))
         self.assertEqual(self.client.heard[-1], Refused("this connection holds dog1 already", True))
-        self.assertEqual(self.yard.holders, [])
+        self.assertEqual(self.yard.driven_robots, [])
 
     def test_drops_for_a_client_that_does_not_read(self) -> None:
         """A busy client gets nothing until it is free again, and then the newest frame, not the oldest."""
@@ -222,7 +222,7 @@ class YardTests(SynchronousTestCase):
         self.ticks(1)
         (newest,) = self.client.of(Sensors)
         assert isinstance(newest, Sensors)
-        self.assertAlmostEqual(newest.t, 11 * TICK)
+        self.assertAlmostEqual(newest.t, 11 * TICK_S)
         self.assertEqual({len(row) for row in newest.samples.values()}, {4})
 
     def test_lives_on_after_rubbish(self) -> None:
@@ -230,24 +230,24 @@ class YardTests(SynchronousTestCase):
         before = self.yard.world.snapshot()
         stranger = Client(self.yard)
         assert stranger.session is not None
-        stranger.session.received(b"\x00\xff" * 500)
-        stranger.say(Order(1, "scatter", (1,)), Drive(0.1, 0.0, 0.0, 1, 1.0, 0.0), Halt())
+        stranger.session.data_received(b"\x00\xff" * 500)
+        stranger.say(WorldCommand(1, "scatter", (1,)), Drive(0.1, 0.0, 0.0, 1, 1.0, 0.0), Halt())
         self.assertEqual((stranger.heard, self.yard.world.snapshot()), ([], before))
 
     def test_shows_the_operator_everything(self) -> None:
         """An operator receives the truth at the requested rate, and an answer to every order, valid or not."""
         operator = Client(self.yard)
-        operator.say(Overlook(VERSION, 5.0))
+        operator.say(SubscribeWorld(VERSION, 5.0))
         self.ticks(31)
-        self.assertIn(len(operator.of(Truth)), (5, 6))
+        self.assertIn(len(operator.of(WorldSnapshot)), (5, 6))
         operator.say(
-            Order(1, "place_target", (2.0, 2.0)),
-            Order(2, "place_target", (2.0,)),
-            Order(3, "place_target", (2, 2)),
-            Order(4, "explode", ()),
-            Order(5, "place_target", (float(9), 2.0)),
+            WorldCommand(1, "place_target", (2.0, 2.0)),
+            WorldCommand(2, "place_target", (2.0,)),
+            WorldCommand(3, "place_target", (2, 2)),
+            WorldCommand(4, "explode", ()),
+            WorldCommand(5, "place_target", (float(9), 2.0)),
         )
-        done = [message for message in operator.heard if isinstance(message, Done)]
+        done = [message for message in operator.heard if isinstance(message, CommandResult)]
         self.assertEqual([(one.number, bool(one.problem)) for one in done], [(n, n > 1) for n in range(1, 6)])
         self.assertIsNotNone(self.yard.world.target)
 
@@ -267,9 +267,9 @@ class BeatTests(SynchronousTestCase):
     def test_keeps_its_rate_on_average(self) -> None:
         """Any rate up to the tick rate is kept; after a pause one picture is due, not all the missed ones."""
         for rate in (0.0, 1.0, 10.0, 15.0, 29.97, 30.0, 31.25):
-            beat = Beat(rate)
-            count = sum(beat.is_due(tick * TICK) for tick in range(1, 3126))
+            beat = PeriodicTimer(rate)
+            count = sum(beat.is_due(tick * TICK_S) for tick in range(1, 3126))
             self.assertLess(abs(count - 100 * rate), 2, rate)
-        beat = Beat(10.0)
+        beat = PeriodicTimer(10.0)
         self.assertTrue(beat.is_due(0.0))
         self.assertEqual([beat.is_due(50.0), beat.is_due(50.032), beat.is_due(50.064)], [True, False, False])

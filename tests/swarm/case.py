@@ -11,10 +11,10 @@ from twisted.internet.defer import Deferred
 from twisted.trial.unittest import SynchronousTestCase
 
 from agents.behaviour import KINDS
-from middleware.consensus.verdict import Verdict, verdict_of, verdicts_key
-from middleware.tasks.task import Member, Task, group_key, member_of
-from sim.robots.scene import FOOTPRINT
-from swarmnode.rehearsal import LAN, VirtualTeam
+from middleware.consensus.decision_record import DecisionRecord, decision_records_key, parse_decision_record
+from middleware.tasks.task import Member, Task, group_key, parse_member
+from sim.robots.scene import FOOTPRINT_RADIUS_M
+from swarmnode.simulated_team import LAN, SimulatedTeam
 
 LOOK_S = 0.05
 
@@ -25,16 +25,16 @@ class TeamCase(SynchronousTestCase):
     def start_team(
         self,
         seed: int = 3,
-        dogs: tuple[str, ...] = VirtualTeam.DOGS,
+        dogs: tuple[str, ...] = SimulatedTeam.DOGS,
         loss: float = 0.0,
         others: tuple[str, ...] = (),
-    ) -> VirtualTeam:
+    ) -> SimulatedTeam:
         """Start a team that stops with the test."""
-        team = VirtualTeam(seed, weather=replace(LAN, loss=loss), dogs=dogs, others=others)
+        team = SimulatedTeam(seed, weather=replace(LAN, loss=loss), dogs=dogs, others=others)
         self.addCleanup(team.stop)
         return team
 
-    def until(self, team: VirtualTeam, is_so: Callable[[], bool], limit: float = 90.0) -> float:
+    def until(self, team: SimulatedTeam, is_so: Callable[[], bool], limit: float = 90.0) -> float:
         """Run the team until a condition holds; return the seconds, or fail after ``limit``."""
         began = team.clock.seconds()
         while not is_so():
@@ -44,52 +44,56 @@ class TeamCase(SynchronousTestCase):
             self.look(team)
         return team.clock.seconds() - began
 
-    def look(self, team: VirtualTeam) -> None:
+    def look(self, team: SimulatedTeam) -> None:
         """Hook that ``until`` calls after each step."""
 
-    def task(self, team: VirtualTeam) -> dict[str, Any]:
+    def task(self, team: SimulatedTeam) -> dict[str, Any]:
         """Return the newest task as the page shows it."""
         tasks = team.state()["tasks"]
         return dict(tasks[0]) if tasks else {"status": "absent"}
 
-    def device(self, team: VirtualTeam, name: str) -> dict[str, Any]:
+    def device(self, team: SimulatedTeam, name: str) -> dict[str, Any]:
         """Return a device as the page shows it."""
         return next((dict(row) for row in team.state()["devices"] if row["name"] == name), {"status": "absent"})
 
-    def statuses(self, team: VirtualTeam) -> dict[str, str]:
+    def statuses(self, team: SimulatedTeam) -> dict[str, str]:
         """Return the status of each device."""
         return {row["name"]: row["status"] for row in team.state()["devices"]}
 
-    def lines(self, team: VirtualTeam, name: str) -> list[str]:
+    def lines(self, team: SimulatedTeam, name: str) -> list[str]:
         """Return the messages of a device."""
         return [text for _, text in self.device(team, name)["messages"]]
 
-    def executing(self, team: VirtualTeam) -> list[str]:
+    def executing(self, team: SimulatedTeam) -> list[str]:
         """Return the devices that execute the newest task."""
         groups = team.state()["groups"]
         return [m["name"] for m in groups[0]["members"] if m["status"] == "EXECUTING"] if groups else []
 
-    def gap(self, team: VirtualTeam, name: str) -> float:
+    def gap(self, team: SimulatedTeam, name: str) -> float:
         """Return the metres between the dog's footprint and the target."""
-        dog, target = team.yard.world.dogs[name], team.yard.world.target
+        dog, target = team.simulator.world.dogs[name], team.simulator.world.target
         assert target is not None
-        return math.hypot(dog.x - target.x, dog.y - target.y) - target.radius - FOOTPRINT
+        return math.hypot(dog.x - target.x, dog.y - target.y) - target.radius - FOOTPRINT_RADIUS_M
 
-    def moving(self, team: VirtualTeam) -> list[str]:
+    def moving(self, team: SimulatedTeam) -> list[str]:
         """Return the dogs that move now."""
-        return [dog.name for dog in team.yard.world.dogs.values() if dog.is_moving]
+        return [dog.name for dog in team.simulator.world.dogs.values() if dog.is_moving]
 
-    def submit(self, team: VirtualTeam, task: Task) -> None:
+    def submit(self, team: SimulatedTeam, task: Task) -> None:
         """Publish a task through the laptop's node."""
         Deferred.fromCoroutine(team.services["vaio"].assembly.node.submit(task))
 
-    def members(self, team: VirtualTeam, task_id: str) -> list[Member]:
+    def members(self, team: SimulatedTeam, task_id: str) -> list[Member]:
         """Return the reports on a task."""
-        return [m for record in team.desk.read(group_key(task_id)) if (m := member_of(record)) is not None]
+        return [m for record in team.desk.read(group_key(task_id)) if (m := parse_member(record)) is not None]
 
-    def verdicts(self, team: VirtualTeam, task_id: str) -> list[Verdict]:
+    def verdicts(self, team: SimulatedTeam, task_id: str) -> list[DecisionRecord]:
         """Return the decision records of a task."""
-        return [v for record in team.desk.read(verdicts_key(task_id)) if (v := verdict_of(record)) is not None]
+        return [
+            v
+            for record in team.desk.read(decision_records_key(task_id))
+            if (v := parse_decision_record(record)) is not None
+        ]
 
     def use_facing(self) -> None:
         """Register the behaviour ``facing`` for this test."""

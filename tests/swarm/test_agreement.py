@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from typing import Any
 
-from middleware.diagnostics.explanation import as_text, explained
+from middleware.diagnostics.explanation import explain_decisions, format_explanation
 from middleware.tasks.task import Member, Task
-from swarmnode.rehearsal import VirtualTeam
+from swarmnode.simulated_team import SimulatedTeam
 from tests.swarm.case import TeamCase
 from tests.swarm.facing import Facing
 
@@ -19,7 +19,7 @@ class AgreementTests(TeamCase):
         self.team.clock.advance(0.5)
         self.told: dict[str, Member] = {}
 
-    def look(self, team: VirtualTeam) -> None:
+    def look(self, team: SimulatedTeam) -> None:
         """Record the latest report of each device."""
         self.told.update({member.name: member for member in self.members(team, "t1")})
 
@@ -32,11 +32,11 @@ class AgreementTests(TeamCase):
 
     def why(self) -> str:
         """Return the output of ``swarm why`` for the task."""
-        return as_text(explained(self.verdicts(self.team, "t1")))
+        return format_explanation(explain_decisions(self.verdicts(self.team, "t1")))
 
     def test_charged_dog_goes(self) -> None:
         """With ``capability_cost`` the nearest dog does not act on a low battery, and the explanations agree."""
-        self.team.yard._senses["dog2"]._power = 0.1
+        self.team.simulator._sensors["dog2"]._power = 0.1
         shown = self.run_task("capability_cost")
         self.assertNotEqual(shown["result"]["by"], "dog2")
         told = self.why()
@@ -46,7 +46,7 @@ class AgreementTests(TeamCase):
 
     def test_nearest_does_not_mind_the_charge(self) -> None:
         """With ``nearest`` the same dog acts, and the explanation does not mention the battery."""
-        self.team.yard._senses["dog2"]._power = 0.1
+        self.team.simulator._sensors["dog2"]._power = 0.1
         self.assertEqual(self.run_task("nearest")["result"]["by"], "dog2")
         self.assertNotIn("battery", self.why())
         self.assertEqual({member.battery for member in self.told.values()}, {1.0})

@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import math
 
-from agents.catalogue import task_named
+from agents.catalogue import create_task
 from drivers.link import MemoryLink
 from middleware.tasks.task import Task
-from sim.demo.experiment import TOUCH_M
-from sim.demo.trials import trial
-from swarmnode.rehearsal import VirtualTeam
+from sim.demo.experiment import REACHED_GAP_M
+from sim.demo.trials import run_trial
+from swarmnode.simulated_team import SimulatedTeam
 from tests.swarm.case import LOOK_S, TeamCase
 
 
@@ -17,7 +17,7 @@ class ExperimentTests(TeamCase):
     def test_nearest_dog_reaches_the_target(self) -> None:
         """Experiment 1: all dogs find the target and agree on the nearest dog, which reaches the target."""
         for seed in (2, 3):
-            outcome = trial(VirtualTeam, 1, seed)
+            outcome = run_trial(SimulatedTeam, 1, seed)
             self.assertEqual(outcome.broken, [], seed)
             self.assertTrue(outcome.held and outcome.found and outcome.agreed and outcome.right, seed)
 
@@ -28,7 +28,7 @@ class ExperimentTests(TeamCase):
         was released or ignored.
         """
         for seed in (1, 2):
-            outcome = trial(VirtualTeam, 2, seed)
+            outcome = run_trial(SimulatedTeam, 2, seed)
             self.assertEqual(outcome.broken, [], seed)
             assert outcome.takeover is not None
             self.assertGreater(outcome.takeover, 0.9, seed)
@@ -147,15 +147,15 @@ class TaskTests(TeamCase):
         team.run_demo()
         self.until(team, lambda: bool(self.executing(team)))
         team.clock.advance(1.0)
-        old = team.yard.world.target
+        old = team.simulator.world.target
         assert old is not None
         x, y = 3.0 - old.x, 2.4 - old.y
-        dogs = team.yard.world.dogs.values()
+        dogs = team.simulator.world.dogs.values()
         if min(math.hypot(dog.x - x, dog.y - y) for dog in dogs) < 0.4:
             x, y = x, old.y
-        team.yard.world.place_target(x, y)
+        team.simulator.world.place_target(x, y)
         self.until(team, lambda: self.task(team)["status"] == "COMPLETED")
-        self.assertLessEqual(self.gap(team, self.task(team)["result"]["by"]), TOUCH_M)
+        self.assertLessEqual(self.gap(team, self.task(team)["result"]["by"]), REACHED_GAP_M)
 
 
 class MembershipTests(TeamCase):
@@ -166,7 +166,7 @@ class MembershipTests(TeamCase):
         team.clock.advance(1.0)
         self.assertEqual([m["name"] for m in team.state()["groups"][0]["members"]], ["dog1"])
         for name in ("dog2", "dog3"):
-            team.add(name)
+            team.add_node(name)
             team.clock.advance(1.0)
         names = [m["name"] for m in team.state()["groups"][0]["members"]]
         self.assertEqual(names, ["dog1", "dog2", "dog3"])
@@ -188,7 +188,7 @@ class MembershipTests(TeamCase):
         team.clock.advance(0.5)
         team.kill(first)
         rest = [name for name in team.DOGS if name != first]
-        world, bumps = team.yard.world, team.yard.world.collisions
+        world, bumps = team.simulator.world, team.simulator.world.collisions
         target = world.target
         assert target is not None
 
@@ -213,14 +213,14 @@ class MembershipTests(TeamCase):
         """A dog that joins during a task takes over only if it is much nearer to the target."""
         for place, takes_over in (((1.5, 0.75), True), ((2.8, 2.2), False)):
             team = self.start_team(6, dogs=("dog1",))
-            world = team.yard.world
+            world = team.simulator.world
             world.move_dog("dog2", 2.8, 0.2, 0.0)
             world.move_dog("dog1", 0.3, 0.3, 0.0)
             world.move_dog("dog3", *place, math.pi / 2)
-            self.submit(team, task_named("find-red-target", "t", 0.0))
+            self.submit(team, create_task("find-red-target", "t", 0.0))
             world.place_target(1.5, 1.3)
             self.until(team, lambda team=team: self.executing(team) == ["dog1"])  # type: ignore[misc]
-            team.add("dog3")
+            team.add_node("dog3")
             self.until(team, lambda team=team: self.task(team)["status"] == "COMPLETED")  # type: ignore[misc]
             self.assertEqual(self.task(team)["result"]["by"], "dog3" if takes_over else "dog1")
 
@@ -230,7 +230,7 @@ class MembershipTests(TeamCase):
         team.run_demo()
         self.until(team, lambda: self.task(team)["status"] == "COMPLETED")
         self.assertEqual(self.task(team)["result"]["by"], "dog2")
-        self.assertLessEqual(self.gap(team, "dog2"), TOUCH_M)
+        self.assertLessEqual(self.gap(team, "dog2"), REACHED_GAP_M)
 
     def test_winner_that_died_is_still_named(self) -> None:
         """While the decision still names a dead dog, the page shows the dog's name instead of its id."""
@@ -253,12 +253,12 @@ class MembershipTests(TeamCase):
         self.until(team, lambda: bool(self.executing(team)))
         first = self.executing(team)[0]
         team.clock.advance(0.5)
-        counters = team.board.counters
+        counters = team.switchboard.counters
         before = counters["sent"], counters["unsent"]
         team.kill(first)
         self.assertEqual((counters["sent"], counters["unsent"]), before)
         team.clock.advance(0.5)
-        self.assertFalse(team.yard.world.dogs[first].is_moving)
+        self.assertFalse(team.simulator.world.dogs[first].is_moving)
 
     def test_disconnected_dog_comes_back(self) -> None:
         """A dog that leaves for 5 s is GONE, returns as the same device, and another dog does its task."""
@@ -269,7 +269,7 @@ class MembershipTests(TeamCase):
         before = self.device(team, first)
         team.desk.disconnect(before["uuid"], 5.0)
         self.until(team, lambda: self.device(team, first)["status"] == "GONE", 2.0)
-        self.assertFalse(team.yard.world.dogs[first].is_moving)
+        self.assertFalse(team.simulator.world.dogs[first].is_moving)
         self.until(team, lambda: self.executing(team) not in ([], [first]), 3.0)
         self.until(team, lambda: self.device(team, first)["status"] not in ("GONE", "absent"), 6.0)
         after = self.device(team, first)
@@ -292,7 +292,7 @@ class MembershipTests(TeamCase):
             self.assertLessEqual(len(leases), 1, leases)
             if leases and not killed and team.clock.seconds() > 8.0:
                 killed = leases[0]
-                team.services[killed].leave(4.0)
+                team.services[killed].leave_for(4.0)
         self.assertTrue(killed)
 
 
@@ -302,8 +302,8 @@ class WeatherTests(TeamCase):
         team = self.start_team(2, loss=0.2)
         team.run_demo()
         self.until(team, lambda: self.task(team)["status"] == "COMPLETED")
-        self.assertGreater(team.board.counters["lost"], 100)
-        self.assertLessEqual(self.gap(team, self.task(team)["result"]["by"]), TOUCH_M)
+        self.assertGreater(team.switchboard.counters["lost"], 100)
+        self.assertLessEqual(self.gap(team, self.task(team)["result"]["by"]), REACHED_GAP_M)
 
     def test_garbage_on_a_robots_link_costs_frames_only(self) -> None:
         """Invalid bytes on the link from a robot are counted and skipped, and the task is completed."""
@@ -316,7 +316,7 @@ class WeatherTests(TeamCase):
         team.run_demo()
         for piece in garbage:
             assert link.receiver is not None
-            link.receiver.received(piece)
+            link.receiver.data_received(piece)
             team.clock.advance(0.1)
         self.assertGreater(driver.diagnostics()["bad_frames"], 0)
         self.assertEqual(driver.state, "ready")

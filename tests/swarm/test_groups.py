@@ -4,16 +4,16 @@ from __future__ import annotations
 
 from itertools import permutations
 
-from middleware.diagnostics.explanation import Ruling, explained
+from middleware.diagnostics.explanation import EpochExplanation, explain_decisions
 from middleware.tasks.task import Task
-from swarmnode.rehearsal import VirtualTeam
+from swarmnode.simulated_team import SimulatedTeam
 from tests.swarm.case import TeamCase
 
 TASKS = {"t0": 1.5, "t1": 2.5, "t2": -2.5}
 """Where to face.  Task by task the nearest dog would have to turn more in all than these three need."""
 SLOW = 0.25
 """Radians a second: the nearest turn takes a second, the others four and more."""
-DOGS = VirtualTeam.DOGS
+DOGS = SimulatedTeam.DOGS
 
 
 class GroupTests(TeamCase):
@@ -24,7 +24,7 @@ class GroupTests(TeamCase):
         self.twice: list[object] = []
         self.agreed = False
 
-    def busy_team(self, dogs: tuple[str, ...] = DOGS, strategy: str = "group_optimal") -> VirtualTeam:
+    def busy_team(self, dogs: tuple[str, ...] = DOGS, strategy: str = "group_optimal") -> SimulatedTeam:
         """Start a team and submit the tasks, one after the other."""
         team = self.start_team(5, dogs)
         team.clock.advance(0.5)
@@ -36,7 +36,7 @@ class GroupTests(TeamCase):
             team.clock.advance(0.15)
         return team
 
-    def look(self, team: VirtualTeam) -> None:
+    def look(self, team: SimulatedTeam) -> None:
         """Record the first costs, the dogs that start each task, and dogs that act on two tasks at a time."""
         acting: dict[str, list[str]] = {}
         for name in TASKS:
@@ -51,17 +51,17 @@ class GroupTests(TeamCase):
         self.agreed = self.agreed or (len(digests) == 1 and "" not in digests)
         self.twice += [pair for pair in acting.items() if len(pair[1]) > 1]
 
-    def are_done(self, team: VirtualTeam) -> bool:
+    def are_done(self, team: SimulatedTeam) -> bool:
         """Return whether all tasks are completed."""
         return [task["status"] for task in team.state()["tasks"]] == ["COMPLETED"] * len(TASKS)
 
-    def by(self, team: VirtualTeam) -> dict[str, str]:
+    def by(self, team: SimulatedTeam) -> dict[str, str]:
         """Return the dog that did each completed task."""
         return {task["id"]: task["result"]["by"] for task in team.state()["tasks"] if task["result"] is not None}
 
-    def ruling(self, team: VirtualTeam, name: str) -> Ruling:
+    def ruling(self, team: SimulatedTeam, name: str) -> EpochExplanation:
         """Return the explanation of the newest decision on a task."""
-        return explained(self.verdicts(team, name)).epochs[0]
+        return explain_decisions(self.verdicts(team, name)).epochs[0]
 
     def test_each_dog_does_one(self) -> None:
         """Three dogs do three tasks at once, one each, with the lowest total cost; all agree.
@@ -126,7 +126,7 @@ class GroupTests(TeamCase):
         self.until(team, lambda: len(self.began) == 2)
         (left,) = set(TASKS) - set(self.began)
         self.assertIn("all bidders have reached their capacity", {m.why for m in self.members(team, left)})
-        team.add("dog3")
+        team.add_node("dog3")
         self.until(team, lambda: left in self.began)
         self.assertEqual(self.began[left], ["dog3"])
         self.until(team, lambda: self.are_done(team), 60.0)

@@ -6,12 +6,12 @@ import random
 
 from twisted.trial.unittest import SynchronousTestCase
 
-from benchmarks.takeover.cause import Cause, Judge, Trial
-from benchmarks.takeover.rehearsed import trial
-from benchmarks.takeover.report import drawn, table
+from benchmarks.takeover.cause import Cause, TakeoverObserver, Trial
+from benchmarks.takeover.report import draw_svg, format_table
+from benchmarks.takeover.virtual import run_trial
 from middleware.directory.presence import EXECUTING
 from middleware.tasks.task import COMPLETED, Result
-from swarmnode.rehearsal import VirtualTeam
+from swarmnode.simulated_team import SimulatedTeam
 from tests.swarm.case import TeamCase
 
 
@@ -25,8 +25,8 @@ class TakeoverTests(TeamCase):
         seeds = {Cause.POLITE_LEAVE: (2,), Cause.LOST_LINK: (1, 2, 3)}
         for cause in (each for each in Cause if each is not Cause.TRIPLE_KILL):
             for seed in seeds.get(cause, (1,)):
-                one = trial(cause, seed)
-                self.assertTrue(one.held, one)
+                one = run_trial(cause, seed)
+                self.assertTrue(one.has_passed, one)
                 self.assertNotEqual(one.by, one.lost)
                 self.assertLess(one.takeover or 99.0, 2.5, one)
 
@@ -39,13 +39,13 @@ class TakeoverTests(TeamCase):
             team = self.start_team(seed, others=("pi",))
             team.run_demo()
             first = self.moving_for_it(team, "")
-            for gone in (first, VirtualTeam.BOOTSTRAP):
+            for gone in (first, SimulatedTeam.BOOTSTRAP):
                 team.kill(gone)
             began = team.clock.seconds()
             self.assertNotEqual(self.moving_for_it(team, first), first)
             self.assertLess(team.clock.seconds() - began, 3.0, seed)
 
-    def moving_for_it(self, team: VirtualTeam, besides: str) -> str:
+    def moving_for_it(self, team: SimulatedTeam, besides: str) -> str:
         """Return the first dog other than ``besides`` that holds a lease and moves."""
 
         def going() -> list[str]:
@@ -62,17 +62,17 @@ class TakeoverTests(TeamCase):
 
 
 class JudgeTests(SynchronousTestCase):
-    def judge(self, cause: Cause = Cause.CRASH) -> Judge:
+    def judge(self, cause: Cause = Cause.CRASH) -> TakeoverObserver:
         """Return a judge for the loss of dog1 at 100 s, with a limit of 25 s and 1 s of observation after the end."""
-        return Judge(cause, 1, "dog1", 100.0, random.Random(1), 25.0, 1.0)
+        return TakeoverObserver(cause, 1, "dog1", 100.0, random.Random(1), 25.0, 1.0)
 
     def test_counts_from_the_loss(self) -> None:
         """The takeover ends when another dog moves; two moving dogs and motion of the lost dog count separately."""
         judge = self.judge()
         looks = [["dog1"], [], ["dog2"], ["dog1", "dog2"], ["dog1"], ["dog3"]]
         for number, moving in enumerate(looks, start=1):
-            judge.look(100.0 + number, moving, None)
-        self.assertEqual(judge.verdict(), Trial("crash", 1, "dog1", "", False, 3.0, 1, 2))
+            judge.record(100.0 + number, moving, None)
+        self.assertEqual(judge.make_trial(), Trial("crash", 1, "dog1", "", False, 3.0, 1, 2))
 
     def test_goes_on_after_the_end(self) -> None:
         """A trial is over a second after the result, or at the time limit."""
@@ -80,18 +80,18 @@ class JudgeTests(SynchronousTestCase):
         self.assertFalse(judge.is_over(124.9))
         self.assertTrue(judge.is_over(125.0))
         for now in (103.0, 103.5):
-            judge.look(now, ["dog2"], Result(COMPLETED, "dog2"))
+            judge.record(now, ["dog2"], Result(COMPLETED, "dog2"))
         self.assertFalse(judge.is_over(103.9))
         self.assertTrue(judge.is_over(104.0))
-        self.assertEqual(judge.verdict(), Trial("crash", 1, "dog1", "dog2", True, 3.0, 0, 0))
+        self.assertEqual(judge.make_trial(), Trial("crash", 1, "dog1", "dog2", True, 3.0, 0, 0))
 
     def test_thaws_the_frozen_once(self) -> None:
         """Only a frozen dog is thawed, once, and the trial is not over before that."""
         judge = self.judge(Cause.FREEZE)
         self.assertFalse(judge.is_over(999.0))
-        self.assertEqual([judge.thaws(now) for now in (102.9, 105.1, 105.2)], [False, True, False])
+        self.assertEqual([judge.take_thaw(now) for now in (102.9, 105.1, 105.2)], [False, True, False])
         self.assertTrue(judge.is_over(999.0))
-        self.assertFalse(self.judge().thaws(105.1))
+        self.assertFalse(self.judge().take_thaw(105.1))
 
 
 class ReportTests(SynchronousTestCase):
@@ -101,18 +101,18 @@ class ReportTests(SynchronousTestCase):
 
     def test_table_says_who_held_and_whether_the_target_is_reached(self) -> None:
         """The line of each cause has the counts, percentiles and the verdict on the target."""
-        line = table(self.trials(1.0, 1.2, 1.4, None)).splitlines()[1].split()
+        line = format_table(self.trials(1.0, 1.2, 1.4, None)).splitlines()[1].split()
         self.assertEqual(line[:7], ["crash", "4", "3", "1.20", "1.40", "1.40", "1.40"])
         self.assertEqual(line[-1], "yes")
-        self.assertTrue(table(self.trials(1.0, 2.1)).endswith("no"))
+        self.assertTrue(format_table(self.trials(1.0, 2.1)).endswith("no"))
 
     def test_zombie_is_no_success(self) -> None:
         """A trial fails if the lost dog moves after the takeover or completes the task."""
-        self.assertFalse(Trial("freeze", 1, "dog1", "dog2", True, 1.0, 0, 1).held)
-        self.assertFalse(Trial("freeze", 1, "dog1", "dog1", True, 1.0, 0, 0).held)
+        self.assertFalse(Trial("freeze", 1, "dog1", "dog2", True, 1.0, 0, 1).has_passed)
+        self.assertFalse(Trial("freeze", 1, "dog1", "dog1", True, 1.0, 0, 0).has_passed)
 
     def test_picture_has_a_bar_for_each_tenth(self) -> None:
         """The histogram has a bar for each tenth of a second, and the largest bin has the highest bar."""
-        picture = drawn(self.trials(1.01, 1.02, 1.55))
+        picture = draw_svg(self.trials(1.01, 1.02, 1.55))
         self.assertIn('height="60.0"', picture)
         self.assertIn('height="30.0"', picture)

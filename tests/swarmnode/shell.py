@@ -14,10 +14,10 @@ from typing import Any
 
 from twisted.trial.unittest import SynchronousTestCase
 
-from middleware.entangled.control.place import made
-from middleware.entangled.control.verb import Verbs
+from middleware.entangled.control.request_handler import RequestHandler
+from middleware.entangled.control.socket_path import prepare_path
 from middleware.node import SwarmNode
-from swarmnode.rehearsal import VirtualTeam
+from swarmnode.simulated_team import SimulatedTeam
 from swarmnode.team.verb import TeamVerbs
 
 Main = Callable[..., int]
@@ -32,16 +32,16 @@ def runtime_folder(case: SynchronousTestCase, node: str = "vaio") -> Path:
     folder = Path(tempfile.mkdtemp())
     case.addCleanup(shutil.rmtree, folder)
     case.patch(os, "environ", {**os.environ, "XDG_RUNTIME_DIR": str(folder)})
-    made(node).touch()
+    prepare_path(node).touch()
     return folder
 
 
 class Shell:
     """Runs commands on the machine of ``node``; an answer may take ``PATIENCE`` seconds of the team's time."""
 
-    def __init__(self, team: VirtualTeam, node: SwarmNode) -> None:
+    def __init__(self, team: SimulatedTeam, node: SwarmNode) -> None:
         self._team = team
-        self._verbs = TeamVerbs(Verbs.of(node.entangled, team.clock, random.Random(1)), node)
+        self._verbs = TeamVerbs(RequestHandler.create(node.entangled, team.clock, random.Random(1)), node)
         self.said = ""
 
     def ask(self, path: Path, request: dict[str, Any]) -> Iterator[dict[str, Any]]:

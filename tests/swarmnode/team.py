@@ -11,7 +11,7 @@ from middleware.entangled.clock import HeapClock
 from middleware.entangled.data.memory import MemoryStore
 from middleware.entangled.network.switchboard import Switchboard
 from middleware.node import SwarmNode
-from swarmnode.seams import Seams
+from swarmnode.dependencies import Dependencies
 from swarmnode.service import NodeService
 
 KEY = "of tests, and of nobody else"
@@ -32,11 +32,11 @@ class World:
         self.board = Switchboard(self.clock, random.Random(1))
         self.pages: list[Page] = []
 
-    def seams(self, name: str, port: int, store: MemoryStore | None = None) -> Seams:
+    def seams(self, name: str, port: int, store: MemoryStore | None = None) -> Dependencies:
         """Return the environment of one node."""
-        return Seams(
+        return Dependencies(
             self.clock,
-            lambda: self.board.network("127.0.0.1", port),
+            lambda: self.board.make_network("127.0.0.1", port),
             MemoryStore() if store is None else store,
             random.Random(name),
             self.clock.seconds,

@@ -16,32 +16,32 @@ from typing import Any
 from twisted.trial.unittest import SynchronousTestCase
 
 from middleware.admission import operator as operators
-from middleware.admission.code import Code
+from middleware.admission.code import JoinCode
+from middleware.admission.join_client import JoinClient
 from middleware.admission.membership import Membership, MembershipFile, MemoryMembership
-from middleware.admission.newcomer import Newcomer
 from middleware.config.settings import Settings
 from middleware.entangled.errors import EntangledError, NoAnswer
 from middleware.entangled.network.network import Address
 from middleware.errors import BadSetting
-from swarmnode.assembly import assembled
-from swarmnode.rehearsal import VirtualTeam
+from swarmnode.assembly import assemble_node
+from swarmnode.simulated_team import SimulatedTeam
 from swarmnode.team import init, invitations, invite, join, members, promote, renew, revoke, rotate
-from swarmnode.team.office import Desk
+from swarmnode.team.common import CommandContext
 from tests.swarmnode.shell import Shell, runtime_folder
 from tests.swarmnode.team import KEY, World
 
-Main = Callable[[Sequence[str], Desk], int]
+Main = Callable[[Sequence[str], CommandContext], int]
 
 
 class AdmissionTests(SynchronousTestCase):
     def setUp(self) -> None:
         self.folder = runtime_folder(self)
-        self.team = VirtualTeam(21, dogs=("dog1",))
+        self.team = SimulatedTeam(21, dogs=("dog1",))
         self.addCleanup(self.team.stop)
         self.laptop = self.team.services["vaio"].assembly.node
         self.shell = Shell(self.team, self.laptop)
         self.key = self.folder / "key"
-        operators.made(self.key, self.team.operator)
+        operators.create_operator_file(self.key, self.team.operator)
         home = {"XDG_CONFIG_HOME": str(self.folder / "config"), "SWARM_OPERATOR": str(self.key)}
         self.patch(os, "environ", {**os.environ, **home})
         self.dice = random.Random(1)
@@ -51,7 +51,7 @@ class AdmissionTests(SynchronousTestCase):
     def run_verb(self, main: Callable[..., int], *words: str, **more: Any) -> tuple[int, str]:
         """Run a verb; return exit code and output, and store the error output in ``said``."""
         out, complaint = io.StringIO(), io.StringIO()
-        desk = Desk(out, self.shell.ask, self.team.clock.seconds, self.dice)
+        desk = CommandContext(out, self.shell.ask, self.team.clock.seconds, self.dice)
         with contextlib.redirect_stderr(complaint):
             code = main(list(words), desk, **more)
         self.said = complaint.getvalue()
@@ -63,11 +63,11 @@ class AdmissionTests(SynchronousTestCase):
         self.assertEqual(code, 0, self.said)
         return json.loads(output)
 
-    def knock(self, code: Code, seed: bytes, wish: str, doors: Sequence[Address], timeout: float) -> Membership:
+    def knock(self, code: JoinCode, seed: bytes, wish: str, doors: Sequence[Address], timeout: float) -> Membership:
         """Send a join request like the verb, in the team's virtual time and network."""
         self.newcomers += 1
-        network = self.team.board.network("127.0.0.1", 9000 + self.newcomers)
-        work = Newcomer(code, seed, network, self.team.clock, self.dice, wish).join(doors, timeout)
+        network = self.team.switchboard.make_network("127.0.0.1", 9000 + self.newcomers)
+        work = JoinClient(code, seed, network, self.team.clock, self.dice, wish).join(doors, timeout)
         outcome: list[Any] = []
         work.addCallbacks(outcome.append, lambda failure: outcome.append(failure.value))
         self.team.clock.advance(timeout + 0.1)
@@ -89,7 +89,7 @@ class AdmissionTests(SynchronousTestCase):
         found = self.done(init.main, *words, "--set", "presence_lease=2.5")
         settings = Settings.load(found["settings"])
         kept = MembershipFile(Path(settings.node.membership))
-        self.assertEqual(kept.membership.operator, operators.load(Path(found["operator"])).public)
+        self.assertEqual(kept.membership.operator, operators.load_operator(Path(found["operator"])).public)
         self.assertEqual((settings.node.presence_lease, settings.node.port), (2.5, 7000))
         self.assertEqual(dict(kept.membership.settings), {"presence_lease": 2.5})
         self.assertEqual(Path(found["operator"]).stat().st_mode & 0o777, 0o600)
@@ -117,7 +117,7 @@ class AdmissionTests(SynchronousTestCase):
         found = self.done(invite.main, "dog9")
 
         def elsewhere(*knock: Any) -> Membership:
-            return replace(self.knock(*knock), known=(Address("192.0.2.7", 7000),))
+            return replace(self.knock(*knock), known_nodes=(Address("192.0.2.7", 7000),))
 
         words = (found["text"], "--folder", str(self.folder / "far"))
         settings = Settings.load(self.done(join.main, *words, knocking=elsewhere)["settings"])
@@ -140,7 +140,7 @@ class AdmissionTests(SynchronousTestCase):
         world = World()
         seams = world.seams("dog9", 7099)
         kept = MembershipFile(Path(settings.node.membership))
-        made_node = assembled(settings, type(seams)(**{**seams.__dict__, "membership": kept})).node
+        made_node = assemble_node(settings, type(seams)(**{**seams.__dict__, "membership": kept})).node
         self.assertEqual(made_node.entangled.identity, kept.membership.identity)
 
     def test_killed_while_joining(self) -> None:
@@ -166,7 +166,7 @@ class AdmissionTests(SynchronousTestCase):
         """The address of a member is described in words for tunnels, relays and unknown addresses."""
         places = {"10.0.0.7:8484": "10.0.0.7:8484", "": "no known address", "~wss-1fa56333f510:1": "by a tunnel"}
         for address, words in {**places, f"~{'ab' * 20}:1": "by a relay"}.items():
-            self.assertEqual(members.place(address), words)
+            self.assertEqual(members.format_location(address), words)
 
     def test_settings_that_were_there(self) -> None:
         """Existing settings are kept and reported; new settings are not reported."""
@@ -186,7 +186,7 @@ class AdmissionTests(SynchronousTestCase):
         seeds: list[bytes] = []
         first, other = (self.done(invite.main, name)["text"] for name in ("dog8", "dog9"))
 
-        def silent(code: Code, seed: bytes, *rest: Any) -> Membership:
+        def silent(code: JoinCode, seed: bytes, *rest: Any) -> Membership:
             seeds.append(seed)
             raise NoAnswer("nobody opens")
 
@@ -271,7 +271,7 @@ class AdmissionTests(SynchronousTestCase):
         self.team.clock.advance(2.0)
         dog = self.team.services["dog1"].assembly.node.team
         assert dog is not None
-        self.assertEqual(dog.door.me.roles, ("device", "bootstrap"))
+        self.assertEqual(dog.admission.me.roles, ("device", "bootstrap"))
         promoted = {row["name"]: row for row in self.done(members.main)["members"]}
         self.assertTrue(promoted["dog1"]["renews"])
         self.assertGreaterEqual(promoted["dog1"]["until"], ends["dog1"]["until"] + 100)
@@ -304,13 +304,13 @@ class AdmissionTests(SynchronousTestCase):
         assert dog is not None and laptop is not None
         self.done(promote.main, "dog1")
         self.team.clock.advance(50.0)
-        self.assertTrue(dog._renewer.renew(laptop.door.me, self.team.clock.seconds()))
+        self.assertTrue(dog._renewer.renew(laptop.admission.me, self.team.clock.seconds()))
         self.team.clock.advance(2.0)
-        self.assertEqual(laptop.door.me.renewer, dog.identity.public)
+        self.assertEqual(laptop.admission.me.renewer, dog.identity.public)
         self.done(revoke.main, "dog1", *words)
         self.team.clock.advance(2.0)
         self.assertIn("vaio", self.names())
-        return laptop.door.me.renewer
+        return laptop.admission.me.renewer
 
     def test_revoke_keeps_renewals(self) -> None:
         """Renewals that a revoked node signed for present members stay valid."""
@@ -323,7 +323,7 @@ class AdmissionTests(SynchronousTestCase):
     def test_keys_of_others(self) -> None:
         """A key of another team, a key that others can read, and a missing key are rejected with a remedy."""
         other = self.folder / "other"
-        operators.made(other, operators.drawn("other", random.Random(2)))
+        operators.create_operator_file(other, operators.create_operator("other", random.Random(2)))
         self.assertEqual(self.run_verb(invite.main, "dog9", "--operator", str(other))[0], 1)
         self.assertIn("another operator", self.said)
         self.key.chmod(0o644)
@@ -335,7 +335,9 @@ class AdmissionTests(SynchronousTestCase):
 
     def test_node_takes_statements_only(self) -> None:
         """A statement over the control socket is accepted only with the signature of the team's operator."""
-        strange = operators.drawn("other", random.Random(2)).revoke(b"r" * 32, "dog1", self.team.clock.seconds())
+        strange = operators.create_operator("other", random.Random(2)).revoke(
+            b"r" * 32, "dog1", self.team.clock.seconds()
+        )
         told = {"statement": {"base64": base64.b64encode(strange).decode()}}
         [line] = self.shell.ask(self.folder, {"verb": "team tell", "with": told})
         self.assertIn("sign with the key of the team", line["text"])
@@ -344,7 +346,7 @@ class AdmissionTests(SynchronousTestCase):
 class TeamSettingsTests(SynchronousTestCase):
     def refusal(self, **node: str) -> str:
         settings = Settings.from_mapping({"node": {"name": "a", **node}}, "a.toml")
-        return str(self.assertRaises(BadSetting, assembled, settings, World().seams("a", 7000)))
+        return str(self.assertRaises(BadSetting, assemble_node, settings, World().seams("a", 7000)))
 
     def test_neither_and_both(self) -> None:
         """A node without a team is rejected with a hint to ``swarm join``, and so is a node with two teams."""
@@ -354,9 +356,9 @@ class TeamSettingsTests(SynchronousTestCase):
     def test_membership_opens_the_door(self) -> None:
         """A membership sets the node's identity and certificate; no team key is needed."""
         dice = random.Random(1)
-        membership = operators.drawn("yard", dice).founded("a", ("device",), 0, dice)
+        membership = operators.create_operator("yard", dice).create_membership("a", ("device",), 0, dice)
         seams = World().seams("a", 7000)
         seams = type(seams)(**{**seams.__dict__, "membership": MemoryMembership(membership)})
-        node = assembled(Settings.from_mapping({"node": {"name": "a"}}, "a.toml"), seams).node
+        node = assemble_node(Settings.from_mapping({"node": {"name": "a"}}, "a.toml"), seams).node
         self.assertEqual(node.entangled.identity, membership.identity)
-        self.assertEqual(node.entangled.endpoint.door.shown, membership.shown)
+        self.assertEqual(node.entangled.endpoint.admission.own_pass, membership.certificate)

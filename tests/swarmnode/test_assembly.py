@@ -12,7 +12,7 @@ from drivers.driver import Filming
 from middleware.config.settings import Settings
 from middleware.entangled.data.memory import MemoryStore
 from middleware.errors import BadSetting
-from swarmnode.assembly import assembled, identity_in
+from swarmnode.assembly import assemble_node, load_identity
 from tests.swarmnode.team import KEY, World
 
 
@@ -31,7 +31,7 @@ class AssemblyTests(SynchronousTestCase):
             driver={"kind": "sim"},
             agent={"module": "search"},
         )
-        made = assembled(settings, world.seams("a", 7000))
+        made = assemble_node(settings, world.seams("a", 7000))
         device = made.node.presence.device
         self.assertEqual(device.kind, "aibo-ers7")
         self.assertEqual(device.capabilities["base2d"], {"max": 1})
@@ -44,30 +44,30 @@ class AssemblyTests(SynchronousTestCase):
         """A robot with a camera as part has the capabilities of both, and its pictures can be requested."""
         parts = [{"kind": "camera", "options": {"source": "/pictures"}}]
         driver = {"kind": "create2", "options": {"port": "/dev/robot"}, "parts": parts}
-        made = assembled(self.settings(driver=driver), World().seams("a", 7000))
+        made = assemble_node(self.settings(driver=driver), World().seams("a", 7000))
         self.assertTrue({"camera", "bumper"} <= set(made.node.presence.device.capabilities))
         self.assertIsInstance(made.driver, Filming)
         with self.assertRaises(BadSetting) as caught:
-            assembled(self.settings(driver={"parts": parts}), World().seams("b", 7001))
+            assemble_node(self.settings(driver={"parts": parts}), World().seams("b", 7001))
         self.assertIn("[driver] parts: are set, but there is no robot", str(caught.exception))
 
     def test_node_without_body_has_no_agent(self) -> None:
         """A laptop has no driver and no agent, and takes its kind from the settings."""
-        made = assembled(self.settings(node={"kind": "laptop"}), World().seams("a", 7000))
+        made = assemble_node(self.settings(node={"kind": "laptop"}), World().seams("a", 7000))
         self.assertEqual((made.agent, made.driver, made.node.presence.device.kind), (None, None, "laptop"))
 
     def test_identity_is_kept_in_the_store(self) -> None:
         """The store keeps the node's identity over restarts with any random generator."""
         store = MemoryStore()
-        first = identity_in(store, random.Random(1))
-        self.assertEqual(identity_in(store, random.Random(2)).node_id, first.node_id)
-        self.assertNotEqual(identity_in(MemoryStore(), random.Random(2)).node_id, first.node_id)
+        first = load_identity(store, random.Random(1))
+        self.assertEqual(load_identity(store, random.Random(2)).node_id, first.node_id)
+        self.assertNotEqual(load_identity(MemoryStore(), random.Random(2)).node_id, first.node_id)
 
     def test_spoiled_identity_is_made_anew(self) -> None:
         """An invalid stored identity is replaced, so the node starts."""
         store = MemoryStore()
-        store.note("identity", b"short")
-        self.assertEqual(identity_in(store, random.Random(1)).node_id, identity_in(store, random.Random(1)).node_id)
+        store.set_note("identity", b"short")
+        self.assertEqual(load_identity(store, random.Random(1)).node_id, load_identity(store, random.Random(1)).node_id)
 
     def test_lost_identity_is_said(self) -> None:
         """A node logs a warning if its existing store has lost the identity, and none if its store is new."""
@@ -75,5 +75,5 @@ class AssemblyTests(SynchronousTestCase):
         lost.origin = "replaced"
         for store, words in ((MemoryStore(), []), (lost, ["the data store has lost the node's identity"])):
             with capturedLogs() as said:
-                identity_in(store, random.Random(1))
+                load_identity(store, random.Random(1))
             self.assertEqual([formatEvent(each).partition(":")[0] for each in said], words)

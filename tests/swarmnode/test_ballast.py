@@ -1,4 +1,4 @@
-"""Tests of ``swarmnode.ballast``: processes without TLS do not import pyOpenSSL, even if it is installed."""
+"""Tests of ``swarmnode.memory_savings``: processes without TLS do not import pyOpenSSL, even if it is installed."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from pathlib import Path
 
 from twisted.trial.unittest import SynchronousTestCase
 
-from swarmnode.ballast import warmed_up
+from swarmnode.memory_savings import release_memory
 
 ROOT = Path(__file__).resolve().parents[2]
 LOADED = "pyOpenSSL is loaded"
@@ -68,7 +68,7 @@ class BallastTests(SynchronousTestCase):
         """After ``warmed_up`` the garbage collector skips older objects and checks newer ones."""
         self.addCleanup(gc.unfreeze)
         before: list[object] = [[]]
-        warmed_up()
+        release_memory()
         after: list[object] = [[]]
         looked_at = {id(each) for each in gc.get_objects()}
         self.assertNotIn(id(before), looked_at)

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 from twisted.trial.unittest import SynchronousTestCase
 
-from sim.robots.crowd.ground import Ground
-from sim.robots.crowd.search import search
-from swarmnode.crowd import DESK, CrowdTeam
+from sim.robots.crowd.scene import CrowdScene
+from sim.robots.crowd.search import run_search
+from swarmnode.crowd import TASK_NODE, CrowdTeam
 from tests.replay import replayed
 
 RUN = """
-from sim.robots.crowd.ground import Ground
+from sim.robots.crowd.scene import Ground
 from sim.robots.crowd.search import search
 from swarmnode.crowd import CrowdTeam
 print(search(CrowdTeam(4, 3, Ground(30, 5.0, 5.0)), 4, 6.0, lambda: 0.0).digest)
@@ -20,7 +20,7 @@ print(search(CrowdTeam(4, 3, Ground(30, 5.0, 5.0)), 4, 6.0, lambda: 0.0).digest)
 class CrowdTeamTests(SynchronousTestCase):
     def made(self, seed: int, agents: int = 5) -> CrowdTeam:
         """Return a team among thirty robots on 5 x 5 m."""
-        team = CrowdTeam(seed, agents, Ground(30, 5.0, 5.0))
+        team = CrowdTeam(seed, agents, CrowdScene(30, 5.0, 5.0))
         self.addCleanup(team.stop)
         return team
 
@@ -30,20 +30,20 @@ class CrowdTeamTests(SynchronousTestCase):
         The desk has no robot, each agent has one, and each node has its own address.
         """
         team = self.made(3)
-        self.assertEqual(list(team.services), [DESK, *team.yard.names])
-        self.assertEqual(sorted(team.yard.holders), sorted(team.yard.names))
+        self.assertEqual(list(team.services), [TASK_NODE, *team.simulator.names])
+        self.assertEqual(sorted(team.simulator.driven_robots), sorted(team.simulator.names))
         self.assertEqual(len({each.assembly.node.entangled.contact.address for each in team.services.values()}), 6)
-        self.assertEqual((team.words(), team.done_by()), ({}, None))
-        outcome = search(team, 3, 120.0, lambda: 0.0)
+        self.assertEqual((team.get_statuses(), team.find_finisher()), ({}, None))
+        outcome = run_search(team, 3, 120.0, lambda: 0.0)
         self.assertEqual((outcome.engaged is not None, outcome.right), (True, True), outcome)
         self.assertIsNotNone(outcome.reach, outcome)
-        crowd, target = team.yard.crowd, team.yard.crowd.target
+        crowd, target = team.simulator.crowd, team.simulator.crowd.target
         assert target is not None
-        body = team.yard.names.index(outcome.by)
+        body = team.simulator.names.index(outcome.by)
         self.assertLess(float(crowd.x[body] - target.x) ** 2 + float(crowd.y[body] - target.y) ** 2, 0.4**2)
 
     def test_seed_replays_it(self) -> None:
         """Processes with different hash seeds exchange the same datagrams; another seed gives another digest."""
         digest = replayed(self, RUN)
-        other = search(self.made(2, 3), 2, 6.0, lambda: 0.0).digest
+        other = run_search(self.made(2, 3), 2, 6.0, lambda: 0.0).digest
         self.assertNotEqual(*(half.split("-") for half in (digest, other)))

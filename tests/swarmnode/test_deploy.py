@@ -8,12 +8,12 @@ from dataclasses import replace
 from twisted.internet.defer import Deferred
 from twisted.trial.unittest import SynchronousTestCase
 
-from agents.catalogue import DEMO, TASKS
-from middleware.consensus.verdict import Verdict, verdict_of, verdicts_key
-from middleware.deployment.shelf import MemoryShelf
-from middleware.entangled.identity import node_id
+from agents.catalogue import DEMO_TASK, TASKS
+from middleware.consensus.decision_record import DecisionRecord, decision_records_key, parse_decision_record
+from middleware.deployment.module_store import MemoryModuleStore
+from middleware.entangled.identity import derive_node_id
 from swarmnode.deploy import main
-from swarmnode.rehearsal import VirtualTeam
+from swarmnode.simulated_team import SimulatedTeam
 from tests.swarmnode.shell import Shell, runtime_folder
 
 FARTHEST = '''
@@ -42,18 +42,18 @@ class Strategy:
 class DeployTests(SynchronousTestCase):
     def setUp(self) -> None:
         self.folder = runtime_folder(self)
-        self.team = VirtualTeam(11, dogs=())
+        self.team = SimulatedTeam(11, dogs=())
         self.addCleanup(self.team.stop)
         self.laptop = self.team.services["vaio"].assembly.node
         self.shell = Shell(self.team, self.laptop)
-        self.shelves = {name: MemoryShelf() for name in self.team.DOGS}
+        self.shelves = {name: MemoryModuleStore() for name in self.team.DOGS}
 
     def let_in(self, *modules: str, refusing: str = "") -> None:
         """Start the dogs, each with its own module store; all but ``refusing`` accept ``modules`` from the laptop."""
         allowed = {"allow": True, "operators": [self.laptop.entangled.identity.public.hex()], "modules": list(modules)}
         for name in self.team.DOGS:
             tables = {} if name == refusing else {"deployment": allowed}
-            self.team.add(name, tables, self.shelves[name])
+            self.team.add_node(name, tables, self.shelves[name])
             self.team.clock.advance(0.5)
 
     def swarm(self, line: str) -> str:
@@ -88,18 +88,20 @@ class DeployTests(SynchronousTestCase):
         devices = self.team.state()["devices"]
         return {d["name"]: d["deployed"].get("farthest", "") for d in devices if d["name"] != "vaio"}
 
-    def verdicts(self, strategy: str, seconds: float) -> list[Verdict]:
+    def verdicts(self, strategy: str, seconds: float) -> list[DecisionRecord]:
         """Submit a task with a strategy and return the decision records of the dogs."""
-        task = replace(TASKS[DEMO], task_id=f"t{self.team.clock.seconds():.0f}", strategy=strategy, waiting_period=30.0)
+        task = replace(
+            TASKS[DEMO_TASK], task_id=f"t{self.team.clock.seconds():.0f}", strategy=strategy, waiting_period=30.0
+        )
         task = replace(task, created=self.team.clock.seconds())
         submitted = Deferred.fromCoroutine(self.laptop.submit(task))
-        self.team.yard.world.scatter(3)
+        self.team.simulator.world.scatter(3)
         self.team.clock.advance(3.0)
         self.team.desk.move_target(1.5, 1.2)
         self.team.clock.advance(seconds)
         self.assertEqual(self.successResultOf(submitted).task_id, task.task_id)
-        records = self.team.desk.read(verdicts_key(task.task_id))
-        return [verdict for each in records if (verdict := verdict_of(each)) is not None]
+        records = self.team.desk.read(decision_records_key(task.task_id))
+        return [verdict for each in records if (verdict := parse_decision_record(each)) is not None]
 
     def test_team_runs_what_is_pushed(self) -> None:
         """All three dogs load a pushed strategy, show it, and use it for the next task."""
@@ -167,7 +169,7 @@ class DeployTests(SynchronousTestCase):
         self.let_in("farthest")
         keys = json.loads(self.swarm("keys --json"))
         devices = {d["name"]: d["uuid"] for d in self.team.state()["devices"]}
-        self.assertEqual({name: node_id(bytes.fromhex(key)).hex() for name, key in keys.items()}, devices)
+        self.assertEqual({name: derive_node_id(bytes.fromhex(key)).hex() for name, key in keys.items()}, devices)
         self.push()
         (row,) = json.loads(self.swarm("status --json"))
         self.assertEqual((row["name"], row["version"], row["by"]), ("farthest", 1, "vaio"))

@@ -8,15 +8,15 @@ from typing import Any
 
 from twisted.internet.defer import Deferred
 
-from middleware.diagnostics.survey import inventory
+from middleware.diagnostics.node_diagnostics import describe_store
 from middleware.frontend.client import TeamClient
-from swarmnode.asker import Asker
+from swarmnode.control_client import ControlClient
 from swarmnode.team.verb import TeamVerbs
-from tests.fleet import FleetCase, SwarmFleet
+from tests.fleet import FleetCase, SwarmTeam
 from tests.swarmnode.shell import runtime_folder
-from webnode.ledger import state_from
-from webnode.state import Departed
-from webnode.team import TeamDesk
+from webnode.state import DepartedDevices
+from webnode.state_builder import build_state
+from webnode.team_control import TeamControl
 
 COUNT = 9
 
@@ -30,7 +30,7 @@ class NoVerbs:
 
 
 class SplitTests(FleetCase):
-    def apart(self) -> SwarmFleet:
+    def apart(self) -> SwarmTeam:
         """Return nodes with a split directory, as in a large team."""
         fleet = self.swarm(COUNT)
         for node in fleet.nodes:
@@ -42,9 +42,9 @@ class SplitTests(FleetCase):
     def test_page(self) -> None:
         """The page of a web node shows every device of a split directory."""
         fleet = self.apart()
-        desk = TeamDesk(TeamClient(fleet.nodes[2]), {}, "")
+        desk = TeamControl(TeamClient(fleet.nodes[2]), {}, "")
         fleet.run(3.0)
-        state = state_from(desk.read, Departed(), "dog2", 0.0)
+        state = build_state(desk.read, DepartedDevices(), "dog2", 0.0)
         self.assertEqual([device["name"] for device in state["devices"]], [f"dog{n}" for n in range(COUNT)])
 
     def test_shell(self) -> None:
@@ -57,11 +57,11 @@ class SplitTests(FleetCase):
             asked = verbs.run(request["verb"], request["with"], lambda event: None)
             yield {"answer": self.done(fleet, asked, 1.0)}
 
-        found = Asker("dog2", ask).devices()
+        found = ControlClient("dog2", ask).list_devices()
         self.assertEqual([device.name for device, _ in found], [f"dog{n}" for n in range(COUNT)])
         self.assertEqual(found[4][1].owner, fleet.nodes[4].entangled.identity.public)
 
     def test_what_a_node_holds(self) -> None:
         """The inventory of a node counts the records of a split directory as devices."""
         fleet = self.apart()
-        self.assertEqual({kind for node in fleet.nodes for kind in inventory(node)["kinds"]}, {"devices"})
+        self.assertEqual({kind for node in fleet.nodes for kind in describe_store(node)["kinds"]}, {"devices"})

@@ -10,9 +10,9 @@ from twisted.trial.unittest import SynchronousTestCase
 
 from middleware.errors import BadSetting
 from middleware.faults.kinds import Fault
-from middleware.faults.scenario import loaded, scenario_of
+from middleware.faults.scenario import load_scenario, parse_scenario
 from swarmnode.faults import main
-from swarmnode.rehearsal import VirtualTeam
+from swarmnode.simulated_team import SimulatedTeam
 from tests.swarmnode.shell import Shell, runtime_folder
 
 SCENARIOS = Path(__file__).parents[2] / "examples" / "scenarios"
@@ -24,7 +24,7 @@ class ChaosTests(SynchronousTestCase):
 
     def team(self, faults: bool = True) -> None:
         """Start a team, with a shell at its laptop."""
-        self.virtual = VirtualTeam(4, faults=faults)
+        self.virtual = SimulatedTeam(4, faults=faults)
         self.addCleanup(self.virtual.stop)
         self.virtual.clock.advance(2.0)
         self.shell = Shell(self.virtual, self.virtual.services["vaio"].assembly.node)
@@ -96,12 +96,12 @@ class ScenarioTests(SynchronousTestCase):
         files = sorted(SCENARIOS.glob("*.toml"))
         self.assertGreater(len(files), 1)
         for file in files:
-            steps = loaded(file).steps
+            steps = load_scenario(file).steps
             self.assertEqual([step.at for step in steps], sorted(step.at for step in steps))
 
     def test_short(self) -> None:
         """The defaults of a step are: at once, the acting device, fifteen seconds."""
-        (step,) = scenario_of({"fault": [{"kind": "radio"}]}, "x").steps
+        (step,) = parse_scenario({"fault": [{"kind": "radio"}]}, "x").steps
         self.assertEqual((step.at, step.device, step.fault), (0.0, "executing", Fault("radio")))
 
     def test_wrong(self) -> None:
@@ -119,5 +119,5 @@ class ScenarioTests(SynchronousTestCase):
             ({"faults": []}, "faults"),
         ]
         for content, key in wrong:
-            error = self.assertRaises(BadSetting, scenario_of, content, "day.toml")
+            error = self.assertRaises(BadSetting, parse_scenario, content, "day.toml")
             self.assertEqual((error.file, error.key), ("day.toml", key))

@@ -8,14 +8,22 @@ from functools import partial
 
 from twisted.trial.unittest import SynchronousTestCase
 
-from middleware.directory.presence import DEVICES, devices_of
+from middleware.directory.presence import DEVICES, parse_devices
 from middleware.entangled.data.memory import MemoryStore
-from swarmnode.gateway import FIRST_S, LOOKS, MOST, SILENCE_S, Gateway, seed_of, sides
-from swarmnode.rehearsal import VirtualTeam
-from swarmnode.seams import Seams
+from swarmnode.dependencies import Dependencies
+from swarmnode.gateway import (
+    FIRST_PICTURE_TIMEOUT_S,
+    MAX_PHONES,
+    PICTURE_BURST,
+    PICTURE_TIMEOUT_S,
+    Gateway,
+    check_picture,
+    derive_seed,
+)
+from swarmnode.simulated_team import SimulatedTeam
 from tests.webnode.picture import jpeg
 from webnode.errors import Refusal
-from webnode.routes.phones import MOST_SIDE
+from webnode.routes.phones import MAX_SIDE_PIXELS
 
 STEP = 0.1
 CAN = {"width": 208, "height": 156, "orientation": False, "position": True}
@@ -34,13 +42,13 @@ class Phone:
         case.phones.append(self)
 
     def look(self, values: Mapping[str, float]) -> None:
-        wanted = self.at.look(self.uuid, jpeg(), values)
+        wanted = self.at.receive_picture(self.uuid, jpeg(), values)
         self.said, self.fps = wanted.say, wanted.fps
 
 
 class GatewayTests(SynchronousTestCase):
     def setUp(self) -> None:
-        self.team = VirtualTeam(3, dogs=("dog1", "dog2"), others=("pi",))
+        self.team = SimulatedTeam(3, dogs=("dog1", "dog2"), others=("pi",))
         self.addCleanup(self.team.stop)
         self.phones: list[Phone] = []
         self.port = 7100
@@ -55,16 +63,16 @@ class GatewayTests(SynchronousTestCase):
     def gateway(self, name: str) -> Gateway:
         service = self.team.services[name]
 
-        def seams() -> Seams:
+        def seams() -> Dependencies:
             self.port += 1
-            network = partial(self.team.board.network, "127.0.0.1", self.port)
+            network = partial(self.team.switchboard.make_network, "127.0.0.1", self.port)
             store = MemoryStore(epoch=self.port.to_bytes(8, "big"))
             clock = self.team.clock
-            return Seams(clock, network, store, random.Random(self.port), clock.seconds)
+            return Dependencies(clock, network, store, random.Random(self.port), clock.seconds)
 
         desk = self.team.desk
         return Gateway(
-            service.settings, service.assembly.node, seams, lambda: [d for d, _ in devices_of(desk.read(DEVICES))]
+            service.settings, service.assembly.node, seams, lambda: [d for d, _ in parse_devices(desk.read(DEVICES))]
         )
 
     def live(self, seconds: float) -> None:
@@ -88,11 +96,11 @@ class GatewayTests(SynchronousTestCase):
         self.assertEqual((device["name"], device["kind"], device["status"]), ("anna", "phone", "IDLE"))
         self.assertEqual(sorted(device["capabilities"]), ["camera", "position"])  # type: ignore[call-overload]
         self.assertNotEqual(device["address"], self.device(self.team.services["vaio"].assembly.node.uuid)["address"])
-        told = next(d for d, _ in devices_of(self.team.desk.read(DEVICES)) if d.uuid == phone.uuid)
+        told = next(d for d, _ in parse_devices(self.team.desk.read(DEVICES)) if d.uuid == phone.uuid)
         self.assertEqual(told.position, {"lat": 52.12346, "lon": 13.0, "accuracy": 12.0})
         self.assertEqual((phone.said, phone.fps), ("Nothing to do at the moment.", 5.0))
         seen: list[bytes] = []
-        stop = self.team.desk.watch(phone.uuid, lambda seq, picture, age: seen.append(picture))
+        stop = self.team.desk.stream_camera(phone.uuid, lambda seq, picture, age: seen.append(picture))
         self.live(1.0)
         stop()
         self.assertGreater(len(seen), 4)
@@ -101,7 +109,7 @@ class GatewayTests(SynchronousTestCase):
     def test_wins_and_is_taken_over(self) -> None:
         """The nearest phone gets the task; when it leaves, a dog that sees the target takes over at once."""
         phone = Phone(self, self.gateways["vaio"])
-        self.team.yard.world.place_target(1.5, 1.2)
+        self.team.simulator.world.place_target(1.5, 1.2)
         self.sees = {"target.bearing": 0.0, "target.distance": 0.05}
         self.live(1.0)
         self.team.desk.assign("watch-target")
@@ -122,25 +130,25 @@ class GatewayTests(SynchronousTestCase):
     def test_silence_is_leaving(self) -> None:
         """A phone that falls silent is removed, and another device has its task within two seconds."""
         phone = Phone(self, self.gateways["vaio"])
-        self.team.yard.world.place_target(1.5, 1.2)
+        self.team.simulator.world.place_target(1.5, 1.2)
         self.sees = {"target.bearing": 0.0, "target.distance": 0.05}
         self.team.desk.assign("watch-target")
         self.until(lambda: self.device(phone.uuid).get("status") == "EXECUTING" and self.dog_waits(), 40.0)
         phone.looks = False
         began = self.team.clock.seconds()
         self.until(self.dog_acts, 2.0)
-        self.live(SILENCE_S)
+        self.live(PICTURE_TIMEOUT_S)
         refusal = self.assertRaises(Refusal, phone.look, {})
         self.assertEqual(refusal.status, 404)
-        self.assertLess(self.team.clock.seconds() - began, 2.0 + SILENCE_S)
+        self.assertLess(self.team.clock.seconds() - began, 2.0 + PICTURE_TIMEOUT_S)
 
     def test_first_look_may_take_longer(self) -> None:
         """The first picture may take up to ``FIRST_S``; after it a phone that falls silent is removed."""
         phone = Phone(self, self.gateways["vaio"])
         phone.looks = False
-        self.live(FIRST_S - 0.2)
+        self.live(FIRST_PICTURE_TIMEOUT_S - 0.2)
         phone.look({})
-        self.live(SILENCE_S + 0.2)
+        self.live(PICTURE_TIMEOUT_S + 0.2)
         self.assertEqual(self.assertRaises(Refusal, phone.look, {}).status, 404)
 
     def test_is_the_same_device_elsewhere(self) -> None:
@@ -151,7 +159,7 @@ class GatewayTests(SynchronousTestCase):
         # The web node dies with the nodes of its phones.
         lost = self.gateways.pop("vaio")
         for each in lost._phones.values():
-            each._node.vanish()
+            each._node.stop_silently()
             each._agent.stopService()
             assert each._timer is not None
             each._timer.cancel()
@@ -168,9 +176,9 @@ class GatewayTests(SynchronousTestCase):
 
     def test_identity_is_of_team_and_phone(self) -> None:
         """Another phone or another team results in another identity."""
-        seeds = {seed_of(team, phone) for team in (b"a" * 32, b"b" * 32) for phone in (b"1" * 32, b"2" * 32)}
+        seeds = {derive_seed(team, phone) for team in (b"a" * 32, b"b" * 32) for phone in (b"1" * 32, b"2" * 32)}
         self.assertEqual(len(seeds), 4)
-        self.assertEqual(seed_of(b"a" * 32, b"1" * 32), seed_of(b"a" * 32, b"1" * 32))
+        self.assertEqual(derive_seed(b"a" * 32, b"1" * 32), derive_seed(b"a" * 32, b"1" * 32))
 
     def test_comes_back_while_it_leaves(self) -> None:
         """A phone that joins again while it releases its task waits for that, and is listed once."""
@@ -210,7 +218,7 @@ class GatewayTests(SynchronousTestCase):
     def test_takes_so_many(self) -> None:
         """A phone beyond ``MOST`` is rejected until another one leaves; a connected phone may join again."""
         gateway = self.gateways["vaio"]
-        phones = [Phone(self, gateway, bytes([n]) * 32, f"p{n}") for n in range(MOST)]
+        phones = [Phone(self, gateway, bytes([n]) * 32, f"p{n}") for n in range(MAX_PHONES)]
         refusal = self.failureResultOf(gateway.join(b"x" * 32, "late", CAN), Refusal).value
         self.assertEqual(refusal.status, 409)
         self.assertEqual(self.successResultOf(gateway.join(bytes([0]) * 32, "p0", CAN)), phones[0].uuid)
@@ -235,14 +243,22 @@ class GatewayTests(SynchronousTestCase):
     def test_refuses_what_is_no_look(self) -> None:
         """An invalid or too large picture, too many pictures, and pictures of an unknown phone are rejected."""
         phone = Phone(self, self.gateways["vaio"])
-        self.assertEqual(sides(jpeg(MOST_SIDE, 10)), (MOST_SIDE, 10))
-        for body in (b"", b"GIF89a", jpeg()[:-2], jpeg(MOST_SIDE + 1, 10), jpeg(10, MOST_SIDE + 1), jpeg(0, 10)):
-            refusal = self.assertRaises(Refusal, phone.at.look, phone.uuid, body, {})
+        self.assertEqual(check_picture(jpeg(MAX_SIDE_PIXELS, 10)), (MAX_SIDE_PIXELS, 10))
+        for body in (
+            b"",
+            b"GIF89a",
+            jpeg()[:-2],
+            jpeg(MAX_SIDE_PIXELS + 1, 10),
+            jpeg(10, MAX_SIDE_PIXELS + 1),
+            jpeg(0, 10),
+        ):
+            refusal = self.assertRaises(Refusal, phone.at.receive_picture, phone.uuid, body, {})
             self.assertEqual(
-                (refusal.status, refusal.remedy), (400, f"send a complete JPEG of at most {MOST_SIDE} pixels a side")
+                (refusal.status, refusal.remedy),
+                (400, f"send a complete JPEG of at most {MAX_SIDE_PIXELS} pixels a side"),
             )
-        self.assertEqual(self.assertRaises(Refusal, phone.at.look, "0" * 40, jpeg(), {}).status, 404)
-        for _ in range(round(LOOKS)):
+        self.assertEqual(self.assertRaises(Refusal, phone.at.receive_picture, "0" * 40, jpeg(), {}).status, 404)
+        for _ in range(round(PICTURE_BURST)):
             phone.look({})
         self.assertEqual(self.assertRaises(Refusal, phone.look, {}).status, 429)
         self.team.clock.advance(STEP)
@@ -253,7 +269,7 @@ class GatewayTests(SynchronousTestCase):
         phone = Phone(self, self.gateways["vaio"])
         self.live(1.0)
         node = self.team.services["vaio"].assembly.node
-        node.halt.stop("test", node.entangled.overlay.contacts())
+        node.stop_state.stop("test", node.entangled.overlay.contacts())
         self.live(0.5)
         self.assertEqual(phone.said, "The team is stopped. Wait.")
 

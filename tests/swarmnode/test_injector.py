@@ -6,24 +6,24 @@ from typing import Any
 
 from twisted.trial.unittest import SynchronousTestCase
 
-from middleware.directory.presence import devices_of
+from middleware.directory.presence import parse_devices
 from middleware.faults.injector import TRANSITIONS, State
-from middleware.faults.kinds import ASKED, CAUSE, KINDS, Fault
-from middleware.faults.takeover import TARGET_S, Takeover, acting
-from swarmnode.asker import Refusal
-from swarmnode.rehearsal import RehearsedStage, VirtualTeam
+from middleware.faults.kinds import CAUSE_METHOD, KINDS, LIST_METHOD, Fault
+from middleware.faults.takeover import TARGET_S, Takeover, find_executing
+from swarmnode.control_client import Rejection
+from swarmnode.simulated_team import SimulatedStage, SimulatedTeam
 
 
 class InjectorTests(SynchronousTestCase):
     def setUp(self) -> None:
-        self.stage = RehearsedStage(3)
+        self.stage = SimulatedStage(3)
         self.addCleanup(self.stage.stop)
 
     def named(self, name: str) -> Any:
         return next(device for device in self.stage.devices() if device.name == name)
 
     def asked(self, name: str) -> dict[str, Any]:
-        told: dict[str, Any] = self.stage._call(self.named(name), ASKED)
+        told: dict[str, Any] = self.stage._call(self.named(name), LIST_METHOD)
         return told
 
     def turn(self) -> tuple[Any, str]:
@@ -31,7 +31,7 @@ class InjectorTests(SynchronousTestCase):
         task = self.stage.assign("turn-around")
         for _ in range(100):
             self.stage.wait(0.05)
-            acts = acting(self.stage.devices())
+            acts = find_executing(self.stage.devices())
             if acts:
                 self.stage.wait(0.4)
                 return next(each for each in self.stage.devices() if each.uuid in acts), task
@@ -40,12 +40,12 @@ class InjectorTests(SynchronousTestCase):
     def takeover(self, fault: Fault) -> Takeover:
         """Inject a fault into the acting device; return the takeover when it is over or its time limit is reached."""
         lost, task = self.turn()
-        self.stage.cause(lost, fault)
+        self.stage.inject(lost, fault)
         now = self.stage.seconds()
         clock = Takeover(lost.uuid, task, now, now + fault.seconds)
         while clock.is_open(self.stage.seconds()) and not self.stage.is_over(task):
             self.stage.wait(0.05)
-            clock.look(acting(self.stage.devices()), self.stage.seconds())
+            clock.observe(find_executing(self.stage.devices()), self.stage.seconds())
         return clock
 
     def test_takeover(self) -> None:
@@ -69,10 +69,10 @@ class InjectorTests(SynchronousTestCase):
     def test_heal(self) -> None:
         """A fault ends after its time, a repeated fault starts again with its new values, other faults continue."""
         dog = self.named("dog1")
-        self.stage.cause(dog, Fault("delay", 2.0, 0.05))
-        self.stage.cause(dog, Fault("loss", 20.0, 0.01))
+        self.stage.inject(dog, Fault("delay", 2.0, 0.05))
+        self.stage.inject(dog, Fault("loss", 20.0, 0.01))
         self.stage.wait(1.5)
-        self.stage.cause(dog, Fault("delay", 3.0, 0.1))
+        self.stage.inject(dog, Fault("delay", 3.0, 0.1))
         self.stage.wait(1.0)
         active = {kind: (left, amount) for kind, left, amount in self.asked("dog1")["active"]}
         self.assertEqual(active["delay"][1], 0.1)
@@ -82,7 +82,7 @@ class InjectorTests(SynchronousTestCase):
 
     def test_cut_off_and_back(self) -> None:
         """The team loses a device without radio, which is back after the fault."""
-        self.stage.cause(self.named("dog2"), Fault("radio", 4.0))
+        self.stage.inject(self.named("dog2"), Fault("radio", 4.0))
         self.stage.wait(3.0)
         self.assertEqual([device.name for device in self.stage.devices()], ["vaio", "dog1", "dog3"])
         self.stage.wait(5.0)
@@ -91,24 +91,24 @@ class InjectorTests(SynchronousTestCase):
     def test_battery_of_idle_dogs(self) -> None:
         """No dog with a drained battery takes a task, until the batteries are charged again."""
         for name in ("dog1", "dog2", "dog3"):
-            self.stage.cause(self.named(name), Fault("battery", 4.0, 0.02))
+            self.stage.inject(self.named(name), Fault("battery", 4.0, 0.02))
         self.stage.wait(0.6)
         self.stage.assign("turn-around")
         for _ in range(30):
             self.stage.wait(0.1)
-            self.assertEqual(acting(self.stage.devices()), {})
+            self.assertEqual(find_executing(self.stage.devices()), {})
         self.stage.wait(3.0)
-        self.assertEqual(len(acting(self.stage.devices())), 1)
+        self.assertEqual(len(find_executing(self.stage.devices())), 1)
 
     def test_what_can_be_suffered(self) -> None:
         """A laptop cannot have a battery fault, and unsupported faults and values are rejected with a reason."""
         self.assertEqual(self.asked("vaio")["kinds"], [kind for kind in KINDS if kind != "battery"])
         self.assertEqual(self.asked("dog1")["kinds"], list(KINDS))
-        error = self.assertRaises(Refusal, self.stage.cause, self.named("vaio"), Fault("battery", 5.0, 0.01))
+        error = self.assertRaises(Rejection, self.stage.inject, self.named("vaio"), Fault("battery", 5.0, 0.01))
         self.assertIn("cannot have battery; choose one of kill, freeze", str(error))
-        error = self.assertRaises(Refusal, self.stage.cause, self.named("dog1"), Fault("radio", 1e9))
+        error = self.assertRaises(Rejection, self.stage.inject, self.named("dog1"), Fault("radio", 1e9))
         self.assertIn("seconds", str(error))
-        error = self.assertRaises(Refusal, self.stage.assign, "fly")
+        error = self.assertRaises(Rejection, self.stage.assign, "fly")
         self.assertIn("turn-around", str(error))
 
 
@@ -129,16 +129,16 @@ class TransitionTests(SynchronousTestCase):
 class ForbiddenTests(SynchronousTestCase):
     def test_nothing_where_not_allowed(self) -> None:
         """A node that does not allow faults rejects the method, and its network works normally."""
-        team = VirtualTeam(3, dogs=("dog1",))
+        team = SimulatedTeam(3, dogs=("dog1",))
         self.addCleanup(team.stop)
         node = team.services["vaio"].assembly.node
         watch = node.watch_devices(lambda records: None)
         team.clock.advance(2.0)
-        contact = next(node.contact_of(r) for device, r in devices_of(watch.records) if device.name == "dog1")
+        contact = next(node.find_contact(r) for device, r in parse_devices(watch.records) if device.name == "dog1")
         assert contact is not None
-        work = node.entangled.call(contact, CAUSE, "radio", 5.0, None, changes=True)
+        work = node.entangled.call(contact, CAUSE_METHOD, "radio", 5.0, None, changes=True)
         problems: list[str] = []
         work.addErrback(lambda failure: problems.append(failure.getErrorMessage()))
         team.clock.advance(4.0)
         self.assertEqual(len(problems), 1)
-        self.assertEqual(len(devices_of(watch.records)), 2)
+        self.assertEqual(len(parse_devices(watch.records)), 2)

@@ -1,4 +1,4 @@
-"""Tests of ``swarmnode.invitation`` and ``swarm web``: the address of the page and its access code."""
+"""Tests of ``swarmnode.page_access`` and ``swarm web``: the address of the page and its access code."""
 
 from __future__ import annotations
 
@@ -11,10 +11,10 @@ from pathlib import Path
 
 from twisted.trial.unittest import SynchronousTestCase
 
-from swarmnode.invitation import Invitation, at_terminal, invitations, invited, url_of
+from swarmnode.page_access import PageAccess, announce_page, find_terminal, list_pages, make_url
 from swarmnode.web_code import main
 
-OWN = Invitation("vaio", "http://127.0.0.1:8080/", "quiet-otter", os.getpid())
+OWN = PageAccess("vaio", "http://127.0.0.1:8080/", "quiet-otter", os.getpid())
 
 
 class InvitationTests(SynchronousTestCase):
@@ -25,28 +25,28 @@ class InvitationTests(SynchronousTestCase):
 
     def test_leave_a_note(self) -> None:
         """A web node writes its address and code to a private file; the next start replaces it."""
-        self.patch(sys.modules["middleware.entangled.control.place"], "MAX_PATH", 4096)
+        self.patch(sys.modules["middleware.entangled.control.socket_path"], "MAX_PATH", 4096)
         for code in ("quiet-otter", "loud-otter"):
-            invited("vaio", "0.0.0.0", lambda: 8080, code)
-        self.assertEqual(invitations(), [Invitation("vaio", "http://127.0.0.1:8080/", "loud-otter", os.getpid())])
-        invited("vaio", "0.0.0.0", lambda: 8080, "quiet-otter", 8443)
-        self.assertEqual(invitations()[0].secure, "https://127.0.0.1:8443/")
+            announce_page("vaio", "0.0.0.0", lambda: 8080, code)
+        self.assertEqual(list_pages(), [PageAccess("vaio", "http://127.0.0.1:8080/", "loud-otter", os.getpid())])
+        announce_page("vaio", "0.0.0.0", lambda: 8080, "quiet-otter", 8443)
+        self.assertEqual(list_pages()[0].secure, "https://127.0.0.1:8443/")
         (note,) = (self.where / "swarm-node").iterdir()
         self.assertEqual(stat.S_IMODE(note.stat().st_mode), 0o600)
 
     def test_show_the_code_at_a_terminal(self) -> None:
         """A node that is started at a terminal prints the code; other or closed streams get none."""
-        self.patch(sys.modules["middleware.entangled.control.place"], "MAX_PATH", 4096)
+        self.patch(sys.modules["middleware.entangled.control.socket_path"], "MAX_PATH", 4096)
         screen = io.StringIO()
-        invited("vaio", "0.0.0.0", lambda: 8080, "quiet-otter", terminal=screen)
+        announce_page("vaio", "0.0.0.0", lambda: 8080, "quiet-otter", terminal=screen)
         self.assertIn("http://127.0.0.1:8080/#code=quiet-otter", screen.getvalue())
-        invited("vaio", "0.0.0.0", lambda: 8080, "", terminal=(silent := io.StringIO()))
+        announce_page("vaio", "0.0.0.0", lambda: 8080, "", terminal=(silent := io.StringIO()))
         self.assertEqual(silent.getvalue(), "")
         closed = io.StringIO()
         closed.close()
         for stream in (None, io.StringIO(), closed):
             self.patch(sys, "__stderr__", stream)
-            self.assertIsNone(at_terminal())
+            self.assertIsNone(find_terminal())
 
     def test_pass_over_what_is_no_note(self) -> None:
         """The note of a node that has ended, and invalid notes, are ignored."""
@@ -57,17 +57,17 @@ class InvitationTests(SynchronousTestCase):
             ("c", '{"name": "c", "url": "", "code": "", "pid": 4194305}'),
         ):
             (self.where / "swarm-node" / f"{name}.page").write_text(words)
-        self.assertEqual(invitations(), [])
+        self.assertEqual(list_pages(), [])
 
     def test_name_an_address_for_this_machine(self) -> None:
         """A wildcard address is shown as an address that a browser on this machine can open."""
-        self.assertEqual(url_of("0.0.0.0", 80), "http://127.0.0.1:80/")
-        self.assertEqual(url_of("::", 80), "http://[::1]:80/")
-        self.assertEqual(url_of("192.168.0.2", 8080), "http://192.168.0.2:8080/")
+        self.assertEqual(make_url("0.0.0.0", 80), "http://127.0.0.1:80/")
+        self.assertEqual(make_url("::", 80), "http://[::1]:80/")
+        self.assertEqual(make_url("192.168.0.2", 8080), "http://192.168.0.2:8080/")
 
 
 class WebCodeTests(SynchronousTestCase):
-    def asked(self, *words: str, here: list[Invitation] | None = None) -> tuple[int, str, str]:
+    def asked(self, *words: str, here: list[PageAccess] | None = None) -> tuple[int, str, str]:
         out, errors = io.StringIO(), io.StringIO()
         self.patch(sys, "stderr", errors)
         code = main(words, out, lambda: [OWN] if here is None else here)
@@ -80,9 +80,9 @@ class WebCodeTests(SynchronousTestCase):
         self.assertIn("vaio: http://127.0.0.1:8080/  code quiet-otter, or open", out)
         self.assertIn("http://127.0.0.1:8080/#code=quiet-otter", out)
         self.assertEqual(json.loads(self.asked("--json")[1])["code"], "quiet-otter")
-        secure = Invitation("a", "http://127.0.0.1:1/", "quiet-otter", 1, "https://127.0.0.1:2/")
+        secure = PageAccess("a", "http://127.0.0.1:1/", "quiet-otter", 1, "https://127.0.0.1:2/")
         self.assertIn("a: http://127.0.0.1:1/ and https://127.0.0.1:2/  code", self.asked(here=[secure])[1])
-        self.assertIn("no sign-in", self.asked(here=[Invitation("a", "http://127.0.0.1:1/", "", 1)])[1])
+        self.assertIn("no sign-in", self.asked(here=[PageAccess("a", "http://127.0.0.1:1/", "", 1)])[1])
 
     def test_tell_that_there_is_none(self) -> None:
         """If no page or no such node runs, one line lists the nodes with a page, and the exit code is 2."""

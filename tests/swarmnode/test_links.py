@@ -11,11 +11,11 @@ from typing import Any
 from twisted.internet.defer import Deferred
 from twisted.trial.unittest import SynchronousTestCase
 
-from middleware.diagnostics.survey import ENDING_S, links, team
-from middleware.entangled.control.link import link
+from middleware.diagnostics.node_diagnostics import ENDING_S, describe_links, describe_team
+from middleware.entangled.control.link_quality import compute_quality
 from middleware.entangled.errors import Refused
 from swarmnode.links import main
-from swarmnode.rehearsal import VirtualTeam
+from swarmnode.simulated_team import SimulatedTeam
 from tests.swarmnode.shell import Shell, runtime_folder
 
 FAR = {"id": "cd" * 20, "address": f"~{'cd' * 20}:1", "way": "carried", "by": "ef" * 20, "for": 150.0, "relayed": True}
@@ -40,7 +40,7 @@ class LinksTests(SynchronousTestCase):
 
     def test_worst_first(self) -> None:
         """Each peer has a line with score, path, measurements and duration; the worst is first."""
-        score = link([0.08] * 9 + [None], True).score
+        score = compute_quality([0.08] * 9 + [None], True).score
         self.assertLess(score, 100)
         code, printed = self.run_it()
         self.assertEqual(
@@ -73,7 +73,7 @@ class LinksTests(SynchronousTestCase):
 
     def test_real_node(self) -> None:
         """A running node lists its peers by their device names."""
-        team = VirtualTeam(3)
+        team = SimulatedTeam(3)
         self.addCleanup(team.stop)
         shell = Shell(team, team.services["vaio"].assembly.node)
         code, printed = shell.run(main, [])
@@ -86,7 +86,7 @@ class TeamTests(SynchronousTestCase):
     """A node of a closed team reports the members and the refused nodes."""
 
     def setUp(self) -> None:
-        self.team = VirtualTeam(5, dogs=("dog1", "dog2"))
+        self.team = SimulatedTeam(5, dogs=("dog1", "dog2"))
         self.addCleanup(self.team.stop)
         self.laptop = self.team.services["vaio"].assembly.node
         self.dog = self.team.services["dog1"].assembly.node
@@ -94,15 +94,15 @@ class TeamTests(SynchronousTestCase):
     def tell(self, statement: bytes) -> None:
         """Distribute a statement of the operator."""
         assert self.laptop.team is not None
-        self.laptop.later(0.0, lambda: Deferred.fromCoroutine(self.laptop.team.tell(statement)))  # type: ignore[union-attr]
+        self.laptop.later(0.0, lambda: Deferred.fromCoroutine(self.laptop.team.publish(statement)))  # type: ignore[union-attr]
         self.team.clock.advance(3.0)
 
     def test_members(self) -> None:
         """A closed team reports its kind, its public fingerprint, and its members with their roles."""
-        told = team(self.laptop)
+        told = describe_team(self.laptop)
         assert self.laptop.team is not None
         self.assertEqual((told["kind"], told["me"]), ("closed", self.laptop.uuid))
-        self.assertEqual(bytes.fromhex(told["fingerprint"]), self.laptop.entangled.endpoint.door.fingerprint)
+        self.assertEqual(bytes.fromhex(told["fingerprint"]), self.laptop.entangled.endpoint.admission.fingerprint)
         self.assertEqual([member["name"] for member in told["members"]], ["dog1", "dog2", "vaio"])
         self.assertEqual(told["members"][0]["uuid"], self.dog.uuid)
         self.assertFalse(told["is_ending"] or any(member["is_ending"] for member in told["members"]))
@@ -114,27 +114,27 @@ class TeamTests(SynchronousTestCase):
         begin = int(self.team.clock.seconds()) + 1
         public = dog.entangled.identity.public
         self.tell(self.team.operator.grant(public, "dog2", ("device",), begin, int(ENDING_S) - 60))
-        told = team(self.laptop)
+        told = describe_team(self.laptop)
         found = [(member["name"], member["is_ending"]) for member in told["members"]]
         self.assertEqual(found, [("dog2", True), ("dog1", False), ("vaio", False)])
-        self.assertEqual((told["is_ending"], team(dog)["is_ending"]), (False, True))
+        self.assertEqual((told["is_ending"], describe_team(dog)["is_ending"]), (False, True))
         self.assertEqual([member["is_renewable"] for member in told["members"]], [False, True, True])
 
     def test_refusals(self) -> None:
         """A revoked node is reported with the remedy, by the nodes that reject it and by itself."""
         self.tell(self.team.operator.revoke(self.dog.entangled.identity.public, "dog1", self.team.clock.seconds()))
         self.team.clock.advance(3.0)
-        ours, theirs = links(self.laptop)["refusals"], links(self.dog)["refusals"]
+        ours, theirs = describe_links(self.laptop)["refusals"], describe_links(self.dog)["refusals"]
         self.assertIn(("dog1", "we", "revoked"), [(each["who"], each["side"], each["code"]) for each in ours])
         self.assertIn(("they", "revoked"), [(each["side"], each["code"]) for each in theirs])
         self.assertIn("admit the node again with a new code", ours[0]["reason"])
-        self.assertNotIn("dog1", [member["name"] for member in team(self.laptop)["members"]])
+        self.assertNotIn("dog1", [member["name"] for member in describe_team(self.laptop)["members"]])
 
     def test_refused_call(self) -> None:
         """A call that the caller's role does not allow is reported by the called node."""
         asked = self.dog.entangled.call(self.laptop.entangled.contact, "device.message", "sit", changes=True)
         self.team.clock.advance(1.0)
         self.failureResultOf(asked, Refused)
-        (told,) = links(self.laptop)["refusals"]
+        (told,) = describe_links(self.laptop)["refusals"]
         self.assertEqual((told["who"], told["side"], told["code"], told["count"]), ("dog1", "call", "role", 1))
         self.assertIn("; ask the operator for another role", told["reason"])

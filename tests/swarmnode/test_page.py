@@ -10,7 +10,7 @@ from middleware.config.settings import Settings
 
 MISSING = [name for name in ("flask",) if find_spec(name) is None]
 if not MISSING:
-    from swarmnode.page import hosts_of
+    from swarmnode.page import list_host_names
 
 
 class HostsTests(SynchronousTestCase):
@@ -21,7 +21,7 @@ class HostsTests(SynchronousTestCase):
         """The page accepts the names of machine and node, bare and on the LAN, and those in the settings only."""
         web = {"names": ["robots.lan", "page.example.org"]}
         settings = Settings.from_mapping({"node": {"name": "Dog1", "team_key": "t"}, "web": web}, "")
-        found = hosts_of(settings, "Vaio.corp.example")
+        found = list_host_names(settings, "Vaio.corp.example")
         for name in ("vaio.corp.example", "vaio", "vaio.local", "vaio.lan", "dog1", "dog1.local", *web["names"]):
             self.assertIn(name, found)
         for name in ("evil.local", ".local", "corp.example", "vaio.example"):

@@ -12,18 +12,18 @@ from twisted.logger import ILogObserver, LogEvent, formatEvent, globalLogPublish
 from twisted.trial.unittest import SynchronousTestCase
 from zope.interface import implementer
 
-from agents.catalogue import DEMO, TASKS
+from agents.catalogue import DEMO_TASK, TASKS
 from drivers.registry import describe
 from middleware.config.settings import Settings
 from middleware.directory.presence import Device
 from middleware.frontend.client import TeamClient
 from sim.robots.emulator.aibo_dog import AiboEmulator
-from sim.robots.emulator.body import MemoryBody
+from sim.robots.emulator.simulated_robot import MemoryRobot
 from swarmnode.service import NodeService
 from tests.swarmnode.team import World
-from webnode.ledger import state_from
-from webnode.state import Departed, device_view
-from webnode.team import TeamDesk
+from webnode.state import DepartedDevices, make_device_view
+from webnode.state_builder import build_state
+from webnode.team_control import TeamControl
 
 FOLDER = Path(__file__).resolve().parents[2] / "examples" / "table-5.1"
 ROWS = [(f"dog{n}", f"dog{n}_laptop", f"dog{n}_agent") for n in (1, 2, 3)]
@@ -69,9 +69,9 @@ class PairingTests(SynchronousTestCase):
         for port, (name, settings) in enumerate(sorted(self.settings.items(), reverse=True), 7000):
             seams = world.seams(name, port)
             host = settings.node.host
-            seams = replace(seams, network=partial(world.board.network, host, port))
+            seams = replace(seams, network=partial(world.board.make_network, host, port))
             if settings.driver.kind:
-                dog = AiboEmulator(world.clock, MemoryBody(), random.Random(name))
+                dog = AiboEmulator(world.clock, MemoryRobot(), random.Random(name))
                 dog.start()
                 self.addCleanup(dog.stop)
                 seams = replace(seams, connector=dog.connector())
@@ -81,8 +81,8 @@ class PairingTests(SynchronousTestCase):
             self.addCleanup(services[name].stopService)
             world.clock.advance(1.0)
         world.clock.advance(3.0)
-        desk = TeamDesk(TeamClient(services["vaio"].assembly.node), TASKS, DEMO, None)
-        devices = state_from(desk.read, Departed(), "vaio", world.clock.seconds())["devices"]
+        desk = TeamControl(TeamClient(services["vaio"].assembly.node), TASKS, DEMO_TASK, None)
+        devices = build_state(desk.read, DepartedDevices(), "vaio", world.clock.seconds())["devices"]
         told = {device["name"]: (device["name"], device["laptop"], device["agent"]) for device in devices}
         self.assertEqual(told, {"vaio": ("vaio", "vaio", ""), **{row[0]: row for row in ROWS}})
         self.assertEqual({device["kind"] for device in devices}, {"laptop", "aibo-ers7"})
@@ -95,6 +95,6 @@ class PairingTests(SynchronousTestCase):
     def test_names_cost_nothing_where_there_are_none(self) -> None:
         """The record of a device without these names has no such keys, and names that are not text are ignored."""
         bare, named = Device("ab", "dog1"), Device("ab", "dog1", laptop="dog1_laptop", agent="dog1_agent")
-        keys = [set(msgpack.unpackb(device.packed())) for device in (bare, named)]
+        keys = [set(msgpack.unpackb(device.pack())) for device in (bare, named)]
         self.assertEqual(keys[0] ^ keys[1], {"laptop", "agent"})
-        self.assertEqual(device_view({"name": "dog1", "laptop": 7})["laptop"], "")
+        self.assertEqual(make_device_view({"name": "dog1", "laptop": 7})["laptop"], "")

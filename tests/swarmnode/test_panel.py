@@ -14,11 +14,11 @@ from agents.context import Context
 from agents.engagement import Engagement
 from agents.state import State
 from drivers.reading import Action, Observation
-from middleware.consensus.bidding.panel import SEATS
+from middleware.consensus.bidding.reporters import ENOUGH_RECORDS
 from middleware.entangled.record import Record
-from middleware.tasks.task import Task, member_of
-from sim.robots.crowd.ground import Ground
-from swarmnode.crowd import DESK, CrowdTeam
+from middleware.tasks.task import Task, parse_member
+from sim.robots.crowd.scene import CrowdScene
+from swarmnode.crowd import TASK_NODE, CrowdTeam
 
 AGENTS = 24
 ANNOUNCED = 4
@@ -53,13 +53,13 @@ class ManyTests(SynchronousTestCase):
     def setUp(self) -> None:
         KINDS["stand"] = f"{__name__}:Stand"
         self.addCleanup(KINDS.pop, "stand")
-        self.team = CrowdTeam(7, AGENTS, Ground(30, 5.0, 5.0), camera_fps=0.0)
+        self.team = CrowdTeam(7, AGENTS, CrowdScene(30, 5.0, 5.0), camera_fps=0.0)
         self.addCleanup(self.team.stop)
         self.records: list[Record] = []
-        node = self.team.services[DESK].assembly.node
+        node = self.team.services[TASK_NODE].assembly.node
         node.watch_group("job", self.heard)
         task = Task("job", "stand", "Stand", {"base2d": {}}, waiting_period=0.5)
-        self.sent = self.team.board.counters["sent"]
+        self.sent = self.team.switchboard.counters["sent"]
         Deferred.fromCoroutine(node.submit(task))
 
     def heard(self, records: list[Record]) -> None:
@@ -68,13 +68,13 @@ class ManyTests(SynchronousTestCase):
 
     def engagements(self) -> dict[str, Engagement]:
         """Return the engagement of each running agent."""
-        named = {name: self.team.services[name] for name in self.team.yard.names}
+        named = {name: self.team.services[name] for name in self.team.simulator.names}
         agents: dict[str, Any] = {name: one.assembly.agent for name, one in named.items() if one.running}
         return {name: agent.engagement for name, agent in agents.items() if agent.engagement is not None}
 
     def acting(self) -> list[str]:
         """Return the names of the agents that execute the task."""
-        return [name for name, one in self.engagements().items() if one.course.state is State.EXECUTING]
+        return [name for name, one in self.engagements().items() if one.state_machine.state is State.EXECUTING]
 
     def run_until_one_acts(self, limit: float) -> tuple[str, float]:
         """Run until an agent acts, never two at once; return its name and the seconds."""
@@ -96,10 +96,10 @@ class ManyTests(SynchronousTestCase):
         self.assertEqual(name, self.ranked()[0])
         self.team.clock.advance(2.0)
         self.assertEqual((self.acting(), len(self.engagements())), ([name], AGENTS))
-        sent = self.team.board.counters["sent"] - self.sent
+        sent = self.team.switchboard.counters["sent"] - self.sent
         self.assertLess(sent / AGENTS, 1000)
-        members = {member.uuid for record in self.records if (member := member_of(record)) is not None}
-        self.assertLessEqual(len(members), SEATS + 2 * ANNOUNCED)  # some write before the last announcement
+        members = {member.uuid for record in self.records if (member := parse_member(record)) is not None}
+        self.assertLessEqual(len(members), ENOUGH_RECORDS + 2 * ANNOUNCED)  # some write before the last announcement
         uuid = self.engagements()[name].me.uuid
         self.assertEqual({one.me.assigned for one in self.engagements().values()}, {uuid})
         self.team.services[name].vanish()

@@ -9,7 +9,7 @@ from twisted.trial.unittest import SynchronousTestCase
 
 from middleware.config.settings import Settings
 from swarmnode.password import main
-from webnode.password import is_password
+from webnode.password import verify_password
 
 
 class PasswordCommandTests(SynchronousTestCase):
@@ -31,7 +31,7 @@ class PasswordCommandTests(SynchronousTestCase):
         path = self.mktemp()
         with open(path, "w", encoding="utf-8") as file:
             file.write(f'[node]\nname = "vaio"\n[web]\n{out}')
-        self.assertTrue(is_password(Settings.load(path).web.password, "correct horse"))
+        self.assertTrue(verify_password(Settings.load(path).web.password, "correct horse"))
         self.assertNotIn("horse", out)
 
     def test_refuse_in_one_line(self) -> None:

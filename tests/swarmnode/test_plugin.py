@@ -11,15 +11,15 @@ from typing import Any
 
 from twisted.trial.unittest import SynchronousTestCase
 
-from drivers.registry import kinds
+from drivers.registry import list_kinds
 from middleware.config.settings import NODE_PORT, Settings
 from middleware.entangled.errors import BadStore, PortInUse, TunnelPortInUse
 from middleware.entangled.network.network import Address
 from middleware.errors import BadSetting, UnknownAgent
 from swarmnode import plugin
-from swarmnode.plugin import CheckedService, Options, makeService, told
-from swarmnode.ports import given_way
-from swarmnode.world import resolved
+from swarmnode.environment import resolve_hosts
+from swarmnode.plugin import CheckedService, Options, format_error, makeService
+from swarmnode.ports import replace_busy_ports
 from tests.swarmnode.team import KEY, World
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -78,7 +78,7 @@ class RefusalTests(SynchronousTestCase):
 
     def test_refuse_what_cannot_be_made(self) -> None:
         """Unknown agents, drivers and stores, and invalid combinations, are rejected with the valid values."""
-        known = "known are " + ", ".join(kinds())
+        known = "known are " + ", ".join(list_kinds())
         (self.folder / "text.sqlite").write_text("this is a letter " * 99, encoding="utf-8")
         driver = '[driver]\nkind = "sim"\n'
         for text, parts in (
@@ -111,38 +111,40 @@ class RefusalTests(SynchronousTestCase):
 
         node = {"name": "a", "known_nodes": ["no-such-host.invalid:7000"]}
         settings = Settings.from_mapping({"node": node}, "x.toml")
-        error = self.assertRaises(BadSetting, resolved, settings, nothing)
+        error = self.assertRaises(BadSetting, resolve_hosts, settings, nothing)
         self.assertEqual(
-            told(error, "x.toml"),
+            format_error(error, "x.toml"),
             "x.toml: [node] known_nodes: no address is known for 'no-such-host.invalid' (Name or service not known); "
             "fix the name, or write a numeric address",
         )
 
     def test_say_which_setting_to_mend(self) -> None:
         """An error without a file is reported in one line after the file and the key."""
-        self.assertEqual(told(PortInUse("UDP 1:2: taken"), "a.toml"), "a.toml: [node] port: UDP 1:2: taken")
+        self.assertEqual(format_error(PortInUse("UDP 1:2: taken"), "a.toml"), "a.toml: [node] port: UDP 1:2: taken")
         self.assertEqual(
-            told(TunnelPortInUse("TCP 1:2: taken"), "a.toml"), "a.toml: [node] tunnel_port: TCP 1:2: taken"
+            format_error(TunnelPortInUse("TCP 1:2: taken"), "a.toml"), "a.toml: [node] tunnel_port: TCP 1:2: taken"
         )
-        self.assertEqual(told(BadStore("two\nlines"), "a.toml"), "a.toml: [node] store: two lines")
-        self.assertEqual(told(UnknownAgent("x"), ""), "[agent] module: x")
+        self.assertEqual(format_error(BadStore("two\nlines"), "a.toml"), "a.toml: [node] store: two lines")
+        self.assertEqual(format_error(UnknownAgent("x"), ""), "[agent] module: x")
 
 
 class CheckedServiceTests(SynchronousTestCase):
     def test_take_the_next_port(self) -> None:
         """A node with a default port that is in use starts at the next port; a configured port is rejected."""
         world = World()
-        world.board.network("127.0.0.1", NODE_PORT).listen(lambda datagram, source: None)
+        world.board.make_network("127.0.0.1", NODE_PORT).listen(lambda datagram, source: None)
 
         def service(**more: Any) -> CheckedService:
             made = CheckedService(
                 Settings.from_mapping({"node": {"name": "a", "team_key": KEY, **more}}, "test"),
                 world.seams("a", NODE_PORT),
             )
-            self.patch(plugin, "real_network", lambda node, *_: lambda: world.board.network(node.host, node.port))
+            self.patch(plugin, "real_network", lambda node, *_: lambda: world.board.make_network(node.host, node.port))
             return made
 
-        self.patch(plugin, "given_way", lambda settings: given_way(settings, lambda _, host, port: port != NODE_PORT))
+        self.patch(
+            plugin, "given_way", lambda settings: replace_busy_ports(settings, lambda _, host, port: port != NODE_PORT)
+        )
         moved = service()
         moved.startService()
         self.addCleanup(moved.stopService)
@@ -201,7 +203,7 @@ class OptionsTests(SynchronousTestCase):
             "node": {"name": "a", "known_nodes": ["laptop.local:7000"], "roles": ["web"]},
             "web": {"yard": "yard.local:7400"},
         }
-        settings = resolved(Settings.from_mapping(mapping, "x.toml"), look_up)
+        settings = resolve_hosts(Settings.from_mapping(mapping, "x.toml"), look_up)
         self.assertEqual(settings.node.known_nodes, (Address("10.9.8.7", 7000),))
         self.assertEqual(settings.web.yard, Address("10.9.8.7", 7400))
         self.assertEqual(asked, [("laptop.local", socket.AF_INET), ("yard.local", socket.AF_UNSPEC)])

@@ -8,7 +8,7 @@ from collections.abc import Collection
 from twisted.trial.unittest import SynchronousTestCase
 
 from middleware.config.settings import NODE_PORT, Settings
-from swarmnode.ports import NEXT, IsFree, given_way
+from swarmnode.ports import PORT_COUNT, IsFree, replace_busy_ports
 
 
 def busy(*ports: int) -> IsFree:
@@ -27,17 +27,17 @@ class PortsTests(SynchronousTestCase):
 
     def test_free_ports_are_taken_as_usual(self) -> None:
         """If no port is in use, each port has its default."""
-        found = given_way(settings(), busy())
+        found = replace_busy_ports(settings(), busy())
         self.assertEqual((found.node.port, found.web.port, found.web.tls_port), (NODE_PORT, 8080, 8443))
 
     def test_usual_ports_give_way(self) -> None:
         """A default port that is in use is replaced by the next free port."""
-        found = given_way(settings(), busy(NODE_PORT, NODE_PORT + 1, 8080, 8443))
+        found = replace_busy_ports(settings(), busy(NODE_PORT, NODE_PORT + 1, 8080, 8443))
         self.assertEqual((found.node.port, found.web.port, found.web.tls_port), (NODE_PORT + 2, 8081, 8444))
 
     def test_many_busy_ports_leave_any(self) -> None:
         """If the next ports are in use as well, the system chooses the port."""
-        found = given_way(settings(), busy(*range(NODE_PORT, NODE_PORT + NEXT)))
+        found = replace_busy_ports(settings(), busy(*range(NODE_PORT, NODE_PORT + PORT_COUNT)))
         self.assertEqual(found.node.port, 0)
 
     def test_a_port_that_was_set_stays(self) -> None:
@@ -45,7 +45,7 @@ class PortsTests(SynchronousTestCase):
         of_file = settings([("port", NODE_PORT)], [("port", 8080), ("tls_port", 8443)])
         of_flags = settings().with_flags(port=NODE_PORT, web_port="8080", web_tls_port="8443")
         for wanted in (of_file, of_flags):
-            found = given_way(wanted, busy(NODE_PORT, 8080, 8443))
+            found = replace_busy_ports(wanted, busy(NODE_PORT, 8080, 8443))
             self.assertEqual((found.node.port, found.web.port, found.web.tls_port), (NODE_PORT, 8080, 8443))
 
     def test_a_node_without_page_looks_for_none(self) -> None:
@@ -56,5 +56,5 @@ class PortsTests(SynchronousTestCase):
             asked.append(kind)
             return True
 
-        given_way(Settings.from_mapping({"node": {"name": "a"}}, ""), is_free)
+        replace_busy_ports(Settings.from_mapping({"node": {"name": "a"}}, ""), is_free)
         self.assertEqual(asked, [socket.SOCK_DGRAM])

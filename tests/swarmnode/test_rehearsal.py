@@ -1,14 +1,14 @@
-"""Tests of ``swarmnode.rehearsal``: a simulated team that a seed reproduces."""
+"""Tests of ``swarmnode.simulated_team``: a simulated team that a seed reproduces."""
 
 from __future__ import annotations
 
 from twisted.trial.unittest import SynchronousTestCase
 
-from swarmnode.rehearsal import VirtualTeam
+from swarmnode.simulated_team import SimulatedTeam
 from tests.replay import replayed
 
 RUN = """
-from swarmnode.rehearsal import VirtualTeam
+from swarmnode.simulated_team import VirtualTeam
 team = VirtualTeam(7)
 team.run_demo()
 team.clock.advance(12.0)
@@ -21,7 +21,7 @@ class ReplayTests(SynchronousTestCase):
         """Processes with different hash seeds exchange the same datagrams; another seed gives another digest."""
         digest = replayed(self, RUN)
         self.assertEqual(len(digest), 64)
-        team = VirtualTeam(8)
+        team = SimulatedTeam(8)
         team.run_demo()
         team.clock.advance(12.0)
-        self.assertNotEqual(team.board.digest(), digest)
+        self.assertNotEqual(team.switchboard.digest(), digest)

@@ -51,7 +51,7 @@ class NodeServiceTests(SynchronousTestCase):
     def test_service_leaves_and_returns(self) -> None:
         """A node that leaves for a time stops its page, and returns with its identity and a new page."""
         before = self.second.assembly.node
-        self.second.leave(3.0)
+        self.second.leave_for(3.0)
         self.assertFalse(self.world.pages[0].running)
         self.world.clock.advance(2.5)
         self.assertEqual(self.seen(), 1)
@@ -63,8 +63,8 @@ class NodeServiceTests(SynchronousTestCase):
 
     def test_second_wish_to_leave_changes_nothing(self) -> None:
         """Two requests to leave within a short time restart the node once."""
-        self.second.leave(2.0)
-        self.second.leave(3.0)
+        self.second.leave_for(2.0)
+        self.second.leave_for(3.0)
         self.world.clock.advance(2.5)
         back = self.second.assembly.node
         self.world.clock.advance(3.0)
@@ -73,7 +73,7 @@ class NodeServiceTests(SynchronousTestCase):
 
     def test_stopped_while_away_stays_away(self) -> None:
         """A node that is stopped while it is away does not return."""
-        self.second.leave(2.0)
+        self.second.leave_for(2.0)
         self.end(self.second)
         self.world.clock.advance(5.0)
         self.assertEqual(self.seen(), 1)
@@ -81,8 +81,8 @@ class NodeServiceTests(SynchronousTestCase):
 
     def test_port_taken_meanwhile_is_tried_again(self) -> None:
         """A node that cannot return because its port is in use tries again until the port is free."""
-        self.second.leave(1.0)
-        squatter = self.world.board.network("127.0.0.1", 7001)
+        self.second.leave_for(1.0)
+        squatter = self.world.board.make_network("127.0.0.1", 7001)
         squatter.listen(lambda datagram, source: None)
         self.world.clock.advance(2.0)
         self.assertFalse(self.second.assembly.node.running)

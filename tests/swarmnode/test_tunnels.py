@@ -11,11 +11,11 @@ from twisted.trial.unittest import SynchronousTestCase
 from middleware.config.settings import Settings
 from middleware.entangled.clock import HeapClock
 from middleware.entangled.network.joint import JointNetwork
-from middleware.entangled.network.network import Network, detours_of
+from middleware.entangled.network.network import Network, find_alternate_paths
 from middleware.entangled.network.switchboard import Switchboard
 from middleware.entangled.network.url import Proxy, Url
 from middleware.faults.network import FaultyNetwork
-from swarmnode.tunnels import proxy_for, with_tunnels
+from swarmnode.tunnels import add_tunnels, find_proxy
 
 
 class WiringTests(SynchronousTestCase):
@@ -24,10 +24,10 @@ class WiringTests(SynchronousTestCase):
         settings = Settings.from_mapping({"node": {"name": "a", **node}}, "test").node
         board = Switchboard(HeapClock(), random.Random(1))
         reactor = MemoryReactorClock()
-        network = with_tunnels(settings, board.network, reactor, random.Random(1), {})()
+        network = add_tunnels(settings, board.make_network, reactor, random.Random(1), {})()
         network.listen(lambda datagram, source: None)
         self.addCleanup(network.close)
-        return network, detours_of(FaultyNetwork(network, HeapClock(), random.Random(1))), reactor
+        return network, find_alternate_paths(FaultyNetwork(network, HeapClock(), random.Random(1))), reactor
 
     def test_nothing_without_tunnels(self) -> None:
         """A node without tunnels and tunnel port has a plain network and opens no TCP port."""
@@ -40,7 +40,7 @@ class WiringTests(SynchronousTestCase):
         """A node has a virtual tunnel address for each known node, and connects to none of them at once."""
         network, addresses, reactor = self.wired(known_nodes=["10.0.0.7:7000"])
         self.assertIsInstance(network, JointNetwork)
-        self.assertEqual(addresses, [Url.of("wss://10.0.0.7").address])
+        self.assertEqual(addresses, [Url.parse("wss://10.0.0.7").address])
         self.assertEqual((reactor.tcpServers, reactor.tcpClients), ([], []))
 
     def test_port(self) -> None:
@@ -60,22 +60,22 @@ class WiringTests(SynchronousTestCase):
                 return _Port()
 
             reactor.listenTCP = listen_tcp  # type: ignore[method-assign,assignment]
-            network = with_tunnels(settings, board.network, reactor, random.Random(1), {})()
+            network = add_tunnels(settings, board.make_network, reactor, random.Random(1), {})()
             network.listen(lambda datagram, source: None)
             network.close()
-            self.assertEqual((opened, detours_of(network)), ([(443, host)], []))
+            self.assertEqual((opened, find_alternate_paths(network)), ([(443, host)], []))
 
     def test_proxy(self) -> None:
         """A valid proxy of the environment is used for TLS, except for hosts in ``no_proxy``."""
-        url, plain = Url.of("wss://node.example"), Url.of("ws://node.example")
+        url, plain = Url.parse("wss://node.example"), Url.parse("ws://node.example")
         said = {"https_proxy": "http://10.0.0.1:8080"}
-        self.assertEqual(proxy_for(said, url), Proxy("10.0.0.1", 8080))
-        self.assertEqual(proxy_for({"HTTPS_PROXY": "10.0.0.1:8080"}, url), Proxy("10.0.0.1", 8080))
+        self.assertEqual(find_proxy(said, url), Proxy("10.0.0.1", 8080))
+        self.assertEqual(find_proxy({"HTTPS_PROXY": "10.0.0.1:8080"}, url), Proxy("10.0.0.1", 8080))
         for environment in ({}, {"https_proxy": ""}, {"https_proxy": "socks5://a:1"}):
-            self.assertIsNone(proxy_for(environment, url))
-        self.assertIsNone(proxy_for(said, plain))
+            self.assertIsNone(find_proxy(environment, url))
+        self.assertIsNone(find_proxy(said, plain))
         for spared, is_used in (("example", False), (".example,a", False), ("*", False), ("ample", True), ("", True)):
-            self.assertEqual(proxy_for({**said, "no_proxy": spared}, url) is not None, is_used, spared)
+            self.assertEqual(find_proxy({**said, "no_proxy": spared}, url) is not None, is_used, spared)
 
 
 class _Port:

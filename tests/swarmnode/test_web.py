@@ -9,8 +9,8 @@ from twisted.internet import reactor
 from twisted.trial.unittest import SynchronousTestCase
 
 from middleware.errors import BadSetting, MissingExtra
-from swarmnode.plugin import told
-from swarmnode.web import web_page
+from swarmnode.plugin import format_error
+from swarmnode.web import make_web_page
 from tests.swarmnode.team import World
 
 
@@ -30,7 +30,7 @@ class WebRoleTests(SynchronousTestCase):
         service = world.service("a", 7000)
         settings = replace(service.settings, web=replace(service.settings.web, tls="auto"))
         error = self.assertRaises(
-            BadSetting, web_page, settings, world.seams("a", 7000), reactor, service.assembly.node
+            BadSetting, make_web_page, settings, world.seams("a", 7000), reactor, service.assembly.node
         )
         for words in ("[web] tls", "the library OpenSSL is not installed", "pip install 'swarm-node[tls]'"):
             self.assertIn(words, str(error))
@@ -53,9 +53,9 @@ class WebRoleTests(SynchronousTestCase):
         world = World()
         service = world.service("a", 7000)
         settings, seams = service.settings, world.seams("a", 7000)
-        error = self.assertRaises(MissingExtra, web_page, settings, seams, reactor, service.assembly.node)
+        error = self.assertRaises(MissingExtra, make_web_page, settings, seams, reactor, service.assembly.node)
         self.assertEqual(
-            told(error, "x.toml"),
+            format_error(error, "x.toml"),
             "x.toml: [node] roles: the web role needs libraries that are not installed; "
             "run: pip install 'swarm-node[web]'",
         )

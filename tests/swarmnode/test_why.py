@@ -8,16 +8,16 @@ from twisted.internet.defer import Deferred
 from twisted.trial.unittest import SynchronousTestCase
 
 from middleware.tasks.task import Task
-from swarmnode.asker import Refusal
-from swarmnode.rehearsal import VirtualTeam
-from swarmnode.why import chosen, main
+from swarmnode.control_client import Rejection
+from swarmnode.simulated_team import SimulatedTeam
+from swarmnode.why import main, select_task
 from tests.swarmnode.shell import Shell, runtime_folder
 
 
 class WhyTests(SynchronousTestCase):
     def setUp(self) -> None:
         runtime_folder(self, "vaio")
-        self.team = VirtualTeam(4)
+        self.team = SimulatedTeam(4)
         self.addCleanup(self.team.stop)
         self.shell = Shell(self.team, self.team.services["vaio"].assembly.node)
 
@@ -95,9 +95,9 @@ class WhyTests(SynchronousTestCase):
     def test_prefix(self) -> None:
         """An ambiguous prefix is rejected with the matching ids; a complete id matches even if it is a prefix."""
         tasks = [Task(name, "k", name, created=float(n)) for n, name in enumerate(("ab", "abc", "b"))]
-        self.assertEqual(chosen("last", tasks).task_id, "b")
-        self.assertEqual(chosen("ab", tasks).task_id, "ab")
-        self.assertEqual(chosen("abc", tasks).task_id, "abc")
-        error = self.assertRaises(Refusal, chosen, "a", tasks)
+        self.assertEqual(select_task("last", tasks).task_id, "b")
+        self.assertEqual(select_task("ab", tasks).task_id, "ab")
+        self.assertEqual(select_task("abc", tasks).task_id, "abc")
+        error = self.assertRaises(Rejection, select_task, "a", tasks)
         self.assertEqual(str(error), "2 tasks begin with 'a': abc, ab; give more of the id")
-        self.assertRaises(Refusal, chosen, "", tasks)
+        self.assertRaises(Rejection, select_task, "", tasks)

@@ -12,7 +12,7 @@ from twisted.python.failure import Failure
 from twisted.web.resource import IResource
 from twisted.web.server import Site
 
-from webnode.channel import CappedRequest, limited
+from webnode.channel import LimitedRequest, limit_connections
 from webnode.limits import AddressLimits
 from webnode.server import QuietSite
 
@@ -60,7 +60,7 @@ class Connection:
 
 def site_of(root: IResource, clock: Clock, limits: AddressLimits | None = None) -> Site:
     """Create a site on ``clock`` with the web node's requests and, if ``limits`` are given, its connections."""
-    site = QuietSite(root, requestFactory=CappedRequest, reactor=clock, timeout=None)
+    site = QuietSite(root, requestFactory=LimitedRequest, reactor=clock, timeout=None)
     if limits is not None:
-        limited(site, limits)
+        limit_connections(site, limits)
     return site

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 from typing import get_args
 
-from webnode.visitor import OpenSessions, Role, Visitor
+from webnode.auth import OpenSessions, Role, User
 
 
 class Guests(OpenSessions):
-    def visitor(self, token: str, now: float) -> Visitor:
+    def authenticate(self, token: str, now: float) -> User:
         """Return a visitor with the role that the token names."""
         for role in get_args(Role):
             if token == role:
-                return Visitor(token, role, f"id of {token}")
-        return Visitor()
+                return User(token, role, f"id of {token}")
+        return User()

@@ -7,20 +7,20 @@ from typing import Any
 
 from twisted.internet.defer import Deferred, fail, succeed
 
-from middleware.config.tuning import WRONG
+from middleware.config.tuning import INVALID_SETTING
 from middleware.entangled.errors import Refused
-from webnode.board import Wanted
 from webnode.camera import OnFrame
+from webnode.diagnostics import Diagnostics
 from webnode.errors import Refusal
 from webnode.faults import FaultControl
-from webnode.field import Json
-from webnode.halting import TeamHalts
-from webnode.invite import TeamInvites
-from webnode.survey import TeamSurvey
-from webnode.team import TeamDesk
+from webnode.invite import Invites
+from webnode.sanitize import Json
+from webnode.services import PictureReply
+from webnode.stop_control import StopControl
+from webnode.team_control import TeamControl
 
 
-class MemorySurvey(TeamSurvey):
+class MemorySurvey(Diagnostics):
     """A survey that returns fixed answers for the network, each device, the links and the team."""
 
     def __init__(self, network: Json, inventories: Mapping[str, Json], links: Json = None, team: Json = None) -> None:
@@ -29,33 +29,33 @@ class MemorySurvey(TeamSurvey):
         self._told_links = links
         self._told_team = team
 
-    def network(self) -> Deferred[Json]:
+    def query_network(self) -> Deferred[Json]:
         """Return the network."""
         return succeed(self._told_network)
 
-    def links(self) -> Deferred[Json]:
+    def query_links(self) -> Deferred[Json]:
         """Return the links."""
         return succeed(self._told_links)
 
-    def team(self) -> Json:
+    def describe_team(self) -> Json:
         """Return the team."""
         return self._told_team
 
-    def inventory(self, uuid: str) -> Deferred[Json]:
+    def query_inventory(self, uuid: str) -> Deferred[Json]:
         """Return the inventory, or fail with 504 for a device that does not answer."""
         if uuid not in self._inventories:
             return fail(Refusal("device", "it did not answer", "wait a moment, then try again", 504))
         return succeed(self._inventories[uuid])
 
 
-class MemoryHalts(TeamHalts):
+class MemoryHalts(StopControl):
     """The emergency stop of a team that obeys: ``devices`` are the answering uuids, ``said`` the requests."""
 
     def __init__(self, *devices: str) -> None:
         self.devices = devices
         self.said: list[tuple[str, str]] = []
 
-    def halt(self, by: str) -> Deferred[dict[str, str]]:
+    def stop(self, by: str) -> Deferred[dict[str, str]]:
         """Record a stop."""
         self.said.append(("halt", by))
         return succeed(dict.fromkeys(self.devices, "stands"))
@@ -78,11 +78,11 @@ class MemoryFaults(FaultControl):
         self.rows: list[dict[str, Json]] = []
         self._can = kinds
 
-    def kinds(self, uuid: str) -> Sequence[str]:
+    def get_kinds(self, uuid: str) -> Sequence[str]:
         """Return the given kinds."""
         return self._can
 
-    def cause(self, uuid: str, kind: str, seconds: float, amount: float | None) -> Deferred[None]:
+    def inject(self, uuid: str, kind: str, seconds: float, amount: float | None) -> Deferred[None]:
         """Record the fault without an effect."""
         self.caused.append((uuid, kind, seconds, amount))
         row: dict[str, Json] = {
@@ -96,7 +96,7 @@ class MemoryFaults(FaultControl):
         self.rows.insert(0, {**row, "task": "t1", "since_s": 0.0, "takeover_s": None, "to": "", "watched": True})
         return succeed(None)
 
-    def active(self) -> list[dict[str, Json]]:
+    def list_active(self) -> list[dict[str, Json]]:
         """Return the recorded faults, the newest first."""
         return self.rows
 
@@ -122,13 +122,13 @@ class MemoryPhones:
         self.here[uuid], self.can = name, can
         return succeed(uuid)
 
-    def look(self, uuid: str, jpeg: bytes, values: Mapping[str, float]) -> Wanted:
+    def receive_picture(self, uuid: str, jpeg: bytes, values: Mapping[str, float]) -> PictureReply:
         """Record the picture."""
         self._check(jpeg)
         if uuid not in self.here:
             raise Refusal("uuid", "this phone takes no part here", "join by POST /api/v1/phones", 404)
         self.looks.append((uuid, jpeg, values))
-        return Wanted(10.0, "Look for the red target: turn slowly.")
+        return PictureReply(10.0, "Look for the red target: turn slowly.")
 
     def leave(self, uuid: str) -> None:
         """Remove the phone."""
@@ -140,7 +140,7 @@ class MemoryPhones:
         return succeed(None)
 
 
-class MemoryInvites(TeamInvites):
+class MemoryInvites(Invites):
     """Invitations with given pages, and drawings that contain only their text."""
 
     def __init__(self, *urls: str, authority: bytes = b"", fingerprint: str = "") -> None:
@@ -152,7 +152,7 @@ class MemoryInvites(TeamInvites):
         """Return the pages."""
         return self.pages
 
-    def drawn(self, text: str) -> Deferred[str]:
+    def draw_qr_code(self, text: str) -> Deferred[str]:
         """Return an empty picture with the title ``text``, or nothing for an empty text."""
         if not text:
             return succeed("")
@@ -179,7 +179,7 @@ class MemoryFrames:
             self.watched[uuid](seq, jpeg, age)
 
 
-class MemoryDesk(TeamDesk):
+class MemoryDesk(TeamControl):
     """A desk that records each request in ``asked``, and has its own small map."""
 
     def __init__(self, catalogue: Sequence[Mapping[str, Any]] = (), yard: Mapping[str, Any] | None = None) -> None:
@@ -191,7 +191,7 @@ class MemoryDesk(TeamDesk):
         self.settings: dict[str, list[list[Any]]] = {}
         self.frames: Any = MemoryFrames()
 
-    def watch(self, uuid: str, on_frame: OnFrame) -> Callable[[], None]:
+    def stream_camera(self, uuid: str, on_frame: OnFrame) -> Callable[[], None]:
         """Watch ``frames``."""
         stop: Callable[[], None] = self.frames.watch(uuid, on_frame)
         return stop
@@ -209,7 +209,7 @@ class MemoryDesk(TeamDesk):
             for key, value in changes.items():
                 row = next((row for row in rows if row[0] == key), None)
                 if row is None:
-                    error = Refused(f"{key}: cannot be changed on this device; leave it out", WRONG)
+                    error = Refused(f"{key}: cannot be changed on this device; leave it out", INVALID_SETTING)
                     return fail(refused(error) or error)
                 row[1] = value
         return succeed(rows)
@@ -233,7 +233,7 @@ class MemoryDesk(TeamDesk):
         told = self.previews.get(name, {"able": [], "refused": {}, "likely": None})
         return {**told, "together": self.together.get(group, [])}
 
-    def catalogue(self) -> list[Mapping[str, Any]]:
+    def list_predefined(self) -> list[Mapping[str, Any]]:
         """Return the given catalogue."""
         return self.tasks
 
@@ -249,7 +249,7 @@ class MemoryDesk(TeamDesk):
         """Record the request."""
         self._noted("resume", task_id)
 
-    def message(self, uuid: str, text: str) -> Deferred[dict[str, Any]]:
+    def send_message(self, uuid: str, text: str) -> Deferred[dict[str, Any]]:
         """Record the request; the message reaches no device."""
         self._noted("message", uuid, text)
         return succeed({"delivered": [], "failed": {}})
@@ -279,7 +279,7 @@ class MemoryDesk(TeamDesk):
         if self.ground is not None:
             self.ground = {**self.ground, **changes}
 
-    def yard(self) -> dict[str, Any] | None:
+    def get_map(self) -> dict[str, Any] | None:
         """Return the map."""
         return self.ground
 

@@ -12,10 +12,10 @@ from twisted.trial.unittest import SynchronousTestCase
 from tests.webnode.guests import Guests
 from tests.webnode.memory import MemoryDesk, MemoryHalts
 from webnode.app import create_app
-from webnode.board import Board
-from webnode.chronicle import TeamChronicle
 from webnode.errors import Refusal
-from webnode.state import state_of
+from webnode.event_log import EventLog
+from webnode.services import Services
+from webnode.state import format_state
 
 DOG = {"name": "dog1", "x": 0.5, "y": 0.5, "heading": 0.25, "stripes": 1}
 API = "/api/v1"
@@ -25,10 +25,10 @@ class ActionTests(SynchronousTestCase):
     def setUp(self) -> None:
         self.desk = MemoryDesk([{"name": "search"}], {"walls": [3.0, 2.4], "dogs": [DOG], "target": None})
         self.halts = MemoryHalts("01", "02")
-        self.chronicle = TeamChronicle()
+        self.chronicle = EventLog()
         self.desk.settings["01"] = [["description", "a dog", "A line", "", None, 200.0]]
-        self.board = Board(self.desk, Guests(), chronicle=self.chronicle, halts=self.halts)
-        state = state_of([{"uuid": "01", "name": "dog1", "joined": 1}], [], {}, node="vaio")
+        self.board = Services(self.desk, Guests(), event_log=self.chronicle, halts=self.halts)
+        state = format_state([{"uuid": "01", "name": "dog1", "joined": 1}], [], {}, node="vaio")
         app = create_app(lambda: {**state, "halted": self.halts.is_halted()}, self.board, wall=lambda: 1e9)
         app.logger.setLevel(logging.CRITICAL + 1)
         self.client: FlaskClient = app.test_client()
@@ -47,7 +47,7 @@ class ActionTests(SynchronousTestCase):
         self.assertEqual(self.ask("DELETE", "halt")[1]["devices"], {"01": "goes on", "02": "goes on"})
         self.assertEqual(self.halts.said, [("halt", "operator"), ("release", "operator")])
         self.assertEqual(
-            [line["route"] for line in self.board.audit.newest(2)], [f"DELETE {API}/halt", f"POST {API}/halt"]
+            [line["route"] for line in self.board.audit.list_newest(2)], [f"DELETE {API}/halt", f"POST {API}/halt"]
         )
 
     def test_stop_is_for_operators(self) -> None:
@@ -121,13 +121,13 @@ class ActionTests(SynchronousTestCase):
             return fail(left)
 
         desk: Any = self.desk
-        desk.message = desk.disconnect = lost
+        desk.send_message = desk.disconnect = lost
         for path, body in (("message", {"text": "sit"}), ("disconnect", {})):
             self.assertEqual(self.ask("POST", f"devices/01/{path}", body), (409, left.fields))
-        self.assertEqual(self.chronicle.since(0), [])
+        self.assertEqual(self.chronicle.list_since(0), [])
 
     def test_disconnecting_is_a_fault_on_purpose(self) -> None:
         """A device that is disconnected is a fault in the chronicle, so the takeover is timed from then on."""
         self.ask("POST", "devices/01/disconnect", {"seconds": 5})
-        (entry,) = self.chronicle.since(0)
+        (entry,) = self.chronicle.list_since(0)
         self.assertEqual((entry.kind, entry.uuid, entry.at), ("fault", "01", 1e9))

@@ -13,12 +13,12 @@ from twisted.trial.unittest import SynchronousTestCase
 
 from tests.webnode.memory import MemoryDesk
 from webnode.app import create_app
-from webnode.board import Board
+from webnode.auth import OpenSessions
 from webnode.fallback import Fallbacks, Page
 from webnode.guard import HEADERS
-from webnode.server import sent
-from webnode.state import Departed, State, state_of
-from webnode.visitor import OpenSessions
+from webnode.server import read_static
+from webnode.services import Services
+from webnode.state import DepartedDevices, State, format_state
 
 YARD: dict[str, Any] = {"walls": [3.0, 2.4], "dogs": [], "target": None}
 
@@ -27,15 +27,15 @@ class AppTests(SynchronousTestCase):
     def setUp(self) -> None:
         self.desk = MemoryDesk([{"name": "search", "title": "Search", "requirements": {}}], YARD)
         dogs = [{"uuid": f"{n:02x}", "name": f"dog{n}", "joined": n} for n in (2, 1, 3)]
-        departed = Departed()
-        departed.of(dogs, 1.0)
-        gone = departed.of(dogs[:2], 2.0)
-        self.state = state_of(dogs[:2], [{"id": "t1", "title": "Search"}], {}, departed=gone, node="vaio")
+        departed = DepartedDevices()
+        departed.update(dogs, 1.0)
+        gone = departed.update(dogs[:2], 2.0)
+        self.state = format_state(dogs[:2], [{"id": "t1", "title": "Search"}], {}, departed=gone, node="vaio")
         self.client = self.client_of(lambda: self.state)
 
     def client_of(self, read: Any) -> FlaskClient:
         fallbacks = Fallbacks(Page("02", "http://other:8080"))
-        self.board = Board(self.desk, OpenSessions(), fallbacks=fallbacks)
+        self.board = Services(self.desk, OpenSessions(), fallbacks=fallbacks)
         app = create_app(read, self.board, wall=lambda: 1e9)
         app.logger.setLevel(logging.CRITICAL + 1)
         return app.test_client()
@@ -206,8 +206,8 @@ class AppTests(SynchronousTestCase):
             found = [room / "static" / (here or beside) for here, beside in named]
             wanted += [each for each in dict.fromkeys(found) if each not in wanted]
         self.assertIn(room / "static" / "stream.js", first)
-        self.assertLess(sum(len(sent(path)) for path in first), 64_000)
-        self.assertLess(sum(len(gzip.compress(sent(path))) for path in first), 28_000)
+        self.assertLess(sum(len(read_static(path)) for path in first), 64_000)
+        self.assertLess(sum(len(gzip.compress(read_static(path))) for path in first), 28_000)
         files = [path for folder in ("static", "templates") for path in (room / folder).iterdir() if path.is_file()]
         for path in files:
             words = (

@@ -11,13 +11,13 @@ from twisted.trial.unittest import SynchronousTestCase
 from tests.webnode.guests import Guests
 from tests.webnode.memory import MemoryDesk
 from webnode.app import create_app
-from webnode.audit import AUDITED, QUIET_S, Audit
-from webnode.board import Board
-from webnode.state import state_of
-from webnode.visitor import Visitor
+from webnode.audit import MAX_LINES, QUIET_S, AuditLog
+from webnode.auth import User
+from webnode.services import Services
+from webnode.state import format_state
 
-ANN = Visitor("ann", "operator", "ab12")
-NOBODY = Visitor()
+ANN = User("ann", "operator", "ab12")
+NOBODY = User()
 
 
 class AuditTests(SynchronousTestCase):
@@ -25,12 +25,12 @@ class AuditTests(SynchronousTestCase):
         self.now = 1000.0
         self.path = Path(self.mktemp())
 
-    def audit(self, most: int = 1 << 20) -> Audit:
-        return Audit(self.path, lambda: self.now, most)
+    def audit(self, most: int = 1 << 20) -> AuditLog:
+        return AuditLog(self.path, lambda: self.now, most)
 
     def test_keep_each_line(self) -> None:
         """Each change is one line of JSON with time, visitor, address, route, target and outcome, in a private file."""
-        self.audit().note(ANN, "10.0.0.9", "POST /x/{uuid}", "01\n\x1b[2J", "202")
+        self.audit().write(ANN, "10.0.0.9", "POST /x/{uuid}", "01\n\x1b[2J", "202")
         (line,) = self.path.read_text().splitlines()
         told = {"at": 1000.0, "who": "ann", "role": "operator", "from": "10.0.0.9", "session": "ab12"}
         self.assertEqual(
@@ -42,56 +42,56 @@ class AuditTests(SynchronousTestCase):
         """After a restart earlier lines are returned, the newest first, and invalid lines are skipped."""
         first = self.audit()
         for number in range(3):
-            first.note(ANN, "h", "POST /x", str(number), "202")
+            first.write(ANN, "h", "POST /x", str(number), "202")
         with self.path.open("a") as file:
             file.write("no JSON\n[]\n")
         again = self.audit()
-        again.note(ANN, "h", "POST /x", "3", "202")
-        self.assertEqual([line["target"] for line in again.newest(3)], ["3", "2", "1"])
-        self.assertEqual(again.counts(), {("operator", "202"): 1})
+        again.write(ANN, "h", "POST /x", "3", "202")
+        self.assertEqual([line["target"] for line in again.list_newest(3)], ["3", "2", "1"])
+        self.assertEqual(again.get_counts(), {("operator", "202"): 1})
 
     def test_stay_within_its_room(self) -> None:
         """A full file is rotated once, so both files stay below twice the limit; the newest lines remain."""
         audit = self.audit(2000)
         for number in range(200):
-            audit.note(ANN, "h", "POST /x", str(number), "202")
+            audit.write(ANN, "h", "POST /x", str(number), "202")
         aside = self.path.with_name(f"{self.path.name}.1")
         self.assertLessEqual(self.path.stat().st_size, 2000)
         self.assertLessEqual(aside.stat().st_size, 2000)
         self.assertIn('"199"', self.path.read_text())
-        self.assertEqual(len(audit.newest(1000)), AUDITED)
+        self.assertEqual(len(audit.list_newest(1000)), MAX_LINES)
 
     def test_let_nobody_flood_it(self) -> None:
         """Repeated requests of an unknown visitor are one line a minute with a count; other lines remain."""
         audit = self.audit()
-        audit.note(ANN, "h", "POST /x", "", "202")
+        audit.write(ANN, "h", "POST /x", "", "202")
         for _ in range(1000):
-            audit.note(NOBODY, "10.0.0.9", "POST /api/v1/session", "", "429 too many")
-        audit.note(NOBODY, "10.0.0.8", "POST /api/v1/session", "", "429 too many")
+            audit.write(NOBODY, "10.0.0.9", "POST /api/v1/session", "", "429 too many")
+        audit.write(NOBODY, "10.0.0.8", "POST /api/v1/session", "", "429 too many")
         self.now += QUIET_S
-        audit.note(NOBODY, "10.0.0.9", "POST /api/v1/session", "", "429 too many")
-        lines = audit.newest(99)
+        audit.write(NOBODY, "10.0.0.9", "POST /api/v1/session", "", "429 too many")
+        lines = audit.list_newest(99)
         self.assertEqual([line.get("repeated", 0) for line in lines], [999, 0, 0, 0])
         self.assertEqual(lines[-1]["who"], "ann")
-        self.assertEqual(audit.counts()["anyone", "429"], 1002)
+        self.assertEqual(audit.get_counts()["anyone", "429"], 1002)
 
     def test_go_on_without_a_file(self) -> None:
         """Without a file, or if it cannot be written, the newest lines are still available."""
         self.path = Path(self.mktemp()) / "missing" / "audit"
         audit = self.audit()
         for number in range(2):
-            audit.note(ANN, "h", "POST /x", str(number), "202")
-        self.assertEqual(len(audit.newest(9)), 2)
-        in_memory = Audit()
-        in_memory.note(ANN, "h", "POST /x", "", "202")
-        self.assertEqual(len(in_memory.newest(9)), 1)
+            audit.write(ANN, "h", "POST /x", str(number), "202")
+        self.assertEqual(len(audit.list_newest(9)), 2)
+        in_memory = AuditLog()
+        in_memory.write(ANN, "h", "POST /x", "", "202")
+        self.assertEqual(len(in_memory.list_newest(9)), 1)
 
 
 class AuditRouteTests(SynchronousTestCase):
     def test_tell_operators(self) -> None:
         """An operator reads the requested number of lines, the newest first; a viewer may not."""
-        state = state_of([], [], {}, node="vaio")
-        client = create_app(lambda: state, Board(MemoryDesk(), Guests())).test_client()
+        state = format_state([], [], {}, node="vaio")
+        client = create_app(lambda: state, Services(MemoryDesk(), Guests())).test_client()
         bearer = {"Authorization": "Bearer operator"}
         for _ in range(3):
             client.post("/api/v1/demo", json={}, headers=bearer)

@@ -1,12 +1,12 @@
-"""Tests of ``webnode.board``: the required and the optional parts of a web node."""
+"""Tests of ``webnode.services``: the required and the optional parts of a web node."""
 
 from __future__ import annotations
 
 from twisted.trial.unittest import SynchronousTestCase
 
 from tests.webnode.memory import MemoryDesk
-from webnode.board import Board
-from webnode.visitor import OpenSessions
+from webnode.auth import OpenSessions
+from webnode.services import Services
 
 
 class BoardTests(SynchronousTestCase):
@@ -14,12 +14,12 @@ class BoardTests(SynchronousTestCase):
         """Open sessions give every visitor the role of operator, with or without a token."""
         sessions = OpenSessions()
         token = self.successResultOf(sessions.sign_in("whatever", "10.0.0.9", 5.0))
-        sessions.revoke(sessions.visitor(token.text, 6.0).token_id)
-        self.assertEqual([sessions.visitor(each, 7.0).role for each in (token.text, "")], ["operator"] * 2)
+        sessions.revoke(sessions.authenticate(token.text, 6.0).token_id)
+        self.assertEqual([sessions.authenticate(each, 7.0).role for each in (token.text, "")], ["operator"] * 2)
         self.assertGreater(token.until, 5.0)
 
     def test_say_what_it_has(self) -> None:
         """``has`` lists only the optional parts that the node has; the map counts if it exists."""
-        self.assertEqual(Board(MemoryDesk(), OpenSessions()).has, [])
+        self.assertEqual(Services(MemoryDesk(), OpenSessions()).feature_names, [])
         yard = MemoryDesk(yard={"walls": [3.0, 2.4], "dogs": [], "target": None})
-        self.assertEqual(Board(yard, OpenSessions()).has, ["yard"])
+        self.assertEqual(Services(yard, OpenSessions()).feature_names, ["yard"])

@@ -18,7 +18,16 @@ if not MISSING:
     from cryptography.hazmat.primitives.serialization import Encoding, NoEncryption, PrivateFormat
     from cryptography.x509.verification import PolicyBuilder, Store, VerificationError
 
-    from webnode.certificate import LASTS, LEFT, Authority, Leaf, authority, leaf, nameable, read
+    from webnode.certificate import (
+        RENEWAL_MARGIN,
+        VALIDITY,
+        Authority,
+        Leaf,
+        filter_names,
+        make_authority,
+        make_leaf,
+        parse_leaf,
+    )
 
 SKIP = "CERTIFICATES ARE NOT TESTED: missing cryptography (pip install 'swarm-node[tls]')"
 NOW = datetime(2026, 11, 22, tzinfo=UTC).timestamp()
@@ -32,7 +41,11 @@ class AuthorityTests(SynchronousTestCase):
 
     def test_be_the_same_after_each_start(self) -> None:
         """A secret always gives the same authority, byte for byte; another secret another one with another name."""
-        first, second, other = authority(SECRET, "vaio"), authority(SECRET, "vaio"), authority(bytes(32), "vaio")
+        first, second, other = (
+            make_authority(SECRET, "vaio"),
+            make_authority(SECRET, "vaio"),
+            make_authority(bytes(32), "vaio"),
+        )
         self.assertEqual(first.pem, second.pem)
         self.assertTrue(first.fingerprint.startswith("BC:95:A9:E3:43:30"), first.fingerprint)
         self.assertNotEqual(other.fingerprint, first.fingerprint)
@@ -40,12 +53,14 @@ class AuthorityTests(SynchronousTestCase):
 
     def test_vouch_for_the_local_network_alone(self) -> None:
         """A client accepts the authority's certificates for private addresses and local names, not for public sites."""
-        signer = authority(SECRET, "vaio")
+        signer = make_authority(SECRET, "vaio")
         for name in ("192.168.0.7", "10.1.2.3", "127.0.0.1", "fd00::7", "vaio.local", "vaio.home.arpa", "localhost"):
-            self.assertTrue(self.is_believed(signer, leaf(signer, "vaio", [name], NOW, random.Random(1)), name), name)
+            self.assertTrue(
+                self.is_believed(signer, make_leaf(signer, "vaio", [name], NOW, random.Random(1)), name), name
+            )
         for name in ("example.org", "local.example.org", "8.8.8.8", "2001:db8::7"):
             self.assertFalse(self.is_believed(signer, forged(signer, name), name), name)
-            self.assertNotIn(name, nameable([name]))
+            self.assertNotIn(name, filter_names([name]))
 
     def is_believed(self, signer: Authority, made: Leaf, name: str) -> bool:
         """Return whether a strict client that trusts the authority accepts the certificate for ``name``."""
@@ -67,18 +82,18 @@ class LeafTests(SynchronousTestCase):
         skip = SKIP
 
     def setUp(self) -> None:
-        self.signer = authority(SECRET, "vaio")
+        self.signer = make_authority(SECRET, "vaio")
         self.names = ["192.168.0.7", "vaio.local"]
-        self.leaf = leaf(self.signer, "vaio", self.names, NOW, random.Random(1))
+        self.leaf = make_leaf(self.signer, "vaio", self.names, NOW, random.Random(1))
 
     def flaw(self, now: float = NOW, names: list[str] | None = None) -> str:
-        return self.leaf.flaw(self.signer, self.names if names is None else names, now)
+        return self.leaf.find_flaw(self.signer, self.names if names is None else names, now)
 
     def test_serve_for_a_year_less_a_month(self) -> None:
         """A certificate is valid until a month before its end; after that, and before its start, it has a flaw."""
         self.assertEqual(self.flaw(), "")
-        self.assertEqual(self.flaw(NOW + (LASTS - LEFT).total_seconds() - 3 * DAY), "")
-        self.assertEqual(self.flaw(NOW + (LASTS - LEFT).total_seconds()), "it expires soon")
+        self.assertEqual(self.flaw(NOW + (VALIDITY - RENEWAL_MARGIN).total_seconds() - 3 * DAY), "")
+        self.assertEqual(self.flaw(NOW + (VALIDITY - RENEWAL_MARGIN).total_seconds()), "it expires soon")
         self.assertEqual(self.flaw(NOW - 3 * DAY), "it is not valid yet")
         lasts = self.leaf.certificate.not_valid_after_utc - self.leaf.certificate.not_valid_before_utc
         self.assertEqual(lasts, timedelta(days=365))
@@ -91,20 +106,20 @@ class LeafTests(SynchronousTestCase):
 
     def test_tell_a_foreign_one(self) -> None:
         """A certificate of another authority, or with the key of another certificate, is rejected."""
-        self.assertIn("another authority", self.leaf.flaw(authority(bytes(32), "vaio"), self.names, NOW))
-        other = leaf(self.signer, "vaio", self.names, NOW, random.Random(2))
-        self.assertIn("key", Leaf(other.key, self.leaf.certificate).flaw(self.signer, self.names, NOW))
+        self.assertIn("another authority", self.leaf.find_flaw(make_authority(bytes(32), "vaio"), self.names, NOW))
+        other = make_leaf(self.signer, "vaio", self.names, NOW, random.Random(2))
+        self.assertIn("key", Leaf(other.key, self.leaf.certificate).find_flaw(self.signer, self.names, NOW))
 
     def test_bear_any_clock(self) -> None:
         """With a clock that is decades wrong a valid certificate is created, and replaced after the clock is set."""
         for now in (0.0, -1e12, 9e9, 1e300):
-            made = leaf(self.signer, "pi", [], now, random.Random(1))
+            made = make_leaf(self.signer, "pi", [], now, random.Random(1))
             self.assertLess(made.certificate.not_valid_before_utc, made.certificate.not_valid_after_utc)
-            self.assertNotEqual(made.flaw(self.signer, [], NOW), "")
+            self.assertNotEqual(made.find_flaw(self.signer, [], NOW), "")
 
     def test_read_what_was_kept(self) -> None:
         """A stored certificate is read again; truncated, empty, binary and other PEM data are rejected."""
-        again = read(self.leaf.pem_with_key)
+        again = parse_leaf(self.leaf.pem_with_key)
         self.assertEqual((again.names, again.pem_with_key), (self.leaf.names, self.leaf.pem_with_key))
         key = rsa.generate_private_key(65537, 2048)
         foreign = key.private_bytes(Encoding.PEM, PrivateFormat.PKCS8, NoEncryption())
@@ -117,12 +132,12 @@ class LeafTests(SynchronousTestCase):
             certificate,
             foreign + certificate,
         ):
-            self.assertRaises(ValueError, read, pem)
+            self.assertRaises(ValueError, parse_leaf, pem)
 
 
 def forged(signer: Authority, name: str) -> Leaf:
     """Return a certificate that an attacker with the secret would sign for an arbitrary name."""
-    made = leaf(signer, "vaio", [], NOW, random.Random(1))
+    made = make_leaf(signer, "vaio", [], NOW, random.Random(1))
     try:
         wanted: Any = x509.IPAddress(ipaddress.ip_address(name))
     except ValueError:

@@ -12,7 +12,7 @@ from twisted.web.resource import Resource
 from twisted.web.server import NOT_DONE_YET
 
 from tests.webnode.browser import Connection, site_of
-from webnode.channel import CLOSE_S, GRACE_S, HEAD_S, KEEP_S, PACE, STALL_S, Channel
+from webnode.channel import CLOSE_LIMIT_S, GRACE_S, HEADERS_LIMIT_S, KEEP_ALIVE_S, PACE, STALL_LIMIT_S, Channel
 from webnode.guard import HEADERS, MAX_BODY
 from webnode.limits import AddressLimits
 
@@ -54,7 +54,7 @@ class ChannelTests(SynchronousTestCase):
         for connection in self.connections:
             connection.leave()
         self.assertEqual(self.clock.getDelayedCalls(), [])
-        self.assertEqual([self.limits.total(kind) for kind in ("unfinished", "stream", "open")], [0, 0, 0])
+        self.assertEqual([self.limits.get_total(kind) for kind in ("unfinished", "stream", "open")], [0, 0, 0])
 
     def opened(self, address: str = "10.0.0.1") -> Connection:
         self.connections.append(Connection(self.site, address))
@@ -88,7 +88,7 @@ class ChannelTests(SynchronousTestCase):
         connection = self.opened()
         for _ in range(3):
             self.assertIn(b"hello", connection.ask("/").taken())
-            self.clock.advance(KEEP_S - 1.0)
+            self.clock.advance(KEEP_ALIVE_S - 1.0)
         connection.send(b"GET / HTTP/1.1\r\nHost: vaio\r\n\r\n" * 3)
         self.assertEqual(connection.taken().count(b"hello"), 3)
         self.drip(connection, HEAD % 5 + b"12345", 0.05)
@@ -102,7 +102,7 @@ class ChannelTests(SynchronousTestCase):
             if before:
                 connection.ask("/").taken()
             took = self.drip(connection, b"GET / HTTP/1.1\r\nX: " + b"x" * 100, 1.0)
-            self.assertEqual(took, HEAD_S)
+            self.assertEqual(took, HEADERS_LIMIT_S)
             self.assert_refused(connection, 408, "in time")
 
     def test_end_who_dribbles_a_body(self) -> None:
@@ -121,22 +121,22 @@ class ChannelTests(SynchronousTestCase):
         """A connection without a request is closed after ten seconds, an idle one after fifteen."""
         silent, idle = self.opened(), self.opened("10.0.0.2")
         idle.ask("/")
-        self.clock.advance(HEAD_S)
+        self.clock.advance(HEADERS_LIMIT_S)
         self.assertTrue(self.is_closed(silent))
         self.assertEqual(silent.taken(), b"")
         self.assertFalse(self.is_closed(idle))
-        self.clock.advance(KEEP_S - HEAD_S)
+        self.clock.advance(KEEP_ALIVE_S - HEADERS_LIMIT_S)
         self.assertTrue(self.is_closed(idle))
 
     def test_abort_who_does_not_hang_up(self) -> None:
         """A rejected client that does not close is disconnected soon after, and its further data is ignored."""
         connection = self.opened()
         connection.send(b"GET / HTTP/1.1\r\n")
-        self.clock.advance(HEAD_S)
+        self.clock.advance(HEADERS_LIMIT_S)
         connection.send(b"Host: vaio\r\n\r\n")
         self.assertEqual(self.echo.served, 0)
         self.assertFalse(connection.transport.disconnected)
-        self.clock.advance(CLOSE_S)
+        self.clock.advance(CLOSE_LIMIT_S)
         self.assertTrue(connection.transport.disconnected)
 
     def test_end_who_reads_nothing(self) -> None:
@@ -145,7 +145,7 @@ class ChannelTests(SynchronousTestCase):
         for connection in (slow, deaf):
             connection.ask("/held")
             connection.protocol.pauseProducing()
-        self.clock.advance(STALL_S - 1.0)
+        self.clock.advance(STALL_LIMIT_S - 1.0)
         slow.protocol.resumeProducing()
         slow.protocol.pauseProducing()
         self.clock.advance(1.0)

@@ -1,4 +1,4 @@
-"""Tests of ``webnode.chronicle``."""
+"""Tests of ``webnode.event_log``."""
 
 from __future__ import annotations
 
@@ -9,9 +9,9 @@ from twisted.trial.unittest import SynchronousTestCase
 from tests.webnode.guests import Guests
 from tests.webnode.memory import MemoryDesk
 from webnode.app import create_app
-from webnode.board import Board
-from webnode.chronicle import TeamChronicle
-from webnode.state import Departed, State, state_of
+from webnode.event_log import EventLog
+from webnode.services import Services
+from webnode.state import DepartedDevices, State, format_state
 
 
 def uuid(number: int) -> str:
@@ -28,19 +28,19 @@ def job(status: str, **more: Any) -> dict[str, Any]:
 
 class ChronicleTests(SynchronousTestCase):
     def setUp(self) -> None:
-        self.chronicle = TeamChronicle()
-        self.departed = Departed()
+        self.chronicle = EventLog()
+        self.departed = DepartedDevices()
         self.heard = 0
 
     def saw(self, now: float, *devices: dict[str, Any], tasks: Any = (), groups: Any = None, **more: Any) -> list[str]:
         """Return the new entries for a team of these devices; ``more`` is added to the state."""
-        gone = self.departed.of(devices, now)
-        state: State = {**state_of(devices, tasks, groups or {}, departed=gone, node="vaio"), **more}
-        self.chronicle.saw(state, now)
+        gone = self.departed.update(devices, now)
+        state: State = {**format_state(devices, tasks, groups or {}, departed=gone, node="vaio"), **more}
+        self.chronicle.record_state(state, now)
         return self.told()
 
     def told(self) -> list[str]:
-        entries = self.chronicle.since(self.heard)
+        entries = self.chronicle.list_since(self.heard)
         self.heard = entries[-1].n if entries else self.heard
         return [entry.text for entry in entries]
 
@@ -70,7 +70,7 @@ class ChronicleTests(SynchronousTestCase):
         self.assertEqual(self.saw(3.6, tasks=[job("OPEN", note="nobody can")]), ["Find it: nobody can"])
         done = job("COMPLETED", result={"by": "dog2", "took": 13.24})
         self.assertEqual(self.saw(4.0, tasks=[done]), ["Find it: open → completed by dog2 in 13.2 s"])
-        self.assertEqual(self.chronicle.since(0)[-1].seconds, 13.24)
+        self.assertEqual(self.chronicle.list_since(0)[-1].seconds, 13.24)
 
     def test_tell_of_consensus(self) -> None:
         """An agreement of all members is described once with the bids, and not before all have decided."""
@@ -99,7 +99,9 @@ class ChronicleTests(SynchronousTestCase):
 
     def takeover(self) -> list[tuple[str, str, float | None]]:
         kinds = ("takeover", "handover")
-        return [(entry.kind, entry.uuid, entry.seconds) for entry in self.chronicle.since(0) if entry.kind in kinds]
+        return [
+            (entry.kind, entry.uuid, entry.seconds) for entry in self.chronicle.list_since(0) if entry.kind in kinds
+        ]
 
     def test_time_a_takeover(self) -> None:
         """A takeover lasts from the loss of the acting device until another device acts."""
@@ -119,7 +121,7 @@ class ChronicleTests(SynchronousTestCase):
         tasks = [job("EXECUTING")]
         both = dog(1, "EXECUTING", "t1"), dog(2, "WAITING", "t1")
         self.saw(1.0, *both, tasks=tasks)
-        self.chronicle.faulted(uuid(1), "radio", 9.0)
+        self.chronicle.record_fault(uuid(1), "radio", 9.0)
         self.assertEqual(self.told(), ["dog1: radio (injected fault)"])
         self.saw(10.0, both[1], tasks=tasks)
         self.saw(10.5, dog(2, "EXECUTING", "t1"), tasks=tasks)
@@ -129,7 +131,7 @@ class ChronicleTests(SynchronousTestCase):
         """A change from a present device, or long after a fault, is a handover without a time."""
         tasks = [job("EXECUTING")]
         self.saw(1.0, dog(1, "EXECUTING", "t1"), dog(2, "WAITING", "t1"), tasks=tasks)
-        self.chronicle.faulted(uuid(1), "skew", 2.0)
+        self.chronicle.record_fault(uuid(1), "skew", 2.0)
         self.saw(70.0, dog(1, "EXECUTING", "t1"), dog(2, "WAITING", "t1"), tasks=tasks)
         self.saw(71.0, dog(1, "WAITING", "t1"), dog(2, "EXECUTING", "t1"), tasks=tasks)
         self.assertEqual(self.takeover(), [("handover", uuid(2), None)])
@@ -148,17 +150,17 @@ class ChronicleTests(SynchronousTestCase):
 
     def test_keep_so_many(self) -> None:
         """Only the newest entries are kept, with increasing numbers; they can be filtered by device or task."""
-        self.chronicle = TeamChronicle(kept=3)
+        self.chronicle = EventLog(kept=3)
         self.saw(1.0, dog(1), dog(2), tasks=[job("OPEN")])
-        self.assertEqual([entry.n for entry in self.chronicle.since(0)], [2, 3, 4])
-        self.assertEqual([entry.n for entry in self.chronicle.since(3)], [4])
-        self.assertEqual([entry.n for entry in self.chronicle.since(0, uuid(2))], [3])
-        self.assertEqual([entry.n for entry in self.chronicle.since(0, "t1")], [4])
+        self.assertEqual([entry.n for entry in self.chronicle.list_since(0)], [2, 3, 4])
+        self.assertEqual([entry.n for entry in self.chronicle.list_since(3)], [4])
+        self.assertEqual([entry.n for entry in self.chronicle.list_since(0, uuid(2))], [3])
+        self.assertEqual([entry.n for entry in self.chronicle.list_since(0, "t1")], [4])
 
     def test_ask_by_http(self) -> None:
         """A viewer reads all entries, entries after a number, or entries of one device; a wrong number is rejected."""
         self.saw(1.0, dog(1), dog(2))
-        app = create_app(lambda: state_of([], [], {}), Board(MemoryDesk(), Guests(), chronicle=self.chronicle))
+        app = create_app(lambda: format_state([], [], {}), Services(MemoryDesk(), Guests(), event_log=self.chronicle))
         client = app.test_client()
 
         def asked(query: str) -> Any:

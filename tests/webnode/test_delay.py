@@ -1,23 +1,23 @@
-"""Tests of ``webnode.delay``: repeated guesses delay only their own source."""
+"""Tests of ``webnode.sign_in_delay``: repeated guesses delay only their own source."""
 
 from __future__ import annotations
 
 from twisted.trial.unittest import SynchronousTestCase
 
-from webnode.delay import FORGOTTEN_S, LONGEST_S, SOURCES, Delays
+from webnode.sign_in_delay import FORGET_S, LONGEST_S, MAX_SOURCES, SignInDelays
 
 
 class DelaysTests(SynchronousTestCase):
     def setUp(self) -> None:
-        self.delays = Delays()
+        self.delays = SignInDelays()
 
     def guesses(self, source: str, seconds: float) -> int:
         """Return the number of tries that a source can make in the given time."""
         now, count = 0.0, 0
         while now < seconds:
-            wait = self.delays.wait(source, now)
+            wait = self.delays.get_wait(source, now)
             if wait == 0.0:
-                self.delays.tried(source, now)
+                self.delays.count_attempt(source, now)
                 count += 1
             now += wait
         return count
@@ -31,47 +31,47 @@ class DelaysTests(SynchronousTestCase):
     def test_lock_out_nobody_else(self) -> None:
         """Guesses from one address do not delay another address."""
         self.guesses("192.168.0.9", 3600.0)
-        self.assertGreater(self.delays.wait("192.168.0.9", 3600.0), 0.0)
-        self.assertEqual(self.delays.wait("192.168.0.10", 3600.0), 0.0)
+        self.assertGreater(self.delays.get_wait("192.168.0.9", 3600.0), 0.0)
+        self.assertEqual(self.delays.get_wait("192.168.0.10", 3600.0), 0.0)
 
     def test_count_a_network_of_addresses_as_one(self) -> None:
         """Addresses of an IPv6 network share one delay; an IPv4 address has its own, in either notation."""
         for number in range(10):
-            self.delays.tried(f"2001:db8::{number:x}", 0.0)
-            self.delays.tried(f"::ffff:10.0.0.{number}", 0.0)
-        self.assertGreater(self.delays.wait("2001:db8::ffff", 0.0), 0.0)
-        self.assertEqual(self.delays.wait("2001:db8:0:1::1", 0.0), 0.0)
-        self.assertEqual(self.delays.wait("10.0.0.3", 0.0), 0.0)
+            self.delays.count_attempt(f"2001:db8::{number:x}", 0.0)
+            self.delays.count_attempt(f"::ffff:10.0.0.{number}", 0.0)
+        self.assertGreater(self.delays.get_wait("2001:db8::ffff", 0.0), 0.0)
+        self.assertEqual(self.delays.get_wait("2001:db8:0:1::1", 0.0), 0.0)
+        self.assertEqual(self.delays.get_wait("10.0.0.3", 0.0), 0.0)
 
     def test_forget(self) -> None:
         """A successful sign-in, or a day without tries, resets the delay."""
         self.guesses("a", 3600.0)
-        self.delays.held("a")
+        self.delays.forget("a")
         self.assertEqual(self.guesses("a", 1.0), 10)
-        self.assertEqual(self.delays.wait("a", FORGOTTEN_S + 1.0), 0.0)
+        self.assertEqual(self.delays.get_wait("a", FORGET_S + 1.0), 0.0)
 
     def test_remember_a_bounded_number(self) -> None:
         """The number of remembered sources is limited, and the latest source is always among them."""
-        for number in range(SOURCES + 10):
+        for number in range(MAX_SOURCES + 10):
             for _ in range(10):
-                self.delays.tried(f"10.{number >> 16}.{number >> 8 & 255}.{number & 255}", 0.0)
-        self.assertEqual(len(self.delays._tries), SOURCES)
-        self.assertGreater(self.delays.wait(f"10.0.{SOURCES >> 8}.9", 0.0), 0.0)
+                self.delays.count_attempt(f"10.{number >> 16}.{number >> 8 & 255}.{number & 255}", 0.0)
+        self.assertEqual(len(self.delays._attempts), MAX_SOURCES)
+        self.assertGreater(self.delays.get_wait(f"10.0.{MAX_SOURCES >> 8}.9", 0.0), 0.0)
 
     def test_survive_a_clock_that_is_set_back(self) -> None:
         """A clock that is set back delays no source beyond the maximum."""
         self.guesses("a", 10**6)
-        self.assertLessEqual(self.delays.wait("a", 0.0), LONGEST_S)
+        self.assertLessEqual(self.delays.get_wait("a", 0.0), LONGEST_S)
 
     def test_take_a_try_back(self) -> None:
         """``undo`` removes a successful try, wrong tries count; the limits are configurable."""
-        delays = Delays(free=3, longest_s=10.0, forgotten_s=100.0)
+        delays = SignInDelays(free=3, longest_s=10.0, forgotten_s=100.0)
         for _ in range(20):
-            delays.tried("everywhere", 0.0)
-            delays.undo("everywhere")
-        self.assertEqual(delays.wait("everywhere", 0.0), 0.0)
+            delays.count_attempt("everywhere", 0.0)
+            delays.uncount_attempt("everywhere")
+        self.assertEqual(delays.get_wait("everywhere", 0.0), 0.0)
         for _ in range(8):
-            delays.tried("everywhere", 0.0)
-        delays.undo("everywhere")
-        self.assertEqual((delays.wait("everywhere", 0.0), delays.wait("everywhere", 100.0)), (10.0, 0.0))
-        delays.undo("nobody")
+            delays.count_attempt("everywhere", 0.0)
+        delays.uncount_attempt("everywhere")
+        self.assertEqual((delays.get_wait("everywhere", 0.0), delays.get_wait("everywhere", 100.0)), (10.0, 0.0))
+        delays.uncount_attempt("nobody")

@@ -8,21 +8,21 @@ from twisted.internet.defer import Deferred
 from twisted.trial.unittest import SynchronousTestCase
 
 from tests.webnode.memory import MemoryDesk
-from webnode.board import Board
-from webnode.dispatch import REMEMBERED, Dispatch
+from webnode.auth import OpenSessions, Role, User
+from webnode.dispatch import MAX_ANSWERS, Dispatch
 from webnode.errors import Refusal
-from webnode.route import Ask, Route
-from webnode.visitor import OpenSessions, Role, Visitor
+from webnode.route import Route, RouteRequest
+from webnode.services import Services
 
 
 class DispatchTests(SynchronousTestCase):
     def setUp(self) -> None:
-        self.board = Board(MemoryDesk(), OpenSessions())
+        self.board = Services(MemoryDesk(), OpenSessions())
         self.dispatch = Dispatch()
-        self.called: list[Ask] = []
+        self.called: list[RouteRequest] = []
         self.told: Any = {"id": 1}
 
-    def answer(self, ask: Ask) -> Any:
+    def answer(self, ask: RouteRequest) -> Any:
         self.called.append(ask)
         if isinstance(self.told, Refusal):
             raise self.told
@@ -37,8 +37,10 @@ class DispatchTests(SynchronousTestCase):
         role: Role = "operator",
     ) -> Deferred[Any]:
         route = Route(method, path, "", role, self.answer, status=202)
-        visitor = Visitor(who, "operator", who)
-        return self.dispatch.carry_out(route, Ask({"uuid": "01", "x": 5}, visitor, self.board, {}, id, "10.0.0.9"))
+        visitor = User(who, "operator", who)
+        return self.dispatch.carry_out(
+            route, RouteRequest({"uuid": "01", "x": 5}, visitor, self.board, {}, id, "10.0.0.9")
+        )
 
     def test_do_once_what_is_asked_twice(self) -> None:
         """A request with a used id gets the answer of the first one, even if that is pending or an error."""
@@ -63,12 +65,12 @@ class DispatchTests(SynchronousTestCase):
 
     def test_forget_old_ids(self) -> None:
         """Only the newest ``REMEMBERED`` ids are known."""
-        for number in range(REMEMBERED + 1):
+        for number in range(MAX_ANSWERS + 1):
             self.successResultOf(self.asked(str(number)))
         self.successResultOf(self.asked("1"))
-        self.assertEqual(len(self.called), REMEMBERED + 1)
+        self.assertEqual(len(self.called), MAX_ANSWERS + 1)
         self.successResultOf(self.asked("0"))
-        self.assertEqual(len(self.called), REMEMBERED + 2)
+        self.assertEqual(len(self.called), MAX_ANSWERS + 2)
 
     def test_note_each_change(self) -> None:
         """Each change is audited with visitor, address, route, target and outcome; reads are not."""
@@ -82,7 +84,7 @@ class DispatchTests(SynchronousTestCase):
         failing = self.asked()
         self.told.errback(RuntimeError("secret"))
         self.failureResultOf(failing, RuntimeError)
-        lines = self.board.audit.newest(9)
+        lines = self.board.audit.list_newest(9)
         line = {"who": "ann", "role": "operator", "from": "10.0.0.9", "route": "POST /things/{uuid}", "target": "01"}
         when: dict[str, object] = {"at": 0.0, "session": "ann"}
         self.assertEqual(lines, [{**line, **when, "outcome": told} for told in ("500", "409 it left", "202")])

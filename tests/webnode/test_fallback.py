@@ -5,8 +5,8 @@ from __future__ import annotations
 from twisted.trial.unittest import SynchronousTestCase
 
 from middleware.directory.presence import Device
-from tests.fleet import FleetCase, SwarmFleet
-from webnode.fallback import REMEMBERED_S, Page, TeamFallbacks, origin_of, pages_of, urls_at
+from tests.fleet import FleetCase, SwarmTeam
+from webnode.fallback import ORIGIN_KEPT_S, Page, TeamFallbacks, find_pages, get_origin, make_urls
 
 
 class UrlTests(SynchronousTestCase):
@@ -19,7 +19,7 @@ class UrlTests(SynchronousTestCase):
             ("http://localhost:8080", "http://127.0.0.1:8080"),
             ("http://[fe80::1]:8080", "http://[fe80::1]:8080"),
         ):
-            self.assertEqual(origin_of(url), origin)
+            self.assertEqual(get_origin(url), origin)
 
     def test_follow_no_url_out_of_the_house(self) -> None:
         """A URL that is no page of a machine in the local network is ignored."""
@@ -35,64 +35,64 @@ class UrlTests(SynchronousTestCase):
             "",
             "null",
         ):
-            self.assertEqual(origin_of(url), "", url)
+            self.assertEqual(get_origin(url), "", url)
         device = Device("01", "dog1", pages=("https://evil.example", "http://192.168.0.5:8080"))
-        self.assertEqual(pages_of([device]), [Page("01", "http://192.168.0.5:8080")])
+        self.assertEqual(find_pages([device]), [Page("01", "http://192.168.0.5:8080")])
 
     def test_give_every_name_of_an_open_page(self) -> None:
         """A page at one address has one URL; a page on all interfaces has a URL for each name of the machine."""
-        self.assertEqual(urls_at("127.0.0.1", 8080, ["vaio.local"]), ["http://127.0.0.1:8080"])
+        self.assertEqual(make_urls("127.0.0.1", 8080, ["vaio.local"]), ["http://127.0.0.1:8080"])
         self.assertEqual(
-            urls_at("0.0.0.0", 80, ["10.0.0.5", "", "v.local"]), ["http://10.0.0.5:80", "http://v.local:80"]
+            make_urls("0.0.0.0", 80, ["10.0.0.5", "", "v.local"]), ["http://10.0.0.5:80", "http://v.local:80"]
         )
-        self.assertEqual(urls_at("::1", 8443, [], is_secure=True), ["https://[::1]:8443"])
+        self.assertEqual(make_urls("::1", 8443, [], is_secure=True), ["https://[::1]:8443"])
 
 
 class TeamFallbacksTests(FleetCase):
-    def web_nodes(self) -> tuple[SwarmFleet, list[TeamFallbacks]]:
+    def web_nodes(self) -> tuple[SwarmTeam, list[TeamFallbacks]]:
         """Return two nodes, each of which serves the page on its own port."""
         swarm = self.swarm(2)
         webs = [TeamFallbacks(node, swarm.clock.seconds) for node in swarm.nodes]
         for place, web in enumerate(webs):
-            web.serves([f"http://127.0.0.1:808{place}"])
+            web.publish([f"http://127.0.0.1:808{place}"])
         swarm.run(2)
         return swarm, webs
 
     def test_know_each_other(self) -> None:
         """Each web node lists its own page first and the other's page next, and accepts requests from it."""
         _, (first, second) = self.web_nodes()
-        self.assertEqual([page.url for page in first.here()], ["http://127.0.0.1:8080", "http://127.0.0.1:8081"])
-        self.assertEqual([page.is_self for page in second.here()], [True, False])
-        self.assertTrue(first.lets_in("http://127.0.0.1:8081"))
-        self.assertTrue(second.lets_in("http://localhost:8080"))
-        self.assertFalse(first.lets_in("https://127.0.0.1:8081"))
-        self.assertFalse(first.lets_in("http://192.168.0.9:8081"))
+        self.assertEqual([page.url for page in first.list_pages()], ["http://127.0.0.1:8080", "http://127.0.0.1:8081"])
+        self.assertEqual([page.is_self for page in second.list_pages()], [True, False])
+        self.assertTrue(first.is_allowed_origin("http://127.0.0.1:8081"))
+        self.assertTrue(second.is_allowed_origin("http://localhost:8080"))
+        self.assertFalse(first.is_allowed_origin("https://127.0.0.1:8081"))
+        self.assertFalse(first.is_allowed_origin("http://192.168.0.9:8081"))
 
     def test_vouch_in_an_open_team(self) -> None:
         """In an open team a node may vouch if it serves the page, or served it within the last hour."""
         swarm = self.swarm(3)
         first, second = (TeamFallbacks(node, swarm.clock.seconds) for node in swarm.nodes[:2])
         for place, web in enumerate((first, second)):
-            web.serves([f"http://127.0.0.1:808{place}"])
+            web.publish([f"http://127.0.0.1:808{place}"])
         swarm.run(2)
         dog = swarm.nodes[2]
         keys = [node.entangled.identity.public for node in swarm.nodes[:2]]
-        self.assertEqual([web.may_vouch(key) for web in (first, second) for key in keys], [True] * 4)
-        self.assertFalse(first.may_vouch(dog.entangled.identity.public))
-        self.assertFalse(first.may_vouch(bytes(32)))
-        swarm.nodes[0].vanish()
+        self.assertEqual([web.can_authenticate(key) for web in (first, second) for key in keys], [True] * 4)
+        self.assertFalse(first.can_authenticate(dog.entangled.identity.public))
+        self.assertFalse(first.can_authenticate(bytes(32)))
+        swarm.nodes[0].stop_silently()
         swarm.run(3)
-        self.assertTrue(second.may_vouch(keys[0]))
-        swarm.run(REMEMBERED_S)
-        self.assertFalse(second.may_vouch(keys[0]))
+        self.assertTrue(second.can_authenticate(keys[0]))
+        swarm.run(ORIGIN_KEPT_S)
+        self.assertFalse(second.can_authenticate(keys[0]))
 
     def test_let_in_the_page_of_the_dead(self) -> None:
         """A dead web node is not listed, but its page in a browser is accepted for an hour."""
         swarm, (first, second) = self.web_nodes()
-        swarm.nodes[0].vanish()
+        swarm.nodes[0].stop_silently()
         swarm.run(3)
-        self.assertEqual([page.url for page in second.here()], ["http://127.0.0.1:8081"])
-        self.assertTrue(second.lets_in("http://127.0.0.1:8080"))
-        swarm.run(REMEMBERED_S)
-        self.assertFalse(second.lets_in("http://127.0.0.1:8080"))
-        self.assertTrue(second.lets_in("http://127.0.0.1:8081"))
+        self.assertEqual([page.url for page in second.list_pages()], ["http://127.0.0.1:8081"])
+        self.assertTrue(second.is_allowed_origin("http://127.0.0.1:8080"))
+        swarm.run(ORIGIN_KEPT_S)
+        self.assertFalse(second.is_allowed_origin("http://127.0.0.1:8080"))
+        self.assertTrue(second.is_allowed_origin("http://127.0.0.1:8081"))

@@ -8,20 +8,20 @@ from typing import Any
 from twisted.trial.unittest import SynchronousTestCase
 
 from middleware.faults.kinds import KINDS
-from swarmnode.rehearsal import VirtualTeam
+from swarmnode.simulated_team import SimulatedTeam
 from tests.webnode.memory import MemoryDesk, MemoryFaults
 from webnode.app import create_app
-from webnode.board import Board
-from webnode.chronicle import TeamChronicle
+from webnode.auth import OpenSessions
 from webnode.errors import Refusal
-from webnode.faults import TOLD_S, FaultControl
-from webnode.state import state_of
-from webnode.visitor import OpenSessions
+from webnode.event_log import EventLog
+from webnode.faults import SHOWN_S, FaultControl
+from webnode.services import Services
+from webnode.state import format_state
 
 
 class FaultControlTests(SynchronousTestCase):
     def setUp(self) -> None:
-        self.team = VirtualTeam(4, faults=True)
+        self.team = SimulatedTeam(4, faults=True)
         self.addCleanup(self.team.stop)
         self.node = self.team.services["vaio"].assembly.node
         self.control = FaultControl(self.node, self.team.clock.seconds)
@@ -34,7 +34,7 @@ class FaultControlTests(SynchronousTestCase):
     def cause(self, uuid: str, kind: str, seconds: float = 4.0, amount: float | None = None) -> Any:
         """Return the outcome of a fault request within two seconds: None, or the refusal."""
         came: list[Any] = []
-        self.control.cause(uuid, kind, seconds, amount).addCallbacks(came.append, lambda f: came.append(f.value))
+        self.control.inject(uuid, kind, seconds, amount).addCallbacks(came.append, lambda f: came.append(f.value))
         for _ in range(40):
             if came:
                 break
@@ -52,12 +52,12 @@ class FaultControlTests(SynchronousTestCase):
 
     def test_learn_what_can_fail(self) -> None:
         """The possible faults of each device are queried; an unknown device has none."""
-        self.assertEqual(list(self.control.kinds(self.uuid("dog1"))), list(KINDS))
-        self.assertNotIn("battery", self.control.kinds(self.uuid("vaio")))
-        self.assertEqual(list(self.control.kinds("00" * 20)), [])
+        self.assertEqual(list(self.control.get_kinds(self.uuid("dog1"))), list(KINDS))
+        self.assertNotIn("battery", self.control.get_kinds(self.uuid("vaio")))
+        self.assertEqual(list(self.control.get_kinds("00" * 20)), [])
         self.assertIsNone(self.cause(self.uuid("dog1"), "kill"))
         self.team.clock.advance(5.0)
-        self.assertEqual(list(self.control.kinds(self.uuid("dog1"))), list(KINDS))
+        self.assertEqual(list(self.control.get_kinds(self.uuid("dog1"))), list(KINDS))
         self.assertEqual(self.cause(self.uuid("dog1"), "loss").problem, "it has left the network")
         self.team.clock.advance(20.0)
         self.assertIsNone(self.cause(self.uuid("dog1"), "loss"))
@@ -68,20 +68,20 @@ class FaultControlTests(SynchronousTestCase):
         lost = self.acting()
         self.assertIsNone(self.cause(lost, "radio"))
         self.team.clock.advance(0.6)
-        (row,) = self.control.active()
+        (row,) = self.control.list_active()
         self.assertEqual((row["uuid"], row["kind"], row["takeover_s"], row["watched"]), (lost, "radio", None, True))
         self.team.clock.advance(2.0)
-        (row,) = self.control.active()
+        (row,) = self.control.list_active()
         self.assertLess(float(str(row["takeover_s"])), 2.0)
         self.assertIn(row["to"], {"dog1", "dog2", "dog3"} - {row["name"]})
         self.assertTrue(0.0 < float(str(row["left_s"])) < 2.0)
-        self.team.clock.advance(4.0 + TOLD_S)
-        self.assertEqual(self.control.active(), [])
+        self.team.clock.advance(4.0 + SHOWN_S)
+        self.assertEqual(self.control.list_active(), [])
 
     def test_idle_device(self) -> None:
         """A fault in an idle device has no takeover time."""
         self.assertIsNone(self.cause(self.uuid("dog2"), "loss", 4.0, 0.3))
-        (row,) = self.control.active()
+        (row,) = self.control.list_active()
         self.assertEqual((row["task"], row["watched"], row["amount"]), ("", False, 0.3))
 
     def test_refuse(self) -> None:
@@ -96,33 +96,33 @@ class FaultControlTests(SynchronousTestCase):
             refusal = self.cause(uuid, kind, 4.0, amount)
             assert isinstance(refusal, Refusal), kind
             self.assertEqual((refusal.status, refusal.field), (status, field))
-        self.team.silence("dog3")
+        self.team.block_datagrams("dog3")
         refusal = self.cause(dog, "loss")
         self.assertEqual((refusal.status, refusal.problem), (504, "dog3 does not answer"))
-        self.assertEqual(self.control.active(), [])
+        self.assertEqual(self.control.list_active(), [])
 
     def test_only_where_allowed(self) -> None:
         """A device that does not allow faults is reported with the setting that allows them."""
-        plain = VirtualTeam(4, dogs=("dog1",))
+        plain = SimulatedTeam(4, dogs=("dog1",))
         self.addCleanup(plain.stop)
         control = FaultControl(plain.services["vaio"].assembly.node, plain.clock.seconds)
         plain.clock.advance(2.0)
         dog = plain.services["dog1"].assembly.node.uuid
-        self.assertEqual(list(control.kinds(dog)), [])
-        refusal = self.failureResultOf(control.cause(dog, "kill", 4.0, None), Refusal).value
+        self.assertEqual(list(control.get_kinds(dog)), [])
+        refusal = self.failureResultOf(control.inject(dog, "kill", 4.0, None), Refusal).value
         self.assertIn("allow = true", refusal.remedy)
 
 
 class RouteTests(SynchronousTestCase):
     def setUp(self) -> None:
         self.faults: MemoryFaults | None = MemoryFaults("kill", "loss")
-        self.chronicle = TeamChronicle()
+        self.chronicle = EventLog()
         self.open(self.faults)
 
     def open(self, faults: MemoryFaults | None) -> None:
         """Serve a dog with these faults."""
-        state = state_of([{"uuid": "01", "name": "dog1", "joined": 1}], [], {}, node="vaio")
-        board = Board(MemoryDesk(), OpenSessions(), chronicle=self.chronicle, faults=faults)
+        state = format_state([{"uuid": "01", "name": "dog1", "joined": 1}], [], {}, node="vaio")
+        board = Services(MemoryDesk(), OpenSessions(), event_log=self.chronicle, faults=faults)
         app = create_app(lambda: state, board, wall=lambda: 1e9)
         app.logger.setLevel(logging.CRITICAL + 1)
         self.client = app.test_client()
@@ -133,7 +133,7 @@ class RouteTests(SynchronousTestCase):
         self.assertEqual((answer.status_code, answer.get_json()), (202, {"id": "01", "kind": "loss", "seconds": 15.0}))
         assert self.faults is not None
         self.assertEqual(self.faults.caused, [("01", "loss", 15.0, 0.3)])
-        self.assertEqual([(each.uuid, each.at) for each in self.chronicle.since(0)], [("01", 1e9)])
+        self.assertEqual([(each.uuid, each.at) for each in self.chronicle.list_since(0)], [("01", 1e9)])
         told = self.client.get("/api/v1/faults").get_json()
         self.assertEqual(told["can"], {"01": ["kill", "loss"]})
         self.assertEqual([kind["kind"] for kind in told["kinds"]], list(KINDS))

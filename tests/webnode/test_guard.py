@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from twisted.trial.unittest import SynchronousTestCase
 
-from webnode.guard import HEADERS, headers, is_local_name, is_own_host, is_own_origin, refusal, token_of
+from webnode.guard import HEADERS, choose_token, find_refusal, is_local_name, is_own_host, is_own_origin, make_headers
 
 
 class GuardTests(SynchronousTestCase):
@@ -43,16 +43,16 @@ class GuardTests(SynchronousTestCase):
 
     def test_read_the_token(self) -> None:
         """A bearer header has priority over a ticket in the query."""
-        self.assertEqual(token_of("Bearer abc", "t"), "abc")
-        self.assertEqual(token_of("bearer  abc ", ""), "abc")
+        self.assertEqual(choose_token("Bearer abc", "t"), "abc")
+        self.assertEqual(choose_token("bearer  abc ", ""), "abc")
         for header in ("", "Basic abc", "Bearer ", "abc"):
-            self.assertEqual(token_of(header, "t"), "t")
+            self.assertEqual(choose_token(header, "t"), "t")
 
     def test_let_in(self) -> None:
         """Changes need the own origin or a team page's, and the ``X-Swarm`` header; reads only need an own host."""
 
         def refused(method: str, origin: str | None = None, is_marked: bool = True, host: str = "vaio") -> str:
-            no = refusal(method, host, origin, is_marked, ("vaio",), lambda origin: origin == "http://other")
+            no = find_refusal(method, host, origin, is_marked, ("vaio",), lambda origin: origin == "http://other")
             return "" if no is None else no.field
 
         self.assertEqual(refused("GET", "http://evil", False), "")
@@ -62,4 +62,4 @@ class GuardTests(SynchronousTestCase):
         self.assertEqual(refused("POST", "http://evil"), "Origin")
         self.assertEqual(refused("POST", None, False), "X-Swarm")
         self.assertEqual(refused("OPTIONS", "http://other", False), "")
-        self.assertEqual(headers("vaio", "http://evil", lambda origin: False), HEADERS)
+        self.assertEqual(make_headers("vaio", "http://evil", lambda origin: False), HEADERS)

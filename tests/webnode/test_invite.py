@@ -9,7 +9,7 @@ from typing import Any
 
 from twisted.trial.unittest import SynchronousTestCase
 
-from webnode.invite import MARGIN, TeamInvites, best_first, code
+from webnode.invite import MARGIN, Invites, make_qr_code, sort_by_reach
 
 LINK = "https://192.168.0.7:8443/#code=AQUAagJ8oCVYkDIF5Q4LZ3Vlc3TsjPp7rFj9hsoSg2xWYr0E/phone"
 
@@ -18,16 +18,16 @@ class InviteTests(SynchronousTestCase):
     def test_offer_the_best_first(self) -> None:
         """Pages on the network come before pages on this machine, and TLS before plain HTTP."""
         here, plain, name = "https://127.0.0.1:8443", "http://192.168.0.7:8080", "https://vaio.local:8443"
-        self.assertEqual(best_first([here, plain, name, plain]), [name, plain, here])
+        self.assertEqual(sort_by_reach([here, plain, name, plain]), [name, plain, here])
         anything: Any = None
-        self.assertEqual(TeamInvites(lambda: [here, plain], b"", "", anything, anything).urls(), [plain, here])
+        self.assertEqual(Invites(lambda: [here, plain], b"", "", anything, anything).urls(), [plain, here])
 
     def test_draw_what_a_camera_reads(self) -> None:
         """A decoder reads the link from the QR code, which has a margin and no style attribute."""
         import cv2
         import numpy as np
 
-        drawing = code(LINK)
+        drawing = make_qr_code(LINK)
         self.assertNotIn("style", drawing)
         (size,) = re.findall(r'viewBox="0 0 (\d+) \1"', drawing)
         picture = np.full((int(size), int(size)), 255, np.uint8)
@@ -47,8 +47,8 @@ class InviteTests(SynchronousTestCase):
 
     def test_draw_nothing_where_it_cannot(self) -> None:
         """An empty link, or a missing library, gives no drawing."""
-        self.assertEqual(code(""), "")
+        self.assertEqual(make_qr_code(""), "")
         self.addCleanup(sys.modules.update, {"segno": sys.modules["segno"]} if "segno" in sys.modules else {})
         self.addCleanup(sys.modules.pop, "segno", None)
         sys.modules["segno"] = None  # type: ignore[assignment]
-        self.assertEqual(code(LINK), "")
+        self.assertEqual(make_qr_code(LINK), "")

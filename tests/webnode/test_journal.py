@@ -7,7 +7,7 @@ from typing import Any
 
 from twisted.trial.unittest import SynchronousTestCase
 
-from webnode.journal import KEPT, KEYS, Journal
+from webnode.journal import KEYS, MAX_CHANGES, Journal
 
 
 def state(**devices: Any) -> dict[str, Any]:
@@ -35,7 +35,7 @@ class JournalTests(SynchronousTestCase):
 
     def taken(self, *states: dict[str, Any]) -> Any:
         for each in states:
-            change = self.journal.take(each)
+            change = self.journal.add_state(each)
         return None if change is None else change.content
 
     def test_tell_what_differs(self) -> None:
@@ -49,23 +49,23 @@ class JournalTests(SynchronousTestCase):
     def test_resume(self) -> None:
         """A page that sends its last id gets the later changes in order."""
         self.taken(state(a="IDLE"), state(a="DONE"), state(b="DONE"))
-        missed = self.journal.since(self.journal.number("ab-1"))
+        missed = self.journal.list_since(self.journal.parse_event_id("ab-1"))
         self.assertEqual([change.n for change in missed or []], [2, 3])
-        self.assertEqual(self.journal.since(self.journal.number(self.journal.id(3))), [])
+        self.assertEqual(self.journal.list_since(self.journal.parse_event_id(self.journal.make_event_id(3))), [])
 
     def test_tell_all_after_a_gap(self) -> None:
         """An id that is too old, from another node or start, in the future or invalid requires the whole state."""
-        for n in range(KEPT + 3):
+        for n in range(MAX_CHANGES + 3):
             self.taken(state(a=n))
         for name in ("ab-1", "ab-2", "ac-60", "ab-999", "ab-", "ab-x", "ab--1", "", "ab-" + "9" * 40, "ab-²"):
-            self.assertIsNone(self.journal.since(self.journal.number(name)), name)
-        self.assertEqual(len(self.journal.since(self.journal.number("ab-3")) or []), KEPT)
+            self.assertIsNone(self.journal.list_since(self.journal.parse_event_id(name)), name)
+        self.assertEqual(len(self.journal.list_since(self.journal.parse_event_id("ab-3")) or []), MAX_CHANGES)
 
     def test_take_nothing_that_json_cannot_carry(self) -> None:
         """A state that is not valid JSON is rejected, and the next change refers to the last valid state."""
         self.taken(state(a="IDLE"))
-        self.assertRaises(ValueError, self.journal.take, state(a=float("nan")))
-        self.assertRaises(ValueError, self.journal.take, {**state(a="IDLE"), "halted": float("nan")})
+        self.assertRaises(ValueError, self.journal.add_state, state(a=float("nan")))
+        self.assertRaises(ValueError, self.journal.add_state, {**state(a="IDLE"), "halted": float("nan")})
         self.assertEqual((self.journal.n, self.taken(state(a="IDLE"))), (1, None))
 
     def test_end_where_the_state_is(self) -> None:
@@ -75,11 +75,11 @@ class JournalTests(SynchronousTestCase):
         for _ in range(200):
             devices = {uuid: dice.choice(("IDLE", "DONE")) for uuid in "abcdef" if dice.random() < 0.7}
             now = {**state(**devices), "halted": dice.random() < 0.5}
-            self.journal.take(now)
+            self.journal.add_state(now)
             tables = {name: {row[KEYS[name]]: row for row in now[name]} for name in KEYS}
             known.append((self.journal.n, {**now, **tables}))
         for n, before in known:
-            missed = self.journal.since(n)
+            missed = self.journal.list_since(n)
             if missed is not None:
                 for change in missed:
                     before = applied(before, change.content)

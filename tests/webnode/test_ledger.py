@@ -1,4 +1,4 @@
-"""Tests of ``Glance`` in ``webnode.ledger``; tests of whole teams check its states."""
+"""Tests of ``Glance`` in ``webnode.state_builder``; tests of whole teams check its states."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from typing import Any
 from twisted.internet.task import Clock
 from twisted.trial.unittest import SynchronousTestCase
 
-from webnode.ledger import FRESH_S, Glance
+from webnode.state_builder import MAX_AGE_S, StateCache
 
 
 class GlanceTests(SynchronousTestCase):
@@ -19,7 +19,7 @@ class GlanceTests(SynchronousTestCase):
             read[0] += 1
             return {"n": read[0]}
 
-        glance = Glance(state, clock.seconds)
+        glance = StateCache(state, clock.seconds)
         self.assertEqual([glance()["n"] for _ in range(100)], [1] * 100)
-        clock.advance(FRESH_S)
+        clock.advance(MAX_AGE_S)
         self.assertEqual((glance()["n"], glance()["n"]), (2, 2))

@@ -13,15 +13,15 @@ from twisted.web.resource import Resource
 from tests.webnode.browser import Connection, site_of
 from tests.webnode.memory import MemoryDesk, MemoryFrames
 from tests.webnode.picture import jpeg
-from webnode.board import Board
+from webnode.auth import OpenSessions, User
 from webnode.camera import OnFrame
-from webnode.chronicle import TeamChronicle
 from webnode.errors import Refusal
+from webnode.event_log import EventLog
 from webnode.fallback import Page
-from webnode.journal import KEPT
-from webnode.live import LEAD_S, MAX_VIEWERS, MAX_WAITING, Events, Shots
+from webnode.journal import MAX_CHANGES
+from webnode.live import MAX_VIEWERS, MAX_WAITING, RENEWAL_LEAD_S, CameraImages, EventStreams
+from webnode.services import Services
 from webnode.state import State
-from webnode.visitor import OpenSessions, Visitor
 
 MORE = "x" * 999
 """What makes a state longer than a few changes."""
@@ -40,10 +40,10 @@ def last_id(data: bytes) -> str:
     return data.decode().rpartition("id: ")[2].split("\n")[0]
 
 
-class Quiet(TeamChronicle):
+class Quiet(EventLog):
     """A chronicle that describes injected faults only."""
 
-    def saw(self, state: State, now: float) -> None:
+    def record_state(self, state: State, now: float) -> None:
         """Ignore the state."""
 
 
@@ -53,13 +53,13 @@ class EventsTests(SynchronousTestCase):
         self.state: dict[str, Any] = {"n": 0}
         self.reads = 0
         self.version: int | None = None
-        self.board = Board(MemoryDesk(), OpenSessions(), chronicle=Quiet())
+        self.board = Services(MemoryDesk(), OpenSessions(), event_log=Quiet())
         self.serve(self.read)
 
     def serve(self, read: Callable[[], State]) -> None:
         """Serve the states that ``read`` returns."""
         wall = lambda: 1e9 + self.clock.seconds()  # noqa: E731
-        self.events = Events(read, self.clock, wall, self.board, lambda: self.version)
+        self.events = EventStreams(read, self.clock, wall, self.board, lambda: self.version)
         root = Resource()
         root.putChild(b"events", self.events)
         self.site = site_of(root, self.clock)
@@ -139,13 +139,13 @@ class EventsTests(SynchronousTestCase):
 
     def test_end_with_the_session(self) -> None:
         """A stream warns once, an hour before its session ends, if a renewal is possible; then it ends."""
-        whos = {"short": (10.0, 10.0), "long": (LEAD_S + 5.0, 2e9), "open": (2e9, 2e9)}
+        whos = {"short": (10.0, 10.0), "long": (RENEWAL_LEAD_S + 5.0, 2e9), "open": (2e9, 2e9)}
 
         class Sessions(OpenSessions):
-            def visitor(self, token: str, now: float) -> Visitor:
+            def authenticate(self, token: str, now: float) -> User:
                 until, limit = whos[token]
                 is_in = now - 1e9 < until
-                return Visitor("ann", "viewer", "a1", 1e9 + until, 1e9 + limit) if is_in else Visitor()
+                return User("ann", "viewer", "a1", 1e9 + until, 1e9 + limit) if is_in else User()
 
         self.board.sessions = Sessions()
         pages = {name: self.connected(f"?ticket={name}") for name in whos}
@@ -153,7 +153,7 @@ class EventsTests(SynchronousTestCase):
         tickets = {
             name: [data for event, data in events_in(page.taken()) if event == "ticket"] for name, page in pages.items()
         }
-        self.assertEqual(tickets, {"short": [], "long": [{"until": 1e9 + LEAD_S + 5.0}], "open": []})
+        self.assertEqual(tickets, {"short": [], "long": [{"until": 1e9 + RENEWAL_LEAD_S + 5.0}], "open": []})
         self.assertEqual(self.events.viewers, 3)
         self.clock.pump([0.1] * 30)
         self.assertEqual(self.events.viewers, 2)
@@ -174,7 +174,7 @@ class EventsTests(SynchronousTestCase):
         """Each entry of the chronicle is sent once to each page, and all entries to a new page."""
         page = self.connected()
         page.taken()
-        self.board.chronicle.faulted("01", "kill", 1e9)
+        self.board.event_log.record_fault("01", "kill", 1e9)
         self.clock.advance(0.1)
         ((name, (row,)),) = events_in(page.taken())
         self.assertEqual((name, row["n"], row["text"]), ("event", 1, "01: kill (injected fault)"))
@@ -196,7 +196,7 @@ class EventsTests(SynchronousTestCase):
 
     def test_keep_the_chronicle_with_nobody_there(self) -> None:
         """Between ``open`` and ``close`` the chronicle gets the state each second, even without a page."""
-        self.events.open()
+        self.events.start()
         self.clock.pump([0.5] * 6)
         self.assertEqual(self.reads, 3)
         self.events.close()
@@ -233,7 +233,7 @@ class EventsTests(SynchronousTestCase):
 
     def test_spare_slow_pages_the_past(self) -> None:
         """If the missed changes are too many or longer than the state, the page gets the state, marked as such."""
-        for more, missed in ((MORE, KEPT + 2), ("", 4)):
+        for more, missed in ((MORE, MAX_CHANGES + 2), ("", 4)):
             self.state.update({"more": more, "n": 0})
             slow = self.connected()
             slow.taken()
@@ -292,10 +292,10 @@ class ShotsTests(SynchronousTestCase):
     def setUp(self) -> None:
         self.clock = Clock()
         self.frames = MemoryFrames()
-        self.shots = Shots(self.frames.watch, self.clock)
+        self.shots = CameraImages(self.frames.watch, self.clock)
         self.site = self.site_with(self.shots)
 
-    def site_with(self, shots: Shots) -> Any:
+    def site_with(self, shots: CameraImages) -> Any:
         root = Resource()
         root.putChild(b"shot", shots)
         return site_of(root, self.clock)
@@ -390,7 +390,7 @@ class ShotsTests(SynchronousTestCase):
 
     def test_tell_of_no_camera(self) -> None:
         """A request to a device without a camera is answered with 404 and leaves no state."""
-        shots = Shots(blind, self.clock)
+        shots = CameraImages(blind, self.clock)
         data = Connection(self.site_with(shots)).ask("/shot/cd?after=").taken()
         self.assertIn(b" 404 ", data)
         self.assertIn(b"it has no camera", data)

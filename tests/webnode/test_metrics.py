@@ -11,10 +11,10 @@ from twisted.trial.unittest import SynchronousTestCase
 from tests.webnode.guests import Guests
 from tests.webnode.memory import MemoryDesk
 from webnode.app import create_app
-from webnode.board import Board
+from webnode.auth import User
 from webnode.limits import AddressLimits
-from webnode.state import state_of
-from webnode.visitor import Visitor
+from webnode.services import Services
+from webnode.state import format_state
 
 DOG = {"uuid": "01", "name": 'do"g\n1', "joined": 1, "since": 5.0, "network": {"contacts": 3, "sent": 7}}
 
@@ -25,9 +25,9 @@ class MetricsTests(SynchronousTestCase):
 
     def setUp(self) -> None:
         self.limits = AddressLimits()
-        self.board = Board(MemoryDesk(), Guests(), limits=self.limits)
+        self.board = Services(MemoryDesk(), Guests(), limits=self.limits)
         tasks = [{"id": "t1", "title": "Find", "created": 1.0, "status": "EXECUTING"}]
-        state = state_of(
+        state = format_state(
             [{**DOG, "status": "IDLE"}], tasks, {"t1": [{"uuid": "01", "name": "x", "cost": 1.0}]}, node="v"
         )
         self.client = create_app(lambda: state, self.board, wall=lambda: 9.5).test_client()
@@ -59,7 +59,7 @@ class MetricsTests(SynchronousTestCase):
     def test_tell_the_page(self) -> None:
         """Connections by kind, and requests by role and status, are counted; reading the metrics is not."""
         self.limits.count("stream", "10.0.0.1", 2)
-        self.board.audit.note(Visitor("ann", "operator"), "h", "POST /x", "", "409 it left")
+        self.board.audit.write(User("ann", "operator"), "h", "POST /x", "", "409 it left")
         told = self.read()
         self.assertEqual(told["swarm_page_connections", ("stream",)], 2)
         self.assertEqual(told["swarm_page_orders_total", ("operator", "409")], 1)

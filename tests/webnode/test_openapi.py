@@ -11,15 +11,15 @@ from twisted.trial.unittest import SynchronousTestCase
 from tests.webnode.guests import Guests
 from tests.webnode.memory import MemoryDesk
 from webnode.app import create_app
-from webnode.board import Board
 from webnode.route import Field, Route
-from webnode.routes.openapi import document
-from webnode.routes.table import TABLE
-from webnode.state import state_of
+from webnode.routes.openapi import make_document
+from webnode.routes.registry import TABLE
+from webnode.services import Services
+from webnode.state import format_state
 
 FIELDS = (
-    Field("uuid", "text", "which", "path", most=64),
-    Field("after", "whole", "a number", "query", least=0, most=9, default=0),
+    Field("uuid", "text", "which", "path", maximum=64),
+    Field("after", "whole", "a number", "query", minimum=0, maximum=9, default=0),
     Field("x", "number", "where", unit="m"),
     Field("kind", "choice", "what", choices=("a", "b"), default="a"),
     Field("name", "text", "who", default=""),
@@ -28,11 +28,11 @@ FIELDS = (
 
 class DocumentTests(SynchronousTestCase):
     def operation(self, route: Route) -> Any:
-        return document([route])["paths"][route.path][route.method.lower()]
+        return make_document([route])["paths"][route.path][route.method.lower()]
 
     def test_have_every_route(self) -> None:
         """The document has exactly the routes of the table, each with a unique operation id."""
-        told = document(TABLE)
+        told = make_document(TABLE)
         found = {f"{method.upper()} {path}" for path, each in told["paths"].items() for method in each}
         self.assertEqual(found, {route.name for route in TABLE})
         names = [each["operationId"] for methods in told["paths"].values() for each in methods.values()]
@@ -68,15 +68,15 @@ class DocumentTests(SynchronousTestCase):
 
     def test_say_what_is_given(self) -> None:
         """A media type is documented as such, other answers as JSON with a description, errors by reference."""
-        picture = self.operation(Route("GET", "/shot", "A picture", "viewer", None, gives="image/jpeg"))
+        picture = self.operation(Route("GET", "/shot", "A picture", "viewer", None, response="image/jpeg"))
         self.assertEqual(list(picture["responses"]["200"]["content"]), ["image/jpeg"])
-        order = self.operation(Route("POST", "/api/v1/x", "X", "operator", lambda ask: {}, gives="id", status=202))
+        order = self.operation(Route("POST", "/api/v1/x", "X", "operator", lambda ask: {}, response="id", status=202))
         self.assertEqual(order["responses"]["202"]["description"], "id")
         self.assertEqual(order["responses"]["default"], {"$ref": "#/components/responses/Refused"})
 
     def test_refer_to_what_is_there(self) -> None:
         """Every reference in the document points to an existing part."""
-        told = document(TABLE)
+        told = make_document(TABLE)
         for reference in re.findall(r'"\$ref": "#/([^"]+)"', json.dumps(told)):
             part: Any = told
             for step in reference.split("/"):
@@ -85,8 +85,8 @@ class DocumentTests(SynchronousTestCase):
 
     def test_be_served(self) -> None:
         """A viewer gets the document of the served routes, with the node's name."""
-        state = state_of([], [], {}, node="vaio")
-        client = create_app(lambda: state, Board(MemoryDesk(), Guests())).test_client()
+        state = format_state([], [], {}, node="vaio")
+        client = create_app(lambda: state, Services(MemoryDesk(), Guests())).test_client()
         self.assertEqual(client.get("/api/v1/openapi.json").status_code, 401)
         told = client.get("/api/v1/openapi.json?ticket=viewer").get_json()
         self.assertIn("vaio", told["info"]["title"])

@@ -13,22 +13,22 @@ from twisted.trial.unittest import SynchronousTestCase
 from twisted.web.resource import Resource
 
 from middleware.entangled.identity import Identity
-from swarmnode.gateway import sides
+from swarmnode.gateway import check_picture
 from tests.webnode.browser import Connection, site_of
 from tests.webnode.memory import MemoryDesk, MemoryPhones
 from tests.webnode.picture import jpeg
 from webnode.app import create_app
-from webnode.audit import Audit
-from webnode.board import Board
+from webnode.audit import AuditLog
+from webnode.auth import OpenSessions
 from webnode.fallback import Fallbacks, Page
 from webnode.guard import MAX_BODY
 from webnode.limits import AddressLimits
-from webnode.routes.phones import MEASURES, ROUTES
+from webnode.routes.phones import ROUTES, VALUE_RANGES
 from webnode.server import Root
-from webnode.session import NOBODY, SignedSessions
-from webnode.state import state_of
+from webnode.services import Services
+from webnode.session import ANONYMOUS, SignedSessions
+from webnode.state import format_state
 from webnode.token import TokenKey
-from webnode.visitor import OpenSessions
 
 SECRET = "0f" * 32
 JOIN: dict[str, Any] = {"secret": SECRET, "name": "anna", "width": 208, "height": 156}
@@ -39,9 +39,9 @@ class PhoneRouteTests(SynchronousTestCase):
         self.sessions = SignedSessions(
             TokenKey(Identity(bytes(32))), lambda _: True, "quiet-otter", "", random.Random(1), lambda *_: succeed(0)
         )
-        self.phones = MemoryPhones(most=2, check=sides)
-        self.board = Board(MemoryDesk(), self.sessions, Audit(), phones=self.phones)
-        state = state_of([], [], {}, node="vaio")
+        self.phones = MemoryPhones(most=2, check=check_picture)
+        self.board = Services(MemoryDesk(), self.sessions, AuditLog(), phones=self.phones)
+        state = format_state([], [], {}, node="vaio")
         self.client = create_app(lambda: state, self.board, wall=lambda: 1000.0).test_client()
         native: dict[str, Resource] = {
             route.path: route.native(self.board, None) for route in ROUTES if route.native is not None
@@ -50,7 +50,7 @@ class PhoneRouteTests(SynchronousTestCase):
         self.token = self.token_of("phone")
 
     def token_of(self, role: Any) -> str:
-        return self.sessions.token(NOBODY, "guest", role, 1000.0, 60.0).text
+        return self.sessions.issue_guest_token(ANONYMOUS, "guest", role, 1000.0, 60.0).text
 
     def join(self, token: str = "", **changes: Any) -> Any:
         bearer = {"Authorization": f"Bearer {token or self.token}"}
@@ -86,7 +86,7 @@ class PhoneRouteTests(SynchronousTestCase):
         status, told = self.send(f"phones/{phone['uuid']}/leave?ticket={phone['ticket']}")
         self.assertEqual((status, told, self.phones.here), (200, {}, {}))
         self.assertEqual(self.look(phone, jpeg())[0], 404)
-        self.assertEqual([line["outcome"] for line in self.board.audit.newest(9)], ["200"] * 3)
+        self.assertEqual([line["outcome"] for line in self.board.audit.list_newest(9)], ["200"] * 3)
 
     def test_ask_for_the_role(self) -> None:
         """Phones and operators join; viewers, unknown visitors and phones with another phone's ticket do not."""
@@ -153,7 +153,7 @@ class PhoneRouteTests(SynchronousTestCase):
             self.assertEqual((status, told["error"]["field"]), (400, "values"), values[:50])
         self.assertEqual(self.phones.looks, [])
         self.assertEqual(self.look(phone, jpeg() + bytes(MAX_BODY))[0], 413)
-        at_bounds = {name: measure.most for name, measure in MEASURES.items()}
+        at_bounds = {name: measure.maximum for name, measure in VALUE_RANGES.items()}
         self.assertEqual(self.look(phone, jpeg(), json.dumps(at_bounds))[0], 200)
 
     def test_answer_posts_alone(self) -> None:

@@ -8,12 +8,12 @@ from typing import Any
 from twisted.trial.unittest import SynchronousTestCase
 
 from tests.webnode.memory import MemoryDesk
-from webnode.board import Board
+from webnode.auth import OpenSessions, User
 from webnode.errors import Refusal
-from webnode.route import ALLOWED, Ask, Field, Route, checked, device, guarded
-from webnode.routes.table import TABLE
-from webnode.state import Departed, state_of
-from webnode.visitor import OpenSessions, Visitor
+from webnode.route import ALLOWED_ROLES, Field, Route, RouteRequest, check_request, check_role, find_device
+from webnode.routes.registry import TABLE
+from webnode.services import Services
+from webnode.state import DepartedDevices, format_state
 
 
 def route(*fields: Field) -> Route:
@@ -25,7 +25,7 @@ class CheckedTests(SynchronousTestCase):
         place = {field.name: value}
         query = place if field.where == "query" else {}
         body = place if field.where == "body" else {}
-        found: Refusal = self.assertRaises(Refusal, checked, route(field), {}, query, body)
+        found: Refusal = self.assertRaises(Refusal, check_request, route(field), {}, query, body)
         return found
 
     def test_take_each_kind(self) -> None:
@@ -34,15 +34,15 @@ class CheckedTests(SynchronousTestCase):
             Field("uuid", "text", "", "path"),
             Field("after", "whole", "", "query"),
             Field("loud", "flag", "", "query"),
-            Field("name", "text", "", most=5),
-            Field("x", "number", "", least=-1.0, most=1.0),
-            Field("n", "whole", "", least=1, most=3),
+            Field("name", "text", "", maximum=5),
+            Field("x", "number", "", minimum=-1.0, maximum=1.0),
+            Field("n", "whole", "", minimum=1, maximum=3),
             Field("how", "choice", "", choices=("slow", "fast")),
             Field("can", "table", ""),
-            Field("all", "list", "", most=2),
+            Field("all", "list", "", maximum=2),
         )
         body = {"name": " a\tb ", "x": 1, "n": 2.0, "how": "fast", "can": {"see": 1}, "all": [1, 2]}
-        given = checked(route(*fields), {"uuid": "01"}, {"after": "7", "loud": "true", "other": "x"}, body)
+        given = check_request(route(*fields), {"uuid": "01"}, {"after": "7", "loud": "true", "other": "x"}, body)
         lawful = {"uuid": "01", "after": 7, "loud": True, "name": "a b", "x": 1.0, "n": 2}
         self.assertEqual(given, {**lawful, "how": "fast", "can": {"see": 1}, "all": [1, 2]})
         self.assertIs(type(given["n"]), int)
@@ -50,15 +50,18 @@ class CheckedTests(SynchronousTestCase):
     def test_refuse_each_kind(self) -> None:
         """An invalid value of each kind is rejected with field, problem and remedy."""
         wrong: list[tuple[Field, list[Any]]] = [
-            (Field("name", "text", "", most=5), [5, None, "", " \x00", "abcdef", ["a"], {}]),
-            (Field("code", "text", "", least=3), ["ab"]),
-            (Field("x", "number", "", least=0.0, most=0.0), ["1", True, None, [], 0.1, -0.1, 10**400, float("nan")]),
+            (Field("name", "text", "", maximum=5), [5, None, "", " \x00", "abcdef", ["a"], {}]),
+            (Field("code", "text", "", minimum=3), ["ab"]),
+            (
+                Field("x", "number", "", minimum=0.0, maximum=0.0),
+                ["1", True, None, [], 0.1, -0.1, 10**400, float("nan")],
+            ),
             (Field("x", "number", ""), [float("inf"), 2e9]),
-            (Field("n", "whole", "", least=1, most=3), [0, 4, 1.5, "2"]),
+            (Field("n", "whole", "", minimum=1, maximum=3), [0, 4, 1.5, "2"]),
             (Field("on", "flag", ""), [1, "true", None]),
             (Field("how", "choice", "", choices=("slow", "fast")), ["fas", 1, None, ["slow"]]),
             (Field("can", "table", ""), [[], "x", None]),
-            (Field("all", "list", "", least=1, most=2), [{}, "x", [], [1, 2, 3]]),
+            (Field("all", "list", "", minimum=1, maximum=2), [{}, "x", [], [1, 2, 3]]),
             (Field("after", "whole", "", "query"), ["x", "1.5", "nan", "", "1e400"]),
             (Field("loud", "flag", "", "query"), ["yes", "1"]),
         ]
@@ -71,43 +74,45 @@ class CheckedTests(SynchronousTestCase):
     def test_ask_for_what_is_missing(self) -> None:
         """A missing field is rejected if it is required, otherwise it has its default."""
         name, seconds = Field("name", "text", ""), Field("s", "number", "", default=15.0)
-        self.assertEqual(self.assertRaises(Refusal, checked, route(name), {}, {}, {}).field, "name")
-        self.assertEqual(checked(route(seconds), {}, {}, {}), {"s": 15.0})
+        self.assertEqual(self.assertRaises(Refusal, check_request, route(name), {}, {}, {}).field, "name")
+        self.assertEqual(check_request(route(seconds), {}, {}, {}), {"s": 15.0})
 
     def test_refuse_unknown_fields(self) -> None:
         """An unknown field is rejected with the nearest known name, and a body that is not an object is rejected."""
-        refusal = self.assertRaises(Refusal, checked, route(Field("tolerates", "whole", "")), {}, {}, {"toleratse": 1})
+        refusal = self.assertRaises(
+            Refusal, check_request, route(Field("tolerates", "whole", "")), {}, {}, {"toleratse": 1}
+        )
         self.assertEqual(refusal.field, "toleratse")
         self.assertIn("tolerates", refusal.remedy)
-        self.assertEqual(self.assertRaises(Refusal, checked, route(), {}, {}, {"x": 1}).status, 400)
+        self.assertEqual(self.assertRaises(Refusal, check_request, route(), {}, {}, {"x": 1}).status, 400)
         bodies: list[object] = [None, [], "x", 5]
         for body in bodies:
-            self.assertEqual(self.assertRaises(Refusal, checked, route(), {}, {}, body).field, "body")
+            self.assertEqual(self.assertRaises(Refusal, check_request, route(), {}, {}, body).field, "body")
 
 
 class GuardedTests(SynchronousTestCase):
     def test_let_in_by_role(self) -> None:
         """Each role may use the routes that ``ALLOWED`` lists; an unknown visitor gets 401, others 403."""
-        for wanted, lawful in ALLOWED.items():
-            for role in ALLOWED:
+        for wanted, lawful in ALLOWED_ROLES.items():
+            for role in ALLOWED_ROLES:
                 if role in lawful:
-                    guarded(wanted, Visitor("x", role))
+                    check_role(wanted, User("x", role))
                 else:
-                    refusal = self.assertRaises(Refusal, guarded, wanted, Visitor("x", role))
+                    refusal = self.assertRaises(Refusal, check_role, wanted, User("x", role))
                     self.assertEqual(refusal.status, 401 if role == "anyone" else 403)
 
 
 class DeviceTests(SynchronousTestCase):
     def test_find_the_device(self) -> None:
         """A present device is found; a lost device is answered with 409, an unknown one with 404."""
-        departed, dogs = Departed(), [{"uuid": f"0{n}", "name": f"dog{n}", "joined": n} for n in (1, 2)]
-        departed.of(dogs, 1.0)
-        state = state_of(dogs[:1], [], {}, departed=departed.of(dogs[:1], 2.0))
-        board = Board(MemoryDesk(), OpenSessions())
-        self.assertEqual(device(Ask({"uuid": "01"}, Visitor(), board, state))["name"], "dog1")
+        departed, dogs = DepartedDevices(), [{"uuid": f"0{n}", "name": f"dog{n}", "joined": n} for n in (1, 2)]
+        departed.update(dogs, 1.0)
+        state = format_state(dogs[:1], [], {}, departed=departed.update(dogs[:1], 2.0))
+        board = Services(MemoryDesk(), OpenSessions())
+        self.assertEqual(find_device(RouteRequest({"uuid": "01"}, User(), board, state))["name"], "dog1")
         for uuid, status in (("02", 409), ("03", 404)):
-            ask = Ask({"uuid": uuid}, Visitor(), board, state)
-            self.assertEqual(self.assertRaises(Refusal, device, ask).status, status)
+            ask = RouteRequest({"uuid": uuid}, User(), board, state)
+            self.assertEqual(self.assertRaises(Refusal, find_device, ask).status, status)
 
 
 class TableTests(SynchronousTestCase):
@@ -116,9 +121,9 @@ class TableTests(SynchronousTestCase):
         for each in TABLE:
             named = {field.name for field in each.fields if field.where == "path"}
             self.assertEqual(named, set(re.findall(r"\{(\w+)\}", each.path)), each.name)
-            self.assertTrue(each.about and all(field.about for field in each.fields), each.name)
+            self.assertTrue(each.description and all(field.description for field in each.fields), each.name)
             is_ours = each.path.startswith("/api/v1/") or each.path in ("/metrics", "/sw.js")
-            self.assertTrue(each.answer is None or is_ours, each.name)
+            self.assertTrue(each.handler is None or is_ours, each.name)
         names = [each.name for each in TABLE]
         self.assertEqual(len(names), len(set(names)))
 

@@ -17,13 +17,13 @@ from twisted.web.static import Data
 from tests.webnode.browser import Connection, site_of
 from tests.webnode.guests import Guests
 from tests.webnode.memory import MemoryDesk
-from webnode.board import Board
+from webnode.auth import OpenSessions
 from webnode.errors import Refusal
 from webnode.fallback import Fallbacks, Page
 from webnode.guard import MAX_BODY
 from webnode.resource import JsonResource
-from webnode.server import Files, Root, caller, sent
-from webnode.visitor import OpenSessions
+from webnode.server import Root, StaticFiles, make_caller, read_static
+from webnode.services import Services
 
 
 class PathResource(Resource):
@@ -48,13 +48,13 @@ class SentTests(SynchronousTestCase):
         """Scripts are sent without full-line comments, with unchanged line numbers and strings."""
         script = Path(self.mktemp()).with_suffix(".js")
         script.write_text("// About it.\nconst a = 1; // one\n  // More.\nexport const URL = `http://a`;\n")
-        self.assertEqual(sent(script), b"\nconst a = 1; // one\n\nexport const URL = `http://a`;\n")
+        self.assertEqual(read_static(script), b"\nconst a = 1; // one\n\nexport const URL = `http://a`;\n")
 
 
 class RootTests(SynchronousTestCase):
     def setUp(self) -> None:
-        native: dict[str, Resource] = {"/events": Data(b"native", "text/plain"), "/static": Files()}
-        self.board = Board(MemoryDesk(), OpenSessions())
+        native: dict[str, Resource] = {"/events": Data(b"native", "text/plain"), "/static": StaticFiles()}
+        self.board = Services(MemoryDesk(), OpenSessions())
         self.site = site_of(Root(PathResource(), native, self.board, lambda: 1e9), Clock())
 
     def asked(self, path: str, method: str = "GET", **headers: str) -> bytes:
@@ -75,7 +75,9 @@ class RootTests(SynchronousTestCase):
 
     def test_refuse_in_json(self) -> None:
         """Errors of native routes are JSON with the strict headers and without the server's version."""
-        self.site = site_of(Root(PathResource(), {**NATIVE, "/static": Files()}, self.board, lambda: 1e9), Clock())
+        self.site = site_of(
+            Root(PathResource(), {**NATIVE, "/static": StaticFiles()}, self.board, lambda: 1e9), Clock()
+        )
         asked = [
             ("/static/nothing.js", "GET", 404),
             ("/static/../app.py", "GET", 404),
@@ -187,7 +189,7 @@ class CallerTests(SynchronousTestCase):
         def refuse() -> None:
             raise Refusal("name", "no", "ask another", 404)
 
-        on_reactor = caller(QuickReactor())
+        on_reactor = make_caller(QuickReactor())
         self.assertEqual(on_reactor(lambda a, b: a + b, 1, 2), 3)
         self.assertEqual(on_reactor(lambda: succeed("t1")), "t1")
         self.assertEqual(self.assertRaises(Refusal, on_reactor, refuse).status, 404)
@@ -196,5 +198,5 @@ class CallerTests(SynchronousTestCase):
         """A desk that does not answer is given up after the limit, with 503."""
         never: Deferred[None] = Deferred()
         for usual_s, given in ((0.0, {}), (1e6, {"limit_s": 0.0})):
-            error = self.assertRaises(Refusal, caller(QuickReactor(), usual_s), lambda: never, **given)
+            error = self.assertRaises(Refusal, make_caller(QuickReactor(), usual_s), lambda: never, **given)
             self.assertEqual(error.status, 503)

@@ -12,13 +12,21 @@ from twisted.trial.unittest import SynchronousTestCase
 from middleware.config.settings import Settings
 from middleware.entangled.identity import Identity
 from middleware.errors import BadSetting
+from webnode.auth import OpenSessions, Token, User
 from webnode.errors import Refusal
-from webnode.password import draw_code, hashed, is_password
-from webnode.session import AT_ONCE, MAX_SIGNED_S, PASS_S, SIGNED_S, WAITING, SignedSessions, sessions
+from webnode.password import draw_code, hash_password, verify_password
+from webnode.session import (
+    MAX_CHECKS,
+    MAX_SESSION_S,
+    MAX_WAITING_CHECKS,
+    PEER_TOKEN_S,
+    SESSION_S,
+    SignedSessions,
+    make_sessions,
+)
 from webnode.token import TokenKey
-from webnode.visitor import OpenSessions, Token, Visitor
 
-HASH = hashed("correct horse", bytes(16), 4)
+HASH = hash_password("correct horse", bytes(16), 4)
 HOME = "10.0.0.9"
 KEYS = {name: TokenKey(Identity(name.encode().ljust(32))) for name in ("vaio", "pi", "nuc", "eve")}
 
@@ -34,7 +42,7 @@ class SignedSessionsTests(SynchronousTestCase):
         self.sessions = self.node()
 
     def node(self, name: str = "vaio", password: str = "", check: Any = None) -> SignedSessions:
-        there = check or (lambda text, word: succeed(is_password(text, word)))
+        there = check or (lambda text, word: succeed(verify_password(text, word)))
         return SignedSessions(
             KEYS[name], self.gateways.__contains__, "quiet-otter", password, random.Random(name), there
         )
@@ -50,59 +58,63 @@ class SignedSessionsTests(SynchronousTestCase):
         """The code, in any notation, signs in an operator for twelve hours; its ticket a viewer for the same time."""
         for words in ("quiet-otter", " Quiet Otter ", "QUIETOTTER"):
             token = self.signed(words)
-            self.assertEqual((token.role, token.until), ("operator", SIGNED_S))
-        who = self.sessions.visitor(token.text, SIGNED_S - 1.0)
+            self.assertEqual((token.role, token.until), ("operator", SESSION_S))
+        who = self.sessions.authenticate(token.text, SESSION_S - 1.0)
         self.assertEqual((who.name, who.role), ("operator", "operator"))
-        looks = self.sessions.visitor(token.ticket, SIGNED_S - 1.0)
+        looks = self.sessions.authenticate(token.ticket, SESSION_S - 1.0)
         self.assertEqual((looks.role, looks.token_id), ("viewer", who.token_id))
         for text in (token.text, token.ticket):
-            self.assertEqual(self.sessions.visitor(text, SIGNED_S), Visitor())
+            self.assertEqual(self.sessions.authenticate(text, SESSION_S), User())
 
     def test_go_on_at_another_web_node(self) -> None:
         """A pass is valid for minutes at the web node that it names; a renewal there continues the session."""
         pi, nuc = self.node("pi"), self.node("nuc")
         token = self.signed()
-        self.assertEqual(pi.visitor(token.text, 1.0), Visitor())
-        who = self.sessions.visitor(token.text, 1.0)
-        given = self.sessions.passes(who, [uuid("pi")], 1.0)[uuid("pi")]
-        self.assertEqual((given.role, given.until), ("operator", 1.0 + PASS_S))
-        self.assertEqual([each.visitor(given.text, 2.0).role for each in (self.sessions, nuc)], ["anyone"] * 2)
-        there = pi.visitor(given.text, 2.0)
+        self.assertEqual(pi.authenticate(token.text, 1.0), User())
+        who = self.sessions.authenticate(token.text, 1.0)
+        given = self.sessions.issue_peer_tokens(who, [uuid("pi")], 1.0)[uuid("pi")]
+        self.assertEqual((given.role, given.until), ("operator", 1.0 + PEER_TOKEN_S))
+        self.assertEqual([each.authenticate(given.text, 2.0).role for each in (self.sessions, nuc)], ["anyone"] * 2)
+        there = pi.authenticate(given.text, 2.0)
         self.assertEqual((there.name, there.role, there.token_id), (who.name, who.role, who.token_id))
-        self.assertEqual(pi.visitor(given.ticket, 2.0).role, "viewer")
-        renewed = pi.renewed(there, 2.0)
-        self.assertEqual(pi.visitor(renewed.text, SIGNED_S).limit, who.limit)
-        further = pi.passes(pi.visitor(renewed.text, 3.0), [uuid("vaio"), uuid("nuc")], 3.0)
-        self.assertEqual(self.sessions.visitor(further[uuid("vaio")].text, 4.0).token_id, who.token_id)
-        self.assertEqual(nuc.visitor(further[uuid("nuc")].text, 4.0).token_id, who.token_id)
-        refusal = self.assertRaises(Refusal, pi.passes, pi.visitor(given.ticket, 2.0), [uuid("nuc")], 2.0)
+        self.assertEqual(pi.authenticate(given.ticket, 2.0).role, "viewer")
+        renewed = pi.renew_token(there, 2.0)
+        self.assertEqual(pi.authenticate(renewed.text, SESSION_S).limit, who.limit)
+        further = pi.issue_peer_tokens(pi.authenticate(renewed.text, 3.0), [uuid("vaio"), uuid("nuc")], 3.0)
+        self.assertEqual(self.sessions.authenticate(further[uuid("vaio")].text, 4.0).token_id, who.token_id)
+        self.assertEqual(nuc.authenticate(further[uuid("nuc")].text, 4.0).token_id, who.token_id)
+        refusal = self.assertRaises(
+            Refusal, pi.issue_peer_tokens, pi.authenticate(given.ticket, 2.0), [uuid("nuc")], 2.0
+        )
         self.assertEqual(refusal.status, 401)
 
     def test_believe_gateways_alone(self) -> None:
         """A session is invalid while one of its vouchers is no gateway, and only gateways allow signing in."""
         pi, token = self.node("pi"), self.signed()
-        given = self.sessions.passes(self.sessions.visitor(token.text, 1.0), [uuid("pi")], 1.0)[uuid("pi")]
-        renewed = pi.renewed(pi.visitor(given.text, 1.0), 1.0)
-        invited = pi.token(pi.visitor(renewed.text, 1.0), "guest", "viewer", 1.0, 60.0)
+        given = self.sessions.issue_peer_tokens(self.sessions.authenticate(token.text, 1.0), [uuid("pi")], 1.0)[
+            uuid("pi")
+        ]
+        renewed = pi.renew_token(pi.authenticate(given.text, 1.0), 1.0)
+        invited = pi.issue_guest_token(pi.authenticate(renewed.text, 1.0), "guest", "viewer", 1.0, 60.0)
         guest = self.successResultOf(pi.sign_in(invited.text, HOME, 1.0))
         self.gateways.discard(KEYS["vaio"].public)
         for text in (given.text, given.ticket, renewed.text, invited.text, guest.text):
-            self.assertEqual(pi.visitor(text, 2.0), Visitor())
-        self.assertEqual(self.sessions.visitor(token.text, 2.0), Visitor())
+            self.assertEqual(pi.authenticate(text, 2.0), User())
+        self.assertEqual(self.sessions.authenticate(token.text, 2.0), User())
         refusal = self.refused("quiet-otter", 2.0)
         self.assertEqual((refusal.field, refusal.status), ("node", 403))
         self.gateways.add(KEYS["vaio"].public)
-        self.assertEqual(self.sessions.visitor(token.text, 3.0).role, "operator")
+        self.assertEqual(self.sessions.authenticate(token.text, 3.0).role, "operator")
 
     def test_end_what_was_made_of_it(self) -> None:
         """Revoking an invitation ends its sessions, and revoking a session ends its derived tickets."""
-        who = self.sessions.visitor(self.signed().text, 1.0)
-        invitation = self.sessions.token(who, "guest", "phone", 1.0, 600.0)
-        guest = self.sessions.visitor(self.signed(invitation.text, 2.0).text, 2.0)
-        derived = self.sessions.derived(guest, "phone/1", "phone", 2.0, 1e9)
-        self.assertEqual((derived.until, self.sessions.visitor(derived.ticket, 3.0).name), (601.0, "phone/1"))
-        self.sessions.revoke(self.sessions.visitor(invitation.text, 3.0).token_id)
-        self.assertEqual(self.sessions.visitor(derived.ticket, 3.0), Visitor())
+        who = self.sessions.authenticate(self.signed().text, 1.0)
+        invitation = self.sessions.issue_guest_token(who, "guest", "phone", 1.0, 600.0)
+        guest = self.sessions.authenticate(self.signed(invitation.text, 2.0).text, 2.0)
+        derived = self.sessions.issue_derived_token(guest, "phone/1", "phone", 2.0, 1e9)
+        self.assertEqual((derived.until, self.sessions.authenticate(derived.ticket, 3.0).name), (601.0, "phone/1"))
+        self.sessions.revoke(self.sessions.authenticate(invitation.text, 3.0).token_id)
+        self.assertEqual(self.sessions.authenticate(derived.ticket, 3.0), User())
         self.assertEqual(self.refused(invitation.text, 3.0).status, 401)
 
     def test_refuse_what_is_not_the_code(self) -> None:
@@ -111,7 +123,7 @@ class SignedSessionsTests(SynchronousTestCase):
             refusal = self.refused(words)
             self.assertEqual((refusal.status, refusal.field), (401, "code"))
         self.assertIn("swarm web", refusal.remedy)
-        self.assertEqual(self.sessions.visitor("", 0.0), Visitor())
+        self.assertEqual(self.sessions.authenticate("", 0.0), User())
 
     def test_slow_guesses_down(self) -> None:
         """After ten guesses a source must wait even with the correct code; other sources sign in at once."""
@@ -139,12 +151,12 @@ class SignedSessionsTests(SynchronousTestCase):
 
         self.sessions = self.node(password=HASH, check=check)
         storm = [self.sessions.sign_in("wrong", f"10.0.0.{n}", 0.0) for n in range(50)]
-        self.assertEqual(len(asked), AT_ONCE)
-        busy = [self.failureResultOf(each, Refusal).value.status for each in storm[AT_ONCE + WAITING :]]
-        self.assertEqual(busy, [503] * (50 - AT_ONCE - WAITING))
+        self.assertEqual(len(asked), MAX_CHECKS)
+        busy = [self.failureResultOf(each, Refusal).value.status for each in storm[MAX_CHECKS + MAX_WAITING_CHECKS :]]
+        self.assertEqual(busy, [503] * (50 - MAX_CHECKS - MAX_WAITING_CHECKS))
         while asked:
             asked.pop(0).callback(False)
-        for each in storm[: AT_ONCE + WAITING]:
+        for each in storm[: MAX_CHECKS + MAX_WAITING_CHECKS]:
             self.failureResultOf(each, Refusal)
         many = [self.sessions.sign_in("wrong", HOME, 0.0) for _ in range(11)]
         self.assertEqual(self.failureResultOf(many.pop(), Refusal).value.status, 429)
@@ -153,42 +165,46 @@ class SignedSessionsTests(SynchronousTestCase):
 
     def test_invite(self) -> None:
         """An invitation signs in with its role and until its end; its ticket and an expired one do not."""
-        invitation = self.sessions.token(OPERATOR, "guest", "viewer", 0.0, 100.0)
+        invitation = self.sessions.issue_guest_token(OPERATOR, "guest", "viewer", 0.0, 100.0)
         token = self.signed(invitation.text, 10.0)
         self.assertEqual((token.role, token.until), ("viewer", 100.0))
         self.assertNotEqual(token.text, invitation.text)
-        self.assertEqual(self.sessions.visitor(token.text, 50.0).name, "guest")
+        self.assertEqual(self.sessions.authenticate(token.text, 50.0).name, "guest")
         self.assertEqual(self.refused(invitation.ticket, 10.0).status, 401)
         self.assertEqual(self.refused(invitation.text, 100.0).status, 401)
-        long = self.sessions.token(OPERATOR, "guest", "viewer", 0.0, 10 * SIGNED_S)
-        self.assertEqual(self.signed(long.text, 1.0).until, SIGNED_S + 1.0)
+        long = self.sessions.issue_guest_token(OPERATOR, "guest", "viewer", 0.0, 10 * SESSION_S)
+        self.assertEqual(self.signed(long.text, 1.0).until, SESSION_S + 1.0)
 
     def test_renew(self) -> None:
         """A valid token can be renewed up to thirty days after signing in, within the same session."""
         token, now = self.signed(), 0.0
-        while token.until < MAX_SIGNED_S:
+        while token.until < MAX_SESSION_S:
             now = token.until - 1.0
-            token = self.sessions.renewed(self.sessions.visitor(token.text, now), now)
-            self.assertEqual(token.until, min(now + SIGNED_S, MAX_SIGNED_S))
-        who = self.sessions.visitor(token.text, now)
-        self.assertEqual(self.sessions.renewed(who, now + 5.0).until, MAX_SIGNED_S)
+            token = self.sessions.renew_token(self.sessions.authenticate(token.text, now), now)
+            self.assertEqual(token.until, min(now + SESSION_S, MAX_SESSION_S))
+        who = self.sessions.authenticate(token.text, now)
+        self.assertEqual(self.sessions.renew_token(who, now + 5.0).until, MAX_SESSION_S)
         self.sessions.revoke(who.token_id, who.until)
-        self.assertEqual(self.sessions.visitor(self.signed(now=now).text, now).role, "operator")
-        self.assertEqual(self.sessions.visitor(token.text, now), Visitor())
+        self.assertEqual(self.sessions.authenticate(self.signed(now=now).text, now).role, "operator")
+        self.assertEqual(self.sessions.authenticate(token.text, now), User())
 
     def test_renew_no_further_than_invited(self) -> None:
         """A guest cannot renew beyond the invitation; a ticket and an unknown visitor cannot renew."""
-        invitation = self.sessions.token(OPERATOR, "guest", "viewer", 0.0, SIGNED_S + 10.0)
+        invitation = self.sessions.issue_guest_token(OPERATOR, "guest", "viewer", 0.0, SESSION_S + 10.0)
         token = self.signed(invitation.text, 1.0)
-        self.assertEqual(token.until, SIGNED_S + 1.0)
-        self.assertEqual(self.sessions.renewed(self.sessions.visitor(token.text, 9.0), 9.0).until, SIGNED_S + 9.0)
-        self.assertEqual(self.sessions.renewed(self.sessions.visitor(token.text, 99.0), 99.0).until, SIGNED_S + 10.0)
+        self.assertEqual(token.until, SESSION_S + 1.0)
+        self.assertEqual(
+            self.sessions.renew_token(self.sessions.authenticate(token.text, 9.0), 9.0).until, SESSION_S + 9.0
+        )
+        self.assertEqual(
+            self.sessions.renew_token(self.sessions.authenticate(token.text, 99.0), 99.0).until, SESSION_S + 10.0
+        )
         for text in (token.ticket, ""):
-            refusal = self.assertRaises(Refusal, self.sessions.renewed, self.sessions.visitor(text, 9.0), 9.0)
+            refusal = self.assertRaises(Refusal, self.sessions.renew_token, self.sessions.authenticate(text, 9.0), 9.0)
             self.assertEqual((refusal.field, refusal.status), ("Authorization", 401))
 
 
-OPERATOR = Visitor("operator", "operator")
+OPERATOR = User("operator", "operator")
 
 
 class FactoryTests(SynchronousTestCase):
@@ -197,7 +213,7 @@ class FactoryTests(SynchronousTestCase):
         settings = Settings.from_mapping({"node": {"name": "vaio", "team_key": "x" * 20}, "web": web}, "vaio.toml")
         entangled = SimpleNamespace(watch=lambda *what, **how: None, identity=Identity(bytes(32)))
         node, team = SimpleNamespace(entangled=entangled), SimpleNamespace(may_vouch=lambda public: True)
-        return sessions(settings, cast(Any, node), None, random.Random(1), cast(Any, team))
+        return make_sessions(settings, cast(Any, node), None, random.Random(1), cast(Any, team))
 
     def test_have_the_code_of_the_settings(self) -> None:
         """The code comes from the settings; otherwise a random code without ambiguous letters is used."""

@@ -11,25 +11,25 @@ from twisted.trial.unittest import SynchronousTestCase
 from middleware.entangled.identity import Identity
 from tests.webnode.memory import MemoryDesk, MemoryInvites
 from webnode.app import create_app
-from webnode.audit import Audit
-from webnode.board import Board
+from webnode.audit import AuditLog
 from webnode.fallback import Fallbacks, Page
-from webnode.password import hashed, is_password
+from webnode.password import hash_password, verify_password
+from webnode.services import Services
 from webnode.session import SignedSessions
-from webnode.state import state_of
+from webnode.state import format_state
 from webnode.token import MAX_TEXT, TokenKey
 
 
 class SessionRouteTests(SynchronousTestCase):
     def setUp(self) -> None:
-        check: Any = lambda text, word: succeed(is_password(text, word))  # noqa: E731
-        password = hashed("correct horse", bytes(16), 4)
+        check: Any = lambda text, word: succeed(verify_password(text, word))  # noqa: E731
+        password = hash_password("correct horse", bytes(16), 4)
         sessions = SignedSessions(
             TokenKey(Identity(bytes(32))), lambda _: True, "quiet-otter", password, random.Random(1), check
         )
-        self.audit = Audit()
-        state = state_of([], [], {}, node="vaio")
-        self.board = Board(MemoryDesk(), sessions, self.audit)
+        self.audit = AuditLog()
+        state = format_state([], [], {}, node="vaio")
+        self.board = Services(MemoryDesk(), sessions, self.audit)
         self.client = create_app(lambda: state, self.board, wall=lambda: 1000.0).test_client()
 
     def signed(self, **body: str) -> dict[str, Any]:
@@ -93,8 +93,8 @@ class SessionRouteTests(SynchronousTestCase):
             answer = self.client.post("/api/v1/session", json=body)
             self.assertEqual(answer.status_code, status, body)
             self.assertNotIn("s3cr3t", answer.get_data(as_text=True))
-        self.assertNotIn("s3cr3t", str(self.audit.newest(100)))
-        self.assertIn("401", str(self.audit.newest(100)))
+        self.assertNotIn("s3cr3t", str(self.audit.list_newest(100)))
+        self.assertIn("401", str(self.audit.list_newest(100)))
 
     def test_answer_each_visitor_for_itself(self) -> None:
         """Two visitors with the same idempotency key get separate answers."""

@@ -8,8 +8,8 @@ from typing import Any
 
 from twisted.trial.unittest import SynchronousTestCase
 
-from swarmnode.assembly import assembled
-from swarmnode.rehearsal import VirtualTeam
+from swarmnode.assembly import assemble_node
+from swarmnode.simulated_team import SimulatedTeam
 from webnode.errors import Refusal
 from webnode.routes.settings import change_settings, read_settings
 
@@ -18,7 +18,7 @@ KEYS = ["description", "presence_lease", "capabilities", "camera_fps"]
 
 class TunerTests(SynchronousTestCase):
     def setUp(self) -> None:
-        self.team = VirtualTeam(4, dogs=("dog1", "dog2"))
+        self.team = SimulatedTeam(4, dogs=("dog1", "dog2"))
         self.addCleanup(self.team.stop)
         self.node = self.team.services["dog1"].assembly.node
 
@@ -79,7 +79,7 @@ class TunerTests(SynchronousTestCase):
                 self.team.clock.advance(0.1)
                 seconds += 0.1
             self.assertTrue(earliest < seconds < latest, seconds)
-            self.team.add("dog1")
+            self.team.add_node("dog1")
             self.team.clock.advance(1.0)
             self.node = self.team.services["dog1"].assembly.node
 
@@ -125,9 +125,9 @@ class TunerTests(SynchronousTestCase):
         """Changed settings survive a restart from the store, and an invalid stored value is ignored."""
         self.change(description="lame", presence_lease=2.5)
         service = self.team.services["dog1"]
-        seams = replace(service._seams, rng=random.Random(1))
-        again = assembled(service.settings, seams).node
+        seams = replace(service._dependencies, rng=random.Random(1))
+        again = assemble_node(service.settings, seams).node
         self.assertEqual((again.presence.device.description, again.entangled.lease), ("lame", 2.5))
         for note in (b"\xc1", b"\x01", b"\x81\xaedescription\x05", b"\x81\xb0presence_lease!!\x05"):
-            seams.store.note("tuning", note)
-            self.assertEqual(assembled(service.settings, seams).node.presence.device.description, "")
+            seams.store.set_note("tuning", note)
+            self.assertEqual(assemble_node(service.settings, seams).node.presence.device.description, "")

@@ -9,9 +9,9 @@ from typing import Any
 
 from twisted.trial.unittest import SynchronousTestCase
 
-from middleware.consensus.verdict import Reported
-from middleware.diagnostics.explanation import Difference, Explanation, Ruling
-from webnode.state import Departed, group_view, state_of
+from middleware.consensus.decision_record import RecordedReport
+from middleware.diagnostics.explanation import Difference, EpochExplanation, Explanation
+from webnode.state import DepartedDevices, format_state, make_group_view
 
 
 def device(number: int, **more: Any) -> dict[str, Any]:
@@ -30,13 +30,13 @@ class StateTests(SynchronousTestCase):
         rng = random.Random(1)
         for _ in range(6):
             rng.shuffle(records)
-            names = [view["name"] for view in state_of(records, [], {})["devices"]]
+            names = [view["name"] for view in format_state(records, [], {})["devices"]]
             self.assertEqual(names, ["dog2", "dog3", "dog4", "dog1"])
 
     def test_name_objective(self) -> None:
         """A device's objective is the title of its task, or the id of an unknown task."""
         tasks = [{"id": "t1", "title": "Find it", "created": 5}]
-        views = state_of([device(1, task="t1"), device(2, task="t9"), device(3)], tasks, {})["devices"]
+        views = format_state([device(1, task="t1"), device(2, task="t9"), device(3)], tasks, {})["devices"]
         self.assertEqual([view["objective"] for view in views], ["Find it", "t9", ""])
 
     def test_tell_where_devices_are(self) -> None:
@@ -49,14 +49,14 @@ class StateTests(SynchronousTestCase):
             *(({"x": x, "y": 1}, None) for x in ("1", None, float("nan"), float("inf"), 1e7, 10**400, True)),
             *((said, None) for said in ({}, None, [1, 2], {"y": 1}, {"lat": 91, "lon": 0}, {"lat": 0, "lon": 181})),
         ):
-            (view,) = state_of([device(1, position=said)], [], {})["devices"]
+            (view,) = format_state([device(1, position=said)], [], {})["devices"]
             self.assertEqual(view["position"], told, said)
 
     def test_list_newest_task_first(self) -> None:
         """Tasks are listed newest first, and a result keeps the finishing device and the duration."""
         result = {"by": "dog2", "took": 41.5}
         tasks = [{"id": "a", "created": 1, "result": result, "status": "COMPLETED"}, {"id": "b", "created": 2}]
-        views = state_of([], tasks, {})["tasks"]
+        views = format_state([], tasks, {})["tasks"]
         self.assertEqual([view["id"] for view in views], ["b", "a"])
         self.assertEqual(views[1]["result"], result)
         self.assertEqual([view["status"] for view in views], ["UNKNOWN", "COMPLETED"])
@@ -74,7 +74,7 @@ class StateTests(SynchronousTestCase):
             "status": {},
             "since": None,
         }
-        state = state_of(
+        state = format_state(
             [bad, {}], [{"id": 5}, {"id": "t", "result": 3, "note": 1}], {"t": [{"cost": "near"}], "u": []}
         )
         json.dumps(state, allow_nan=False)
@@ -86,14 +86,16 @@ class StateTests(SynchronousTestCase):
 class GroupTests(SynchronousTestCase):
     def test_agree(self) -> None:
         """If all members name the same agent, it is the assigned agent, and the costs share one scale."""
-        view = group_view("t", "T", [member(3, 2.0, 2), member(1, 1.0, 2), member(2, 0.5, 2)])
+        view = make_group_view("t", "T", [member(3, 2.0, 2), member(1, 1.0, 2), member(2, 0.5, 2)])
         self.assertEqual((view["assigned"], view["agree"], view["of"]), ("dog2", 3, 3))
         self.assertEqual([each["share"] for each in view["members"]], [0.5, 0.25, 1.0])
         self.assertEqual((view["differ"], view["undecided"]), ([], []))
 
     def test_differ(self) -> None:
         """Members with another choice and undecided members are listed by name; no cost means no share."""
-        view = group_view("t", "T", [member(1, 1.0, 1), member(2, 0.5, 2), member(3, 0.7, 2), member(4, None, None)])
+        view = make_group_view(
+            "t", "T", [member(1, 1.0, 1), member(2, 0.5, 2), member(3, 0.7, 2), member(4, None, None)]
+        )
         self.assertEqual((view["assigned"], view["agree"], view["of"]), ("dog2", 2, 4))
         self.assertEqual((view["differ"], view["undecided"]), (["dog1"], ["dog4"]))
         self.assertIsNone(view["members"][3]["share"])
@@ -101,12 +103,12 @@ class GroupTests(SynchronousTestCase):
     def test_decide_even_votes(self) -> None:
         """Equal votes give the lowest uuid, in any order of the members."""
         members = [member(1, 1.0, 2), member(2, 1.0, 1)]
-        self.assertEqual(group_view("t", "T", members)["assigned"], "dog1")
-        self.assertEqual(group_view("t", "T", members[::-1])["assigned"], "dog1")
+        self.assertEqual(make_group_view("t", "T", members)["assigned"], "dog1")
+        self.assertEqual(make_group_view("t", "T", members[::-1])["assigned"], "dog1")
 
     def test_be_undecided(self) -> None:
         """A group without a named winner has no assigned agent, and zero costs cause no division by zero."""
-        view = group_view("t", "T", [member(1, 0.0, None)])
+        view = make_group_view("t", "T", [member(1, 0.0, None)])
         self.assertEqual((view["assigned"], view["agree"]), ("", 0))
         self.assertEqual(view["members"][0]["share"], 0.0)
 
@@ -114,11 +116,11 @@ class GroupTests(SynchronousTestCase):
 class WhyTests(SynchronousTestCase):
     def test_rows_of_a_decision(self) -> None:
         """A decision has a row for each reporting, silent or differing device, with a note."""
-        reports = [Reported("02" * 20, "dog2", 0.5), Reported("01" * 20, "dog1", 1.5)]
+        reports = [RecordedReport("02" * 20, "dog2", 0.5), RecordedReport("01" * 20, "dog1", 1.5)]
         differ = (Difference("dog1", "names dog1"), Difference("dog4", "names dog1"))
         head = (2, "02" * 20, "dog2", ("dog2", "dog3"), 4, differ, "nearest", "1", "nobody acted before")
-        ruling = Ruling(*head, ("dog1",), "1a2b", 3, 2, tuple(reports), ("dog3",))
-        (view,) = state_of([], [{"id": "t", "why": asdict(Explanation("t", (ruling,)))}], {})["tasks"]
+        ruling = EpochExplanation(*head, ("dog1",), "1a2b", 3, 2, tuple(reports), ("dog3",))
+        (view,) = format_state([], [{"id": "t", "why": asdict(Explanation("t", (ruling,)))}], {})["tasks"]
         (why,) = view["why"]
         self.assertEqual((why["chosen"], why["agree"], why["of"], why["rule"]), ("dog2", 2, 4, "nearest 1"))
         self.assertEqual(
@@ -132,24 +134,24 @@ class WhyTests(SynchronousTestCase):
         )
         self.assertEqual(why["differ"], ["dog1", "dog4"])
         json.dumps(view, allow_nan=False)
-        self.assertEqual(state_of([], [{"id": "t", "why": 7}], {})["tasks"][0]["why"], [])
+        self.assertEqual(format_state([], [{"id": "t", "why": 7}], {})["tasks"][0]["why"], [])
 
 
 class DepartedTests(SynchronousTestCase):
     def test_remember_for_a_minute(self) -> None:
         """A device that left is listed as gone at its place for sixty seconds."""
-        departed = Departed()
+        departed = DepartedDevices()
         both = [device(1), device(2, status="EXECUTING")]
-        departed.of(both, 100.0)
-        state = state_of(both[1:], [], {}, departed=departed.of(both[1:], 101.0))
+        departed.update(both, 100.0)
+        state = format_state(both[1:], [], {}, departed=departed.update(both[1:], 101.0))
         self.assertEqual([(v["name"], v["status"], v["gone"]) for v in state["devices"]][0], ("dog1", "GONE", 101.0))
-        self.assertEqual([v["gone"] for v in departed.of(both[1:], 160.9)], [101.0])
-        self.assertEqual(departed.of(both[1:], 161.0), [])
+        self.assertEqual([v["gone"] for v in departed.update(both[1:], 160.9)], [101.0])
+        self.assertEqual(departed.update(both[1:], 161.0), [])
 
     def test_forget_when_back(self) -> None:
         """A device that returns is present at once, and its next loss has a new time."""
-        departed = Departed()
-        departed.of([device(1)], 1.0)
-        self.assertEqual(len(departed.of([], 2.0)), 1)
-        self.assertEqual(departed.of([device(1)], 3.0), [])
-        self.assertEqual([v["gone"] for v in departed.of([], 4.0)], [4.0])
+        departed = DepartedDevices()
+        departed.update([device(1)], 1.0)
+        self.assertEqual(len(departed.update([], 2.0)), 1)
+        self.assertEqual(departed.update([device(1)], 3.0), [])
+        self.assertEqual([v["gone"] for v in departed.update([], 4.0)], [4.0])

@@ -1,40 +1,40 @@
-"""Tests of ``webnode.survey`` and ``middleware.diagnostics.survey`` with nodes in virtual time."""
+"""Tests of ``webnode.diagnostics`` and ``middleware.diagnostics.node_diagnostics`` with nodes in virtual time."""
 
 from __future__ import annotations
 
 from typing import Any
 
-from middleware.diagnostics.survey import LINKS, NETWORK, answer_survey, network
-from middleware.entangled.control.link import Link
-from middleware.entangled.network.switchboard import Weather
-from middleware.entangled.record import hashed_key
-from middleware.entangled.wire.door import UNPROTECTED
+from middleware.diagnostics.node_diagnostics import LINKS_METHOD, NETWORK_METHOD, describe_network, expose_diagnostics
+from middleware.entangled.control.link_quality import LinkQuality
+from middleware.entangled.network.switchboard import LinkConditions
+from middleware.entangled.record import hash_key
+from middleware.entangled.wire.admission_check import OPEN_TEAM_WARNING
 from middleware.frontend.client import TeamClient
 from middleware.node import SwarmNode
-from tests.fleet import FleetCase, SwarmFleet
+from tests.fleet import FleetCase, SwarmTeam
 from tests.webnode.guests import Guests
 from tests.webnode.memory import MemoryDesk, MemorySurvey
 from webnode.app import create_app
-from webnode.board import Board
+from webnode.diagnostics import ANSWER_LIMIT_S, Diagnostics
 from webnode.errors import Refusal
-from webnode.state import state_of
-from webnode.survey import PATIENCE_S, TeamSurvey
+from webnode.services import Services
+from webnode.state import format_state
 
 
 class SurveyTests(FleetCase):
     def setUp(self) -> None:
         super().setUp()
-        self.team: SwarmFleet = self.swarm(3, weather=Weather(delay_s=0.003))
+        self.team: SwarmTeam = self.swarm(3, weather=LinkConditions(delay_s=0.003))
         self.team.run(3)
         for node in self.team.nodes:
-            answer_survey(node)
+            expose_diagnostics(node)
         self.dogs = [node.uuid for node in self.team.nodes]
         client = TeamClient(self.team.nodes[0])
         self.team.run(1)
-        self.survey = TeamSurvey(self.team.nodes[0], client)
+        self.survey = Diagnostics(self.team.nodes[0], client)
 
     def network(self) -> Any:
-        return self.done(self.team, self.survey.network(), PATIENCE_S + 1)
+        return self.done(self.team, self.survey.query_network(), ANSWER_LIMIT_S + 1)
 
     def test_tell_who_knows_whom(self) -> None:
         """Each of three nodes, in the order of joining, lists the two others with round trip and last contact."""
@@ -55,13 +55,13 @@ class SurveyTests(FleetCase):
                 asked.append(node.uuid)
                 return {"known": 2}
 
-            node.entangled.endpoint.expose(NETWORK, answer)
+            node.entangled.endpoint.expose(NETWORK_METHOD, answer)
 
         for node in self.team.nodes[1:]:
             expose(node)
-        waiting: list[Any] = [self.survey.network() for _ in range(20)]
+        waiting: list[Any] = [self.survey.query_network() for _ in range(20)]
         self.team.run(0.5)
-        waiting.append(self.survey.network())
+        waiting.append(self.survey.query_network())
         self.assertEqual(len([self.successResultOf(each) for each in waiting]), 21)
         self.assertEqual(sorted(asked), sorted(self.dogs[1:]))
         self.team.run(1)
@@ -70,9 +70,9 @@ class SurveyTests(FleetCase):
 
     def test_name_the_silent(self) -> None:
         """A device that does not answer is listed as silent, and the others are shown in time."""
-        self.team.nodes[2].vanish()
-        waiting = self.survey.network()
-        self.team.run(PATIENCE_S + 0.3)
+        self.team.nodes[2].stop_silently()
+        waiting = self.survey.query_network()
+        self.team.run(ANSWER_LIMIT_S + 0.3)
         told: Any = self.successResultOf(waiting)
         self.assertEqual((list(told["devices"]), told["silent"]), (self.dogs[:2], self.dogs[2:]))
 
@@ -86,7 +86,7 @@ class SurveyTests(FleetCase):
     def test_believe_nothing_unlawful(self) -> None:
         """Answers of the wrong shape are replaced by empty ones."""
         for told in ({"contacts": [3, {"uuid": 5}, {"uuid": "ab", "rtt_ms": "x"}], "lookups": 7, "sent": []}, "no", {}):
-            self.team.nodes[1].entangled.endpoint.expose(NETWORK, lambda peer, told=told: told)
+            self.team.nodes[1].entangled.endpoint.expose(NETWORK_METHOD, lambda peer, told=told: told)
             self.team.run(2)
             view = self.network()["devices"].get(self.dogs[1])
             if isinstance(told, dict):
@@ -97,7 +97,7 @@ class SurveyTests(FleetCase):
                 self.assertIsNone(view)
 
     def links(self) -> Any:
-        return self.done(self.team, self.survey.links(), PATIENCE_S + 1)
+        return self.done(self.team, self.survey.query_links(), ANSWER_LIMIT_S + 1)
 
     def test_tell_how_each_is_reached(self) -> None:
         """Each of three nodes lists its paths to the two others; a later read has their scores."""
@@ -118,7 +118,9 @@ class SurveyTests(FleetCase):
         self.team.run(3)
         far = self.team.address(2)
         for near in (0, 1):
-            self.team.board.set_weather(self.team.address(near), far, Weather(delay_s=0.15, jitter_s=0.02))
+            self.team.switchboard.set_conditions(
+                self.team.address(near), far, LinkConditions(delay_s=0.15, jitter_s=0.02)
+            )
         for _ in range(6):
             self.team.run(2)
             told = self.links()
@@ -126,7 +128,7 @@ class SurveyTests(FleetCase):
         self.assertEqual(scores["dog1"], 100)
         self.assertTrue(0 < scores["dog2"] < 80, scores)
         way = next(each for each in told["devices"][self.dogs[0]]["links"] if each["name"] == "dog2")
-        judged = Link(way["loss"], way["rtt_ms"] / 1000, way["jitter_ms"] / 1000, False).score
+        judged = LinkQuality(way["loss"], way["rtt_ms"] / 1000, way["jitter_ms"] / 1000, False).score
         self.assertEqual(way["score"], judged)
 
     def test_carrying_costs(self) -> None:
@@ -135,10 +137,10 @@ class SurveyTests(FleetCase):
             {"id": uuid, "way": way, "by": by, "loss": 0.0, "round_trip": 0.002, "jitter": 0.0}
             for uuid, way, by in ((self.dogs[0], "punched", ""), (self.dogs[2], "carried", self.dogs[0]))
         ]
-        self.team.nodes[1].entangled.endpoint.expose(LINKS, lambda peer: {"links": ways, "refusals": []})
+        self.team.nodes[1].entangled.endpoint.expose(LINKS_METHOD, lambda peer: {"links": ways, "refusals": []})
         punched, carried = self.links()["devices"][self.dogs[1]]["links"]
         self.assertEqual((punched["score"], punched["by"]), (100, ""))
-        self.assertEqual((carried["score"], carried["by"]), (Link(0.0, 0.002, 0.0, True).score, "dog0"))
+        self.assertEqual((carried["score"], carried["by"]), (LinkQuality(0.0, 0.002, 0.0, True).score, "dog0"))
         self.assertLess(carried["score"], 100)
 
     def test_believe_no_unlawful_way(self) -> None:
@@ -146,7 +148,7 @@ class SurveyTests(FleetCase):
         way = {"id": "ab", "way": "magic", "loss": 7, "round_trip": float("nan"), "for": -1, "by": 3, "address": ["x"]}
         refusal = {"who": "x\n" * 99, "side": 3, "code": None, "reason": "why; do; this", "ago": "y", "count": 1.5}
         answer = {"links": [way, {"id": 4}, 5], "refusals": [refusal, "x"]}
-        self.team.nodes[1].entangled.endpoint.expose(LINKS, lambda peer: answer)
+        self.team.nodes[1].entangled.endpoint.expose(LINKS_METHOD, lambda peer: answer)
         view = self.links()["devices"][self.dogs[1]]
         ((only,), (refused,)) = view["links"], view["refusals"]
         self.assertEqual((only["way"], only["loss"], only["score"], only["for_s"]), ("none", 1.0, 0, None))
@@ -155,14 +157,14 @@ class SurveyTests(FleetCase):
 
     def test_open_team(self) -> None:
         """An open team lists the protections that it lacks."""
-        told: Any = self.survey.team()
-        self.assertEqual((told["kind"], told["unprotected"]), ("open", UNPROTECTED))
+        told: Any = self.survey.describe_team()
+        self.assertEqual((told["kind"], told["unprotected"]), ("open", OPEN_TEAM_WARNING))
 
     def test_tell_what_is_stored(self) -> None:
         """The inventory of another node and of the own node counts records by kind and lists the newest."""
-        self.done(self.team, self.team.nodes[1].entangled.put(hashed_key("a"), "note", b"\xa1x", "team"), 1)
+        self.done(self.team, self.team.nodes[1].entangled.put(hash_key("a"), "note", b"\xa1x", "team"), 1)
         for uuid in self.dogs[:2]:
-            told: Any = self.done(self.team, self.survey.inventory(uuid), 1)
+            told: Any = self.done(self.team, self.survey.query_inventory(uuid), 1)
             self.assertEqual(told["kinds"], {"devices": 3, "other": 1})
             self.assertEqual((told["records"], told["deleted"]), (4, 0))
             kind, name, size, lifetime = told["newest"][0]
@@ -171,46 +173,46 @@ class SurveyTests(FleetCase):
 
     def test_say_who_did_not_answer(self) -> None:
         """A silent device is answered with 504, a device without the method and a missing device with 409."""
-        self.assertEqual(self.assertRaises(Refusal, self.survey.inventory, "ff").status, 409)
+        self.assertEqual(self.assertRaises(Refusal, self.survey.query_inventory, "ff").status, 409)
         self.team.nodes[1].entangled.endpoint.expose("device.inventory", _refuse)
-        waiting = self.survey.inventory(self.dogs[1])
+        waiting = self.survey.query_inventory(self.dogs[1])
         self.team.run(1)
         self.assertEqual(self.failureResultOf(waiting, Refusal).value.status, 409)
-        self.team.nodes[2].vanish()
-        waiting = self.survey.inventory(self.dogs[2])
-        self.team.run(PATIENCE_S + 0.3)
+        self.team.nodes[2].stop_silently()
+        waiting = self.survey.query_inventory(self.dogs[2])
+        self.team.run(ANSWER_LIMIT_S + 0.3)
         refusal = self.failureResultOf(waiting, Refusal).value
         self.assertEqual((refusal.status, refusal.problem), (504, "dog2 did not answer"))
 
     def test_remember_lookups(self) -> None:
         """A lookup is recorded with its requests, hops and results."""
-        large = self.swarm(12, weather=Weather(delay_s=0.003))
+        large = self.swarm(12, weather=LinkConditions(delay_s=0.003))
         large.run(3)
         node: SwarmNode = large.nodes[11]
-        self.done(large, node.entangled.find_node(hashed_key("x")), 1)
-        lookups = network(node)["lookups"]
+        self.done(large, node.entangled.find_node(hash_key("x")), 1)
+        lookups = describe_network(node)["lookups"]
         self.assertTrue(lookups)
         for each in lookups:
             self.assertTrue(1 <= each["hops"] <= each["asked"] and each["found"] == 8 and each["ms"] > 0, each)
 
     def test_ask_by_http(self) -> None:
         """Viewers read the surveys; an unknown device gives 404, a silent one 504, a node without surveys 409."""
-        state = state_of([{"uuid": "01", "name": "dog1"}, {"uuid": "02", "name": "dog2"}], [], {})
+        state = format_state([{"uuid": "01", "name": "dog1"}, {"uuid": "02", "name": "dog2"}], [], {})
         others: Any = ({"here": "01", "devices": {}, "silent": []}, {"kind": "open", "unprotected": "much"})
         survey = MemorySurvey({"devices": {}, "silent": ["02"]}, {"01": {"records": 4}}, *others)
 
-        def asked(board: Board, path: str) -> tuple[int, Any]:
+        def asked(board: Services, path: str) -> tuple[int, Any]:
             client = create_app(lambda: state, board).test_client()
             answer = client.get(f"/api/v1/{path}?ticket=viewer", headers={"Host": "localhost"})
             return answer.status_code, answer.get_json()
 
-        board = Board(MemoryDesk(), Guests(), survey=survey)
+        board = Services(MemoryDesk(), Guests(), survey=survey)
         self.assertEqual(asked(board, "network"), (200, {"devices": {}, "silent": ["02"]}))
         self.assertEqual((asked(board, "links"), asked(board, "team")), ((200, others[0]), (200, others[1])))
         self.assertEqual(asked(board, "devices/01/inventory"), (200, {"records": 4}))
         self.assertEqual([asked(board, f"devices/{uuid}/inventory")[0] for uuid in ("02", "03")], [504, 404])
         for path in ("network", "links", "team"):
-            self.assertEqual(asked(Board(MemoryDesk(), Guests()), path)[0], 409)
+            self.assertEqual(asked(Services(MemoryDesk(), Guests()), path)[0], 409)
 
 
 def _refuse(peer: object, too: int, many: int) -> None:

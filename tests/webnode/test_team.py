@@ -1,4 +1,4 @@
-"""Tests of ``webnode.team``: the answers of devices to requests, in a small team in memory."""
+"""Tests of ``webnode.team_control``: the answers of devices to requests, in a small team in memory."""
 
 from __future__ import annotations
 
@@ -9,17 +9,17 @@ from typing import Any
 from twisted.internet.defer import Deferred
 from twisted.trial.unittest import SynchronousTestCase
 
-from agents.catalogue import DEMO, TASKS
+from agents.catalogue import DEMO_TASK, TASKS
 from middleware.frontend.client import LOOKUP_S, TeamClient
 from middleware.tasks.task import TASKS as ALL_TASKS
-from swarmnode.rehearsal import VirtualTeam
+from swarmnode.simulated_team import SimulatedTeam
 from webnode.errors import Refusal
-from webnode.team import PATIENCE, PLACING, TeamDesk
+from webnode.team_control import ANSWER_LIMIT_S, PLACE_TARGET_S, TeamControl
 
 
 class TeamDeskTests(SynchronousTestCase):
     def setUp(self) -> None:
-        self.team = VirtualTeam(3, dogs=("dog1", "dog2"))
+        self.team = SimulatedTeam(3, dogs=("dog1", "dog2"))
         self.addCleanup(self.team.stop)
         self.desk = self.team.desk
 
@@ -27,7 +27,7 @@ class TeamDeskTests(SynchronousTestCase):
         """Return the uuid of a device."""
         return str(self.team.services[name].assembly.node.uuid)
 
-    def refusal(self, asked: Deferred[Any], seconds: float = PATIENCE + 0.2) -> Refusal:
+    def refusal(self, asked: Deferred[Any], seconds: float = ANSWER_LIMIT_S + 0.2) -> Refusal:
         """Return the error of a request."""
         self.team.clock.advance(seconds)
         refusal = self.failureResultOf(asked, Refusal).value
@@ -36,38 +36,38 @@ class TeamDeskTests(SynchronousTestCase):
 
     def test_say_who_has_a_message(self) -> None:
         """A message to all returns its recipients, and the reason for each device without it."""
-        told = self.desk.message("", "sit")
+        told = self.desk.send_message("", "sit")
         self.team.clock.advance(0.1)
         self.assertEqual(self.successResultOf(told), {"delivered": ["dog1", "dog2", "vaio"], "failed": {}})
-        self.team.silence("dog2")
-        told = self.desk.message("", "stay")
-        self.team.clock.advance(PATIENCE + 0.2)
+        self.team.block_datagrams("dog2")
+        told = self.desk.send_message("", "stay")
+        self.team.clock.advance(ANSWER_LIMIT_S + 0.2)
         answer = self.successResultOf(told)
         self.assertEqual(answer["delivered"], ["dog1", "vaio"])
         self.assertEqual(list(answer["failed"]), ["dog2"])
 
     def test_device_that_vanishes_is_told(self) -> None:
         """A device that dies during a request is reported within the patience of the page."""
-        orders: list[tuple[Any, Any]] = [(self.desk.message, "sit"), (self.desk.disconnect, 5.0)]
+        orders: list[tuple[Any, Any]] = [(self.desk.send_message, "sit"), (self.desk.disconnect, 5.0)]
         for order, what in orders:
             uuid = self.uuid("dog2")
             self.team.kill("dog2")
             refusal = self.refusal(order(uuid, what))
             self.assertEqual((refusal.field, refusal.status), ("device", 409))
             self.assertEqual(refusal.problem, "dog2 left during the request")
-            self.team.add("dog2")
+            self.team.add_node("dog2")
             self.team.clock.advance(3.0)
 
     def test_device_that_is_silent_is_told(self) -> None:
         """A device that is present but does not answer is reported with 504."""
         presence = self.team.services["dog2"].assembly.node
         presence.entangled.endpoint.expose("device.message", lambda peer, text: Deferred(), changes=True)
-        refusal = self.refusal(self.desk.message(self.uuid("dog2"), "sit"))
+        refusal = self.refusal(self.desk.send_message(self.uuid("dog2"), "sit"))
         self.assertEqual((refusal.status, refusal.problem), (504, "dog2 did not answer"))
 
     def test_device_that_says_no_is_told(self) -> None:
         """A device's refusal is forwarded in its words, and an unknown uuid is reported as a lost device."""
-        refusal = self.refusal(self.desk.message(self.uuid("dog2"), "x" * 300))
+        refusal = self.refusal(self.desk.send_message(self.uuid("dog2"), "x" * 300))
         self.assertEqual(refusal.status, 409)
         self.assertIn("dog2 refused: a message is a text of 1 to 200 characters", refusal.problem)
         self.assertIn("has left the network", self.refusal(self.desk.disconnect("ab" * 16, 5.0)).problem)
@@ -123,17 +123,17 @@ class TeamDeskTests(SynchronousTestCase):
         """If the web node dies after it started the demonstration, the simulator still places the target."""
         self.team.run_demo()
         self.team.clock.advance(1.0)
-        self.assertIsNone(self.team.truth()["target"])
+        self.assertIsNone(self.team.get_true_state()["target"])
         self.team.kill("vaio")
-        self.team.clock.advance(PLACING)
-        self.assertIsNotNone(self.team.truth()["target"])
+        self.team.clock.advance(PLACE_TARGET_S)
+        self.assertIsNotNone(self.team.get_true_state()["target"])
 
     def test_lift_a_robot(self) -> None:
         """A robot is moved to the given place, and a taken place is rejected with the simulator's error."""
         moved = self.desk.move_robot("dog1", 1.0, 1.0, 0.5)
         self.team.clock.advance(0.1)
         self.assertIsNone(moved.addCallback(lambda _: None).result)
-        dog = self.team.truth()["dogs"][0]
+        dog = self.team.get_true_state()["dogs"][0]
         self.assertLess(abs(dog["x"] - 1.0) + abs(dog["y"] - 1.0), 0.05)
         refusal = self.refusal(self.desk.move_robot("dog2", 1.0, 1.0, 0.5), 0.1)
         self.assertEqual((refusal.field, refusal.status), ("dog2", 409))
@@ -144,24 +144,24 @@ class RepeatedWishTests(SynchronousTestCase):
     """One request, sent to two web nodes."""
 
     def setUp(self) -> None:
-        self.team = VirtualTeam(3, dogs=("dog1", "dog2"), others=("pi",))
+        self.team = SimulatedTeam(3, dogs=("dog1", "dog2"), others=("pi",))
         self.addCleanup(self.team.stop)
         self.desk = self.team.desk
-        self.reserve = TeamDesk(TeamClient(self.team.services["pi"].assembly.node), TASKS, DEMO)
+        self.reserve = TeamControl(TeamClient(self.team.services["pi"].assembly.node), TASKS, DEMO_TASK)
         self.team.clock.advance(1.0)
 
     def test_wish_that_is_repeated_elsewhere(self) -> None:
         """A request that another web node has carried out is not repeated, even if this node missed it."""
-        wishes: list[Callable[[TeamDesk], Any]] = [
+        wishes: list[Callable[[TeamControl], Any]] = [
             lambda desk: desk.assign("find-red-target", 2, "yard", task_id="a1").addCallback(itemgetter("id")),
             lambda desk: desk.run_demo("b2"),
         ]
         owner = self.team.services["vaio"].assembly.node.entangled.contact.public
         for wish, task_id in zip(wishes, ("a1", "b2"), strict=True):
-            self.team.silence("pi")
+            self.team.block_datagrams("pi")
             first = wish(self.desk)
             self.team.clock.advance(1.0)
-            self.team.board.heal()
+            self.team.switchboard.heal()
             self.assertNotIn(task_id, [record.name for record in self.reserve.read(ALL_TASKS)])
             again = wish(self.reserve)
             self.team.clock.advance(LOOKUP_S)

@@ -23,17 +23,17 @@ from twisted.web.static import Data
 
 from middleware.entangled.data.memory import MemoryStore
 from tests.webnode.browser import Connection, site_of
-from webnode.channel import CLOSE_S, HEAD_S
+from webnode.channel import CLOSE_LIMIT_S, HEADERS_LIMIT_S
 from webnode.errors import PortTaken
 from webnode.limits import AddressLimits
-from webnode.live import SENT_AHEAD, SYSTEM_AHEAD, Viewer
+from webnode.live import KERNEL_BUFFER_BYTES, SEND_BUFFER_BYTES, Viewer
 
 MISSING = [name for name in ("OpenSSL", "cryptography") if find_spec(name) is None]
 if not MISSING:
     from middleware.config.settings import Settings
-    from webnode.certificate import authority, leaf, read
-    from webnode.keyfile import keep
-    from webnode.tls import Certified, TlsDoor, door
+    from webnode.certificate import make_authority, make_leaf, parse_leaf
+    from webnode.keyfile import write_key_file
+    from webnode.tls import CertificateProvider, TlsPort, make_tls_port
 
 SKIP = f"TLS IS NOT TESTED: missing {', '.join(MISSING)} (pip install 'swarm-node[tls]')"
 NOW = 1.8e9
@@ -50,17 +50,19 @@ class CertifiedTests(SynchronousTestCase):
         folder = Path(self.mktemp())
         folder.mkdir()
         self.path = folder / "a.sqlite.tls"
-        self.signer = authority(b"1" * 32, "a")
+        self.signer = make_authority(b"1" * 32, "a")
         self.names = ["192.168.0.7"]
         self.now = NOW
 
-    def certified(self, seed: int = 1) -> tuple[Certified, str]:
+    def certified(self, seed: int = 1) -> tuple[CertificateProvider, str]:
         """Return the certificate of a node after its start, and its log lines."""
         with capturedLogs() as said:
-            made = Certified(self.signer, "a", self.path, lambda: self.names, lambda: self.now, random.Random(seed))
+            made = CertificateProvider(
+                self.signer, "a", self.path, lambda: self.names, lambda: self.now, random.Random(seed)
+            )
         return made, "\n".join(formatEvent(each) for each in said)
 
-    def served(self, certified: Certified) -> list[str]:
+    def served(self, certified: CertificateProvider) -> list[str]:
         """Return the names in the certificate after the next connection."""
         certified.serverConnectionForTLS(None)
         return certified.names
@@ -71,7 +73,7 @@ class CertifiedTests(SynchronousTestCase):
         self.assertIn("there is none yet", said)
         pem = self.path.read_bytes()
         self.assertEqual(stat.S_IMODE(self.path.stat().st_mode), 0o600)
-        self.assertEqual(set(read(pem).names), {"localhost", "127.0.0.1", "::1", "192.168.0.7"})
+        self.assertEqual(set(parse_leaf(pem).names), {"localhost", "127.0.0.1", "::1", "192.168.0.7"})
         self.assertEqual(self.certified(2)[1], "")
         self.assertEqual(self.path.read_bytes(), pem)
 
@@ -85,7 +87,7 @@ class CertifiedTests(SynchronousTestCase):
             self.names = ["192.168.0.8"]
 
         def sworn() -> None:
-            self.signer = authority(b"2" * 32, "a")
+            self.signer = make_authority(b"2" * 32, "a")
 
         def aged() -> None:
             self.now += 340 * DAY
@@ -100,12 +102,12 @@ class CertifiedTests(SynchronousTestCase):
         ]
         for seed, (fault, words) in enumerate(faults):
             self.certified(seed)
-            before = read(self.path.read_bytes()).certificate.serial_number
+            before = parse_leaf(self.path.read_bytes()).certificate.serial_number
             fault()
             _, said = self.certified(100 + seed)
             self.assertIn(words, said)
             self.assertIn("is replaced", said)
-            self.assertNotEqual(read(self.path.read_bytes()).certificate.serial_number, before)
+            self.assertNotEqual(parse_leaf(self.path.read_bytes()).certificate.serial_number, before)
             self.assertEqual(stat.S_IMODE(self.path.stat().st_mode), 0o600)
 
     def test_go_on_without_a_place(self) -> None:
@@ -121,9 +123,9 @@ class CertifiedTests(SynchronousTestCase):
         self.names = ["10.0.0.5"]
         self.assertNotIn("10.0.0.5", certified.names)
         self.assertIn("10.0.0.5", self.served(certified))
-        certified.reached("172.16.0.9")
+        certified.add_reached("172.16.0.9")
         self.assertIn("172.16.0.9", self.served(certified))
-        certified.reached("8.8.8.8")
+        certified.add_reached("8.8.8.8")
         before = self.path.read_bytes()
         self.served(certified)
         self.assertEqual(self.path.read_bytes(), before)
@@ -153,10 +155,10 @@ class DoorTests(SynchronousTestCase):
         self.folder = Path(self.mktemp()).resolve()
         self.folder.mkdir()
 
-    def door(self, store: str = "a.sqlite", kept: MemoryStore | None = None, seed: int = 1) -> TlsDoor:
+    def door(self, store: str = "a.sqlite", kept: MemoryStore | None = None, seed: int = 1) -> TlsPort:
         node = {"name": "a", "roles": ["web"], "store": store, "team_key": "of a test"}
         settings = Settings.from_mapping({"node": node, "web": {"tls": "auto"}}, str(self.folder / "a.toml"))
-        return door(
+        return make_tls_port(
             settings,
             MemoryStore() if kept is None else kept,
             Clock(),
@@ -176,10 +178,10 @@ class DoorTests(SynchronousTestCase):
     def test_migrate(self) -> None:
         """A certificate of an authority from an earlier version is replaced."""
         path = self.folder / "a.sqlite.tls"
-        old = leaf(authority(b"7" * 32, "a"), "a", ["192.168.0.7"], NOW, random.Random(1))
-        keep(path, old.pem_with_key)
+        old = make_leaf(make_authority(b"7" * 32, "a"), "a", ["192.168.0.7"], NOW, random.Random(1))
+        write_key_file(path, old.pem_with_key)
         made = self.door()
-        self.assertEqual(read(path.read_bytes()).flaw(made.signer, ["192.168.0.7"], NOW), "")
+        self.assertEqual(parse_leaf(path.read_bytes()).find_flaw(made.signer, ["192.168.0.7"], NOW), "")
 
     def test_keep_nothing_in_memory(self) -> None:
         """A node with a store in memory leaves no file."""
@@ -214,14 +216,14 @@ class HandshakeTests(SynchronousTestCase):
         skip = SKIP
 
     def setUp(self) -> None:
-        self.signer = authority(b"1" * 32, "a")
+        self.signer = make_authority(b"1" * 32, "a")
         self.reactor = MemoryReactorClock()
-        certified = Certified(self.signer, "a", None, lambda: ["10.0.0.9"], lambda: NOW, random.Random(1))
+        certified = CertificateProvider(self.signer, "a", None, lambda: ["10.0.0.9"], lambda: NOW, random.Random(1))
         self.limits = AddressLimits()
         root = Resource()
         root.putChild(b"page", Data(b"hello", "text/plain"))
         self.site: Any = site_of(root, self.reactor, self.limits)
-        TlsDoor(self.reactor, "127.0.0.1", 8443, self.signer, certified).open(self.site)
+        TlsPort(self.reactor, "127.0.0.1", 8443, self.signer, certified).open(self.site)
         self.connections = self.reactor.tcpServers[0][1]
 
     def connected(self) -> Connection:
@@ -278,10 +280,10 @@ class HandshakeTests(SynchronousTestCase):
         with socket.socket() as below:
             connection.transport.getHandle = lambda: below  # type: ignore[attr-defined]
             request: Any = SimpleNamespace(channel=SimpleNamespace(transport=connection.protocol))
-            Viewer(request).narrow()
+            Viewer(request).shrink_buffers()
             # Linux reports twice the requested value.
-            self.assertLessEqual(below.getsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF), 2 * SYSTEM_AHEAD)
-        self.assertEqual(connection.transport.bufferSize, SENT_AHEAD)  # type: ignore[attr-defined]
+            self.assertLessEqual(below.getsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF), 2 * KERNEL_BUFFER_BYTES)
+        self.assertEqual(connection.transport.bufferSize, SEND_BUFFER_BYTES)  # type: ignore[attr-defined]
         connection.leave()
 
     def test_let_go_who_dribbles_a_handshake(self) -> None:
@@ -290,12 +292,12 @@ class HandshakeTests(SynchronousTestCase):
         self.assertRaises(ssl.SSLWantReadError, client.do_handshake)
         hello = outgoing.read()
         silent, dribbler = self.connected(), self.connected()
-        for second in range(int(HEAD_S + CLOSE_S) + 1):
+        for second in range(int(HEADERS_LIMIT_S + CLOSE_LIMIT_S) + 1):
             if not dribbler.transport.disconnecting and not dribbler.transport.disconnected:
                 dribbler.send(hello[second : second + 1])
             self.reactor.advance(1.0)
         for connection in (silent, dribbler):
             self.assertTrue(connection.transport.disconnected or connection.transport.disconnecting)
             connection.leave()
-        self.assertEqual(self.limits.total("open"), 0)
+        self.assertEqual(self.limits.get_total("open"), 0)
         self.assertEqual([call for call in self.reactor.getDelayedCalls() if call.getTime() > 60], [])

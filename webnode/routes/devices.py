@@ -4,57 +4,64 @@ from __future__ import annotations
 
 from typing import Any
 
-from webnode.field import Json
-from webnode.route import API, DEVICE, Ask, Field, Route, device
+from webnode.route import API, DEVICE, Field, Route, RouteRequest, find_device
+from webnode.sanitize import Json
 
 MAX_MESSAGE = 140
 MIN_AWAY_S, MAX_AWAY_S = 0.1, 600.0
 AWAY_S = 15.0
-TEXT = Field("text", "text", "the message", most=MAX_MESSAGE)
+TEXT = Field("text", "text", "the message", maximum=MAX_MESSAGE)
 
 
-def devices(ask: Ask) -> Json:
+def list_devices(ask: RouteRequest) -> Json:
     """Return all devices."""
     listed: Json = ask.state["devices"]
     return listed
 
 
-def announce(ask: Ask) -> Any:
+def send_to_all(ask: RouteRequest) -> Any:
     """Send a message to all devices."""
-    return ask.board.desk.message("", ask.given["text"])
+    return ask.services.control.send_message("", ask.values["text"])
 
 
-def message(ask: Ask) -> Any:
+def send_message(ask: RouteRequest) -> Any:
     """Send a message to one device."""
-    uuid = device(ask)["uuid"]
-    return ask.board.desk.message(uuid, ask.given["text"]).addCallback(lambda answer: {"id": uuid, **answer})
+    uuid = find_device(ask)["uuid"]
+    return ask.services.control.send_message(uuid, ask.values["text"]).addCallback(
+        lambda answer: {"id": uuid, **answer}
+    )
 
 
-def disconnect(ask: Ask) -> Any:
+def disconnect(ask: RouteRequest) -> Any:
     """Let a device leave the network for some time."""
-    uuid, seconds = device(ask)["uuid"], ask.given["seconds"]
+    uuid, seconds = find_device(ask)["uuid"], ask.values["seconds"]
 
     def left(_: object) -> Json:
-        ask.board.chronicle.faulted(uuid, "disconnect", ask.now)
+        ask.services.event_log.record_fault(uuid, "disconnect", ask.now)
         return {"id": uuid, "seconds": seconds}
 
-    return ask.board.desk.disconnect(uuid, seconds).addCallback(left)
+    return ask.services.control.disconnect(uuid, seconds).addCallback(left)
 
 
-GIVES = "delivered (names), failed (reason by name)"
+RESPONSE = "delivered (names), failed (reason by name)"
 ROUTES = (
     Route(
-        "GET", f"{API}/devices", "The devices, in the order of joining", "viewer", devices, gives="a list of devices"
+        "GET",
+        f"{API}/devices",
+        "The devices, in the order of joining",
+        "viewer",
+        list_devices,
+        response="a list of devices",
     ),
-    Route("POST", f"{API}/message", "A message to all devices", "operator", announce, (TEXT,), GIVES, 202),
+    Route("POST", f"{API}/message", "A message to all devices", "operator", send_to_all, (TEXT,), RESPONSE, 202),
     Route(
         "POST",
         f"{API}/devices/{{uuid}}/message",
         "A message to one device",
         "operator",
-        message,
+        send_message,
         (DEVICE, TEXT),
-        gives=f"id, {GIVES}",
+        response=f"id, {RESPONSE}",
         status=202,
     ),
     Route(
@@ -69,13 +76,13 @@ ROUTES = (
                 "seconds",
                 "number",
                 "duration",
-                least=MIN_AWAY_S,
-                most=MAX_AWAY_S,
+                minimum=MIN_AWAY_S,
+                maximum=MAX_AWAY_S,
                 default=AWAY_S,
                 unit="s",
             ),
         ),
-        gives="id, seconds",
+        response="id, seconds",
         status=202,
     ),
 )

@@ -4,20 +4,20 @@ from __future__ import annotations
 
 from dataclasses import asdict
 
-from webnode.audit import AUDITED
-from webnode.field import Json
-from webnode.route import API, Ask, Field, Route
+from webnode.audit import MAX_LINES
+from webnode.route import API, Field, Route, RouteRequest
+from webnode.sanitize import Json
 
 
-def events(ask: Ask) -> Json:
+def list_events(ask: RouteRequest) -> Json:
     """Return the entries of the chronicle, oldest first."""
-    entries = ask.board.chronicle.since(ask.given["after"], ask.given["about"])
+    entries = ask.services.event_log.list_since(ask.values["after"], ask.values["about"])
     return [asdict(entry) for entry in entries]
 
 
-def audit(ask: Ask) -> Json:
+def list_audit(ask: RouteRequest) -> Json:
     """Return the newest lines of the audit log."""
-    return [*ask.board.audit.newest(ask.given["count"])]
+    return [*ask.services.audit.list_newest(ask.values["count"])]
 
 
 ROUTES = (
@@ -26,28 +26,28 @@ ROUTES = (
         f"{API}/events",
         "Events since this node started to observe the team, oldest first",
         "viewer",
-        events,
+        list_events,
         (
-            Field("after", "whole", "number of the last event received", "query", least=0, default=0),
+            Field("after", "whole", "number of the last event received", "query", minimum=0, default=0),
             Field(
                 "about",
                 "text",
                 "uuid of a device or id of a task: only its events",
                 "query",
-                least=0,
-                most=64,
+                minimum=0,
+                maximum=64,
                 default="",
             ),
         ),
-        gives="a list of n, at, kind, uuid, task, text, seconds",
+        response="a list of n, at, kind, uuid, task, text, seconds",
     ),
     Route(
         "GET",
         f"{API}/audit",
         "Changes made through this node, newest first",
         "operator",
-        audit,
-        (Field("count", "whole", "maximum number of lines", "query", least=1, most=AUDITED, default=50),),
-        gives="a list of at (unix seconds), who, role, from, session, route, target, outcome",
+        list_audit,
+        (Field("count", "whole", "maximum number of lines", "query", minimum=1, maximum=MAX_LINES, default=50),),
+        response="a list of at (unix seconds), who, role, from, session, route, target, outcome",
     ),
 )

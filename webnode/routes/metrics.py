@@ -10,24 +10,24 @@ from collections import Counter
 from collections.abc import Iterable, Iterator
 from typing import Any, get_args
 
-from webnode.board import Board
 from webnode.errors import Refusal
-from webnode.limits import Kept
-from webnode.route import Ask, Content, Route
+from webnode.limits import CountedKind
+from webnode.route import Content, Route, RouteRequest
+from webnode.services import Services
 from webnode.state import State
 
-TEXT = "text/plain; version=0.0.4; charset=utf-8"
+MEDIA_TYPE = "text/plain; version=0.0.4; charset=utf-8"
 """The format that every version of Prometheus supports."""
-FLOWS = ("sent", "received", "dropped")
+TRAFFIC_COUNTERS = ("sent", "received", "dropped")
 
 
-def metrics(state: State, board: Board, now: float) -> bytes:
+def make_exposition(state: State, board: Services, now: float) -> bytes:
     """Return the exposition; ``now`` is unix seconds.  Raises ``ModuleNotFoundError`` without the library."""
     from prometheus_client import CollectorRegistry
     from prometheus_client.exposition import generate_latest
 
     registry = CollectorRegistry(auto_describe=False)
-    registry.register(_Collector(list(_families(state, board, now))))
+    registry.register(_Collector(list(_make_families(state, board, now))))
     text: bytes = generate_latest(registry)
     return text
 
@@ -43,7 +43,7 @@ class _Collector:
         return ()
 
 
-def _families(state: State, board: Board, now: float) -> Iterator[Any]:
+def _make_families(state: State, board: Services, now: float) -> Iterator[Any]:
     from prometheus_client.core import CounterMetricFamily, GaugeMetricFamily
 
     def by_status(name: str, about: str, rows: Any) -> Any:
@@ -63,7 +63,7 @@ def _families(state: State, board: Board, now: float) -> Iterator[Any]:
         since.add_metric(whose, device["since"])
         if "contacts" in network:
             contacts.add_metric(whose, network["contacts"])
-        for name in FLOWS:
+        for name in TRAFFIC_COUNTERS:
             if name in network:
                 flow.add_metric([*whose, name], network[name])
     yield from (contacts, since, flow)
@@ -78,20 +78,20 @@ def _families(state: State, board: Board, now: float) -> Iterator[Any]:
         "Connections of this node's page: open, with an incomplete request, with a response in progress.",
         labels=("kind",),
     )
-    for kind in get_args(Kept):
-        kept.add_metric([kind], board.limits.total(kind))
+    for kind in get_args(CountedKind):
+        kept.add_metric([kind], board.limits.get_total(kind))
     yield kept
     orders = CounterMetricFamily("swarm_page_orders", "Orders given through this node.", labels=("role", "status"))
-    for (role, status), count in sorted(board.audit.counts().items()):
+    for (role, status), count in sorted(board.audit.get_counts().items()):
         orders.add_metric([role, status], count)
     yield orders
     yield GaugeMetricFamily("swarm_page_time_seconds", "Unix time at this node.", value=now)
 
 
-def read(ask: Ask) -> Content:
+def read_metrics(ask: RouteRequest) -> Content:
     """Return all metrics."""
     try:
-        return Content(metrics(ask.state, ask.board, ask.now), TEXT)
+        return Content(make_exposition(ask.state, ask.services, ask.now), MEDIA_TYPE)
     except ModuleNotFoundError as error:
         if error.name != "prometheus_client":
             raise
@@ -100,5 +100,12 @@ def read(ask: Ask) -> Content:
 
 
 ROUTES = (
-    Route("GET", "/metrics", "Metrics of the team and the page, for Prometheus", "viewer", read, gives="text/plain"),
+    Route(
+        "GET",
+        "/metrics",
+        "Metrics of the team and the page, for Prometheus",
+        "viewer",
+        read_metrics,
+        response="text/plain",
+    ),
 )

@@ -4,35 +4,35 @@ from __future__ import annotations
 
 from typing import Any
 
+from webnode.diagnostics import Diagnostics
 from webnode.errors import Refusal
-from webnode.route import API, DEVICE, Ask, Route, device
-from webnode.survey import TeamSurvey
+from webnode.route import API, DEVICE, Route, RouteRequest, find_device
 
 
-def network(ask: Ask) -> Any:
+def read_network(ask: RouteRequest) -> Any:
     """Return the contacts of each device and their round-trip times."""
-    return _survey(ask).network()
+    return _require_diagnostics(ask).query_network()
 
 
-def links(ask: Ask) -> Any:
+def read_links(ask: RouteRequest) -> Any:
     """Return the path and its quality from each device to the others."""
-    return _survey(ask).links()
+    return _require_diagnostics(ask).query_links()
 
 
-def team(ask: Ask) -> Any:
+def read_team(ask: RouteRequest) -> Any:
     """Return the kind of team and its members."""
-    return _survey(ask).team()
+    return _require_diagnostics(ask).describe_team()
 
 
-def inventory(ask: Ask) -> Any:
+def read_inventory(ask: RouteRequest) -> Any:
     """Return the records that a device stores."""
-    return _survey(ask).inventory(device(ask)["uuid"])
+    return _require_diagnostics(ask).query_inventory(find_device(ask)["uuid"])
 
 
-def _survey(ask: Ask) -> TeamSurvey:
-    if ask.board.survey is None:
+def _require_diagnostics(ask: RouteRequest) -> Diagnostics:
+    if ask.services.survey is None:
         raise Refusal("node", "it cannot query devices", "use another web node of the team", 409)
-    return ask.board.survey
+    return ask.services.survey
 
 
 ROUTES = (
@@ -41,32 +41,32 @@ ROUTES = (
         f"{API}/network",
         "Contacts of each device with round-trip times, traffic and the newest lookups; queries each device",
         "viewer",
-        network,
-        gives="devices (by uuid: contacts, known, sent, received, lost, lookups), silent",
+        read_network,
+        response="devices (by uuid: contacts, known, sent, received, lost, lookups), silent",
     ),
     Route(
         "GET",
         f"{API}/links",
         "Path and measured quality from each device to the others, and refused nodes; measured while a client asks",
         "viewer",
-        links,
-        gives="here (this node), devices (by uuid: links, refusals), silent",
+        read_links,
+        response="here (this node), devices (by uuid: links, refusals), silent",
     ),
     Route(
         "GET",
         f"{API}/team",
         "Open or closed team; for a closed one its members, their roles, and the expiry of their certificates",
         "viewer",
-        team,
-        gives="kind; unprotected, or name, fingerprint, me, until, is_renewable, is_ending, known, members",
+        read_team,
+        response="kind; unprotected, or name, fingerprint, me, until, is_renewable, is_ending, known, members",
     ),
     Route(
         "GET",
         f"{API}/devices/{{uuid}}/inventory",
         "Records that a device stores; queries the device",
         "viewer",
-        inventory,
+        read_inventory,
         (DEVICE,),
-        gives="records, deleted, bytes, most_bytes, kinds, newest (kind, name, bytes, lifetime)",
+        response="records, deleted, bytes, most_bytes, kinds, newest (kind, name, bytes, lifetime)",
     ),
 )

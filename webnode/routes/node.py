@@ -7,39 +7,39 @@ from dataclasses import asdict
 from pathlib import Path
 
 from webnode.fallback import Page
-from webnode.field import Json
-from webnode.route import API, DEVICE, Ask, Content, Field, Route
+from webnode.route import API, DEVICE, Content, Field, Route, RouteRequest
+from webnode.sanitize import Json
 
 VERSION = 1
 """Version of the API; a page of another version does not switch to this node."""
-WORKER = Path(__file__).parents[1] / "static" / "sw.js"
+WORKER_FILE = Path(__file__).parents[1] / "static" / "sw.js"
 
 
-def node(ask: Ask) -> Json:
+def read_node(ask: RouteRequest) -> Json:
     """Return the identity of this node, with nothing that requires signing in."""
-    board = ask.board
-    pages = board.fallbacks.here()
+    board = ask.services
+    pages = board.fallbacks.list_pages()
     return {
         "node": next((page.node for page in pages if page.is_self), ""),
         "api": VERSION,
         "name": ask.state["node"],
-        "sign_in": board.sessions.visitor("", ask.now).role == "anyone",
-        "pages": rows(pages),
-        "has": list(board.has),
+        "sign_in": board.sessions.authenticate("", ask.now).role == "anyone",
+        "pages": make_page_rows(pages),
+        "has": list(board.feature_names),
     }
 
 
-def rows(pages: Iterable[Page]) -> list[Json]:
+def make_page_rows(pages: Iterable[Page]) -> list[Json]:
     """Return the web nodes as JSON."""
     return [asdict(page) for page in pages]
 
 
-def worker(ask: Ask) -> Content:
+def read_worker(ask: RouteRequest) -> Content:
     """Return the service worker; its scope would be limited to /static if it were served there."""
-    return Content(WORKER.read_bytes(), "text/javascript; charset=utf-8")
+    return Content(WORKER_FILE.read_bytes(), "text/javascript; charset=utf-8")
 
 
-def state(ask: Ask) -> Json:
+def read_state(ask: RouteRequest) -> Json:
     """Return the whole state that the page shows."""
     return ask.state
 
@@ -50,19 +50,24 @@ ROUTES = (
         f"{API}/node",
         "The serving node, and the URLs of the team's other web nodes",
         "anyone",
-        node,
-        gives="node, api, name, sign_in, pages (node, url, is_secure, is_self), has",
+        read_node,
+        response="node, api, name, sign_in, pages (node, url, is_secure, is_self), has",
     ),
     Route(
         "GET",
         "/sw.js",
         "The service worker, which keeps the page in the browser",
         "anyone",
-        worker,
-        gives="text/javascript",
+        read_worker,
+        response="text/javascript",
     ),
     Route(
-        "GET", f"{API}/state", "The state that the page shows", "viewer", state, gives="node, devices, tasks, groups"
+        "GET",
+        f"{API}/state",
+        "The state that the page shows",
+        "viewer",
+        read_state,
+        response="node, devices, tasks, groups",
     ),
     Route(
         "GET",
@@ -71,10 +76,10 @@ ROUTES = (
         "viewer",
         None,
         (
-            Field("since", "text", "the last event id received", "query", least=0, most=40, default=""),
+            Field("since", "text", "the last event id received", "query", minimum=0, maximum=40, default=""),
             Field("whole", "flag", "send whole states instead of changes", "query", default=False),
         ),
-        gives="text/event-stream",
+        response="text/event-stream",
     ),
     Route(
         "GET",
@@ -84,10 +89,10 @@ ROUTES = (
         None,
         (
             DEVICE,
-            Field("after", "text", "number of the last picture (X-Seq)", "query", least=0, default=""),
-            Field("viewer", "text", "name of the viewer", "query", least=0, most=40, default=""),
+            Field("after", "text", "number of the last picture (X-Seq)", "query", minimum=0, default=""),
+            Field("viewer", "text", "name of the viewer", "query", minimum=0, maximum=40, default=""),
         ),
-        gives="image/jpeg",
+        response="image/jpeg",
     ),
     Route("GET", "/static/{file}", "A file of the page", "anyone", None, (Field("file", "text", "file name", "path"),)),
 )

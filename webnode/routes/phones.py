@@ -14,97 +14,97 @@ from dataclasses import dataclass
 from twisted.internet.defer import Deferred
 from twisted.web.http import Request
 
-from webnode.board import Board, Phones
+from webnode.auth import User
 from webnode.errors import Refusal
-from webnode.field import Json
-from webnode.resource import JsonResource, answer
-from webnode.route import API, Ask, Field, Route
-from webnode.visitor import Visitor
+from webnode.resource import JsonResource, write_refusal
+from webnode.route import API, Field, Route, RouteRequest
+from webnode.sanitize import Json
+from webnode.services import Phones, Services
 
-SECRET = 32
+SECRET_BYTES = 32
 """Length of a phone's secret in bytes; sent as twice as many hexadecimal digits."""
 TICKET_S = 12 * 3600.0
-BOUND = "phone/"
+PHONE_PREFIX = "phone/"
 """Prefix of the name in a phone's ticket, before the phone's uuid; the ticket is valid for that phone only."""
-MAX_VALUES = 1000
-MOST_SIDE = 640
+MAX_VALUES_CHARS = 1000
+MAX_SIDE_PIXELS = 640
 """Maximum side of a picture in pixels: a small file can declare huge dimensions, and viewers would decode it."""
-FPS = 10.0
+REQUESTED_FPS = 10.0
 
 
 @dataclass(frozen=True)
-class Measure:
+class ValueRange:
     """The range of a value that a phone measures."""
 
-    least: float
-    most: float
+    minimum: float
+    maximum: float
     unit: str
 
 
-MEASURES: Mapping[str, Measure] = {
-    "target.bearing": Measure(-math.pi, math.pi, "rad"),
-    "target.distance": Measure(0.0, 100.0, "m"),
-    "orientation.yaw": Measure(0.0, math.tau, "rad"),
-    "orientation.pitch": Measure(-math.pi, math.pi, "rad"),
-    "orientation.roll": Measure(-math.pi, math.pi, "rad"),
-    "position.lat": Measure(-90.0, 90.0, "deg"),
-    "position.lon": Measure(-180.0, 180.0, "deg"),
-    "position.accuracy": Measure(0.0, 1e6, "m"),
+VALUE_RANGES: Mapping[str, ValueRange] = {
+    "target.bearing": ValueRange(-math.pi, math.pi, "rad"),
+    "target.distance": ValueRange(0.0, 100.0, "m"),
+    "orientation.yaw": ValueRange(0.0, math.tau, "rad"),
+    "orientation.pitch": ValueRange(-math.pi, math.pi, "rad"),
+    "orientation.roll": ValueRange(-math.pi, math.pi, "rad"),
+    "position.lat": ValueRange(-90.0, 90.0, "deg"),
+    "position.lon": ValueRange(-180.0, 180.0, "deg"),
+    "position.accuracy": ValueRange(0.0, 1e6, "m"),
 }
-TOGETHER = (("target.bearing", "target.distance"), ("position.lat", "position.lon"))
+PAIRED_VALUES = (("target.bearing", "target.distance"), ("position.lat", "position.lon"))
 """Pairs of values of which both or none have to be present."""
 
 
-def join(ask: Ask) -> Deferred[Json]:
+def register_phone(ask: RouteRequest) -> Deferred[Json]:
     """Register a phone as a device."""
-    if ask.board.phones is None:
+    if ask.services.phones is None:
         raise Refusal("phone", "this node does not accept phones", "use another web node", 409)
-    if ask.who.name.startswith(BOUND):
+    if ask.user.name.startswith(PHONE_PREFIX):
         raise Refusal("ticket", "it is valid for one phone's pictures only", "sign in and use that token", 403)
-    given = ask.given
+    given = ask.values
     secret, name = given["secret"], given["name"]
-    if not re.fullmatch(rf"[0-9a-fA-F]{{{2 * SECRET}}}", secret):
-        raise Refusal("secret", "invalid secret", f"send {2 * SECRET} hexadecimal digits, always the same")
+    if not re.fullmatch(rf"[0-9a-fA-F]{{{2 * SECRET_BYTES}}}", secret):
+        raise Refusal("secret", "invalid secret", f"send {2 * SECRET_BYTES} hexadecimal digits, always the same")
     if not re.fullmatch(r"[A-Za-z0-9_-]+", name):
         raise Refusal("name", "invalid device name", "send 1 to 40 letters, digits, _ or -")
     can = {key: given[key] for key in ("width", "height", "orientation", "position")}
 
     def joined(uuid: str) -> Json:
-        token = ask.board.sessions.derived(ask.who, f"{BOUND}{uuid}", "phone", ask.now, TICKET_S)
-        return {"uuid": uuid, "ticket": token.ticket, "until": token.until, "fps": FPS}
+        token = ask.services.sessions.issue_derived_token(ask.user, f"{PHONE_PREFIX}{uuid}", "phone", ask.now, TICKET_S)
+        return {"uuid": uuid, "ticket": token.ticket, "until": token.until, "fps": REQUESTED_FPS}
 
-    return ask.board.phones.join(bytes.fromhex(secret), name, can).addCallback(joined)
+    return ask.services.phones.join(bytes.fromhex(secret), name, can).addCallback(joined)
 
 
-def values_of(text: str) -> dict[str, float]:
+def parse_values(text: str) -> dict[str, float]:
     """Parse the values measured with a picture; raises ``Refusal``."""
     try:
-        found = json.loads(text or "{}") if len(text) <= MAX_VALUES else None
+        found = json.loads(text or "{}") if len(text) <= MAX_VALUES_CHARS else None
     except (ValueError, RecursionError):
         found = None
     if not isinstance(found, dict):
         raise Refusal("values", "not a JSON object", 'send for example {"target.bearing": 0.1}')
     for name, value in found.items():
-        measure = MEASURES.get(name)
+        measure = VALUE_RANGES.get(name)
         if measure is None:
-            raise Refusal("values", f"unknown value {name[:40]!r}", f"send some of {', '.join(MEASURES)}")
+            raise Refusal("values", f"unknown value {name[:40]!r}", f"send some of {', '.join(VALUE_RANGES)}")
         is_number = isinstance(value, int | float) and not isinstance(value, bool)
-        if not is_number or not measure.least <= value <= measure.most:
-            bounds = f"{measure.least:.4g} to {measure.most:.4g} {measure.unit}"
+        if not is_number or not measure.minimum <= value <= measure.maximum:
+            bounds = f"{measure.minimum:.4g} to {measure.maximum:.4g} {measure.unit}"
             raise Refusal("values", f"{name} is out of range", f"send a number from {bounds}")
-    for pair in TOGETHER:
+    for pair in PAIRED_VALUES:
         if len([name for name in pair if name in found]) == 1:
             raise Refusal("values", f"{' and '.join(pair)} belong together", "send both, or neither")
     return {name: float(value) for name, value in found.items()}
 
 
-class OfPhone(JsonResource):
+class PhoneResource(JsonResource):
     """Native resource for a phone's requests, authorized by its ticket or by an operator."""
 
     isLeaf = True
     methods = (b"POST",)
 
-    def __init__(self, board: Board, take: Callable[[Board, Phones, str, Request], Json]) -> None:
+    def __init__(self, board: Services, take: Callable[[Services, Phones, str, Request], Json]) -> None:
         super().__init__()
         self._board = board
         self._handle = take
@@ -112,60 +112,63 @@ class OfPhone(JsonResource):
     def render_POST(self, request: Request) -> bytes:
         """Process the request, or refuse it."""
         uuid = request.prepath[-2].decode("ascii", "replace")  # type: ignore[attr-defined]
-        who = who_asks(request)
+        who = get_user(request)
         try:
             if self._board.phones is None:
                 raise Refusal("phone", "this node does not accept phones", "use another web node", 409)
-            if who.role == "phone" and who.name != f"{BOUND}{uuid}":
+            if who.role == "phone" and who.name != f"{PHONE_PREFIX}{uuid}":
                 raise Refusal("ticket", "it belongs to another phone", f"join by POST {API}/phones", 403)
             reply = self._handle(self._board, self._board.phones, uuid, request)
         except Refusal as refusal:
-            return answer(request, refusal)
+            return write_refusal(request, refusal)
         request.setHeader("Content-Type", "application/json")
         request.setHeader("Cache-Control", "no-store")
         return json.dumps(reply).encode()
 
 
-def who_asks(request: Request) -> Visitor:
+def get_user(request: Request) -> User:
     """Return the visitor of a native request."""
-    return getattr(request, "who", Visitor())
+    return getattr(request, "who", User())
 
 
-def look(board: Board, phones: Phones, uuid: str, request: Request) -> Json:
+def receive_picture(board: Services, phones: Phones, uuid: str, request: Request) -> Json:
     """Take one picture and its measured values."""
     given: bytes = (request.args or {}).get(b"values", [b""])[0]
-    values = values_of(given.decode("utf-8", "replace"))
-    wanted = phones.look(uuid, request.content.read() if request.content is not None else b"", values)
+    values = parse_values(given.decode("utf-8", "replace"))
+    wanted = phones.receive_picture(uuid, request.content.read() if request.content is not None else b"", values)
     return {"fps": wanted.fps, "say": wanted.say}
 
 
-def leave(board: Board, phones: Phones, uuid: str, request: Request) -> Json:
+def remove_phone(board: Services, phones: Phones, uuid: str, request: Request) -> Json:
     """Remove the phone; sent by a page that is closed or hidden."""
     phones.leave(uuid)
     source = str(getattr(request.getClientAddress(), "host", ""))
-    board.audit.note(who_asks(request), source, f"POST {API}/phones/{{uuid}}/leave", uuid[:64], "200")
+    board.audit.write(get_user(request), source, f"POST {API}/phones/{{uuid}}/leave", uuid[:64], "200")
     return {}
 
 
-UUID = Field("uuid", "text", "the phone", "path", most=64)
+UUID = Field("uuid", "text", "the phone", "path", maximum=64)
 ROUTES = (
     Route(
         "POST",
         f"{API}/phones",
         "Register a phone as a device, which this node connects to the team; can be repeated",
         "phone",
-        join,
+        register_phone,
         (
             Field(
-                "secret", "text", "the phone's secret in hexadecimal digits; it identifies the device", most=2 * SECRET
+                "secret",
+                "text",
+                "the phone's secret in hexadecimal digits; it identifies the device",
+                maximum=2 * SECRET_BYTES,
             ),
-            Field("name", "text", "display name: letters, digits, _ or -", most=40),
-            Field("width", "whole", "of its pictures", least=16, most=MOST_SIDE, unit="pixels"),
-            Field("height", "whole", "of its pictures", least=16, most=MOST_SIDE, unit="pixels"),
+            Field("name", "text", "display name: letters, digits, _ or -", maximum=40),
+            Field("width", "whole", "of its pictures", minimum=16, maximum=MAX_SIDE_PIXELS, unit="pixels"),
+            Field("height", "whole", "of its pictures", minimum=16, maximum=MAX_SIDE_PIXELS, unit="pixels"),
             Field("orientation", "flag", "whether it measures its orientation", default=False),
             Field("position", "flag", "whether it measures its position", default=False),
         ),
-        gives="uuid, ticket (for its pictures only, in the query), until (unix seconds), fps",
+        response="uuid, ticket (for its pictures only, in the query), until (unix seconds), fps",
         limit_s=4.5,
     ),
     Route(
@@ -180,16 +183,16 @@ ROUTES = (
                 "values",
                 "text",
                 "measured values as a JSON object: "
-                + ", ".join(f"{name} ({measure.unit})" for name, measure in MEASURES.items()),
+                + ", ".join(f"{name} ({measure.unit})" for name, measure in VALUE_RANGES.items()),
                 "query",
-                least=0,
-                most=MAX_VALUES,
+                minimum=0,
+                maximum=MAX_VALUES_CHARS,
                 default="",
             ),
         ),
-        gives="fps (requested pictures per second), say (text to show on the phone)",
-        native=lambda board, reactor: OfPhone(board, look),
-        takes="image/jpeg",
+        response="fps (requested pictures per second), say (text to show on the phone)",
+        native=lambda board, reactor: PhoneResource(board, receive_picture),
+        body_type="image/jpeg",
     ),
     Route(
         "POST",
@@ -198,6 +201,6 @@ ROUTES = (
         "phone",
         None,
         (UUID,),
-        native=lambda board, reactor: OfPhone(board, leave),
+        native=lambda board, reactor: PhoneResource(board, remove_phone),
     ),
 )

@@ -8,96 +8,101 @@ from urllib.parse import urlsplit
 
 from twisted.internet.defer import Deferred, gatherResults
 
+from webnode.auth import Token
 from webnode.errors import Refusal
 from webnode.fallback import is_loopback
-from webnode.field import Json
-from webnode.invite import TeamInvites
-from webnode.route import API, Ask, Content, Field, Route
-from webnode.session import MAX_SIGNED_S, SIGNED_S
+from webnode.invite import Invites
+from webnode.route import API, Content, Field, Route, RouteRequest
+from webnode.sanitize import Json
+from webnode.session import MAX_SESSION_S, SESSION_S
 from webnode.token import MAX_TEXT
-from webnode.visitor import Token
 
-INVITED_S = 86400.0
-MAX_INVITED_S = MAX_SIGNED_S
+INVITATION_S = 86400.0
+MAX_INVITATION_S = MAX_SESSION_S
 
 
-def sign_in(ask: Ask) -> Deferred[Json]:
+def sign_in(ask: RouteRequest) -> Deferred[Json]:
     """Sign in with a code or a password."""
-    code, password = ask.given["code"], ask.given["password"]
+    code, password = ask.values["code"], ask.values["password"]
     if bool(code) == bool(password):
         problem = "both code and password are given" if code else "it is missing or empty"
         raise Refusal("code", problem, 'send {"code": "..."} or {"password": "..."}')
-    return ask.board.sessions.sign_in(code or password, ask.source, ask.now).addCallback(_token_fields)
+    return ask.services.sessions.sign_in(code or password, ask.source, ask.now).addCallback(_describe_token)
 
 
-def session(ask: Ask) -> Json:
+def read_session(ask: RouteRequest) -> Json:
     """Return the name and role of the visitor."""
-    return {"name": ask.who.name, "role": ask.who.role}
+    return {"name": ask.user.name, "role": ask.user.role}
 
 
-def sign_out(ask: Ask) -> Json:
+def sign_out(ask: RouteRequest) -> Json:
     """End the session."""
-    if ask.who.token_id:
+    if ask.user.token_id:
         # Another web node may have renewed the session just now; that token ends as well.
-        until = min(ask.who.limit, max(ask.who.until, ask.now + SIGNED_S))
-        ask.board.sessions.revoke(ask.who.token_id, until)
+        until = min(ask.user.limit, max(ask.user.until, ask.now + SESSION_S))
+        ask.services.sessions.revoke(ask.user.token_id, until)
     return {}
 
 
-def renew(ask: Ask) -> Json:
+def renew_session(ask: RouteRequest) -> Json:
     """Return another token for the session."""
-    return _token_fields(ask.board.sessions.renewed(ask.who, ask.now))
+    return _describe_token(ask.services.sessions.renew_token(ask.user, ask.now))
 
 
-def passes(ask: Ask) -> Json:
+def issue_peer_tokens(ask: RouteRequest) -> Json:
     """Return tokens with which the page can continue at the team's other web nodes."""
-    nodes = [page.node for page in ask.board.fallbacks.here() if not page.is_self]
-    return {node: _token_fields(token) for node, token in ask.board.sessions.passes(ask.who, nodes, ask.now).items()}
+    nodes = [page.node for page in ask.services.fallbacks.list_pages() if not page.is_self]
+    return {
+        node: _describe_token(token)
+        for node, token in ask.services.sessions.issue_peer_tokens(ask.user, nodes, ask.now).items()
+    }
 
 
-def invite(ask: Ask) -> Any:
+def invite_guest(ask: RouteRequest) -> Any:
     """Return a token for a guest, and the link with which the guest opens the page."""
-    given, invites = ask.given, ask.board.invites
+    given, invites = ask.values, ask.services.invites
     urls = [] if invites is None else invites.urls()
     if given["page"] and given["page"] not in urls:
         raise Refusal("page", "not a URL of this node's page", f"choose one of {', '.join(urls) or 'none'}")
-    token = ask.board.sessions.token(ask.who, given["name"], given["role"], ask.now, given["seconds"])
+    token = ask.services.sessions.issue_guest_token(ask.user, given["name"], given["role"], ask.now, given["seconds"])
     if invites is None or not urls:
-        return _token_fields(token)
+        return _describe_token(token)
     url = given["page"] or urls[0]
     link = f"{url}/#code={token.text}" + ("/phone" if token.role == "phone" else "")
     answer: dict[str, Json] = {
-        **_token_fields(token),
+        **_describe_token(token),
         "link": link,
-        **_url_fields(url),
-        **_authority_fields(invites, urls),
+        **_describe_url(url),
+        **_describe_authority(invites, urls),
     }
     answer["pages"] = [*urls]
     if not given["draw"]:
         return answer
-    qr_codes = gatherResults([invites.drawn(text) for text in (link, str(answer["certificate"]))], consumeErrors=True)
-    return qr_codes.addCallback(partial(_with_codes, answer))
+    qr_codes = gatherResults(
+        [invites.draw_qr_code(text) for text in (link, str(answer["certificate"]))], consumeErrors=True
+    )
+    return qr_codes.addCallback(partial(_add_qr_codes, answer))
 
 
-def authority(ask: Ask) -> Content:
+def read_authority(ask: RouteRequest) -> Content:
     """Return the certificate authority that a browser has to trust; it is public."""
-    pem = b"" if ask.board.invites is None else ask.board.invites.authority
+    pem = b"" if ask.services.invites is None else ask.services.invites.authority
     if not pem:
         raise Refusal("certificate", "the page is not served over TLS", 'set tls = "auto" below [web]', 404)
     return Content(pem, "application/x-x509-ca-cert")
 
 
-def _with_codes(answer: dict[str, Json], codes: list[str]) -> Json:
+def _add_qr_codes(answer: dict[str, Json], codes: list[str]) -> Json:
     return {**answer, "code": codes[0], "certificate_code": codes[1]}
 
 
-def _url_fields(url: str) -> dict[str, Json]:
+def _describe_url(url: str) -> dict[str, Json]:
     """Return who can open a page at ``url``, and whether the browser allows it to use the camera."""
     is_here = is_loopback(urlsplit(url).hostname or "")
     return {"is_secure": url.startswith("https:"), "reaches": "machine" if is_here else "network"}
 
 
-def _authority_fields(invites: TeamInvites, urls: list[str]) -> dict[str, Json]:
+def _describe_authority(invites: Invites, urls: list[str]) -> dict[str, Json]:
     """Return the URL of the authority, without TLS, as a browser that lacks it would show a warning."""
     if not invites.authority:
         return {"certificate": "", "fingerprint": ""}
@@ -105,7 +110,7 @@ def _authority_fields(invites: TeamInvites, urls: list[str]) -> dict[str, Json]:
     return {"certificate": f"{plain}{API}/ca.crt", "fingerprint": invites.fingerprint}
 
 
-def _token_fields(token: Token) -> dict[str, Json]:
+def _describe_token(token: Token) -> dict[str, Json]:
     return {"token": token.text, "ticket": token.ticket, "role": token.role, "until": token.until}
 
 
@@ -117,21 +122,23 @@ ROUTES = (
         "anyone",
         sign_in,
         (
-            Field("code", "text", "the code, or an invitation's token", most=MAX_TEXT, default=""),
+            Field("code", "text", "the code, or an invitation's token", maximum=MAX_TEXT, default=""),
             Field("password", "text", "the password", default=""),
         ),
-        gives="token, ticket, role, until (unix seconds)",
+        response="token, ticket, role, until (unix seconds)",
         # Checking a password takes a small device some time.
         limit_s=4.5,
     ),
-    Route("GET", f"{API}/session", "The visitor; anyone if not signed in", "anyone", session, gives="name, role"),
+    Route(
+        "GET", f"{API}/session", "The visitor; anyone if not signed in", "anyone", read_session, response="name, role"
+    ),
     Route(
         "PUT",
         f"{API}/session",
         "Renew the session: another token for it; the present token stays valid until its expiry",
         "viewer",
-        renew,
-        gives="token, ticket, role, until (unix seconds)",
+        renew_session,
+        response="token, ticket, role, until (unix seconds)",
     ),
     Route(
         "GET",
@@ -139,8 +146,8 @@ ROUTES = (
         "Tokens for the same session at the team's other web nodes, by uuid: each valid only there, for minutes; "
         "PUT session at that node renews it",
         "viewer",
-        passes,
-        gives="uuid: token, ticket, role, until (unix seconds)",
+        issue_peer_tokens,
+        response="uuid: token, ticket, role, until (unix seconds)",
     ),
     Route("DELETE", f"{API}/session", "Sign out, at every web node of the team", "anyone", sign_out),
     Route(
@@ -148,23 +155,23 @@ ROUTES = (
         f"{API}/invitations",
         "A token for a guest: as a link for a person, who signs in with it, or for a program, which uses it directly",
         "operator",
-        invite,
+        invite_guest,
         (
             Field("role", "choice", "role of the guest", choices=("viewer", "phone", "operator")),
-            Field("name", "text", "name of the guest", most=40, default="guest"),
+            Field("name", "text", "name of the guest", maximum=40, default="guest"),
             Field(
                 "seconds",
                 "number",
                 "validity",
-                least=1,
-                most=MAX_INVITED_S,
-                default=INVITED_S,
+                minimum=1,
+                maximum=MAX_INVITATION_S,
+                default=INVITATION_S,
                 unit="s",
             ),
-            Field("page", "text", "URL of the page, one of this node's", least=0, default=""),
+            Field("page", "text", "URL of the page, one of this node's", minimum=0, default=""),
             Field("draw", "flag", "also draw QR codes", default=False),
         ),
-        gives="token, ticket, role, until (unix seconds), link, reaches (network, or this machine), is_secure, pages, "
+        response="token, ticket, role, until (unix seconds), link, reaches (network, or this machine), is_secure, pages, "
         "certificate (URL), fingerprint, code (SVG), certificate_code",
     ),
     Route(
@@ -172,7 +179,7 @@ ROUTES = (
         f"{API}/ca.crt",
         "The certificate authority of this node, to be trusted by browsers that open its page over TLS",
         "anyone",
-        authority,
-        gives="application/x-x509-ca-cert",
+        read_authority,
+        response="application/x-x509-ca-cert",
     ),
 )

@@ -9,35 +9,35 @@ from typing import Any
 from twisted.internet.defer import maybeDeferred
 
 from webnode.errors import Refusal
-from webnode.field import Json
-from webnode.route import API, Ask, Field, Route
+from webnode.route import API, Field, Route, RouteRequest
+from webnode.sanitize import Json
 
-TASK = Field("task_id", "text", "the task", "path", most=64)
+TASK = Field("task_id", "text", "the task", "path", maximum=64)
 
 
-def tasks(ask: Ask) -> Json:
+def list_tasks(ask: RouteRequest) -> Json:
     """Return all tasks."""
     listed: Json = ask.state["tasks"]
     return listed
 
 
-def catalogue(ask: Ask) -> Json:
+def list_predefined(ask: RouteRequest) -> Json:
     """Return the predefined tasks."""
-    return [dict(task) for task in ask.board.desk.catalogue()]
+    return [dict(task) for task in ask.services.control.list_predefined()]
 
 
-def demo(ask: Ask) -> Any:
+def run_demo(ask: RouteRequest) -> Any:
     """Run the demonstration."""
-    return maybeDeferred(ask.board.desk.run_demo, _id(ask, "demo")).addCallback(_named)
+    return maybeDeferred(ask.services.control.run_demo, _derive_task_id(ask, "demo")).addCallback(_wrap_id)
 
 
-def assign(ask: Ask) -> Any:
+def assign_task(ask: RouteRequest) -> Any:
     """Assign a predefined task."""
-    given = ask.given["name"], ask.given["tolerates"], ask.given["group"]
-    return maybeDeferred(ask.board.desk.assign, *given, _id(ask, "task")).addCallback(_named)
+    given = ask.values["name"], ask.values["tolerates"], ask.values["group"]
+    return maybeDeferred(ask.services.control.assign, *given, _derive_task_id(ask, "task")).addCallback(_wrap_id)
 
 
-def _id(ask: Ask, what: str) -> str:
+def _derive_task_id(ask: RouteRequest, what: str) -> str:
     """Derive the id of the new task from the idempotency key; empty without a key.
 
     It is the same at every web node: a page whose node failed before answering repeats the request at another one,
@@ -45,53 +45,53 @@ def _id(ask: Ask, what: str) -> str:
     """
     if not ask.id:
         return ""
-    wish = "\n".join((what, ask.who.token_id, ask.id))
+    wish = "\n".join((what, ask.user.token_id, ask.id))
     return blake2s(wish.encode(), digest_size=6).hexdigest()
 
 
-def _named(answer: Any) -> Json:
+def _wrap_id(answer: Any) -> Json:
     told: Json = answer if isinstance(answer, dict) else {"id": answer}
     return told
 
 
-def preview(ask: Ask) -> Any:
+def preview_task(ask: RouteRequest) -> Any:
     """Return which devices can take a predefined task."""
-    return ask.board.desk.preview(ask.given["name"], ask.given["group"])
+    return ask.services.control.preview(ask.values["name"], ask.values["group"])
 
 
-def _order(word: str, about: str, wish: Callable[[Ask], Callable[[str], Any]]) -> Route:
+def _make_order_route(word: str, about: str, wish: Callable[[RouteRequest], Callable[[str], Any]]) -> Route:
     """Return the route of the order ``word`` for an existing task."""
 
-    def answer(ask: Ask) -> Json:
-        task_id = ask.given["task_id"]
+    def answer(ask: RouteRequest) -> Json:
+        task_id = ask.values["task_id"]
         if task_id not in [task["id"] for task in ask.state["tasks"]]:
             raise Refusal("task", "unknown task", f"choose one of {API}/tasks", 404)
         wish(ask)(task_id)
         return {"id": task_id}
 
     path = f"{API}/tasks/{{task_id}}/{word}"
-    return Route("POST", path, about, "operator", answer, (TASK,), gives="id", status=202)
+    return Route("POST", path, about, "operator", answer, (TASK,), response="id", status=202)
 
 
-NAME = Field("name", "text", "name in the catalogue", most=64)
-GROUP = Field("group", "text", "tasks of one group are divided among the devices together", most=64, default="")
+NAME = Field("name", "text", "name in the catalogue", maximum=64)
+GROUP = Field("group", "text", "tasks of one group are divided among the devices together", maximum=64, default="")
 ROUTES = (
-    Route("GET", f"{API}/tasks", "The tasks, the newest first", "viewer", tasks, gives="a list of tasks"),
+    Route("GET", f"{API}/tasks", "The tasks, the newest first", "viewer", list_tasks, response="a list of tasks"),
     Route(
         "GET",
         f"{API}/catalogue",
         "The predefined tasks",
         "viewer",
-        catalogue,
-        gives="a list of name, title, requirements",
+        list_predefined,
+        response="a list of name, title, requirements",
     ),
     Route(
         "POST",
         f"{API}/demo",
         "Run Demo: cancel open tasks, remove the target, assign the demonstration's task, place the target 5 s later",
         "operator",
-        demo,
-        gives="id",
+        run_demo,
+        response="id",
         status=202,
     ),
     Route(
@@ -99,20 +99,20 @@ ROUTES = (
         f"{API}/tasks",
         "Assign a predefined task",
         "operator",
-        assign,
+        assign_task,
         (
             NAME,
             Field(
                 "tolerates",
                 "whole",
                 "members of its council that may fail at once",
-                least=1,
-                most=3,
+                minimum=1,
+                maximum=3,
                 default=1,
             ),
             GROUP,
         ),
-        gives="id, able, refused (reasons by name)",
+        response="id, able, refused (reasons by name)",
         status=202,
     ),
     Route(
@@ -120,12 +120,14 @@ ROUTES = (
         f"{API}/tasks/preview",
         "Which devices can take a predefined task, and why others cannot; assigns nothing",
         "viewer",
-        preview,
+        preview_task,
         (NAME, GROUP),
-        gives="able (uuid, name, busy: its current task), refused (reasons by name), likely (a name, or null), "
+        response="able (uuid, name, busy: its current task), refused (reasons by name), likely (a name, or null), "
         "together (id, title: tasks that the group divides with it)",
     ),
-    _order("cancel", "End a task; its lease is no longer granted", lambda ask: ask.board.desk.cancel),
-    _order("pause", "Pause a task; its devices stop and are free for other tasks", lambda ask: ask.board.desk.pause),
-    _order("resume", "Resume a paused task", lambda ask: ask.board.desk.resume),
+    _make_order_route("cancel", "End a task; its lease is no longer granted", lambda ask: ask.services.control.cancel),
+    _make_order_route(
+        "pause", "Pause a task; its devices stop and are free for other tasks", lambda ask: ask.services.control.pause
+    ),
+    _make_order_route("resume", "Resume a paused task", lambda ask: ask.services.control.resume),
 )

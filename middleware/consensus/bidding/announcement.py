@@ -13,15 +13,15 @@ from dataclasses import dataclass, field, replace
 import msgpack
 
 from middleware.consensus.bidding.auction import Auction
-from middleware.consensus.bidding.bid import packed_report, report_of
-from middleware.consensus.bidding.rule import MAX_REPORTS
+from middleware.consensus.bidding.bid import pack_report, parse_report
+from middleware.consensus.bidding.merge_rule import MAX_REPORTS
 from middleware.consensus.strategy import Report
-from middleware.entangled.identity import verified
-from middleware.entangled.value import is_whole
+from middleware.entangled.identity import is_signature_valid
+from middleware.entangled.value import is_natural
 
 
 @dataclass(frozen=True)
-class Entry:
+class AnnouncedReport:
     """One report that stands, and the revision of its bid."""
 
     report: Report
@@ -34,7 +34,7 @@ class Announcement:
 
     number: int
     rank: int
-    entries: tuple[Entry, ...]
+    entries: tuple[AnnouncedReport, ...]
     signature: bytes = field(default=b"", compare=False)
 
     @property
@@ -47,7 +47,7 @@ class Announcement:
         """The reports that stand."""
         return tuple(entry.report for entry in self.entries)
 
-    def signed(self, sign: Callable[[bytes], bytes], auction: Auction) -> Announcement:
+    def sign(self, sign: Callable[[bytes], bytes], auction: Auction) -> Announcement:
         """Return this announcement with the signature of ``sign`` for ``auction``."""
         return replace(self, signature=sign(self._signed_bytes(auction)))
 
@@ -55,40 +55,40 @@ class Announcement:
         """Return whether a quorum member of ``auction`` signed exactly this announcement for it."""
         if self.rank >= len(auction.council):
             return False
-        return verified(auction.council[self.rank].public, self._signed_bytes(auction), self.signature)
+        return is_signature_valid(auction.council[self.rank].public, self._signed_bytes(auction), self.signature)
 
-    def packed(self) -> list[object]:
+    def pack(self) -> list[object]:
         """Return the encoding for messages."""
-        return [self.number, self.rank, self._packed_entries(), self.signature]
+        return [self.number, self.rank, self._pack_entries(), self.signature]
 
-    def _packed_entries(self) -> list[object]:
-        return [[e.report.agent, packed_report(e.report), e.revision] for e in self.entries]
+    def _pack_entries(self) -> list[object]:
+        return [[e.report.agent, pack_report(e.report), e.revision] for e in self.entries]
 
     def _signed_bytes(self, auction: Auction) -> bytes:
-        content = [auction.digest, self.number, self.rank, self._packed_entries()]
+        content = [auction.digest, self.number, self.rank, self._pack_entries()]
         return b"announcement" + bytes(msgpack.packb(content))
 
 
-def announcement_of(content: object) -> Announcement | None:
+def parse_announcement(content: object) -> Announcement | None:
     """Decode an announcement; None if it is malformed.  Never raises."""
     if not isinstance(content, list) or len(content) != 4:
         return None
     number, rank, packed, signature = content
-    if not (is_whole(number) and is_whole(rank) and isinstance(signature, bytes) and len(signature) == 64):
+    if not (is_natural(number) and is_natural(rank) and isinstance(signature, bytes) and len(signature) == 64):
         return None
     if not isinstance(packed, list) or len(packed) > MAX_REPORTS:
         return None
-    entries = [entry for each in packed if (entry := _entry_of(each)) is not None]
+    entries = [entry for each in packed if (entry := _parse_entry(each)) is not None]
     if number == 0 or len({entry.report.agent for entry in entries}) != len(packed):
         return None
     return Announcement(number, rank, tuple(entries), signature)
 
 
-def _entry_of(content: object) -> Entry | None:
+def _parse_entry(content: object) -> AnnouncedReport | None:
     if not isinstance(content, list) or len(content) != 3:
         return None
     agent, packed, revision = content
-    if not (isinstance(agent, str) and len(agent) == 40 and agent.isascii() and is_whole(revision)):
+    if not (isinstance(agent, str) and len(agent) == 40 and agent.isascii() and is_natural(revision)):
         return None
-    report = report_of(packed, agent)
-    return Entry(report, revision) if report is not None else None
+    report = parse_report(packed, agent)
+    return AnnouncedReport(report, revision) if report is not None else None

@@ -12,13 +12,13 @@ from functools import cached_property
 
 import msgpack
 
-from middleware.entangled.contact import Contact, unpacked
-from middleware.entangled.record import MAX_NAME, hashed_key
-from middleware.entangled.value import is_number, is_whole
+from middleware.entangled.contact import Contact, parse_contact
+from middleware.entangled.record import MAX_NAME_BYTES, hash_key
+from middleware.entangled.value import is_natural, is_number
 
 MAX_COUNCIL = 9
-MAX_STRATEGY = 64
-MAX_WAITING = 600.0
+MAX_STRATEGY_CHARACTERS = 64
+MAX_WAITING_S = 600.0
 
 
 @dataclass(frozen=True)
@@ -33,46 +33,46 @@ class Auction:
     epoch: int
     council: tuple[Contact, ...]
     strategy: str = "nearest"
-    waiting: float = 0.5
+    waiting_period: float = 0.5
     exclusive: bool = True
 
     @cached_property
     def key(self) -> bytes:
         """The id in the key space to which bids travel: the key of the task's group."""
-        return hashed_key(f"task/{self.task_id}")
+        return hash_key(f"task/{self.task_id}")
 
     @cached_property
     def digest(self) -> bytes:
         """A unique identifier of this auction, 16 bytes."""
-        return hashlib.blake2s(msgpack.packb(self.packed()), digest_size=16).digest()
+        return hashlib.blake2s(msgpack.packb(self.pack()), digest_size=16).digest()
 
-    def rank(self, node_id: bytes) -> int | None:
+    def find_rank(self, node_id: bytes) -> int | None:
         """Return a node's index among the quorum members, or None if it is not a member."""
         return next((place for place, member in enumerate(self.council) if member.node_id == node_id), None)
 
-    def packed(self) -> list[object]:
+    def pack(self) -> list[object]:
         """Return the encoding for messages."""
-        council = [contact.packed() for contact in self.council]
-        return [self.task_id, self.epoch, council, self.strategy, float(self.waiting), self.exclusive]
+        council = [contact.pack() for contact in self.council]
+        return [self.task_id, self.epoch, council, self.strategy, float(self.waiting_period), self.exclusive]
 
 
-def auction_of(fields: object) -> Auction | None:
+def parse_auction(fields: object) -> Auction | None:
     """Decode an auction; None if it is malformed.  Never raises."""
     if not isinstance(fields, list) or len(fields) != 6:
         return None
     task_id, epoch, council, strategy, waiting, exclusive = fields
     if not isinstance(council, list) or not 0 < len(council) <= MAX_COUNCIL:
         return None
-    members = [contact for each in council if (contact := unpacked(each)) is not None]
+    members = [contact for each in council if (contact := parse_contact(each)) is not None]
     is_valid = (
         isinstance(task_id, str)
-        and 0 < len(task_id) <= MAX_NAME
-        and is_whole(epoch)
+        and 0 < len(task_id) <= MAX_NAME_BYTES
+        and is_natural(epoch)
         and len({member.node_id for member in members}) == len(council)
         and isinstance(strategy, str)
-        and 0 < len(strategy) <= MAX_STRATEGY
+        and 0 < len(strategy) <= MAX_STRATEGY_CHARACTERS
         and is_number(waiting)
-        and 0 <= waiting <= MAX_WAITING
+        and 0 <= waiting <= MAX_WAITING_S
         and isinstance(exclusive, bool)
     )
     return Auction(task_id, epoch, tuple(members), strategy, float(waiting), exclusive) if is_valid else None

@@ -16,10 +16,10 @@ import msgpack
 
 from middleware.consensus.bidding.auction import Auction
 from middleware.consensus.strategy import Report
-from middleware.entangled.identity import Identity, node_id, verified
-from middleware.entangled.value import is_number, is_whole
+from middleware.entangled.identity import Identity, derive_node_id, is_signature_valid
+from middleware.entangled.value import is_natural, is_number
 
-MAX_TEXT = 200
+MAX_TEXT_CHARACTERS = 200
 MAX_ITEMS = 16
 _DEFAULTS = {f.name: f.default for f in fields(Report) if f.default is not MISSING}
 
@@ -36,31 +36,31 @@ class Bid:
     @cached_property
     def agent(self) -> str:
         """The bidder's uuid."""
-        return node_id(self.public).hex()
+        return derive_node_id(self.public).hex()
 
     @cached_property
     def rank(self) -> tuple[int, bytes]:
         """The sort key: of two bids of one agent the higher one is valid, even if both have the same revision."""
-        content = msgpack.packb(packed_report(self.report))
+        content = msgpack.packb(pack_report(self.report))
         return self.revision, hashlib.blake2s(content, digest_size=8).digest()
 
-    def signed(self, identity: Identity, auction: Auction) -> Bid:
+    def sign(self, identity: Identity, auction: Auction) -> Bid:
         """Return this bid with its agent's signature for ``auction``."""
         return replace(self, signature=identity.sign(self._signed_bytes(auction)))
 
     def is_genuine(self, auction: Auction) -> bool:
         """Return whether its agent signed exactly this bid for this auction."""
-        return verified(self.public, self._signed_bytes(auction), self.signature)
+        return is_signature_valid(self.public, self._signed_bytes(auction), self.signature)
 
-    def packed(self) -> list[object]:
+    def pack(self) -> list[object]:
         """Return the encoding for messages; the agent's uuid is derived from the key."""
-        return [self.public, packed_report(self.report), self.revision, self.signature]
+        return [self.public, pack_report(self.report), self.revision, self.signature]
 
     def _signed_bytes(self, auction: Auction) -> bytes:
-        return b"bid" + bytes(msgpack.packb([auction.digest, packed_report(self.report), self.revision]))
+        return b"bid" + bytes(msgpack.packb([auction.digest, pack_report(self.report), self.revision]))
 
 
-def bid_of(content: object) -> Bid | None:
+def parse_bid(content: object) -> Bid | None:
     """Decode a bid; None if it is malformed.  Never raises."""
     if not isinstance(content, list) or len(content) != 4:
         return None
@@ -68,17 +68,17 @@ def bid_of(content: object) -> Bid | None:
     is_valid = (
         isinstance(public, bytes)
         and len(public) == 32
-        and is_whole(revision)
+        and is_natural(revision)
         and isinstance(signature, bytes)
         and len(signature) == 64
     )
     if not is_valid:
         return None
-    report = None if packed is None else report_of(packed, node_id(public).hex())
+    report = None if packed is None else parse_report(packed, derive_node_id(public).hex())
     return Bid(public, report, revision, signature) if packed is None or report is not None else None
 
 
-def packed_report(report: Report | None) -> dict[str, object] | None:
+def pack_report(report: Report | None) -> dict[str, object] | None:
     """Encode a report without its agent; fields with their default value are left out."""
     if report is None:
         return None
@@ -86,7 +86,7 @@ def packed_report(report: Report | None) -> dict[str, object] | None:
     return {name: value for name, value in content.items() if name not in _DEFAULTS or value != _DEFAULTS[name]}
 
 
-def report_of(content: object, agent: str) -> Report | None:
+def parse_report(content: object, agent: str) -> Report | None:
     """Decode the report of ``agent``; None if it is malformed or its cost is invalid."""
     if not isinstance(content, Mapping) or not is_cost(content.get("cost")):
         return None
@@ -119,4 +119,4 @@ def _matches_type(value: object, default: object) -> bool:
 
 
 def _is_item(value: object) -> bool:
-    return len(value) <= MAX_TEXT if isinstance(value, str) else is_number(value)
+    return len(value) <= MAX_TEXT_CHARACTERS if isinstance(value, str) else is_number(value)

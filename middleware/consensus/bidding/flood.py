@@ -10,14 +10,14 @@ import random
 from collections.abc import Callable, Iterable
 
 from middleware.consensus.bidding.bid import Bid
-from middleware.consensus.bidding.errand import Cry
-from middleware.consensus.bidding.rule import Rule
+from middleware.consensus.bidding.merge_rule import MergeRule
+from middleware.consensus.bidding.outgoing_message import FloodedBids
 from middleware.consensus.bidding.summary import Summary
 from middleware.entangled.contact import Contact
-from middleware.entangled.kademlia.distance import closest
+from middleware.entangled.kademlia.distance import select_closest
 
-NEIGHBOURS = 8
-NEAREST = 4
+MAX_NEIGHBOURS = 8
+NEAREST_NEIGHBOURS = 4
 """Number of these neighbours that are the nearest by id, so that every part of the key space is reached."""
 
 
@@ -25,7 +25,7 @@ class Flood:
     """The flooded bids that one node has received and sends."""
 
     def __init__(
-        self, own_id: bytes, rule: Rule, contacts: Callable[[], Iterable[Contact]], rng: random.Random
+        self, own_id: bytes, rule: MergeRule, contacts: Callable[[], Iterable[Contact]], rng: random.Random
     ) -> None:
         self.summary = Summary(rule)
         self._own_id = own_id
@@ -38,27 +38,27 @@ class Flood:
     def join(self, bids: Iterable[Bid], sender: Contact | None = None) -> bool:
         """Add bids, the own one or those of ``sender``; returns whether they changed anything."""
         changed = self.summary.join(bids)
-        if sender is not None and len(self._senders) < NEIGHBOURS:
+        if sender is not None and len(self._senders) < MAX_NEIGHBOURS:
             self._senders.setdefault(sender.node_id, sender)
         self._is_changed = self._is_changed or changed
         return changed
 
-    def cries(self) -> list[Cry]:
+    def take_due_messages(self) -> list[FloodedBids]:
         """Return the messages that are due now: one per neighbour for each change."""
         if not self._is_changed:
             return []
         self._is_changed = False
-        return [Cry(neighbour, self.summary.bids()) for neighbour in self._choose_neighbours()]
+        return [FloodedBids(neighbour, self.summary.list_bids()) for neighbour in self._choose_neighbours()]
 
     def _choose_neighbours(self) -> list[Contact]:
         """Return the neighbours: the nearest, some random ones, and senders that have this node as a neighbour."""
         if not self._neighbours:
             known = list(self._contacts())
-            near = closest(known, self._own_id, NEAREST)
+            near = select_closest(known, self._own_id, NEAREST_NEIGHBOURS)
             far = [contact for contact in known if contact not in near]
-            self._neighbours = near + self._rng.sample(far, min(len(far), NEIGHBOURS - len(near)))
+            self._neighbours = near + self._rng.sample(far, min(len(far), MAX_NEIGHBOURS - len(near)))
         once = {contact.node_id: contact for contact in self._neighbours}
         for node_id, contact in self._senders.items():
-            if len(once) < NEIGHBOURS:
+            if len(once) < MAX_NEIGHBOURS:
                 once.setdefault(node_id, contact)
         return list(once.values())

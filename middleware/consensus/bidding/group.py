@@ -11,29 +11,29 @@ from typing import TYPE_CHECKING
 
 from twisted.internet.defer import Deferred
 
-from middleware.consensus.bidding.panel import BELIEVED, Panel
+from middleware.consensus.bidding.reporters import ASSUMED_PRESENT_S, Reporters
+from middleware.consensus.report_view import ReportView
 from middleware.consensus.strategy import Report
-from middleware.consensus.view import View
 from middleware.directory.presence import WAITING
 from middleware.entangled.node import EntangledNode
 from middleware.entangled.record import Record
 from middleware.entangled.replication.owner import Stored
-from middleware.tasks.task import DONE, MEMBER, Member, Result, Task, done_packed, group_key, member_of, outcome_of
+from middleware.tasks.task import DONE, MEMBER, Member, Result, Task, find_outcome, group_key, pack_done, parse_member
 
 if TYPE_CHECKING:
-    from middleware.consensus.bidding.auctions import Bidding
+    from middleware.consensus.bidding.auction_service import Bidding
 
-Heard = Callable[[list[Member], Result | None], None]
+OnMembers = Callable[[list[Member], Result | None], None]
 """Called with all present members, including the own one, and the task's outcome (None: it is open)."""
 
-Enter = Callable[[Callable[[tuple[Report, ...]], None]], "Bidding"]
+StartBidding = Callable[[Callable[[tuple[Report, ...]], None]], "Bidding"]
 """Starts bidding; its argument is called with the reports that the quorum members announce."""
 
 Later = Callable[[float, Callable[[], None]], Callable[[], None]]
 """Calls a function after a delay in seconds; returns a function that cancels the call."""
 
 
-class Roll:
+class TaskMembers:
     """The members of one task, merged from two sources; ``view`` is the part of a report that the strategy reads.
 
     Records under the group's key show the present members; announcements of the quorum members have the best bids.  The
@@ -41,8 +41,8 @@ class Roll:
     arrived yet is kept.
     """
 
-    def __init__(self, view: View | None = None) -> None:
-        self._view = view or View()
+    def __init__(self, view: ReportView | None = None) -> None:
+        self._view = view or ReportView()
         self._present: dict[str, Member] = {}
         self._announced: dict[str, Report] = {}
         self._early: set[str] = set()
@@ -51,18 +51,18 @@ class Roll:
     def __len__(self) -> int:
         return len(self._present)
 
-    def present(self, members: Iterable[Member]) -> None:
+    def update_present(self, members: Iterable[Member]) -> None:
         """Process the records; a changed report replaces an announced one."""
         before, self._present = self._present, {member.uuid: member for member in members}
         for uuid, member in self._present.items():
-            if uuid in before and self._view.report(before[uuid]) != self._view.report(member):
+            if uuid in before and self._view.make_report(before[uuid]) != self._view.make_report(member):
                 self._drop_announced(uuid)
         departed = before.keys() - self._present.keys()
         for uuid in departed:
             self._drop_announced(uuid)
         self._left = (self._left | departed) - self._present.keys()
 
-    def announced(self, reports: Iterable[Report]) -> None:
+    def update_announced(self, reports: Iterable[Report]) -> None:
         """Process an announcement; members that it does not name are unchanged.
 
         Except members that were announced before their records arrived: their records may be newer.
@@ -73,18 +73,18 @@ class Roll:
         self._early |= named.keys() - self._present.keys()
         self._announced.update(named)
 
-    def awaited(self) -> list[Report]:
+    def list_awaited(self) -> list[Report]:
         """Return the announced reports of members whose records have not arrived."""
         return [report for uuid, report in self._announced.items() if uuid not in self._present]
 
-    def uuids(self) -> Set[str]:
+    def get_uuids(self) -> Set[str]:
         """Return the uuids of the present members."""
         return self._present.keys()
 
-    def members(self) -> list[Member]:
+    def list_members(self) -> list[Member]:
         """Return the present members with their valid reports."""
         return [
-            self._view.told(member, self._announced[uuid]) if uuid in self._announced else member
+            self._view.apply_report(member, self._announced[uuid]) if uuid in self._announced else member
             for uuid, member in self._present.items()
         ]
 
@@ -108,12 +108,12 @@ class Group:
         self,
         task: Task,
         entangled: EntangledNode,
-        heard: Heard,
+        heard: OnMembers,
         quietly: Callable[[Deferred[Stored]], None],
         ordered: Callable[[list[Record]], None],
-        enter: Enter | None,
-        view: View | None,
-        panel: Panel,
+        enter: StartBidding | None,
+        view: ReportView | None,
+        panel: Reporters,
         devices: Callable[[], int],
         seconds: Callable[[], float],
         later: Later,
@@ -121,103 +121,103 @@ class Group:
         self._task = task
         self._key = group_key(task.task_id)
         self._entangled = entangled
-        self._heard = heard
-        self._ordered = ordered
-        self._quietly = quietly
-        self._view = view or View()
-        self._roll = Roll(self._view)
+        self._on_members = heard
+        self._on_orders = ordered
+        self._log_failures = quietly
+        self._view = view or ReportView()
+        self._members = TaskMembers(self._view)
         self._outcome: Result | None = None
-        self._panel = panel
+        self._reporters = panel
         self._devices = devices
         self._seconds = seconds
         self._later = later
         self._me: Member | None = None
         self._cancel: Callable[[], None] = lambda: None
-        self._is_left = False
-        panel.heard((), devices(), seconds())
-        self._bidding = enter(self._announced) if enter is not None else None
+        self._has_left = False
+        panel.on_records((), devices(), seconds())
+        self._bidding = enter(self._on_announcement) if enter is not None else None
         self._watch = entangled.watch(self._key, self._on_records)
 
     def report(self, member: Member) -> None:
         """Publish the agent's report; its record is removed when this node leaves."""
         self._me = member
-        self._write()
+        self._write_record()
         if self._bidding is None:
             return
-        self._bidding.expect(self._expected_bidders())
-        report = self._view.report(member)
+        self._bidding.expect_bidders(self._count_expected_bidders())
+        report = self._view.make_report(member)
         if report is not None:
             self._bidding.report(report)
-        elif self._bidding.is_standing:  # an agent without a first measurement does not abstain
+        elif self._bidding.has_bid:  # an agent without a first measurement does not abstain
             self._bidding.withdraw()
 
     def withdraw(self) -> None:
         """Withdraw this node's report."""
         self._me = None
-        if self._panel.is_written:
-            self._quietly(self._entangled.remove(self._key, MEMBER))
-            self._panel.wrote(None, self._seconds())
+        if self._reporters.is_written:
+            self._log_failures(self._entangled.remove(self._key, MEMBER))
+            self._reporters.on_written(None, self._seconds())
         if self._bidding is not None:
             self._bidding.withdraw()
 
     def conclude(self, result: Result, proof: bytes) -> Deferred[Stored]:
         """Record the outcome with its proof; the record remains when this node leaves."""
-        return self._entangled.put(self._key, DONE, done_packed(result, proof), "team")
+        return self._entangled.put(self._key, DONE, pack_done(result, proof), "team")
 
     def leave(self) -> None:
         """Stop watching the group."""
-        self._is_left = True
+        self._has_left = True
         self._cancel()
         self._watch.stop()
         if self._bidding is not None:
             self._bidding.leave()
 
     def _on_records(self, records: list[Record]) -> None:
-        self._roll.present(m for record in records if (m := member_of(record)) is not None)
-        self._outcome = outcome_of(self._task, records)
-        self._panel.heard(self._roll.uuids(), self._devices(), self._seconds())
+        self._members.update_present(m for record in records if (m := parse_member(record)) is not None)
+        self._outcome = find_outcome(self._task, records)
+        self._reporters.on_records(self._members.get_uuids(), self._devices(), self._seconds())
         if self._bidding is not None:
-            self._bidding.expect(self._expected_bidders())
+            self._bidding.expect_bidders(self._count_expected_bidders())
         self._notify()
-        self._ordered(records)
-        self._write()
+        self._on_orders(records)
+        self._write_record()
 
-    def _announced(self, reports: tuple[Report, ...]) -> None:
-        self._roll.announced(reports)
-        self._panel.announced([report.agent for report in reports], self._seconds())
+    def _on_announcement(self, reports: tuple[Report, ...]) -> None:
+        self._members.update_announced(reports)
+        self._reporters.on_announcement([report.agent for report in reports], self._seconds())
         self._notify()
-        self._write()
-        if self._awaited_members():
-            self._later(BELIEVED, self._notify)
+        self._write_record()
+        if self._make_awaited_members():
+            self._later(ASSUMED_PRESENT_S, self._notify)
 
     def _notify(self) -> None:
-        if not self._is_left:
-            self._heard([*self._roll.members(), *self._awaited_members()], self._outcome)
+        if not self._has_left:
+            self._on_members([*self._members.list_members(), *self._make_awaited_members()], self._outcome)
 
-    def _awaited_members(self) -> list[Member]:
+    def _make_awaited_members(self) -> list[Member]:
         """Return the announced members that are assumed present although their records have not arrived."""
         now = self._seconds()
-        if not self._panel.is_partial(now):
+        if not self._reporters.is_partial(now):
             return []
         return [
-            self._view.told(Member(report.agent, report.agent[:8], WAITING), report)
-            for report in self._roll.awaited()
-            if self._panel.believes(report.agent, now)
+            self._view.apply_report(Member(report.agent, report.agent[:8], WAITING), report)
+            for report in self._members.list_awaited()
+            if self._reporters.is_assumed_present(report.agent, now)
         ]
 
-    def _expected_bidders(self) -> float:
+    def _count_expected_bidders(self) -> float:
         """Return the number of bidders after which the quorum members need not wait longer."""
-        return math.inf if self._panel.is_partial(self._seconds()) else len(self._roll)
+        return math.inf if self._reporters.is_partial(self._seconds()) else len(self._members)
 
-    def _write(self) -> None:
+    def _write_record(self) -> None:
         """Write the record if the panel requires it, or set a timer for later."""
         self._cancel()
         if self._me is None:
             return
         now = self._seconds()
-        due = self._panel.due(self._me, now)
+        due = self._reporters.compute_due(self._me, now)
         if due <= now:
-            self._panel.wrote(self._me, now)
-            self._quietly(self._entangled.put(self._key, MEMBER, self._me.packed(), "leased"))
+            self._reporters.on_written(self._me, now)
+            self._log_failures(self._entangled.put(self._key, MEMBER, self._me.pack(), "leased"))
         elif due != math.inf:
-            self._cancel = self._later(due - now, self._write)
+            self._cancel = self._later(due - now, self._write_record)

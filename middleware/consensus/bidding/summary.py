@@ -10,7 +10,7 @@ from __future__ import annotations
 from collections.abc import Iterable
 
 from middleware.consensus.bidding.bid import Bid
-from middleware.consensus.bidding.rule import Rule
+from middleware.consensus.bidding.merge_rule import MergeRule
 from middleware.consensus.strategy import Report
 
 MAX_SUPERSEDING = 256
@@ -19,7 +19,7 @@ MAX_SUPERSEDING = 256
 class Summary:
     """The bids that stand under ``rule``, and those that replaced others."""
 
-    def __init__(self, rule: Rule) -> None:
+    def __init__(self, rule: MergeRule) -> None:
         self._rule = rule
         self._bids: dict[str, Bid] = {}
         self._standing: tuple[Report, ...] = ()
@@ -29,11 +29,11 @@ class Summary:
         """The reports that stand."""
         return self._standing
 
-    def bids(self) -> tuple[Bid, ...]:
+    def list_bids(self) -> tuple[Bid, ...]:
         """Return the bids to forward, sorted by the agents' ids."""
         return tuple(self._bids[agent] for agent in sorted(self._bids))
 
-    def of(self, agent: str) -> Bid | None:
+    def get(self, agent: str) -> Bid | None:
         """Return the bid of an agent, or None if it is not kept."""
         return self._bids.get(agent)
 
@@ -51,10 +51,10 @@ class Summary:
         self._bids.update(newer)
         if replaced:
             known_reports = [bid.report for bid in self._bids.values() if bid.report is not None]
-            self._standing = self._rule.merged(known_reports, ())
+            self._standing = self._rule.merge(known_reports, ())
         else:
             new_reports = [bid.report for bid in newer.values() if bid.report is not None]
-            self._standing = self._rule.merged(self._standing, new_reports)
+            self._standing = self._rule.merge(self._standing, new_reports)
         self._remove_unneeded()
         return self._bids != before
 

@@ -12,19 +12,19 @@ from collections.abc import Callable, Iterable
 
 from middleware.consensus.bidding.auction import Auction
 from middleware.consensus.bidding.bid import Bid
-from middleware.consensus.bidding.errand import MAX_BIDS, Offer
-from middleware.consensus.bidding.rule import Rule
+from middleware.consensus.bidding.merge_rule import MergeRule
+from middleware.consensus.bidding.outgoing_message import MAX_BIDS_PER_MESSAGE, Offer
 from middleware.consensus.bidding.summary import Summary
 from middleware.entangled.contact import Contact
-from middleware.entangled.kademlia.distance import closest, distance
+from middleware.entangled.kademlia.distance import distance, select_closest
 
-HOLD_PER_BIT = 0.02
+HOLD_PER_BIT_S = 0.02
 """Seconds to wait per bit that the own id shares with the key: a hop gains three bits and takes at least 30 ms."""
 HOLD_SHARE = 0.5
 """The maximum wait, as a share of the waiting period."""
-LATER = 0.05
+LATE_BIDS_S = 0.05
 """Seconds over which bids after the first message are collected."""
-AGAIN, MOST_PAUSE = 1.0, 30.0
+RETRY_PAUSE_S, MAX_RETRY_PAUSE_S = 1.0, 30.0
 """Initial and maximum seconds after which all contacts are tried again when none answered; doubled each time."""
 
 
@@ -40,7 +40,7 @@ MAX_HOPS = 4
 """Number of contacts that are tried before the quorum members."""
 
 
-def hops(auction: Auction, own_id: bytes, contacts: Iterable[Contact]) -> list[Contact]:
+def find_hops(auction: Auction, own_id: bytes, contacts: Iterable[Contact]) -> list[Contact]:
     """Return the contacts to send to, in order: the nearest contacts to the key, then the quorum members.
 
     Only contacts nearer than this node are used, so bids do not circulate (Kademlia, section 2).  If the nearest
@@ -48,36 +48,38 @@ def hops(auction: Auction, own_id: bytes, contacts: Iterable[Contact]) -> list[C
     """
     own = distance(own_id, auction.key)
     nearer = [c for c in contacts if distance(c.node_id, auction.key) < own]
-    found = closest(nearer, auction.key, MAX_HOPS)
+    found = select_closest(nearer, auction.key, MAX_HOPS)
     council = [member for member in auction.council if member.node_id != own_id]
-    if found and auction.rank(found[0].node_id) is not None:
+    if found and auction.find_rank(found[0].node_id) is not None:
         return [found[0], *(member for member in council if member.node_id != found[0].node_id)]
-    return [*(c for c in found if auction.rank(c.node_id) is None), *council]
+    return [*(c for c in found if auction.find_rank(c.node_id) is None), *council]
 
 
-def shared_bits(a: bytes, b: bytes) -> int:
+def count_shared_bits(a: bytes, b: bytes) -> int:
     """Return the length of the common prefix of two ids in bits."""
     return 8 * len(a) - distance(a, b).bit_length()
 
 
-class Branch:
+class TreeNode:
     """The forwarding of bids through the node ``own_id``, which is not a quorum member.
 
     ``contacts`` returns the node's contacts.
     """
 
-    def __init__(self, auction: Auction, own_id: bytes, rule: Rule, contacts: Callable[[], Iterable[Contact]]) -> None:
+    def __init__(
+        self, auction: Auction, own_id: bytes, rule: MergeRule, contacts: Callable[[], Iterable[Contact]]
+    ) -> None:
         self.summary = Summary(rule)
-        self.is_alone = False
+        self.is_isolated = False
         self._auction = auction
         self._own_id = own_id
         self._contacts = contacts
-        bits = shared_bits(own_id, auction.key)
-        self._hold = min(HOLD_PER_BIT * bits, auction.waiting * HOLD_SHARE)
+        bits = count_shared_bits(own_id, auction.key)
+        self._hold_s = min(HOLD_PER_BIT_S * bits, auction.waiting_period * HOLD_SHARE)
         self._parent: Contact | None = None
-        self._refused: set[bytes] = set()
+        self._failed_parents: set[bytes] = set()
         self._confirmed: dict[str, tuple[int, bytes]] = {}
-        self._under_way: Offer | None = None
+        self._in_flight: Offer | None = None
         self._send_at = math.inf
         self._has_sent = False
         self._rounds = 0
@@ -85,53 +87,53 @@ class Branch:
     @property
     def due(self) -> float:
         """The time of the next message."""
-        return math.inf if self._under_way is not None else self._send_at
+        return math.inf if self._in_flight is not None else self._send_at
 
     def join(self, bids: Iterable[Bid], now: float) -> None:
         """Add bids."""
         if self.summary.join(bids):
-            self._send_at = min(self._send_at, now + (LATER if self._has_sent else self._hold))
+            self._send_at = min(self._send_at, now + (LATE_BIDS_S if self._has_sent else self._hold_s))
 
-    def offers(self, age: float, now: float) -> list[Offer]:
+    def take_due_offers(self, age: float, now: float) -> list[Offer]:
         """Return the message that is due now."""
         if now < self.due:
             return []
         self._send_at = math.inf
-        unconfirmed = tuple(b for b in self.summary.bids() if self._confirmed.get(b.agent) != b.rank)
-        parent = self._parent if self._parent is not None else self._next_parent()
+        unconfirmed = tuple(b for b in self.summary.list_bids() if self._confirmed.get(b.agent) != b.rank)
+        parent = self._parent if self._parent is not None else self._find_next_parent()
         if not unconfirmed or parent is None:
             return []
         self._parent, self._has_sent = parent, True
-        self._under_way = Offer(parent, unconfirmed[:MAX_BIDS], age)
-        return [self._under_way]
+        self._in_flight = Offer(parent, unconfirmed[:MAX_BIDS_PER_MESSAGE], age)
+        return [self._in_flight]
 
-    def answered(self, offer: Offer, now: float) -> None:
+    def on_answer(self, offer: Offer, now: float) -> None:
         """Record that the parent confirmed the bids."""
-        self.is_alone, self._rounds = False, 0
+        self.is_isolated, self._rounds = False, 0
         self._on_sent(offer, now)
         self._confirmed.update((bid.agent, bid.rank) for bid in offer.bids)
 
-    def failed(self, offer: Offer, now: float) -> None:
+    def on_failure(self, offer: Offer, now: float) -> None:
         """Record that the parent did not answer; the next parent gets all bids."""
         self._on_sent(offer, now)
-        self._refused.add(offer.to.node_id)
+        self._failed_parents.add(offer.to.node_id)
         self._confirmed.clear()
-        self._parent = self._next_parent()
+        self._parent = self._find_next_parent()
         self._send_at = now
         if self._parent is None:
-            self.is_alone = True
-            self._refused.clear()
-            self._send_at = now + min(MOST_PAUSE, AGAIN * 2.0 ** min(self._rounds, 8))
+            self.is_isolated = True
+            self._failed_parents.clear()
+            self._send_at = now + min(MAX_RETRY_PAUSE_S, RETRY_PAUSE_S * 2.0 ** min(self._rounds, 8))
             self._rounds += 1
 
     def _on_sent(self, offer: Offer, now: float) -> None:
-        if offer is self._under_way:
-            self._under_way = None
+        if offer is self._in_flight:
+            self._in_flight = None
             sent = {bid.agent: bid.rank for bid in offer.bids}
             known = {**self._confirmed, **sent}
-            if any(known.get(bid.agent) != bid.rank for bid in self.summary.bids()):
-                self._send_at = min(self._send_at, now + LATER)
+            if any(known.get(bid.agent) != bid.rank for bid in self.summary.list_bids()):
+                self._send_at = min(self._send_at, now + LATE_BIDS_S)
 
-    def _next_parent(self) -> Contact | None:
-        known = hops(self._auction, self._own_id, self._contacts())
-        return next((contact for contact in known if contact.node_id not in self._refused), None)
+    def _find_next_parent(self) -> Contact | None:
+        known = find_hops(self._auction, self._own_id, self._contacts())
+        return next((contact for contact in known if contact.node_id not in self._failed_parents), None)

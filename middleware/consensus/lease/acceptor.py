@@ -2,15 +2,15 @@
 
 from __future__ import annotations
 
-from middleware.consensus.lease.lease_codec import AHEAD, CODEC
+from middleware.consensus.lease.lease_codec import CODEC, EARLY_PROMISE_SHARE
 from middleware.entangled.data.store import Store
-from middleware.entangled.quorum.acceptor import Acceptor, Terms
-from middleware.entangled.quorum.ballot import FIRST, Ballot
-from middleware.entangled.quorum.log import Log
-from middleware.entangled.quorum.register import Kind, Register, Reply
+from middleware.entangled.quorum.acceptor import Acceptor, AcceptorSettings
+from middleware.entangled.quorum.ballot import FIRST_CONFIGURATION, Ballot
+from middleware.entangled.quorum.log import RegisterLog
+from middleware.entangled.quorum.register import Register, Reply, ReplyKind
 
 MAX_LISTENERS = 16
-ENDED_AGE, IDLE_AGE = 600.0, 86_400.0
+ENDED_AGE_S, IDLE_AGE_S = 600.0, 86_400.0
 """Seconds after the last change until a register may be evicted: of an ended task, and of any other task."""
 
 
@@ -21,9 +21,9 @@ class LeaseAcceptor(Acceptor[str]):
     """
 
     def __init__(self, store: Store, born_at: float) -> None:
-        log = Log(store, CODEC, may_forget, born_at)
-        log.is_whole = log.is_whole and store.origin != "replaced"
-        super().__init__(log, Terms(AHEAD), born_at)
+        log = RegisterLog(store, CODEC, may_evict, born_at)
+        log.is_complete = log.is_complete and store.origin != "replaced"
+        super().__init__(log, AcceptorSettings(EARLY_PROMISE_SHARE), born_at)
 
     def prepare(
         self, key: str, configuration: int, ballot: Ballot, ttl: float, now: float, reserve: float = 0.0
@@ -31,34 +31,34 @@ class LeaseAcceptor(Acceptor[str]):
         """Promise as ``Acceptor`` does; an agent blocked by a lease is added to the listeners for its release."""
         reply = super().prepare(key, configuration, ballot, ttl, now, reserve)
         register = self.log.get(key)
-        if reply.remaining > 0.0 and register is not None and register.until > now and not register.is_given_back:
+        if reply.remaining > 0.0 and register is not None and register.lease_until > now and not register.is_released:
             register.listeners.pop(ballot.proposer, None)
             if len(register.listeners) >= MAX_LISTENERS:
                 del register.listeners[next(iter(register.listeners))]
             register.listeners[ballot.proposer] = now + ttl
         return reply
 
-    def free(self, key: str, ballot: Ballot, now: float, rest: float = 0.0) -> list[str]:
+    def release_by_ballot(self, key: str, ballot: Ballot, now: float, rest: float = 0.0) -> list[str]:
         """Release promises and leases under ``ballot``; return the agents to notify."""
         register = self.log.get(key)
-        released = self.release(key, ballot, now, rest).kind is Kind.GRANTED
-        if not released or register is None or (register.until > now and not register.is_given_back):
+        released = self.release(key, ballot, now, rest).kind is ReplyKind.GRANTED
+        if not released or register is None or (register.lease_until > now and not register.is_released):
             return []
         listeners, register.listeners = register.listeners, {}
         return [agent for agent, until in listeners.items() if until > now and agent != ballot.proposer]
 
-    def freed(self, key: str, agent: str, token: int, now: float, rest: float = 0.0) -> list[str]:
+    def release_by_token(self, key: str, agent: str, token: int, now: float, rest: float = 0.0) -> list[str]:
         """Release the lease that ``agent`` holds with ``token``; return the agents to notify."""
         register = self.log.get(key)
         if register is None or (register.holder.proposer, register.token) != (agent, token):
             return []
-        return self.free(key, register.holder, now, rest)
+        return self.release_by_ballot(key, register.holder, now, rest)
 
 
-def may_forget(task_id: str, register: Register, now: float) -> bool:
+def may_evict(task_id: str, register: Register, now: float) -> bool:
     """Return whether a register may be evicted: its lease expired long ago, or its task has ended."""
-    age = ENDED_AGE if register.is_over else IDLE_AGE
+    age = ENDED_AGE_S if register.is_closed else IDLE_AGE_S
     # C3: while the task is open an old configuration must not become valid again.
-    return max(register.until, register.touched_at) + age <= now and (
-        register.configuration == FIRST or register.is_over
+    return max(register.lease_until, register.touched_at) + age <= now and (
+        register.configuration == FIRST_CONFIGURATION or register.is_closed
     )

@@ -13,18 +13,31 @@ from typing import Any, NamedTuple
 
 import msgpack
 
-from middleware.consensus.lease.lease_codec import MAX_COUNCIL, MAX_PROOF_BYTES, members_of, pack_members, unpack_note
+from middleware.consensus.lease.lease_codec import (
+    MAX_COUNCIL,
+    MAX_PROOF_BYTES,
+    pack_members,
+    parse_members,
+    unpack_note,
+)
 from middleware.entangled.contact import Contact
 from middleware.entangled.errors import Refused
-from middleware.entangled.identity import Identity, verified
-from middleware.entangled.quorum.ballot import FIRST, NONE, ROOM, Ballot, is_number, majority
+from middleware.entangled.identity import Identity, is_signature_valid
+from middleware.entangled.quorum.ballot import (
+    FIRST_CONFIGURATION,
+    INITIAL_CEILING,
+    NO_BALLOT,
+    Ballot,
+    is_number,
+    majority,
+)
 from middleware.entangled.quorum.register import Reply
 
-MAX_LINKS = 64
+MAX_CHANGES = 64
 """Maximum changes of one task's council; a change to three members takes 350 bytes, one to seven 700."""
-LEAST = 3
+MIN_MEMBERS = 3
 """Minimum members of a new council after a change: a single member of a smaller one would be a majority."""
-MAX_TOKEN = 2 * ROOM
+MAX_TOKEN = 2 * INITIAL_CEILING
 """Upper bound of the first token of a council, so that one member cannot exhaust the tokens."""
 SIGNATURE_BYTES = 64
 
@@ -32,7 +45,7 @@ Votes = tuple[tuple[int, int, bytes], ...]
 """For each member that signed: its place in the council, its highest token, its signature."""
 
 
-class Link(NamedTuple):
+class CouncilChange(NamedTuple):
     """One change: the ``members`` of the next council, and the ``votes`` of the previous one under ``ballot``."""
 
     members: tuple[Contact, ...]
@@ -47,38 +60,38 @@ class Charter:
     owner: bytes
     first: tuple[Contact, ...]
     signature: bytes
-    links: tuple[Link, ...] = ()
+    changes: tuple[CouncilChange, ...] = ()
 
     @property
     def configuration(self) -> int:
         """The number of the newest council."""
-        return FIRST + len(self.links)
+        return FIRST_CONFIGURATION + len(self.changes)
 
     @property
     def members(self) -> tuple[Contact, ...]:
         """The newest council."""
-        return self.links[-1].members if self.links else self.first
+        return self.changes[-1].members if self.changes else self.first
 
     @property
     def ballot(self) -> Ballot:
         """The ballot under which the newest council was chosen."""
-        return self.links[-1].ballot if self.links else NONE
+        return self.changes[-1].ballot if self.changes else NO_BALLOT
 
     @property
     def token(self) -> int:
         """The token above which the newest council grants leases."""
-        return min(MAX_TOKEN, max((token for link in self.links for _, token, _ in link.votes), default=0))
+        return min(MAX_TOKEN, max((token for link in self.changes for _, token, _ in link.votes), default=0))
 
     @property
-    def pin(self) -> tuple[bytes, bytes]:
+    def first_council_id(self) -> tuple[bytes, bytes]:
         """The identity of the first council: its owner and signature."""
         return self.owner, self.signature
 
-    def extended(self, members: tuple[Contact, ...], ballot: Ballot, votes: Votes) -> Charter:
+    def with_change(self, members: tuple[Contact, ...], ballot: Ballot, votes: Votes) -> Charter:
         """Return this charter with one more council; raise ``Refused`` after ``MAX_LINKS`` changes."""
-        if len(self.links) >= MAX_LINKS:
-            raise Refused(f"the council has changed {MAX_LINKS} times; ask the operator to submit the task again")
-        return replace(self, links=(*self.links, Link(members, ballot, votes)))
+        if len(self.changes) >= MAX_CHANGES:
+            raise Refused(f"the council has changed {MAX_CHANGES} times; ask the operator to submit the task again")
+        return replace(self, changes=(*self.changes, CouncilChange(members, ballot, votes)))
 
     def is_genuine(self, task_id: str) -> bool:
         """Return whether all signatures are valid; does not check whether ``owner`` may publish tasks."""
@@ -87,13 +100,15 @@ class Charter:
     @cached_property
     def packed(self) -> bytes:
         """The encoding for messages, records and notes."""
-        links = [[pack_members(link.members), *link.ballot, [list(vote) for vote in link.votes]] for link in self.links]
+        links = [
+            [pack_members(link.members), *link.ballot, [list(vote) for vote in link.votes]] for link in self.changes
+        ]
         return bytes(msgpack.packb([self.owner, pack_members(self.first), self.signature, links]))
 
 
-def pin(identity: Identity, task_id: str, members: tuple[Contact, ...]) -> Charter:
+def create_charter(identity: Identity, task_id: str, members: tuple[Contact, ...]) -> Charter:
     """Return the charter of a new task with the first council ``members``."""
-    return Charter(identity.public, members, identity.sign(_pin_bytes(task_id, members)))
+    return Charter(identity.public, members, identity.sign(_first_council_bytes(task_id, members)))
 
 
 def sign_change(
@@ -108,9 +123,9 @@ def sign_end(identity: Identity, task_id: str, configuration: int, agent: str, t
     return identity.sign(_end_bytes(task_id, configuration, agent, token))
 
 
-def charter_of(packed: object) -> Charter | None:
+def parse_charter(packed: object) -> Charter | None:
     """Decode a charter without a check of its signatures; None if it is invalid; never raises."""
-    return _charter_of(packed) if isinstance(packed, bytes) and 0 < len(packed) <= MAX_PROOF_BYTES else None
+    return _parse_charter(packed) if isinstance(packed, bytes) and 0 < len(packed) <= MAX_PROOF_BYTES else None
 
 
 def is_change_signed(
@@ -118,16 +133,16 @@ def is_change_signed(
 ) -> bool:
     """Return whether ``reply`` has a valid signature of the change by ``member`` (``sign_change``)."""
     statement = _change_bytes(task_id, configuration, ballot, members, reply.token)
-    return verified(member.public, statement, reply.proof)
+    return is_signature_valid(member.public, statement, reply.proof)
 
 
 def is_end_signed(member: Contact, task_id: str, configuration: int, agent: str, token: int, proof: bytes) -> bool:
     """Return whether ``proof`` is a valid signature of the end by ``member`` (``sign_end``)."""
-    return verified(member.public, _end_bytes(task_id, configuration, agent, token), proof)
+    return is_signature_valid(member.public, _end_bytes(task_id, configuration, agent, token), proof)
 
 
 @dataclass(frozen=True)
-class Ending:
+class EndProof:
     """The proof that a task was ended under a token, signed by a majority of the council of ``charter``."""
 
     charter: Charter
@@ -144,33 +159,33 @@ class Ending:
     @property
     def packed(self) -> bytes:
         """The encoding for a record, without the first council, which the task's record has already."""
-        charter = self.charter.packed if self.charter.links else b""
+        charter = self.charter.packed if self.charter.changes else b""
         return bytes(msgpack.packb([charter, [list(each) for each in self.signatures]]))
 
 
-def ending_of(packed: object, pinned: Charter) -> Ending | None:
+def parse_end_proof(packed: object, pinned: Charter) -> EndProof | None:
     """Decode the proof for the task published with the charter ``pinned``; None if invalid; never raises."""
     fields = unpack_note(packed) if isinstance(packed, bytes) and len(packed) <= 2 * MAX_PROOF_BYTES else None
     if not isinstance(fields, list) or len(fields) != 2 or not isinstance(fields[1], list):
         return None
-    charter, signatures = charter_of(fields[0]) if fields[0] else pinned, fields[1]
-    if charter is None or charter.pin != pinned.pin or len(signatures) > MAX_COUNCIL:
+    charter, signatures = parse_charter(fields[0]) if fields[0] else pinned, fields[1]
+    if charter is None or charter.first_council_id != pinned.first_council_id or len(signatures) > MAX_COUNCIL:
         return None
     if not all(isinstance(each, list) and len(each) == 2 and _is_vote(each[0], 0, each[1]) for each in signatures):
         return None
-    return Ending(charter, tuple((place, signature) for place, signature in signatures))
+    return EndProof(charter, tuple((place, signature) for place, signature in signatures))
 
 
-class Judge:
+class CharterVerifier:
     """Checks charters from peers; ``may_pin`` returns whether the owner of a key may publish the task."""
 
     def __init__(self, may_pin: Callable[[bytes, str], bool]) -> None:
-        self._may_pin = may_pin
+        self._may_publish = may_pin
 
-    def read(self, task_id: str, packed: object) -> Charter | None:
+    def parse(self, task_id: str, packed: object) -> Charter | None:
         """Decode and check the charter of ``task_id``; None if anything in it is invalid."""
-        charter = charter_of(packed)
-        if charter is None or not self._may_pin(charter.owner, task_id) or not charter.is_genuine(task_id):
+        charter = parse_charter(packed)
+        if charter is None or not self._may_publish(charter.owner, task_id) or not charter.is_genuine(task_id):
             return None
         return charter
 
@@ -180,16 +195,18 @@ class Judge:
 
 @lru_cache(maxsize=64)  # 80 us per signature, and the same charter is read repeatedly
 def _is_genuine(packed: bytes, task_id: str) -> bool:
-    charter = _charter_of(packed)
-    if charter is None or not verified(charter.owner, _pin_bytes(task_id, charter.first), charter.signature):
+    charter = _parse_charter(packed)
+    if charter is None or not is_signature_valid(
+        charter.owner, _first_council_bytes(task_id, charter.first), charter.signature
+    ):
         return False
-    previous, configuration = charter.first, FIRST
-    for members, ballot, votes in charter.links:
+    previous, configuration = charter.first, FIRST_CONFIGURATION
+    for members, ballot, votes in charter.changes:
         statements = {
             place: (_change_bytes(task_id, configuration, ballot, members, token), signature)
             for place, token, signature in votes
         }
-        if len(members) < LEAST or not _is_majority(previous, statements):
+        if len(members) < MIN_MEMBERS or not _is_majority(previous, statements):
             return False
         previous, configuration = members, configuration + 1
     return True
@@ -199,35 +216,37 @@ def _is_majority(members: tuple[Contact, ...], signed: Mapping[int, tuple[bytes,
     """Return whether a majority of ``members`` signed, each the statement at its place."""
     if len(signed) < majority(len(members)) or any(place >= len(members) for place in signed):
         return False
-    return all(verified(members[place].public, *pair) for place, pair in signed.items())
+    return all(is_signature_valid(members[place].public, *pair) for place, pair in signed.items())
 
 
 @lru_cache(maxsize=64)
-def _charter_of(packed: bytes) -> Charter | None:
+def _parse_charter(packed: bytes) -> Charter | None:
     fields = unpack_note(packed)
     if not isinstance(fields, list) or len(fields) != 4:
         return None
     owner, first, signature, rows = fields
-    members = members_of(first)
+    members = parse_members(first)
     if not members or not _is_bytes(owner, 32) or not _is_bytes(signature, SIGNATURE_BYTES):
         return None
-    if not isinstance(rows, list) or len(rows) > MAX_LINKS:
+    if not isinstance(rows, list) or len(rows) > MAX_CHANGES:
         return None
-    links = [_link_of(row) for row in rows]
+    links = [_parse_change(row) for row in rows]
     valid = tuple(link for link in links if link is not None)
     return Charter(owner, members, signature, valid) if len(valid) == len(links) else None
 
 
-def _link_of(row: Any) -> Link | None:
+def _parse_change(row: Any) -> CouncilChange | None:
     if not isinstance(row, list) or len(row) != 4 or not isinstance(row[3], list) or len(row[3]) > MAX_COUNCIL:
         return None
     packed, counter, agent, votes = row
-    members = members_of(packed)
+    members = parse_members(packed)
     if not members or not is_number(counter) or not isinstance(agent, str):
         return None
     if not all(isinstance(vote, list) and len(vote) == 3 and _is_vote(*vote) for vote in votes):
         return None
-    return Link(members, Ballot(counter, agent), tuple((place, token, signature) for place, token, signature in votes))
+    return CouncilChange(
+        members, Ballot(counter, agent), tuple((place, token, signature) for place, token, signature in votes)
+    )
 
 
 def _is_vote(place: object, token: object, signature: object) -> bool:
@@ -238,8 +257,8 @@ def _is_bytes(value: object, size: int) -> bool:
     return isinstance(value, bytes) and len(value) == size
 
 
-def _pin_bytes(task_id: str, members: tuple[Contact, ...]) -> bytes:
-    return bytes(msgpack.packb([b"swarm-council-1", task_id, FIRST, pack_members(members)]))
+def _first_council_bytes(task_id: str, members: tuple[Contact, ...]) -> bytes:
+    return bytes(msgpack.packb([b"swarm-council-1", task_id, FIRST_CONFIGURATION, pack_members(members)]))
 
 
 def _change_bytes(task_id: str, configuration: int, ballot: Ballot, members: tuple[Contact, ...], token: int) -> bytes:

@@ -9,36 +9,36 @@ import zlib
 
 import msgpack
 
-from middleware.entangled.contact import Contact, unpacked
-from middleware.entangled.quorum.ballot import NONE, Ballot, Ceiling, is_number
+from middleware.entangled.contact import Contact, parse_contact
+from middleware.entangled.quorum.ballot import NO_BALLOT, Ballot, Ceiling, is_number
 from middleware.entangled.quorum.log import Codec, Floor
-from middleware.entangled.quorum.register import Kind, Register, Reply
+from middleware.entangled.quorum.register import Register, Reply, ReplyKind
 
 MAX_COUNCIL = 7
 MAX_PROOF_BYTES = 2**16
 _BUCKETS = 64
-LIFE = 2**20
+BALLOT_MODULUS = 2**20
 """Modulus of ballot counters; the remainder is random for each run of an agent."""
-AHEAD = 0.2
+EARLY_PROMISE_SHARE = 0.2
 """Share of the ttl before the end of a lease in which the next lease may be promised."""
 
 
 def pack_reply(reply: Reply) -> list[object]:
     """Encode a reply for a message; most have no proof."""
-    is_sealed = reply.kind is Kind.SEALED
+    is_sealed = reply.kind is ReplyKind.SEALED
     ballot, members = (reply.accepted, reply.value) if is_sealed else (reply.promised, ())
     proof = [reply.proof] if reply.proof else []
     return [reply.kind.value, *ballot, reply.token, reply.remaining, reply.configuration, pack_members(members), *proof]
 
 
-def unpack_reply(answer: object) -> Reply | None:
+def parse_reply(answer: object) -> Reply | None:
     """Decode a reply; None if it is invalid; never raises."""
     if not isinstance(answer, list) or not 7 <= len(answer) <= 8:
         return None
     name, counter, agent, token, remaining, configuration, packed = answer[:7]
     proof = answer[7] if len(answer) > 7 else b""
-    kind = next((kind for kind in Kind if kind.value == name), None)
-    members = members_of(packed)
+    kind = next((kind for kind in ReplyKind if kind.value == name), None)
+    members = parse_members(packed)
     is_valid = (
         all(map(is_number, (counter, token, configuration)))
         and isinstance(agent, str)
@@ -50,20 +50,20 @@ def unpack_reply(answer: object) -> Reply | None:
     # Negative values and NaN count as 0.
     remaining = remaining if remaining > 0.0 else 0.0
     ballot = Ballot(counter, agent)
-    accepted, value = (ballot, members) if kind is Kind.SEALED else (NONE, None)
+    accepted, value = (ballot, members) if kind is ReplyKind.SEALED else (NO_BALLOT, None)
     return Reply(kind, ballot, token, remaining, configuration, accepted, value, proof)
 
 
 def pack_members(members: tuple[Contact, ...]) -> list[list[object]]:
     """Encode the members of a council."""
-    return [member.packed() for member in members]
+    return [member.pack() for member in members]
 
 
-def members_of(packed: object) -> tuple[Contact, ...] | None:
+def parse_members(packed: object) -> tuple[Contact, ...] | None:
     """Decode the members of a council; None if they are invalid."""
     if not isinstance(packed, list) or len(packed) > MAX_COUNCIL:
         return None
-    members = tuple(contact for fields in packed if (contact := unpacked(fields)) is not None)
+    members = tuple(contact for fields in packed if (contact := parse_contact(fields)) is not None)
     return members if len(members) == len(packed) == len({member.public for member in members}) else None
 
 
@@ -79,7 +79,7 @@ def _unpack(noted: bytes) -> tuple[dict[str, Register], bool]:
     rows = unpack_note(noted)
     if not isinstance(rows, dict):
         return {}, False
-    read = {task_id: unpack_row(row) for task_id, row in rows.items()}
+    read = {task_id: parse_row(row) for task_id, row in rows.items()}
     valid = {task_id: each for task_id, each in read.items() if each is not None and isinstance(task_id, str)}
     return valid, len(valid) == len(rows)
 
@@ -99,7 +99,7 @@ def _unpack_floor(noted: bytes | None) -> Floor | None:
     return Floor(counter, token, longest) if is_valid else None
 
 
-def unpack_row(row: object) -> Register | None:
+def parse_row(row: object) -> Register | None:
     """Decode the register of one task from a note; None if it is invalid; never raises."""
     if not isinstance(row, list) or not 6 <= len(row) <= 8:
         return None
@@ -108,7 +108,7 @@ def unpack_row(row: object) -> Register | None:
     if not isinstance(ballots, list) or len(ballots) != 8:
         return None
     grantee = row[7] if len(row) > 7 else ballots[3]  # older versions have it only for an unreleased lease
-    members = members_of(packed)
+    members = parse_members(packed)
     is_valid = (
         all(map(is_number, (configuration, token, *ballots[::2])))
         and all(isinstance(agent, str) for agent in (*ballots[1::2], grantee))
@@ -121,8 +121,8 @@ def unpack_row(row: object) -> Register | None:
         return None
     promised, holder, spent, accepted = (Ballot(ballots[n], ballots[n + 1]) for n in range(0, 8, 2))
     return Register(
-        Ceiling(0.0, LIFE), configuration, promised, holder, spent, accepted, token, grantee, ttl,
-        value=members, is_over=is_over, proof=proof,
+        Ceiling(0.0, BALLOT_MODULUS), configuration, promised, holder, spent, accepted, token, grantee, ttl,
+        value=members, is_closed=is_over, proof=proof,
     )  # fmt: skip
 
 
@@ -135,10 +135,10 @@ def unpack_note(noted: bytes) -> object:
 
 
 def _pack_row(register: Register) -> list[object]:
-    ballots = [*register.promised, *register.holder, *register.spent, *register.accepted]
+    ballots = [*register.promised, *register.holder, *register.released, *register.accepted]
     members, grantee = pack_members(register.value or ()), register.grantee
     token, ttl = register.token, register.ttl
-    return [register.configuration, ballots, token, ttl, members, register.is_over, register.proof, grantee]
+    return [register.configuration, ballots, token, ttl, members, register.is_closed, register.proof, grantee]
 
 
 CODEC: Codec[str] = Codec(
@@ -146,7 +146,7 @@ CODEC: Codec[str] = Codec(
     "lease/{}",
     _BUCKETS,
     "",
-    LIFE,
+    BALLOT_MODULUS,
     _bucket_of,
     _pack,
     _unpack,

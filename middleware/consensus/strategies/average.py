@@ -6,7 +6,7 @@ import math
 from collections.abc import Sequence
 
 from middleware.consensus.strategies.nearest import Nearest
-from middleware.consensus.strategy import Consensus, Report, led_by, refusal, standing
+from middleware.consensus.strategy import Consensus, Report, build_consensus, refusal, standing
 
 Point = tuple[float, ...]
 
@@ -27,8 +27,8 @@ class Average(Nearest):
         if not counted:
             return Consensus(None, strategy=self.name, reason="no agent reports a value")
         order = sorted(counted, key=lambda r: (r.cost, r.agent))
-        value = self.point([r.value for r in counted], [r.weight for r in counted])
-        return led_by(self.name, order, counted, f"{self.name} of {len(order)}", value=value)
+        value = self.combine_points([r.value for r in counted], [r.weight for r in counted])
+        return build_consensus(self.name, order, counted, f"{self.name} of {len(order)}", value=value)
 
     def merge(self, a: Sequence[Report], b: Sequence[Report]) -> tuple[Report, ...]:
         """Return the newest value of each agent, for the task whose id sorts first.
@@ -40,7 +40,7 @@ class Average(Nearest):
         alike = (r for r in valued if (-r.epoch, r.task, len(r.value)) == first)
         return standing(alike, lambda report: -report.sequence)
 
-    def point(self, points: Sequence[Point], weights: Sequence[float]) -> Point:
+    def combine_points(self, points: Sequence[Point], weights: Sequence[float]) -> Point:
         """Combine the points of all agents, which may be in any order."""
         return mean(points, weights)
 

@@ -8,8 +8,8 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from middleware.consensus.strategies.nearest import Nearest, best_of
-from middleware.consensus.strategy import Consensus, Report, led_by
+from middleware.consensus.strategies.nearest import Nearest, select_best
+from middleware.consensus.strategy import Consensus, Report, build_consensus
 
 BATTERY_S = 30.0
 """Seconds of travel time that an empty battery adds to the cost."""
@@ -26,12 +26,12 @@ class CapabilityCost(Nearest):
 
     def find(self, contacts: Sequence[Report]) -> Consensus:
         """Decide; no agent is assigned if no report is valid (``strategy.refusal`` gives the reason for each)."""
-        order = best_of(contacts, self.weigh)
+        order = select_best(contacts, self.weigh)
         if not order:
             return Consensus(None, strategy=self.name, reason="no device is able to do it")
         first = order[0]
         reason = f"{first.cost:.1f} s away, battery {first.battery:.0%}, {first.load:g} other tasks"
-        return led_by(self.name, order, order, reason)
+        return build_consensus(self.name, order, order, reason)
 
     def weigh(self, report: Report) -> float:
         """Return the rank of a report in seconds: travel time plus battery penalty plus load penalty."""

@@ -10,14 +10,21 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 
-from middleware.consensus.item import Item, Sharing, capacities, exact, listed, shared_out
+from middleware.consensus.assignment import (
+    Item,
+    MultiTaskStrategy,
+    build_decisions,
+    find_capacities,
+    sort_items,
+    to_millionths,
+)
 from middleware.consensus.strategy import Consensus, Report, standing
 
-SWEEPS = 50
+MAX_SWEEPS = 50
 """Maximum number of passes of moves and swaps over an assignment."""
 
 
-class Cbba(Sharing):
+class Cbba(MultiTaskStrategy):
     """The sequential greedy assignment, improved by moves and swaps; for a single task the nearest agent."""
 
     name = "cbba"
@@ -25,18 +32,18 @@ class Cbba(Sharing):
 
     def find_group(self, contacts: Sequence[Report], items: Sequence[Item]) -> tuple[Consensus, ...]:
         """Decide all items, one agent each, sorted by task name."""
-        items = listed(items)
+        items = sort_items(items)
         wanted = {item.task for item in items}
         counted = [r for r in standing(contacts) if r.task in wanted]
-        capacity_left = capacities(counted)
+        capacity_left = find_capacities(counted)
         costs: dict[str, dict[str, int]] = {agent: {} for agent in capacity_left}
         for report in counted:
-            costs[report.agent][report.task] = exact(report.cost)
-        owners = exchanged(greedy(costs, capacity_left), costs, capacity_left)
-        return shared_out(self.name, counted, items, {task: [agent] for task, agent in owners.items()})
+            costs[report.agent][report.task] = to_millionths(report.cost)
+        owners = improve_assignment(assign_greedily(costs, capacity_left), costs, capacity_left)
+        return build_decisions(self.name, counted, items, {task: [agent] for task, agent in owners.items()})
 
 
-def greedy(costs: Mapping[str, Mapping[str, float]], capacities: Mapping[str, int]) -> dict[str, str]:
+def assign_greedily(costs: Mapping[str, Mapping[str, float]], capacities: Mapping[str, int]) -> dict[str, str]:
     """Return the agent of each task: always the cheapest remaining pair is assigned next; ties are broken by id."""
     capacity_left = dict(capacities)
     owner: dict[str, str] = {}
@@ -48,7 +55,7 @@ def greedy(costs: Mapping[str, Mapping[str, float]], capacities: Mapping[str, in
     return owner
 
 
-def exchanged(
+def improve_assignment(
     owners: Mapping[str, str], costs: Mapping[str, Mapping[str, int]], capacities: Mapping[str, int]
 ) -> dict[str, str]:
     """Improve an assignment by moving tasks to other agents and swapping pairs while that lowers the total cost.
@@ -61,7 +68,7 @@ def exchanged(
     capacity_left = {agent: capacities.get(agent, 1) - task_counts[agent] for agent in costs}
     free = {agent for agent, places in capacity_left.items() if places > 0}
     known = {agent: sorted(costs[agent].keys() & owner.keys()) for agent in costs}
-    for _ in range(SWEEPS):
+    for _ in range(MAX_SWEEPS):
         changed = [
             _move_task(task, owner, costs, capacity_left, free) | _swap_task(task, owner, costs, known)
             for task in owner

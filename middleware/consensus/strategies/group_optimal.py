@@ -8,46 +8,53 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
 
-from middleware.consensus.item import Item, Sharing, capacities, exact, listed, shared_out
+from middleware.consensus.assignment import (
+    Item,
+    MultiTaskStrategy,
+    build_decisions,
+    find_capacities,
+    sort_items,
+    to_millionths,
+)
 from middleware.consensus.strategies import hungarian
 from middleware.consensus.strategy import Consensus, Report, standing
 
-BIDS = 20
+FIRST_PASS_BIDS = 20
 """Number of bids per agent in the first pass; that many fit into one datagram and lead to about 1 % above the optimum.
 """
 
 
-class GroupOptimal(Sharing):
+class GroupOptimal(MultiTaskStrategy):
     """The cheapest assignment that serves as many tasks as possible; for a single task the nearest agent."""
 
     name = "group_optimal"
     version = "1"
-    bids = BIDS
+    bids = FIRST_PASS_BIDS
 
     def find_group(self, contacts: Sequence[Report], items: Sequence[Item]) -> tuple[Consensus, ...]:
         """Decide all items, sorted by task name."""
-        items = listed(items)
+        items = sort_items(items)
         slots = {item.task: item.slots for item in items}
         counted = [r for r in standing(contacts) if r.task in slots]
-        capacity_left = capacities(counted)
+        capacity_left = find_capacities(counted)
         rows = [task for task, places in slots.items() for _ in range(places)]
-        bids = cheapest(counted, self.bids)
+        bids = select_cheapest(counted, self.bids)
         while True:
             owners = _solve(rows, capacity_left, bids)
             uncovered = {task for task, places in slots.items() if len(owners.get(task, ())) < places}
-            more = {(r.task, r.agent): exact(r.cost) for r in counted if r.task in uncovered}
+            more = {(r.task, r.agent): to_millionths(r.cost) for r in counted if r.task in uncovered}
             if more.items() <= bids.items():
-                return shared_out(self.name, counted, items, owners)
+                return build_decisions(self.name, counted, items, owners)
             bids |= more
 
 
-def cheapest(contacts: Iterable[Report], most: int) -> dict[tuple[str, str], int]:
+def select_cheapest(contacts: Iterable[Report], most: int) -> dict[tuple[str, str], int]:
     """Return the costs of the ``most`` cheapest tasks of each agent, by task and agent."""
     own: dict[str, list[Report]] = {}
     for report in contacts:
         own.setdefault(report.agent, []).append(report)
     return {
-        (r.task, agent): exact(r.cost)
+        (r.task, agent): to_millionths(r.cost)
         for agent, reports in own.items()
         for r in sorted(reports, key=lambda r: (r.cost, r.task))[:most]
     }
@@ -76,7 +83,7 @@ def _solve(rows: list[str], capacity_left: dict[str, int], bids: dict[tuple[str,
             costs.append(line)
         owners: dict[str, list[str]] = {}
         has_duplicate = False
-        for number, column in enumerate(hungarian.assigned(costs)):
+        for number, column in enumerate(hungarian.solve(costs)):
             if costs[number][column] < unassigned:
                 agent = columns[column]
                 if agent in owners.setdefault(rows[number], []):

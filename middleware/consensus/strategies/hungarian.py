@@ -9,11 +9,11 @@ from collections.abc import Sequence
 
 Costs = Sequence[Sequence[float]]
 """Whole numbers; ``float`` instead of ``int`` while the sums are exact, for speed."""
-BEYOND = 2**52
+INEXACT_SUM = 2**52
 """From here on sums are not exact in floating point."""
 
 
-def assigned(costs: Costs) -> list[int]:
+def solve(costs: Costs) -> list[int]:
     """Return the column of each row.
 
     There are at least as many columns as rows, and all rows have the same length.  Of several optima the result is the
@@ -21,12 +21,12 @@ def assigned(costs: Costs) -> list[int]:
     """
     if not costs:
         return []
-    if max(map(max, costs)) * len(costs) < BEYOND:
+    if max(map(max, costs)) * len(costs) < INEXACT_SUM:
         costs = [list(map(float, row)) for row in costs]
-    return first_of_equals(costs, *solved(costs))
+    return select_first_optimum(costs, *find_optimum(costs))
 
 
-def solved(costs: Costs) -> tuple[list[int], list[float]]:
+def find_optimum(costs: Costs) -> tuple[list[int], list[float]]:
     """Return one optimal assignment and the price of each column.
 
     Prices are at most 0, and 0 for columns without a row.  Each row's column minimises cost minus price for that row,
@@ -104,7 +104,7 @@ def _augment(costs: Costs, prices: list[float], owner: list[int], row: int) -> N
         reached = where[through]
 
 
-def first_of_equals(costs: Costs, columns: Sequence[int], prices: Sequence[float]) -> list[int]:
+def select_first_optimum(costs: Costs, columns: Sequence[int], prices: Sequence[float]) -> list[int]:
     """Of all assignments of equal cost, return the lexicographically first one.
 
     Each row in turn gets the lowest column that still leaves an optimal assignment for the rows after it.

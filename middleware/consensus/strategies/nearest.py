@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 
-from middleware.consensus.strategy import Consensus, Report, led_by, refusal, standing
+from middleware.consensus.strategy import Consensus, Report, build_consensus, refusal, standing
 
-KEPT = 4
+SUMMARY_REPORTS = 4
 """Number of reports in a summary: one agent acts, the others are standbys.  Four signed reports fill a datagram."""
 
 
@@ -19,10 +19,10 @@ class Nearest:
 
     def find(self, contacts: Sequence[Report]) -> Consensus:
         """Decide; no agent is assigned if no report is valid (``strategy.refusal`` gives the reason for each)."""
-        order = best_of(contacts, self.weigh)
+        order = select_best(contacts, self.weigh)
         if not order:
             return Consensus(None, strategy=self.name, reason="no report counts")
-        return led_by(self.name, order, order, f"{order[0].cost:.2f}, least of {len(order)}")
+        return build_consensus(self.name, order, order, f"{order[0].cost:.2f}, least of {len(order)}")
 
     def improves(self, current: Report, offer: Report, hysteresis: float) -> bool:
         """Return whether ``offer`` weighs less than ``current`` by more than the share ``hysteresis``.
@@ -35,17 +35,17 @@ class Nearest:
 
     def merge(self, a: Sequence[Report], b: Sequence[Report]) -> tuple[Report, ...]:
         """Return the best reports of both."""
-        return tuple(best_of((*a, *b), self.weigh))
+        return tuple(select_best((*a, *b), self.weigh))
 
     def weigh(self, report: Report) -> float:
         """Return the rank of a report; the lowest wins."""
         return report.cost
 
 
-def best_of(contacts: Sequence[Report], rank: Callable[[Report], float]) -> list[Report]:
+def select_best(contacts: Sequence[Report], rank: Callable[[Report], float]) -> list[Report]:
     """Return the best reports by ``rank``, one per agent, the best first.
 
     Of several tasks only the one whose id sorts first counts.
     """
     counted = standing(contacts, rank)
-    return sorted((r for r in counted if r.task == counted[0].task), key=lambda r: (rank(r), r.agent))[:KEPT]
+    return sorted((r for r in counted if r.task == counted[0].task), key=lambda r: (rank(r), r.agent))[:SUMMARY_REPORTS]

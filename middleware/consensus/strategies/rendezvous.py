@@ -12,7 +12,7 @@ from itertools import combinations
 
 from middleware.consensus.strategies.average import Average, Point, mean
 
-STEPS = 200
+ITERATIONS = 200
 """Iterations of the median, and of the centre in three dimensions; the same on every machine."""
 SLACK = 1e-9
 
@@ -28,7 +28,7 @@ class Centre(Average):
 
     name = "rendezvous_centre"
 
-    def point(self, points: Sequence[Point], weights: Sequence[float]) -> Point:
+    def combine_points(self, points: Sequence[Point], weights: Sequence[float]) -> Point:
         """Return the centre of the points, which may be in any order."""
         return centre(points)
 
@@ -38,7 +38,7 @@ class Median(Average):
 
     name = "rendezvous_median"
 
-    def point(self, points: Sequence[Point], weights: Sequence[float]) -> Point:
+    def combine_points(self, points: Sequence[Point], weights: Sequence[float]) -> Point:
         """Return the median of the points, which may be in any order."""
         return median(points, weights)
 
@@ -53,7 +53,7 @@ def centre(points: Sequence[Point]) -> Point:
     if len(places[0]) == 2:
         return _clamp(_smallest_circle(places)[0], places)
     estimate = mean(places, [1.0] * len(places))
-    for step in range(1, STEPS + 1):  # Badoiu and Clarkson 2003
+    for step in range(1, ITERATIONS + 1):  # Badoiu and Clarkson 2003
         far = max(places, key=lambda p: math.dist(estimate, p))
         estimate = tuple(a + (b - a) / (step + 1) for a, b in zip(estimate, far, strict=True))
     return estimate
@@ -65,7 +65,7 @@ def median(points: Sequence[Point], weights: Sequence[float]) -> Point:
     places, shares = [p for p, _ in pairs], [w for _, w in pairs]
     best = min(places, key=lambda p: (_total_distance(p, places, shares), p))
     estimate = mean(places, shares)
-    for _ in range(STEPS):
+    for _ in range(ITERATIONS):
         near = [w / max(math.dist(estimate, p), SLACK) for p, w in pairs]
         estimate = mean(places, near)
     # If the median is one of the places, the iterations converge to it slowly.

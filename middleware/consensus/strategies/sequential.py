@@ -10,13 +10,13 @@ import heapq
 import math
 from collections.abc import Mapping, Sequence
 
-from middleware.consensus.item import Item, capacities, listed, shared_out
+from middleware.consensus.assignment import Item, build_decisions, find_capacities, sort_items
 from middleware.consensus.strategies.cbba import Cbba
 from middleware.consensus.strategy import Consensus, Report, standing
 
 Place = tuple[float, ...]
-SWEEPS = 20
-NO_GAIN = 1e-9
+MAX_SWEEPS = 20
+MIN_GAIN_M = 1e-9
 
 
 class Sequential(Cbba):
@@ -28,16 +28,16 @@ class Sequential(Cbba):
 
     def find_group(self, contacts: Sequence[Report], items: Sequence[Item]) -> tuple[Consensus, ...]:
         """Decide all items, sorted by task name; as ``cbba`` if agents or items have no positions."""
-        items = listed(items)
+        items = sort_items(items)
         counted = [r for r in standing(contacts) if r.value]
-        routes = ways_of(contacts, items)
+        routes = plan_routes(contacts, items)
         if routes is None:
             return super().find_group(contacts, items)
         owners = {task: [agent] for agent, route in routes.items() for task in route}
-        return shared_out(self.name, counted, items, owners)
+        return build_decisions(self.name, counted, items, owners)
 
 
-def ways_of(contacts: Sequence[Report], items: Sequence[Item]) -> dict[str, list[str]] | None:
+def plan_routes(contacts: Sequence[Report], items: Sequence[Item]) -> dict[str, list[str]] | None:
     """Return each agent's tasks in the order of its route; None if agents or items have no comparable positions.
 
     An agent whose reports name tasks takes only those tasks; an agent whose report names none takes any.
@@ -52,19 +52,19 @@ def ways_of(contacts: Sequence[Report], items: Sequence[Item]) -> dict[str, list
     sizes = {len(place) for place in (*starts.values(), *places.values())}
     if len(sizes) != 1 or 0 in sizes:
         return None
-    capacity_left = capacities(counted)
+    capacity_left = find_capacities(counted)
     biddable = {agent: set(places) if "" in tasks else tasks & places.keys() for agent, tasks in able.items()}
     routes = _run_auction(starts, places, capacity_left, biddable)
     _improve_routes(routes, starts, places, capacity_left, biddable)
     return routes
 
 
-def length(start: Place, route: Sequence[Place]) -> float:
+def compute_length(start: Place, route: Sequence[Place]) -> float:
     """Return the length of the route from ``start`` through all its places."""
     return sum(math.dist(a, b) for a, b in zip((start, *route), route, strict=False))
 
 
-def insertion(start: Place, route: Sequence[Place], place: Place) -> tuple[float, int]:
+def find_insertion(start: Place, route: Sequence[Place], place: Place) -> tuple[float, int]:
     """Return the smallest growth of a route by one more place, and the index of the place in the route."""
     best = (math.dist(route[-1] if route else start, place), len(route))
     before = start
@@ -97,13 +97,13 @@ def _run_auction(
         if task not in unsold or sold != len(route) or sold >= capacity_left[agent]:
             continue  # bid made before the agent's route changed
         route_places = [places[t] for t in route]
-        route.insert(insertion(starts[agent], route_places, places[task])[1], task)
+        route.insert(find_insertion(starts[agent], route_places, places[task])[1], task)
         unsold.discard(task)
         if len(route) < capacity_left[agent]:
             route_places = [places[t] for t in route]
             for other in unsold & biddable[agent]:
                 heapq.heappush(
-                    bids, (insertion(starts[agent], route_places, places[other])[0], agent, other, len(route))
+                    bids, (find_insertion(starts[agent], route_places, places[other])[0], agent, other, len(route))
                 )
     return routes
 
@@ -121,7 +121,7 @@ def _improve_routes(
     for agent in routes:
         for task in biddable[agent] & bidders.keys():
             bidders[task].append(agent)
-    for _ in range(SWEEPS):
+    for _ in range(MAX_SWEEPS):
         is_changed = False
         for task in bidders:
             is_changed |= _move_task(task, owners, bidders[task], routes, starts, places, capacity_left)
@@ -143,16 +143,16 @@ def _move_task(
     owner = owners[task]
     number = routes[owner].index(task)
     rest = [t for t in routes[owner] if t != task]
-    saving = length(starts[owner], [places[t] for t in routes[owner]]) - length(
+    saving = compute_length(starts[owner], [places[t] for t in routes[owner]]) - compute_length(
         starts[owner], [places[t] for t in rest]
     )
-    best = (saving - NO_GAIN, owner, number)
+    best = (saving - MIN_GAIN_M, owner, number)
     for agent in bidders:
         route = routes[agent]
         if agent != owner and len(route) >= capacity_left[agent]:
             continue
         route_places = [places[t] for t in (rest if agent == owner else route)]
-        growth, index = insertion(starts[agent], route_places, places[task])
+        growth, index = find_insertion(starts[agent], route_places, places[task])
         if growth < best[0]:
             best = (growth, agent, index)
     if best[1:] == (owner, number):
@@ -169,7 +169,10 @@ def _reverse_segments(route: list[str], start: Place, places: Mapping[str, Place
     for first in range(len(route) - 1):
         for last in range(first + 1, len(route)):
             candidate = route[:first] + route[first : last + 1][::-1] + route[last + 1 :]
-            if length(start, [places[t] for t in candidate]) < length(start, [places[t] for t in route]) - NO_GAIN:
+            if (
+                compute_length(start, [places[t] for t in candidate])
+                < compute_length(start, [places[t] for t in route]) - MIN_GAIN_M
+            ):
                 route[:] = candidate
                 is_changed = True
     return is_changed

@@ -7,7 +7,7 @@ import math
 from collections.abc import Sequence
 
 from middleware.consensus.strategies.nearest import Nearest
-from middleware.consensus.strategy import Consensus, Report, led_by, standing
+from middleware.consensus.strategy import Consensus, Report, build_consensus, standing
 
 
 class WeightedVote(Nearest):
@@ -39,9 +39,9 @@ class WeightedVote(Nearest):
         is_decided = best != "" and (2.0 * weights[best] > all_weight or cast >= all_weight > 0.0)
         if not is_decided:
             why = f"{tally or 'no vote'}; more than half of {all_weight:g} decides"
-            return led_by(self.name, (), counted, why)
+            return build_consensus(self.name, (), counted, why)
         side = sorted((r for r in counted if r.choice == best), key=lambda r: (r.cost, r.agent))
-        return led_by(self.name, side, counted, f"{best} of {tally}", choice=best)
+        return build_consensus(self.name, side, counted, f"{best} of {tally}", choice=best)
 
     def merge(self, a: Sequence[Report], b: Sequence[Report]) -> tuple[Report, ...]:
         """Return the newest vote of each agent, for the task whose id sorts first."""

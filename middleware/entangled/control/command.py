@@ -14,18 +14,18 @@ from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any, TextIO
 
-from middleware.entangled.control import word
-from middleware.entangled.control.place import NoControl, check_socket, found, owner_of
+from middleware.entangled.control import conversion
+from middleware.entangled.control.socket_path import NoControl, check_owner, check_socket, find_socket
 
-FAILED, WRONG = 1, 2
-FORMS = """fields:     7  1.5  true  null  "7"  words       valid JSON, otherwise text
+EXIT_FAILED, EXIT_USAGE = 1, 2
+FIELDS_HELP = """fields:     7  1.5  true  null  "7"  words       valid JSON, otherwise text
 templates:  _  any;  ?int ?float ?str ?bytes ?bool  a type;  >5  <=5  !=red  in:a,b  prefix:job-  a predicate"""
-KEYS = "A key is any text, or id: followed by 40 hexadecimal digits."
+KEYS_HELP = "A key is any text, or id: followed by 40 hexadecimal digits."
 
-Ask = Callable[[Path, dict[str, Any]], Iterator[dict[str, Any]]]
+SendRequest = Callable[[Path, dict[str, Any]], Iterator[dict[str, Any]]]
 
 
-def parser(group: str) -> argparse.ArgumentParser:
+def make_parser(group: str) -> argparse.ArgumentParser:
     """Return the argument parser of one group of verbs."""
     common = argparse.ArgumentParser(add_help=False)
     common.add_argument("--node", metavar="NAME", help="name of the node, if several run on this machine")
@@ -38,10 +38,10 @@ def parser(group: str) -> argparse.ArgumentParser:
         rpc.add_argument("--changes", action="store_true", help="the method changes state and must run only once")
         rpc.set_defaults(verb="rpc")
         return rpc
-    build = {"dht": _dht, "tuple": _tuple, "keyword": _keyword}[group]
+    build = {"dht": _add_dht_commands, "tuple": _add_tuple_commands, "keyword": _add_keyword_commands}[group]
     top = argparse.ArgumentParser(
         prog=f"swarm {group}",
-        epilog=FORMS if group == "tuple" else KEYS if group == "dht" else None,
+        epilog=FIELDS_HELP if group == "tuple" else KEYS_HELP if group == "dht" else None,
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
     verbs = top.add_subparsers(dest="verb", required=True, metavar="VERB")
@@ -55,7 +55,7 @@ def parser(group: str) -> argparse.ArgumentParser:
     return top
 
 
-def _dht(verb: Callable[[str, str], argparse.ArgumentParser]) -> None:
+def _add_dht_commands(verb: Callable[[str, str], argparse.ArgumentParser]) -> None:
     get = verb("get", "Print the records under a key.")
     get.add_argument("key")
     get.add_argument("--concern", choices=("fast", "majority"), default="majority", help="one replica, or a majority")
@@ -75,7 +75,7 @@ def _dht(verb: Callable[[str, str], argparse.ArgumentParser]) -> None:
     verb("watch", "Print the records under a key on each change, until Ctrl-C.").add_argument("key")
 
 
-def _keyword(verb: Callable[[str, str], argparse.ArgumentParser]) -> None:
+def _add_keyword_commands(verb: Callable[[str, str], argparse.ArgumentParser]) -> None:
     publish = verb("publish", "Publish data under every word of a name.")
     publish.add_argument("name")
     publish.add_argument("value", help="text, - for standard input, or @FILE")
@@ -84,7 +84,7 @@ def _keyword(verb: Callable[[str, str], argparse.ArgumentParser]) -> None:
     verb("remove", "Remove this node's publication under a name.").add_argument("name")
 
 
-def _tuple(verb: Callable[[str, str], argparse.ArgumentParser]) -> None:
+def _add_tuple_commands(verb: Callable[[str, str], argparse.ArgumentParser]) -> None:
     put = verb("put", "Put a tuple into the space.")
     put.add_argument("fields", nargs="+", metavar="FIELD")
     put.add_argument("--ttl", type=float, metavar="SECONDS", help="remove it after that time")
@@ -96,22 +96,26 @@ def _tuple(verb: Callable[[str, str], argparse.ArgumentParser]) -> None:
     read.add_argument("--all", action="store_true", help="print all matching tuples")
 
 
-def request_of(options: argparse.Namespace) -> dict[str, Any]:
+def make_request(options: argparse.Namespace) -> dict[str, Any]:
     """Return the request of a command line; raise ``word.BadWord``, also for an unreadable file."""
     given = {name: value for name, value in vars(options).items() if name not in ("verb", "node", "json")}
     if "node_asked" in given:
         given["node"] = given.pop("node_asked")
     if isinstance(given.get("words"), list):
         given["words"] = " ".join(given["words"])
-    for name, read in (("fields", word.scalar), ("arguments", _json_or_text), ("template", word.pattern)):
+    for name, read in (
+        ("fields", conversion.parse_field),
+        ("arguments", _json_or_text),
+        ("template", conversion.parse_template_field),
+    ):
         if name in given:
             given[name] = [read(each) for each in given[name]]
     if "value" in given:
-        given["value"] = _value(given["value"])
+        given["value"] = _read_value(given["value"])
     return {"verb": options.verb, "with": {name: value for name, value in given.items() if value is not None}}
 
 
-def asked(path: Path, request: dict[str, Any]) -> Iterator[dict[str, Any]]:
+def send_request(path: Path, request: dict[str, Any]) -> Iterator[dict[str, Any]]:
     """Send ``request`` to the socket at ``path`` and yield the answer's lines; raise ``NoControl`` on failure."""
     check_socket(path)
     with socket.socket(socket.AF_UNIX, socket.SOCK_STREAM) as connection:
@@ -134,59 +138,59 @@ def check_peer(connection: socket.socket, path: Path) -> None:
         return
     credentials = struct.Struct("3i")
     _, user, _ = credentials.unpack(connection.getsockopt(socket.SOL_SOCKET, option, credentials.size))
-    if user not in (owner_of(path.parent), 0):
+    if user not in (check_owner(path.parent), 0):
         raise NoControl(f"another user's process listens at {path}; remove it and restart the node")
 
 
-def main(group: str, words: Sequence[str], out: TextIO | None = None, ask: Ask = asked) -> int:
+def main(group: str, words: Sequence[str], out: TextIO | None = None, ask: SendRequest = send_request) -> int:
     """Run one command; return 0, 1 (nothing found, or the node refused), or 2 (wrong command)."""
     out = out or sys.stdout
-    options = parser(group).parse_args(words)
+    options = make_parser(group).parse_args(words)
     try:
-        request = request_of(options)
-        path = found(options.node)
+        request = make_request(options)
+        path = find_socket(options.node)
         for line in ask(path, request):
             if "error" in line:
                 if options.json:
-                    out.write(word.written(line) + "\n")
-                return _fail(group, line["text"], WRONG if line["error"] == "BadRequest" else FAILED)
+                    out.write(conversion.format_json(line) + "\n")
+                return _fail(group, line["text"], EXIT_USAGE if line["error"] == "BadRequest" else EXIT_FAILED)
             answer = line["answer"] if "answer" in line else line.get("event")
-            out.write("".join(f"{text}\n" for text in _texts(options.verb, answer, options.json)))
+            out.write("".join(f"{text}\n" for text in _format_answer(options.verb, answer, options.json)))
             out.flush()
             if "answer" in line:
-                return FAILED if _is_nothing(options.verb, answer) else 0
+                return EXIT_FAILED if _is_empty(options.verb, answer) else 0
     except KeyboardInterrupt:
         return 0
-    except (NoControl, word.BadWord, OSError) as problem:
-        return _fail(group, problem, WRONG)
-    return _fail(group, "the node closed the connection without an answer", FAILED)
+    except (NoControl, conversion.InvalidValue, OSError) as problem:
+        return _fail(group, problem, EXIT_USAGE)
+    return _fail(group, "the node closed the connection without an answer", EXIT_FAILED)
 
 
-def _texts(verb: str, answer: Any, is_json: bool) -> list[str]:
+def _format_answer(verb: str, answer: Any, is_json: bool) -> list[str]:
     if is_json:
-        return [word.written(answer)]
+        return [conversion.format_json(answer)]
     if answer is None:
         return []
     if verb == "dht find":
-        return [word.printable(f"{each['id']}  {each['host']}:{each['port']}") for each in answer]
+        return [conversion.remove_control_characters(f"{each['id']}  {each['host']}:{each['port']}") for each in answer]
     if verb in ("dht get", "dht watch", "keyword search", "keyword watch"):
-        rows = [f"{each['owner'][:10]}  {each['name'] or '-'}  {_plain(each['value'])}" for each in answer]
-        lines = [word.printable(row) for row in rows]
+        rows = [f"{each['owner'][:10]}  {each['name'] or '-'}  {_format_value(each['value'])}" for each in answer]
+        lines = [conversion.remove_control_characters(row) for row in rows]
         return [*lines, *([""] if verb.endswith("watch") else [])]
     if verb == "tuple read" and answer and isinstance(answer[0], list):
-        return [word.shown(each) for each in answer]
+        return [conversion.format_tuple(each) for each in answer]
     if verb in ("tuple get", "tuple read"):
-        return [word.shown(answer)]
+        return [conversion.format_tuple(answer)]
     if isinstance(answer, dict) and "replicas" in answer:
         return [f"stored at {answer['replicas']} replicas"]
-    return [word.written(answer)]
+    return [conversion.format_json(answer)]
 
 
-def _is_nothing(verb: str, answer: Any) -> bool:
+def _is_empty(verb: str, answer: Any) -> bool:
     return verb in ("dht get", "tuple get", "tuple read", "keyword search") and not answer
 
 
-def _plain(value: Any) -> str:
+def _format_value(value: Any) -> str:
     return value if isinstance(value, str) else json.dumps(value)
 
 
@@ -197,17 +201,17 @@ def _json_or_text(text: str) -> Any:
         return text
 
 
-def _value(text: str) -> Any:
+def _read_value(text: str) -> Any:
     if text == "-":
-        return word.plain(sys.stdin.buffer.read())
+        return conversion.to_json(sys.stdin.buffer.read())
     if text.startswith("@"):
         try:
-            return word.plain(Path(text[1:]).read_bytes())
+            return conversion.to_json(Path(text[1:]).read_bytes())
         except OSError as error:
-            raise word.BadWord(f"{text[1:]} cannot be read: {error.strerror or error}") from error
+            raise conversion.InvalidValue(f"{text[1:]} cannot be read: {error.strerror or error}") from error
     return text
 
 
 def _fail(group: str, problem: object, code: int) -> int:
-    sys.stderr.write(word.printable(f"swarm {group}: {problem}") + "\n")
+    sys.stderr.write(conversion.remove_control_characters(f"swarm {group}: {problem}") + "\n")
     return code

@@ -12,12 +12,12 @@ from twisted.internet.task import deferLater
 
 from middleware.entangled.background import Background
 from middleware.entangled.contact import Contact
-from middleware.entangled.control.link import link
+from middleware.entangled.control.link_quality import compute_quality
 from middleware.entangled.errors import EntangledError
 from middleware.entangled.network.network import is_relayed
 from middleware.entangled.node import EntangledNode
 
-ASKED = 10
+PINGS = 10
 """Pings to each peer."""
 PING_INTERVAL_S = 0.1
 PING_TIMEOUT_S = 1.5
@@ -25,14 +25,14 @@ MAX_LINKS = 32
 """Peers that are measured: 32 x 10 pings in a second are 50 kB in each direction."""
 SLOW_INTERVAL_S = 1.0
 """Seconds between two pings to a peer, after the first ``ASKED`` ones."""
-FEW = 10
+FEW_PEERS = 10
 """Peers up to which that holds.  With more peers the interval grows, so that a node sends at most 10 pings per second,
 and 100 at first: 1 and 10 kB in each direction."""
-IDLE = 12.0
+IDLE_S = 12.0
 """Seconds after the last call of ``Gauge.links`` until the measurement stops."""
 
 
-def health(node: EntangledNode) -> Mapping[str, Any]:
+def read_health(node: EntangledNode) -> Mapping[str, Any]:
     """Return the number of contacts, the store's usage and limits, and the nodes that reject this one."""
     usage = node.store.usage
     return {
@@ -43,29 +43,29 @@ def health(node: EntangledNode) -> Mapping[str, Any]:
         "max_rows": usage.max_rows,
         "bytes": usage.bytes,
         "max_bytes": usage.max_bytes,
-        "trouble": node.store.trouble,
+        "trouble": node.store.write_error,
         "refusals": [[code, str(contact.address)] for contact, code in node.endpoint.refusals.values()],
     }
 
 
-async def links(node: EntangledNode, clock: IReactorTime) -> list[Mapping[str, Any]]:
+async def measure_links(node: EntangledNode, clock: IReactorTime) -> list[Mapping[str, Any]]:
     """Return the path to each peer with the durations of ``ASKED`` pings, None for a lost one.
 
     All times are seconds; ``for`` is the time since the path came into use, None if the peer is unreachable.
     """
     contacts = sorted(node.overlay.contacts(), key=lambda contact: contact.node_id)[:MAX_LINKS]
-    pings = [Deferred.fromCoroutine(_times(node, clock, contact)) for contact in contacts]
+    pings = [Deferred.fromCoroutine(_ping_repeatedly(node, clock, contact)) for contact in contacts]
     answers = await DeferredList(pings, consumeErrors=True)
     return [
-        {**way(node, clock, contact), "times": times}
+        {**describe_path(node, clock, contact), "times": times}
         for contact, (ok, times) in zip(contacts, answers, strict=True)
         if ok
     ]
 
 
-def way(node: EntangledNode, clock: IReactorTime, contact: Contact) -> dict[str, Any]:
+def describe_path(node: EntangledNode, clock: IReactorTime, contact: Contact) -> dict[str, Any]:
     """Return the path to a peer: ``way`` is a ``passage.Kind``, ``by`` the id of the relay, or empty."""
-    passage = node.reach.ways.passage(contact)
+    passage = node.nat.paths.find_path(contact)
     return {
         "id": contact.node_id.hex(),
         "address": str(passage.address or contact.address),
@@ -76,7 +76,7 @@ def way(node: EntangledNode, clock: IReactorTime, contact: Contact) -> dict[str,
     }
 
 
-async def timed(node: EntangledNode, clock: IReactorTime, contact: Contact) -> float | None:
+async def ping(node: EntangledNode, clock: IReactorTime, contact: Contact) -> float | None:
     """Ping a peer; return the round-trip time in seconds, None if it does not answer."""
     started_at = clock.seconds()
     try:
@@ -86,16 +86,16 @@ async def timed(node: EntangledNode, clock: IReactorTime, contact: Contact) -> f
     return clock.seconds() - started_at
 
 
-async def _times(node: EntangledNode, clock: IReactorTime, contact: Contact) -> list[float | None]:
-    await timed(node, clock, contact)  # opens a session if there is none
+async def _ping_repeatedly(node: EntangledNode, clock: IReactorTime, contact: Contact) -> list[float | None]:
+    await ping(node, clock, contact)  # opens a session if there is none
     pings = []
-    for _ in range(ASKED):
-        pings.append(Deferred.fromCoroutine(timed(node, clock, contact)))
+    for _ in range(PINGS):
+        pings.append(Deferred.fromCoroutine(ping(node, clock, contact)))
         await deferLater(clock, PING_INTERVAL_S)
     return [seconds for _, seconds in await DeferredList(pings, consumeErrors=True)]
 
 
-class Gauge:
+class LinkMetrics:
     """Measures the paths from ``node`` to its peers, only while ``links`` is called.
 
     The first call returns at once, without figures; later calls have more.  Each peer gets several pings in quick
@@ -105,13 +105,13 @@ class Gauge:
     def __init__(self, node: EntangledNode, clock: IReactorTime, chores: Background) -> None:
         self._node = node
         self._clock = clock
-        self._chores = chores
+        self._background = chores
         self._times: dict[bytes, deque[float | None]] = {}
         self._ping_rounds = 0
         self._called_at = float("-inf")
         self._is_running = False
 
-    def links(self) -> list[dict[str, Any]]:
+    def read(self) -> list[dict[str, Any]]:
         """Return the path to each peer with the figures measured so far, and keep measuring.
 
         Each entry has the fields of ``way``, ``loss``, ``round_trip`` and ``jitter`` (None: unknown).
@@ -122,35 +122,38 @@ class Gauge:
             self._ping_rounds = 0
             self._times.clear()
             self._ping_peers()
-        return [{**way(self._node, self._clock, each), **self._figures(each)} for each in self._peers()]
+        return [
+            {**describe_path(self._node, self._clock, each), **self._compute_metrics(each)}
+            for each in self._list_peers()
+        ]
 
-    def _figures(self, contact: Contact) -> dict[str, float | None]:
+    def _compute_metrics(self, contact: Contact) -> dict[str, float | None]:
         times = self._times.get(contact.public)
         if not times:
             return {"loss": None, "round_trip": None, "jitter": None}
-        found = link(list(times), False)
+        found = compute_quality(list(times), False)
         return {"loss": round(found.loss, 3), "round_trip": found.round_trip, "jitter": found.jitter}
 
-    def _peers(self) -> list[Contact]:
+    def _list_peers(self) -> list[Contact]:
         return sorted(self._node.overlay.contacts(), key=lambda contact: contact.node_id)[:MAX_LINKS]
 
     def _ping_peers(self) -> None:
-        if self._clock.seconds() - self._called_at > IDLE:
+        if self._clock.seconds() - self._called_at > IDLE_S:
             self._is_running = False
             self._times.clear()
             return
         self._ping_rounds += 1
-        peers = self._peers()
+        peers = self._list_peers()
         present = {contact.public for contact in peers}
         self._times = {public: times for public, times in self._times.items() if public in present}
         for contact in peers:
             # The first ping opens the session and takes longer, so it is not counted.
-            is_met = self._node.endpoint.is_met(contact)
-            self._chores.fork(self._record_ping(contact) if is_met else timed(self._node, self._clock, contact))
-        pause = PING_INTERVAL_S if self._ping_rounds < ASKED else SLOW_INTERVAL_S
-        self._chores.later(pause * max(1.0, len(peers) / FEW), self._ping_peers)
+            is_met = self._node.endpoint.has_session(contact)
+            self._background.fork(self._record_ping(contact) if is_met else ping(self._node, self._clock, contact))
+        pause = PING_INTERVAL_S if self._ping_rounds < PINGS else SLOW_INTERVAL_S
+        self._background.later(pause * max(1.0, len(peers) / FEW_PEERS), self._ping_peers)
 
     async def _record_ping(self, contact: Contact) -> None:
-        seconds = await timed(self._node, self._clock, contact)
+        seconds = await ping(self._node, self._clock, contact)
         if self._is_running:
-            self._times.setdefault(contact.public, deque(maxlen=ASKED)).append(seconds)
+            self._times.setdefault(contact.public, deque(maxlen=PINGS)).append(seconds)

@@ -14,44 +14,44 @@ from typing import Any
 import msgpack
 
 from middleware.entangled.errors import BadStore
-from middleware.entangled.record import Record, unpacked
+from middleware.entangled.record import Record, parse_record
 
 APPLICATION_ID = 0x53574E31
 """Identifies the file in its header as a store ("SWN1")."""
 SCHEMA_VERSION = 2
-MARK = bytes.fromhex("a9531c4e5fd0428fb1e7706d2c8834f6")
+FILE_MARK = bytes.fromhex("a9531c4e5fd0428fb1e7706d2c8834f6")
 """Value of a note that identifies a store file with a damaged header."""
-RECORDS_1 = (
+CREATE_RECORDS_1 = (
     "CREATE TABLE records(key BLOB, owner BLOB, name TEXT, sequence INTEGER, lifetime TEXT, ttl REAL, value BLOB,"
     " signature BLOB, PRIMARY KEY(key, owner, name)) WITHOUT ROWID"
 )
 """Schema 1; large values slow it down, because they are stored in the tree that SQLite searches."""
-RECORDS = (
+CREATE_RECORDS = (
     "CREATE TABLE records(id INTEGER PRIMARY KEY, key BLOB, owner BLOB, name TEXT, sequence INTEGER, lifetime TEXT,"
     " ttl REAL, signature BLOB, crc INTEGER, value BLOB, UNIQUE(key, owner, name))"
 )
-NOTES = "CREATE TABLE notes(name TEXT PRIMARY KEY, value BLOB, crc INTEGER)"
-ROTTEN = (
+CREATE_NOTES = "CREATE TABLE notes(name TEXT PRIMARY KEY, value BLOB, crc INTEGER)"
+CREATE_ROTTEN = (
     "CREATE TABLE rotten(id INTEGER PRIMARY KEY, key BLOB, owner BLOB, name TEXT, sequence INTEGER, lifetime TEXT,"
     " ttl REAL, signature BLOB, crc INTEGER, value BLOB)"
 )
-MAX_ROTTEN = 16
+MAX_CORRUPT_ROWS = 16
 """Number of corrupt rows kept for diagnosis; more of them cost space on the card."""
 
 FIELDS = "key, owner, name, sequence, lifetime, ttl, signature, crc, value"
-SELECT = f"SELECT {FIELDS} FROM records"
-PUT = (
+SELECT_RECORDS = f"SELECT {FIELDS} FROM records"
+PUT_RECORD = (
     f"INSERT INTO records({FIELDS}) VALUES (?, ?, ?, ?, ?, ?, ?, ?, ?) ON CONFLICT(key, owner, name) DO UPDATE SET"
     " sequence = excluded.sequence, lifetime = excluded.lifetime, ttl = excluded.ttl, signature = excluded.signature,"
     " crc = excluded.crc, value = excluded.value"
 )
-DELETE = "DELETE FROM records WHERE key = ? AND owner = ? AND name = ?"
-NOTE = "REPLACE INTO notes VALUES (?, ?, ?)"
+DELETE_RECORD = "DELETE FROM records WHERE key = ? AND owner = ? AND name = ?"
+PUT_NOTE = "REPLACE INTO notes VALUES (?, ?, ?)"
 
 Statement = tuple[str, Sequence[Any]]
 
 
-class Rotten(Exception):
+class CorruptStore(Exception):
     """The file is a damaged store; ``str()`` is the symptom."""
 
 
@@ -61,33 +61,33 @@ class Contents:
 
     records: list[Record] = field(default_factory=list)
     notes: dict[str, bytes] = field(default_factory=dict)
-    rotten: int = 0
+    corrupt_rows: int = 0
     repairs: list[Statement] = field(default_factory=list)
 
 
-def row_of(record: Record) -> tuple[object, ...]:
+def make_row(record: Record) -> tuple[object, ...]:
     """Return the row of ``record`` in the order of ``FIELDS``."""
-    crc = _crc(record.packed())
+    crc = _crc(record.pack())
     return *record.slot, record.sequence, record.lifetime, record.ttl, record.signature, crc, record.value
 
 
-def record_of(row: Sequence[Any]) -> Record | None:
+def parse_row(row: Sequence[Any]) -> Record | None:
     """Return the record in a row of ``FIELDS`` with texts as bytes; None if the row is corrupt."""
-    record = _unchecked(row)
-    return record if record is not None and _crc(record.packed()) == row[7] else None
+    record = _parse_unchecked(row)
+    return record if record is not None and _crc(record.pack()) == row[7] else None
 
 
-def note_of(name: str, value: bytes) -> tuple[str, bytes, int]:
+def make_note_row(name: str, value: bytes) -> tuple[str, bytes, int]:
     """Return a row of ``notes``."""
     return name, value, _crc([name, value])
 
 
-def open_rows(connection: sqlite3.Connection) -> None:
+def use_bytes(connection: sqlite3.Connection) -> None:
     """Make ``connection`` return texts as bytes, because a corrupt text may not be UTF-8."""
     connection.text_factory = bytes
 
 
-def checked_version(path: str, connection: sqlite3.Connection) -> int:
+def check_version(path: str, connection: sqlite3.Connection) -> int:
     """Return the schema version of the file, 0 if it is empty.
 
     Raises ``BadStore`` if it is no store or has a newer schema, ``Rotten`` if it is a damaged store.
@@ -96,22 +96,22 @@ def checked_version(path: str, connection: sqlite3.Connection) -> int:
     (version,) = connection.execute("PRAGMA user_version").fetchone()
     tables = [_decode_text(sql) for (sql,) in connection.execute("SELECT sql FROM sqlite_schema WHERE type = 'table'")]
     if application != APPLICATION_ID:
-        if RECORDS in tables or RECORDS_1 in tables:
-            raise Rotten("its header has another application id")
+        if CREATE_RECORDS in tables or CREATE_RECORDS_1 in tables:
+            raise CorruptStore("its header has another application id")
         if application or version or tables:
             raise BadStore(f"store {path}: belongs to another program; name another file")
         return 0
     if version > SCHEMA_VERSION:
         raise BadStore(f"store {path}: has the newer schema {version}; update this program, or name another file")
-    if (RECORDS if version == SCHEMA_VERSION else RECORDS_1) not in tables:
-        raise Rotten(f"it lacks the tables of schema {version}")
+    if (CREATE_RECORDS if version == SCHEMA_VERSION else CREATE_RECORDS_1) not in tables:
+        raise CorruptStore(f"it lacks the tables of schema {version}")
     (verdict,) = connection.execute("PRAGMA integrity_check(1)").fetchone()
     if _decode_text(verdict) != "ok":
-        raise Rotten(str(_decode_text(verdict)))
+        raise CorruptStore(str(_decode_text(verdict)))
     return int(version)
 
 
-def make(connection: sqlite3.Connection, version: int) -> None:
+def create_tables(connection: sqlite3.Connection, version: int) -> None:
     """Create or migrate the tables from ``version`` (0: empty) to ``SCHEMA_VERSION`` in one transaction."""
     if version == SCHEMA_VERSION:
         return
@@ -120,11 +120,11 @@ def make(connection: sqlite3.Connection, version: int) -> None:
         if version == 1:
             connection.execute("ALTER TABLE records RENAME TO old_records")
             connection.execute("ALTER TABLE notes RENAME TO old_notes")
-        for statement in (RECORDS, NOTES, ROTTEN):
+        for statement in (CREATE_RECORDS, CREATE_NOTES, CREATE_ROTTEN):
             connection.execute(statement)
         if version == 1:
             _migrate_from_1(connection)
-        connection.execute(NOTE, note_of("mark", MARK))
+        connection.execute(PUT_NOTE, make_note_row("mark", FILE_MARK))
         connection.execute(f"PRAGMA application_id = {APPLICATION_ID}")
         connection.execute(f"PRAGMA user_version = {SCHEMA_VERSION}")
         connection.execute("COMMIT")
@@ -133,26 +133,26 @@ def make(connection: sqlite3.Connection, version: int) -> None:
         raise
 
 
-def contents(connection: sqlite3.Connection) -> Contents:
+def read_contents(connection: sqlite3.Connection) -> Contents:
     """Read the whole file, records in order of insertion."""
     found = Contents()
     # Many rows share an owner or a key; share their bytes objects.
     known: dict[bytes, bytes] = {}
     for row_id, key, owner, *rest in connection.execute(f"SELECT id, {FIELDS} FROM records ORDER BY id"):
-        record = record_of([known.setdefault(key, key), known.setdefault(owner, owner), *rest])
+        record = parse_row([known.setdefault(key, key), known.setdefault(owner, owner), *rest])
         if record is None:
-            found.rotten += 1
+            found.corrupt_rows += 1
             found.repairs += _set_aside(row_id)
         elif record.lifetime == "team":
             found.records.append(record)
     # Leases end with the process that received the owners' signs of life.
     found.repairs.append(("DELETE FROM records WHERE lifetime = 'leased'", ()))
-    found.notes, bad = notes_in(connection)
-    found.rotten += bad
+    found.notes, bad = read_notes(connection)
+    found.corrupt_rows += bad
     return found
 
 
-def notes_in(connection: sqlite3.Connection) -> tuple[dict[str, bytes], int]:
+def read_notes(connection: sqlite3.Connection) -> tuple[dict[str, bytes], int]:
     """Return the notes with a valid checksum, and the number of corrupt ones."""
     notes: dict[str, bytes] = {}
     rotten = 0
@@ -169,27 +169,27 @@ def _migrate_from_1(connection: sqlite3.Connection) -> None:
     """Copy the rows of schema 1 and compute their checksums."""
     fields = "key, owner, name, sequence, lifetime, ttl, signature, NULL, value"
     for row in connection.execute(f"SELECT {fields} FROM old_records ORDER BY key, owner, name"):
-        record = _unchecked(row)
+        record = _parse_unchecked(row)
         if record is None:
             connection.execute(f"INSERT INTO rotten({FIELDS}) VALUES (?, ?, ?, ?, ?, ?, ?, ?, ?)", row)
         else:
-            connection.execute(PUT, row_of(record))
+            connection.execute(PUT_RECORD, make_row(record))
     notes = connection.execute("SELECT name, value FROM old_notes").fetchall()
-    connection.executemany(NOTE, [note_of(name.decode(), value) for name, value in notes])
+    connection.executemany(PUT_NOTE, [make_note_row(name.decode(), value) for name, value in notes])
     connection.execute("DROP TABLE old_records")
     connection.execute("DROP TABLE old_notes")
 
 
-def _unchecked(row: Sequence[Any]) -> Record | None:
+def _parse_unchecked(row: Sequence[Any]) -> Record | None:
     key, owner, name, sequence, lifetime, ttl, signature, _, value = row
-    return unpacked([key, _decode_text(name), owner, sequence, _decode_text(lifetime), ttl, value, signature])
+    return parse_record([key, _decode_text(name), owner, sequence, _decode_text(lifetime), ttl, value, signature])
 
 
 def _set_aside(row_id: int) -> list[Statement]:
     return [
         (f"INSERT INTO rotten({FIELDS}) SELECT {FIELDS} FROM records WHERE id = ?", (row_id,)),
         ("DELETE FROM records WHERE id = ?", (row_id,)),
-        ("DELETE FROM rotten WHERE id <= (SELECT max(id) FROM rotten) - ?", (MAX_ROTTEN,)),
+        ("DELETE FROM rotten WHERE id <= (SELECT max(id) FROM rotten) - ?", (MAX_CORRUPT_ROWS,)),
     ]
 
 

@@ -15,26 +15,26 @@ from urllib.parse import quote
 from twisted.internet.defer import Deferred
 from twisted.logger import Logger
 
-from middleware.entangled.data.salvage import is_ours, saved_notes, set_aside
+from middleware.entangled.data.recovery import is_store, read_saved_notes, set_aside
 from middleware.entangled.data.schema import (
-    SELECT,
+    SELECT_RECORDS,
     Contents,
-    Rotten,
-    checked_version,
-    contents,
-    make,
-    open_rows,
-    record_of,
+    CorruptStore,
+    check_version,
+    create_tables,
+    parse_row,
+    read_contents,
+    use_bytes,
 )
-from middleware.entangled.data.store import HOLD, MAX_BYTES, MAX_ROWS, Durable, Origin, Store
-from middleware.entangled.data.writer import Deliver, Writer
+from middleware.entangled.data.store import MAX_BYTES, MAX_ROWS, TOMBSTONE_HOLD_S, Durability, Origin, Store
+from middleware.entangled.data.writer import CallInThread, Writer
 from middleware.entangled.errors import BadStore, NotRunning
 from middleware.entangled.record import Record, Slot
 
-SYNCHRONOUS: dict[Durable, str] = {"power": "FULL", "crash": "NORMAL"}
-EPOCH = "epoch"
+SYNCHRONOUS: dict[Durability, str] = {"power": "FULL", "crash": "NORMAL"}
+EPOCH_NOTE = "epoch"
 """The note that holds the store's epoch; it is not copied from a corrupt file to the new one."""
-MAX_LOG = 4 * 2**20
+MAX_LOG_BYTES = 4 * 2**20
 """Bytes to which the write-ahead log is truncated after a burst of writes."""
 
 
@@ -46,7 +46,7 @@ class SqliteStore(Store):
     """
 
     _log = Logger()
-    make_writer: Callable[[str, sqlite3.Connection, Deliver | None], Writer] = Writer
+    make_writer: Callable[[str, sqlite3.Connection, CallInThread | None], Writer] = Writer
     """Factory of the writer; simulations replace it by one without a thread."""
 
     def __init__(
@@ -73,10 +73,10 @@ class SqliteStore(Store):
         now: float,
         max_rows: int = MAX_ROWS,
         max_bytes: int = MAX_BYTES,
-        hold: float = HOLD,
-        deliver: Deliver | None = None,
+        hold: float = TOMBSTONE_HOLD_S,
+        deliver: CallInThread | None = None,
         fresh_epoch: bytes | None = None,
-        durable: Durable = "power",
+        durable: Durability = "power",
     ) -> SqliteStore:
         """Open the store in the file ``path``, or create it; raise ``BadStore`` with the reason and a remedy.
 
@@ -93,10 +93,10 @@ class SqliteStore(Store):
         origin: Origin = "kept"
         try:
             connection, lock, version, found = _open_file(path, durable)
-        except Rotten as error:
+        except CorruptStore as error:
             aside = set_aside(path)
-            notes = saved_notes(aside)
-            notes.pop(EPOCH, None)
+            notes = read_saved_notes(aside)
+            notes.pop(EPOCH_NOTE, None)
             saved = f"its notes were saved ({', '.join(notes)})" if notes else "nothing in it could be saved"
             cls._log.error(
                 "store {path} is corrupt ({why}); it is renamed to {aside}, and the node starts with an empty store; "
@@ -110,38 +110,38 @@ class SqliteStore(Store):
             origin = "replaced"
         if not version and origin == "kept":
             origin = "new"
-        epoch = found.notes.get(EPOCH, fresh_epoch)
+        epoch = found.notes.get(EPOCH_NOTE, fresh_epoch)
         writer = cls.make_writer(path, connection, deliver)
         store = cls(path, connection, lock, writer, max_rows, max_bytes, hold, epoch)
         store.origin = origin
         store._load(found, now)
         writer.start(found.repairs)
-        for name, value in {**notes, EPOCH: epoch}.items():
-            store.note(name, value)
+        for name, value in {**notes, EPOCH_NOTE: epoch}.items():
+            store.set_note(name, value)
         return store
 
     def put(self, record: Record, expires_at: float) -> bool:
         """Store ``record`` if it beats the record in its slot; see ``Store.put``."""
         self._check_open()
-        if self._writer.trouble and record.beats(self.slot(record.slot)):
-            raise self._writer.refusal(self._writer.trouble)
+        if self._writer.error and record.supersedes(self.get_slot(record.slot)):
+            raise self._writer.make_error(self._writer.error)
         return super().put(record, expires_at)
 
-    def written(self) -> Deferred[None]:
+    def wait_for_write(self) -> Deferred[None]:
         """Fire when all changes made so far are in the file; fail with ``Unwritable`` if it is not writable."""
-        return self._writer.written()
+        return self._writer.wait_for_write()
 
     @property
-    def trouble(self) -> str:
+    def write_error(self) -> str:
         """The reason why the file is not writable at present; empty if it is."""
-        return self._writer.trouble
+        return self._writer.error
 
-    def note(self, name: str, value: bytes) -> None:
+    def set_note(self, name: str, value: bytes) -> None:
         """Store a small value for the node's own use under ``name``; it is durable once ``written`` fires."""
         self._check_open()
-        if self.noted(name) != value:
-            super().note(name, value)
-            self._writer.owe_note(name, value)
+        if self.get_note(name) != value:
+            super().set_note(name, value)
+            self._writer.queue_note(name, value)
 
     def flush(self, timeout: float = 5.0) -> None:
         """Block until all changes are in the file; raise ``BadStore`` after ``timeout`` seconds."""
@@ -164,20 +164,20 @@ class SqliteStore(Store):
         for record in found.records:
             self._insert(record, now + record.ttl)
         self._notes.update(found.notes)
-        self.rotten = found.rotten
-        if found.rotten:
+        self.corrupt_rows = found.corrupt_rows
+        if found.corrupt_rows:
             self._log.warn(
                 "store {path}: {count} corrupt rows are set aside; their records are missing until replicas send them",
                 path=self._path,
-                count=found.rotten,
+                count=found.corrupt_rows,
             )
 
     def _check_open(self) -> None:
         if self._writer.is_closed:
             raise NotRunning(f"store {self._path} is closed")
 
-    def _changed(self, slot: Slot, record: Record | None) -> None:
-        self._writer.owe(slot, record)
+    def _on_changed(self, slot: Slot, record: Record | None) -> None:
+        self._writer.queue_change(slot, record)
 
 
 def read_records(path: str | os.PathLike[str], key: bytes) -> list[Record]:
@@ -189,17 +189,17 @@ def read_records(path: str | os.PathLike[str], key: bytes) -> list[Record]:
     connection = None
     try:
         connection = sqlite3.connect(f"file:{quote(path)}?mode=ro", uri=True, timeout=1.0)
-        open_rows(connection)
-        rows = connection.execute(SELECT + " WHERE key = ? AND value IS NOT NULL ORDER BY owner, name", (key,))
-        return [record for record in map(record_of, rows) if record is not None]
+        use_bytes(connection)
+        rows = connection.execute(SELECT_RECORDS + " WHERE key = ? AND value IS NOT NULL ORDER BY owner, name", (key,))
+        return [record for record in map(parse_row, rows) if record is not None]
     except sqlite3.Error as error:
-        raise _bad_store(path, str(error), "is it the store of a running node?") from error
+        raise _make_error(path, str(error), "is it the store of a running node?") from error
     finally:
         if connection is not None:
             connection.close()
 
 
-def _open_file(path: str, durable: Durable) -> tuple[sqlite3.Connection, int, int, Contents]:
+def _open_file(path: str, durable: Durability) -> tuple[sqlite3.Connection, int, int, Contents]:
     """Lock and open the file; return the connection, the lock, the version that it had, and its contents.
 
     Raises ``BadStore`` if it is not usable, ``Rotten`` if it is a damaged store.
@@ -210,17 +210,17 @@ def _open_file(path: str, durable: Durable) -> tuple[sqlite3.Connection, int, in
         # Autocommit: the code begins transactions explicitly.  One thread at a time uses the connection, this one until
         # the writer starts.
         connection = sqlite3.connect(path, isolation_level=None, check_same_thread=False, timeout=5.0)
-        open_rows(connection)
-        version = checked_version(path, connection)
+        use_bytes(connection)
+        version = check_version(path, connection)
         # Only now, to leave another program's file unchanged.
         os.fchmod(lock, 0o600)
         connection.execute("PRAGMA journal_mode = WAL")
         # Robots lose power at any time; less than FULL loses the last commits, less than NORMAL may damage the file.
         connection.execute(f"PRAGMA synchronous = {SYNCHRONOUS[durable]}")
         connection.execute("PRAGMA cache_size = -512")
-        connection.execute(f"PRAGMA journal_size_limit = {MAX_LOG}")
-        make(connection, version)
-        return connection, lock, version, contents(connection)
+        connection.execute(f"PRAGMA journal_size_limit = {MAX_LOG_BYTES}")
+        create_tables(connection, version)
+        return connection, lock, version, read_contents(connection)
     except BaseException as error:
         if connection is not None:
             connection.close()
@@ -228,49 +228,51 @@ def _open_file(path: str, durable: Durable) -> tuple[sqlite3.Connection, int, in
             sqlite3.SQLITE_CORRUPT,
             sqlite3.SQLITE_NOTADB,
         ):
-            ours = is_ours(path)
+            ours = is_store(path)
             os.close(lock)
             if ours:
-                raise Rotten(_line(error)) from error
-            raise _bad_store(path, str(error), "name another file") from error
+                raise CorruptStore(_join_lines(error)) from error
+            raise _make_error(path, str(error), "name another file") from error
         os.close(lock)
         if isinstance(error, sqlite3.Error | OSError):
-            raise _bad_store(path, str(error), "make room, or name another file") from error
+            raise _make_error(path, str(error), "make room, or name another file") from error
         raise
 
 
-def _line(problem: object) -> str:
+def _join_lines(problem: object) -> str:
     # SQLite's messages may have several lines.
     return " ".join(str(problem).split())
 
 
-def _bad_store(path: str, problem: str, remedy: str) -> BadStore:
-    return BadStore(f"store {path}: {_line(problem)}; {remedy}")
+def _make_error(path: str, problem: str, remedy: str) -> BadStore:
+    return BadStore(f"store {path}: {_join_lines(problem)}; {remedy}")
 
 
 def _lock_file(path: str) -> int:
     """Create or open the file and lock it against other nodes; return the descriptor."""
     if os.path.isdir(path):
-        raise _bad_store(path, "is a directory", "name a file in it")
+        raise _make_error(path, "is a directory", "name a file in it")
     try:
         # Readable by its owner only: it holds the seed of the node's identity.
         lock = os.open(path, os.O_RDWR | os.O_CREAT, 0o600)
     except OSError as error:
-        raise _bad_store(path, error.strerror or str(error), "name a file that can be written") from error
+        raise _make_error(path, error.strerror or str(error), "name a file that can be written") from error
     try:
         fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
     except BlockingIOError as error:
-        holder = _holder(lock)
+        holder = _find_lock_holder(lock)
         os.close(lock)
         problem = "another node uses it" + (f" (process {holder})" if holder else "")
-        raise _bad_store(path, problem, "stop it, or give each node its own store, which holds its identity") from error
+        raise _make_error(
+            path, problem, "stop it, or give each node its own store, which holds its identity"
+        ) from error
     except OSError as error:
         os.close(lock)
-        raise _bad_store(path, error.strerror or str(error), "name a file on a local disk that is yours") from error
+        raise _make_error(path, error.strerror or str(error), "name a file on a local disk that is yours") from error
     return lock
 
 
-def _holder(lock: int) -> int:
+def _find_lock_holder(lock: int) -> int:
     """Return the id of the process that holds the lock, 0 if unknown."""
     inode = os.fstat(lock).st_ino
     try:

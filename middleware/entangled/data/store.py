@@ -30,11 +30,11 @@ MAX_ROWS = 12_000
 with ``MAX_BYTES`` a full store adds 22 MiB to a node of 40 MiB, the limit for a device with 64 MB."""
 MAX_BYTES = 8 * 2**20
 """Bytes of a store by ``weight``.  More hold more large values, at the cost of memory and flash."""
-HOLD = 86_400.0
+TOMBSTONE_HOLD_S = 86_400.0
 """Seconds before a tombstone may be removed for room: the longest absence after which a returning node does not bring
 back a deleted record.  More is safer; less frees space earlier."""
-OWNER_ROWS = 250
-OWNER_BYTES = 65_536
+MIN_OWNER_ROWS = 250
+MIN_OWNER_BYTES = 65_536
 """Minimum share of each owner while the store has room, independent of the others."""
 FIXED_BYTES = 17
 """Bytes of a record's sequence (8), ttl (8) and lifetime (1)."""
@@ -44,7 +44,7 @@ MAX_SEARCHED = 1000
 
 Origin = Literal["new", "kept", "replaced"]
 """Origin of a store: newly created, read from its file, or created because the file was corrupt."""
-Durable = Literal["power", "crash"]
+Durability = Literal["power", "crash"]
 """Event that written data survives: a power failure, or only a crash of the process."""
 
 
@@ -61,7 +61,7 @@ class Usage(NamedTuple):
 
 
 @dataclass(slots=True)
-class _Held:
+class _StoredRecord:
     """A record with its expiry time; ``queued_at`` is its key in the heap."""
 
     record: Record
@@ -79,11 +79,15 @@ class Store:
 
     origin: Origin = "new"
     """Origin of the store; records of one that is not ``new`` may be stale or missing until they are reconciled."""
-    rotten = 0
+    corrupt_rows = 0
     """Corrupt rows when the store was opened; their records are missing until other replicas send them."""
 
     def __init__(
-        self, max_rows: int = MAX_ROWS, max_bytes: int = MAX_BYTES, hold: float = HOLD, epoch: bytes = bytes(8)
+        self,
+        max_rows: int = MAX_ROWS,
+        max_bytes: int = MAX_BYTES,
+        hold: float = TOMBSTONE_HOLD_S,
+        epoch: bytes = bytes(8),
     ) -> None:
         self.epoch = epoch
         self._max_rows = max_rows
@@ -91,14 +95,14 @@ class Store:
         self._hold = hold
         self._now = float("-inf")
         self._bytes = 0
-        self._slots: dict[Slot, _Held] = {}
-        self._by_key: dict[bytes, dict[Slot, _Held]] = {}
-        self._by_owner: dict[bytes, dict[Slot, _Held]] = {}
+        self._slots: dict[Slot, _StoredRecord] = {}
+        self._by_key: dict[bytes, dict[Slot, _StoredRecord]] = {}
+        self._by_owner: dict[bytes, dict[Slot, _StoredRecord]] = {}
         self._bytes_of: dict[bytes, int] = {}
         # In the order of removal.
-        self._tombstones: dict[Slot, _Held] = {}
+        self._tombstones: dict[Slot, _StoredRecord] = {}
         self._removed_for_room: list[Record] = []
-        self._sorted: dict[bytes, list[_Held]] = {}
+        self._sorted: dict[bytes, list[_StoredRecord]] = {}
         self._heap: list[tuple[float, Slot]] = []
         self._notes: dict[str, bytes] = {}
 
@@ -107,7 +111,7 @@ class Store:
         return len(self._slots)
 
     @property
-    def trouble(self) -> str:
+    def write_error(self) -> str:
         """The reason why the store is not writable at present; empty if it is."""
         return ""
 
@@ -125,7 +129,7 @@ class Store:
         """
         slot = record.slot
         held = self._slots.get(slot)
-        if held is not None and not record.beats(held.record):
+        if held is not None and not record.supersedes(held.record):
             if record == held.record:
                 held.expires_at = max(held.expires_at, expires_at)
                 self._index_tombstone(slot, held)
@@ -135,10 +139,10 @@ class Store:
             self._insert(record, expires_at)
         else:
             self._replace(held, record, expires_at)
-        self._changed(slot, record)
+        self._on_changed(slot, record)
         return True
 
-    def written(self) -> Deferred[None]:
+    def wait_for_write(self) -> Deferred[None]:
         """Fire when all changes made so far are durable; fail with ``Unwritable`` if they cannot be."""
         return succeed(None)
 
@@ -153,17 +157,17 @@ class Store:
             holding = self._sorted[key] = [slots[slot] for slot in sorted(slots)]
         return [held.record for held in holding if tombstones or held.record.value is not None]
 
-    def slot(self, slot: Slot) -> Record | None:
+    def get_slot(self, slot: Slot) -> Record | None:
         """Return the record or tombstone in ``slot``, or None."""
         held = self._slots.get(slot)
         return held.record if held else None
 
-    def expiry(self, slot: Slot) -> float | None:
+    def find_expiry(self, slot: Slot) -> float | None:
         """Return the expiry time of the record in ``slot``, or None."""
         held = self._slots.get(slot)
         return held.expires_at if held else None
 
-    def owned(self, owner: bytes) -> list[Record]:
+    def find_owned(self, owner: bytes) -> list[Record]:
         """Return the records of ``owner``, tombstones included, in the order of their slots."""
         slots = self._by_owner.get(owner, {})
         return [slots[slot].record for slot in sorted(slots)]
@@ -172,7 +176,7 @@ class Store:
         """Return every owner of a slot, in order of insertion."""
         return list(self._by_owner)
 
-    def extend(self, owner: bytes, expires_at: float) -> int:
+    def extend_leases(self, owner: bytes, expires_at: float) -> int:
         """Extend all leased records of ``owner`` to ``expires_at`` at least; return their number."""
         leased = 0
         for held in self._by_owner.get(owner, {}).values():
@@ -200,7 +204,7 @@ class Store:
         expired.sort(key=lambda ended: ended[:2])
         return removed + [record for _, _, record in expired]
 
-    def due(self) -> float:
+    def next_expiry(self) -> float:
         """Return the next time at which ``expire`` may remove a record; infinite if the store is empty."""
         if self._removed_for_room:
             return float("-inf")
@@ -208,7 +212,7 @@ class Store:
 
     def drop_leased(self, owner: bytes) -> list[Record]:
         """Remove all leased records of ``owner``; return them in the order of their slots."""
-        return [self._remove(record.slot) for record in self.owned(owner) if record.lifetime == "leased"]
+        return [self._remove(record.slot) for record in self.find_owned(owner) if record.lifetime == "leased"]
 
     def discard(self, slot: Slot) -> bool:
         """Remove the record in ``slot``; return whether there was one."""
@@ -221,11 +225,11 @@ class Store:
         """Return all records, tombstones included, in the order of insertion of their slots."""
         return [held.record for held in self._slots.values()]
 
-    def note(self, name: str, value: bytes) -> None:
+    def set_note(self, name: str, value: bytes) -> None:
         """Store a small value for the node's own use (its seed, its contacts) under ``name``."""
         self._notes[name] = value
 
-    def noted(self, name: str) -> bytes | None:
+    def get_note(self, name: str) -> bytes | None:
         """Return the note ``name``, or None."""
         return self._notes.get(name)
 
@@ -240,14 +244,14 @@ class Store:
             return len(self._slots) + rows <= 2 * self._max_rows
         return len(self._slots) + rows <= self._max_rows and self._bytes + size <= self._max_bytes
 
-    def _make_room(self, record: Record, held: _Held | None) -> None:
+    def _make_room(self, record: Record, held: _StoredRecord | None) -> None:
         """Remove old tombstones until ``record`` fits instead of ``held``; raise ``Full`` if that is not enough."""
         rows = 1 if held is None else 0
-        size = weight(record) - (0 if held is None else weight(held.record))
+        size = count_bytes(record) - (0 if held is None else count_bytes(held.record))
         if not rows and size <= 0:
             return
         leaving: dict[Slot, None] = {}
-        own = (slot for slot in islice(self._removable(record.slot), MAX_SEARCHED) if slot.owner == record.owner)
+        own = (slot for slot in islice(self._find_removable(record.slot), MAX_SEARCHED) if slot.owner == record.owner)
         while not self._is_within_share(record, rows, size):
             slot = next(own, None)
             if slot is None:
@@ -258,8 +262,8 @@ class Store:
                     OWNER_FULL,
                 )
             leaving[slot] = None
-            rows, size = rows - 1, size - weight(self._slots[slot].record)
-        candidates = (slot for slot in self._removable(record.slot) if slot not in leaving)
+            rows, size = rows - 1, size - count_bytes(self._slots[slot].record)
+        candidates = (slot for slot in self._find_removable(record.slot) if slot not in leaving)
         while not self._fits(record, rows, size):
             slot = next(candidates, None)
             if slot is None:
@@ -267,7 +271,7 @@ class Store:
                     f"store full: it holds {self.usage}, no room for {size} bytes; remove some, or raise its limits"
                 )
             leaving[slot] = None
-            rows, size = rows - 1, size - weight(self._slots[slot].record)
+            rows, size = rows - 1, size - count_bytes(self._slots[slot].record)
         self._removed_for_room += [self._remove(slot) for slot in leaving]
 
     def _is_within_share(self, record: Record, rows: int, size: int) -> bool:
@@ -276,11 +280,11 @@ class Store:
         has_bytes = self._bytes_of.get(record.owner, 0) + size
         free_rows = self._max_rows - len(self._slots) - rows
         free_bytes = self._max_bytes - self._bytes - size
-        return has_rows <= max(OWNER_ROWS, free_rows) and (
-            record.is_tombstone or has_bytes <= max(OWNER_BYTES, free_bytes)
+        return has_rows <= max(MIN_OWNER_ROWS, free_rows) and (
+            record.is_tombstone or has_bytes <= max(MIN_OWNER_BYTES, free_bytes)
         )
 
-    def _removable(self, kept: Slot) -> Iterator[Slot]:
+    def _find_removable(self, kept: Slot) -> Iterator[Slot]:
         """Yield the removable slots in order of removal, except ``kept``."""
         for slot, held in self._tombstones.items():
             if held.expires_at - held.record.ttl + self._hold > self._now:
@@ -290,17 +294,17 @@ class Store:
 
     # -- inside ------------------------------------------------------------------------------------------------------
 
-    def _changed(self, slot: Slot, record: Record | None) -> None:
+    def _on_changed(self, slot: Slot, record: Record | None) -> None:
         """Handle a change of ``slot`` to ``record``, or to empty."""
 
     def _insert(self, record: Record, expires_at: float) -> None:
         slot = record.slot
-        held = _Held(record, expires_at, expires_at)
+        held = _StoredRecord(record, expires_at, expires_at)
         self._slots[slot] = held
         self._by_key.setdefault(slot.key, {})[slot] = held
         self._by_owner.setdefault(slot.owner, {})[slot] = held
         self._sorted.pop(slot.key, None)
-        self._count_bytes(slot.owner, weight(record))
+        self._count_bytes(slot.owner, count_bytes(record))
         self._index_tombstone(slot, held)
         self._queue(held)
 
@@ -308,20 +312,20 @@ class Store:
         self._bytes += more
         self._bytes_of[owner] = self._bytes_of.get(owner, 0) + more
 
-    def _replace(self, held: _Held, record: Record, expires_at: float) -> None:
-        self._count_bytes(record.owner, weight(record) - weight(held.record))
+    def _replace(self, held: _StoredRecord, record: Record, expires_at: float) -> None:
+        self._count_bytes(record.owner, count_bytes(record) - count_bytes(held.record))
         held.record, held.expires_at = record, expires_at
         self._index_tombstone(record.slot, held)
         if expires_at < held.queued_at:
             self._queue(held)
 
-    def _index_tombstone(self, slot: Slot, held: _Held) -> None:
+    def _index_tombstone(self, slot: Slot, held: _StoredRecord) -> None:
         """Append ``held`` to the removable tombstones if it is one."""
         self._tombstones.pop(slot, None)
         if held.record.is_tombstone:
             self._tombstones[slot] = held
 
-    def _queue(self, held: _Held) -> None:
+    def _queue(self, held: _StoredRecord) -> None:
         held.queued_at = held.expires_at
         heapq.heappush(self._heap, (held.expires_at, held.record.slot))
         if len(self._heap) > 2 * len(self._slots) + 64:
@@ -336,15 +340,15 @@ class Store:
             if not index[name]:
                 del index[name]
         self._sorted.pop(slot.key, None)
-        self._count_bytes(slot.owner, -weight(held.record))
+        self._count_bytes(slot.owner, -count_bytes(held.record))
         if slot.owner not in self._by_owner:
             del self._bytes_of[slot.owner]
         self._tombstones.pop(slot, None)
-        self._changed(slot, None)
+        self._on_changed(slot, None)
         return held.record
 
 
-def weight(record: Record) -> int:
+def count_bytes(record: Record) -> int:
     """Return the size of ``record`` in bytes of all its fields, as the limits count it."""
     name = len(record.name.encode())
     return len(record.key) + len(record.owner) + name + len(record.value or b"") + len(record.signature) + FIXED_BYTES

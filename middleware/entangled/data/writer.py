@@ -16,24 +16,24 @@ from dataclasses import dataclass, field
 from twisted.internet.defer import Deferred, fail, succeed
 from twisted.logger import Logger
 
-from middleware.entangled.data.schema import DELETE, NOTE, PUT, Statement, note_of, row_of
+from middleware.entangled.data.schema import DELETE_RECORD, PUT_NOTE, PUT_RECORD, Statement, make_note_row, make_row
 from middleware.entangled.errors import BadStore, NotRunning, Unwritable
 from middleware.entangled.record import Record, Slot
 
-COMMIT_AFTER = 0.02
+COMMIT_AFTER_S = 0.02
 """Seconds that a change may wait for others if no caller waits for it.  More means fewer writes to the card; less means
 fewer changes lost in a power failure."""
-COMMIT_FULL = 200
+MAX_BATCH = 200
 """Pending changes that are committed without waiting."""
-TRY_AGAIN = 0.5
+RETRY_INTERVAL_S = 0.5
 """Seconds between two attempts after a failed commit, as on a full disk."""
 
-Deliver = Callable[[Callable[[], None]], object]
+CallInThread = Callable[[Callable[[], None]], object]
 """Calls a function in the thread of the store's user: ``reactor.callFromThread``."""
 
 
 @dataclass
-class _Owed:
+class _Batch:
     """Pending changes: only the last one of each slot and note, so they never exceed the store's size."""
 
     statements: list[Statement] = field(default_factory=list)
@@ -43,9 +43,9 @@ class _Owed:
     def __len__(self) -> int:
         return len(self.statements) + len(self.changes) + len(self.notes)
 
-    def before(self, later: _Owed) -> _Owed:
+    def merge(self, later: _Batch) -> _Batch:
         """Return the changes of this batch followed by ``later``."""
-        return _Owed(
+        return _Batch(
             self.statements + later.statements, {**self.changes, **later.changes}, {**self.notes, **later.notes}
         )
 
@@ -58,75 +58,75 @@ class Writer:
 
     _log = Logger()
 
-    def __init__(self, path: str, connection: sqlite3.Connection, deliver: Deliver | None) -> None:
+    def __init__(self, path: str, connection: sqlite3.Connection, deliver: CallInThread | None) -> None:
         self._path = path
         self._connection = connection
-        self._deliver = deliver
-        self._turn = threading.Condition()
+        self._call_in_thread = deliver
+        self._condition = threading.Condition()
         # Access to these needs the lock of ``_turn``.
-        self._owed = _Owed()
+        self._pending = _Batch()
         self._waiting: list[Deferred[None]] = []
-        self._writing = False
-        self._hurry = False
-        self._closing = False
-        self._trouble = ""
+        self._is_writing = False
+        self._is_urgent = False
+        self._is_closing = False
+        self._error = ""
         # The writer appends, the caller's thread pops.
-        self._news: deque[tuple[Deferred[None], str]] = deque()
-        self._thread = threading.Thread(target=self._write_on, name=f"writer of {path}", daemon=True)
+        self._notifications: deque[tuple[Deferred[None], str]] = deque()
+        self._thread = threading.Thread(target=self._run, name=f"writer of {path}", daemon=True)
 
     @property
-    def trouble(self) -> str:
+    def error(self) -> str:
         """The reason why the last commit failed; empty if it succeeded."""
-        return self._trouble
+        return self._error
 
     @property
     def is_closed(self) -> bool:
         """Whether ``close`` has been called."""
-        return self._closing
+        return self._is_closing
 
     # -- the caller's thread -------------------------------------------------------------------------------------------
 
     def start(self, statements: list[Statement]) -> None:
         """Start the thread, which executes ``statements`` first."""
-        self._owed.statements += statements
+        self._pending.statements += statements
         self._thread.start()
 
-    def owe(self, slot: Slot, record: Record | None) -> None:
+    def queue_change(self, slot: Slot, record: Record | None) -> None:
         """Queue the change of ``slot`` to ``record``, or to empty."""
-        with self._turn:
-            self._owed.changes[slot] = record
-            self._turn.notify_all()
+        with self._condition:
+            self._pending.changes[slot] = record
+            self._condition.notify_all()
 
-    def owe_note(self, name: str, value: bytes) -> None:
+    def queue_note(self, name: str, value: bytes) -> None:
         """Queue the change of a note."""
-        with self._turn:
-            self._owed.notes[name] = value
-            self._turn.notify_all()
+        with self._condition:
+            self._pending.notes[name] = value
+            self._condition.notify_all()
 
-    def written(self) -> Deferred[None]:
+    def wait_for_write(self) -> Deferred[None]:
         """Fire once all changes queued so far are in the file; fail with ``Unwritable`` as soon as a commit fails."""
-        with self._turn:
-            if self._closing:
+        with self._condition:
+            if self._is_closing:
                 return fail(NotRunning(f"store {self._path} is closed"))
-            if self._trouble:
-                return fail(self.refusal(self._trouble))
-            if not self._owed and not self._writing:
+            if self._error:
+                return fail(self.make_error(self._error))
+            if not self._pending and not self._is_writing:
                 return succeed(None)
             waiting: Deferred[None] = Deferred()
             self._waiting.append(waiting)
-            self._hurry = True
-            self._turn.notify_all()
+            self._is_urgent = True
+            self._condition.notify_all()
             return waiting
 
     def flush(self, timeout: float) -> None:
         """Block until all queued changes are in the file; raise ``BadStore`` after ``timeout`` seconds."""
-        with self._turn:
-            self._hurry = True
-            self._turn.notify_all()
-            done = self._turn.wait_for(lambda: not self._owed and not self._writing, timeout)
-        self._tell()
+        with self._condition:
+            self._is_urgent = True
+            self._condition.notify_all()
+            done = self._condition.wait_for(lambda: not self._pending and not self._is_writing, timeout)
+        self._notify_waiting()
         if not done:
-            why = self._trouble or "slow"
+            why = self._error or "slow"
             raise BadStore(f"store {self._path}: not written within {timeout} s: {why}; free disk space and retry")
 
     def close(self) -> bool:
@@ -134,91 +134,93 @@ class Writer:
 
         If the file is not writable the queued changes are lost and the reason is logged.
         """
-        with self._turn:
-            if self._closing:
+        with self._condition:
+            if self._is_closing:
                 return False
-            self._closing = True
-            self._turn.notify_all()
+            self._is_closing = True
+            self._condition.notify_all()
         self._thread.join()
-        self._tell()
+        self._notify_waiting()
         return True
 
-    def refusal(self, why: str) -> Unwritable:
+    def make_error(self, why: str) -> Unwritable:
         """Return the error for callers while the file is not writable."""
         # Sent to peers as well: without the path, which is in the log.
         return Unwritable(f"the data store cannot be written: {why}")
 
-    def _tell(self) -> None:
+    def _notify_waiting(self) -> None:
         """Notify waiting callers; runs in the caller's thread."""
-        while self._news:
-            waiting, trouble = self._news.popleft()
+        while self._notifications:
+            waiting, trouble = self._notifications.popleft()
             if waiting.called:
                 continue  # cancelled by its caller
             if trouble:
-                waiting.errback(self.refusal(trouble))
+                waiting.errback(self.make_error(trouble))
             else:
                 waiting.callback(None)
 
     # -- the writer's thread -------------------------------------------------------------------------------------------
 
-    def _write_on(self) -> None:
+    def _run(self) -> None:
         """Write until the store is closed, and then until no changes are left or a commit fails."""
         ended = False
         while not ended:
-            batch, waiting = self._take()
+            batch, waiting = self._take_batch()
             trouble = self._commit(batch) if batch else ""
-            ended = self._settle(batch, waiting, trouble)
-            if self._news and self._deliver is not None:
-                self._deliver(self._tell)
+            ended = self._finish_batch(batch, waiting, trouble)
+            if self._notifications and self._call_in_thread is not None:
+                self._call_in_thread(self._notify_waiting)
 
-    def _take(self) -> tuple[_Owed, list[Deferred[None]]]:
+    def _take_batch(self) -> tuple[_Batch, list[Deferred[None]]]:
         """Wait until a commit is due; return the pending changes and the Deferreds that wait for them."""
-        with self._turn:
-            if self._trouble:
-                self._turn.wait_for(lambda: self._closing, TRY_AGAIN)
-            self._turn.wait_for(lambda: self._owed or self._closing)
-            self._turn.wait_for(lambda: len(self._owed) >= COMMIT_FULL or self._hurry or self._closing, COMMIT_AFTER)
-            batch, self._owed = self._owed, _Owed()
+        with self._condition:
+            if self._error:
+                self._condition.wait_for(lambda: self._is_closing, RETRY_INTERVAL_S)
+            self._condition.wait_for(lambda: self._pending or self._is_closing)
+            self._condition.wait_for(
+                lambda: len(self._pending) >= MAX_BATCH or self._is_urgent or self._is_closing, COMMIT_AFTER_S
+            )
+            batch, self._pending = self._pending, _Batch()
             waiting, self._waiting = self._waiting, []
-            self._hurry = False
-            self._writing = True
+            self._is_urgent = False
+            self._is_writing = True
             return batch, waiting
 
-    def _settle(self, batch: _Owed, waiting: list[Deferred[None]], trouble: str) -> bool:
+    def _finish_batch(self, batch: _Batch, waiting: list[Deferred[None]], trouble: str) -> bool:
         """Requeue the changes of a failed commit, schedule notifications, and return whether to end the thread."""
-        with self._turn:
+        with self._condition:
             if trouble:
-                self._owed = batch.before(self._owed)
-            if trouble or not self._owed:
+                self._pending = batch.merge(self._pending)
+            if trouble or not self._pending:
                 waiting += self._waiting
                 self._waiting = []
-            self._news.extend((each, trouble) for each in waiting)
-            if trouble != self._trouble:
+            self._notifications.extend((each, trouble) for each in waiting)
+            if trouble != self._error:
                 self._log.warn("store {path}: {what}", path=self._path, what=trouble or "writable again")
-            self._trouble = trouble
-            self._writing = False
-            self._turn.notify_all()
-            left = len(self._owed)
-            if self._closing and trouble:
+            self._error = trouble
+            self._is_writing = False
+            self._condition.notify_all()
+            left = len(self._pending)
+            if self._is_closing and trouble:
                 self._log.error("store {path}: {left} changes are lost: {why}", path=self._path, left=left, why=trouble)
-            return self._closing and (bool(trouble) or not left)
+            return self._is_closing and (bool(trouble) or not left)
 
-    def _commit(self, batch: _Owed) -> str:
+    def _commit(self, batch: _Batch) -> str:
         """Write the batch in one transaction; return the error, empty if none."""
         connection = self._connection
         try:
             connection.execute("BEGIN IMMEDIATE")
             for sql, values in batch.statements:
                 connection.execute(sql, values)
-            connection.executemany(DELETE, (slot for slot, record in batch.changes.items() if record is None))
-            connection.executemany(PUT, (row_of(r) for r in batch.changes.values() if r is not None))
-            connection.executemany(NOTE, (note_of(*note) for note in batch.notes.items()))
+            connection.executemany(DELETE_RECORD, (slot for slot, record in batch.changes.items() if record is None))
+            connection.executemany(PUT_RECORD, (make_row(r) for r in batch.changes.values() if r is not None))
+            connection.executemany(PUT_NOTE, (make_note_row(*note) for note in batch.notes.items()))
             connection.execute("COMMIT")
         except Exception as error:  # whatever the error, the waiting callers must be notified
-            return f"{' '.join(str(error).split()) or type(error).__name__}{self._rolled_back()}"
+            return f"{' '.join(str(error).split()) or type(error).__name__}{self._roll_back()}"
         return ""
 
-    def _rolled_back(self) -> str:
+    def _roll_back(self) -> str:
         try:
             self._connection.rollback()
         except sqlite3.Error as error:

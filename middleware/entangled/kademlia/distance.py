@@ -20,7 +20,7 @@ def bucket_index(own: bytes, other: bytes) -> int:
     return apart.bit_length() - 1
 
 
-def closest(contacts: Iterable[Contact], target: bytes, count: int) -> list[Contact]:
+def select_closest(contacts: Iterable[Contact], target: bytes, count: int) -> list[Contact]:
     """Return at most ``count`` of ``contacts``, the closest to ``target`` first; equal ids keep their order."""
     goal = int.from_bytes(target)
     return sorted(contacts, key=lambda contact: int.from_bytes(contact.node_id) ^ goal)[:count]

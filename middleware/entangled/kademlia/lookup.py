@@ -11,7 +11,7 @@ from collections.abc import Iterable
 from enum import Enum
 
 from middleware.entangled.contact import Contact
-from middleware.entangled.kademlia.distance import closest, distance
+from middleware.entangled.kademlia.distance import distance, select_closest
 
 
 class _State(Enum):
@@ -50,7 +50,7 @@ class Lookup:
         """Whether the k closest candidates that have not failed have answered; True without candidates."""
         return all(self._states[node_id] is _State.ANSWERED for node_id in self._nearest(_State.FAILED))
 
-    def next(self) -> list[Contact]:
+    def take_next(self) -> list[Contact]:
         """Return the contacts to ask now, closest first, and mark them as asked."""
         asked = []
         # While a slow contact has time left, the next closest is asked too, in case the slow one fails.
@@ -62,19 +62,19 @@ class Lookup:
                 asked.append(self._contacts[node_id])
         return asked
 
-    def answered(self, contact: Contact, contacts: Iterable[Contact]) -> None:
+    def record_answer(self, contact: Contact, contacts: Iterable[Contact]) -> None:
         """Record that ``contact`` answered with ``contacts``, of which at most the k closest are used."""
         if self._was_asked(contact):
             self._set_state(contact.node_id, _State.ANSWERED)
-            for found in closest(contacts, self._target, self._k):
+            for found in select_closest(contacts, self._target, self._k):
                 self._add(found)
 
-    def failed(self, contact: Contact) -> None:
+    def record_failure(self, contact: Contact) -> None:
         """Record that ``contact`` did not answer."""
         if self._was_asked(contact):
             self._set_state(contact.node_id, _State.FAILED)
 
-    def slow(self, contact: Contact) -> None:
+    def mark_slow(self, contact: Contact) -> None:
         """Exclude ``contact`` from the parallel requests without giving up on it (a hedge)."""
         if self._states.get(contact.node_id) is _State.ASKED:
             self._set_state(contact.node_id, _State.SLOW)
@@ -82,7 +82,7 @@ class Lookup:
     def closest(self) -> list[Contact]:
         """Return the k closest contacts that have answered, closest first."""
         answered = [c for node_id, c in self._contacts.items() if self._states[node_id] is _State.ANSWERED]
-        return closest(answered, self._target, self._k)
+        return select_closest(answered, self._target, self._k)
 
     def _add(self, contact: Contact) -> None:
         if contact.node_id != self._exclude and contact.node_id not in self._contacts:

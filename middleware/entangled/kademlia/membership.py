@@ -17,41 +17,41 @@ from twisted.internet.interfaces import IReactorTime
 from twisted.logger import Logger
 
 from middleware.entangled.background import Background
-from middleware.entangled.bounded import keep
-from middleware.entangled.contact import Contact, unpacked
+from middleware.entangled.bounded import put_bounded
+from middleware.entangled.contact import Contact, parse_contact
 from middleware.entangled.errors import NoAnswer, NotRunning, Refused
-from middleware.entangled.kademlia.detour import Detour
-from middleware.entangled.kademlia.overlay import Overlay, contacts_of
-from middleware.entangled.kademlia.roster import MAX_MEMBERS
-from middleware.entangled.kademlia.sounding import PROBE, Sounding
+from middleware.entangled.kademlia.alternate_path import AlternatePaths
+from middleware.entangled.kademlia.liveness_probe import STEP_S, LivenessProber
+from middleware.entangled.kademlia.member_table import MAX_MEMBERS
+from middleware.entangled.kademlia.overlay import Overlay, parse_contacts
 from middleware.entangled.network.network import Address
 from middleware.entangled.wire.endpoint import Endpoint
 
-SILENCE = 3.0
+MIN_PING_INTERVAL_S = 3.0
 """The seconds of silence after which a contact is pinged, in a team of up to ``SMALL`` members."""
-SMALL = 10
-MAX_SILENCE = 9.0
-REFRESH = 3600.0
+SMALL_TEAM = 10
+MAX_PING_INTERVAL_S = 9.0
+REFRESH_INTERVAL_S = 3600.0
 """The seconds after which a bucket without a lookup is refreshed (Kademlia, section 2.3)."""
-BACKOFF = (0.2, 5.0)
+BACKOFF_S = (0.2, 5.0)
 HINT_AFTER = 4
 """The failed tries after which the log suggests a diagnosis, once: a node of another team gets no answer at all."""
-MAX_FORMER = 32
+MAX_FORMER_ADDRESSES = 32
 """The addresses of known nodes and lost contacts that are tried when no contact is left."""
-AGAIN = 4.0
+RETRY_INTERVAL_S = 4.0
 """The seconds before an absent member, or one that was only named, is tried again."""
-LARGE_FOR = 60.0
+LARGE_REPORT_S = 60.0
 """The seconds for which one notification that the network is large is valid.  A node that gets no further one for as
 long again starts to learn all members again."""
-BREATH = 0.02
+NEWCOMER_DELAY_S = 0.02
 """The seconds that a newcomer waits before it contacts the next few unknown members, so that first reads are not
 delayed; up to as much again is added at random."""
-AT_ONCE = 8
+MAX_PARALLEL = 8
 """The number of unknown members that are contacted at the same time: a handshake takes 0.3 ms of a core on each side.
 """
-_BY_TABLE = b"-"
+_LARGE_DIGEST = b"-"
 """The digest of a node without a list, because its network is large; it differs from every other digest."""
-PAGE = 20
+PAGE_MEMBERS = 20
 """The number of members in one message."""
 
 
@@ -67,23 +67,23 @@ class Membership:
         self._endpoint = endpoint
         self._clock = clock
         self._rng = rng
-        self._chores = chores
+        self._background = chores
         self._former_addresses: dict[Address, None] = {}
         self._tried_at: dict[bytes, float] = {}
         self._listed_at: dict[bytes, float] = {}
-        self._returning = False
+        self._is_rejoining = False
         self._large_until = float("-inf")
-        self.sounding = Sounding(overlay, endpoint, rng, chores, self._keep_up)
-        self._joining = False
-        self._is_entered = False
-        self.detour = Detour(overlay, endpoint, clock, rng, chores, self._enter)
+        self.prober = LivenessProber(overlay, endpoint, rng, chores, self._maintain)
+        self._is_joining = False
+        self._has_entered = False
+        self.alternate_paths = AlternatePaths(overlay, endpoint, clock, rng, chores, self._enter)
         endpoint.expose("ping", self._answer_ping, changes=True, idempotent=True)
         endpoint.expose("members", self._answer_members, early=True)
         endpoint.expose("known", self._answer_known, early=True)
 
     def start(self) -> None:
         """Start to probe the contacts."""
-        self._chores.every(PROBE, self._probe)
+        self._background.every(STEP_S, self._ping_silent)
 
     async def join(self, known: Sequence[Address], remembered: Sequence[Contact] = ()) -> None:
         """Contact the known nodes, with exponential backoff until one answers.
@@ -91,15 +91,15 @@ class Membership:
         ``remembered`` contacts are tried too, but waited for only if there are known nodes: otherwise this may be the
         first node of its network.  A known node that turns out to be this node is skipped.
         """
-        others, pause, tries = list(known), BACKOFF[0], 0
+        others, pause, tries = list(known), BACKOFF_S[0], 0
         for contact in remembered:
-            self._overlay.roster.remembered(contact, self._clock.seconds())
+            self._overlay.members.add_absent(contact, self._clock.seconds())
         addresses = [contact.address for contact in remembered if not contact.address.is_virtual]
         self._former_addresses |= dict.fromkeys([*known, *addresses])
         while others or addresses:
-            if await self._contact_any(others, addresses) or self._is_entered:
+            if await self._contact_any(others, addresses) or self._has_entered:
                 return
-            if self._chores.is_stopped:
+            if self._background.is_stopped:
                 raise NotRunning("the node stopped while it was joining")
             if not others:
                 break
@@ -108,44 +108,44 @@ class Membership:
             tries += 1
             if tries == HINT_AFTER:
                 self._log.warn("no known node admits this node; run: swarm doctor SETTINGS")
-            await self._chores.sleep(pause * (0.75 + self._rng.random() / 2))
-            pause = min(pause * 2, BACKOFF[1])
+            await self._background.sleep(pause * (0.75 + self._rng.random() / 2))
+            pause = min(pause * 2, BACKOFF_S[1])
         # Other nodes may have joined meanwhile and reported that the network is large.
-        if not self._is_entered and not self._overlay.is_large:
-            self._overlay.is_whole = True
+        if not self._has_entered and not self._overlay.is_large:
+            self._overlay.has_all_members = True
 
     @property
-    def is_entered(self) -> bool:
+    def has_entered(self) -> bool:
         """Whether a path other than a known node led into the network."""
-        return self._is_entered
+        return self._has_entered
 
-    async def meet(self, address: Address) -> bool:
+    async def contact_address(self, address: Address) -> bool:
         """Contact the node of the team at ``address``, which merges its network with this node's.
 
         Returns whether it is another node; raises ``NoAnswer``.
         """
-        found = await self._endpoint.greet(address)
+        found = await self._endpoint.discover(address)
         if found.node_id == self._overlay.own_id:
             return False
         await self._enter(found)
         return True
 
-    async def settle(self) -> None:
+    async def lookup_neighbours(self) -> None:
         """Look up this node's id (Kademlia, section 2.3), so that it learns its neighbours and they learn it."""
-        if not self._overlay.is_whole:
-            await self._chores.sleep(self._draw_pause())
-        if not self._overlay.is_whole:
+        if not self._overlay.has_all_members:
+            await self._background.sleep(self._draw_pause())
+        if not self._overlay.has_all_members:
             await self._overlay.lookup(self._overlay.own_id)
-        self._overlay.is_placed = True
+        self._overlay.has_found_neighbours = True
         if self._overlay.is_large:
-            self._chores.fork(self.sounding.look_around())
+            self._background.fork(self.prober.lookup_neighbours())
 
-    def lost(self, contact: Contact) -> None:
+    def remember_lost(self, contact: Contact) -> None:
         """Remember the address of a lost contact."""
-        self.sounding.lost()
+        self.prober.record_loss()
         if contact.address.is_virtual:
             return
-        keep(self._former_addresses, contact.address, None, MAX_FORMER)
+        put_bounded(self._former_addresses, contact.address, None, MAX_FORMER_ADDRESSES)
 
     def forget(self, contact: Contact) -> None:
         """Do not try the address of ``contact`` again."""
@@ -156,7 +156,7 @@ class Membership:
     async def _contact_any(self, known: list[Address], remembered: Sequence[Address]) -> bool:
         """Return whether any of the addresses answers; delete from ``known`` the addresses of this node itself."""
         addresses = list(dict.fromkeys([*known, *remembered]))
-        greetings = await DeferredList([self._endpoint.greet(address) for address in addresses], consumeErrors=True)
+        greetings = await DeferredList([self._endpoint.discover(address) for address in addresses], consumeErrors=True)
         found = []
         for address, (ok, contact) in zip(addresses, greetings, strict=True):
             if ok and contact.node_id == self._overlay.own_id:
@@ -169,31 +169,31 @@ class Membership:
     async def _enter(self, contact: Contact) -> None:
         """Enter the network through a discovered contact."""
         await self._ping(contact)
-        self._is_entered = True
+        self._has_entered = True
 
     async def _ping(self, contact: Contact) -> None:
         # Without all members there is no list to compare.
-        digest = self._overlay.roster.digest() if self._overlay.is_whole else b""
+        digest = self._overlay.members.digest() if self._overlay.has_all_members else b""
         answer = await self._overlay.ask(contact, "ping", digest, changes=True)
-        if answer == b"" and not self._overlay.is_placed and not self._overlay.is_whole:
+        if answer == b"" and not self._overlay.has_found_neighbours and not self._overlay.has_all_members:
             # its network is large; the duration is requested as soon as this node has its neighbours
             self._set_large(0.0)
-        self._compare(contact, _BY_TABLE if answer == b"" else answer)
+        self._compare(contact, _LARGE_DIGEST if answer == b"" else answer)
 
     def _compare(self, contact: Contact, digest: object) -> None:
         """Request the members of ``contact`` if its list differs from this node's."""
         now = self._clock.seconds()
-        if self._overlay.is_large or not digest or (self._joining and not self._overlay.is_whole):
+        if self._overlay.is_large or not digest or (self._is_joining and not self._overlay.has_all_members):
             return
-        if self._overlay.is_whole and digest == self._overlay.roster.digest():
+        if self._overlay.has_all_members and digest == self._overlay.members.digest():
             return
-        if now - self._listed_at.get(contact.node_id, -AGAIN) < AGAIN:
+        if now - self._listed_at.get(contact.node_id, -RETRY_INTERVAL_S) < RETRY_INTERVAL_S:
             return
         if len(self._listed_at) > 4 * MAX_MEMBERS:
             self._listed_at.clear()
         self._listed_at[contact.node_id] = now
-        self._chores.fork(
-            self._fetch_members(contact) if self._overlay.is_whole else self._fetch_first_members(contact)
+        self._background.fork(
+            self._fetch_members(contact) if self._overlay.has_all_members else self._fetch_first_members(contact)
         )
 
     async def _fetch_first_members(self, contact: Contact) -> None:
@@ -202,55 +202,57 @@ class Membership:
         A newcomer has no vote before that, so a request that gets no answer is repeated, to another member if there is
         one.
         """
-        self._joining = True
+        self._is_joining = True
         try:
-            while not self._chores.is_stopped:
-                await self._chores.sleep(self._draw_pause())
+            while not self._background.is_stopped:
+                await self._background.sleep(self._draw_pause())
                 try:
                     return await self._fetch_members(contact)
                 except NoAnswer:
-                    live = self._overlay.roster.live()
+                    live = self._overlay.members.list_live()
                     if not live:
                         return  # the next contact will be asked
                     contact = live[self._rng.randrange(len(live))]
         finally:
-            self._joining = False
+            self._is_joining = False
 
     def _draw_pause(self) -> float:
-        return BREATH * (1 + self._rng.random())
+        return NEWCOMER_DELAY_S * (1 + self._rng.random())
 
     async def _fetch_members(self, contact: Contact) -> None:
         """Ping every member that ``contact`` knows and this node does not."""
         after, strangers = b"", []
-        for _ in range(1 + MAX_MEMBERS // PAGE):
+        for _ in range(1 + MAX_MEMBERS // PAGE_MEMBERS):
             answer = await self._overlay.ask(contact, "members", after, is_light=self._overlay.is_large)
             if answer is None or (type(answer) is int and answer > 0):
-                return self._set_large(LARGE_FOR if answer is None else min(float(answer), LARGE_FOR))
+                return self._set_large(LARGE_REPORT_S if answer is None else min(float(answer), LARGE_REPORT_S))
             if self._overlay.is_large or type(answer) is int:
                 return None  # it has not learned yet that the network is large, or its notification has expired
-            found = contacts_of(answer)
+            found = parse_contacts(answer)
             for named in found:
                 self._overlay.on_named(named, contact)
             strangers += [c for c in found if self._may_try(c)]
-            if len(found) < PAGE:
+            if len(found) < PAGE_MEMBERS:
                 break
             after = found[-1].node_id
-        for first in range(0, len(strangers), AT_ONCE):
-            pings = [Deferred.fromCoroutine(self._ping(stranger)) for stranger in strangers[first : first + AT_ONCE]]
+        for first in range(0, len(strangers), MAX_PARALLEL):
+            pings = [
+                Deferred.fromCoroutine(self._ping(stranger)) for stranger in strangers[first : first + MAX_PARALLEL]
+            ]
             await DeferredList(pings, consumeErrors=True)
-            if first + AT_ONCE < len(strangers):
-                await self._chores.sleep(self._draw_pause())
-        if not self._overlay.is_whole and not self._overlay.roster.is_settled:
+            if first + MAX_PARALLEL < len(strangers):
+                await self._background.sleep(self._draw_pause())
+        if not self._overlay.has_all_members and not self._overlay.members.is_voter:
             await self._count_absent()
-        self._overlay.is_whole = not self._overlay.is_large
+        self._overlay.has_all_members = not self._overlay.is_large
 
     def _set_large(self, seconds: float) -> None:
         """Treat the network as large during the next ``seconds``."""
         self._large_until = max(self._large_until, self._clock.seconds() + seconds)
         if not self._overlay.is_large:
-            self._overlay.grew()
-            if self._overlay.is_placed:
-                self._chores.fork(self.sounding.look_around())
+            self._overlay.enter_large_mode()
+            if self._overlay.has_found_neighbours:
+                self._background.fork(self.prober.lookup_neighbours())
 
     async def _count_absent(self) -> None:
         """Count members as absent that others know and this newcomer cannot reach.
@@ -259,7 +261,7 @@ class Membership:
         half of the answers name it, so a lying node cannot invent members.  The answers of newcomers count only if
         there are no others.  Raises ``NoAnswer`` if no node answers.
         """
-        there = self._overlay.roster.live()[:AT_ONCE]
+        there = self._overlay.members.list_live()[:MAX_PARALLEL]
         asked = [Deferred.fromCoroutine(self._overlay.ask(contact, "known")) for contact in there]
         answers = await DeferredList(asked, consumeErrors=True)
         answers_by_id: dict[bytes, dict[Contact, int]] = {}
@@ -273,13 +275,13 @@ class Membership:
         for contact in dict.fromkeys(contact for opinion in opinions for contact in opinion):
             named = [opinion[contact] for opinion in opinions if contact in opinion]
             if 2 * len(named) > len(opinions) and contact.node_id != self._overlay.own_id:
-                self._overlay.roster.remembered(contact, self._clock.seconds() - max(named))
+                self._overlay.members.add_absent(contact, self._clock.seconds() - max(named))
 
     def _may_try(self, contact: Contact) -> bool:
-        if contact.node_id == self._overlay.own_id or self._overlay.roster.get(contact.node_id) is not None:
+        if contact.node_id == self._overlay.own_id or self._overlay.members.get(contact.node_id) is not None:
             return False
         now = self._clock.seconds()
-        if now - self._tried_at.get(contact.node_id, -AGAIN) < AGAIN:
+        if now - self._tried_at.get(contact.node_id, -RETRY_INTERVAL_S) < RETRY_INTERVAL_S:
             return False
         if len(self._tried_at) > 4 * MAX_MEMBERS:
             self._tried_at.clear()
@@ -288,85 +290,89 @@ class Membership:
 
     async def _rejoin(self) -> None:
         """Try the remembered addresses: a radio failure costs a node all its contacts."""
-        self._returning = True
+        self._is_rejoining = True
         try:
-            if await self._contact_any([], list(self._former_addresses)) or await self.detour.taken():
+            if await self._contact_any([], list(self._former_addresses)) or await self.alternate_paths.try_once():
                 await self._overlay.lookup(self._overlay.own_id)
         finally:
-            self._returning = False
+            self._is_rejoining = False
 
     async def _check_absent(self, contact: Contact) -> None:
         """Check whether an absent member answers at its address; a discovery request costs a sixth of a handshake."""
-        found = await self._endpoint.greet(contact.address)
+        found = await self._endpoint.discover(contact.address)
         if found.node_id != self._overlay.own_id:
             await self._ping(found)
 
-    def _probe(self) -> None:
+    def _ping_silent(self) -> None:
         overlay, now = self._overlay, self._clock.seconds()
-        if overlay.is_large and self.sounding.step(now):
+        if overlay.is_large and self.prober.step(now):
             return
-        overlay.roster.strike(now)
+        overlay.members.remove_expired(now)
         contacts = overlay.contacts()
-        if not contacts and (self._former_addresses or self.detour.is_possible) and not self._returning:
-            self._chores.fork(self._rejoin())
+        if not contacts and (self._former_addresses or self.alternate_paths.is_configured) and not self._is_rejoining:
+            self._background.fork(self._rejoin())
         # Each pair of n members needs one ping per interval, so the interval grows with n and the total stays constant.
-        patience = min(MAX_SILENCE, SILENCE * max(1.0, len(contacts) / SMALL))
+        patience = min(MAX_PING_INTERVAL_S, MIN_PING_INTERVAL_S * max(1.0, len(contacts) / SMALL_TEAM))
         for contact in contacts:
             if overlay.silence(contact) > patience:
-                self._chores.fork(self._ping(contact))
-        absent = [c for c in overlay.roster.absent() if now - self._tried_at.get(c.node_id, -AGAIN) >= AGAIN]
+                self._background.fork(self._ping(contact))
+        absent = [
+            c
+            for c in overlay.members.list_absent()
+            if now - self._tried_at.get(c.node_id, -RETRY_INTERVAL_S) >= RETRY_INTERVAL_S
+        ]
         if absent:
             contact = absent[self._rng.randrange(len(absent))]
             self._tried_at[contact.node_id] = now
-            self._chores.fork(self._check_absent(contact))
+            self._background.fork(self._check_absent(contact))
         self._refresh(now)
 
     def _refresh(self, now: float) -> None:
         overlay = self._overlay
-        for index in overlay.table.stale_buckets(now, REFRESH)[:1]:
+        for index in overlay.table.find_stale(now, REFRESH_INTERVAL_S)[:1]:
             target = overlay.table.refresh_target(index, self._rng)
-            overlay.table.searched(target, now)
+            overlay.table.record_lookup(target, now)
             if not overlay.is_complete:
-                self._chores.fork(overlay.lookup(target))
+                self._background.fork(overlay.lookup(target))
 
     # -- in a large network -----------------------------------------------------------------------------------------
 
-    def _keep_up(self, now: float) -> None:
+    def _maintain(self, now: float) -> None:
         self._check_large(now)
         self._refresh(now)
 
     def _check_large(self, now: float) -> None:
         """Check from time to time whether the network is still large, by this node's contacts or by notifications."""
         overlay = self._overlay
-        if overlay.sees_many:
-            self._large_until = now + LARGE_FOR
-        elif now > self._large_until + LARGE_FOR:
-            overlay.shrank()
+        if overlay.is_surely_large:
+            self._large_until = now + LARGE_REPORT_S
+        elif now > self._large_until + LARGE_REPORT_S:
+            overlay.leave_large_mode()
         elif now > self._large_until and (contacts := overlay.contacts()):
-            self._chores.fork(self._fetch_members(contacts[self._rng.randrange(len(contacts))]))
+            self._background.fork(self._fetch_members(contacts[self._rng.randrange(len(contacts))]))
 
     def _answer_ping(self, peer: Contact, digest: bytes = b"") -> bytes:
-        self._overlay.heard(peer)
+        self._overlay.process_message(peer)
         self._compare(peer, digest)
-        return b"" if self._overlay.is_large else self._overlay.roster.digest()
+        return b"" if self._overlay.is_large else self._overlay.members.digest()
 
     def _answer_known(self, peer: Contact) -> list[object]:
         """KNOWN: the settled members, and the seconds of their absence; a newcomer does not include itself."""
-        roster = self._overlay.roster
-        known = [(self._overlay.me(), 0.0)] if roster.is_settled else []
-        return [[contact.packed(), int(away)] for contact, away in known + roster.known(self._clock.seconds())]
+        roster = self._overlay.members
+        known = [(self._overlay.own_contact(), 0.0)] if roster.is_voter else []
+        return [[contact.pack(), int(away)] for contact, away in known + roster.list_voters(self._clock.seconds())]
 
     def _answer_members(self, peer: Contact, after: bytes) -> list[object] | int | None:
         """MEMBERS: the next page; None if the network is large, or the seconds for which reports of that are valid."""
         if len(after) not in (0, len(peer.node_id)):
             raise Refused("members: the argument must be empty or a node id of 20 bytes")
         overlay = self._overlay
-        if overlay.roster.is_full or (overlay.is_large and overlay.sees_many):
+        if overlay.members.is_full or (overlay.is_large and overlay.is_surely_large):
             return None
         if overlay.is_large:
             return max(0, int(self._large_until - self._clock.seconds()))
-        later = [c for c in self._overlay.roster.live() if c.node_id > after]
-        return [c.packed() for c in later[:PAGE]]
+        later = [c for c in self._overlay.members.list_live() if c.node_id > after]
+        return [c.pack() for c in later[:PAGE_MEMBERS]]
 
 
 def _decode_known(answer: object) -> dict[Contact, int]:
@@ -374,7 +380,7 @@ def _decode_known(answer: object) -> dict[Contact, int]:
     found: dict[Contact, int] = {}
     for fields in answer[:MAX_MEMBERS] if isinstance(answer, list) else ():
         named, away = fields if isinstance(fields, list) and len(fields) == 2 else (None, None)
-        contact = unpacked(named)
+        contact = parse_contact(named)
         if contact is not None and type(away) is int and away >= 0:
             found[contact] = away
     return found

@@ -17,12 +17,12 @@ from twisted.internet.defer import Deferred
 from twisted.internet.interfaces import IReactorTime
 
 from middleware.entangled.background import Background
-from middleware.entangled.bounded import keep
-from middleware.entangled.contact import Contact, unpacked
+from middleware.entangled.bounded import put_bounded
+from middleware.entangled.contact import Contact, parse_contact
 from middleware.entangled.errors import EntangledError, NoAnswer, Refused
-from middleware.entangled.kademlia.distance import closest
+from middleware.entangled.kademlia.distance import select_closest
 from middleware.entangled.kademlia.lookup import Lookup
-from middleware.entangled.kademlia.roster import MAX_MEMBERS, Roster
+from middleware.entangled.kademlia.member_table import MAX_MEMBERS, MemberTable
 from middleware.entangled.kademlia.routing import STALE_AFTER, RoutingTable
 from middleware.entangled.listeners import Listeners
 from middleware.entangled.wire.congestion import RoundTrip
@@ -30,28 +30,28 @@ from middleware.entangled.wire.endpoint import Endpoint
 
 K = 8
 ALPHA = 3
-CHECK_GAP = 4.0
+CHECK_INTERVAL_S = 4.0
 """The seconds before this node pings an unknown node, or a contact at a new address, again to authenticate it."""
-MISS_GAP = 0.5
+MISS_INTERVAL_S = 0.5
 """The seconds in which several unanswered requests count as one miss: a failed burst is no evidence of a failed node.
 """
-FRESH = 0.1
+RECORD_INTERVAL_S = 0.1
 """The seconds within which further datagrams of a contact are not recorded."""
-FIRST_HEDGE, MOST_HEDGE = 0.01, 0.15
+INITIAL_HEDGE_S, MAX_HEDGE_S = 0.01, 0.15
 """The delay of a hedged request in seconds: before the first measurement, and at most.  Otherwise it is the time within
 which nearly all answers arrive."""
-LEAST_PATIENCE, MOST_PATIENCE, TRIES = 0.4, 2.5, 2.6
+MIN_LOOKUP_TIMEOUT_S, MAX_LOOKUP_TIMEOUT_S, TIMEOUTS_PER_REQUEST = 0.4, 2.5, 2.6
 """The minimum and maximum timeout in seconds of a lookup's request in a large network, and the number of initial
 timeouts that it lasts: enough for two tries; at a high loss rate it lasts longer."""
 MAX_FOUND = 512
 """The number of keys for which the result of the last lookup is cached."""
-MAX_HEARD = 4096
+MAX_RECORDED = 4096
 """The number of contacts with a recorded time of the last datagram or miss; the oldest is deleted first."""
 
-PLACING, PLACING_STEP = 15, 0.1
-MEETING, MEETING_STEP = 75, 0.02
+CONTACT_WAIT_STEPS, CONTACT_WAIT_STEP_S = 15, 0.1
+MEMBERS_WAIT_STEPS, MEMBERS_WAIT_STEP_S = 75, 0.02
 """The steps for which an operation that needs a majority waits until the members are known, and the seconds of each."""
-LOOKUPS_KEPT = 16
+MAX_LOOKUP_STATS = 16
 
 
 class Voters(NamedTuple):
@@ -70,7 +70,7 @@ class Voters(NamedTuple):
         return len(self.ids.intersection(ids))
 
 
-class Looked(NamedTuple):
+class LookupStats(NamedTuple):
     """A finished lookup: the numbers of requests, hops and contacts found, and its duration in seconds."""
 
     key: bytes
@@ -94,30 +94,30 @@ class Overlay:
     """
 
     def __init__(self, me: Callable[[], Contact], endpoint: Endpoint, clock: IReactorTime, chores: Background) -> None:
-        self.me = me
+        self.own_contact = me
         self.own_id = me().node_id
         self._endpoint = endpoint
         self._clock = clock
-        self._chores = chores
+        self._background = chores
         self.table = RoutingTable(self.own_id, K)
-        self.roster = Roster(self.own_id)
-        self.is_whole = False
+        self.members = MemberTable(self.own_id)
+        self.has_all_members = False
         self.is_large = False
-        self.is_placed = False
-        self.on_newcomer = Listeners[[Contact]]()
+        self.has_found_neighbours = False
+        self.on_new_contact = Listeners[[Contact]]()
         self.on_lost = Listeners[[Contact]]()
         self.on_named = Listeners[[Contact, Contact]]()
-        self._heard_at: dict[bytes, float] = {}
-        self._round_trip = RoundTrip(FIRST_HEDGE)
+        self._last_received_at: dict[bytes, float] = {}
+        self._round_trip = RoundTrip(INITIAL_HEDGE_S)
         self._slow: set[bytes] = set()
-        self._found: dict[bytes, list[Contact]] = {}
+        self._lookup_results: dict[bytes, list[Contact]] = {}
         self._misses: dict[bytes, tuple[int, float]] = {}
-        self._near: list[Contact] = []
-        self._near_of = (-1, -1)
-        self.patience = 0.0
+        self._neighbours: list[Contact] = []
+        self._neighbours_version = (-1, -1)
+        self.max_silence = 0.0
         self._checked_at: dict[bytes, float] = {}
-        self.lookups: deque[Looked] = deque(maxlen=LOOKUPS_KEPT)
-        endpoint.on_contact.add(self.proved)
+        self.lookups: deque[LookupStats] = deque(maxlen=MAX_LOOKUP_STATS)
+        endpoint.on_contact.add(self.mark_authenticated)
         endpoint.expose("find_node", self._answer_find_node, early=True)
 
     @cached_property
@@ -131,108 +131,120 @@ class Overlay:
     @property
     def is_complete(self) -> bool:
         """Whether all nodes are known, so that no lookup is necessary."""
-        return self.is_whole and not self.roster.is_full
+        return self.has_all_members and not self.members.is_full
 
     @property
     def is_sparse(self) -> bool:
         """Whether there are more nodes than are known here, so that the nodes close to a key must be looked up."""
-        return not self.is_complete and (len(self.table) >= K or not self.is_placed)
+        return not self.is_complete and (len(self.table) >= K or not self.has_found_neighbours)
 
-    def responsible(self, key: bytes) -> list[Contact]:
+    def find_responsible(self, key: bytes) -> list[Contact]:
         """Return the k closest live nodes to ``key`` that are known here, including this one, closest first."""
         if self.is_complete:
-            return self.roster.closest(key, K, self.me())
-        known = [*self._found.get(key, ()), *self.table.closest(key), *self.roster.live(), self.me()]
+            return self.members.closest(key, K, self.own_contact())
+        known = [
+            *self._lookup_results.get(key, ()),
+            *self.table.closest(key),
+            *self.members.list_live(),
+            self.own_contact(),
+        ]
         return _closest(known, key)
 
-    def neighbours(self) -> list[Contact]:
+    def find_neighbours(self) -> list[Contact]:
         """Return the k contacts closest to this node, which hold mostly the same records."""
-        version = self.table.version, self.roster.version
-        if self._near_of != version:
-            self._near_of, self._near = version, self.nearest(self.own_id)
-        return self._near
+        version = self.table.version, self.members.version
+        if self._neighbours_version != version:
+            self._neighbours_version, self._neighbours = version, self.find_nearest(self.own_id)
+        return self._neighbours
 
     @property
-    def sees_many(self) -> bool:
+    def is_surely_large(self) -> bool:
         """Whether this node knows so many contacts that the network is certainly large."""
-        return self.roster.is_full or len(self.table) + len(self.roster) >= MAX_MEMBERS
+        return self.members.is_full or len(self.table) + len(self.members) >= MAX_MEMBERS
 
-    def keepers(self, key: bytes) -> list[Contact]:
+    def find_possible_replicas(self, key: bytes) -> list[Contact]:
         """Return the other nodes that may hold records of ``key``: the responsible ones, and the last ones found.
 
         A bucket has room for only k contacts, so in a large network not all nodes that were found are in the table.
         """
         if self.is_complete:
-            return [c for c in self.responsible(key) if c.node_id != self.own_id]
-        both = {c.node_id: c for c in [*self._found.get(key, ()), *self.responsible(key)]}
+            return [c for c in self.find_responsible(key) if c.node_id != self.own_id]
+        both = {c.node_id: c for c in [*self._lookup_results.get(key, ()), *self.find_responsible(key)]}
         return [contact for node_id, contact in both.items() if node_id != self.own_id]
 
     def is_responsible(self, key: bytes) -> bool:
         """Return whether this node is one of the k closest known nodes to ``key``."""
-        return self.belongs(key, self.me())
+        return self.is_replica(key, self.own_contact())
 
-    def belongs(self, key: bytes, contact: Contact) -> bool:
+    def is_replica(self, key: bytes, contact: Contact) -> bool:
         """Return whether ``contact`` is among the k closest known nodes to ``key``."""
-        return any(c.node_id == contact.node_id for c in self.responsible(key))
+        return any(c.node_id == contact.node_id for c in self.find_responsible(key))
 
-    async def holders(self, key: bytes) -> list[Contact]:
+    async def lookup_replicas(self, key: bytes) -> list[Contact]:
         """Return the k closest live nodes to ``key``, including this one; looks them up if not all nodes are known.
 
         A node that is still joining waits for its first contacts.
         """
-        await self._wait(lambda: self.is_whole or self.is_large or len(self.roster) > 0, PLACING, PLACING_STEP)
+        await self._wait(
+            lambda: self.has_all_members or self.is_large or len(self.members) > 0,
+            CONTACT_WAIT_STEPS,
+            CONTACT_WAIT_STEP_S,
+        )
         if not self.is_sparse:
-            self._found.pop(key, None)
-            return self.responsible(key)
+            self._lookup_results.pop(key, None)
+            return self.find_responsible(key)
         found = await self.lookup(key)
-        nearest = _closest([*found, self.me()], key)
-        self.note_found(key, [contact for contact in nearest if contact.node_id != self.own_id])
-        return nearest if len(found) >= K else self.responsible(key)
+        nearest = _closest([*found, self.own_contact()], key)
+        self.cache_lookup(key, [contact for contact in nearest if contact.node_id != self.own_id])
+        return nearest if len(found) >= K else self.find_responsible(key)
 
-    async def met(self) -> None:
+    async def wait_for_members(self) -> None:
         """Wait a limited time for a node that is still joining to learn the members."""
-        await self._wait(lambda: self.is_whole or self.is_large, MEETING, MEETING_STEP)
+        await self._wait(lambda: self.has_all_members or self.is_large, MEMBERS_WAIT_STEPS, MEMBERS_WAIT_STEP_S)
 
-    def note_found(self, key: bytes, found: list[Contact]) -> None:
+    def cache_lookup(self, key: bytes, found: list[Contact]) -> None:
         """Cache the result of a lookup."""
-        keep(self._found, key, found, MAX_FOUND)
+        put_bounded(self._lookup_results, key, found, MAX_FOUND)
 
-    def voters(self, key: bytes, targets: list[Contact]) -> Voters:
+    def find_voters(self, key: bytes, targets: list[Contact]) -> Voters:
         """Return the voters for ``key`` with the replicas ``targets``.
 
         In a team with a roster absent members are voters too; in a larger network the voters are the nodes found.
         """
-        if not (self.is_whole or self.is_large):
+        if not (self.has_all_members or self.is_large):
             # It has not met its team yet: the few nodes that it knows must not count as all.
             return Voters(frozenset([self.own_id]), 2)
-        absent = [] if self.roster.is_full or self.is_large else self.roster.absent()
+        absent = [] if self.members.is_full or self.is_large else self.members.list_absent()
         ids = frozenset(contact.node_id for contact in (_closest([*targets, *absent], key) if absent else targets))
         return Voters(ids, len(ids))
 
     async def lookup(self, target: bytes) -> list[Contact]:
         """Return the k live nodes closest to ``target``, without this one (Kademlia, section 2.3)."""
-        seeds = [*self.table.closest(target), *(self.roster.closest(target, K, self.me()) if len(self.roster) else ())]
+        seeds = [
+            *self.table.closest(target),
+            *(self.members.closest(target, K, self.own_contact()) if len(self.members) else ()),
+        ]
         lookup = Lookup(target, K, ALPHA, seeds, exclude=self.own_id)
         began = self._clock.seconds()
-        self.table.searched(target, began)
+        self.table.record_lookup(target, began)
         hops: dict[bytes, int] = {}
         asked: list[int] = []
 
         async def visit(contact: Contact) -> None:
             asked.append(hops.setdefault(contact.node_id, 1))
-            named = contacts_of(await self._request_contacts(contact, target))
+            named = parse_contacts(await self._request_contacts(contact, target))
             for other in named:
                 self.on_named(other, contact)
                 hops.setdefault(other.node_id, hops[contact.node_id] + 1)
-            lookup.answered(contact, named)
+            lookup.record_answer(contact, named)
 
-        await self.walk(lookup, visit)
+        await self.run_lookup(lookup, visit)
         found = lookup.closest()
         took = self._clock.seconds() - began
-        self.lookups.append(Looked(target, len(asked), max(asked, default=0), len(found), took))
+        self.lookups.append(LookupStats(target, len(asked), max(asked, default=0), len(found), took))
         return found
 
-    async def walk(
+    async def run_lookup(
         self, lookup: Lookup, visit: Callable[[Contact], Any], is_done: Callable[[], bool] = lambda: False
     ) -> None:
         """Visit the contacts that ``lookup`` names, alpha in parallel and another for each slow one, until it ends."""
@@ -244,20 +256,20 @@ class Overlay:
             if lookup.is_finished or is_done():
                 done.callback(None)
                 return
-            for contact in lookup.next():
-                self._chores.fork(go(contact))
+            for contact in lookup.take_next():
+                self._background.fork(go(contact))
 
         def hedge(contact: Contact) -> None:
-            self.slow(contact)
-            lookup.slow(contact)
+            self.mark_slow(contact)
+            lookup.mark_slow(contact)
             step()
 
         async def go(contact: Contact) -> None:
-            in_time = self._chores.later(self.hedge(), hedge, contact)
+            in_time = self._background.later(self.hedge_delay(), hedge, contact)
             try:
                 await visit(contact)
             except EntangledError:
-                lookup.failed(contact)
+                lookup.record_failure(contact)
             in_time()
             step()
 
@@ -277,16 +289,16 @@ class Overlay:
     ) -> Any:
         """Send a request to ``contact``; a missing answer counts as a miss."""
         began = self._clock.seconds()
-        is_met = self._endpoint.is_met(contact)
+        is_met = self._endpoint.has_session(contact)
         try:
             answer = await self._endpoint.ask(
                 contact, method, *arguments, changes=changes, timeout=timeout, is_light=is_light
             )
         except NoAnswer:
-            self.missed(contact)
+            self.record_miss(contact)
             raise
         if is_met:  # otherwise the time includes a handshake
-            self._round_trip.measured(self._clock.seconds() - began)
+            self._round_trip.add_sample(self._clock.seconds() - began)
         return answer
 
     async def _request_contacts(self, contact: Contact, target: bytes) -> Any:
@@ -298,25 +310,27 @@ class Overlay:
         """
         began = self._clock.seconds()
         try:
-            return await self.ask(contact, "find_node", target, timeout=self.patience_of_lookups)
+            return await self.ask(contact, "find_node", target, timeout=self.lookup_timeout)
         except NoAnswer:
             if self.silence(contact) >= self._clock.seconds() - began:
                 raise
-            return await self.ask(contact, "find_node", target, timeout=self.patience_of_lookups)
+            return await self.ask(contact, "find_node", target, timeout=self.lookup_timeout)
 
-    def hedge(self) -> float:
+    def hedge_delay(self) -> float:
         """Return the seconds after which others are asked in parallel with a contact that does not answer.
 
         It is measured over all contacts, because a single contact has few and old samples; hedging a distant contact
         costs only a few more requests.
         """
         if self.is_large:  # unknown contacts need a handshake, and may be distant
-            guess = self._endpoint.peers.guess
-            return guess if not self._round_trip.is_measured else min(guess, max(MOST_HEDGE, self._round_trip.usual))
-        return min(MOST_HEDGE, self._round_trip.usual)
+            guess = self._endpoint.peers.initial_timeout
+            return (
+                guess if not self._round_trip.is_measured else min(guess, max(MAX_HEDGE_S, self._round_trip.nearly_all))
+            )
+        return min(MAX_HEDGE_S, self._round_trip.nearly_all)
 
     @property
-    def patience_of_lookups(self) -> float | None:
+    def lookup_timeout(self) -> float | None:
         """The timeout of one request of a lookup in seconds; None: the default.
 
         In a large network there are always alternatives, and some of the named contacts have failed.
@@ -324,15 +338,18 @@ class Overlay:
         if not self.is_large:
             return None
         peers = self._endpoint.peers
-        return min(MOST_PATIENCE, max(LEAST_PATIENCE, max(TRIES, peers.loss.tries) * peers.guess))
+        return min(
+            MAX_LOOKUP_TIMEOUT_S,
+            max(MIN_LOOKUP_TIMEOUT_S, max(TIMEOUTS_PER_REQUEST, peers.loss.tries) * peers.initial_timeout),
+        )
 
-    def slow(self, contact: Contact) -> None:
+    def mark_slow(self, contact: Contact) -> None:
         """Record that ``contact`` exceeded the usual time; until it is heard, others are asked first."""
-        if len(self._slow) >= MAX_HEARD:
+        if len(self._slow) >= MAX_RECORDED:
             self._slow.clear()
         self._slow.add(contact.node_id)
 
-    def quickest(self, contacts: Iterable[Contact]) -> list[Contact]:
+    def order_by_speed(self, contacts: Iterable[Contact]) -> list[Contact]:
         """Return ``contacts`` in a random order that spreads the load, with slow ones last."""
         shuffled = list(contacts)
         self._rng.shuffle(shuffled)
@@ -340,98 +357,106 @@ class Overlay:
 
     def silence(self, contact: Contact) -> float:
         """Return the seconds since ``contact`` was heard."""
-        return self._clock.seconds() - self._heard_at.get(contact.node_id, float("-inf"))
+        return self._clock.seconds() - self._last_received_at.get(contact.node_id, float("-inf"))
 
-    def proved(self, contact: Contact) -> None:
+    def mark_authenticated(self, contact: Contact) -> None:
         """Record that ``contact`` has proved its key and its address by an answer."""
         if contact.node_id == self.own_id:
             return
         now, node_id = self._clock.seconds(), contact.node_id
-        is_fresh = now - self._heard_at.get(node_id, -FRESH) < FRESH
-        if is_fresh and node_id not in self._misses and node_id not in self._slow and self.contact(node_id) == contact:
+        is_fresh = now - self._last_received_at.get(node_id, -RECORD_INTERVAL_S) < RECORD_INTERVAL_S
+        if (
+            is_fresh
+            and node_id not in self._misses
+            and node_id not in self._slow
+            and self.find_contact(node_id) == contact
+        ):
             return  # it was recorded a moment ago
-        is_new = self.table.get(contact.node_id) is None and self.roster.get(contact.node_id) is None
-        keep(self._heard_at, node_id, now, MAX_HEARD)
+        is_new = self.table.get(contact.node_id) is None and self.members.get(contact.node_id) is None
+        put_bounded(self._last_received_at, node_id, now, MAX_RECORDED)
         self._misses.pop(contact.node_id, None)
         self._slow.discard(contact.node_id)
-        doubtful = self.table.saw(contact, now)
-        if doubtful is not None and self.silence(doubtful) >= self.patience:
-            self._chores.fork(self.check(doubtful))
+        doubtful = self.table.record_contact(contact, now)
+        if doubtful is not None and self.silence(doubtful) >= self.max_silence:
+            self._background.fork(self.check(doubtful))
         has_place = self.table.get(node_id) is not None
-        is_new_here = self._is_for_roster(node_id, has_place) and self.roster.heard(contact, now)
+        is_new_here = self._belongs_to_members(node_id, has_place) and self.members.mark_alive(contact, now)
         if is_new_here or (is_new and has_place):
             # One reactor turn later: messages to a newcomer must not overtake the answer to its own request.
-            self._chores.later(0.0, self.on_newcomer, contact)
+            self._background.later(0.0, self.on_new_contact, contact)
 
-    def heard(self, contact: Contact) -> None:
+    def process_message(self, contact: Contact) -> None:
         """Record a message of ``contact`` in its session; a new address must be authenticated first."""
-        if self.contact(contact.node_id) == contact:
-            self.proved(contact)
+        if self.find_contact(contact.node_id) == contact:
+            self.mark_authenticated(contact)
             return
         now = self._clock.seconds()
-        if self.is_large and self.sees_many and not self.table.has_place(contact.node_id):
+        if self.is_large and self.is_surely_large and not self.table.has_room(contact.node_id):
             return
-        if contact.node_id == self.own_id or now - self._checked_at.get(contact.node_id, -CHECK_GAP) < CHECK_GAP:
+        if (
+            contact.node_id == self.own_id
+            or now - self._checked_at.get(contact.node_id, -CHECK_INTERVAL_S) < CHECK_INTERVAL_S
+        ):
             # in a large network not all contacts find a place here: two such nodes must not ping each other forever
             return
         if len(self._checked_at) > MAX_FOUND:
             self._checked_at.clear()
         self._checked_at[contact.node_id] = now
-        self._chores.fork(self.check(contact))
+        self._background.fork(self.check(contact))
 
-    def left(self, contact: Contact) -> None:
+    def remove(self, contact: Contact) -> None:
         """Delete ``contact``, which left the network."""
         self.table.remove(contact, self._clock.seconds())
-        self.roster.left(contact.node_id)
+        self.members.remove(contact.node_id)
         self._forget(contact)
 
-    def turned_away(self, contact: Contact) -> None:
+    def mark_rejecting(self, contact: Contact) -> None:
         """Record that ``contact`` rejects this node; a member is then absent."""
         now = self._clock.seconds()
         self.table.remove(contact, now)
-        if self.roster.lost(contact.node_id, now):
+        if self.members.mark_absent(contact.node_id, now):
             self._forget(contact)
 
-    def known(self, node_id: bytes) -> Contact | None:
+    def find_known(self, node_id: bytes) -> Contact | None:
         """Return the contact with this id, including absent members."""
-        absent = (contact for contact in self.roster.absent() if contact.node_id == node_id)
-        return self.contact(node_id) or next(absent, None)
+        absent = (contact for contact in self.members.list_absent() if contact.node_id == node_id)
+        return self.find_contact(node_id) or next(absent, None)
 
     def contacts(self) -> list[Contact]:
         """Return all contacts."""
-        return list({c.node_id: c for c in [*self.table.contacts(), *self.roster.live()]}.values())
+        return list({c.node_id: c for c in [*self.table.list_contacts(), *self.members.list_live()]}.values())
 
     async def check(self, contact: Contact) -> None:
         """Ping ``contact``; in a large network without opening a session."""
-        await self.ask(contact, "ping", self.roster.digest(), changes=True, is_light=self.is_large)
+        await self.ask(contact, "ping", self.members.digest(), changes=True, is_light=self.is_large)
 
     def silences(self) -> list[tuple[bytes, float]]:
         """Return the ids of recently heard nodes with their silence in seconds, the longest first."""
         now = self._clock.seconds()
-        return [(node_id, now - at) for node_id, at in self._heard_at.items()]
+        return [(node_id, now - at) for node_id, at in self._last_received_at.items()]
 
-    def contact(self, node_id: bytes) -> Contact | None:
+    def find_contact(self, node_id: bytes) -> Contact | None:
         """Return the contact with this id."""
-        return self.roster.get(node_id) or self.table.get(node_id)
+        return self.members.get(node_id) or self.table.get(node_id)
 
     def is_contact(self, contact: Contact) -> bool:
         """Return whether a contact with this key and address is known."""
-        return self.contact(contact.node_id) == contact
+        return self.find_contact(contact.node_id) == contact
 
-    def missed(self, contact: Contact, is_over: bool = False) -> None:
+    def record_miss(self, contact: Contact, is_over: bool = False) -> None:
         """Record that ``contact`` did not answer; ``is_over``: delete it at once.
 
         In a large network one miss makes a distant contact stale: others of its range are equivalent, and a lookup that
         waits for a failed node costs more than one that skips a live one.
         """
         now = self._clock.seconds()
-        count, at = self._misses.get(contact.node_id, (0, -MISS_GAP))
-        if now - at < MISS_GAP and not is_over:
+        count, at = self._misses.get(contact.node_id, (0, -MISS_INTERVAL_S))
+        if now - at < MISS_INTERVAL_S and not is_over:
             return
         was_known = self.table.get(contact.node_id) is not None
-        is_far = self.is_large and was_known and contact not in self.neighbours()
+        is_far = self.is_large and was_known and contact not in self.find_neighbours()
         count += STALE_AFTER if is_far or is_over else 1
-        if len(self._misses) >= MAX_HEARD or len(self._slow) >= MAX_HEARD:
+        if len(self._misses) >= MAX_RECORDED or len(self._slow) >= MAX_RECORDED:
             self._misses.clear()
             self._slow.clear()
         self._slow.add(contact.node_id)
@@ -439,52 +464,52 @@ class Overlay:
         if is_over:
             self.table.remove(contact, now)
         for _ in range(STALE_AFTER if is_far else 1):
-            self.table.failed(contact, now)
+            self.table.record_miss(contact, now)
         if count < STALE_AFTER:
             return
-        was_member = self.roster.lost(contact.node_id, now)
+        was_member = self.members.mark_absent(contact.node_id, now)
         if was_member or (was_known and self.table.get(contact.node_id) is None) or not was_known:
             self._forget(contact)
 
-    def doubted(self) -> list[Contact]:
+    def list_suspects(self) -> list[Contact]:
         """Return the contacts that did not answer the latest request."""
-        return [contact for node_id in self._misses if (contact := self.contact(node_id)) is not None]
+        return [contact for node_id in self._misses if (contact := self.find_contact(node_id)) is not None]
 
     @property
-    def is_anybody_doubted(self) -> bool:
+    def has_suspects(self) -> bool:
         """Whether any node did not answer the latest request."""
         return bool(self._misses)
 
-    def is_doubted(self, contact: Contact) -> bool:
+    def is_suspect(self, contact: Contact) -> bool:
         """Return whether ``contact`` did not answer the latest request."""
         return contact.node_id in self._misses
 
-    def grew(self) -> None:
+    def enter_large_mode(self) -> None:
         """Use only the routing table from now on, because the network is too large to know all its members."""
-        self.is_whole, self.is_large = False, True
-        self._endpoint.peers.is_wide = True
-        self.tidy()
+        self.has_all_members, self.is_large = False, True
+        self._endpoint.peers.is_large = True
+        self.delete_unneeded()
 
-    def shrank(self) -> None:
+    def leave_large_mode(self) -> None:
         """Learn all members again like a newcomer, because the network is no longer large."""
-        self.is_large, self.patience = False, 0.0
-        self._endpoint.peers.is_wide = False
-        for contact in self.table.contacts():
-            self.roster.heard(contact, self._clock.seconds())
+        self.is_large, self.max_silence = False, 0.0
+        self._endpoint.peers.is_large = False
+        for contact in self.table.list_contacts():
+            self.members.mark_alive(contact, self._clock.seconds())
 
-    def tidy(self) -> None:
+    def delete_unneeded(self) -> None:
         """Delete state that is unnecessary in a large network: members in the table or absent, and old records."""
-        table, live = self.table, self.roster.live()
+        table, live = self.table, self.members.list_live()
         spare = max(0, MAX_MEMBERS - len(table))
         extra = [contact.node_id for contact in live if table.get(contact.node_id) is None]
         kept = frozenset(extra[:spare])
-        self.roster.shed([c.node_id for c in (*live, *self.roster.absent()) if c.node_id not in kept])
-        before = self._clock.seconds() - CHECK_GAP
-        heard = self._heard_at
-        unheard = {c.node_id: float("-inf") for c in table.contacts() if c.node_id not in heard}
-        for node_id in [node_id for node_id in self._misses if self.contact(node_id) is None]:
+        self.members.remove_all([c.node_id for c in (*live, *self.members.list_absent()) if c.node_id not in kept])
+        before = self._clock.seconds() - CHECK_INTERVAL_S
+        heard = self._last_received_at
+        unheard = {c.node_id: float("-inf") for c in table.list_contacts() if c.node_id not in heard}
+        for node_id in [node_id for node_id in self._misses if self.find_contact(node_id) is None]:
             del self._misses[node_id]
-        self._heard_at = unheard | {
+        self._last_received_at = unheard | {
             node_id: at
             for node_id, at in heard.items()
             if at > before or node_id in kept or table.get(node_id) is not None
@@ -497,37 +522,37 @@ class Overlay:
         for _ in range(steps):
             if is_over():
                 return
-            await self._chores.sleep(step)
+            await self._background.sleep(step)
 
-    def _is_for_roster(self, node_id: bytes, has_place: bool) -> bool:
+    def _belongs_to_members(self, node_id: bytes, has_place: bool) -> bool:
         if not self.is_large:
             return True
-        return not has_place and (self.roster.get(node_id) is not None or not self.sees_many)
+        return not has_place and (self.members.get(node_id) is not None or not self.is_surely_large)
 
     def _forget(self, contact: Contact) -> None:
-        for memory in (self._heard_at, self._misses):
+        for memory in (self._last_received_at, self._misses):
             memory.pop(contact.node_id, None)
         self._slow.discard(contact.node_id)
-        for found in self._found.values():
+        for found in self._lookup_results.values():
             found[:] = [c for c in found if c.node_id != contact.node_id]
         self.on_lost(contact)
 
     def _answer_find_node(self, peer: Contact, target: bytes) -> list[object]:
         if len(target) != len(peer.node_id):
             raise Refused("find_node: the argument must be a node id of 20 bytes")
-        return [c.packed() for c in self.nearest(target) if c.node_id != peer.node_id]
+        return [c.pack() for c in self.find_nearest(target) if c.node_id != peer.node_id]
 
-    def nearest(self, target: bytes) -> list[Contact]:
+    def find_nearest(self, target: bytes) -> list[Contact]:
         """Return the k closest contacts to ``target`` that are known here, without this node."""
-        members, near = self.roster.live(), self.table.closest(target)
+        members, near = self.members.list_live(), self.table.closest(target)
         if not members:
             return near
-        return closest({c.node_id: c for c in [*members, *near]}.values(), target, K)
+        return select_closest({c.node_id: c for c in [*members, *near]}.values(), target, K)
 
 
-def contacts_of(answer: object) -> list[Contact]:
+def parse_contacts(answer: object) -> list[Contact]:
     """Decode the contacts in an answer; invalid ones are skipped."""
-    found = [unpacked(fields) for fields in answer] if isinstance(answer, list) else []
+    found = [parse_contact(fields) for fields in answer] if isinstance(answer, list) else []
     return [contact for contact in found if contact is not None]
 
 
@@ -536,4 +561,4 @@ def _closest(contacts: list[Contact], key: bytes) -> list[Contact]:
     once: dict[bytes, Contact] = {}
     for contact in contacts:
         once.setdefault(contact.node_id, contact)
-    return closest(once.values(), key, K)
+    return select_closest(once.values(), key, K)

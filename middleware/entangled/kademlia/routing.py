@@ -13,16 +13,16 @@ import random
 from bisect import bisect_right
 from dataclasses import dataclass, field
 
-from middleware.entangled.bounded import keep
+from middleware.entangled.bounded import put_bounded
 from middleware.entangled.contact import Contact
 from middleware.entangled.identity import ID_BYTES
-from middleware.entangled.kademlia.distance import bucket_index, closest
+from middleware.entangled.kademlia.distance import bucket_index, select_closest
 
 STALE_AFTER = 3
 """The successive misses that make a contact stale: any new contact may replace it."""
 DROPPED_AFTER = 5
 """The successive misses after which a contact is deleted even without a replacement."""
-PATIENCE = 1.0
+PING_INTERVAL_S = 1.0
 """The seconds for which a contact that was heard, or returned for a ping, is not returned again."""
 
 
@@ -32,7 +32,7 @@ class _Entry:
 
     contact: Contact
     seen_at: float
-    questioned_at: float
+    pinged_at: float
     misses: int = 0
 
     @property
@@ -47,7 +47,7 @@ class _Bucket:
     low: int
     high: int
     entries: dict[bytes, _Entry] = field(default_factory=dict)
-    waiting: dict[bytes, Contact] = field(default_factory=dict)
+    replacements: dict[bytes, Contact] = field(default_factory=dict)
 
 
 class RoutingTable:
@@ -66,8 +66,8 @@ class RoutingTable:
         self.version = 0
         self._lows = [0]
         self._searched_at: dict[int, float] = {}
-        self._apart: list[int] = []
-        self._nearest_of = -1
+        self._nearest_distances: list[int] = []
+        self._nearest_version = -1
 
     def __len__(self) -> int:
         return self._size
@@ -78,7 +78,7 @@ class RoutingTable:
         entry = bucket.entries.get(node_id) if bucket else None
         return entry.contact if entry else None
 
-    def contacts(self) -> list[Contact]:
+    def list_contacts(self) -> list[Contact]:
         """Return all contacts, nearest bucket first and in each the least recently seen first."""
         nearest_first = sorted(self._buckets, key=lambda bucket: bucket.low ^ self._own & -(bucket.high - bucket.low))
         return [entry.contact for bucket in nearest_first for entry in bucket.entries.values()]
@@ -97,14 +97,14 @@ class RoutingTable:
             live: list[Contact] = []
             for entry in bucket.entries.values():
                 (stale if entry.misses >= STALE_AFTER else live).append(entry.contact)
-            chosen += closest(live, target, wanted - len(chosen))
+            chosen += select_closest(live, target, wanted - len(chosen))
             if len(chosen) == wanted:
                 return chosen
         if stale:
-            chosen = closest([*chosen, *closest(stale, target, wanted - len(chosen))], target, wanted)
+            chosen = select_closest([*chosen, *select_closest(stale, target, wanted - len(chosen))], target, wanted)
         return chosen
 
-    def saw(self, contact: Contact, now: float) -> Contact | None:
+    def record_contact(self, contact: Contact, now: float) -> Contact | None:
         """Record that ``contact`` has proved its key and its address.
 
         Returns the least recently seen contact of a full bucket: the caller pings it, and if it does not answer
@@ -112,33 +112,33 @@ class RoutingTable:
         """
         if contact.node_id == self._own_id:
             return None
-        bucket = self._bucket_of(contact.node_id)
+        bucket = self._find_bucket(contact.node_id)
         entry = bucket.entries.pop(contact.node_id, None)
         if entry is not None:
             bucket.entries[contact.node_id] = entry  # the most recently seen is last
             if entry.contact != contact:  # otherwise keep the existing object, which others share
                 entry.contact = contact
                 self.version += 1
-            entry.seen_at = entry.questioned_at = now
+            entry.seen_at = entry.pinged_at = now
             entry.misses = 0
             return None
         self._searched_at.setdefault(bucket_index(self._own_id, contact.node_id), now)
         while len(bucket.entries) >= self._k and self._may_split(bucket, contact.node_id):
             self._split(bucket)
-            bucket = self._bucket_of(contact.node_id)
+            bucket = self._find_bucket(contact.node_id)
         if len(bucket.entries) >= self._k:
             stale = next((node_id for node_id, entry in bucket.entries.items() if entry.is_stale), None)
             if stale is None:
                 return self._cache(bucket, contact, now)
             del bucket.entries[stale]
             self._size -= 1
-        bucket.waiting.pop(contact.node_id, None)
+        bucket.replacements.pop(contact.node_id, None)
         bucket.entries[contact.node_id] = _Entry(contact, now, now)
         self._size += 1
         self.version += 1
         return None
 
-    def has_place(self, node_id: bytes) -> bool:
+    def has_room(self, node_id: bytes) -> bool:
         """Return whether a contact with this id has, or would find, a place in its bucket."""
         bucket = self._bucket(node_id)
         if bucket is None:
@@ -148,7 +148,7 @@ class RoutingTable:
             return True
         return self._may_split(bucket, node_id)
 
-    def failed(self, contact: Contact, now: float) -> None:
+    def record_miss(self, contact: Contact, now: float) -> None:
         """Record that ``contact`` did not answer at its address.
 
         After ``STALE_AFTER`` successive misses the most recently seen waiting contact replaces it; without one it
@@ -157,35 +157,35 @@ class RoutingTable:
         bucket = self._bucket(contact.node_id)
         if bucket is None:
             return
-        if bucket.waiting.get(contact.node_id) == contact:
-            del bucket.waiting[contact.node_id]
+        if bucket.replacements.get(contact.node_id) == contact:
+            del bucket.replacements[contact.node_id]
         entry = bucket.entries.get(contact.node_id)
         if entry is None or entry.contact != contact:
             return
         entry.misses += 1
-        if entry.misses >= DROPPED_AFTER or (entry.is_stale and bucket.waiting):
+        if entry.misses >= DROPPED_AFTER or (entry.is_stale and bucket.replacements):
             self._remove_entry(bucket, contact.node_id, now)
 
     def remove(self, contact: Contact, now: float = 0.0) -> None:
         """Delete ``contact``, which left the network; a waiting contact replaces it."""
         bucket = self._bucket(contact.node_id)
         if bucket is not None:
-            bucket.waiting.pop(contact.node_id, None)
+            bucket.replacements.pop(contact.node_id, None)
             if contact.node_id in bucket.entries:
                 self._remove_entry(bucket, contact.node_id, now)
 
-    def searched(self, target: bytes, now: float) -> None:
+    def record_lookup(self, target: bytes, now: float) -> None:
         """Record a lookup for ``target``, which refreshes its range."""
         if target != self._own_id:
             self._searched_at[bucket_index(self._own_id, target)] = now
 
-    def stale_buckets(self, now: float, older_than: float) -> list[int]:
+    def find_stale(self, now: float, older_than: float) -> list[int]:
         """Return the ranges without a lookup for ``older_than`` seconds, by the i of distances from 2**i on.
 
         They extend from the nearest range with a contact to the farthest one, because nearer ranges are empty
         (Kademlia, section 2.3).
         """
-        filled = [bucket_index(self._own_id, contact.node_id) for contact in self.contacts()]
+        filled = [bucket_index(self._own_id, contact.node_id) for contact in self.list_contacts()]
         if not filled:
             return []
         before = now - older_than
@@ -197,9 +197,9 @@ class RoutingTable:
         return (int.from_bytes(self._own_id) ^ apart).to_bytes(ID_BYTES)
 
     def _bucket(self, node_id: bytes) -> _Bucket | None:
-        return None if node_id == self._own_id else self._bucket_of(node_id)
+        return None if node_id == self._own_id else self._find_bucket(node_id)
 
-    def _bucket_of(self, node_id: bytes) -> _Bucket:
+    def _find_bucket(self, node_id: bytes) -> _Bucket:
         number = int.from_bytes(node_id)
         return self._buckets[bisect_right(self._lows, number) - 1]
 
@@ -213,12 +213,12 @@ class RoutingTable:
 
     def _nearest(self) -> list[int]:
         """Return the distances of the k contacts closest to this node, in ascending order."""
-        if self._nearest_of != self.version:
-            self._nearest_of = self.version
+        if self._nearest_version != self.version:
+            self._nearest_version = self.version
             own = self._own
             apart = [int.from_bytes(node_id) ^ own for bucket in self._buckets for node_id in bucket.entries]
-            self._apart = sorted(apart)[: self._k]
-        return self._apart
+            self._nearest_distances = sorted(apart)[: self._k]
+        return self._nearest_distances
 
     def _split(self, bucket: _Bucket) -> None:
         """Replace ``bucket`` by two buckets of half the range each."""
@@ -226,8 +226,8 @@ class RoutingTable:
         halves = [_Bucket(bucket.low, middle), _Bucket(middle, bucket.high)]
         for node_id, entry in bucket.entries.items():
             halves[int.from_bytes(node_id) >= middle].entries[node_id] = entry
-        for node_id, contact in bucket.waiting.items():
-            halves[int.from_bytes(node_id) >= middle].waiting[node_id] = contact
+        for node_id, contact in bucket.replacements.items():
+            halves[int.from_bytes(node_id) >= middle].replacements[node_id] = contact
         place = self._buckets.index(bucket)
         self._buckets[place : place + 1] = halves
         self._lows = [each.low for each in self._buckets]
@@ -237,17 +237,17 @@ class RoutingTable:
         del bucket.entries[node_id]
         self._size -= 1
         self.version += 1
-        if bucket.waiting:
-            newcomer_id, newcomer = bucket.waiting.popitem()
+        if bucket.replacements:
+            newcomer_id, newcomer = bucket.replacements.popitem()
             bucket.entries[newcomer_id] = _Entry(newcomer, now, now)
             self._size += 1
 
     def _cache(self, bucket: _Bucket, newcomer: Contact, now: float) -> Contact | None:
         """Add ``newcomer`` to the replacement cache, and return the contact to ping."""
-        keep(bucket.waiting, newcomer.node_id, newcomer, self._k)
+        put_bounded(bucket.replacements, newcomer.node_id, newcomer, self._k)
         oldest = next(iter(bucket.entries.values()))
         # Many new contacts must not cause many pings to one old contact.
-        if now - max(oldest.seen_at, oldest.questioned_at) < PATIENCE:
+        if now - max(oldest.seen_at, oldest.pinged_at) < PING_INTERVAL_S:
             return None
-        oldest.questioned_at = now
+        oldest.pinged_at = now
         return oldest.contact

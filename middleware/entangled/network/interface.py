@@ -26,7 +26,7 @@ class Interface:
     is_running: bool = True
 
 
-def interfaces() -> list[Interface]:
+def list_interfaces() -> list[Interface]:
     """Return the interfaces that are up; an empty list if the system does not report them."""
     found: list[Interface] = []
     ipv6_addresses = _read_ipv6_addresses()
@@ -61,7 +61,7 @@ def interfaces() -> list[Interface]:
     return found
 
 
-def chosen(found: list[Interface], host: str) -> list[Interface]:
+def select_interfaces(found: list[Interface], host: str) -> list[Interface]:
     """Return the interfaces in ``found`` at which a node that listens at ``host`` is reachable.
 
     The loopback is included only if there is no other interface, or if the node listens at a loopback address.

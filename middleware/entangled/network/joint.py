@@ -6,9 +6,9 @@ from collections import Counter
 from typing import Any
 
 from middleware.entangled.errors import EntangledError
-from middleware.entangled.network.network import Address, Network, Ports, Receiver, ports_of
+from middleware.entangled.network.network import Address, LocalPorts, Network, Receiver, find_ports
 from middleware.entangled.network.tunnel import TunnelNetwork
-from middleware.entangled.network.url import VIRTUAL
+from middleware.entangled.network.url import VIRTUAL_PREFIX
 
 
 class JointNetwork:
@@ -33,9 +33,9 @@ class JointNetwork:
         return counted
 
     @property
-    def ports(self) -> Ports | None:
+    def ports(self) -> LocalPorts | None:
         """The local ports of ``udp``, if it supports several."""
-        return ports_of(self.udp)
+        return find_ports(self.udp)
 
     @property
     def detours(self) -> list[Address]:
@@ -58,7 +58,7 @@ class JointNetwork:
 
     def send(self, datagram: bytes, to: Address) -> None:
         """Send over the network to which the address belongs."""
-        if to.host.startswith(VIRTUAL):
+        if to.host.startswith(VIRTUAL_PREFIX):
             self.tunnel.send(datagram, to)
         else:
             self.udp.send(datagram, to)

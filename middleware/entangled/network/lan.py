@@ -18,11 +18,11 @@ from twisted.internet.protocol import DatagramProtocol
 from twisted.logger import Logger
 
 from middleware.entangled.background import cancel
-from middleware.entangled.network.interface import Interface, chosen, interfaces
+from middleware.entangled.network.interface import Interface, list_interfaces, select_interfaces
 from middleware.entangled.network.multicast import GROUP, GROUP6
-from middleware.entangled.network.network import MAX_DATAGRAM, Address, Receiver
+from middleware.entangled.network.network import MAX_DATAGRAM_BYTES, Address, Receiver
 
-LOOK = 3.0
+LIST_INTERVAL_S = 3.0
 """The seconds between two listings of the interfaces; a listing takes 0.1 ms."""
 _IP_PKTINFO, _IP_MULTICAST_ALL, _IPV6_MULTICAST_ALL = 8, 49, 29
 
@@ -35,13 +35,13 @@ class LanMulticast:
 
     _log = Logger()
 
-    def __init__(self, reactor: Any, host: str, look: Callable[[], list[Interface]] = interfaces) -> None:
+    def __init__(self, reactor: Any, host: str, look: Callable[[], list[Interface]] = list_interfaces) -> None:
         self._on_move: Callable[[], None] = lambda: None
         self.counters: Counter[str] = Counter()
         self._reactor = reactor
         self._host = host
-        self._look = look
-        self._known: list[Interface] = []
+        self._list_interfaces = look
+        self._interfaces: list[Interface] = []
         self._families: list[_Family] = []
         self._timer: IDelayedCall | None = None
 
@@ -59,7 +59,7 @@ class LanMulticast:
 
     def send(self, datagram: bytes) -> None:
         """Send to the group from every address of every interface."""
-        for interface in self._known:
+        for interface in self._interfaces:
             for family in self._families:
                 family.send(datagram, interface)
 
@@ -72,11 +72,11 @@ class LanMulticast:
 
     def _update_interfaces(self) -> None:
         cancel(self._timer)
-        self._timer = self._reactor.callLater(LOOK, self._update_interfaces)
-        found = chosen(self._look(), self._host)
-        if found == self._known:
+        self._timer = self._reactor.callLater(LIST_INTERVAL_S, self._update_interfaces)
+        found = select_interfaces(self._list_interfaces(), self._host)
+        if found == self._interfaces:
             return
-        is_first, self._known = not self._known, found
+        is_first, self._interfaces = not self._interfaces, found
         for interface in found:
             for family in self._families:
                 family.join(interface)
@@ -139,7 +139,7 @@ class _Family:
                 sock.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
             self._prepare(sock)
             sock.bind(at)
-            return reactor.adoptDatagramPort(sock.fileno(), self.family, protocol, MAX_DATAGRAM + 1)
+            return reactor.adoptDatagramPort(sock.fileno(), self.family, protocol, MAX_DATAGRAM_BYTES + 1)
 
     def _prepare(self, sock: socket.socket) -> None:
         raise NotImplementedError
@@ -194,7 +194,7 @@ class _Protocol(DatagramProtocol):
 
     def datagramReceived(self, datagram: bytes, addr: Any) -> None:
         """Pass a datagram to the receiver."""
-        if len(datagram) <= MAX_DATAGRAM:
+        if len(datagram) <= MAX_DATAGRAM_BYTES:
             self._counters["received"] += 1
             self._receiver(datagram, Address(addr[0], addr[1]))
 

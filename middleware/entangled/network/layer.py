@@ -7,12 +7,12 @@ import ssl
 from tempfile import NamedTemporaryFile
 from typing import Protocol
 
-from formats.head import MAX_HEAD, head, taken
+from formats.head import MAX_HEAD_BYTES, encode_head, pop_head
 
-_PIECE = 16384
+_READ_BYTES = 16384
 
 
-class Layer(Protocol):
+class StreamLayer(Protocol):
     """A transformation between a transport and a protocol.  After a ``fault`` it produces nothing more."""
 
     is_open: bool
@@ -21,14 +21,14 @@ class Layer(Protocol):
     def opening(self) -> bytes:
         """Return the first bytes to send."""
 
-    def received(self, data: bytes) -> tuple[bytes, bytes]:
+    def decode(self, data: bytes) -> tuple[bytes, bytes]:
         """Process received bytes; return the decoded bytes, and the bytes to send back at once."""
 
-    def wrapped(self, data: bytes) -> bytes:
+    def encode(self, data: bytes) -> bytes:
         """Encode ``data`` for sending; call it only while the layer is open."""
 
 
-class Tls:
+class TlsLayer:
     """One end of TLS, with Python's ``ssl``; ``host`` is the server name that a client sends (SNI)."""
 
     def __init__(self, context: ssl.SSLContext, host: str = "", is_server: bool = False) -> None:
@@ -42,7 +42,7 @@ class Tls:
         self._do_handshake()
         return self._out.read()
 
-    def received(self, data: bytes) -> tuple[bytes, bytes]:
+    def decode(self, data: bytes) -> tuple[bytes, bytes]:
         """Process received bytes; return the decrypted bytes, and the bytes to send back at once."""
         self._in.write(data)
         if not self.is_open and not self.fault:
@@ -50,7 +50,7 @@ class Tls:
         pieces = []
         while self.is_open and not self.fault:
             try:
-                piece = self._tls.read(_PIECE)
+                piece = self._tls.read(_READ_BYTES)
             except ssl.SSLWantReadError:
                 break
             except ssl.SSLError as error:
@@ -61,7 +61,7 @@ class Tls:
             pieces.append(piece)
         return b"".join(pieces), self._out.read()
 
-    def wrapped(self, data: bytes) -> bytes:
+    def encode(self, data: bytes) -> bytes:
         """Encrypt ``data``."""
         try:
             self._tls.write(data)
@@ -82,7 +82,7 @@ class Tls:
         self.fault = f"TLS: {error.reason or error}"
 
 
-class Proxied:
+class ProxyLayer:
     """The connection through an HTTP proxy: CONNECT (RFC 9110, section 9.3.6); ``login`` is ``user:password``."""
 
     def __init__(self, target: str, login: str = "") -> None:
@@ -96,32 +96,32 @@ class Proxied:
         """Return the first bytes to send."""
         login = base64.b64encode(self._login.encode()).decode()
         more = [f"Proxy-Authorization: Basic {login}"] if login else []
-        return head(f"CONNECT {self._target} HTTP/1.1", f"Host: {self._target}", *more)
+        return encode_head(f"CONNECT {self._target} HTTP/1.1", f"Host: {self._target}", *more)
 
-    def received(self, data: bytes) -> tuple[bytes, bytes]:
+    def decode(self, data: bytes) -> tuple[bytes, bytes]:
         """Process received bytes; bytes after the proxy's response belong to the stream."""
         if self.is_open:
             return data, b""
         self._buffer += data
-        answer = taken(self._buffer)
+        answer = pop_head(self._buffer)
         if answer is None:
-            if len(self._buffer) >= MAX_HEAD:
+            if len(self._buffer) >= MAX_HEAD_BYTES:
                 self.fault = "the response is not from an HTTP proxy; check the proxy's address"
             return b"", b""
         version, status = [*answer.first.split(b" "), b""][:2]
         if not version.startswith(b"HTTP/1.") or not status.startswith(b"2"):
-            self.fault = f"the proxy refused the connection: {answer.said!r}"
+            self.fault = f"the proxy refused the connection: {answer.summary!r}"
             return b"", b""
         self.is_open = True
         rest, self._buffer = bytes(self._buffer), bytearray()
         return rest, b""
 
-    def wrapped(self, data: bytes) -> bytes:
+    def encode(self, data: bytes) -> bytes:
         """Return ``data`` unchanged."""
         return data
 
 
-def client_context() -> ssl.SSLContext:
+def make_client_context() -> ssl.SSLContext:
     """Return a client's TLS context; it verifies no certificate, because Noise authenticates the peer."""
     context = ssl.SSLContext(ssl.PROTOCOL_TLS_CLIENT)
     context.check_hostname = False
@@ -130,7 +130,7 @@ def client_context() -> ssl.SSLContext:
     return context
 
 
-def server_context(pem: str) -> ssl.SSLContext:
+def make_server_context(pem: str) -> ssl.SSLContext:
     """Return the TLS context of a server; ``pem`` is a key with its certificate."""
     context = ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER)
     _configure(context)

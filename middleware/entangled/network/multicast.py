@@ -32,7 +32,7 @@ class Multicast(Protocol):
         """Leave the group; may be called twice."""
 
 
-class Segment:
+class SimulatedLan:
     """A simulated LAN: all its members are in one group, over the ports of a ``Switchboard``.
 
     ``is_blocked``: multicast does not pass, as at many access points.
@@ -40,24 +40,24 @@ class Segment:
 
     def __init__(self, board: Switchboard) -> None:
         self.is_blocked = False
-        self.groups: list[SegmentMulticast] = []
-        self._board = board
+        self.groups: list[SimulatedMulticast] = []
+        self._switchboard = board
 
-    def group(self, host: str = "10.0.0.1") -> SegmentMulticast:
+    def join(self, host: str = "10.0.0.1") -> SimulatedMulticast:
         """Create a membership of the group for the node at ``host``."""
-        return SegmentMulticast(self, self._board.network(host), self._board.network(host))
+        return SimulatedMulticast(self, self._switchboard.make_network(host), self._switchboard.make_network(host))
 
 
-class SegmentMulticast:
+class SimulatedMulticast:
     """One node's membership on a ``Segment``; a ``Multicast``.
 
     As with sockets, it receives at one port and sends from another; ``addresses`` are both.  A test calls ``moved``
     when it moves the node to another LAN.
     """
 
-    def __init__(self, segment: Segment, ear: SwitchboardNetwork, mouth: SwitchboardNetwork) -> None:
-        self.moved: Callable[[], None] = lambda: None
-        self._segment = segment
+    def __init__(self, segment: SimulatedLan, ear: SwitchboardNetwork, mouth: SwitchboardNetwork) -> None:
+        self.on_moved: Callable[[], None] = lambda: None
+        self._lan = segment
         self._receiving_network = ear
         self._sending_network = mouth
 
@@ -68,20 +68,20 @@ class SegmentMulticast:
 
     def listen(self, receiver: Receiver, moved: Callable[[], None]) -> None:
         """Pass each datagram from the group, and each reply, to ``receiver``."""
-        self.moved = moved
+        self.on_moved = moved
         self._receiving_network.listen(receiver)
         self._sending_network.listen(receiver)
-        self._segment.groups.append(self)
+        self._lan.groups.append(self)
 
     def send(self, datagram: bytes) -> None:
         """Send to every member of the group, including this node."""
-        if not self._segment.is_blocked:
-            for other in self._segment.groups:
+        if not self._lan.is_blocked:
+            for other in self._lan.groups:
                 self._sending_network.send(datagram, other.addresses[0])
 
     def close(self) -> None:
         """Leave the group; may be called twice."""
-        if self in self._segment.groups:
-            self._segment.groups.remove(self)
+        if self in self._lan.groups:
+            self._lan.groups.remove(self)
         self._receiving_network.close()
         self._sending_network.close()

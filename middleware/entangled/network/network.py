@@ -10,18 +10,18 @@ from collections.abc import Callable
 from ipaddress import IPv6Address
 from typing import NamedTuple, Protocol, runtime_checkable
 
-MAX_DATAGRAM = 1400
-MAX_CARRIED = 1452
+MAX_DATAGRAM_BYTES = 1400
+MAX_RELAYED_BYTES = 1452
 """The length of a relayed datagram, which contains another one: 1500 bytes without the headers of IPv6 and UDP."""
-EVERYWHERE = "*"
+ANY_HOST = "*"
 """The host that stands for every interface of both families."""
-MAX_LED = 1024
+MAX_ASSIGNED = 1024
 """The number of addresses for which a network remembers the local port to send from."""
-_RELAYED = 41
-ADDRESS = 18
+_RELAYED_LENGTH = 41
+ADDRESS_BYTES = 18
 """The bytes of an address in datagrams: an IPv6 address (16, IPv4 mapped into it) and the port (2)."""
-_MAPPED = bytes(10) + b"\xff\xff"
-_NONE = bytes(ADDRESS)
+_IPV4_PREFIX = bytes(10) + b"\xff\xff"
+_NONE = bytes(ADDRESS_BYTES)
 
 
 class Address(NamedTuple):
@@ -39,35 +39,35 @@ class Address(NamedTuple):
         return f"{self.host}:{self.port}"
 
 
-def relayed(node_id: bytes) -> Address:
+def relayed_address(node_id: bytes) -> Address:
     """Return the virtual address of the node with this id, which is reached through relays."""
     return Address(f"~{node_id.hex()}", 1)
 
 
 def is_relayed(address: Address) -> bool:
     """Return whether an address is the result of ``relayed``."""
-    return len(address.host) == _RELAYED and address.host[0] == "~"
+    return len(address.host) == _RELAYED_LENGTH and address.host[0] == "~"
 
 
-def packed_address(address: Address) -> bytes:
+def pack_address(address: Address) -> bytes:
     """Encode an address in 18 bytes; zero if its host is not an IP address."""
     host, port = address
     try:
         if ":" in host:
             packed = IPv6Address(host.partition("%")[0]).packed
         else:
-            packed = _MAPPED + bytes(map(int, host.split(".")))
+            packed = _IPV4_PREFIX + bytes(map(int, host.split(".")))
         return packed + port.to_bytes(2, "little") if len(packed) == 16 else _NONE
     except (ValueError, OverflowError):
         return _NONE
 
 
-def address_of(packed: bytes) -> Address | None:
+def parse_address(packed: bytes) -> Address | None:
     """Decode an address from 18 bytes; None for zero, or if the length is wrong."""
     port = int.from_bytes(packed[16:], "little")
-    if len(packed) != ADDRESS or not port:
+    if len(packed) != ADDRESS_BYTES or not port:
         return None
-    if packed.startswith(_MAPPED):
+    if packed.startswith(_IPV4_PREFIX):
         return Address(".".join(map(str, packed[12:16])), port)
     return Address(str(IPv6Address(packed[:16])), port)
 
@@ -93,7 +93,7 @@ class Network(Protocol):
 
 
 @runtime_checkable
-class Ports(Protocol):
+class LocalPorts(Protocol):
     """A network that can use several local ports: 0 stands for the listening port.
 
     A datagram leaves by the port that was assigned to its target, otherwise by the port that first received from the
@@ -103,24 +103,24 @@ class Ports(Protocol):
     def open_port(self) -> int:
         """Open an additional free local port and return it; 0 if that fails."""
 
-    def shut_port(self, port: int) -> None:
+    def close_port(self, port: int) -> None:
         """Close an additional port; its targets are assigned to the listening port again."""
 
-    def lead(self, to: Address, port: int) -> int:
+    def assign_port(self, to: Address, port: int) -> int:
         """Assign a local port to the target ``to``; return the previous one."""
 
-    def local(self, to: Address, port: int = 0) -> Address:
+    def source_address(self, to: Address, port: int = 0) -> Address:
         """Return the local source address of datagrams to ``to`` (from ``port``, if given)."""
 
-    def hosts(self) -> list[str]:
+    def local_hosts(self) -> list[str]:
         """Return the addresses of this machine at which ``listen`` receives, without the loopback."""
 
 
-def ports_of(network: object) -> Ports | None:
+def find_ports(network: object) -> LocalPorts | None:
     """Return the local ports of a network, or of the network that it wraps (its ``ports``); None if it has only one."""
-    return network if isinstance(network, Ports) else getattr(network, "ports", None)
+    return network if isinstance(network, LocalPorts) else getattr(network, "ports", None)
 
 
-def detours_of(network: object) -> list[Address]:
+def find_alternate_paths(network: object) -> list[Address]:
     """Return the virtual addresses by which a network reaches known nodes without UDP (its ``detours``)."""
     return list(getattr(network, "detours", ()))

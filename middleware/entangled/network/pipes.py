@@ -17,15 +17,15 @@ from zope.interface import implementer
 
 from middleware.entangled.background import cancel
 from middleware.entangled.errors import PortInUse
-from middleware.entangled.network.carrier import Accept, Strain
 from middleware.entangled.network.network import Address
+from middleware.entangled.network.stream_transport import Accept, StreamState
 
-PIECE = 4096
-REPEAT_S = 0.2
+CHUNK_BYTES = 4096
+RETRANSMIT_S = 0.2
 """The seconds between two retransmissions."""
 
 
-class Pipes:
+class PipeNetwork:
     """Connects the carriers of one process."""
 
     def __init__(self, clock: IReactorTime, delay_s: float = 0.0, rate: float = float("inf")) -> None:
@@ -39,9 +39,9 @@ class Pipes:
         self._listeners: dict[Address, Accept] = {}
         self._cut: set[str] = set()
 
-    def carrier(self, host: str, port: int = 0) -> PipeCarrier:
+    def make_transport(self, host: str, port: int = 0) -> PipeTransport:
         """Return a carrier of the host ``host``, which listens at ``port``."""
-        return PipeCarrier(self, Address(host, port))
+        return PipeTransport(self, Address(host, port))
 
     def cut(self, host: str) -> None:
         """Block all bytes from and to ``host``; its streams stay open and stall."""
@@ -54,12 +54,12 @@ class Pipes:
             for end in (pipe, pipe.other):
                 end.pump()
 
-    def _passes(self, *hosts: str) -> bool:
+    def _is_connected(self, *hosts: str) -> bool:
         return self._cut.isdisjoint(hosts)
 
     def _connect(self, host: str, to: Address, protocol: IProtocol, failed: Callable[[str], None]) -> None:
         accept = self._listeners.get(to)
-        if not self._passes(host, to.host):
+        if not self._is_connected(host, to.host):
             self.clock.callLater(5.0, failed, "timed out")
             return
         theirs = None if accept is None else accept(host)
@@ -78,10 +78,10 @@ class Pipes:
             far.abortConnection()
 
 
-class PipeCarrier:
+class PipeTransport:
     """The ``Carrier`` of one host."""
 
-    def __init__(self, pipes: Pipes, address: Address) -> None:
+    def __init__(self, pipes: PipeNetwork, address: Address) -> None:
         self._pipes = pipes
         self._address = address
 
@@ -99,9 +99,13 @@ class PipeCarrier:
             2 * self._pipes.delay_s, self._pipes._connect, self._address.host, to, protocol, failed
         )
 
-    def strain(self, transport: Any) -> Strain | None:
+    def read_state(self, transport: Any) -> StreamState | None:
         """Return the state of the stream of a transport."""
-        return Strain(transport.held, transport.moved, transport.repeated) if isinstance(transport, Pipe) else None
+        return (
+            StreamState(transport.unacked, transport.acknowledged, transport.retransmissions)
+            if isinstance(transport, Pipe)
+            else None
+        )
 
     def close(self) -> None:
         """Stop listening."""
@@ -123,47 +127,47 @@ class Pipe:
 
     bufferSize = 65536  # noqa: N815
 
-    def __init__(self, pipes: Pipes, host: str) -> None:
+    def __init__(self, pipes: PipeNetwork, host: str) -> None:
         self.other: Pipe
         self.protocol: IProtocol | None = None
         self.host = host
-        self.is_read = True
+        self.is_reading = True
         self.is_lost = False
         self.buffer = bytearray()
-        self.moved = 0
+        self.acknowledged = 0
         self._written = 0
-        self._is_still = False
-        self._still_since = 0.0
+        self._is_stalled = False
+        self._stalled_since = 0.0
         self._pipes = pipes
         self._producer: Any = None
         self._is_paused = False
-        self._is_losing = False
+        self._is_closing = False
         self._timer: IDelayedCall | None = None
 
     @property
-    def is_still(self) -> bool:
+    def is_stalled(self) -> bool:
         """Whether everything that this end sends is lost."""
-        return self._is_still
+        return self._is_stalled
 
-    @is_still.setter
-    def is_still(self, is_so: bool) -> None:
-        self._is_still, self._still_since = is_so, self._pipes.clock.seconds()
+    @is_stalled.setter
+    def is_stalled(self, is_so: bool) -> None:
+        self._is_stalled, self._stalled_since = is_so, self._pipes.clock.seconds()
         self.pump()
 
     @property
-    def held(self) -> int:
+    def unacked(self) -> int:
         """The number of bytes that are not acknowledged."""
-        return self._written - self.moved
+        return self._written - self.acknowledged
 
     @property
-    def repeated(self) -> int:
+    def retransmissions(self) -> int:
         """The number of retransmissions since the stream stalled."""
-        is_vain = self._is_still and self.held
-        return int((self._pipes.clock.seconds() - self._still_since) / REPEAT_S) if is_vain else 0
+        is_vain = self._is_stalled and self.unacked
+        return int((self._pipes.clock.seconds() - self._stalled_since) / RETRANSMIT_S) if is_vain else 0
 
     def write(self, data: bytes) -> None:
         """Send bytes."""
-        if self.is_lost or self._is_losing:
+        if self.is_lost or self._is_closing:
             return
         self.buffer += data
         self._written += len(data)
@@ -182,15 +186,15 @@ class Pipe:
 
     def loseConnection(self) -> None:  # noqa: N802
         """Close the stream after sending the buffer."""
-        self._is_losing = True
+        self._is_closing = True
         self.pump()
 
     def abortConnection(self) -> None:  # noqa: N802
         """Close the stream at once; the other end is notified unless the path is cut."""
         if not self.is_lost:
-            if self._pipes._passes(self.host, self.other.host):
-                self._pipes.clock.callLater(self._pipes.delay_s, self.other._lost, ConnectionAborted())
-            self._lost(ConnectionAborted())
+            if self._pipes._is_connected(self.host, self.other.host):
+                self._pipes.clock.callLater(self._pipes.delay_s, self.other._close, ConnectionAborted())
+            self._close(ConnectionAborted())
 
     def getPeer(self) -> IAddress:  # noqa: N802
         """Return the address of the other end."""
@@ -200,15 +204,15 @@ class Pipe:
         """Send the next bytes of the buffer, if possible."""
         if self._timer is not None or self.is_lost:
             return
-        if self._is_still or not self._pipes._passes(self.host, self.other.host) or not self.other.is_read:
+        if self._is_stalled or not self._pipes._is_connected(self.host, self.other.host) or not self.other.is_reading:
             return
         if self.buffer:
-            piece = bytes(self.buffer[:PIECE])
-            del self.buffer[:PIECE]
+            piece = bytes(self.buffer[:CHUNK_BYTES])
+            del self.buffer[:CHUNK_BYTES]
             self._timer = self._pipes.clock.callLater(len(piece) / self._pipes.rate, self._on_sent, piece)
-        elif self._is_losing:
-            self._pipes.clock.callLater(self._pipes.delay_s, self.other._lost, ConnectionDone())
-            self._lost(ConnectionDone())
+        elif self._is_closing:
+            self._pipes.clock.callLater(self._pipes.delay_s, self.other._close, ConnectionDone())
+            self._close(ConnectionDone())
 
     def _on_sent(self, piece: bytes) -> None:
         self._timer = None
@@ -220,13 +224,13 @@ class Pipe:
         self.pump()
 
     def _acknowledge(self, size: int) -> None:
-        self.moved += size
+        self.acknowledged += size
 
     def _deliver(self, piece: bytes) -> None:
         if not self.is_lost and self.protocol is not None:
             self.protocol.dataReceived(piece)
 
-    def _lost(self, error: Exception) -> None:
+    def _close(self, error: Exception) -> None:
         if self.is_lost:
             return
         self.is_lost = True

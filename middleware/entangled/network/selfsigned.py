@@ -19,7 +19,7 @@ _SUBJECT_ALTERNATIVE = bytes.fromhex("0603551d11")
 _FROM, _UNTIL = b"20200101000000Z", b"20991231235959Z"
 
 
-def selfsigned(seed: bytes, serial: bytes, name: str = "localhost") -> str:
+def make_certificate(seed: bytes, serial: bytes, name: str = "localhost") -> str:
     """Return key and certificate in PEM for the 32-byte ``seed``; ``serial`` has 1 to 19 bytes."""
     public, secret = bindings.crypto_sign_seed_keypair(seed)
     subject = _sequence(_der(0x31, _sequence(_COMMON_NAME, _der(0x0C, name.encode()))))

@@ -16,19 +16,19 @@ from typing import Protocol
 
 from twisted.internet.interfaces import IReactorTime
 
-from middleware.entangled.bounded import keep
+from middleware.entangled.bounded import put_bounded
 from middleware.entangled.errors import PortInUse
-from middleware.entangled.network.nat import Nat
-from middleware.entangled.network.network import MAX_CARRIED, MAX_LED, Address, Receiver
+from middleware.entangled.network.nat_router import NatRouter
+from middleware.entangled.network.network import MAX_ASSIGNED, MAX_RELAYED_BYTES, Address, Receiver
 
 _FIRST_FREE_PORT = 49152
-_BATCH = 256
+_TRACE_BATCH = 256
 """The number of deliveries that are hashed together, because one large update is faster than many small ones."""
 _MAX_NAMES = 50_000
 
 
 @dataclass(frozen=True)
-class Weather:
+class LinkConditions:
     """The conditions of a link.
 
     Each datagram takes ``delay_s``, plus or minus up to ``jitter_s`` (uniform), at least 0.  ``loss``, ``duplicate``
@@ -41,14 +41,14 @@ class Weather:
     duplicate: float = 0.0
     reorder: float = 0.0
 
-    def delays(self, rng: random.Random) -> list[float]:
+    def draw_delays(self, rng: random.Random) -> list[float]:
         """Return the delay of each copy of one datagram in seconds: none if it is lost, two if it is duplicated."""
         if self.loss and rng.random() < self.loss:
             return []
         copies = 2 if self.duplicate and rng.random() < self.duplicate else 1
-        return [self._delay(rng) for _ in range(copies)]
+        return [self._draw_delay(rng) for _ in range(copies)]
 
-    def _delay(self, rng: random.Random) -> float:
+    def _draw_delay(self, rng: random.Random) -> float:
         delay = self.delay_s
         if self.jitter_s:
             delay = max(0.0, delay + rng.uniform(-self.jitter_s, self.jitter_s))
@@ -57,16 +57,16 @@ class Weather:
         return delay
 
 
-CALM = Weather()
+PERFECT = LinkConditions()
 
 
-class Link(Protocol):
+class LinkModel(Protocol):
     """A model of the links between all nodes, for distances, bursts and queues.
 
     There is one object for the whole switchboard, because pairs are too many; it keeps state per sender and receiver.
     """
 
-    def delays(self, source: Address, to: Address, size: int, now: float, rng: random.Random) -> Sequence[float]:
+    def draw_delays(self, source: Address, to: Address, size: int, now: float, rng: random.Random) -> Sequence[float]:
         """Return the delay in seconds of each copy of a datagram of ``size`` bytes sent at ``now``; none if lost."""
 
 
@@ -74,7 +74,7 @@ Barrier = Callable[[Address, Address], bool]
 """Returns whether datagrams from the first address to the second are blocked."""
 
 
-class Traffic:
+class TrafficCounters:
     """The datagrams and bytes that one port has sent and received."""
 
     __slots__ = ("sent", "sent_bytes", "received", "received_bytes")
@@ -90,14 +90,18 @@ class SwitchboardNetwork:
     """
 
     def __init__(
-        self, board: Switchboard, address: Address, home: Nat | None = None, traffic: Traffic | None = None
+        self,
+        board: Switchboard,
+        address: Address,
+        home: NatRouter | None = None,
+        traffic: TrafficCounters | None = None,
     ) -> None:
-        self._board = board
+        self._switchboard = board
         self._address = address
         self._port_by_target: dict[Address, int] = {}
-        self.traffic = Traffic() if traffic is None else traffic
-        self.home = home
-        self.further: set[int] = set()
+        self.traffic = TrafficCounters() if traffic is None else traffic
+        self.router = home
+        self.additional_ports: set[int] = set()
         self.receiver: Receiver | None = None
         self.is_unplugged = False
 
@@ -108,47 +112,47 @@ class SwitchboardNetwork:
 
     def listen(self, receiver: Receiver) -> None:
         """Open the port and pass each datagram to ``receiver``; raises ``PortInUse`` if the port is in use."""
-        self._board._plug(self, self._address)
+        self._switchboard._register(self, self._address)
         self.receiver = receiver
 
     def send(self, datagram: bytes, to: Address) -> None:
         """Send a datagram; a datagram that cannot be sent is lost."""
         if self.receiver is None or self.is_unplugged:
-            self._board.counters["unsent"] += 1
+            self._switchboard.counters["unsent"] += 1
         else:
-            self._board._transmit(self, datagram, to)
+            self._switchboard._transmit(self, datagram, to)
 
     def close(self) -> None:
         """Close the port; may be called twice."""
         self.receiver = None
-        for port in list(self.further):
-            self.shut_port(port)
-        self._board._release(self, self._address)
+        for port in list(self.additional_ports):
+            self.close_port(port)
+        self._switchboard._release(self, self._address)
 
     def open_port(self) -> int:
         """Open an additional local port and return it."""
-        port = self._board._free_port(self._address.host, self.home)
-        self.further.add(port)
-        self._board._plug(self, self._address._replace(port=port))
+        port = self._switchboard._free_port(self._address.host, self.router)
+        self.additional_ports.add(port)
+        self._switchboard._register(self, self._address._replace(port=port))
         return port
 
-    def shut_port(self, port: int) -> None:
+    def close_port(self, port: int) -> None:
         """Close an additional port."""
-        self.further.discard(port)
+        self.additional_ports.discard(port)
         self._port_by_target = {to: by for to, by in self._port_by_target.items() if by != port}
-        self._board._release(self, self._address._replace(port=port))
+        self._switchboard._release(self, self._address._replace(port=port))
 
-    def lead(self, to: Address, port: int) -> int:
+    def assign_port(self, to: Address, port: int) -> int:
         """Assign ``port`` to the target ``to``; 0 is the listening port."""
         before = self._port_by_target.get(to, 0)
-        keep(self._port_by_target, to, port if port in self.further else 0, MAX_LED)
+        put_bounded(self._port_by_target, to, port if port in self.additional_ports else 0, MAX_ASSIGNED)
         return before
 
-    def local(self, to: Address, port: int = 0) -> Address:
+    def source_address(self, to: Address, port: int = 0) -> Address:
         """Return the node's address, before any translation."""
         return self._address._replace(port=port) if port else self._source(to)
 
-    def hosts(self) -> list[str]:
+    def local_hosts(self) -> list[str]:
         """Return the node's host."""
         return [self._address.host]
 
@@ -158,7 +162,7 @@ class SwitchboardNetwork:
 
     def _receive(self, datagram: bytes, source: Address, port: int) -> None:
         if port != self._address.port and source not in self._port_by_target:
-            self.lead(source, port)
+            self.assign_port(source, port)
         if self.receiver is not None:
             self.traffic.received += 1
             self.traffic.received_bytes += len(datagram)
@@ -175,17 +179,17 @@ class Switchboard:
     address), unsent (the sender is closed or unplugged), blocked (by a router) and oversized.
     """
 
-    def __init__(self, clock: IReactorTime, rng: random.Random, weather: Weather = CALM) -> None:
-        self.weather = weather
-        self.link: Link | None = None
+    def __init__(self, clock: IReactorTime, rng: random.Random, weather: LinkConditions = PERFECT) -> None:
+        self.conditions = weather
+        self.link_model: LinkModel | None = None
         self.barriers: list[Barrier] = []
         self.counters: Counter[str] = Counter()
         self._clock = clock
         self._rng = rng
-        self._ports: dict[tuple[Nat | None, Address], SwitchboardNetwork] = {}
-        self._routers: dict[str, Nat] = {}
-        self.router_weather: dict[Nat, Weather] = {}
-        self._links: dict[tuple[Address, Address], Weather] = {}
+        self._ports: dict[tuple[NatRouter | None, Address], SwitchboardNetwork] = {}
+        self._routers: dict[str, NatRouter] = {}
+        self.router_conditions: dict[NatRouter, LinkConditions] = {}
+        self._links: dict[tuple[Address, Address], LinkConditions] = {}
         self._cuts: set[tuple[Address, Address]] = set()
         self._sides: dict[Address, int] = {}
         self._next_port = _FIRST_FREE_PORT
@@ -193,19 +197,23 @@ class Switchboard:
         self._untraced: list[bytes] = []
         self._names: dict[Address, str] = {}
 
-    def network(
-        self, host: str = "127.0.0.1", port: int = 0, home: Nat | None = None, traffic: Traffic | None = None
+    def make_network(
+        self,
+        host: str = "127.0.0.1",
+        port: int = 0,
+        home: NatRouter | None = None,
+        traffic: TrafficCounters | None = None,
     ) -> SwitchboardNetwork:
         """Create a network at that address, behind the router ``home``; port 0 takes the next free one."""
         return SwitchboardNetwork(self, Address(host, port or self._free_port(host, home)), home, traffic)
 
-    def router(self, nat: Nat, weather: Weather = CALM) -> Nat:
+    def add_router(self, nat: NatRouter, weather: LinkConditions = PERFECT) -> NatRouter:
         """Add a router; ``weather`` applies to all datagrams through it, in addition to the link's."""
         self._routers[nat.host] = nat
-        self.router_weather[nat] = weather
+        self.router_conditions[nat] = weather
         return nat
 
-    def set_weather(self, a: Address, b: Address, weather: Weather | None, one_way: bool = False) -> None:
+    def set_conditions(self, a: Address, b: Address, weather: LinkConditions | None, one_way: bool = False) -> None:
         """Set the conditions of the link between ``a`` and ``b`` (or from ``a`` to ``b``); None resets them."""
         for link in [(a, b)] if one_way else [(a, b), (b, a)]:
             if weather is None:
@@ -237,10 +245,10 @@ class Switchboard:
 
     def digest(self) -> str:
         """Return a hash, in hex, of (time, from, to, datagram) of every delivery so far."""
-        self._hash()
+        self._hash_trace()
         return self._trace.hexdigest()
 
-    def _free_port(self, host: str, home: Nat | None) -> int:
+    def _free_port(self, host: str, home: NatRouter | None) -> int:
         while True:
             port = self._next_port
             self._next_port += 1
@@ -249,18 +257,18 @@ class Switchboard:
             if (home, Address(host, port)) not in self._ports:
                 return port
 
-    def _plug(self, network: SwitchboardNetwork, address: Address) -> None:
-        holder = self._ports.get((network.home, address))
+    def _register(self, network: SwitchboardNetwork, address: Address) -> None:
+        holder = self._ports.get((network.router, address))
         if holder is not None and holder is not network:
             raise PortInUse(f"{address}: the port is in use; choose another port, or 0 for any")
         network.is_unplugged = False
-        self._ports[network.home, address] = network
+        self._ports[network.router, address] = network
 
     def _release(self, network: SwitchboardNetwork, address: Address) -> None:
-        if self._ports.get((network.home, address)) is network:
-            del self._ports[network.home, address]
+        if self._ports.get((network.router, address)) is network:
+            del self._ports[network.router, address]
 
-    def _passes(self, source: Address, to: Address) -> bool:
+    def _is_connected(self, source: Address, to: Address) -> bool:
         if self._cuts and (source, to) in self._cuts:
             return False
         if self._sides and self._sides.get(source, 0) != self._sides.get(to, 0):
@@ -272,56 +280,60 @@ class Switchboard:
         network.traffic.sent += 1
         network.traffic.sent_bytes += len(datagram)
         source = network._source(to)
-        if len(datagram) > MAX_CARRIED:
+        if len(datagram) > MAX_RELAYED_BYTES:
             self.counters["oversized"] += 1
             return
-        home = network.home
+        home = network.router
         if home is not None:
             if (home, to) in self._ports:
                 self._clock.callLater(0.0, self._pass_to_listener, home, to, source, to, datagram)
                 return
-            outside = home.out(source, to, self._clock.seconds()) if to.host != home.host else None
+            outside = home.translate_outgoing(source, to, self._clock.seconds()) if to.host != home.host else None
             if outside is None:
                 self.counters["blocked"] += 1
                 return
             source = outside
-        if not self._passes(source, to):
+        if not self._is_connected(source, to):
             self.counters["cut"] += 1
             return
         own = self._links.get((source, to)) if self._links else None
-        weather = own or self.weather
+        weather = own or self.conditions
         routers = (home, self._routers.get(to.host)) if self._routers else ()
-        router_conditions = [self.router_weather[router] for router in routers if router is not None] if routers else []
+        router_conditions = (
+            [self.router_conditions[router] for router in routers if router is not None] if routers else []
+        )
         delays: Sequence[float]
-        if self.link is not None and own is None:
-            delays = self.link.delays(source, to, len(datagram), self._clock.seconds(), self._rng)
-        elif weather is CALM and not router_conditions:
+        if self.link_model is not None and own is None:
+            delays = self.link_model.draw_delays(source, to, len(datagram), self._clock.seconds(), self._rng)
+        elif weather is PERFECT and not router_conditions:
             self._clock.callLater(0.0, self._deliver, source, to, datagram)
             return
         else:
-            delays = weather.delays(self._rng)
+            delays = weather.draw_delays(self._rng)
         for each in router_conditions:
-            delays = [delay + more for delay in delays for more in each.delays(self._rng)]
+            delays = [delay + more for delay in delays for more in each.draw_delays(self._rng)]
         if len(delays) != 1:
             self.counters["duplicated" if delays else "lost"] += 1
         for delay in delays:
             self._clock.callLater(delay, self._deliver, source, to, datagram)
 
     def _deliver(self, source: Address, to: Address, datagram: bytes) -> None:
-        if not self._passes(source, to):
+        if not self._is_connected(source, to):
             self.counters["cut"] += 1
             return
         router = self._routers.get(to.host) if self._routers else None
         if router is None:
             self._pass_to_listener(None, to, source, to, datagram)
             return
-        inner = router.into(source, to.port, self._clock.seconds())
+        inner = router.translate_incoming(source, to.port, self._clock.seconds())
         if inner is None:
             self.counters["blocked"] += 1
         else:
             self._pass_to_listener(router, inner, source, to, datagram)
 
-    def _pass_to_listener(self, home: Nat | None, at: Address, source: Address, to: Address, datagram: bytes) -> None:
+    def _pass_to_listener(
+        self, home: NatRouter | None, at: Address, source: Address, to: Address, datagram: bytes
+    ) -> None:
         """Pass a datagram to the listener at an address behind ``home``."""
         network = self._ports.get((home, at))
         if network is None or network.receiver is None:
@@ -333,8 +345,8 @@ class Switchboard:
         target_name = names.get(to) or self._add_name(to)
         route = f"{source_name}>{target_name} {len(datagram)}:".encode()
         self._untraced += (struct.pack("<d", self._clock.seconds()), route, datagram)
-        if len(self._untraced) > 3 * _BATCH:
-            self._hash()
+        if len(self._untraced) > 3 * _TRACE_BATCH:
+            self._hash_trace()
         network._receive(datagram, source, at.port)
 
     def _add_name(self, address: Address) -> str:
@@ -343,6 +355,6 @@ class Switchboard:
         name = self._names[address] = str(address)
         return name
 
-    def _hash(self) -> None:
+    def _hash_trace(self) -> None:
         self._trace.update(b"".join(self._untraced))
         self._untraced.clear()

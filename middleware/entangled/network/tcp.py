@@ -17,8 +17,8 @@ from twisted.internet.protocol import Factory
 from twisted.python.failure import Failure
 
 from middleware.entangled.errors import TunnelPortInUse
-from middleware.entangled.network.carrier import Accept, Strain
-from middleware.entangled.network.network import EVERYWHERE, Address
+from middleware.entangled.network.network import ANY_HOST, Address
+from middleware.entangled.network.stream_transport import Accept, StreamState
 
 CONNECT_S = 3.0
 _NOTSENT_LOWAT = 25
@@ -26,28 +26,28 @@ _THIN_LINEAR_TIMEOUTS = 16
 """Retransmit a stream with little data in flight, as here, six times without exponential backoff (Linux, tcp(7)):
 otherwise a stream would stall for seconds at 30 % loss."""
 _RTO_MAX_MS = 44
-LONGEST_WAIT_MS = 1000
+MAX_RETRANSMIT_MS = 1000
 """The maximum retransmission timeout in milliseconds (Linux 6.15 and later)."""
 _INFO_BYTES = 148
-UNSENT = 16 * 1024
+MAX_UNSENT_BYTES = 16 * 1024
 """The bytes of a stream that the system may buffer (Linux): buffered bytes cannot be dropped, so they arrive late."""
 
 
-class TcpCarrier:
+class TcpTransport:
     """Byte streams over TCP; it listens at ``host`` (a numeric address; ``*``: all of IPv4 and IPv6) and ``port``."""
 
-    def __init__(self, reactor: Any, host: str = EVERYWHERE, port: int = 0) -> None:
+    def __init__(self, reactor: Any, host: str = ANY_HOST, port: int = 0) -> None:
         self._reactor = reactor
         self._host = host
-        self._wanted = port
+        self._requested_port = port
         self._port: IListeningPort | None = None
-        self._dialling: set[Deferred[Any]] = set()
+        self._connectors: set[Deferred[Any]] = set()
         self.closed: Deferred[Any] | None = None
 
     @property
-    def number(self) -> int:
+    def port(self) -> int:
         """The port at which it listens."""
-        return self._wanted if self._port is None else int(self._port.getHost().port)  # type: ignore[attr-defined]
+        return self._requested_port if self._port is None else int(self._port.getHost().port)  # type: ignore[attr-defined]
 
     def listen(self, accept: Accept) -> None:
         """Accept connections; raises ``PortInUse``."""
@@ -58,9 +58,9 @@ class TcpCarrier:
             remedy = "choose another port"
             if getattr(error.socketError, "errno", None) == errno.EACCES:
                 remedy = "permit it (AmbientCapabilities=CAP_NET_BIND_SERVICE), or use a port above 1023 behind a proxy"
-            raise TunnelPortInUse(f"TCP {self._host}:{self._wanted}: {reason}; {remedy}") from error
+            raise TunnelPortInUse(f"TCP {self._host}:{self._requested_port}: {reason}; {remedy}") from error
         # Accepted connections inherit the options.
-        _tune(port.socket)
+        _configure(port.socket)
         self._port = port
 
     def dial(self, to: Address, protocol: IProtocol, failed: Callable[[str], None]) -> None:
@@ -69,22 +69,22 @@ class TcpCarrier:
         from twisted.internet.endpoints import HostnameEndpoint
 
         attempt = HostnameEndpoint(self._reactor, to.host, to.port, timeout=CONNECT_S).connect(_SingleFactory(protocol))
-        self._dialling.add(attempt)
+        self._connectors.add(attempt)
 
         def on_connected(_: object) -> None:
-            self._dialling.discard(attempt)
+            self._connectors.discard(attempt)
             transport: Any = getattr(protocol, "transport", None)
             if transport is not None and hasattr(transport, "getHandle"):
-                _tune(transport.getHandle())
+                _configure(transport.getHandle())
 
         def on_failed(failure: Failure) -> None:
-            self._dialling.discard(attempt)
+            self._connectors.discard(attempt)
             if failure.check(CancelledError) is None:
                 failed(failure.getErrorMessage())
 
         attempt.addCallbacks(on_connected, on_failed)
 
-    def strain(self, transport: Any) -> Strain | None:
+    def read_state(self, transport: Any) -> StreamState | None:
         """Return the state of a transport's stream from ``struct tcp_info``; None on systems other than Linux."""
         if sys.platform != "linux" or not hasattr(transport, "getHandle"):
             return None
@@ -97,23 +97,23 @@ class TcpCarrier:
         segment, unacked = struct.unpack_from("=I4xI", info, 16)
         (repeated,) = struct.unpack_from("=I", info, 100)
         acked, unsent = struct.unpack_from("=Q16xI", info, 120)
-        return Strain(unacked * segment + unsent, acked, repeated)
+        return StreamState(unacked * segment + unsent, acked, repeated)
 
     def close(self) -> None:
         """Stop listening and dialling."""
-        for attempt in list(self._dialling):
+        for attempt in list(self._connectors):
             attempt.cancel()
         if self._port is not None:
             port, self._port = self._port, None
             self.closed = port.stopListening()
 
     def _listen_on_families(self, accept: Accept) -> Any:
-        if self._host == EVERYWHERE:
+        if self._host == ANY_HOST:
             # One port for both families, if the machine has both.
             with suppress(CannotListenError):
-                return self._reactor.listenTCP(self._wanted, _AcceptFactory(accept), 128, "::")
+                return self._reactor.listenTCP(self._requested_port, _AcceptFactory(accept), 128, "::")
         return self._reactor.listenTCP(
-            self._wanted, _AcceptFactory(accept), 128, "" if self._host == EVERYWHERE else self._host
+            self._requested_port, _AcceptFactory(accept), 128, "" if self._host == ANY_HOST else self._host
         )
 
 
@@ -139,11 +139,11 @@ class _SingleFactory(Factory):
         return self._protocol
 
 
-def _tune(stream: Any) -> None:
+def _configure(stream: Any) -> None:
     """Limit the send buffer of a stream, send without delay, and retransmit soon."""
     options = [(socket.TCP_NODELAY, 1)]
     if sys.platform == "linux":
-        options += [(_NOTSENT_LOWAT, UNSENT), (_THIN_LINEAR_TIMEOUTS, 1), (_RTO_MAX_MS, LONGEST_WAIT_MS)]
+        options += [(_NOTSENT_LOWAT, MAX_UNSENT_BYTES), (_THIN_LINEAR_TIMEOUTS, 1), (_RTO_MAX_MS, MAX_RETRANSMIT_MS)]
     for option, value in options:
         with suppress(OSError):  # the connection was lost meanwhile, or the system does not have the option
             stream.setsockopt(socket.IPPROTO_TCP, option, value)

@@ -16,16 +16,16 @@ from twisted.internet.error import CannotListenError
 from twisted.internet.protocol import DatagramProtocol
 from twisted.logger import Logger
 
-from middleware.entangled.bounded import keep
+from middleware.entangled.bounded import put_bounded
 from middleware.entangled.errors import PortInUse
-from middleware.entangled.network.interface import interfaces, is_any
-from middleware.entangled.network.network import EVERYWHERE, MAX_CARRIED, MAX_LED, Address, Receiver
+from middleware.entangled.network.interface import is_any, list_interfaces
+from middleware.entangled.network.network import ANY_HOST, MAX_ASSIGNED, MAX_RELAYED_BYTES, Address, Receiver
 
 # Bursts arrive faster than Python reads: the usual 208 KiB hold 160 full datagrams, this buffer five times as many.
-RECEIVE_BUFFER = 1 << 20
-ROUTE_S = 5.0
+RECEIVE_BUFFER_BYTES = 1 << 20
+ROUTE_CACHE_S = 5.0
 """The seconds for which routes and addresses are cached: they change when a laptop moves."""
-_PAIRS = 8
+_PORT_ATTEMPTS = 8
 
 
 class UdpNetwork:
@@ -44,20 +44,20 @@ class UdpNetwork:
         self.counters: Counter[str] = Counter()
         self.closed: Deferred[Any] = succeed(None)
         self._reactor = reactor
-        self._host = EVERYWHERE if host == "" else host
-        self._wanted = port
+        self._host = ANY_HOST if host == "" else host
+        self._requested_port = port
         self._number = port
         self._receiver: Receiver | None = None
         self._ports: dict[tuple[int, bool], Any] = {}
         self._port_by_target: dict[Address, int] = {}
-        self._locals: dict[str, tuple[str, float]] = {}
+        self._routes: dict[str, tuple[str, float]] = {}
         self._hosts: list[str] = []
         self._hosts_at = -math.inf
 
     @property
     def address(self) -> Address:
         """The node's address; the port is known after ``listen``."""
-        host = self._cached("", self._own_host) if is_any(self._host) else self._host
+        host = self._find_route("", self._own_host) if is_any(self._host) else self._host
         return Address(host, self._number)
 
     def listen(self, receiver: Receiver) -> None:
@@ -65,22 +65,22 @@ class UdpNetwork:
         if self._ports:
             return
         self._receiver = receiver
-        if self._host != EVERYWHERE:
-            self._number = self._open(0, self._host, self._wanted)
+        if self._host != ANY_HOST:
+            self._number = self._open(0, self._host, self._requested_port)
             return
-        for left in reversed(range(1 if self._wanted else _PAIRS)):
-            self._number = self._open(0, "0.0.0.0", self._wanted)
+        for left in reversed(range(1 if self._requested_port else _PORT_ATTEMPTS)):
+            self._number = self._open(0, "0.0.0.0", self._requested_port)
             try:
                 self._open_ipv6(self._number)
                 return
             except PortInUse:  # without a configured port any will do, but it must be the same in both families
-                self._shut(0)
+                self._close_port(0)
                 if not left:
                     raise
 
     def send(self, datagram: bytes, to: Address) -> None:
         """Send at most ``MAX_CARRIED`` bytes; a datagram that cannot be sent is counted and lost."""
-        if len(datagram) > MAX_CARRIED:
+        if len(datagram) > MAX_RELAYED_BYTES:
             self.counters["oversized"] += 1
             return
         is_six = ":" in to.host
@@ -113,38 +113,38 @@ class UdpNetwork:
         """Open an additional local port, with IPv4 if enabled, and return it; 0 if that fails."""
         if not self._ports:
             return 0
-        host = "0.0.0.0" if self._host == EVERYWHERE else self._host
+        host = "0.0.0.0" if self._host == ANY_HOST else self._host
         try:
             return self._open(None, host, 0)
         except PortInUse:
             return 0
 
-    def shut_port(self, port: int) -> None:
+    def close_port(self, port: int) -> None:
         """Close an additional port."""
         if port:
             self._port_by_target = {to: number for to, number in self._port_by_target.items() if number != port}
-            self._shut(port)
+            self._close_port(port)
 
-    def lead(self, to: Address, port: int) -> int:
+    def assign_port(self, to: Address, port: int) -> int:
         """Assign ``port`` to the target ``to``; 0 is the listening port."""
         before = self._port_by_target.get(to, 0)
-        keep(self._port_by_target, to, port, MAX_LED)
+        put_bounded(self._port_by_target, to, port, MAX_ASSIGNED)
         return before
 
-    def local(self, to: Address, port: int = 0) -> Address:
+    def source_address(self, to: Address, port: int = 0) -> Address:
         """Return the local source address of datagrams to ``to``."""
         host = self._host
         if is_any(host):
-            host = self._cached(to.host, lambda: _route(to.host)) or self.address.host
+            host = self._find_route(to.host, lambda: _ask_route(to.host)) or self.address.host
         return Address(host, port or self._port_by_target.get(to, 0) or self._number)
 
-    def hosts(self) -> list[str]:
+    def local_hosts(self) -> list[str]:
         """Return the addresses of this machine at which it listens, cached for ``ROUTE_S``."""
         if not is_any(self._host):
             return [self._host]
         now = self._reactor.seconds()
-        if now - self._hosts_at > ROUTE_S:
-            self._hosts, self._hosts_at = _own_hosts(), now
+        if now - self._hosts_at > ROUTE_CACHE_S:
+            self._hosts, self._hosts_at = _list_own_hosts(), now
         families = {is_six for _, is_six in self._ports}
         return [host for host in self._hosts if (":" in host) in families]
 
@@ -155,12 +155,12 @@ class UdpNetwork:
         protocol = _Protocol(self, number or 0)
         try:
             # One byte more than the maximum, to detect oversized datagrams.
-            port = self._reactor.listenUDP(wanted, protocol, host, MAX_CARRIED + 1)
+            port = self._reactor.listenUDP(wanted, protocol, host, MAX_RELAYED_BYTES + 1)
         except CannotListenError as error:
-            raise _port_in_use(host, wanted, error.socketError) from error
+            raise _make_port_error(host, wanted, error.socketError) from error
         own: int = port.getHost().port
         protocol.number = own if number is None else number
-        self._keep(port, protocol.number, ":" in host)
+        self._add_port(port, protocol.number, ":" in host)
         return own
 
     def _open_ipv6(self, wanted: int) -> None:
@@ -171,23 +171,23 @@ class UdpNetwork:
                 sock.setblocking(False)
                 sock.bind(("::", wanted))
                 port = self._reactor.adoptDatagramPort(
-                    sock.fileno(), socket.AF_INET6, _Protocol(self, 0), MAX_CARRIED + 1
+                    sock.fileno(), socket.AF_INET6, _Protocol(self, 0), MAX_RELAYED_BYTES + 1
                 )
         except OSError as error:
             if error.errno == errno.EADDRINUSE:
-                raise _port_in_use("::", wanted, error) from error
+                raise _make_port_error("::", wanted, error) from error
             self._log.info("IPv6 is not available on this machine: {error}", error=error)
         else:
-            self._keep(port, 0, True)
+            self._add_port(port, 0, True)
 
-    def _keep(self, port: Any, number: int, is_six: bool) -> None:
+    def _add_port(self, port: Any, number: int, is_six: bool) -> None:
         self._ports[number, is_six] = port
         try:
-            port.socket.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, RECEIVE_BUFFER)
+            port.socket.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, RECEIVE_BUFFER_BYTES)
         except OSError as error:
             self._log.debug("cannot enlarge the receive buffer: {error}", error=error)
 
-    def _shut(self, number: int) -> None:
+    def _close_port(self, number: int) -> None:
         for is_six in (False, True):
             port = self._ports.pop((number, is_six), None)
             if port is not None:
@@ -196,45 +196,45 @@ class UdpNetwork:
     def _own_host(self) -> str:
         # Any address outside this machine will do, because nothing is sent there (RFC 5737 and 3849).
         six = self._host == "::"
-        own = [host for host in _own_hosts() if (":" in host) == six]
-        return _route("2001:db8::1" if six else "192.0.2.1") or next(iter(own), "::1" if six else "127.0.0.1")
+        own = [host for host in _list_own_hosts() if (":" in host) == six]
+        return _ask_route("2001:db8::1" if six else "192.0.2.1") or next(iter(own), "::1" if six else "127.0.0.1")
 
-    def _cached(self, host: str, ask: Callable[[], str]) -> str:
+    def _find_route(self, host: str, ask: Callable[[], str]) -> str:
         """Return a cached route to ``host``, calling ``ask`` again after ``ROUTE_S``."""
-        found, asked_at = self._locals.get(host, ("", -math.inf))
+        found, asked_at = self._routes.get(host, ("", -math.inf))
         now = self._reactor.seconds()
-        if now - asked_at > ROUTE_S:
-            if len(self._locals) > MAX_LED:
-                self._locals.clear()
+        if now - asked_at > ROUTE_CACHE_S:
+            if len(self._routes) > MAX_ASSIGNED:
+                self._routes.clear()
             found = ask()
-            self._locals[host] = found, now
+            self._routes[host] = found, now
         return found
 
     def _receive(self, datagram: bytes, source: Address, number: int) -> None:
-        if len(datagram) > MAX_CARRIED:
+        if len(datagram) > MAX_RELAYED_BYTES:
             self.counters["oversized"] += 1
             return
         self.counters["received"] += 1
         if number and source not in self._port_by_target:
-            self.lead(source, number)
+            self.assign_port(source, number)
         if self._receiver is not None:
             self._receiver(datagram, source)
 
 
-def _port_in_use(host: str, port: int, error: Any) -> PortInUse:
+def _make_port_error(host: str, port: int, error: Any) -> PortInUse:
     reason = getattr(error, "strerror", None) or error
     is_foreign = getattr(error, "errno", None) == errno.EADDRNOTAVAIL
     remedy = "set host to an address of this machine" if is_foreign else "choose another port, or 0 for any"
     return PortInUse(f"UDP {host}:{port}: {reason}; {remedy}")
 
 
-def _own_hosts() -> list[str]:
+def _list_own_hosts() -> list[str]:
     """Return the addresses of this machine that other nodes may reach: no loopback or link-local ones."""
-    found = [host for interface in interfaces() if not interface.is_loopback for host in interface.addresses]
+    found = [host for interface in list_interfaces() if not interface.is_loopback for host in interface.addresses]
     return sorted(found, key=lambda host: ":" in host)
 
 
-def _route(host: str) -> str:
+def _ask_route(host: str) -> str:
     """Return the local source address for ``host``; empty if there is no route."""
     if not _is_ip(host):
         return ""

@@ -10,10 +10,10 @@ from urllib.parse import unquote
 from middleware.entangled.network.network import Address
 
 PATH = "/swarm"
-USUAL_PORTS = {"wss": 443, "ws": 80}
-VIRTUAL = "~wss-"
+DEFAULT_PORTS = {"wss": 443, "ws": 80}
+VIRTUAL_PREFIX = "~wss-"
 """The prefix of the virtual addresses of tunnels, at both ends."""
-_FORM = re.compile(r"(wss?)://(\[[0-9a-fA-F:.]{2,45}\]|[A-Za-z0-9._-]{1,253})(?::([0-9]{1,5}))?(/[!-~]{0,200})?")
+_PATTERN = re.compile(r"(wss?)://(\[[0-9a-fA-F:.]{2,45}\]|[A-Za-z0-9._-]{1,253})(?::([0-9]{1,5}))?(/[!-~]{0,200})?")
 
 
 class Url(NamedTuple):
@@ -25,10 +25,10 @@ class Url(NamedTuple):
     path: str = PATH
 
     @classmethod
-    def of(cls, text: str) -> Url:
+    def parse(cls, text: str) -> Url:
         """Parse a URL; raise ``ValueError`` if it is invalid."""
-        found = _FORM.fullmatch(text)
-        port = int(found[3] or USUAL_PORTS[found[1]]) if found else 0
+        found = _PATTERN.fullmatch(text)
+        port = int(found[3] or DEFAULT_PORTS[found[1]]) if found else 0
         if found is None or not 0 < port < 65536:
             raise ValueError(f"{text[:80]!r} is no wss://host:port/path")
         return cls(found[1], found[2].strip("[]"), port, found[4] or PATH)
@@ -42,12 +42,12 @@ class Url(NamedTuple):
     def authority(self) -> str:
         """Host and port as in HTTP; a default port is omitted, as browsers do."""
         host = f"[{self.host}]" if ":" in self.host else self.host
-        return host if self.port == USUAL_PORTS[self.scheme] else f"{host}:{self.port}"
+        return host if self.port == DEFAULT_PORTS[self.scheme] else f"{host}:{self.port}"
 
     @property
     def address(self) -> Address:
         """The virtual address of the node that serves the URL."""
-        return Address(VIRTUAL + hashlib.blake2s(str(self).encode(), digest_size=6).hexdigest(), 1)
+        return Address(VIRTUAL_PREFIX + hashlib.blake2s(str(self).encode(), digest_size=6).hexdigest(), 1)
 
     def __str__(self) -> str:
         return f"{self.scheme}://{self.authority}{self.path}"
@@ -61,7 +61,7 @@ class Proxy(NamedTuple):
     login: str = ""
 
     @classmethod
-    def of(cls, text: str) -> Proxy:
+    def parse(cls, text: str) -> Proxy:
         """Parse the environment variable ``https_proxy``; raise ``ValueError`` if it is invalid."""
         found = re.fullmatch(r"(?:http://)?(?:([^@/]+)@)?(\[[0-9a-fA-F:.]+\]|[^:@/\[\]]+)(?::([0-9]{1,5}))?/?", text)
         port = int(found[3] or 3128) if found else 0

@@ -13,11 +13,11 @@ from dataclasses import dataclass
 from enum import Enum
 from typing import Any, Generic, NamedTuple
 
-from middleware.entangled.quorum.ballot import FIRST, NONE, Ballot, Ceiling, Name
-from middleware.entangled.quorum.log import Key, Log
-from middleware.entangled.quorum.register import Kind, Register, Reply
+from middleware.entangled.quorum.ballot import FIRST_CONFIGURATION, NO_BALLOT, Ballot, Ceiling, ProposerName
+from middleware.entangled.quorum.log import Key, RegisterLog
+from middleware.entangled.quorum.register import Register, Reply, ReplyKind
 
-NO_ROOM = Reply(Kind.QUIET, remaining=1.0)
+NO_ROOM_REPLY = Reply(ReplyKind.QUIET, remaining=1.0)
 """The reply if there is no room for a register: ask again in a second."""
 
 
@@ -39,7 +39,7 @@ class Event(Enum):
     RELEASE = "release"
 
 
-class Stand(Enum):
+class BallotRelation(Enum):
     """The relation of a ballot to a register at one time."""
 
     BEHIND = "behind"
@@ -67,14 +67,22 @@ class _Request(NamedTuple):
     event: Event
     ballot: Ballot
     now: float
-    configuration: int = FIRST
+    configuration: int = FIRST_CONFIGURATION
     token: int = 0
     ttl: float = 0.0
     gives_back: bool = False
 
 
-_COLUMNS = (Stand.HELD, Stand.LOWER, Stand.OVERTAKEN, Stand.OWN, Stand.ENDING, Stand.RESERVED, Stand.FREE)
-_G, _H, _O = Kind.GRANTED, Kind.HELD, Kind.OUTBID
+_COLUMNS = (
+    BallotRelation.HELD,
+    BallotRelation.LOWER,
+    BallotRelation.OVERTAKEN,
+    BallotRelation.OWN,
+    BallotRelation.ENDING,
+    BallotRelation.RESERVED,
+    BallotRelation.FREE,
+)
+_G, _H, _O = ReplyKind.GRANTED, ReplyKind.HELD, ReplyKind.OUTBID
 _VOTES = {
     # L3: a prepare during a lease changes nothing.
     Event.PREPARE: (_H, _O, _O, _G, _G, _H, _G),
@@ -85,54 +93,62 @@ _VOTES = {
     # C2: no value is accepted during a lease.
     Event.ACCEPT: (_H, _O, _O, _H, _H, _G, _G),
 }
-_RELEASES = {Stand.FOREIGN: Kind.UNPREPARED, Stand.LOWER: _O, Stand.HELD: _G, Stand.FREE: _G}
+_RELEASES = {
+    BallotRelation.FOREIGN: ReplyKind.UNPREPARED,
+    BallotRelation.LOWER: _O,
+    BallotRelation.HELD: _G,
+    BallotRelation.FREE: _G,
+}
 
 
-def _rows() -> Iterator[tuple[tuple[State, Event, Stand], tuple[Kind, State]]]:
+def _make_rows() -> Iterator[tuple[tuple[State, Event, BallotRelation], tuple[ReplyKind, State]]]:
     for state in State:
         is_unknown, is_sealed = state is State.UNKNOWN, state is State.SEALED
         for stand, kind in _RELEASES.items():
-            yield (state, Event.RELEASE, stand), (Kind.UNPREPARED if is_unknown else kind, state)
+            yield (state, Event.RELEASE, stand), (ReplyKind.UNPREPARED if is_unknown else kind, state)
         for event, kinds in _VOTES.items():
-            stands = dict(zip(_COLUMNS, kinds, strict=True)) | {Stand.BEHIND: Kind.BEHIND, Stand.MOVED: Kind.MOVED}
+            stands = dict(zip(_COLUMNS, kinds, strict=True)) | {
+                BallotRelation.BEHIND: ReplyKind.BEHIND,
+                BallotRelation.MOVED: ReplyKind.MOVED,
+            }
             for stand, kind in stands.items():
                 answer, after = kind, state
                 if is_unknown and event is not Event.PREPARE:
-                    answer = Kind.UNPREPARED  # R4: the acceptor may have forgotten a promise
-                elif state is State.OVER and stand is not Stand.BEHIND:
-                    answer = Kind.OVER  # C4: after the end nothing is granted
-                elif is_sealed and event is Event.LEASE and kind not in (Kind.BEHIND, Kind.MOVED):
-                    answer = Kind.SEALED  # C1: a sealed configuration leases nothing
-                elif is_sealed and event is Event.PREPARE and kind is Kind.GRANTED:
-                    answer = Kind.SEALED  # A2: a promise reports the accepted value
-                elif kind is Kind.GRANTED and (is_unknown or event is Event.ACCEPT):
+                    answer = ReplyKind.UNPREPARED  # R4: the acceptor may have forgotten a promise
+                elif state is State.OVER and stand is not BallotRelation.BEHIND:
+                    answer = ReplyKind.OVER  # C4: after the end nothing is granted
+                elif is_sealed and event is Event.LEASE and kind not in (ReplyKind.BEHIND, ReplyKind.MOVED):
+                    answer = ReplyKind.SEALED  # C1: a sealed configuration leases nothing
+                elif is_sealed and event is Event.PREPARE and kind is ReplyKind.GRANTED:
+                    answer = ReplyKind.SEALED  # A2: a promise reports the accepted value
+                elif kind is ReplyKind.GRANTED and (is_unknown or event is Event.ACCEPT):
                     after = State.OPEN if is_unknown else State.SEALED
                 yield (state, event, stand), (answer, after)
 
 
-TABLE = dict(_rows())
+TABLE = dict(_make_rows())
 """(state, event, stand) to (answer, next state)."""
 
 
 @dataclass(frozen=True)
-class Terms:
+class AcceptorSettings:
     """Parameters of one use of registers.
 
     During the last ``ahead`` share of a lease the time after it may be promised.  Only its proposer may complete an
     accepted value within ``finish`` seconds.  With ``must_prepare`` an unknown register has to be prepared first.
     """
 
-    ahead: float = 0.0
-    finish: float = 0.0
+    early_share: float = 0.0
+    completion_s: float = 0.0
     must_prepare: bool = False
 
 
 class Acceptor(Generic[Key]):
     """An acceptor started at ``born_at``; if its log is incomplete it grants nothing for the longest ttl."""
 
-    def __init__(self, log: Log[Key], terms: Terms, born_at: float = -math.inf) -> None:
+    def __init__(self, log: RegisterLog[Key], terms: AcceptorSettings, born_at: float = -math.inf) -> None:
         self.log = log
-        self._terms = terms
+        self._settings = terms
         self._started_at = born_at
 
     def prepare(
@@ -144,30 +160,30 @@ class Acceptor(Generic[Key]):
         acceptor whose lease expired because it missed a renewal must not be lost to the healthy holder.
         """
         register, reply = self._decide(key, _Request(Event.PREPARE, ballot, now, configuration, ttl=ttl))
-        if reply.kind in (Kind.GRANTED, Kind.SEALED):
+        if reply.kind in (ReplyKind.GRANTED, ReplyKind.SEALED):
             register.touched_at = now
             if ballot.counter > 0:
                 is_new = ballot > register.promised or reserve != register.reserve
                 register.promised = ballot  # P1
                 register.reserve, register.reserved_until = reserve, now + reserve
                 if is_new:  # D1: durable before the reply
-                    self.log.keep(key)
+                    self.log.write(key)
             reply = self._reply(reply.kind, register, now)
-        return reply._replace(remaining=0.0) if ballot.is_kin(register.holder, self.log.codec.lives) else reply
+        return reply._replace(remaining=0.0) if ballot.is_same_life(register.holder, self.log.codec.lives) else reply
 
     def lease(self, key: Key, configuration: int, ballot: Ballot, token: int, ttl: float, now: float) -> Reply:
         """Grant or renew the lease for ``ttl`` seconds from now."""
         register, reply = self._decide(key, _Request(Event.LEASE, ballot, now, configuration, token, ttl))
-        if reply.kind is not Kind.GRANTED:
+        if reply.kind is not ReplyKind.GRANTED:
             return reply
         promised = max(register.promised, ballot)
         before = register.promised, register.holder, register.token, register.ttl
         register.promised, register.holder, register.token, register.ttl = promised, ballot, token, ttl
         register.grantee = ballot.proposer
-        register.until, register.touched_at = now + ttl, now
+        register.lease_until, register.touched_at = now + ttl, now
         if before != (promised, ballot, token, ttl):  # D1: durable before the reply
-            self.log.keep(key)
-        return self._reply(Kind.GRANTED, register, now)
+            self.log.write(key)
+        return self._reply(ReplyKind.GRANTED, register, now)
 
     def accept(
         self,
@@ -185,16 +201,16 @@ class Acceptor(Generic[Key]):
         ``token`` is the highest token that the proposer knows.
         """
         register, reply = self._decide(key, _Request(Event.ACCEPT, ballot, now, configuration, token, 0.0, gives_back))
-        if reply.kind is not Kind.GRANTED:
+        if reply.kind is not ReplyKind.GRANTED:
             return reply
         is_new = (register.accepted, register.value) != (ballot, value)
         register.promised = register.accepted = ballot
         register.value, register.touched_at = value, now
-        register.reserve, register.reserved_until = self._terms.finish, now + self._terms.finish
-        register.hear_token(token)
+        register.reserve, register.reserved_until = self._settings.completion_s, now + self._settings.completion_s
+        register.record_token(token)
         if is_new:  # D1
-            self.log.keep(key)
-        return self._reply(Kind.GRANTED, register, now)
+            self.log.write(key)
+        return self._reply(ReplyKind.GRANTED, register, now)
 
     def release(self, key: Key, ballot: Ballot, now: float, rest: float = 0.0) -> Reply:
         """Release promises and leases under ``ballot`` and older ballots of its life; accepted values stay.
@@ -204,23 +220,23 @@ class Acceptor(Generic[Key]):
         """
         request = _Request(Event.RELEASE, ballot, now)
         register, reply = self._decide(key, request)
-        if reply.kind is not Kind.GRANTED:
+        if reply.kind is not ReplyKind.GRANTED:
             return reply
-        if self._stand(register, request) is Stand.HELD:
+        if self._find_relation(register, request) is BallotRelation.HELD:
             # The promise was for the time after another's lease, which stays valid.
-            register.promised = max(register.promised, Ballot(ballot.counter + 1, self.log.codec.nobody))
+            register.promised = max(register.promised, Ballot(ballot.counter + 1, self.log.codec.lowest_name))
         else:
             # B3: a delayed request under this ballot is refused.
-            register.spent = ballot
+            register.released = ballot
         if register.promised <= ballot:
             register.reserve, register.reserved_until = 0.0, now
-        if ballot.is_kin(register.holder, self.log.codec.lives) and register.holder <= ballot:
-            register.until = min(register.until, now + rest)
-            register.holder = register.holder if register.until > now else NONE
-        self.log.keep(key)  # D1
-        return self._reply(Kind.GRANTED, register, now)
+        if ballot.is_same_life(register.holder, self.log.codec.lives) and register.holder <= ballot:
+            register.lease_until = min(register.lease_until, now + rest)
+            register.holder = register.holder if register.lease_until > now else NO_BALLOT
+        self.log.write(key)  # D1
+        return self._reply(ReplyKind.GRANTED, register, now)
 
-    def close(self, key: Key, proposer: Name, configuration: int, token: int, now: float) -> Reply:
+    def close(self, key: Key, proposer: ProposerName, configuration: int, token: int, now: float) -> Reply:
         """Close the register, so that it grants nothing; ``remaining`` is the time in which a holder may still act.
 
         A proposer proves itself by the token that it was granted here, even if it has released the lease since; token
@@ -229,14 +245,16 @@ class Acceptor(Generic[Key]):
         """
         register = self._get_or_enter(key, now)
         if register is None:
-            return NO_ROOM
+            return NO_ROOM_REPLY
         if token and (register.token, register.grantee) != (token, proposer):  # C5: a proof names the granted token
-            return self._reply(Kind.OUTBID if token < register.token else Kind.BEHIND, register, now)
-        if not register.is_over:
-            register.is_over, register.touched_at = True, now
-            self.log.keep(key)  # D1
-        has_moved, is_sealed = configuration < register.configuration, register.accepted != NONE
-        reply = self._reply(Kind.MOVED if has_moved else Kind.SEALED if is_sealed else Kind.OVER, register, now)
+            return self._reply(ReplyKind.OUTBID if token < register.token else ReplyKind.BEHIND, register, now)
+        if not register.is_closed:
+            register.is_closed, register.touched_at = True, now
+            self.log.write(key)  # D1
+        has_moved, is_sealed = configuration < register.configuration, register.accepted != NO_BALLOT
+        reply = self._reply(
+            ReplyKind.MOVED if has_moved else ReplyKind.SEALED if is_sealed else ReplyKind.OVER, register, now
+        )
         is_done = register.holder.proposer == proposer and register.token == token
         return reply._replace(remaining=0.0) if is_done else reply
 
@@ -247,7 +265,7 @@ class Acceptor(Generic[Key]):
         value: Any,
         token: int,
         now: float,
-        ballot: Ballot = NONE,
+        ballot: Ballot = NO_BALLOT,
         ttl: float = 0.0,
         proof: bytes = b"",
     ) -> Reply:
@@ -258,15 +276,17 @@ class Acceptor(Generic[Key]):
         """
         register = self._get_or_enter(key, now)
         if register is None:
-            return NO_ROOM
+            return NO_ROOM_REPLY
         if configuration > register.configuration:  # C3: configurations only rise
-            register.configuration, register.value, register.accepted = configuration, value, NONE
-            register.holder, register.until = ballot, now if ballot == NONE else now + ttl
+            register.configuration, register.value, register.accepted = configuration, value, NO_BALLOT
+            register.holder, register.lease_until = ballot, now if ballot == NO_BALLOT else now + ttl
             register.touched_at, register.proof = now, proof
-            register.hear_token(token, ballot.proposer)
+            register.record_token(token, ballot.proposer)
             register.ceiling = Ceiling(now, self.log.codec.lives, register.promised.counter, register.token)
-            self.log.keep(key)  # D1
-        return self._reply(Kind.GRANTED if configuration == register.configuration else Kind.MOVED, register, now)
+            self.log.write(key)  # D1
+        return self._reply(
+            ReplyKind.GRANTED if configuration == register.configuration else ReplyKind.MOVED, register, now
+        )
 
     # -- inside -----------------------------------------------------------------------------------------------------
 
@@ -274,65 +294,71 @@ class Acceptor(Generic[Key]):
         """Return the register and the reply by the table; store a new register only if something is granted."""
         event, ballot, now, *_ = request
         known = self.log.get(key)
-        register = known or self.log.blank(now)
-        quiet = self._silence(request.ttl) - now
+        register = known or self.log.make_register(now)
+        quiet = self._quiet_until(request.ttl) - now
         if quiet > 0.0 and event is not Event.RELEASE:  # R1: it may have forgotten a grant
-            return register, Reply(Kind.QUIET, remaining=quiet)
-        is_unknown = known is None and (self._terms.must_prepare or event is Event.RELEASE)
-        state = State.UNKNOWN if is_unknown else state_of(register)
-        kind, _ = TABLE[state, event, self._stand(register, request)]
-        if known is None and kind is Kind.GRANTED and ballot.counter > 0 and not self.log.enter(key, register, now):
-            return register, NO_ROOM
+            return register, Reply(ReplyKind.QUIET, remaining=quiet)
+        is_unknown = known is None and (self._settings.must_prepare or event is Event.RELEASE)
+        state = State.UNKNOWN if is_unknown else find_state(register)
+        kind, _ = TABLE[state, event, self._find_relation(register, request)]
+        if known is None and kind is ReplyKind.GRANTED and ballot.counter > 0 and not self.log.add(key, register, now):
+            return register, NO_ROOM_REPLY
         return register, self._reply(kind, register, now)
 
-    def _stand(self, register: Register, request: _Request) -> Stand:
+    def _find_relation(self, register: Register, request: _Request) -> BallotRelation:
         event, ballot, now, configuration, token, _, gives_back = request
         lives = self.log.codec.lives
-        left = register.until - now
-        is_own = ballot.is_kin(register.holder, lives)  # L2: an earlier life of the holder is another holder
-        is_held = left > 0.0 and not is_own and not register.is_given_back
+        left = register.lease_until - now
+        is_own = ballot.is_same_life(register.holder, lives)  # L2: an earlier life of the holder is another holder
+        is_held = left > 0.0 and not is_own and not register.is_released
         if event is Event.RELEASE:
-            if not (is_own or ballot.is_kin(register.promised, lives)):
-                return Stand.FOREIGN
-            return Stand.LOWER if ballot <= register.spent else Stand.HELD if is_held else Stand.FREE
+            if not (is_own or ballot.is_same_life(register.promised, lives)):
+                return BallotRelation.FOREIGN
+            return (
+                BallotRelation.LOWER
+                if ballot <= register.released
+                else BallotRelation.HELD
+                if is_held
+                else BallotRelation.FREE
+            )
         if configuration != register.configuration:  # C3
-            return Stand.BEHIND if configuration > register.configuration else Stand.MOVED
-        if is_held and (ballot.counter == 0 or left > self._terms.ahead * register.ttl):
-            return Stand.HELD
+            return BallotRelation.BEHIND if configuration > register.configuration else BallotRelation.MOVED
+        if is_held and (ballot.counter == 0 or left > self._settings.early_share * register.ttl):
+            return BallotRelation.HELD
         if ballot.counter > 0:
             is_lower_token = token < register.token or (token == register.token and not is_own)
             if event is Event.LEASE and is_lower_token:  # T2: a token belongs to one holder
-                return Stand.LOWER
-            if ballot <= register.spent:  # B3
-                return Stand.LOWER
+                return BallotRelation.LOWER
+            if ballot <= register.released:  # B3
+                return BallotRelation.LOWER
             if not register.ceiling.admits(now, ballot.counter, token):  # N1
-                return Stand.LOWER
+                return BallotRelation.LOWER
             if ballot < register.promised:  # P1
-                extends = left > 0.0 and is_own and not register.is_given_back and token == register.token
-                return Stand.OVERTAKEN if extends else Stand.LOWER
+                extends = left > 0.0 and is_own and not register.is_released and token == register.token
+                return BallotRelation.OVERTAKEN if extends else BallotRelation.LOWER
         if left > 0.0 and not (gives_back and is_own):
-            return Stand.OWN if is_own else Stand.ENDING
-        is_reserved = register.reserved_until > now and not ballot.is_kin(register.promised, lives)
-        return Stand.RESERVED if is_reserved else Stand.FREE
+            return BallotRelation.OWN if is_own else BallotRelation.ENDING
+        is_reserved = register.reserved_until > now and not ballot.is_same_life(register.promised, lives)
+        return BallotRelation.RESERVED if is_reserved else BallotRelation.FREE
 
-    def _silence(self, ttl: float) -> float:
+    def _quiet_until(self, ttl: float) -> float:
         """Return the time until which nothing is granted."""
-        return -math.inf if self.log.is_whole else self._started_at + max(ttl, self.log.floor.longest)
+        return -math.inf if self.log.is_complete else self._started_at + max(ttl, self.log.floor.longest)
 
     def _get_or_enter(self, key: Key, now: float) -> Register | None:
         """Return the register, a new one if needed, or None if there is no room."""
-        register = self.log.get(key) or self.log.blank(now)
-        return register if key in self.log.registers or self.log.enter(key, register, now) else None
+        register = self.log.get(key) or self.log.make_register(now)
+        return register if key in self.log.registers or self.log.add(key, register, now) else None
 
-    def _reply(self, kind: Kind, register: Register, now: float) -> Reply:
-        remaining = max(0.0, register.until - now, register.reserved_until - now)
-        proof = register.proof if kind is Kind.MOVED else b""
+    def _reply(self, kind: ReplyKind, register: Register, now: float) -> Reply:
+        remaining = max(0.0, register.lease_until - now, register.reserved_until - now)
+        proof = register.proof if kind is ReplyKind.MOVED else b""
         known = register.promised, register.token, remaining, register.configuration, register.accepted, register.value
         return Reply(kind, *known, proof)
 
 
-def state_of(register: Register) -> State:
+def find_state(register: Register) -> State:
     """Return the state of a register for the table."""
-    if register.is_over:
+    if register.is_closed:
         return State.OVER
-    return State.OPEN if register.accepted == NONE else State.SEALED
+    return State.OPEN if register.accepted == NO_BALLOT else State.SEALED

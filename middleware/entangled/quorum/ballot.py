@@ -7,16 +7,16 @@ from typing import Any, NamedTuple
 
 MAX_NUMBER = 2**62
 """Exclusive upper bound of counters, tokens and configurations."""
-FIRST = 1
+FIRST_CONFIGURATION = 1
 """The first configuration of a register."""
-ROOM = 2**32
-RATE = 2**10
+INITIAL_CEILING = 2**32
+CEILING_RATE_PER_S = 2**10
 """An acceptor refuses tokens and attempts above ``ROOM``, or above its own at its start, plus ``RATE`` per second.  A
 proposer cannot exhaust them: the 2**42 attempts last for 136 years, and there are more tokens."""
-TOLD_BY_ONE = ROOM // 2
+MAX_UNCONFIRMED = INITIAL_CEILING // 2
 """A proposer believes a higher number only from two acceptors: a single one may have invented it."""
 
-Name = Any
+ProposerName = Any
 """The name of a proposer: ``str`` or ``bytes``, the same in all ballots of a register."""
 
 
@@ -24,31 +24,31 @@ class Ballot(NamedTuple):
     """The number of an attempt; the name of its proposer makes it unique and breaks ties (invariant B1)."""
 
     counter: int
-    proposer: Name
+    proposer: ProposerName
 
-    def is_kin(self, other: Ballot, lives: int) -> bool:
+    def is_same_life(self, other: Ballot, lives: int) -> bool:
         """Return whether both are from the same life (process) of a proposer, which ``counter % lives`` identifies."""
         return self.proposer == other.proposer and self.counter % lives == other.counter % lives
 
 
-NONE = Ballot(0, "")
+NO_BALLOT = Ballot(0, "")
 
 
 class Ceiling:
     """Upper bounds of attempts (``counter // lives``) and tokens at an acceptor, rising from the time ``since``."""
 
-    __slots__ = ("_attempts", "_lives", "_since", "_tokens")
+    __slots__ = ("_max_attempts", "_lives", "_since", "_max_tokens")
 
     def __init__(self, since: float, lives: int, counter: int = 0, token: int = 0) -> None:
         self._since = since
         self._lives = lives
-        self._attempts = max(ROOM, counter // lives)
-        self._tokens = max(ROOM, token)
+        self._max_attempts = max(INITIAL_CEILING, counter // lives)
+        self._max_tokens = max(INITIAL_CEILING, token)
 
     def admits(self, now: float, counter: int, token: int = 0) -> bool:
         """Return whether both numbers are within the bounds at ``now``."""
-        rise = int(RATE * max(0.0, now - self._since))
-        return counter // self._lives <= self._attempts + rise and token <= self._tokens + rise
+        rise = int(CEILING_RATE_PER_S * max(0.0, now - self._since))
+        return counter // self._lives <= self._max_attempts + rise and token <= self._max_tokens + rise
 
 
 def is_number(value: object) -> bool:
@@ -56,11 +56,11 @@ def is_number(value: object) -> bool:
     return type(value) is int and 0 <= value < MAX_NUMBER
 
 
-def believed(numbers: Iterable[int], size: int) -> int:
+def highest_credible(numbers: Iterable[int], size: int) -> int:
     """Return the highest of ``numbers``, sent by a quorum of ``size``, that no single member can have invented."""
     descending = sorted(numbers, reverse=True)
     witnessed = descending[1:] if size > 2 else descending
-    return max([*witnessed[:1], *(number for number in descending if number <= TOLD_BY_ONE)], default=0)
+    return max([*witnessed[:1], *(number for number in descending if number <= MAX_UNCONFIRMED)], default=0)
 
 
 def majority(size: int) -> int:

@@ -10,7 +10,7 @@ from collections.abc import Callable, Hashable, Iterator
 from dataclasses import dataclass
 from typing import Generic, NamedTuple, Protocol, TypeVar
 
-from middleware.entangled.quorum.ballot import NONE, Ballot, Ceiling, Name
+from middleware.entangled.quorum.ballot import NO_BALLOT, Ballot, Ceiling, ProposerName
 from middleware.entangled.quorum.register import Register
 
 MAX_REGISTERS = 4096
@@ -28,13 +28,13 @@ class Floor(NamedTuple):
     longest: float = 0.0
 
 
-class Notes(Protocol):
+class NoteStore(Protocol):
     """A durable map of small values; ``Store`` implements it."""
 
-    def note(self, name: str, value: bytes) -> None:
+    def set_note(self, name: str, value: bytes) -> None:
         """Store ``value`` under ``name``."""
 
-    def noted(self, name: str) -> bytes | None:
+    def get_note(self, name: str) -> bytes | None:
         """Return the value under ``name``, or None."""
 
 
@@ -50,7 +50,7 @@ class Codec(Generic[Key]):
     floor_name: str
     name: str
     buckets: int
-    nobody: Name
+    lowest_name: ProposerName
     lives: int
     bucket_of: Callable[[Key], str]
     pack: Callable[[dict[Key, Register]], bytes]
@@ -64,7 +64,7 @@ class Codec(Generic[Key]):
         return map(self.name.format, range(self.buckets))
 
 
-class Log(Generic[Key]):
+class RegisterLog(Generic[Key]):
     """The registers of one acceptor, in memory and in ``notes``.
 
     ``is_whole`` is False if notes of an earlier process are missing or corrupt; ``may_forget`` returns whether a
@@ -72,22 +72,22 @@ class Log(Generic[Key]):
     """
 
     def __init__(
-        self, notes: Notes, codec: Codec[Key], may_forget: Callable[[Key, Register, float], bool], now: float = 0.0
+        self, notes: NoteStore, codec: Codec[Key], may_forget: Callable[[Key, Register, float], bool], now: float = 0.0
     ) -> None:
         self.registers: dict[Key, Register] = {}
         self._notes = notes
         self.codec = codec
         self._may_forget = may_forget
         self._buckets: dict[str, dict[Key, None]] = {}
-        floor = codec.unpack_floor(notes.noted(codec.floor_name))
-        self.is_whole = floor is not None
+        floor = codec.unpack_floor(notes.get_note(codec.floor_name))
+        self.is_complete = floor is not None
         self.floor = floor or Floor()
         for name in codec.names:
-            noted = notes.noted(name)
+            noted = notes.get_note(name)
             rows, is_whole = codec.unpack(noted) if noted else ({}, True)
-            self.is_whole = self.is_whole and is_whole
+            self.is_complete = self.is_complete and is_whole
             for key, register in rows.items():
-                register.wake(now, codec.lives)
+                register.restart_leases(now, codec.lives)
                 self._add(key, register)
         if floor is None:
             self._note_floor()
@@ -99,22 +99,22 @@ class Log(Generic[Key]):
         """Return the register under ``key``, or None."""
         return self.registers.get(key)
 
-    def blank(self, now: float) -> Register:
+    def make_register(self, now: float) -> Register:
         """Return a new register that is not in the log yet."""
         counter, token, _ = self.floor
         # R3: ballots that an evicted register may have promised or outbid are lower.
-        promised = Ballot(counter + 1, self.codec.nobody) if counter else NONE
+        promised = Ballot(counter + 1, self.codec.lowest_name) if counter else NO_BALLOT
         ceiling = Ceiling(now, self.codec.lives, counter, token)
         return Register(ceiling, promised=promised, token=token, touched_at=now)
 
-    def enter(self, key: Key, register: Register, now: float) -> bool:
+    def add(self, key: Key, register: Register, now: float) -> bool:
         """Add a register; return False if there is no room."""
         if len(self.registers) >= MAX_REGISTERS and not self._make_room(now):
             return False
         self._add(key, register)
         return True
 
-    def keep(self, key: Key) -> None:
+    def write(self, key: Key) -> None:
         """Write the present state of a register to the notes."""
         longest = self.registers[key].ttl
         if longest > self.floor.longest:
@@ -126,9 +126,9 @@ class Log(Generic[Key]):
         """Remove all registers and the floor, once no proposer relies on this acceptor's votes."""
         self.registers.clear()
         self._buckets.clear()
-        self.floor, self.is_whole = Floor(), True
+        self.floor, self.is_complete = Floor(), True
         for name in self.codec.names:
-            if self._notes.noted(name):
+            if self._notes.get_note(name):
                 self._note(name)
         self._note_floor()
 
@@ -158,7 +158,7 @@ class Log(Generic[Key]):
 
     def _note(self, name: str) -> None:
         rows = {key: self.registers[key] for key in self._buckets.get(name, ())}
-        self._notes.note(name, self.codec.pack(rows))
+        self._notes.set_note(name, self.codec.pack(rows))
 
     def _note_floor(self) -> None:
-        self._notes.note(self.codec.floor_name, self.codec.pack_floor(self.floor))
+        self._notes.set_note(self.codec.floor_name, self.codec.pack_floor(self.floor))

@@ -8,10 +8,10 @@ from enum import Enum
 from typing import Any, NamedTuple
 
 from middleware.entangled.quorum.ballot import Ballot
-from middleware.entangled.quorum.register import Kind
+from middleware.entangled.quorum.register import ReplyKind
 from middleware.entangled.quorum.round import Tally
 
-BACK_OFF = (0.05, 2.0)
+BACKOFF_S = (0.05, 2.0)
 """Seconds of the first and the longest pause between two attempts; the pause doubles each time."""
 
 
@@ -45,15 +45,15 @@ def conclude(tally: Tally) -> Outcome:
     """Return the outcome of a finished round."""
     replies = tally.replies.values()
     counter = max((reply.promised.counter for reply in replies), default=0)
-    if tally.chosen is not None:
-        return Outcome(Result.DECIDED, tally.chosen, counter)
+    if tally.chosen_value is not None:
+        return Outcome(Result.DECIDED, tally.chosen_value, counter)
     if tally.is_won:
-        return Outcome(Result.WON, tally.to_complete, counter)
-    remaining = max((reply.remaining for reply in replies if reply.kind is Kind.HELD), default=0.0)
+        return Outcome(Result.WON, tally.value_to_complete, counter)
+    remaining = max((reply.remaining for reply in replies if reply.kind is ReplyKind.HELD), default=0.0)
     kinds = [reply.kind for reply in replies]
-    if Kind.OUTBID in kinds:
+    if ReplyKind.OUTBID in kinds:
         return Outcome(Result.OUTBID, None, counter, remaining)
-    return Outcome(Result.HELD if Kind.HELD in kinds else Result.SILENT, None, counter, remaining)
+    return Outcome(Result.HELD if ReplyKind.HELD in kinds else Result.SILENT, None, counter, remaining)
 
 
 async def decide(
@@ -69,7 +69,7 @@ async def decide(
     Proposes ``value`` if no other value was accepted.  With None it proposes none, and returns None if no value was
     accepted.
     """
-    pause = BACK_OFF[0]
+    pause = BACKOFF_S[0]
     while True:
         outcome = await prepare(ballot)
         counter = max(ballot.counter, outcome.counter)
@@ -84,6 +84,6 @@ async def decide(
         if outcome.result is Result.DECIDED:
             return ballot, outcome.value
         # Shorter than another's lease, which may be released early or end in a decision.
-        await sleep(max(min(outcome.remaining, BACK_OFF[1]), pause * (0.5 + rng.random())))
-        pause = min(2 * pause, BACK_OFF[1])
+        await sleep(max(min(outcome.remaining, BACKOFF_S[1]), pause * (0.5 + rng.random())))
+        pause = min(2 * pause, BACKOFF_S[1])
         ballot = Ballot(counter + 1, ballot.proposer)

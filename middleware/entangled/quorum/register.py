@@ -6,10 +6,10 @@ from dataclasses import dataclass, field
 from enum import Enum
 from typing import Any, NamedTuple
 
-from middleware.entangled.quorum.ballot import FIRST, NONE, Ballot, Ceiling, Name
+from middleware.entangled.quorum.ballot import FIRST_CONFIGURATION, NO_BALLOT, Ballot, Ceiling, ProposerName
 
 
-class Kind(Enum):
+class ReplyKind(Enum):
     """The kind of an acceptor's reply."""
 
     GRANTED = "granted"
@@ -39,12 +39,12 @@ class Reply(NamedTuple):
     acceptor.
     """
 
-    kind: Kind
-    promised: Ballot = NONE
+    kind: ReplyKind
+    promised: Ballot = NO_BALLOT
     token: int = 0
     remaining: float = 0.0
     configuration: int = 0
-    accepted: Ballot = NONE
+    accepted: Ballot = NO_BALLOT
     value: Any = None
     proof: bytes = b""
 
@@ -61,36 +61,36 @@ class Register:
     """
 
     ceiling: Ceiling
-    configuration: int = FIRST
-    promised: Ballot = NONE
-    holder: Ballot = NONE
-    spent: Ballot = NONE
-    accepted: Ballot = NONE
+    configuration: int = FIRST_CONFIGURATION
+    promised: Ballot = NO_BALLOT
+    holder: Ballot = NO_BALLOT
+    released: Ballot = NO_BALLOT
+    accepted: Ballot = NO_BALLOT
     token: int = 0
-    grantee: Name = ""
+    grantee: ProposerName = ""
     ttl: float = 0.0
     reserve: float = 0.0
     value: Any = None
-    is_over: bool = False
+    is_closed: bool = False
     proof: bytes = b""
-    until: float = 0.0
+    lease_until: float = 0.0
     reserved_until: float = 0.0
     touched_at: float = 0.0
-    listeners: dict[Name, float] = field(default_factory=dict)
+    listeners: dict[ProposerName, float] = field(default_factory=dict)
 
     @property
-    def is_given_back(self) -> bool:
+    def is_released(self) -> bool:
         """Whether the holder has released the lease; its device may still move until it is at rest."""
-        return self.holder <= self.spent
+        return self.holder <= self.released
 
-    def hear_token(self, token: int, grantee: Name = "") -> None:
+    def record_token(self, token: int, grantee: ProposerName = "") -> None:
         """Record a token that other acceptors granted, to ``grantee`` if known."""
         if token > self.token:  # T1: the token never falls
             self.token, self.grantee = token, grantee
 
-    def wake(self, now: float, lives: int) -> None:
+    def restart_leases(self, now: float, lives: int) -> None:
         """Restart all leases at ``now``, because their times were on the clock of an earlier process."""
         self.touched_at = now
-        self.until = now + self.ttl if self.holder != NONE else 0.0  # R2: a restart shortens no lease
+        self.lease_until = now + self.ttl if self.holder != NO_BALLOT else 0.0  # R2: a restart shortens no lease
         self.reserved_until = now + self.reserve
         self.ceiling = Ceiling(now, lives, self.promised.counter, self.token)

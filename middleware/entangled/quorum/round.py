@@ -11,15 +11,15 @@ from twisted.internet.defer import Deferred
 from twisted.internet.interfaces import IDelayedCall, IReactorTime
 from twisted.python.failure import Failure
 
-from middleware.entangled.quorum.ballot import NONE, majority
-from middleware.entangled.quorum.register import Kind, Reply
+from middleware.entangled.quorum.ballot import NO_BALLOT, majority
+from middleware.entangled.quorum.register import Reply, ReplyKind
 
-TRIES = 3
+MIN_TRIES = 3
 """Minimum number of requests to a member: a majority would be enough, but a member that missed a renewal may promise to
 another proposer."""
-PAUSE = 0.1
+RETRY_INTERVAL_S = 0.1
 """Seconds between two requests to a member that has not answered."""
-NEWS = 0.03
+NEWS_INTERVAL_S = 0.03
 """Seconds before the next request to a member that has not received a release yet."""
 MIN_PAUSE_S = 0.005
 """Minimum seconds before the next request to a member with a lease about to expire."""
@@ -31,7 +31,7 @@ Decode = Callable[[int, object], "Sequence[Reply | None] | None"]
 class Tally:
     """The replies of a quorum of ``size`` members about one register; replies of ``kinds`` agree."""
 
-    def __init__(self, size: int, kinds: tuple[Kind, ...] = (Kind.GRANTED,)) -> None:
+    def __init__(self, size: int, kinds: tuple[ReplyKind, ...] = (ReplyKind.GRANTED,)) -> None:
         self.replies: dict[int, Reply] = {}
         self.kinds = kinds
         self.size = size
@@ -46,39 +46,39 @@ class Tally:
             self.replies[place] = reply
 
     @property
-    def agreed(self) -> list[int]:
+    def agreeing_places(self) -> list[int]:
         """The places of the agreeing members."""
         return [place for place, reply in self.replies.items() if reply.kind in self.kinds]
 
     @property
     def is_won(self) -> bool:
         """Whether a majority agrees."""
-        return len(self.agreed) >= self.needed > 0
+        return len(self.agreeing_places) >= self.needed > 0
 
     @property
     def is_lost(self) -> bool:
         """Whether a majority can no longer agree."""
-        return self.size - len(self._unreachable | self.replies.keys()) + len(self.agreed) < self.needed
+        return self.size - len(self._unreachable | self.replies.keys()) + len(self.agreeing_places) < self.needed
 
     @property
-    def chosen(self) -> Any:
+    def chosen_value(self) -> Any:
         """The value that a majority accepted under one ballot; None if there is none."""
-        accepted = Counter(reply.accepted for reply in self.replies.values() if reply.accepted != NONE)
-        ballot, count = max(accepted.items(), key=lambda item: item[1], default=(NONE, 0))
+        accepted = Counter(reply.accepted for reply in self.replies.values() if reply.accepted != NO_BALLOT)
+        ballot, count = max(accepted.items(), key=lambda item: item[1], default=(NO_BALLOT, 0))
         if count < self.needed:  # A3
             return None
         return next(reply.value for reply in self.replies.values() if reply.accepted == ballot)
 
     @property
-    def to_complete(self) -> Any:
+    def value_to_complete(self) -> Any:
         """The value accepted under the highest ballot among agreeing members, which must be proposed; or None."""
-        accepted = [reply for place in self.agreed if (reply := self.replies[place]).accepted != NONE]
+        accepted = [reply for place in self.agreeing_places if (reply := self.replies[place]).accepted != NO_BALLOT]
         return max(accepted, key=lambda reply: reply.accepted).value if accepted else None  # A2
 
     @property
     def is_decided(self) -> bool:
         """Whether no further reply can change the result."""
-        return self.is_won or self.is_lost or self.chosen is not None
+        return self.is_won or self.is_lost or self.chosen_value is not None
 
 
 class Round:
@@ -98,7 +98,7 @@ class Round:
         decode: Decode,
         clock: IReactorTime,
         patience: float = math.inf,
-        short: float = PAUSE,
+        short: float = RETRY_INTERVAL_S,
         single: bool = False,
     ) -> None:
         self.tallies = tallies
@@ -108,14 +108,14 @@ class Round:
         self._decode = decode
         self._clock = clock
         self._patience = patience
-        self._short = short
+        self._short_s = short
         self._single = single
         self._sent_times: dict[int, float] = {}
         self._answer_times: dict[int, tuple[float, float, float]] = {}
         self._attempts = 0
         self._is_closed = False
         self._timer: IDelayedCall | None = None
-        self._end: IDelayedCall | None = None if math.isinf(patience) else clock.callLater(patience, self._finish)
+        self._end_timer: IDelayedCall | None = None if math.isinf(patience) else clock.callLater(patience, self._finish)
         self._send_requests()
 
     @property
@@ -129,31 +129,31 @@ class Round:
         return not self.outcome.called and not self._is_closed
 
     @property
-    def answered(self) -> list[int]:
+    def answered_places(self) -> list[int]:
         """The places of the members that have answered."""
         return list(self._answer_times)
 
     @property
-    def silent(self) -> list[int]:
+    def silent_places(self) -> list[int]:
         """The places without an answer after ``TRIES`` requests."""
         return [
-            place for place in range(self.tally.size) if place not in self._answer_times and self._attempts >= TRIES
+            place for place in range(self.tally.size) if place not in self._answer_times and self._attempts >= MIN_TRIES
         ]
 
     @property
     def sent_at(self) -> float:
         """The time at which the request to a majority was sent, and so the earliest start of its grants (L5)."""
-        times = sorted((self._sent_times[place] for place in self.tally.agreed), reverse=True)
+        times = sorted((self._sent_times[place] for place in self.tally.agreeing_places), reverse=True)
         return times[self.tally.needed - 1]
 
     def close(self) -> None:
         """Stop all requests and timers."""
         self._is_closed = True
-        for timer in (self._timer, self._end):
+        for timer in (self._timer, self._end_timer):
             if timer is not None and timer.active():
                 timer.cancel()
 
-    def free_in(self) -> float:
+    def estimate_wait(self) -> float:
         """Return the estimated seconds until a majority may be free to agree.
 
         The time of a member's reply is taken as half way between its request and its arrival.
@@ -166,8 +166,8 @@ class Round:
 
     def _send_requests(self) -> None:
         self._attempts += 1
-        if not self._single and (self._attempts < TRIES or not self.outcome.called):
-            self._timer = self._clock.callLater(PAUSE, self._send_requests)
+        if not self._single and (self._attempts < MIN_TRIES or not self.outcome.called):
+            self._timer = self._clock.callLater(RETRY_INTERVAL_S, self._send_requests)
         for place in range(self.tally.size):
             self._send_request(place)
         if not self.tally.size:
@@ -189,8 +189,8 @@ class Round:
         reply = replies[0]
         if reply is not None:
             self._answer_times[place] = sent, self._clock.seconds(), reply.remaining
-            if reply.kind is Kind.HELD and reply.remaining < self._short:
-                pause = reply.remaining if reply.remaining < PAUSE else NEWS
+            if reply.kind is ReplyKind.HELD and reply.remaining < self._short_s:
+                pause = reply.remaining if reply.remaining < RETRY_INTERVAL_S else NEWS_INTERVAL_S
                 self._clock.callLater(max(MIN_PAUSE_S, pause), self._send_request, place)
                 return
         self._sent_times[place] = sent
@@ -202,9 +202,9 @@ class Round:
             self._fire_outcome()
         elif len(self._sent_times) == self.tally.needed and not self._single and not self.outcome.called:
             # The other members decide; a member that is down must not delay a proposer that lost to another.
-            if self._end is not None and self._end.active():
-                self._end.cancel()
-            self._end = self._clock.callLater(min(PAUSE, self._patience), self._finish)
+            if self._end_timer is not None and self._end_timer.active():
+                self._end_timer.cancel()
+            self._end_timer = self._clock.callLater(min(RETRY_INTERVAL_S, self._patience), self._finish)
 
     def _finish(self) -> None:
         self.close()

@@ -9,7 +9,7 @@ from middleware.entangled.record import Record
 
 MAX_KEYS = 256
 MAX_BYTES = 256 * 1024
-MAX_AGE = 60.0
+MAX_AGE_S = 60.0
 """Seconds that a copy is kept at the node next to the closest; each node in between halves it."""
 
 
@@ -26,7 +26,7 @@ class PathCache:
         self.drop(key)
         if size > MAX_BYTES or not ttl > 0.0:
             return
-        self._copies[key] = (now + min(ttl, MAX_AGE), size, records)
+        self._copies[key] = (now + min(ttl, MAX_AGE_S), size, records)
         self._bytes += size
         while self._bytes > MAX_BYTES or len(self._copies) > MAX_KEYS:
             self.drop(next(iter(self._copies)))

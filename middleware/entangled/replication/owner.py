@@ -15,42 +15,42 @@ from typing import Literal
 from twisted.internet.defer import Deferred
 from twisted.internet.interfaces import IReactorTime
 
-from middleware.entangled.background import Background, paced, until
+from middleware.entangled.background import Background, gather_until, run_limited
 from middleware.entangled.contact import Contact
 from middleware.entangled.data.store import Store
 from middleware.entangled.errors import OWNER_FULL, Conflict, EntangledError, Full, NoAnswer, NotAcknowledged, Refused
 from middleware.entangled.identity import Identity
 from middleware.entangled.kademlia.overlay import Overlay
-from middleware.entangled.record import TEAM_TTL, TOMBSTONE_TTL, Lifetime, Record, Slot
-from middleware.entangled.replication.replica import Replica, pages_of
-from middleware.entangled.replication.shipper import Shipper
+from middleware.entangled.record import TEAM_TTL_S, TOMBSTONE_TTL_S, Lifetime, Record, Slot
+from middleware.entangled.replication.batcher import RecordBatcher
+from middleware.entangled.replication.replica import Replica, split_pages
 from middleware.entangled.replication.store_reply import STORED, UNSYNCED, Outcome, StoreReply, decode_reply
 from middleware.entangled.replication.watch import digest_of
-from middleware.entangled.wire.door import ROLE, meaning
+from middleware.entangled.wire.admission_check import ROLE, explain
 from middleware.entangled.wire.endpoint import Endpoint
 
-Concern = Literal["one", "majority", "all"]
+ConsistencyLevel = Literal["one", "majority", "all"]
 """Consistency level: the number of replicas that must store a record before ``put`` succeeds."""
 RETRY_INTERVAL_S = 10.0
 """Seconds between attempts to store a record at replicas that missed it."""
-REPUBLISH = 3600.0
+REPUBLISH_INTERVAL_S = 3600.0
 """Seconds between two publications of a team record by its owner: 24 per lifetime (Kademlia, section 2.5).  A replica
 republishes a record that no other node republished for as long."""
-BEATS_PER_LEASE = 3
-EARLY_S = 1e-6
+RENEWALS_PER_LEASE = 3
+RENEWAL_TOLERANCE_S = 1e-6
 """Seconds that a renewal may be early, for rounding errors in sums of times."""
 MAX_ATTEMPTS = 3
 UNSYNCED_RETRIES_S = (0.1, 0.2, 0.4, 0.8)
 """Seconds between repeated requests to a voter that is not synced yet."""
 MAX_PARALLEL = 32
 """Own records republished at the same time; more finish earlier but delay other requests."""
-TWO_WAVES_BYTES = 2**16
+MIN_TWO_WAVES_BYTES = 2**16
 """Bytes of a value from which its copies are sent in two waves."""
 SECOND_WAVE_S = 0.5
 """Seconds after which the second wave is sent even if the first has not finished."""
-OWNERS_FAULT = (ROLE, OWNER_FULL)
+OWNER_FAULT_CODES = (ROLE, OWNER_FULL)
 """Codes of refusals caused by the owner of the record, not by the replica."""
-SEQUENCES = "sequences"
+SEQUENCES_NOTE = "sequences"
 SEQUENCE_BLOCK = 1024
 """Sequence numbers reserved by one note in the store, so that not every write has to write one."""
 
@@ -61,7 +61,7 @@ class Stored(int):
     sequence: int
 
     @classmethod
-    def of(cls, replicas: int, sequence: int) -> Stored:
+    def make(cls, replicas: int, sequence: int) -> Stored:
         """Return ``replicas`` with the attribute ``sequence``."""
         stored = cls(replicas)
         stored.sequence = sequence
@@ -89,29 +89,29 @@ class Owner:
         self._overlay = overlay
         self._endpoint = endpoint
         self._clock = clock
-        self._chores = chores
-        self._shipper = Shipper(overlay, chores)
+        self._background = chores
+        self._batcher = RecordBatcher(overlay, chores)
         self._own: dict[Slot, Record] = {}
-        self._unsettled: dict[Slot, None] = {}
+        self._incomplete: dict[Slot, None] = {}
         self._published_at: dict[Slot, float] = {}
         self._leases: dict[Slot, float] = {}
         self._due_at: dict[Slot, float] = {}
-        self._holders: dict[Slot, list[Contact]] = {}
-        self._period = lease / BEATS_PER_LEASE
-        self._transfers: set[bytes] = set()
-        self._republishing = False
+        self._replicas: dict[Slot, list[Contact]] = {}
+        self._period = lease / RENEWALS_PER_LEASE
+        self._transferring: set[bytes] = set()
+        self._is_republishing = False
         self._cancel_renewal: Callable[[], None] | None = None
         self._paused_at = -1.0
-        self._first = self._last = self._reserved = 0
+        self._first_sequence = self._last_sequence = self._reserved_sequence = 0
         endpoint.expose("missing", self._answer_missing, changes=True)
 
     def start(self) -> None:
         """Load the team records of an earlier run, and start to renew all own records."""
-        for record in self._store.owned(self._identity.public):
+        for record in self._store.find_owned(self._identity.public):
             if record.lifetime == "team" and not record.is_tombstone:
                 self._own[record.slot] = record
-        self._cancel_renewal = self._chores.later(self._period, self._renew_due)
-        self._chores.every(RETRY_INTERVAL_S, self._republish)
+        self._cancel_renewal = self._background.later(self._period, self._renew_due)
+        self._background.every(RETRY_INTERVAL_S, self._republish)
 
     def set_lease(self, lease: float) -> None:
         """Set the duration of own leases to ``lease`` seconds and renew them at once."""
@@ -128,11 +128,11 @@ class Owner:
         record = self._own.get(slot)
         if record is not None and record.lifetime == "leased":
             self._forget(slot)
-            self._replica.answer_let_go(self._overlay.me(), [digest_of([record])])
+            self._replica.answer_let_go(self._overlay.own_contact(), [digest_of([record])])
 
-    def review(self) -> None:
+    def recheck(self) -> None:
         """Drop the own records that this node's role no longer allows."""
-        if self._replica.certificates.door.authority(self._identity.public).is_final:
+        if self._replica.certificates.admission.find_authority(self._identity.public).is_final:
             for slot in [slot for slot in self._own if not self._replica.may_store(slot)]:
                 self._forget(slot)
 
@@ -140,7 +140,7 @@ class Owner:
         """Return whether this node maintains the record in ``slot``."""
         return slot in self._own
 
-    def next(
+    def make_record(
         self,
         key: bytes,
         name: str,
@@ -156,18 +156,18 @@ class Owner:
         the slot is not ``expect``; ``read`` is the record that other nodes hold there.
         """
         slot = Slot(key, self._identity.public, name)
-        held = (self._own.get(slot), self._store.slot(slot), read)
+        held = (self._own.get(slot), self._store.get_slot(slot), read)
         known = max((record.sequence for record in held if record is not None), default=0)
         if expect is not None and known != expect:
             raise Conflict(expect, known)
         self._leases.pop(slot, None)
         if lease is not None and lease > self._lease:
             self._leases[slot] = lease
-        ttl = TOMBSTONE_TTL if value is None else self._lease_of(slot) if lifetime == "leased" else TEAM_TTL
+        ttl = TOMBSTONE_TTL_S if value is None else self._lease_of(slot) if lifetime == "leased" else TEAM_TTL_S
         sequence = self._next_sequence(known)
         return self._sign(Record(key, name, slot.owner, sequence, lifetime, ttl, value))
 
-    async def put(self, record: Record, concern: Concern = "majority") -> Stored:
+    async def put(self, record: Record, concern: ConsistencyLevel = "majority") -> Stored:
         """Store ``record`` at its replicas, as many as ``concern`` requires.
 
         If the replicas hold a higher sequence number, from an earlier run of this node, the record gets a higher one.
@@ -176,7 +176,7 @@ class Owner:
         for _ in range(MAX_ATTEMPTS):
             held, newest = await self.store_everywhere(record, concern)
             if not newest:
-                return Stored.of(held, record.sequence)
+                return Stored.make(held, record.sequence)
             current = self._own.get(record.slot, record)
             if current.sequence <= newest:
                 current = self._sign(replace(current, sequence=self._next_sequence(newest)))
@@ -184,26 +184,26 @@ class Owner:
             record = current
         raise NoAnswer(f"replicas still hold a higher sequence number after {MAX_ATTEMPTS} attempts; put again")
 
-    async def store_everywhere(self, record: Record, concern: Concern = "majority") -> tuple[int, int]:
+    async def store_everywhere(self, record: Record, concern: ConsistencyLevel = "majority") -> tuple[int, int]:
         """Store at all replicas; return the number that stored it, and the highest conflicting sequence (0: none).
 
         Raises ``NotAcknowledged`` if too few stored it and there was no conflict; ``Refused`` if the reason is the
         owner's role or its share of the store.
         """
         if concern != "one":
-            await self._overlay.met()
-        targets = await self._overlay.holders(record.key)
-        voters = self._overlay.voters(record.key, targets)
+            await self._overlay.wait_for_members()
+        targets = await self._overlay.lookup_replicas(record.key)
+        voters = self._overlay.find_voters(record.key, targets)
         needed = {"one": 1, "majority": voters.majority, "all": voters.size}[concern]
 
         def is_vote(node_id: bytes, reply: StoreReply) -> bool:
             return concern == "one" or (node_id in voters.ids and reply.outcome is not Outcome.UNSYNCED)
 
-        left = self.left(record)
+        left = self.remaining_lifetime(record)
         replies: dict[bytes, StoreReply] = {}
         forbidden: list[Refused] = []
         counted = [c for c in targets if concern == "one" or c.node_id in voters.ids]
-        second_wave = self._second_wave(record, targets, counted, needed)
+        second_wave = self._choose_second_wave(record, targets, counted, needed)
         released: Deferred[None] = Deferred()
 
         def release() -> None:
@@ -217,25 +217,25 @@ class Owner:
                 reply = await self._store_latest(contact, record, left)
             except EntangledError as error:
                 release()
-                if isinstance(error, Refused) and error.code in OWNERS_FAULT:
+                if isinstance(error, Refused) and error.code in OWNER_FAULT_CODES:
                     forbidden.append(error)
                 raise
             for pause in UNSYNCED_RETRIES_S if concern != "one" and contact.node_id in voters.ids else ():
                 if reply.outcome is not Outcome.UNSYNCED:
                     break
                 release()
-                await self._chores.sleep(pause)
+                await self._background.sleep(pause)
                 reply = await self._store_latest(contact, record, left)
             replies[contact.node_id] = reply
             votes = voters.count_known(each for each, reply in replies.items() if reply.outcome is Outcome.STORED)
             if len(replies) == len(targets) and votes >= voters.majority:
-                self._mark_settled(record)
+                self._mark_complete(record)
 
-        work = until(
+        work = gather_until(
             lambda _: sum(1 for node_id, reply in replies.items() if is_vote(node_id, reply)) >= needed,
             [store(c) for c in sorted(targets, key=lambda c: c.node_id != self._identity.node_id)],
         )
-        in_time = self._chores.later(SECOND_WAVE_S, release) if second_wave else release
+        in_time = self._background.later(SECOND_WAVE_S, release) if second_wave else release
         await work
         in_time()
         release()
@@ -258,34 +258,34 @@ class Owner:
         """
         if contact.node_id == self._identity.node_id:
             return self._replica.store(record, left)
-        reply = decode_reply(await self._shipper.store(contact, record, left), record)
+        reply = decode_reply(await self._batcher.store(contact, record, left), record)
         outcome = None if reply is None else reply.outcome
         if reply is not None and (reply.is_stored or outcome is Outcome.SUPERSEDED):
             return reply
         if outcome is Outcome.FORBIDDEN:
-            raise Refused(f"{contact.address} refuses {record.name!r} of its owner: {meaning(ROLE)}", ROLE)
+            raise Refused(f"{contact.address} refuses {record.name!r} of its owner: {explain(ROLE)}", ROLE)
         if outcome is Outcome.NO_ROOM:
             text = f"{contact.address} has no more room for the owner of {record.name!r}; remove some of its records"
             raise Full(text, OWNER_FULL)
         raise Refused(f"{contact.address} refuses the record")
 
-    def left(self, record: Record) -> float | None:
+    def remaining_lifetime(self, record: Record) -> float | None:
         """Return the seconds for which a receiver is to keep ``record``; None for an own one: its whole ttl."""
-        return None if record.owner == self._identity.public else self._replica.left(record)
+        return None if record.owner == self._identity.public else self._replica.remaining_lifetime(record)
 
-    def welcome(self, contact: Contact) -> None:
+    def handle_new_contact(self, contact: Contact) -> None:
         """Store at a new node the own leased records it should hold; it fetches team records by itself."""
-        lacking = [r for r in self._leased() if self._overlay.belongs(r.key, contact)]
+        lacking = [r for r in self._list_leased() if self._overlay.is_replica(r.key, contact)]
         if lacking:
-            self._chores.fork(self._send(contact, lacking))
+            self._background.fork(self._send(contact, lacking))
 
-    def lost_here(self, record: Record) -> bool:
+    def restore(self, record: Record) -> bool:
         """Store an own record again that expired here because of a late timer; return whether it is an own one."""
         own = self._own.get(record.slot)
         if own is None:
             return False
         with suppress(Refused):  # no room here; other replicas may have some
-            self._replica.keep(own)
+            self._replica.store_locally(own)
         return True
 
     # -- inside -----------------------------------------------------------------------------------------------------
@@ -297,7 +297,7 @@ class Owner:
         """
         reply = await self.store_at(contact, record, left)
         is_own = record.owner == self._identity.public and reply.outcome is Outcome.SUPERSEDED
-        if not (is_own and self._first <= reply.sequence <= self._last):
+        if not (is_own and self._first_sequence <= reply.sequence <= self._last_sequence):
             return reply
         later = self._own.get(record.slot)
         if later is None:
@@ -305,54 +305,54 @@ class Owner:
         reply = await self.store_at(contact, later)
         return UNSYNCED if reply.outcome is Outcome.SUPERSEDED else reply
 
-    def _second_wave(
+    def _choose_second_wave(
         self, record: Record, targets: list[Contact], counted: list[Contact], needed: int
     ) -> frozenset[bytes]:
         """Return the replicas that get a long record in the second wave: copies sent at once share the bandwidth."""
-        if len(record.value or b"") < TWO_WAVES_BYTES or len(counted) < needed:
+        if len(record.value or b"") < MIN_TWO_WAVES_BYTES or len(counted) < needed:
             return frozenset()
-        likely = self._overlay.quickest(c for c in counted if c.node_id != self._identity.node_id)
+        likely = self._overlay.order_by_speed(c for c in counted if c.node_id != self._identity.node_id)
         has_own = len(likely) < len(counted)
         at_first = {c.node_id for c in likely[: needed - has_own]} | {self._identity.node_id}
         return frozenset(c.node_id for c in targets if c.node_id not in at_first)
 
     def _next_sequence(self, above: int) -> int:
         """Return a sequence number above all earlier ones of this node, in any slot or run."""
-        if not self._reserved:
+        if not self._reserved_sequence:
             try:
-                self._last = int(self._store.noted(SEQUENCES) or 0)
+                self._last_sequence = int(self._store.get_note(SEQUENCES_NOTE) or 0)
             except ValueError:  # a corrupt file may hold anything
-                self._last = 0
-            self._last = max(self._last, above)
-            self._first = self._last + 1
-        self._last = max(self._last, above) + 1
-        if self._last > self._reserved:
-            self._reserved = self._last + SEQUENCE_BLOCK
-            self._store.note(SEQUENCES, b"%d" % self._reserved)
-        return self._last
+                self._last_sequence = 0
+            self._last_sequence = max(self._last_sequence, above)
+            self._first_sequence = self._last_sequence + 1
+        self._last_sequence = max(self._last_sequence, above) + 1
+        if self._last_sequence > self._reserved_sequence:
+            self._reserved_sequence = self._last_sequence + SEQUENCE_BLOCK
+            self._store.set_note(SEQUENCES_NOTE, b"%d" % self._reserved_sequence)
+        return self._last_sequence
 
     def _sign(self, record: Record) -> Record:
-        record = record.signed(self._identity)
+        record = record.sign(self._identity)
         self._own[record.slot] = record
-        self._unsettled[record.slot] = None
+        self._incomplete[record.slot] = None
         if record.lifetime == "leased":
-            self._renew_within(self._lease_of(record.slot) / BEATS_PER_LEASE)
+            self._renew_within(self._lease_of(record.slot) / RENEWALS_PER_LEASE)
         return record
 
     def _forget(self, slot: Slot) -> None:
-        for memory in (self._own, self._unsettled, self._published_at, self._leases, self._due_at, self._holders):
+        for memory in (self._own, self._incomplete, self._published_at, self._leases, self._due_at, self._replicas):
             memory.pop(slot, None)
 
-    def _mark_settled(self, record: Record) -> None:
+    def _mark_complete(self, record: Record) -> None:
         """Note that all replicas have ``record``."""
         if self._own.get(record.slot) != record:
             return
-        self._unsettled.pop(record.slot, None)
+        self._incomplete.pop(record.slot, None)
         self._published_at[record.slot] = self._clock.seconds()
         if record.is_tombstone:
             self._forget(record.slot)
 
-    def _leased(self) -> list[Record]:
+    def _list_leased(self) -> list[Record]:
         return [r for r in self._own.values() if r.lifetime == "leased"]
 
     def _lease_of(self, slot: Slot) -> float:
@@ -360,9 +360,9 @@ class Owner:
 
     def _renew_due(self) -> None:
         """Send the renewals that are due, and schedule the next ones by the shortest lease."""
-        leases = [self._lease_of(record.slot) for record in self._leased()]
-        self._period = min(leases, default=self._lease) / BEATS_PER_LEASE
-        self._cancel_renewal = self._chores.later(self._period, self._renew_due)
+        leases = [self._lease_of(record.slot) for record in self._list_leased()]
+        self._period = min(leases, default=self._lease) / RENEWALS_PER_LEASE
+        self._cancel_renewal = self._background.later(self._period, self._renew_due)
         if not self._send_renewals():
             self._cancel_renewal()
             self._cancel_renewal, self._paused_at = None, self._clock.seconds()
@@ -373,16 +373,16 @@ class Owner:
             self._resume_renewals()
         elif self._cancel_renewal is not None and pause < self._period:
             self._cancel_renewal()
-            self._cancel_renewal = self._chores.later(pause, self._renew_due)
+            self._cancel_renewal = self._background.later(pause, self._renew_due)
 
     def _resume_renewals(self) -> None:
         """Resume renewals after a time without leases, at a multiple of the renewal period."""
         now, at = self._clock.seconds(), self._paused_at
-        beat = self._lease / BEATS_PER_LEASE
+        beat = self._lease / RENEWALS_PER_LEASE
         at += beat * math.floor((now - at) / beat)
         while at <= now:
             at += beat
-        self._cancel_renewal = self._chores.later(at - now, self._renew_due)
+        self._cancel_renewal = self._background.later(at - now, self._renew_due)
 
     def _send_renewals(self) -> bool:
         """Renew the own leases that are due: send each replica its lease and the digest of its records.
@@ -392,54 +392,60 @@ class Owner:
         now = self._clock.seconds()
         due: set[bytes] = set()
         there: dict[bytes, tuple[Contact, list[Record]]] = {}
-        for record in self._leased():
+        for record in self._list_leased():
             slot = record.slot
-            if self._due_at.get(slot, now) <= now + EARLY_S:
-                self._due_at[slot] = now + self._lease_of(slot) / BEATS_PER_LEASE
-                self._holders[slot] = self._overlay.keepers(record.key)
-                due.update(contact.node_id for contact in self._holders[slot])
-            for contact in self._holders[slot]:
+            if self._due_at.get(slot, now) <= now + RENEWAL_TOLERANCE_S:
+                self._due_at[slot] = now + self._lease_of(slot) / RENEWALS_PER_LEASE
+                self._replicas[slot] = self._overlay.find_possible_replicas(record.key)
+                due.update(contact.node_id for contact in self._replicas[slot])
+            for contact in self._replicas[slot]:
                 there.setdefault(contact.node_id, (contact, []))[1].append(record)
-        held = self._store.extend(self._identity.public, now + BEATS_PER_LEASE * self._period)
+        held = self._store.extend_leases(self._identity.public, now + RENEWALS_PER_LEASE * self._period)
         for contact, records in there.values():
             if contact.node_id in due:
                 lease = min(self._lease_of(record.slot) for record in records)
-                self._endpoint.tell(contact, "alive", lease, digest_of(records))
-        return held > 0 or bool(self._leased())
+                self._endpoint.notify(contact, "alive", lease, digest_of(records))
+        return held > 0 or bool(self._list_leased())
 
     def _answer_missing(self, peer: Contact, marks: list[object]) -> None:
         """MISSING: store at ``peer`` the own leased records that it lacks, and name those it should drop."""
-        there = [r for r in self._leased() if any(c.node_id == peer.node_id for c in self._overlay.keepers(r.key))]
+        there = [
+            r
+            for r in self._list_leased()
+            if any(c.node_id == peer.node_id for c in self._overlay.find_possible_replicas(r.key))
+        ]
         expected = [digest_of([r]) for r in there]
-        self._chores.fork(self._send(peer, [r for r, mark in zip(there, expected, strict=True) if mark not in marks]))
+        self._background.fork(
+            self._send(peer, [r for r, mark in zip(there, expected, strict=True) if mark not in marks])
+        )
         unexpected = [mark for mark in marks if mark not in expected]
         if unexpected:
-            self._endpoint.tell(peer, "let_go", unexpected)
+            self._endpoint.notify(peer, "let_go", unexpected)
 
     def _republish(self) -> None:
-        old = self._clock.seconds() - REPUBLISH
+        old = self._clock.seconds() - REPUBLISH_INTERVAL_S
         due = [
-            r for slot, r in self._own.items() if slot in self._unsettled or self._published_at.get(slot, old) <= old
+            r for slot, r in self._own.items() if slot in self._incomplete or self._published_at.get(slot, old) <= old
         ]
-        if due and not self._republishing:
-            self._chores.fork(self._republish_all(due))
+        if due and not self._is_republishing:
+            self._background.fork(self._republish_all(due))
 
     async def _republish_all(self, due: list[Record]) -> None:
         """Republish ``due`` except for records that were replaced meanwhile."""
-        self._republishing = True
+        self._is_republishing = True
         try:
-            await paced(MAX_PARALLEL, (self.store_everywhere(r) for r in due if self._own.get(r.slot) is r))
+            await run_limited(MAX_PARALLEL, (self.store_everywhere(r) for r in due if self._own.get(r.slot) is r))
         finally:
-            self._republishing = False
+            self._is_republishing = False
 
     async def _send(self, contact: Contact, records: list[Record]) -> None:
         """Store own records at ``contact``, page by page, unless such a transfer to it is running."""
-        if contact.node_id in self._transfers:
+        if contact.node_id in self._transferring:
             return
-        self._transfers.add(contact.node_id)
+        self._transferring.add(contact.node_id)
         try:
-            for page in pages_of(records):
+            for page in split_pages(records):
                 with suppress(Refused):  # no room for one of them; the next page may have smaller ones
-                    await self._overlay.ask(contact, "store", [r.packed() for r in page], changes=True)
+                    await self._overlay.ask(contact, "store", [r.pack() for r in page], changes=True)
         finally:
-            self._transfers.discard(contact.node_id)
+            self._transferring.discard(contact.node_id)

@@ -15,17 +15,17 @@ from twisted.python.failure import Failure
 
 from middleware.entangled.background import Background
 from middleware.entangled.contact import Contact
-from middleware.entangled.errors import NotRunning, Refused, WeatherError
+from middleware.entangled.errors import NotRunning, Refused, TransientError
 from middleware.entangled.record import Record, Slot
 from middleware.entangled.wire.endpoint import Endpoint
 
-WATCH_TTL, MAX_TTL = 8.0, 60.0
+WATCH_TTL_S, MAX_WATCH_TTL_S = 8.0, 60.0
 MAX_WATCHERS = 1000
-FEW, GATHERED = 64, 0.1
+MAX_IMMEDIATE, BATCH_DELAY_S = 64, 0.1
 """Watchers of a key up to which each change is pushed at once; beyond, seconds of changes that share a push."""
-PUSH_BYTES, MOST_GONE = 12_000, 100
+PUSH_BYTES, MAX_REMOVED = 12_000, 100
 """Approximate bytes, and the number of removed slots, in one push of several changes."""
-MAX_WATCHED = 10_000
+MAX_KEYS = 10_000
 """Keys with watchers at the same time."""
 
 
@@ -44,20 +44,20 @@ class Pusher:
     def __init__(self, endpoint: Endpoint, clock: IReactorTime, chores: Background) -> None:
         self._endpoint = endpoint
         self._clock = clock
-        self._chores = chores
+        self._background = chores
         self._watchers: dict[bytes, dict[bytes, _Watcher]] = {}
-        self._gathered: dict[bytes, dict[Slot, tuple[Record, bool]]] = {}
+        self._batches: dict[bytes, dict[Slot, tuple[Record, bool]]] = {}
 
     def start(self) -> None:
         """Start to remove expired watchers periodically."""
-        self._chores.every(WATCH_TTL, self._prune)
+        self._background.every(WATCH_TTL_S, self._prune)
 
-    def watched(self, key: bytes, peer: Contact, ttl: float = WATCH_TTL) -> int:
+    def add_watcher(self, key: bytes, peer: Contact, ttl: float = WATCH_TTL_S) -> int:
         """Add or renew a watcher of ``key``; return the number of the last push to it.  Raises ``Refused``."""
-        if not 0.0 < ttl <= MAX_TTL:
-            raise Refused(f"a watch lasts at most {MAX_TTL:g} s")
+        if not 0.0 < ttl <= MAX_WATCH_TTL_S:
+            raise Refused(f"a watch lasts at most {MAX_WATCH_TTL_S:g} s")
         watchers = self._watchers.get(key, {})
-        is_full = len(watchers) >= MAX_WATCHERS or (not watchers and len(self._watchers) >= MAX_WATCHED)
+        is_full = len(watchers) >= MAX_WATCHERS or (not watchers and len(self._watchers) >= MAX_KEYS)
         if peer.node_id not in watchers and is_full:
             raise Refused("too many watchers; try again later")
         until = self._clock.seconds() + ttl
@@ -71,27 +71,27 @@ class Pusher:
         watchers = self._watchers.get(key)
         if not watchers:
             return
-        if len(watchers) <= FEW and key not in self._gathered:
-            self._push(key, [record.packed() for record in records], [[record.owner, record.name] for record in gone])
+        if len(watchers) <= MAX_IMMEDIATE and key not in self._batches:
+            self._push(key, [record.pack() for record in records], [[record.owner, record.name] for record in gone])
             return
-        if key not in self._gathered:
-            self._chores.later(GATHERED, self._push_gathered, key)
+        if key not in self._batches:
+            self._background.later(BATCH_DELAY_S, self._push_batch, key)
         # Only the last change of each slot is pushed.
-        changes = self._gathered.setdefault(key, {})
+        changes = self._batches.setdefault(key, {})
         changes.update((record.slot, (record, True)) for record in records)
         changes.update((record.slot, (record, False)) for record in gone)
 
-    def _push_gathered(self, key: bytes) -> None:
+    def _push_batch(self, key: bytes) -> None:
         packed: list[object] = []
         places: list[object] = []
         size = 0
-        for record, is_there in self._gathered.pop(key).values():
+        for record, is_there in self._batches.pop(key).values():
             if is_there:
-                packed.append(record.packed())
+                packed.append(record.pack())
                 size += record.message_bytes
             else:
                 places.append([record.owner, record.name])
-            if size > PUSH_BYTES or len(places) >= MOST_GONE:
+            if size > PUSH_BYTES or len(places) >= MAX_REMOVED:
                 self._push(key, packed, places)
                 packed, places, size = [], [], 0
         if packed or places:
@@ -108,7 +108,7 @@ class Pusher:
             pushed: Deferred[object] = self._endpoint.ask(
                 watcher.contact, "push", key, watcher.number, packed, places, changes=True
             )
-            pushed.addErrback(_ignore_weather)
+            pushed.addErrback(_ignore_transient)
 
     def forget(self, peer: Contact) -> None:
         """Remove ``peer``, which left the network, from all keys."""
@@ -124,5 +124,5 @@ class Pusher:
                 del self._watchers[key]
 
 
-def _ignore_weather(failure: Failure) -> None:
-    failure.trap(WeatherError, Refused, NotRunning)
+def _ignore_transient(failure: Failure) -> None:
+    failure.trap(TransientError, Refused, NotRunning)

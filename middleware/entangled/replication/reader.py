@@ -11,29 +11,29 @@ from typing import Literal, NamedTuple
 
 from twisted.internet.defer import Deferred
 
-from middleware.entangled.background import Background, until
+from middleware.entangled.background import Background, gather_until
 from middleware.entangled.contact import Contact
 from middleware.entangled.errors import EntangledError, Refused, Unavailable
 from middleware.entangled.kademlia.lookup import Lookup
-from middleware.entangled.kademlia.overlay import ALPHA, K, Overlay, Voters, contacts_of
-from middleware.entangled.record import Record, Slot, unpacked
-from middleware.entangled.replication.cache import MAX_AGE
-from middleware.entangled.replication.owner import OWNERS_FAULT, Owner
-from middleware.entangled.replication.replica import CACHED, SURE, UNSURE, Replica
+from middleware.entangled.kademlia.overlay import ALPHA, K, Overlay, Voters, parse_contacts
+from middleware.entangled.record import Record, Slot, parse_record
+from middleware.entangled.replication.cache import MAX_AGE_S
+from middleware.entangled.replication.owner import OWNER_FAULT_CODES, Owner
+from middleware.entangled.replication.replica import CACHED_REPLY, SYNCED_REPLY, UNSYNCED_REPLY, Replica
 from middleware.entangled.replication.store_reply import Outcome
 from middleware.entangled.replication.watch import digest_of
 
-ReadConcern = Literal["fast", "majority"]
-CATCHING_UP, CATCHING_UP_STEP = 1.5, 0.1
+ReadConsistency = Literal["fast", "majority"]
+CATCH_UP_TIMEOUT_S, CATCH_UP_INTERVAL_S = 1.5, 0.1
 """Seconds that a read waits for its own node to catch up, and seconds between two attempts meanwhile."""
 MAX_PAGES = 2000
 
 
-class Answer(NamedTuple):
+class ReplicaReply(NamedTuple):
     """The reply of one replica: its records, tombstones included, its ``worth``, and contacts nearer to the key."""
 
     records: list[Record]
-    worth: int
+    sync_level: int
     nearer: list[Contact]
 
 
@@ -44,9 +44,9 @@ class Reader:
         self._replica = replica
         self._overlay = overlay
         self._owner = owner
-        self._chores = chores
+        self._background = chores
 
-    async def read(self, key: bytes, concern: ReadConcern) -> list[Record]:
+    async def read(self, key: bytes, concern: ReadConsistency) -> list[Record]:
         """Return the records of ``key``, without tombstones, in the order of (owner, name); raise ``Unavailable``.
 
         A new node has no vote until it has caught up, so its reads wait up to ``CATCHING_UP`` seconds until it has.
@@ -54,25 +54,29 @@ class Reader:
         timed_out: list[bool] | None = None
         while True:
             try:
-                records = list((await self.newest(key)).values()) if concern == "majority" else await self._fast(key)
+                records = (
+                    list((await self.read_newest(key)).values())
+                    if concern == "majority"
+                    else await self._read_fast(key)
+                )
                 break
             except Unavailable:
-                if timed_out or self._replica.is_sure():
+                if timed_out or self._replica.is_synced():
                     raise
             if timed_out is None:
                 timed_out = []
-                self._chores.later(CATCHING_UP, timed_out.append, True)
-            await self._chores.sleep(CATCHING_UP_STEP)
+                self._background.later(CATCH_UP_TIMEOUT_S, timed_out.append, True)
+            await self._background.sleep(CATCH_UP_INTERVAL_S)
         return sorted((r for r in records if not r.is_tombstone), key=lambda r: (r.owner, r.name))
 
-    async def pages(
+    async def read_pages(
         self,
         contact: Contact,
         key: bytes,
         page: object = None,
         wants_sure: bool = True,
         same: list[Record] | None = None,
-    ) -> Answer:
+    ) -> ReplicaReply:
         """Read the records that ``contact`` holds under ``key``, from ``page`` on (None: from the first one).
 
         If its records are exactly ``same``, it sends none.
@@ -82,21 +86,21 @@ class Reader:
             digest = (digest_of(same),) if same else ()
             page = await self._overlay.ask(contact, "find_value", key, None, wants_sure, *digest)
             if same and isinstance(page, list) and len(page) == 3 and page[0] is None:
-                return Answer(same, SURE if page[2] == SURE else UNSURE, [])
-        worth, nearer = UNSURE, []
+                return ReplicaReply(same, SYNCED_REPLY if page[2] == SYNCED_REPLY else UNSYNCED_REPLY, [])
+        worth, nearer = UNSYNCED_REPLY, []
         for _ in range(MAX_PAGES):
             if not (isinstance(page, list) and len(page) >= 2 and isinstance(page[0], list)):
                 break
-            received = [record for record in map(unpacked, page[0]) if record is not None]
-            await self._replica.certificates.learn(contact, (record.owner for record in received))
+            received = [record for record in map(parse_record, page[0]) if record is not None]
+            await self._replica.certificates.fetch_missing(contact, (record.owner for record in received))
             records += [record for record in received if self.is_credible(record, key, contact)]
             # The last page counts: the replica may have lost contact in between.
-            worth = page[2] if len(page) > 2 and page[2] in (SURE, CACHED) else UNSURE
-            nearer = contacts_of(page[3]) if len(page) > 3 else []
+            worth = page[2] if len(page) > 2 and page[2] in (SYNCED_REPLY, CACHED_REPLY) else UNSYNCED_REPLY
+            nearer = parse_contacts(page[3]) if len(page) > 3 else []
             if page[1] is None or not page[0]:
                 break
             page = await self._overlay.ask(contact, "find_value", key, page[1], wants_sure)
-        return Answer(records, worth, nearer)
+        return ReplicaReply(records, worth, nearer)
 
     def is_credible(self, record: Record, key: bytes, contact: Contact) -> bool:
         """Return whether ``record``, received from ``contact``, belongs to ``key`` and is authentic."""
@@ -108,35 +112,41 @@ class Reader:
 
     # -- inside -----------------------------------------------------------------------------------------------------
 
-    async def _fast(self, key: bytes) -> list[Record]:
-        here = self._replica.held(key)
+    async def _read_fast(self, key: bytes) -> list[Record]:
+        here = self._replica.get_held(key)
         # Records from a time when this node was among the closest may be outdated.
-        if _is_something(here) and self._replica.is_sure() and self._overlay.belongs(key, self._overlay.me()):
+        if (
+            _has_values(here)
+            and self._replica.is_synced()
+            and self._overlay.is_replica(key, self._overlay.own_contact())
+        ):
             return here
         if self._overlay.is_sparse:
             return await self._find_value(key)
-        targets = await self._overlay.holders(key)
-        voters = self._overlay.voters(key, targets)
-        answers = await self._query(key, targets, voters, lambda given: _is_clear(given, voters), width=1)
+        targets = await self._overlay.lookup_replicas(key)
+        voters = self._overlay.find_voters(key, targets)
+        answers = await self._query_replicas(key, targets, voters, lambda given: _is_conclusive(given, voters), width=1)
         for answer in answers.values():
-            if _is_something(answer.records):
+            if _has_values(answer.records):
                 return answer.records
         return self._confirm_empty(answers, voters)
 
-    async def newest(self, key: bytes) -> dict[Slot, Record]:
+    async def read_newest(self, key: bytes) -> dict[Slot, Record]:
         """Return the newest records of ``key`` at a majority, tombstones included; raise ``Unavailable``."""
-        targets = await self._overlay.holders(key)
-        voters = self._overlay.voters(key, targets)
+        targets = await self._overlay.lookup_replicas(key)
+        voters = self._overlay.find_voters(key, targets)
         needed = voters.majority
-        answers = await self._query(key, targets, voters, lambda given: _votes(given, voters) >= needed, width=needed)
-        _check_votes(_votes(answers, voters), voters)
-        newest = newest_of(answer.records for answer in answers.values())
+        answers = await self._query_replicas(
+            key, targets, voters, lambda given: _count_votes(given, voters) >= needed, width=needed
+        )
+        _check_votes(_count_votes(answers, voters), voters)
+        newest = merge_newest(answer.records for answer in answers.values())
         await self._repair(newest, targets, voters, answers)
         return newest
 
-    def _confirm_empty(self, answers: dict[bytes, Answer], voters: Voters) -> list[Record]:
+    def _confirm_empty(self, answers: dict[bytes, ReplicaReply], voters: Voters) -> list[Record]:
         """Return no records if a majority has answered; otherwise raise ``Unavailable``."""
-        _check_votes(_votes(answers, voters), voters)
+        _check_votes(_count_votes(answers, voters), voters)
         return []
 
     async def _repair(
@@ -144,7 +154,7 @@ class Reader:
         newest: dict[Slot, Record],
         targets: list[Contact],
         voters: Voters,
-        answers: dict[bytes, Answer],
+        answers: dict[bytes, ReplicaReply],
     ) -> None:
         """Store records that a minority holds at a majority before returning them, so that later reads see them too."""
         has: dict[Slot, set[bytes]] = {slot: set() for slot in newest}
@@ -159,38 +169,38 @@ class Reader:
 
             async def repair_at(contact: Contact, record: Record = record, holding: set[bytes] = holding) -> None:
                 try:
-                    reply = await self._owner.store_at(contact, record, self._owner.left(record))
+                    reply = await self._owner.store_at(contact, record, self._owner.remaining_lifetime(record))
                     if reply.outcome is Outcome.UNSYNCED:
                         return
                 except Refused as error:
-                    if error.code not in OWNERS_FAULT:
+                    if error.code not in OWNER_FAULT_CODES:
                         raise
                 holding.add(contact.node_id)  # stored, superseded there, or refused because of its owner
 
             lacking = [repair_at(c) for c in targets if c.node_id not in holding]
-            await until(lambda _, holding=holding: voters.count_known(holding) >= voters.majority, lacking)  # type: ignore
+            await gather_until(lambda _, holding=holding: voters.count_known(holding) >= voters.majority, lacking)  # type: ignore
             _check_votes(voters.count_known(holding), voters)
 
-    async def _query(
+    async def _query_replicas(
         self,
         key: bytes,
         targets: list[Contact],
         voters: Voters,
-        is_enough: Callable[[dict[bytes, Answer]], bool],
+        is_enough: Callable[[dict[bytes, ReplicaReply]], bool],
         width: int,
-    ) -> dict[bytes, Answer]:
+    ) -> dict[bytes, ReplicaReply]:
         """Collect the answers of ``targets``: ask ``width`` at once, and two more for each that is slow or fails.
 
         Two, because failures are correlated: with half of the team gone, every second replica is silent.
         """
-        answers: dict[bytes, Answer] = {}
+        answers: dict[bytes, ReplicaReply] = {}
         own_id = self._overlay.own_id
         here: list[Record] = []
         if any(c.node_id == own_id for c in targets):
-            here = self._replica.held(key)
-            answers[own_id] = Answer(here, SURE if self._replica.is_sure() else UNSURE, [])
+            here = self._replica.get_held(key)
+            answers[own_id] = ReplicaReply(here, SYNCED_REPLY if self._replica.is_synced() else UNSYNCED_REPLY, [])
             width -= 1
-        waiting = self._overlay.quickest(c for c in targets if c.node_id != own_id)
+        waiting = self._overlay.order_by_speed(c for c in targets if c.node_id != own_id)
         done: Deferred[None] = Deferred()
         pending = 0
 
@@ -200,21 +210,21 @@ class Reader:
 
         def ask_next() -> None:
             if waiting and not done.called:
-                self._chores.fork(ask(waiting.pop(0)))
+                self._background.fork(ask(waiting.pop(0)))
 
         def hedge(contact: Contact) -> None:
-            self._overlay.slow(contact)
+            self._overlay.mark_slow(contact)
             ask_next()
             ask_next()
 
         async def ask(contact: Contact) -> None:
             nonlocal pending
             pending += 1
-            in_time = self._chores.later(self._overlay.hedge(), hedge, contact)
+            in_time = self._background.later(self._overlay.hedge_delay(), hedge, contact)
             more = 1
             try:
-                answer = answers[contact.node_id] = await self.pages(contact, key, same=here)
-                if answer.worth == SURE and contact.node_id in voters.ids:
+                answer = answers[contact.node_id] = await self.read_pages(contact, key, same=here)
+                if answer.sync_level == SYNCED_REPLY and contact.node_id in voters.ids:
                     more = 2 if initial == 1 else 0
             except EntangledError:
                 pass
@@ -240,46 +250,46 @@ class Reader:
         other node has any.  The nearest node without the key gets a cached copy, with a lifetime that halves for each
         node nearer to the key.
         """
-        lookup = Lookup(key, K, ALPHA, self._overlay.nearest(key), exclude=self._overlay.own_id)
+        lookup = Lookup(key, K, ALPHA, self._overlay.find_nearest(key), exclude=self._overlay.own_id)
         found: list[Record] = []
-        answers: dict[bytes, Answer] = {}
+        answers: dict[bytes, ReplicaReply] = {}
 
         async def visit(contact: Contact) -> None:
-            answer = await self.pages(contact, key, wants_sure=False)
-            if _is_something(answer.records) and answer.worth in (SURE, CACHED):
+            answer = await self.read_pages(contact, key, wants_sure=False)
+            if _has_values(answer.records) and answer.sync_level in (SYNCED_REPLY, CACHED_REPLY):
                 found[:] = found or answer.records
             else:
                 answers[contact.node_id] = answer
-            lookup.answered(contact, answer.nearer)
+            lookup.record_answer(contact, answer.nearer)
 
-        await self._overlay.walk(lookup, visit, lambda: bool(found))
+        await self._overlay.run_lookup(lookup, visit, lambda: bool(found))
         nearest = lookup.closest()
         if not found:
-            voters = self._overlay.voters(key, nearest)
-            self._overlay.note_found(key, nearest)
-            some = list(newest_of(answer.records for answer in answers.values()).values())
-            return some if _is_something(some) else self._confirm_empty(answers, voters)
+            voters = self._overlay.find_voters(key, nearest)
+            self._overlay.cache_lookup(key, nearest)
+            some = list(merge_newest(answer.records for answer in answers.values()).values())
+            return some if _has_values(some) else self._confirm_empty(answers, voters)
         lacking_nodes = [contact for contact in nearest if contact.node_id in answers]
         if lacking_nodes and all(record.lifetime == "team" for record in found):
             between = nearest.index(lacking_nodes[0])
-            packed = [record.packed() for record in found]
-            copy = self._overlay.ask(lacking_nodes[0], "cache", key, packed, MAX_AGE / 2**between, changes=True)
-            self._chores.fork(copy)
+            packed = [record.pack() for record in found]
+            copy = self._overlay.ask(lacking_nodes[0], "cache", key, packed, MAX_AGE_S / 2**between, changes=True)
+            self._background.fork(copy)
         return found
 
 
-def newest_of(opinions: Iterable[list[Record]]) -> dict[Slot, Record]:
+def merge_newest(opinions: Iterable[list[Record]]) -> dict[Slot, Record]:
     """Return the record of each slot that beats the others."""
     newest: dict[Slot, Record] = {}
     for records in opinions:
         for record in records:
-            if record.beats(newest.get(record.slot)):
+            if record.supersedes(newest.get(record.slot)):
                 newest[record.slot] = record
     return newest
 
 
-def _votes(answers: dict[bytes, Answer], voters: Voters) -> int:
-    return voters.count_known(node_id for node_id, answer in answers.items() if answer.worth == SURE)
+def _count_votes(answers: dict[bytes, ReplicaReply], voters: Voters) -> int:
+    return voters.count_known(node_id for node_id, answer in answers.items() if answer.sync_level == SYNCED_REPLY)
 
 
 def _check_votes(votes: int, voters: Voters) -> None:
@@ -288,11 +298,11 @@ def _check_votes(votes: int, voters: Voters) -> None:
         raise Unavailable(votes, voters.majority)
 
 
-def _is_clear(answers: dict[bytes, Answer], voters: Voters) -> bool:
-    is_found = any(_is_something(answer.records) for answer in answers.values())
-    return is_found or _votes(answers, voters) >= voters.majority
+def _is_conclusive(answers: dict[bytes, ReplicaReply], voters: Voters) -> bool:
+    is_found = any(_has_values(answer.records) for answer in answers.values())
+    return is_found or _count_votes(answers, voters) >= voters.majority
 
 
-def _is_something(records: list[Record]) -> bool:
+def _has_values(records: list[Record]) -> bool:
     """Return whether there is more than tombstones; a replica with only tombstones may lack records."""
     return any(not record.is_tombstone for record in records)

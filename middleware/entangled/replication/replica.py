@@ -20,26 +20,26 @@ from middleware.entangled.data.store import Store
 from middleware.entangled.errors import OWNER_FULL, Full, Refused
 from middleware.entangled.kademlia.overlay import Overlay
 from middleware.entangled.listeners import Listeners
-from middleware.entangled.record import KEY_BYTES, Record, Signed, Slot, unpacked
+from middleware.entangled.record import KEY_BYTES, Record, SignatureCache, Slot, parse_record
 from middleware.entangled.replication.cache import PathCache
 from middleware.entangled.replication.certificates import Certificates
-from middleware.entangled.replication.keepsake import Keepsakes
-from middleware.entangled.replication.pusher import WATCH_TTL, Pusher
+from middleware.entangled.replication.pusher import WATCH_TTL_S, Pusher
 from middleware.entangled.replication.store_reply import STORED, UNSYNCED, Outcome, StoreReply
 from middleware.entangled.replication.watch import digest_of
-from middleware.entangled.wire.door import Authority
+from middleware.entangled.replication.watched_copy import WatchedCopies
+from middleware.entangled.wire.admission_check import Authority
 from middleware.entangled.wire.endpoint import Endpoint
 
 PAGE_BYTES = 12_000
 """Bytes of a page; it fits into the first congestion window, ten datagrams."""
-SWEEP, LONGEST_SWEEP = 0.1, 60.0
+SWEEP_INTERVAL_S, MAX_SWEEP_INTERVAL_S = 0.1, 60.0
 """Minimum and maximum seconds between two checks for expired records."""
-MAX_LEASE = 3600.0
-MARKS = 100
-MAX_DOUBTFUL = 4096
+MAX_LEASE_S = 3600.0
+MAX_MARKS = 100
+MAX_MISMATCHED = 4096
 """Peers remembered whose last ALIVE did not match the records held."""
 
-UNSURE, SURE, CACHED = 0, 1, 2
+UNSYNCED_REPLY, SYNCED_REPLY, CACHED_REPLY = 0, 1, 2
 """Worth of a reply: from a replica that is not synced, from one that is, or a cached copy."""
 
 
@@ -57,27 +57,27 @@ class Replica:
     def __init__(
         self, store: Store, endpoint: Endpoint, overlay: Overlay, clock: IReactorTime, chores: Background
     ) -> None:
-        self.keepsakes = Keepsakes(store)
+        self.watched_copies = WatchedCopies(store)
         self._store = store
         self._endpoint = endpoint
         self._overlay = overlay
         self._clock = clock
         self.pusher = Pusher(endpoint, clock, chores)
         self.cache = PathCache()
-        self._signed = Signed()
+        self._signature_cache = SignatureCache()
         self.certificates = Certificates(endpoint, clock)
-        self.may_store: Callable[[Slot], bool] = endpoint.door.may_store
-        self.may_stay: Callable[[Slot], bool] = endpoint.door.may_stay
+        self.may_store: Callable[[Slot], bool] = endpoint.admission.may_store
+        self.may_stay: Callable[[Slot], bool] = endpoint.admission.may_keep
         self._authorities: dict[bytes, Authority] = {}
-        self.is_sure: Callable[[], bool] = lambda: True
+        self.is_synced: Callable[[], bool] = lambda: True
         self._mismatched: set[bytes] = set()
         self._swept_at = self._sweep_at = -1.0
         self._cancel_sweep: Callable[[], None] = lambda: None
         self.on_record = Listeners[[Record]]()
         self.on_gone = Listeners[[Record]]()
-        self.on_silent = Listeners[[bytes]]()
-        self._chores = chores
-        endpoint.expose("store", self._after_write(self.answer_store), changes=True, idempotent=True)
+        self.on_owner_expired = Listeners[[bytes]]()
+        self._background = chores
+        endpoint.expose("store", self._wait_for_write(self.answer_store), changes=True, idempotent=True)
         endpoint.expose("find_value", self.answer_find_value, early=True)
         endpoint.expose("cache", self.answer_cache, changes=True, idempotent=True)
         endpoint.expose("watch", self.answer_watch, changes=True, idempotent=True)
@@ -91,34 +91,34 @@ class Replica:
         self._schedule_sweep()
         self.pusher.start()
 
-    def held(self, key: bytes) -> list[Record]:
+    def get_held(self, key: bytes) -> list[Record]:
         """Return the records held under ``key`` as a replica, tombstones included."""
-        copies = self.keepsakes.under(key)
+        copies = self.watched_copies.slots_of(key)
         return [r for r in self._store.get(key, tombstones=True) if r.slot not in copies and self.may_stay(r.slot)]
 
-    def shown(self, slot: Slot) -> Record | None:
+    def get_visible(self, slot: Slot) -> Record | None:
         """Return the record held in ``slot`` as a replica, if peers may see it."""
-        return None if slot in self.keepsakes or not self.may_stay(slot) else self._store.slot(slot)
+        return None if slot in self.watched_copies or not self.may_stay(slot) else self._store.get_slot(slot)
 
     def team_records(self) -> list[Record]:
         """Return the team records held as a replica that peers may see, tombstones included."""
-        copies = self.keepsakes
+        copies = self.watched_copies
         return [
             r for r in self._store.records() if r.lifetime == "team" and r.slot not in copies and self.may_stay(r.slot)
         ]
 
     def holds(self, record: Record) -> bool:
         """Return whether exactly ``record`` is held as a replica."""
-        return self._store.slot(record.slot) == record and record.slot not in self.keepsakes
+        return self._store.get_slot(record.slot) == record and record.slot not in self.watched_copies
 
-    def keep(self, record: Record, left: float | None = None) -> StoreReply:
+    def store_locally(self, record: Record, left: float | None = None) -> StoreReply:
         """Store ``record`` if it beats the record in its slot; return STORED or SUPERSEDED.
 
         It expires after ``left`` seconds, the lifetime remaining at its sender; by default after a whole ttl.
         """
-        self.keepsakes.release(record.slot)
+        self.watched_copies.remove(record.slot)
         self.cache.drop(record.key)
-        before = self._store.slot(record.slot)
+        before = self._store.get_slot(record.slot)
         life = record.ttl if left is None else min(left, record.ttl)
         if self._store.put(record, self._clock.seconds() + life):
             self._sweep_earlier()
@@ -130,22 +130,22 @@ class Replica:
 
     def store(self, record: Record, left: float | None = None) -> StoreReply:
         """Store ``record`` as ``keep`` does; return UNSYNCED instead of STORED if this replica is not synced."""
-        reply = self.keep(record, left)
-        return UNSYNCED if reply is STORED and not self.is_sure() else reply
+        reply = self.store_locally(record, left)
+        return UNSYNCED if reply is STORED and not self.is_synced() else reply
 
-    def left(self, record: Record) -> float:
+    def remaining_lifetime(self, record: Record) -> float:
         """Return the seconds until the record in this slot expires here; the ttl of ``record`` if the slot is empty."""
-        expiry = self._store.expiry(record.slot)
+        expiry = self._store.find_expiry(record.slot)
         return record.ttl if expiry is None else expiry - self._clock.seconds()
 
-    def review(self) -> bool:
+    def recheck(self) -> bool:
         """Check the records of owners with a changed authority; return whether there are any such owners.
 
         Watchers are notified that a record is gone if its owner may no longer write it.  The record is removed if that
         is final; if the reason is the clock or a missing certificate, it is hidden until it is allowed or expires.
         """
-        before, door = self._authorities, self.certificates.door
-        self._authorities = {owner: door.authority(owner) for owner in self._store.owners()}
+        before, door = self._authorities, self.certificates.admission
+        self._authorities = {owner: door.find_authority(owner) for owner in self._store.owners()}
         changed = [owner for owner, authority in self._authorities.items() if before.get(owner) != authority]
         for owner in changed:
             self._apply_authority(owner, self._authorities[owner], before.get(owner))
@@ -161,14 +161,14 @@ class Replica:
         ``left`` is the remaining lifetime in seconds of each record, if the sender is not its owner.  Unknown
         certificates are requested from ``peer``.
         """
-        self._overlay.heard(peer)
-        records = [record for record in map(unpacked, packed) if record is not None]
-        lives = [None] * len(packed) if left is None else [_checked_life(life) for life in left]
+        self._overlay.process_message(peer)
+        records = [record for record in map(parse_record, packed) if record is not None]
+        lives = [None] * len(packed) if left is None else [_check_lifetime(life) for life in left]
         if len(records) < len(packed) or len(lives) != len(packed):
             raise Refused("not a record")
         owners = [record.owner for record in records]
-        if self.certificates.lacking(peer, owners):
-            learning = Deferred.fromCoroutine(self.certificates.learn(peer, owners))
+        if self.certificates.find_missing(peer, owners):
+            learning = Deferred.fromCoroutine(self.certificates.fetch_missing(peer, owners))
             return learning.addCallback(lambda _: self._store_all(peer, records, lives))
         return self._store_all(peer, records, lives)
 
@@ -187,74 +187,74 @@ class Replica:
         records, such as its own, may be incomplete.  If ``digest`` equals the digest of all records held, None is
         returned instead of them.
         """
-        if digest and digest == digest_of(self.held(_checked_key(key))):
-            return [None, None, self._worth()]
-        page, following = self._page(_checked_key(key), after)
+        if digest and digest == digest_of(self.get_held(_check_key(key))):
+            return [None, None, self._sync_level()]
+        page, following = self._make_page(_check_key(key), after)
         is_nothing = not page and after is None
         cached = self.cache.get(key, self._clock.seconds()) if is_nothing and not wants_sure else None
         if cached:
-            return [[record.packed() for record in cached if self.may_store(record.slot)], None, CACHED]
+            return [[record.pack() for record in cached if self.may_store(record.slot)], None, CACHED_REPLY]
         is_aside = not is_nothing and not wants_sure and not self._overlay.is_responsible(key)
         if not (is_nothing or is_aside):
-            return [page, following, self._worth()]
-        near = [contact.packed() for contact in self._overlay.nearest(key) if contact.node_id != peer.node_id]
-        return [page, following, UNSURE if is_aside else self._worth(), near]
+            return [page, following, self._sync_level()]
+        near = [contact.pack() for contact in self._overlay.find_nearest(key) if contact.node_id != peer.node_id]
+        return [page, following, UNSYNCED_REPLY if is_aside else self._sync_level(), near]
 
     def answer_cache(self, peer: Contact, key: bytes, packed: list[object], ttl: float) -> None:
         """CACHE: keep a copy of records that a lookup found, for later lookups on its path (Kademlia, section 2.3)."""
-        records = [record for record in map(unpacked, packed) if record is not None]
-        if len(records) < len(packed) or any(record.key != _checked_key(key) for record in records):
+        records = [record for record in map(parse_record, packed) if record is not None]
+        if len(records) < len(packed) or any(record.key != _check_key(key) for record in records):
             raise Refused("not records of this key")
-        if not self.held(key) and all(self.is_genuine(record) for record in records):
+        if not self.get_held(key) and all(self.is_genuine(record) for record in records):
             self.cache.put(key, records, ttl, self._clock.seconds())
 
-    def answer_watch(self, peer: Contact, key: bytes, digest: bytes, ttl: float = WATCH_TTL) -> list[object]:
+    def answer_watch(self, peer: Contact, key: bytes, digest: bytes, ttl: float = WATCH_TTL_S) -> list[object]:
         """WATCH: push changes of ``key`` to ``peer`` for ``ttl`` seconds, at most one minute.
 
         Returns the number of the last push and the first page of records, None if ``digest`` equals their digest.
         """
-        self._overlay.heard(peer)
-        number = self.pusher.watched(_checked_key(key), peer, ttl)
-        return [number, None if digest == digest_of(self.held(key)) else list(self._page(key, None))]
+        self._overlay.process_message(peer)
+        number = self.pusher.add_watcher(_check_key(key), peer, ttl)
+        return [number, None if digest == digest_of(self.get_held(key)) else list(self._make_page(key, None))]
 
     def answer_alive(self, peer: Contact, lease: float, digest: bytes) -> None:
         """ALIVE: extend the leases of ``peer``; send MISSING after two mismatches of its digest with the records held.
 
         If none are held, they expired here though the peer is alive, and MISSING is sent at once.
         """
-        self._overlay.heard(peer)
-        held = self._leased(peer.public)
-        self._store.extend(peer.public, self._clock.seconds() + min(float(lease), MAX_LEASE))
+        self._overlay.process_message(peer)
+        held = self._list_leased(peer.public)
+        self._store.extend_leases(peer.public, self._clock.seconds() + min(float(lease), MAX_LEASE_S))
         if digest == digest_of(held):
             self._mismatched.discard(peer.node_id)
         elif peer.node_id in self._mismatched or not held:
             self._mismatched.discard(peer.node_id)
-            self._endpoint.tell(peer, "missing", [digest_of([r]) for r in held[:MARKS]])
+            self._endpoint.notify(peer, "missing", [digest_of([r]) for r in held[:MAX_MARKS]])
         else:
-            if len(self._mismatched) >= MAX_DOUBTFUL:
+            if len(self._mismatched) >= MAX_MISMATCHED:
                 self._mismatched.clear()  # these get MISSING one renewal later
             self._mismatched.add(peer.node_id)
 
     def answer_let_go(self, peer: Contact, marks: list[object]) -> None:
         """LET_GO: remove leased records of ``peer``, identified by their digests, that no longer belong here."""
         self._notify_gone(
-            [r for r in self._leased(peer.public) if digest_of([r]) in marks and self._store.discard(r.slot)]
+            [r for r in self._list_leased(peer.public) if digest_of([r]) in marks and self._store.discard(r.slot)]
         )
 
     def answer_goodbye(self, peer: Contact) -> None:
         """GOODBYE: remove the leased records of ``peer``, which leaves the network (thesis, section 4.2.2)."""
         self._notify_gone(self._store.drop_leased(peer.public))
-        self.on_silent(peer.public)
+        self.on_owner_expired(peer.public)
         self.pusher.forget(peer)
         self._mismatched.discard(peer.node_id)
-        self._overlay.left(peer)
+        self._overlay.remove(peer)
 
-    def _refusal(self, record: Record, peer: Contact) -> StoreReply | None:
+    def _find_refusal(self, record: Record, peer: Contact) -> StoreReply | None:
         if not self.may_store(record.slot):
             return StoreReply(Outcome.FORBIDDEN)
-        return None if self.is_lawful(record, peer) else StoreReply(Outcome.FORGED)
+        return None if self.may_accept(record, peer) else StoreReply(Outcome.FORGED)
 
-    def is_lawful(self, record: Record, peer: Contact) -> bool:
+    def may_accept(self, record: Record, peer: Contact) -> bool:
         """Return whether ``peer`` may store ``record``.
 
         The session of its owner authenticates a record.  From another peer a team record needs a valid signature;
@@ -267,17 +267,17 @@ class Replica:
 
         A record that this node already holds needs no second check of its signature.
         """
-        return self.may_store(record.slot) and (self.holds(record) or self._signed.is_genuine(record))
+        return self.may_store(record.slot) and (self.holds(record) or self._signature_cache.is_genuine(record))
 
     # -- inside -----------------------------------------------------------------------------------------------------
 
-    def _after_write(
+    def _wait_for_write(
         self, answer: Callable[..., list[int] | Deferred[list[int]]]
     ) -> Callable[..., Deferred[list[int]]]:
         """Wrap ``answer`` so that its reply is sent only after the store has written the changes durably."""
 
         def written(answers: list[int]) -> Deferred[list[int]]:
-            return self._store.written().addCallback(lambda _: answers)
+            return self._store.wait_for_write().addCallback(lambda _: answers)
 
         @wraps(answer)
         def acknowledged(*arguments: object) -> Deferred[list[int]]:
@@ -291,7 +291,7 @@ class Replica:
         replies = []
         for record, life in zip(records, lives, strict=True):
             try:
-                replies.append(self._refusal(record, peer) or self.store(record, life))
+                replies.append(self._find_refusal(record, peer) or self.store(record, life))
             except Full as error:
                 if len(records) == 1 or error.code != OWNER_FULL:
                     raise
@@ -301,54 +301,56 @@ class Replica:
     def _apply_authority(self, owner: bytes, authority: Authority, before: Authority | None) -> None:
         """Hide or remove the records that ``owner`` may not write, and show the others again."""
         hidden = []
-        for record in self._store.owned(owner):
+        for record in self._store.find_owned(owner):
             if not self.may_stay(record.slot):
                 hidden.append(record)
-            elif before is not None and before.refusal and record.slot not in self.keepsakes:
+            elif before is not None and before.refusal and record.slot not in self.watched_copies:
                 self.on_record(record)
                 self.pusher.push(record.key, [record], [])
         self._notify_gone(hidden)
         for record in hidden if authority.is_final else ():
             self._store.discard(record.slot)
 
-    def _leased(self, owner: bytes) -> list[Record]:
+    def _list_leased(self, owner: bytes) -> list[Record]:
         """Return the leased records of ``owner`` held as a replica."""
-        return [r for r in self._store.owned(owner) if r.lifetime == "leased" and r.slot not in self.keepsakes]
+        return [
+            r for r in self._store.find_owned(owner) if r.lifetime == "leased" and r.slot not in self.watched_copies
+        ]
 
-    def _worth(self) -> int:
-        return SURE if self.is_sure() else UNSURE
+    def _sync_level(self) -> int:
+        return SYNCED_REPLY if self.is_synced() else UNSYNCED_REPLY
 
-    def _page(self, key: bytes, after: list[object] | None) -> tuple[list[object], list[object] | None]:
-        cursor = _checked_cursor(after)
-        records = self.held(key)
+    def _make_page(self, key: bytes, after: list[object] | None) -> tuple[list[object], list[object] | None]:
+        cursor = _check_cursor(after)
+        records = self.get_held(key)
         begin = bisect_right(records, cursor, key=lambda record: (record.owner, record.name)) if cursor else 0
         left = records[begin:]
-        page = next(pages_of(left), [])
+        page = next(split_pages(left), [])
         following: list[object] | None = [page[-1].owner, page[-1].name] if len(page) < len(left) else None
-        return [record.packed() for record in page], following
+        return [record.pack() for record in page], following
 
     def _notify_gone(self, records: list[Record]) -> None:
         for record in records:
-            if record.slot in self.keepsakes:
-                self.keepsakes.release(record.slot)
+            if record.slot in self.watched_copies:
+                self.watched_copies.remove(record.slot)
                 continue
             self.pusher.push(record.key, [], [record])
             self.on_gone(record)
 
     def _sweep_earlier(self) -> None:
         """Schedule the next sweep earlier if a new record expires before it."""
-        if self._swept_at >= 0 and self._store.due() <= self._sweep_at - SWEEP:
+        if self._swept_at >= 0 and self._store.next_expiry() <= self._sweep_at - SWEEP_INTERVAL_S:
             self._cancel_sweep()
             self._schedule_sweep()
 
     def _schedule_sweep(self) -> None:
         """Schedule the next sweep for the next expiry, rounded up to a multiple of ``SWEEP``."""
-        now, at = self._clock.seconds(), self._swept_at + SWEEP
-        due = min(self._store.due(), now + LONGEST_SWEEP)
+        now, at = self._clock.seconds(), self._swept_at + SWEEP_INTERVAL_S
+        due = min(self._store.next_expiry(), now + MAX_SWEEP_INTERVAL_S)
         while at < due or at <= now:
-            at += SWEEP
+            at += SWEEP_INTERVAL_S
         self._sweep_at = at
-        self._cancel_sweep = self._chores.later(at - now, self._sweep)
+        self._cancel_sweep = self._background.later(at - now, self._sweep)
 
     def _sweep(self) -> None:
         self._swept_at = self._sweep_at
@@ -358,10 +360,10 @@ class Replica:
             self._schedule_sweep()
         self._notify_gone(ended)
         for owner in dict.fromkeys(r.owner for r in ended if r.lifetime == "leased"):
-            self.on_silent(owner)
+            self.on_owner_expired(owner)
 
 
-def pages_of(records: list[Record], most: int | None = None) -> Iterator[list[Record]]:
+def split_pages(records: list[Record], most: int | None = None) -> Iterator[list[Record]]:
     """Split ``records`` into pages of about ``PAGE_BYTES`` and at most ``most`` records each."""
     page: list[Record] = []
     size = 0
@@ -375,13 +377,13 @@ def pages_of(records: list[Record], most: int | None = None) -> Iterator[list[Re
         yield page
 
 
-def _checked_key(key: object) -> bytes:
+def _check_key(key: object) -> bytes:
     if not isinstance(key, bytes) or len(key) != KEY_BYTES:
         raise Refused(f"a key has {KEY_BYTES} bytes")
     return key
 
 
-def _checked_cursor(after: list[object] | None) -> tuple[bytes, str] | None:
+def _check_cursor(after: list[object] | None) -> tuple[bytes, str] | None:
     if after is None:
         return None
     if len(after) != 2 or not isinstance(after[0], bytes) or not isinstance(after[1], str):
@@ -389,7 +391,7 @@ def _checked_cursor(after: list[object] | None) -> tuple[bytes, str] | None:
     return after[0], after[1]
 
 
-def _checked_life(life: object) -> float:
+def _check_lifetime(life: object) -> float:
     if type(life) is not float or not math.isfinite(life):
         raise Refused("a remaining lifetime is a finite float of seconds")
     return life

@@ -45,7 +45,7 @@ class StoreReply(NamedTuple):
 
 STORED = StoreReply(Outcome.STORED)
 UNSYNCED = StoreReply(Outcome.UNSYNCED)
-_BY_CODE = {each.value: StoreReply(each) for each in Outcome if each is not Outcome.SUPERSEDED}
+_REPLIES_BY_CODE = {each.value: StoreReply(each) for each in Outcome if each is not Outcome.SUPERSEDED}
 
 
 def decode_reply(code: object, record: Record) -> StoreReply | None:
@@ -55,4 +55,4 @@ def decode_reply(code: object, record: Record) -> StoreReply | None:
     if code > 0:
         is_valid = record.sequence <= code < MAX_SEQUENCE
         return StoreReply(Outcome.SUPERSEDED, code) if is_valid else None
-    return _BY_CODE.get(code)
+    return _REPLIES_BY_CODE.get(code)

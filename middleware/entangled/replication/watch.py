@@ -10,10 +10,10 @@ from __future__ import annotations
 import hashlib
 from collections.abc import Callable, Iterable
 
-from middleware.entangled.identity import node_id
+from middleware.entangled.identity import derive_node_id
 from middleware.entangled.record import Record, Slot
 
-Changed = Callable[[list[Record]], None]
+OnChanged = Callable[[list[Record]], None]
 
 
 _EMPTY_DIGEST = hashlib.blake2s(digest_size=8).digest()
@@ -45,7 +45,7 @@ class View:
     def add(self, replica: bytes, record: Record) -> None:
         """Add ``record`` to the report of ``replica``."""
         held = self._reports.setdefault(replica, {})
-        if record.beats(held.get(record.slot)):
+        if record.supersedes(held.get(record.slot)):
             held[record.slot] = record
 
     def remove(self, replica: bytes, slot: Slot) -> None:
@@ -69,15 +69,15 @@ class View:
         """Return the digest of the report of ``replica``."""
         return digest_of(self._reports.get(replica, {}).values())
 
-    def merged(self) -> list[Record]:
+    def merge(self) -> list[Record]:
         """Return the merged records, without tombstones, in the order of (owner, name)."""
         best: dict[Slot, Record] = {}
         for replica, held in self._reports.items():
             for slot, record in held.items():
-                is_own_lease = record.lifetime == "leased" and node_id(record.owner) == replica
+                is_own_lease = record.lifetime == "leased" and derive_node_id(record.owner) == replica
                 if is_own_lease and replica != self._own_id:
                     continue
-                if record.beats(best.get(slot)):
+                if record.supersedes(best.get(slot)):
                     best[slot] = record
         live = [record for record in best.values() if not record.is_tombstone]
         return sorted(live, key=lambda r: (r.owner, r.name))
@@ -94,7 +94,7 @@ class Watch:
     def __init__(
         self,
         key: bytes,
-        changed: Changed,
+        changed: OnChanged,
         unwatch: Callable[[Watch], None],
         own_id: bytes = b"",
         keep: bool = False,
@@ -102,27 +102,27 @@ class Watch:
         self.key = key
         self.view = View(own_id)
         self.records: list[Record] = []
-        self.asked: set[bytes] = set()
-        self.pushed: dict[bytes, int] = {}
+        self.requested: set[bytes] = set()
+        self.push_numbers: dict[bytes, int] = {}
         self.due_at = 0.0
-        self.keep = keep
-        self._changed = changed
-        self._unwatch = unwatch
+        self.has_copies = keep
+        self._on_changed = changed
+        self._on_stop = unwatch
 
-    def settle(self) -> None:
+    def update(self) -> None:
         """Merge the view, and notify the subscriber if the records changed."""
-        records = self.view.merged()
+        records = self.view.merge()
         if records != self.records:
             self.records = records
-            self._changed(list(records))
+            self._on_changed(list(records))
 
     def forget(self, replica: bytes) -> None:
         """Discard the report of ``replica`` and ignore its pushes until the next request to it."""
-        self.asked.discard(replica)
-        self.pushed.pop(replica, None)
+        self.requested.discard(replica)
+        self.push_numbers.pop(replica, None)
         self.view.forget(replica)
 
     def stop(self) -> None:
         """End the subscription without further notifications."""
-        self._changed = lambda _records: None
-        self._unwatch(self)
+        self._on_changed = lambda _records: None
+        self._on_stop(self)

@@ -13,12 +13,12 @@ from dataclasses import dataclass
 
 from twisted.internet.defer import Deferred
 
-from middleware.entangled.background import first
+from middleware.entangled.background import gather_first
 from middleware.entangled.errors import LocalError, NoAnswer, TooLarge
-from middleware.entangled.record import MAX_NAME, MAX_VALUE, Record, hashed_key
+from middleware.entangled.record import MAX_NAME_BYTES, MAX_VALUE_BYTES, Record, hash_key
 from middleware.entangled.replication.owner import Stored
 from middleware.entangled.replication.watch import Watch
-from middleware.entangled.space.peer import Records
+from middleware.entangled.space.node_interface import RecordAccess
 
 MAX_WORDS = 16
 
@@ -45,7 +45,7 @@ def words(text: str) -> list[str]:
 
 def keyword_key(word: str) -> bytes:
     """Return the key of the index of ``word``."""
-    return hashed_key(f"keyword/{word}")
+    return hash_key(f"keyword/{word}")
 
 
 def matches(records: Iterable[Record], wanted: Sequence[str]) -> list[Match]:
@@ -60,7 +60,7 @@ def matches(records: Iterable[Record], wanted: Sequence[str]) -> list[Match]:
 class Keywords:
     """Publishing and search by keyword through one node."""
 
-    def __init__(self, node: Records) -> None:
+    def __init__(self, node: RecordAccess) -> None:
         self._node = node
 
     def publish(self, name: str, data: bytes) -> Deferred[None]:
@@ -69,28 +69,30 @@ class Keywords:
         Raises ``BadName`` and ``TooLarge`` at once; fails with ``NoAnswer`` if the index of a word is unreachable; the
         other indexes may have the entry.
         """
-        if len(data) > MAX_VALUE:
-            raise TooLarge(f"{name}: data of {len(data)} bytes; at most {MAX_VALUE} can be published under a name")
-        if len(name.encode(errors="replace")) > MAX_NAME:
-            raise TooLarge(f"{name}: the name is longer than {MAX_NAME} bytes")
-        keys = [keyword_key(word) for word in _checked(name)]
-        return Deferred.fromCoroutine(_all(name, [self._node.put(key, name, data) for key in keys]))
+        if len(data) > MAX_VALUE_BYTES:
+            raise TooLarge(
+                f"{name}: data of {len(data)} bytes; at most {MAX_VALUE_BYTES} can be published under a name"
+            )
+        if len(name.encode(errors="replace")) > MAX_NAME_BYTES:
+            raise TooLarge(f"{name}: the name is longer than {MAX_NAME_BYTES} bytes")
+        keys = [keyword_key(word) for word in _check_words(name)]
+        return Deferred.fromCoroutine(_run_all(name, [self._node.put(key, name, data) for key in keys]))
 
     def remove(self, name: str) -> Deferred[None]:
         """Remove this node's publication under ``name``; fails as ``publish`` does."""
-        keys = [keyword_key(word) for word in _checked(name)]
-        return Deferred.fromCoroutine(_all(name, [self._node.remove(key, name) for key in keys]))
+        keys = [keyword_key(word) for word in _check_words(name)]
+        return Deferred.fromCoroutine(_run_all(name, [self._node.remove(key, name) for key in keys]))
 
     def search(self, keywords: str | Sequence[str]) -> Deferred[list[Match]]:
         """Fire with the publications with all ``keywords`` (a text or a sequence); raise ``BadName``."""
-        wanted = _checked(keywords if isinstance(keywords, str) else " ".join(keywords))
+        wanted = _check_words(keywords if isinstance(keywords, str) else " ".join(keywords))
         # The longest word is likely the rarest, and its index the shortest to read.
         found = self._node.get(keyword_key(max(wanted, key=len)))
         return found.addCallback(matches, wanted)
 
     def watch_keyword(self, word: str, changed: Callable[[list[Match]], None]) -> Watch:
         """Call ``changed`` with all matches of ``word`` on each change, until ``stop()`` of the returned watch."""
-        wanted = _checked(word)
+        wanted = _check_words(word)
         reported: list[Match] = []
 
         def report(records: list[Record]) -> None:
@@ -102,18 +104,18 @@ class Keywords:
         return self._node.watch(keyword_key(max(wanted, key=len)), report)
 
 
-def _checked(text: str) -> list[str]:
+def _check_words(text: str) -> list[str]:
     found = words(text)
     if not 0 < len(found) <= MAX_WORDS:
         raise BadName(f"{text!r} has {len(found)} words; it must have 1 to {MAX_WORDS}")
     return found
 
 
-async def _all(name: str, work: list[Deferred[Stored]]) -> None:
-    done = await first(len(work), [_awaited(each) for each in work])
+async def _run_all(name: str, work: list[Deferred[Stored]]) -> None:
+    done = await gather_first(len(work), [_run(each) for each in work])
     if len(done) < len(work):
         raise NoAnswer(f"{name}: the indexes of {len(work) - len(done)} of its {len(work)} words did not answer")
 
 
-async def _awaited(work: Deferred[Stored]) -> int:
+async def _run(work: Deferred[Stored]) -> int:
     return await work

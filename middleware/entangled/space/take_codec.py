@@ -8,16 +8,16 @@ from typing import Any
 import msgpack
 
 from middleware.entangled.quorum.acceptor import Event
-from middleware.entangled.quorum.ballot import NONE, Ballot, Ceiling
+from middleware.entangled.quorum.ballot import NO_BALLOT, Ballot, Ceiling
 from middleware.entangled.quorum.log import Codec, Floor
-from middleware.entangled.quorum.register import Kind, Register, Reply
+from middleware.entangled.quorum.register import Register, Reply, ReplyKind
 from middleware.entangled.record import KEY_BYTES
-from middleware.entangled.space.posting import Place, is_name, place_unpacked
+from middleware.entangled.space.tuple_record import TupleId, is_taker_name, parse_tuple_id
 
 MAX_COUNTER = 2**48
-MAX_LEASE = 600.0
+MAX_LEASE_S = 600.0
 _GRANTED = {Event.PREPARE: 0, Event.ACCEPT: 1, Event.RELEASE: 5}
-_OTHERS = {Kind.HELD: 2, Kind.OUTBID: 3, Kind.UNPREPARED: 4}
+_OTHERS = {ReplyKind.HELD: 2, ReplyKind.OUTBID: 3, ReplyKind.UNPREPARED: 4}
 _KINDS = {code: kind for kind, code in _OTHERS.items()}
 
 
@@ -28,13 +28,18 @@ def is_counter(value: object) -> bool:
 
 def is_lease(value: object) -> bool:
     """Return whether ``value`` may be the remaining seconds of a lease."""
-    return type(value) is float and 0.0 <= value <= MAX_LEASE
+    return type(value) is float and 0.0 <= value <= MAX_LEASE_S
 
 
 def pack_reply(reply: Reply, event: Event) -> list[object]:
     """Encode the reply to ``event`` for a message."""
     code = _OTHERS.get(reply.kind, _GRANTED[event])
-    return [code, reply.promised.counter, min(reply.remaining, MAX_LEASE), _pack_accepted(reply.accepted, reply.value)]
+    return [
+        code,
+        reply.promised.counter,
+        min(reply.remaining, MAX_LEASE_S),
+        _pack_accepted(reply.accepted, reply.value),
+    ]
 
 
 def unpack_reply(fields: object, event: Event) -> Reply | None:
@@ -44,26 +49,26 @@ def unpack_reply(fields: object, event: Event) -> Reply | None:
     code, counter, remaining, accepted = fields
     if type(code) is not int or not (is_counter(counter) or (type(counter) is int and counter == 0)):
         return None
-    kind = Kind.GRANTED if code == _GRANTED[event] else _KINDS.get(code)
+    kind = ReplyKind.GRANTED if code == _GRANTED[event] else _KINDS.get(code)
     decoded = _unpack_accepted(accepted)
     if kind is None or not is_lease(remaining) or decoded is None:
         return None
     return Reply(kind, Ballot(counter, b""), remaining=remaining, accepted=decoded[0], value=decoded[1])
 
 
-def _bucket_of(key: Place) -> str:
+def _bucket_of(key: TupleId) -> str:
     return f"decree/{hashlib.blake2s(key.mark + key.owner, digest_size=1).hexdigest()}"
 
 
-def _pack(registers: dict[Place, Register]) -> bytes:
+def _pack(registers: dict[TupleId, Register]) -> bytes:
     rows: list[list[Any]] = []
     for place, register in registers.items():
         accepted = _pack_accepted(register.accepted, register.value)
-        rows.append([place.key, place.packed(), *register.promised, register.reserve, accepted])
+        rows.append([place.key, place.pack(), *register.promised, register.reserve, accepted])
     return bytes(msgpack.packb(rows))
 
 
-def _unpack(noted: bytes) -> tuple[dict[Place, Register], bool]:
+def _unpack(noted: bytes) -> tuple[dict[TupleId, Register], bool]:
     try:
         rows = msgpack.unpackb(noted, strict_map_key=True, max_ext_len=0)
     except Exception:  # msgpack on bytes that may be corrupt
@@ -80,12 +85,12 @@ def _unpack_floor(noted: bytes | None) -> Floor:
     return Floor(int.from_bytes(noted or b""))
 
 
-def _unpack_row(row: object) -> tuple[Place, Register] | None:
+def _unpack_row(row: object) -> tuple[TupleId, Register] | None:
     if not isinstance(row, list) or len(row) != 6 or not isinstance(row[0], bytes) or len(row[0]) != KEY_BYTES:
         return None
     key, fields, counter, taker, lease, accepted = row
-    place, decoded = place_unpacked(key, fields), _unpack_accepted(accepted)
-    if place is None or decoded is None or not (is_counter(counter) and is_name(taker) and is_lease(lease)):
+    place, decoded = parse_tuple_id(key, fields), _unpack_accepted(accepted)
+    if place is None or decoded is None or not (is_counter(counter) and is_taker_name(taker) and is_lease(lease)):
         return None
     ballot, value = decoded
     ceiling = Ceiling(0.0, 1)
@@ -93,20 +98,24 @@ def _unpack_row(row: object) -> tuple[Place, Register] | None:
 
 
 def _pack_accepted(ballot: Ballot, value: object) -> list[object] | None:
-    return None if ballot == NONE else [*ballot, value]
+    return None if ballot == NO_BALLOT else [*ballot, value]
 
 
 def _unpack_accepted(fields: object) -> tuple[Ballot, bytes | None] | None:
     """Decode the accepted ballot, ``NONE`` if there is none, and value; None if the fields are invalid."""
     if fields is None:
-        return NONE, None
+        return NO_BALLOT, None
     if not isinstance(fields, list) or len(fields) != 3:
         return None
     counter, taker, value = fields
-    return (Ballot(counter, taker), value) if is_counter(counter) and is_name(taker) and is_name(value) else None
+    return (
+        (Ballot(counter, taker), value)
+        if is_counter(counter) and is_taker_name(taker) and is_taker_name(value)
+        else None
+    )
 
 
-CODEC: Codec[Place] = Codec(
+CODEC: Codec[TupleId] = Codec(
     "decree/floor",
     "decree/{:02x}",
     256,

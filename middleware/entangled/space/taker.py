@@ -12,23 +12,23 @@ from typing import Any
 from twisted.internet.defer import Deferred, FirstError, fail, gatherResults, maybeDeferred
 from twisted.internet.interfaces import IReactorTime
 
-from middleware.entangled.background import Background, first
+from middleware.entangled.background import Background, gather_first
 from middleware.entangled.contact import Contact
 from middleware.entangled.errors import EntangledError, NoAnswer, Refused
-from middleware.entangled.kademlia.distance import closest
+from middleware.entangled.kademlia.distance import select_closest
 from middleware.entangled.listeners import Listeners
 from middleware.entangled.quorum.ballot import Ballot
 from middleware.entangled.quorum.proposer import Outcome, Result
-from middleware.entangled.space.council import Council
-from middleware.entangled.space.keeper import Keeper
-from middleware.entangled.space.peer import Peer
-from middleware.entangled.space.posting import INCARNATION_BYTES, Member, Place, Posted, standing
-from middleware.entangled.space.seat import MAX_PLACES
+from middleware.entangled.space.node_interface import NodeInterface
+from middleware.entangled.space.slot_maintenance import SlotMaintenance
+from middleware.entangled.space.take_acceptor import MAX_TUPLES
+from middleware.entangled.space.take_proposer import TakeProposer
 from middleware.entangled.space.template import Template, Tuple
+from middleware.entangled.space.tuple_record import INCARNATION_BYTES, Member, StoredTuple, TupleId, parse_records
 
-MARGIN = 0.02
+CLOCK_DRIFT = 0.02
 """Relative drift between the clocks of two correct nodes (1 % each)."""
-ENROLLED_S = 5.0
+COUNCIL_CACHE_S = 5.0
 """Seconds that the enrolled council of a key is reused."""
 MAX_ENROLMENTS = 3
 """Attempts to look up and enrol the nodes closest to a key."""
@@ -37,14 +37,14 @@ LEASED_RETRY_S = 0.5
 CONTEST_RETRY_S = (0.02, 0.08)
 SILENT_RETRY_S = (0.2, 0.6)
 MAX_REMEMBERED = 10_000
-OVER = "the claim has already been confirmed or released"
+OVER_TEXT = "the claim has already been confirmed or released"
 
 
 class ClaimLost(Refused):
     """Another claimant took the tuple; the caller must discard its work on it."""
 
 
-class Wait:
+class WaitingCall:
     """A call that waits for a tuple; ``is_over`` when it was answered, cancelled or timed out."""
 
     def __init__(self) -> None:
@@ -67,7 +67,7 @@ class Claim:
     of a failed taker becomes available again.
     """
 
-    posted: Posted
+    stored_tuple: StoredTuple
     ballot: Ballot
     lease: float
     deadline: float
@@ -77,7 +77,7 @@ class Claim:
     @property
     def fields(self) -> Tuple:
         """The tuple."""
-        return self.posted.fields
+        return self.stored_tuple.fields
 
     def confirm(self) -> Deferred[Tuple]:
         """Take the tuple permanently; fires when the council has decided.
@@ -85,7 +85,7 @@ class Claim:
         Fails with ``ClaimLost`` if the council decided for another claimant, which is possible only after the deadline.
         If the call is cancelled and the council decides for it, the tuple is put back.
         """
-        return fail(ClaimLost(OVER)) if self.is_over else self._taker.confirm(self)
+        return fail(ClaimLost(OVER_TEXT)) if self.is_over else self._taker.confirm(self)
 
     def release(self) -> None:
         """Make the tuple available to others at once."""
@@ -95,7 +95,7 @@ class Claim:
 
     def renew(self) -> Deferred[None]:
         """Renew the lease from now; fails with ``ClaimLost``, or with ``NoAnswer`` while the lease is valid."""
-        return fail(ClaimLost(OVER)) if self.is_over else Deferred.fromCoroutine(self._taker.renew(self))
+        return fail(ClaimLost(OVER_TEXT)) if self.is_over else Deferred.fromCoroutine(self._taker.renew(self))
 
 
 class Taker:
@@ -107,35 +107,35 @@ class Taker:
 
     def __init__(
         self,
-        node: Peer,
+        node: NodeInterface,
         clock: IReactorTime,
         rng: random.Random,
         chores: Background,
-        keeper: Keeper,
+        keeper: SlotMaintenance,
         council: int,
-        freed: Callable[[Place], None],
+        freed: Callable[[TupleId], None],
         put_back: Callable[[Tuple], object],
     ) -> None:
-        self._freed = freed
-        self._put_back = put_back
-        self.held: set[Place] = set()
-        self.gone: dict[Place, bytes] = {}
+        self._on_freed = freed
+        self._on_unwanted = put_back
+        self.claimed: set[TupleId] = set()
+        self.taken: dict[TupleId, bytes] = {}
         self._node = node
         self._clock = clock
         self._rng = rng
-        self._chores = chores
-        self._keeper = keeper
-        self._size = council
-        self._council = Council(self._ask, clock, rng, chores)
+        self._background = chores
+        self._slots = keeper
+        self._council_size = council
+        self._proposer = TakeProposer(self._ask, clock, rng, chores)
         self._seed = zlib.crc32(node.identity.node_id)
-        self._counters: dict[Place, int] = {}
-        self._not_before: dict[Place, float] = {}
+        self._counters: dict[TupleId, int] = {}
+        self._not_before: dict[TupleId, float] = {}
         self._members: dict[bytes, tuple[float, list[Member]]] = {}
-        chores.every(REPAIR_INTERVAL_S, self._complete_unsettled)
+        chores.every(REPAIR_INTERVAL_S, self._complete_unfinished)
 
     # -- councils ---------------------------------------------------------------------------------------------------
 
-    async def enrolled(self, key: bytes) -> list[Member]:
+    async def enrol_council(self, key: bytes) -> list[Member]:
         """Return the council for a new tuple: the live nodes closest to ``key``, this one among them.
 
         It is smaller than configured only if the network is.  Fails with ``NoAnswer`` if other nodes do not answer,
@@ -146,18 +146,20 @@ class Taker:
             return members
         members = []
         for _ in range(MAX_ENROLMENTS):
-            near = closest([*await self._node.find_node(key), self._node.contact], key, 2 * self._size)
+            near = select_closest([*await self._node.find_node(key), self._node.contact], key, 2 * self._council_size)
             agreed = {member.contact.node_id for member in members}
             left, silent = [contact for contact in near if contact.node_id not in agreed], 0
-            while left and len(members) < self._size:
-                requested, left = left[: self._size - len(members)], left[self._size - len(members) :]
-                answers = await first(len(requested), [self._enrol(contact) for contact in requested])
+            while left and len(members) < self._council_size:
+                requested, left = left[: self._council_size - len(members)], left[self._council_size - len(members) :]
+                answers = await gather_first(len(requested), [self._enrol(contact) for contact in requested])
                 members += [member for member in answers if member is not None]
                 silent += len(requested) - len(answers)
-            if members and (len(members) == self._size or not silent):
-                self._members[key] = (self._clock.seconds() + ENROLLED_S, members)
+            if members and (len(members) == self._council_size or not silent):
+                self._members[key] = (self._clock.seconds() + COUNCIL_CACHE_S, members)
                 return members
-        raise NoAnswer(f"{len(members)} of {self._size} nodes agreed to be in the council of a tuple; try again")
+        raise NoAnswer(
+            f"{len(members)} of {self._council_size} nodes agreed to be in the council of a tuple; try again"
+        )
 
     async def _enrol(self, contact: Contact) -> Member | None:
         """Ask the node to be a member; return None if it refuses."""
@@ -171,60 +173,62 @@ class Taker:
     def _ask(self, contact: Contact, method: str, arguments: tuple[object, ...]) -> Deferred[Any]:
         node = self._node
         if contact.node_id == node.identity.node_id:
-            answer = getattr(node.seat, method.replace("decree.", "answer_"))
+            answer = getattr(node.take_acceptor, method.replace("decree.", "answer_"))
             return maybeDeferred(answer, node.contact, *arguments)
         # A member may have moved since the tuple was put; its key is still the same.
-        return node.endpoint.ask(node.newest(contact), method, *arguments, changes=method != "decree.enrol")
+        return node.endpoint.ask(node.find_newest(contact), method, *arguments, changes=method != "decree.enrol")
 
     # -- choosing ---------------------------------------------------------------------------------------------------
 
-    def candidates(
-        self, posted: Sequence[Posted], template: Template, is_patient: bool = True
-    ) -> tuple[list[Posted], float | None]:
+    def find_candidates(
+        self, posted: Sequence[StoredTuple], template: Template, is_patient: bool = True
+    ) -> tuple[list[StoredTuple], float | None]:
         """Return the tuples to try now, in this node's order, and the seconds until another may be tried.
 
         The order differs between nodes, so that takers rarely compete for a tuple.  Tuples that this node failed to
         claim come last, the oldest failure first, so that tuples with an unreachable council do not block the others.
         """
         now = self._clock.seconds()
-        open_ = [p for p in posted if p.place not in self.gone and p.place not in self.held]
+        open_ = [p for p in posted if p.tuple_id not in self.taken and p.tuple_id not in self.claimed]
         fitting = [p for p in open_ if template.matches(p.fields)]
-        ready = [p for p in fitting if not is_patient or self._not_before.get(p.place, 0.0) <= now]
-        ready.sort(key=lambda p: (self._not_before.get(p.place, 0.0), zlib.crc32(p.place.mark, self._seed), p.place))
-        times = [self._not_before[p.place] for p in fitting if p.place in self._not_before]
+        ready = [p for p in fitting if not is_patient or self._not_before.get(p.tuple_id, 0.0) <= now]
+        ready.sort(
+            key=lambda p: (self._not_before.get(p.tuple_id, 0.0), zlib.crc32(p.tuple_id.mark, self._seed), p.tuple_id)
+        )
+        times = [self._not_before[p.tuple_id] for p in fitting if p.tuple_id in self._not_before]
         return ready, min((max(0.001, time - now) for time in times), default=None)
 
-    def batch(self, posted: Sequence[Posted], most: int) -> list[Posted]:
+    def select_batch(self, posted: Sequence[StoredTuple], most: int) -> list[StoredTuple]:
         """Return the first of ``posted`` and others with the same council, as many as fit into one request."""
         same_council = [one for one in posted if one.council == posted[0].council]
-        return same_council[: min(most, MAX_PLACES)]
+        return same_council[: min(most, MAX_TUPLES)]
 
     # -- taking -----------------------------------------------------------------------------------------------------
 
-    async def claim(self, posted: Sequence[Posted], lease: float) -> tuple[list[Claim], bool]:
+    async def claim(self, posted: Sequence[StoredTuple], lease: float) -> tuple[list[Claim], bool]:
         """Claim tuples of one council; return the claims won, and whether too few members answered."""
-        places = [one.place for one in posted]
-        self.held.update(places)
-        ballot = Ballot(1 + max(self._counters.get(place, 0) for place in places), self._new_bidder())
+        places = [one.tuple_id for one in posted]
+        self.claimed.update(places)
+        ballot = Ballot(1 + max(self._counters.get(place, 0) for place in places), self._make_proposer_name())
         sent = self._clock.seconds()
-        outcomes = await self._council.claim(posted, ballot, lease)
+        outcomes = await self._proposer.claim(posted, ballot, lease)
         claims = []
         for one, outcome in zip(posted, outcomes, strict=True):
-            self._counters[one.place] = max(ballot.counter, outcome.counter)
+            self._counters[one.tuple_id] = max(ballot.counter, outcome.counter)
             if outcome.result is Result.WON and outcome.value is None:
-                deadline = sent + lease * (1.0 - MARGIN)
+                deadline = sent + lease * (1.0 - CLOCK_DRIFT)
                 claims.append(Claim(one, ballot, lease, deadline, self))
                 self._expire(claims[-1])
             elif outcome.result is Result.WON:
                 # A taker failed during its confirmation: complete it in that taker's name.
-                self._chores.fork(self._complete(one, outcome.value))
+                self._background.fork(self._complete(one, outcome.value))
             else:
-                self._note_failed_claim(one.place, outcome)
-        _trim(self._counters)
-        _trim(self._not_before)
+                self._note_failed_claim(one.tuple_id, outcome)
+        _limit_size(self._counters)
+        _limit_size(self._not_before)
         return claims, any(outcome.result is Result.SILENT for outcome in outcomes)
 
-    async def decide(self, claims: Sequence[Claim], wait: Wait | None = None) -> list[bool]:
+    async def decide(self, claims: Sequence[Claim], wait: WaitingCall | None = None) -> list[bool]:
         """Confirm claims of one ballot; return for each whether this node took the tuple.
 
         Retries until the council has decided, because no other node can take a tuple that may have been given to this
@@ -235,7 +239,7 @@ class Taker:
         for claim in claims:
             claim.is_over = True
         ballot = claims[0].ballot
-        outcomes = await self._council.confirm([claim.posted for claim in claims], ballot, ballot.proposer)
+        outcomes = await self._proposer.confirm([claim.stored_tuple for claim in claims], ballot, ballot.proposer)
         pairs = zip(claims, outcomes, strict=True)
         works = [Deferred.fromCoroutine(self._finish_decision(claim, outcome, wait)) for claim, outcome in pairs]
         try:
@@ -243,41 +247,43 @@ class Taker:
         except FirstError as error:  # the node is stopping
             error.subFailure.raiseException()
 
-    async def _finish_decision(self, claim: Claim, outcome: Outcome, wait: Wait | None) -> bool:
-        taker, place = claim.ballot.proposer, claim.posted.place
+    async def _finish_decision(self, claim: Claim, outcome: Outcome, wait: WaitingCall | None) -> bool:
+        taker, place = claim.ballot.proposer, claim.stored_tuple.tuple_id
         winner = taker if outcome.result is Result.WON else outcome.value
         if winner is None:
             counter = max(claim.ballot.counter, outcome.counter)
-            winner = await self._council.resolve(claim.posted, taker, taker, counter) or taker
+            winner = await self._proposer.resolve(claim.stored_tuple, taker, taker, counter) or taker
         self._forget_taken(place, winner)
         if winner != taker:
-            self._keeper.doubt(place, winner)
+            self._slots.check_taken_note(place, winner)
             return False
         with suppress(EntangledError):  # the node republishes the note later, and the council knows the taker
-            await self._keeper.note(place, winner)
+            await self._slots.put_taken_note(place, winner)
         if wait is not None and wait.is_over:
-            self._put_back(claim.fields)
+            self._on_unwanted(claim.fields)
         return True
 
-    async def _complete(self, posted: Posted, value: bytes | None) -> None:
-        place = posted.place
-        self.held.add(place)
+    async def _complete(self, posted: StoredTuple, value: bytes | None) -> None:
+        place = posted.tuple_id
+        self.claimed.add(place)
         try:
-            winner = await self._council.resolve(posted, self._new_bidder(), value, self._counters.get(place, 0))
+            winner = await self._proposer.resolve(
+                posted, self._make_proposer_name(), value, self._counters.get(place, 0)
+            )
         finally:
-            self.held.discard(place)
+            self.claimed.discard(place)
         if winner is not None:
             self._forget_taken(place, winner)
-            self._keeper.doubt(place, winner)
-            self._node.seat.settle(place)
+            self._slots.check_taken_note(place, winner)
+            self._node.take_acceptor.finish(place)
         else:
-            self._freed(place)
+            self._on_freed(place)
 
-    def _note_failed_claim(self, place: Place, outcome: Outcome) -> None:
+    def _note_failed_claim(self, place: TupleId, outcome: Outcome) -> None:
         now = self._clock.seconds()
         if outcome.result is Result.DECIDED and outcome.value is not None:
             self._forget_taken(place, outcome.value)
-            self._keeper.doubt(place, outcome.value)
+            self._slots.check_taken_note(place, outcome.value)
         elif outcome.result is Result.HELD:
             self._not_before[place] = now + min(outcome.remaining, LEASED_RETRY_S) + self._rng.uniform(*CONTEST_RETRY_S)
         elif outcome.result is Result.OUTBID:
@@ -285,35 +291,37 @@ class Taker:
         else:
             self._not_before[place] = now + self._rng.uniform(*SILENT_RETRY_S)
         # Wake other calls of this node that wait because this one held the tuple.
-        self._free(place)
+        self._free_tuple(place)
 
-    def _forget_taken(self, place: Place, winner: bytes) -> None:
-        self.held.discard(place)
+    def _forget_taken(self, place: TupleId, winner: bytes) -> None:
+        self.claimed.discard(place)
         self._counters.pop(place, None)
         self._not_before.pop(place, None)
-        self.gone[place] = winner
-        _trim(self.gone)
+        self.taken[place] = winner
+        _limit_size(self.taken)
 
-    def _new_bidder(self) -> bytes:
+    def _make_proposer_name(self) -> bytes:
         """Return a new unique name for a ballot of this node."""
         return self._node.identity.node_id + self._rng.randbytes(8)
 
-    def _complete_unsettled(self) -> None:
+    def _complete_unfinished(self) -> None:
         """Complete takes that this node accepted as a council member without seeing their end."""
-        late = [posted for posted in self._node.seat.unsettled() if posted.place.key in self._keeper.keys]
-        for key in dict.fromkeys(posted.place.key for posted in late):
-            _, taken = standing(self._node.store.get(key))
+        late = [
+            posted for posted in self._node.take_acceptor.list_unfinished() if posted.tuple_id.key in self._slots.keys
+        ]
+        for key in dict.fromkeys(posted.tuple_id.key for posted in late):
+            _, taken = parse_records(self._node.store.get(key))
             for posted in late:
-                if posted.place in taken:
-                    self._node.seat.settle(posted.place)
-                elif posted.place.key == key and posted.place not in self.held:
-                    self._chores.fork(self._complete(posted, None))
+                if posted.tuple_id in taken:
+                    self._node.take_acceptor.finish(posted.tuple_id)
+                elif posted.tuple_id.key == key and posted.tuple_id not in self.claimed:
+                    self._background.fork(self._complete(posted, None))
 
     # -- methods of a claim -----------------------------------------------------------------------------------------
 
     def confirm(self, claim: Claim) -> Deferred[Tuple]:
         """Confirm a claim; if the call is cancelled and the council decides for it, put the tuple back."""
-        wait = Wait()
+        wait = WaitingCall()
 
         async def work() -> None:
             [won] = await self.decide([claim], wait)
@@ -324,23 +332,23 @@ class Taker:
             else:
                 wait.deferred.errback(ClaimLost("another node took the tuple after the claim had expired"))
 
-        self._chores.fork(work())
+        self._background.fork(work())
         return wait.deferred
 
     def release(self, claim: Claim) -> None:
         """Give up a claim, and notify its council."""
-        self._council.release([claim.posted], claim.ballot)
-        self._free(claim.posted.place)
+        self._proposer.release([claim.stored_tuple], claim.ballot)
+        self._free_tuple(claim.stored_tuple.tuple_id)
 
     async def renew(self, claim: Claim) -> None:
         """Renew the lease of a claim; raises ``ClaimLost`` and ``NoAnswer``."""
         sent = self._clock.seconds()
-        [outcome] = await self._council.renew([claim.posted], claim.ballot, claim.lease)
+        [outcome] = await self._proposer.renew([claim.stored_tuple], claim.ballot, claim.lease)
         if outcome.result is Result.SILENT:
             raise NoAnswer("too few council members answer to renew the claim; try again before its deadline")
         if outcome.result is not Result.WON or outcome.value is not None:
             raise ClaimLost("another node claimed the tuple after the claim had expired")
-        claim.deadline = sent + claim.lease * (1.0 - MARGIN)
+        claim.deadline = sent + claim.lease * (1.0 - CLOCK_DRIFT)
 
     def _expire(self, claim: Claim) -> None:
         """Give up ``claim`` at its deadline, unless it was renewed."""
@@ -348,16 +356,16 @@ class Taker:
         if claim.is_over:
             return
         if left > 0:
-            self._chores.later(left, self._expire, claim)
+            self._background.later(left, self._expire, claim)
         else:
-            self._free(claim.posted.place)
+            self._free_tuple(claim.stored_tuple.tuple_id)
 
-    def _free(self, place: Place) -> None:
-        self.held.discard(place)
-        self._freed(place)
+    def _free_tuple(self, place: TupleId) -> None:
+        self.claimed.discard(place)
+        self._on_freed(place)
 
 
-def _trim(remembered: dict[Place, Any]) -> None:
+def _limit_size(remembered: dict[TupleId, Any]) -> None:
     """Drop the oldest entries above the limit; the council still knows them."""
     while len(remembered) > MAX_REMEMBERED:
         del remembered[next(iter(remembered))]

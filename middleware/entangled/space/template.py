@@ -21,11 +21,11 @@ Value = None | bool | int | float | str | bytes
 Tuple = tuple[Value, ...]
 
 MAX_FIELDS = 32
-MAX_TUPLE = 600
+MAX_TUPLE_BYTES = 600
 """Maximum bytes of a tuple or template in msgpack; a record also has to hold the council."""
 MAX_CHOICES = 32
 OPERATORS = ("<", "<=", ">", ">=", "!=", "in", "prefix")
-_COMPARE: Final[dict[str, Callable[[Any, Any], bool]]] = {"<": lt, "<=": le, ">": gt, ">=": ge}
+_COMPARISONS: Final[dict[str, Callable[[Any, Any], bool]]] = {"<": lt, "<=": le, ">": gt, ">=": ge}
 _TYPES: Final = (bool, bytes, float, int, str)
 
 
@@ -52,15 +52,15 @@ class Predicate:
         """Return whether ``value`` passes; a value of another type does not, except under ``!=``."""
         operand = self.operand
         if isinstance(operand, tuple):
-            return any(_same(value, choice) for choice in operand)
+            return any(_are_equal(value, choice) for choice in operand)
         if self.operator == "!=":
-            return not (value == operand if _are_numbers(value, operand) else _same(value, operand))
+            return not (value == operand if _are_numbers(value, operand) else _are_equal(value, operand))
         if self.operator == "prefix":
             if isinstance(value, str) and isinstance(operand, str):
                 return value.startswith(operand)
             return isinstance(value, bytes) and isinstance(operand, bytes) and value.startswith(operand)
         is_ordered = _are_numbers(value, operand) or (type(value) is type(operand) and isinstance(value, str | bytes))
-        return is_ordered and _COMPARE[self.operator](value, operand)
+        return is_ordered and _COMPARISONS[self.operator](value, operand)
 
 
 Field = Value | Wildcard | type | Predicate
@@ -99,12 +99,12 @@ def where(operator: str, operand: Value | Sequence[Value]) -> Predicate:
         raise BadTuple(f"{operator}: {operand!r} is no value")
     elif operator == "prefix" and not isinstance(operand, str | bytes):
         raise BadTuple("prefix: takes a str or bytes")
-    elif operator in _COMPARE and (operand is None or isinstance(operand, bool)):
+    elif operator in _COMPARISONS and (operand is None or isinstance(operand, bool)):
         raise BadTuple(f"{operator}: {operand!r} has no order")
     return Predicate(operator, operand)
 
 
-def template_of(fields: Sequence[Field] | Template) -> Template:
+def make_template(fields: Sequence[Field] | Template) -> Template:
     """Return the template with these fields; raise ``BadTuple`` or ``TooLarge``."""
     if isinstance(fields, Template):
         return fields
@@ -115,11 +115,11 @@ def template_of(fields: Sequence[Field] | Template) -> Template:
         )
         if not is_valid:
             raise BadTuple(f"field {place}: {field!r} is no value, ANY, type or predicate")
-    _check_size([_packed_field(field) for field in fields])
+    _check_size([_pack_field(field) for field in fields])
     return Template(tuple(fields))
 
 
-def tuple_of(fields: Sequence[Value]) -> Tuple:
+def make_tuple(fields: Sequence[Value]) -> Tuple:
     """Return the tuple with these fields; raise ``BadTuple`` or ``TooLarge``."""
     _check_count(fields)
     for place, field in enumerate(fields):
@@ -143,14 +143,14 @@ def is_value(value: object) -> TypeGuard[Value]:
     return type(value) is bytes
 
 
-def tuple_unpacked(fields: object) -> Tuple:
+def parse_tuple(fields: object) -> Tuple:
     """Return the tuple in a decoded message or record; raise only ``Malformed``."""
     if not isinstance(fields, list) or not 0 < len(fields) <= MAX_FIELDS or not all(map(is_value, fields)):
         raise Malformed("not a tuple")
     return tuple(fields)
 
 
-def _packed_field(field: Field) -> list[object]:
+def _pack_field(field: Field) -> list[object]:
     """Encode the field to measure its size."""
     if isinstance(field, Wildcard):
         return [1]
@@ -168,10 +168,10 @@ def _fits(field: Field, value: Value) -> bool:
         return type(value) is field
     if isinstance(field, Predicate):
         return field.holds(value)
-    return _same(value, field)
+    return _are_equal(value, field)
 
 
-def _same(a: Value, b: Value) -> bool:
+def _are_equal(a: Value, b: Value) -> bool:
     return type(a) is type(b) and a == b
 
 
@@ -188,8 +188,10 @@ def _check_count(fields: Sequence[object]) -> None:
 
 def _check_size(fields: list[object]) -> None:
     size = len(msgpack.packb(fields))
-    if size > MAX_TUPLE:
-        raise TooLarge(f"a tuple of {size} bytes; at most {MAX_TUPLE} fit: store large values under their own key")
+    if size > MAX_TUPLE_BYTES:
+        raise TooLarge(
+            f"a tuple of {size} bytes; at most {MAX_TUPLE_BYTES} fit: store large values under their own key"
+        )
 
 
 def _is_text(text: str) -> bool:

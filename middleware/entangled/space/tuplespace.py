@@ -15,15 +15,15 @@ from twisted.internet.interfaces import IReactorTime
 from twisted.logger import Logger
 
 from middleware.entangled.background import Background
-from middleware.entangled.errors import EntangledError, NoAnswer, NotRunning, WeatherError
-from middleware.entangled.space.keeper import Keeper
-from middleware.entangled.space.peer import Peer
-from middleware.entangled.space.posting import Place, space_key, standing
-from middleware.entangled.space.shelf import Shelf
-from middleware.entangled.space.taker import Claim, Taker, Wait
-from middleware.entangled.space.template import Field, Template, Tuple, Value, template_of, tuple_of
+from middleware.entangled.errors import EntangledError, NoAnswer, NotRunning, TransientError
+from middleware.entangled.space.node_interface import NodeInterface
+from middleware.entangled.space.slot_maintenance import SlotMaintenance
+from middleware.entangled.space.taker import Claim, Taker, WaitingCall
+from middleware.entangled.space.template import Field, Template, Tuple, Value, make_template, make_tuple
+from middleware.entangled.space.tuple_cache import TupleCache
+from middleware.entangled.space.tuple_record import TupleId, parse_records, space_key
 
-COUNCIL = 3
+COUNCIL_MEMBERS = 3
 GET_LEASE_S = 2.0
 MAX_PASSES = 4
 PASS_PAUSE_S = (0.01, 0.05)
@@ -31,7 +31,7 @@ PASS_PAUSE_S = (0.01, 0.05)
 T = TypeVar("T")
 
 
-class NoTuple(WeatherError):
+class NoTuple(TransientError):
     """No matching tuple was found before the timeout."""
 
 
@@ -46,39 +46,39 @@ class TupleSpace:
 
     def __init__(
         self,
-        node: Peer,
+        node: NodeInterface,
         clock: IReactorTime,
         rng: random.Random,
         name: str = "default",
-        council: int = COUNCIL,
+        council: int = COUNCIL_MEMBERS,
     ) -> None:
         self.name = name
         self._node = node
         self._clock = clock
         self._rng = rng
-        self._chores = Background(clock)
-        self._keeper = Keeper(node, rng, self._chores)
+        self._background = Background(clock)
+        self._slots = SlotMaintenance(node, rng, self._background)
         self._taker = Taker(
             node,
             clock,
             rng,
-            self._chores,
-            self._keeper,
+            self._background,
+            self._slots,
             council,
-            self._freed,
-            lambda fields: self._chores.fork(self._put(fields, None)),
+            self._on_freed,
+            lambda fields: self._background.fork(self._put(fields, None)),
         )
-        self._shelves: dict[bytes, Shelf] = {}
-        self._waits: dict[Wait, None] = {}
+        self._caches: dict[bytes, TupleCache] = {}
+        self._waiting_calls: dict[WaitingCall, None] = {}
 
     def stop(self) -> None:
         """Fail all calls with ``NotRunning`` and stop all timers; claimed tuples return when their lease ends."""
-        if self._chores.is_stopped:
+        if self._background.is_stopped:
             return
-        self._chores.stop()
-        for shelf in self._shelves.values():
+        self._background.stop()
+        for shelf in self._caches.values():
             shelf.close()
-        for wait in list(self._waits):
+        for wait in list(self._waiting_calls):
             if not wait.is_over:
                 wait.end()
                 wait.deferred.errback(NotRunning(f"the tuple space {self.name} has stopped"))
@@ -91,11 +91,11 @@ class TupleSpace:
         With ``ttl`` it is removed after that many seconds, if this node is alive.  Raises ``BadTuple`` and ``TooLarge``
         at once.  If it fails with ``NoAnswer`` the tuple may appear nevertheless.
         """
-        return self._work(self._put(tuple_of(fields), ttl))
+        return self._start(self._put(make_tuple(fields), ttl))
 
     async def _put(self, fields: Tuple, ttl: float | None) -> None:
         key = space_key(self.name, len(fields))
-        await self._keeper.post(key, fields, await self._taker.enrolled(key), ttl)
+        await self._slots.put_tuple(key, fields, await self._taker.enrol_council(key), ttl)
 
     # -- take -------------------------------------------------------------------------------------------------------
 
@@ -104,7 +104,7 @@ class TupleSpace:
 
         If the council decides for a call that was cancelled at that time, the tuple is put back.
         """
-        return self._blocking(self._get, template_of(template), timeout)
+        return self._start_waiting(self._get, make_template(template), timeout)
 
     def get_if_exists(self, template: Sequence[Field] | Template) -> Deferred[Tuple | None]:
         """Take a matching tuple; fire with None if there is none, or all are claimed by others.
@@ -116,22 +116,22 @@ class TupleSpace:
 
     def get_many(self, template: Sequence[Field] | Template, most: int) -> Deferred[list[Tuple]]:
         """Take up to ``most`` existing matching tuples, many per request; fails as ``get_if_exists`` does."""
-        return self._work(self._get_many(template_of(template), most))
+        return self._start(self._get_many(make_template(template), most))
 
     def claim(
         self, template: Sequence[Field] | Template, lease: float = 10.0, timeout: float | None = None
     ) -> Deferred[Claim]:
         """Claim a matching tuple for ``lease`` seconds, waiting for one as ``get`` does; confirm it after use."""
 
-        async def work(wanted: Template, wait: Wait) -> Claim | None:
+        async def work(wanted: Template, wait: WaitingCall) -> Claim | None:
             claim = await self._claim(wanted, wait, lease)
             if claim is not None and wait.is_over:
                 claim.release()
             return claim
 
-        return self._blocking(work, template_of(template), timeout)
+        return self._start_waiting(work, make_template(template), timeout)
 
-    async def _get(self, template: Template, wait: Wait) -> Tuple | None:
+    async def _get(self, template: Template, wait: WaitingCall) -> Tuple | None:
         while True:
             claim = await self._claim(template, wait, GET_LEASE_S)
             if claim is None:
@@ -143,14 +143,14 @@ class TupleSpace:
             if won or wait.is_over:
                 return claim.fields
 
-    async def _claim(self, template: Template, wait: Wait, lease: float) -> Claim | None:
+    async def _claim(self, template: Template, wait: WaitingCall, lease: float) -> Claim | None:
         """Wait for and claim a matching tuple; return None when the call has ended."""
-        shelf = self._shelf(space_key(self.name, template.arity))
-        shelf.enter()
+        shelf = self._find_cache(space_key(self.name, template.arity))
+        shelf.start_waiting()
         wait.on_end.add(shelf.wake)
         try:
             while not wait.is_over:
-                ready, pause = self._taker.candidates(shelf.posted, template)
+                ready, pause = self._taker.find_candidates(shelf.tuples, template)
                 if ready:
                     claims, _ = await self._taker.claim(ready[:1], lease)
                     if claims:
@@ -158,26 +158,26 @@ class TupleSpace:
                 else:
                     await shelf.sleep(pause)
         finally:
-            shelf.leave()
+            shelf.stop_waiting()
         return None
 
     async def _get_many(self, template: Template, most: int) -> list[Tuple]:
         key = space_key(self.name, template.arity)
-        shelf = self._shelf(key)
-        shelf.visit()
+        shelf = self._find_cache(key)
+        shelf.record_call()
         taken: list[Tuple] = []
         is_silent = False
         for number in range(MAX_PASSES):
             # Tuples under watch need no read: the council refuses a tuple that was taken.
-            ready = self._taker.candidates(shelf.posted, template)[0] if shelf.is_open and not number else []
+            ready = self._taker.find_candidates(shelf.tuples, template)[0] if shelf.is_open and not number else []
             if not ready:
-                posted, _ = standing(await self._node.get(key))
-                ready, _ = self._taker.candidates(posted, template, is_patient=False)
-            left = [one for one in ready if one.place not in self._taker.held]
+                posted, _ = parse_records(await self._node.get(key))
+                ready, _ = self._taker.find_candidates(posted, template, is_patient=False)
+            left = [one for one in ready if one.tuple_id not in self._taker.claimed]
             if not left:
                 return taken
             while left and len(taken) < most:
-                batch = self._taker.batch(left, most - len(taken))
+                batch = self._taker.select_batch(left, most - len(taken))
                 left = [one for one in left if one not in batch]
                 claims, silent = await self._taker.claim(batch, GET_LEASE_S)
                 is_silent = is_silent or silent
@@ -186,7 +186,7 @@ class TupleSpace:
             if taken:
                 return taken
             # Others held all of them, perhaps briefly, as when three nodes claim at once.
-            await self._chores.sleep(self._rng.uniform(*PASS_PAUSE_S))
+            await self._background.sleep(self._rng.uniform(*PASS_PAUSE_S))
         if is_silent:
             raise NoAnswer("a tuple matches, but too few members of its council answer to take it; try again")
         return taken
@@ -195,7 +195,7 @@ class TupleSpace:
 
     def read(self, template: Sequence[Field] | Template, timeout: float | None = None) -> Deferred[Tuple]:
         """Read a matching tuple, waiting for one; fails with ``NoTuple`` after ``timeout`` seconds; cancellable."""
-        return self._blocking(self._read, template_of(template), timeout)
+        return self._start_waiting(self._read, make_template(template), timeout)
 
     def read_if_exists(self, template: Sequence[Field] | Template) -> Deferred[Tuple | None]:
         """Read a matching tuple; fire with None if there is none."""
@@ -204,55 +204,55 @@ class TupleSpace:
 
     def read_all(self, template: Sequence[Field] | Template) -> Deferred[list[Tuple]]:
         """Read all matching tuples that were not taken, claimed ones included."""
-        return self._work(self._read_all(template_of(template)))
+        return self._start(self._read_all(make_template(template)))
 
-    async def _read(self, template: Template, wait: Wait) -> Tuple | None:
-        shelf = self._shelf(space_key(self.name, template.arity))
-        shelf.enter()
+    async def _read(self, template: Template, wait: WaitingCall) -> Tuple | None:
+        shelf = self._find_cache(space_key(self.name, template.arity))
+        shelf.start_waiting()
         wait.on_end.add(shelf.wake)
         try:
             while not wait.is_over:
-                for one in shelf.posted:
-                    if one.place not in self._taker.gone and template.matches(one.fields):
+                for one in shelf.tuples:
+                    if one.tuple_id not in self._taker.taken and template.matches(one.fields):
                         return one.fields
                 await shelf.sleep(None)
         finally:
-            shelf.leave()
+            shelf.stop_waiting()
         return None
 
     async def _read_all(self, template: Template) -> list[Tuple]:
-        posted, _ = standing(await self._node.get(space_key(self.name, template.arity)))
-        gone = self._taker.gone
-        return [one.fields for one in posted if one.place not in gone and template.matches(one.fields)]
+        posted, _ = parse_records(await self._node.get(space_key(self.name, template.arity)))
+        gone = self._taker.taken
+        return [one.fields for one in posted if one.tuple_id not in gone and template.matches(one.fields)]
 
     # -- inside -----------------------------------------------------------------------------------------------------
 
-    def _shelf(self, key: bytes) -> Shelf:
-        self._keeper.look_after(key)
-        return self._shelves.setdefault(key, Shelf(self._node, key, self._chores))
+    def _find_cache(self, key: bytes) -> TupleCache:
+        self._slots.add_key(key)
+        return self._caches.setdefault(key, TupleCache(self._node, key, self._background))
 
-    def _freed(self, place: Place) -> None:
-        if place.key in self._shelves:
-            self._shelves[place.key].wake()
+    def _on_freed(self, place: TupleId) -> None:
+        if place.key in self._caches:
+            self._caches[place.key].wake()
 
-    def _work(self, work: Coroutine[Any, Any, T]) -> Deferred[T]:
+    def _start(self, work: Coroutine[Any, Any, T]) -> Deferred[T]:
         async def checked() -> T:
-            if self._chores.is_stopped:
+            if self._background.is_stopped:
                 work.close()
                 raise NotRunning(f"the tuple space {self.name} has stopped")
             return await work
 
         return Deferred.fromCoroutine(checked())
 
-    def _blocking(
+    def _start_waiting(
         self,
-        work: Callable[[Template, Wait], Coroutine[Any, Any, Any]],
+        work: Callable[[Template, WaitingCall], Coroutine[Any, Any, Any]],
         template: Template,
         timeout: float | None,
     ) -> Deferred[Any]:
-        wait = Wait()
-        self._waits[wait] = None
-        wait.on_end.add(lambda: self._waits.pop(wait, None))
+        wait = WaitingCall()
+        self._waiting_calls[wait] = None
+        wait.on_end.add(lambda: self._waiting_calls.pop(wait, None))
 
         def answered(value: object) -> None:
             if not wait.is_over:
@@ -272,6 +272,6 @@ class TupleSpace:
                 wait.deferred.errback(NoTuple(f"no matching tuple within {timeout} s"))
 
         if timeout is not None:
-            wait.on_end.add(self._chores.later(timeout, expired))
-        self._work(work(template, wait)).addCallbacks(answered, failed)
+            wait.on_end.add(self._background.later(timeout, expired))
+        self._start(work(template, wait)).addCallbacks(answered, failed)
         return wait.deferred

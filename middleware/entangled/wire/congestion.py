@@ -4,29 +4,29 @@ from __future__ import annotations
 
 import math
 
-FIRST_GUESS = 0.1
-SHORTEST = 0.05
+INITIAL_TIMEOUT_S = 0.1
+MIN_TIMEOUT_S = 0.05
 # On a path without jitter the deviation converges to zero; this minimum keeps the timeout longer than the round trip.
-GRAIN = 0.01
-LATE = 0.002
-LONGEST = 1.0
-BACK_OFF = 1.5
-FIRST_WINDOW = 10.0  # RFC 6928
-LEAST_WINDOW = 4.0
-MOST_WINDOW = 512.0
-BASE_S = 10.0
-SAMPLE = 32
+MIN_DEVIATION_S = 0.01
+MIN_LATENESS_S = 0.002
+MAX_TIMEOUT_S = 1.0
+BACKOFF_FACTOR = 1.5
+INITIAL_WINDOW = 10.0  # RFC 6928
+MIN_WINDOW = 4.0
+MAX_WINDOW = 512.0
+BASE_ROUND_TRIP_S = 10.0
+MIN_LOSS_SAMPLES = 32
 ROUND_SAMPLES = 8
 FIRST_GAIN, GAIN = 1 / 16, 1 / 128
 """The weight of the first datagram, as if 15 had arrived before it, and of each one after the first hundred."""
-MOST_AT_ONCE = 4
+MAX_GAP_LOSSES = 4
 """The most losses that one gap counts for: after a partition or a suspended peer, one session shows a gap of hundreds.
 """
-LEAST = 0.01
+MIN_LOSS = 0.01
 """Smaller loss rates count as zero: the usual number of tries covers them."""
-RARE = 1e-4
+TOLERATED_FAILURES = 1e-4
 """The tolerated rate of exchanges that fail although both sides are alive."""
-MOST_TRIES = 12
+MAX_TRIES_AT_LOSS = 12
 
 
 class RoundTrip:
@@ -37,16 +37,16 @@ class RoundTrip:
     again.
     """
 
-    __slots__ = ("wait", "is_measured", "_smoothed", "_deviation", "_shortest")
+    __slots__ = ("timeout", "is_measured", "_smoothed", "_deviation", "_min_timeout")
 
-    def __init__(self, first: float = FIRST_GUESS, shortest: float = SHORTEST) -> None:
-        self.wait = first
+    def __init__(self, first: float = INITIAL_TIMEOUT_S, shortest: float = MIN_TIMEOUT_S) -> None:
+        self.timeout = first
         self.is_measured = False
         self._smoothed = 0.0
         self._deviation = 0.0
-        self._shortest = shortest
+        self._min_timeout = shortest
 
-    def measured(self, seconds: float) -> None:
+    def add_sample(self, seconds: float) -> None:
         """Update the estimate with the round trip of a first try."""
         if self.is_measured:
             self._deviation += (abs(seconds - self._smoothed) - self._deviation) / 4
@@ -54,7 +54,9 @@ class RoundTrip:
         else:
             self._smoothed, self._deviation = seconds, seconds / 2
             self.is_measured = True
-        self.wait = min(LONGEST, max(self._shortest, self._smoothed + max(GRAIN, 4 * self._deviation)))
+        self.timeout = min(
+            MAX_TIMEOUT_S, max(self._min_timeout, self._smoothed + max(MIN_DEVIATION_S, 4 * self._deviation))
+        )
 
     @property
     def mean(self) -> float | None:
@@ -62,27 +64,27 @@ class RoundTrip:
         return self._smoothed if self.is_measured else None
 
     @property
-    def likely(self) -> float | None:
+    def most(self) -> float | None:
         """The time in seconds within which most answers arrive, or None before the first measurement."""
-        return self._smoothed + max(LATE, 2 * self._deviation) if self.is_measured else None
+        return self._smoothed + max(MIN_LATENESS_S, 2 * self._deviation) if self.is_measured else None
 
     @property
-    def usual(self) -> float:
+    def nearly_all(self) -> float:
         """The time in seconds within which nearly all answers arrive; at first the initial timeout."""
         if not self.is_measured:
-            return self.wait
-        return max(self._smoothed * 9 / 8, self._smoothed + max(LATE, 4 * self._deviation))
+            return self.timeout
+        return max(self._smoothed * 9 / 8, self._smoothed + max(MIN_LATENESS_S, 4 * self._deviation))
 
-    def ambiguous(self, seconds: float) -> None:
+    def lengthen(self, seconds: float) -> None:
         """Lengthen the timeout after an answer to a retransmitted request, ``seconds`` after its first try.
 
         Before the first measurement ``seconds`` may be the length of the path.
         """
-        longer = self.wait * BACK_OFF
-        self.wait = min(LONGEST, longer if self.is_measured else max(longer, seconds))
+        longer = self.timeout * BACKOFF_FACTOR
+        self.timeout = min(MAX_TIMEOUT_S, longer if self.is_measured else max(longer, seconds))
 
 
-class Window:
+class CongestionWindow:
     """The congestion window: the number of fragments that may be under way to one peer.
 
     It grows in slow start, then slowly, and decreases multiplicatively. Radio links lose datagrams without congestion,
@@ -96,109 +98,109 @@ class Window:
     __slots__ = (
         "size",
         "_threshold",
-        "_base",
-        "_base_at",
-        "_quickest",
+        "_min_round_trip",
+        "_min_measured_at",
+        "_round_min",
         "_samples",
-        "_last",
+        "_last_round_trip",
         "_jitter",
         "_round_end",
-        "_taken",
+        "_acknowledged",
         "_lost",
     )
 
     def __init__(self) -> None:
-        self.size = FIRST_WINDOW
-        self._threshold = MOST_WINDOW
-        self._base = math.inf
-        self._base_at = -math.inf
-        self._quickest = math.inf
+        self.size = INITIAL_WINDOW
+        self._threshold = MAX_WINDOW
+        self._min_round_trip = math.inf
+        self._min_measured_at = -math.inf
+        self._round_min = math.inf
         self._samples = 0
-        self._last = -1.0
+        self._last_round_trip = -1.0
         self._jitter = 0.0
         self._round_end = 0
-        self._taken = self._lost = 0
+        self._acknowledged = self._lost = 0
 
-    def taken(self, count: int, order: int, last_order: int, round_trip: float | None, now: float) -> None:
+    def acknowledge(self, count: int, order: int, last_order: int, round_trip: float | None, now: float) -> None:
         """Process an acknowledgement of ``count`` fragments; the newest was number ``order`` of ``last_order`` sent."""
         if round_trip is not None:
-            self._quickest = min(self._quickest, round_trip)
+            self._round_min = min(self._round_min, round_trip)
             self._samples += 1
-            if self._last >= 0.0:
-                self._jitter += (abs(round_trip - self._last) - self._jitter) / 16
-            self._last = round_trip
-            if round_trip <= self._base or now - self._base_at > BASE_S:
-                self._base, self._base_at = round_trip, now
-        self._taken += count
+            if self._last_round_trip >= 0.0:
+                self._jitter += (abs(round_trip - self._last_round_trip) - self._jitter) / 16
+            self._last_round_trip = round_trip
+            if round_trip <= self._min_round_trip or now - self._min_measured_at > BASE_ROUND_TRIP_S:
+                self._min_round_trip, self._min_measured_at = round_trip, now
+        self._acknowledged += count
         if self.size < self._threshold:
             self.size += count
         else:
             self.size += count * max(1 / self.size, 1 / 32)
-        self.size = min(self.size, MOST_WINDOW)
+        self.size = min(self.size, MAX_WINDOW)
         if order >= self._round_end and self._samples >= ROUND_SAMPLES:
             self._adjust_to_congestion()
             self._round_end = last_order + 1
-            self._quickest = math.inf
+            self._round_min = math.inf
             self._samples = 0
 
-    def lost(self, count: int) -> None:
+    def count_losses(self, count: int) -> None:
         """Count lost fragments."""
         self._lost += count
 
     def collapse(self) -> None:
         """Restart from the smallest window, after more than a round trip without any receipt."""
-        self._threshold = max(LEAST_WINDOW, self.size / 2)
-        self.size = LEAST_WINDOW
+        self._threshold = max(MIN_WINDOW, self.size / 2)
+        self.size = MIN_WINDOW
 
-    def rested(self) -> None:
+    def shrink_after_idle(self) -> None:
         """Reduce the window to its initial size after the path was idle."""
-        self.size = min(self.size, FIRST_WINDOW)
+        self.size = min(self.size, INITIAL_WINDOW)
 
     def _adjust_to_congestion(self) -> None:
-        is_queueing = self._quickest > self._base + max(0.004, self._base / 8, 2 * self._jitter)
-        is_known = self._lost + self._taken >= SAMPLE
-        if (is_queueing and self._lost > 0) or (is_known and 6 * self._lost > self._lost + self._taken):
-            self.size = self._threshold = max(LEAST_WINDOW, self.size / 2)
+        is_queueing = self._round_min > self._min_round_trip + max(0.004, self._min_round_trip / 8, 2 * self._jitter)
+        is_known = self._lost + self._acknowledged >= MIN_LOSS_SAMPLES
+        if (is_queueing and self._lost > 0) or (is_known and 6 * self._lost > self._lost + self._acknowledged):
+            self.size = self._threshold = max(MIN_WINDOW, self.size / 2)
             is_known = True
         elif is_queueing:
             self._threshold = min(self._threshold, self.size)
         if is_known:
-            self._taken = self._lost = 0
+            self._acknowledged = self._lost = 0
 
 
-class Loss:
+class LossRate:
     """Measures the recent loss rate (``share``) of the datagrams to this node.
 
     Each session numbers the datagrams that it sends, so a gap in the received numbers is a loss, as in the reports of
     RTP (RFC 3550, section 6.4.1).  Unlike a count of retransmissions, it does not mistake a slow answer for a lost one.
     """
 
-    __slots__ = ("share", "_gain")
+    __slots__ = ("rate", "_gain")
 
     def __init__(self) -> None:
-        self.share = 0.0
+        self.rate = 0.0
         self._gain = FIRST_GAIN
 
-    def arrived(self, ahead: int) -> None:
+    def record_arrival(self, ahead: int) -> None:
         """Update the rate with a datagram, its counter being ``ahead`` of the newest one before it in its session.
 
         A reordered datagram (0 or less) was counted as lost before.
         """
-        for _ in range(1, min(ahead, MOST_AT_ONCE + 1)):
-            self._learn(1.0)
+        for _ in range(1, min(ahead, MAX_GAP_LOSSES + 1)):
+            self._add_sample(1.0)
         if ahead > 0:
-            self._learn(0.0)
+            self._add_sample(0.0)
         else:
-            self.share = max(0.0, self.share - self._gain)
+            self.rate = max(0.0, self.rate - self._gain)
 
-    def _learn(self, lost: float) -> None:
+    def _add_sample(self, lost: float) -> None:
         self._gain = max(GAIN, self._gain / (1 + self._gain))  # the mean of all, and later a moving average
-        self.share += (lost - self.share) * self._gain
+        self.rate += (lost - self.rate) * self._gain
 
     @property
     def tries(self) -> int:
         """The number of tries after which an exchange rarely fails, if both directions lose the same share."""
-        if self.share < LEAST:
+        if self.rate < MIN_LOSS:
             return 1
-        failure_rate = 1 - (1 - self.share) ** 2
-        return min(MOST_TRIES, math.ceil(math.log(RARE) / math.log(failure_rate)))
+        failure_rate = 1 - (1 - self.rate) ** 2
+        return min(MAX_TRIES_AT_LOSS, math.ceil(math.log(TOLERATED_FAILURES) / math.log(failure_rate)))

@@ -16,33 +16,31 @@ from twisted.internet.defer import Deferred
 from twisted.internet.interfaces import IReactorTime
 from twisted.logger import Logger
 
-from middleware.entangled.bounded import keep
+from middleware.entangled.bounded import put_bounded
 from middleware.entangled.contact import Contact
 from middleware.entangled.errors import Forged, Malformed, NotAdmitted, NotRunning
 from middleware.entangled.identity import Identity
 from middleware.entangled.listeners import Listeners
-from middleware.entangled.network.network import MAX_CARRIED, MAX_DATAGRAM, Address, Network
-from middleware.entangled.wire.answerer import Answerer
-from middleware.entangled.wire.asker import PATIENCE, Asker
-from middleware.entangled.wire.courier import Courier
-from middleware.entangled.wire.door import (
+from middleware.entangled.network.network import MAX_DATAGRAM_BYTES, MAX_RELAYED_BYTES, Address, Network
+from middleware.entangled.wire.admission_check import (
     DOUBLED,
     FOREIGN,
-    OPEN,
+    OPEN_ADMISSION,
     REVOKED,
     ROLE,
     SUPERSEDED,
-    Door,
-    Life,
-    Lives,
-    Noted,
-    Stamps,
-    checked_secrets,
+    AdmissionCheck,
+    Incarnation,
+    Incarnations,
+    InitTimestamps,
+    LogLimiter,
+    check_secrets,
+    explain,
     is_refusal,
-    meaning,
 )
-from middleware.entangled.wire.greeting import COOKIE, HERE, WHO, Cookies, Greeter
-from middleware.entangled.wire.hail import ECHO, HAIL, Echo, Echoer, Hailer
+from middleware.entangled.wire.discovery import COOKIE, DISCOVERY, DISCOVERY_REPLY, CookieCheck, Discoverer
+from middleware.entangled.wire.dispatcher import Dispatcher
+from middleware.entangled.wire.fragmenter import Fragmenter
 from middleware.entangled.wire.message import (
     PART,
     RECEIPT,
@@ -50,33 +48,35 @@ from middleware.entangled.wire.message import (
     Answer,
     Cancel,
     Failure,
-    Key,
-    Question,
-    Told,
-    decoded,
+    MessageKey,
+    Notification,
+    Request,
+    decode,
 )
 from middleware.entangled.wire.method import Method
 from middleware.entangled.wire.peer import Peers
-from middleware.entangled.wire.rebuff import Rebuffs, Side
+from middleware.entangled.wire.probe import PROBE, PROBE_REPLY, Prober, ProbeReply, ProbeResponder
+from middleware.entangled.wire.rejection import Rejections, Side
+from middleware.entangled.wire.requester import TIMEOUT_S, Requester
 from middleware.entangled.wire.session import (
     DATA,
     INIT,
-    INIT_LEAST,
-    OVERHEAD,
+    MIN_INIT_BYTES,
+    MIN_RESP_BYTES,
+    OVERHEAD_BYTES,
     RESP,
-    RESP_LEAST,
-    Acceptance,
     Credentials,
-    HalfOpen,
+    HalfOpenSessions,
+    ResponderHandshake,
     Session,
-    index_of,
     is_init_of_team,
+    read_index,
 )
 
 _REFUSAL = bytes([REFUSAL])
-MAX_REFUSALS = 32
+MAX_REJECTING_PEERS = 32
 
-Inside = Callable[[Session, bytes, Address], None]
+MessageReceiver = Callable[[Session, bytes, Address], None]
 """Takes the content of a DATA datagram: its session, the plaintext, and its source address."""
 
 
@@ -107,17 +107,17 @@ class Endpoint:
         network: Network,
         clock: IReactorTime,
         rng: random.Random,
-        door: Door = OPEN,
+        door: AdmissionCheck = OPEN_ADMISSION,
     ) -> None:
-        self.door = door
+        self.admission = door
         self.on_contact = Listeners[[Contact]]()
         self.on_seen = Listeners[[Contact, Address]]()
-        self.on_refused = Listeners[[Contact, str]]()
-        self.on_refusing = Listeners[[Contact, str]]()
-        self.on_let_go = Listeners[[bytes]]()
+        self.on_rejected = Listeners[[Contact, str]]()
+        self.on_rejecting = Listeners[[Contact, str]]()
+        self.on_forgotten = Listeners[[bytes]]()
         self.refusals: dict[bytes, tuple[Contact, str]] = {}
         """Peers that reject this node, by key, with the refusal code; the latest ``MAX_REFUSALS``."""
-        self.rebuffs = Rebuffs()
+        self.rejections = Rejections()
         """Rejections of the last hour, in both directions."""
         self.counters: Counter[str] = Counter()
         self.is_running = False
@@ -125,38 +125,40 @@ class Endpoint:
         self._clock = clock
         self._rng = rng
         self._identity = identity
-        self._credentials = Credentials.of(identity, team_key)
-        self._lives = Lives()
-        self._stamps = Stamps()
-        self._noted = Noted()
+        self._credentials = Credentials.derive(identity, team_key)
+        self._incarnations = Incarnations()
+        self._timestamps = InitTimestamps()
+        self._log_limiter = LogLimiter()
         self._peers = Peers([self._credentials], clock, rng, network, self.counters, door)
-        self._courier = Courier(
+        self._fragmenter = Fragmenter(
             clock,
             self._send_to,
-            self._on_parcel,
-            self._peers.wait_for,
-            lambda number, public: self._asker.is_asked(number, public),
-            lambda number, public: self._asker.progressed(number, public),
+            self._on_fragmented_message,
+            self._peers.find_timeout,
+            lambda number, public: self._requester.is_pending(number, public),
+            lambda number, public: self._requester.record_progress(number, public),
             self.counters,
         )
-        self._answerer = Answerer(clock, self._send, self._courier, self.counters, door.may, self._refuse_call)
-        self._asker = Asker(clock, rng, self._peers, self._courier, self._send, self.counters)
-        self.greeter = Greeter(identity.public, self._peers, network, clock, rng, self.counters)
-        self._cookies = Cookies(self._credentials.cookie_key, rng)
-        self.echoer = Echoer(self.post, clock, lambda: door.fingerprint)
-        self.hailer = Hailer(self.post, clock, rng)
+        self._dispatcher = Dispatcher(
+            clock, self._send, self._fragmenter, self.counters, door.may_call, self._record_refused_call
+        )
+        self._requester = Requester(clock, rng, self._peers, self._fragmenter, self._send, self.counters)
+        self.discoverer = Discoverer(identity.public, self._peers, network, clock, rng, self.counters)
+        self._cookies = CookieCheck(self._credentials.cookie_key, rng)
+        self.probe_responder = ProbeResponder(self.send_datagram, clock, lambda: door.fingerprint)
+        self.prober = Prober(self.send_datagram, clock, rng)
         self._sessions = self._peers.sessions
-        self._half_open = HalfOpen(self._sessions)
-        self._inside: dict[int, Inside] = {}
+        self._half_open = HalfOpenSessions(self._sessions)
+        self._message_receivers: dict[int, MessageReceiver] = {}
         self._receivers: dict[int, Callable[[bytes, Address], None]] = {
             DATA: self._on_data,
             INIT: self._on_init,
             RESP: self._on_resp,
-            WHO: self.greeter.on_who,
-            HERE: self.greeter.on_here,
-            COOKIE: self.greeter.on_cookie,
-            HAIL: lambda datagram, source: self._count(self.echoer.on_hail(datagram, source)),
-            ECHO: lambda datagram, source: self._count(self.hailer.on_echo(datagram, source)),
+            DISCOVERY: self.discoverer.on_discovery,
+            DISCOVERY_REPLY: self.discoverer.on_discovery_reply,
+            COOKIE: self.discoverer.on_cookie,
+            PROBE: lambda datagram, source: self._count(self.probe_responder.on_probe(datagram, source)),
+            PROBE_REPLY: lambda datagram, source: self._count(self.prober.on_reply(datagram, source)),
         }
 
     @property
@@ -167,7 +169,7 @@ class Endpoint:
     def start(self) -> None:
         """Open the network; raise ``PortInUse`` if the port is in use."""
         if not self.is_running:
-            self._network.listen(self._received)
+            self._network.listen(self._on_datagram)
             self.is_running = True
 
     def stop(self) -> None:
@@ -176,24 +178,24 @@ class Endpoint:
             return
         self.is_running = False
         self._network.close()
-        self._answerer.clear()
+        self._dispatcher.clear()
         self._half_open.clear()
         error = NotRunning("the endpoint was stopped")
-        self.greeter.stop(error)
-        self.hailer.stop(error)
-        self._asker.stop(error)
-        self._courier.stop()
+        self.discoverer.stop(error)
+        self.prober.stop(error)
+        self._requester.stop(error)
+        self._fragmenter.stop()
         self._peers.stop()
 
-    def rekey(self, newest: bytes, *older: bytes) -> None:
+    def replace_secrets(self, newest: bytes, *older: bytes) -> None:
         """Replace the secret of the team (32 bytes); existing sessions continue.
 
         This node opens handshakes under the ``newest`` secret.  While not all members have it, handshakes under the
         ``older`` ones are accepted too, and a peer that does not answer under one secret is retried under the next.
         Raises ``ValueError`` for an invalid secret.
         """
-        secrets = checked_secrets([newest, *older])
-        self._peers.rekey([Credentials.of(self._identity, secret) for secret in secrets])
+        secrets = check_secrets([newest, *older])
+        self._peers.rekey([Credentials.derive(self._identity, secret) for secret in secrets])
         self._credentials = self._peers.ring[0]
 
     def evict(self, public: bytes, code: str = REVOKED) -> None:
@@ -201,11 +203,11 @@ class Endpoint:
 
         The admission check must reject the peer from then on.
         """
-        peer = self._peers.known(public)
+        peer = self._peers.get(public)
         if peer is not None and peer.session is not None:
-            self._refuse(peer.session, code)
+            self._reject(peer.session, code)
         else:
-            self._disconnect(public, f"{public.hex()[:16]} is rejected: {meaning(code)}", code)
+            self._disconnect(public, f"{public.hex()[:16]} is rejected: {explain(code)}", code)
 
     def route(self, kind: int, receiver: Callable[[bytes, Address], None]) -> None:
         """Pass datagrams with the first byte ``kind`` to ``receiver``; raise ``ValueError`` if the kind is taken."""
@@ -213,7 +215,7 @@ class Endpoint:
             raise ValueError(f"datagrams of kind {kind:#x} already have a receiver; use another kind")
         self._receivers[kind] = receiver
 
-    def post(self, datagram: bytes, to: Address) -> None:
+    def send_datagram(self, datagram: bytes, to: Address) -> None:
         """Send a datagram of a routed kind unencrypted; no effect while the endpoint is not running."""
         if self.is_running:
             self._network.send(datagram, to)
@@ -243,19 +245,19 @@ class Endpoint:
         keyword-only parameter ``deadline`` receives that time, in seconds of this node's clock (infinite if there is
         none).
         """
-        self._answerer.methods[name] = Method(name, answer, changes, idempotent, early)
+        self._dispatcher.methods[name] = Method(name, answer, changes, idempotent, early)
 
-    def route_inside(self, kind: int, receiver: Inside) -> None:
+    def route_message(self, kind: int, receiver: MessageReceiver) -> None:
         """Pass messages in confirmed sessions with this first byte to ``receiver``.
 
         They do not change the address of their peer, because they may arrive by a path other than the usual one.
         """
-        self._inside[kind] = receiver
+        self._message_receivers[kind] = receiver
 
-    def send_inside(self, session: Session, plain: bytes, to: Address | None = None) -> None:
+    def send_sealed(self, session: Session, plain: bytes, to: Address | None = None) -> None:
         """Seal ``plain`` for the peer of a session and send it to the peer's address, or to its address ``to``."""
         if self.is_running:
-            self._network.send(self._sealed(session, plain), to or session.contact.address)
+            self._network.send(self._seal(session, plain), to or session.contact.address)
 
     @property
     def peers(self) -> Peers:
@@ -286,25 +288,25 @@ class Endpoint:
         """
         if not self.is_running:
             return defer.fail(NotRunning("the endpoint is not running; start it first"))
-        return self._asker.ask(contact, method, arguments, timeout, changes, is_light)
+        return self._requester.ask(contact, method, arguments, timeout, changes, is_light)
 
-    def tell(self, contact: Contact, method: str, *arguments: object) -> None:
+    def notify(self, contact: Contact, method: str, *arguments: object) -> None:
         """Send a notification: call a peer's method once, without an answer or retransmission.
 
         It must fit into one datagram.  Opens a session if there is none.  Raises ``TooLarge`` and ``NotRunning``.
         """
         if not self.is_running:
             raise NotRunning("the endpoint is not running; start it first")
-        self._asker.tell(contact, method, arguments)
+        self._requester.notify(contact, method, arguments)
 
-    def is_met(self, contact: Contact) -> bool:
+    def has_session(self, contact: Contact) -> bool:
         """Return whether there is a session with ``contact``; then a request needs one round trip and no handshake."""
-        peer = self._peers.known(contact.public)
-        return peer is not None and self._peers.is_in_touch(peer)
+        peer = self._peers.get(contact.public)
+        return peer is not None and self._peers.has_live_session(peer)
 
     def round_trip(self, contact: Contact) -> float | None:
         """Return the smoothed round trip to ``contact`` in seconds, or None if it was not measured."""
-        peer = self._peers.known(contact.public)
+        peer = self._peers.get(contact.public)
         return None if peer is None else peer.round_trip.mean
 
     @property
@@ -312,18 +314,18 @@ class Endpoint:
         """The counters of the underlying network (``sent``, ``received``, ...); empty if it has none."""
         return dict(getattr(self._network, "counters", {}))
 
-    def greet(self, address: Address, timeout: float = PATIENCE) -> Deferred[Contact]:
+    def discover(self, address: Address, timeout: float = TIMEOUT_S) -> Deferred[Contact]:
         """Discover the contact at ``address``; fails with ``NoAnswer``.  The contact has not proved its key yet."""
         if not self.is_running:
             return defer.fail(NotRunning("the endpoint is not running; start it first"))
-        return self.greeter.greet(address, timeout)
+        return self.discoverer.discover(address, timeout)
 
-    def overhear(self, datagram: bytes, source: Address) -> None:
+    def process_datagram(self, datagram: bytes, source: Address) -> None:
         """Process a datagram that did not arrive at the node's own port; answers are sent from that port."""
         if self.is_running:
-            self._received(datagram, source)
+            self._on_datagram(datagram, source)
 
-    def let_go(self, seconds: float) -> None:
+    def forget_silent(self, seconds: float) -> None:
         """Forget the peers that sent nothing for ``seconds``, unless a request to them is pending.
 
         The other side does the same, or discovers it with its next unanswered request; either side opens a new session
@@ -331,28 +333,28 @@ class Endpoint:
         """
         now = self._clock.seconds()
         self._half_open.sweep(now)
-        self._answerer.tidy(now)
-        for public in self._peers.let_go(now - seconds):
-            self._courier.let_go(public)
-            self.on_let_go(public)
+        self._dispatcher.delete_full_limiters(now)
+        for public in self._peers.forget_silent(now - seconds):
+            self._fragmenter.forget_flow(public)
+            self.on_forgotten(public)
 
     def reopen(self, contact: Contact) -> None:
         """Open a session at the contact's address even if there is one elsewhere; the newest session is used."""
         if self.is_running:
-            self._peers.open(self._peers.peer(contact), contact.address)
+            self._peers.open(self._peers.get_or_create(contact), contact.address)
 
-    def hail(self, address: Address, timeout: float = PATIENCE) -> Deferred[Echo]:
+    def probe(self, address: Address, timeout: float = TIMEOUT_S) -> Deferred[ProbeReply]:
         """Probe ``address`` for a node of any team; fails with ``NoAnswer``.  The reply is not authenticated."""
         if not self.is_running:
             return defer.fail(NotRunning("the endpoint is not running; start it first"))
-        return self.hailer.hail(address, timeout)
+        return self.prober.probe(address, timeout)
 
     def _count(self, reason: str) -> None:
         if reason:
             self.counters[reason] += 1
 
-    def _received(self, datagram: bytes, source: Address) -> None:
-        if len(datagram) > MAX_DATAGRAM and not (datagram[0] == DATA and len(datagram) <= MAX_CARRIED):
+    def _on_datagram(self, datagram: bytes, source: Address) -> None:
+        if len(datagram) > MAX_DATAGRAM_BYTES and not (datagram[0] == DATA and len(datagram) <= MAX_RELAYED_BYTES):
             self.counters["oversized"] += 1
             return
         receiver = self._receivers.get(datagram[0]) if datagram else None
@@ -362,10 +364,10 @@ class Endpoint:
             receiver(datagram, source)
 
     def _on_data(self, datagram: bytes, source: Address) -> None:
-        if len(datagram) < OVERHEAD:
+        if len(datagram) < OVERHEAD_BYTES:
             self.counters["malformed"] += 1
             return
-        session = self._sessions.get(index_of(datagram))
+        session = self._sessions.get(read_index(datagram))
         if session is None:
             self.counters["stale"] += 1
             return
@@ -377,87 +379,89 @@ class Endpoint:
         except Forged:
             self.counters["forged"] += 1
             return
-        self._peers.loss.arrived(ahead)
-        session.heard_at = self._clock.seconds()
+        self._peers.loss.record_arrival(ahead)
+        session.last_received_at = self._clock.seconds()
         if data[:1] == _REFUSAL:
             self._on_refusal(session, data[1:])
             return
-        if session.is_over:
-            self._refuse(session, SUPERSEDED)
+        if session.is_superseded:
+            self._reject(session, SUPERSEDED)
             return
-        inside = self._inside.get(data[0]) if data else None
+        inside = self._message_receivers.get(data[0]) if data else None
         if ahead > 0 and source != session.contact.address and inside is None:
             session.contact = Contact(session.contact.public, source)
-            self._peers.moved(session)
+            self._peers.record_move(session)
         if not session.is_confirmed:
-            code = self._find_refusal(session.contact.public, session.shown, session.life, self.door.admit)
-            session.shown = b""
+            code = self._find_refusal(
+                session.contact.public, session.peer_pass, session.incarnation, self.admission.admit
+            )
+            session.peer_pass = b""
             if code:  # two nodes with one identity opened a session at once, or the membership list is full
-                self._refuse(session, code)
+                self._reject(session, code)
                 return
             self._half_open.confirm(session)
-            self._established(session, is_owed=False)
-            self._peers.confirmed(session)
+            self._add_session(session, is_owed=False)
+            self._peers.measure_confirmation(session)
             self.on_contact(session.contact)
         if not data or not self.is_running:
             return
         if inside is not None:
             inside(session, data, source)
-        elif len(datagram) > MAX_DATAGRAM:
+        elif len(datagram) > MAX_DATAGRAM_BYTES:
             self.counters["oversized"] += 1
         elif data[0] == PART:
-            self._courier.on_part(session, data)
+            self._fragmenter.on_fragment(session, data)
         elif data[0] == RECEIPT:
-            self._courier.on_receipt(session, data)
+            self._fragmenter.on_receipt(session, data)
         else:
             self._on_message(data, session)
 
     def _on_message(self, data: bytes, session: Session) -> None:
         try:
-            message = decoded(data)
+            message = decode(data)
         except Malformed:
             self.counters["malformed"] += 1
             return
-        if isinstance(message, Question):
-            self._answerer.answer(message, session)
-        elif isinstance(message, Told):
-            self._answerer.take(message, session.contact)
+        if isinstance(message, Request):
+            self._dispatcher.dispatch(message, session)
+        elif isinstance(message, Notification):
+            self._dispatcher.run_notification(message, session.contact)
         elif isinstance(message, Cancel):
-            self._answerer.cancel(message, session.contact.public)
+            self._dispatcher.cancel(message, session.contact.public)
         else:
             self._resolve(message, session.contact)
 
-    def _on_parcel(self, session: Session, key: Key, data: bytes) -> None:
+    def _on_fragmented_message(self, session: Session, key: MessageKey, data: bytes) -> None:
         """Process a message that arrived in fragments; reject one with a kind or id other than its fragments say."""
         try:
-            message = decoded(data)
+            message = decode(data)
         except Malformed:
             self.counters["malformed"] += 1
             return
-        if isinstance(message, Question) and key == (False, message.id):
-            self._answerer.answer(message, session, is_bulky=True)
+        if isinstance(message, Request) and key == (False, message.id):
+            self._dispatcher.dispatch(message, session, is_bulky=True)
         elif isinstance(message, Answer | Failure) and key == (True, message.id):
             self._resolve(message, session.contact)
         else:
             self.counters["malformed"] += 1
 
-    def _established(self, session: Session, is_owed: bool) -> None:
+    def _add_session(self, session: Session, is_owed: bool) -> None:
         self.refusals.pop(session.contact.public, None)
-        peer = self._peers.established(session)
-        if self._lives.met(session.contact.public, session.life):
+        peer = self._peers.add_session(session)
+        if self._incarnations.record(session.contact.public, session.incarnation):
             for other in peer.sessions:
-                other.is_over = other.life != session.life
-        self._courier.restart(peer.public)
-        self._asker.established(peer, session, is_owed)
+                other.is_superseded = other.incarnation != session.incarnation
+        self._fragmenter.restart(peer.public)
+        self._requester.send_waiting(peer, session, is_owed)
 
     def _resolve(self, message: Answer | Failure, contact: Contact) -> None:
-        if self._asker.is_asked(message.id, contact.public):
+        if self._requester.is_pending(message.id, contact.public):
             self.on_contact(contact)
-        self._asker.resolve(message, contact.public)
+        self._requester.resolve(message, contact.public)
 
     def _on_init(self, datagram: bytes, source: Address) -> None:
         own = None
-        if INIT_LEAST + self.door.room <= len(datagram) <= MAX_DATAGRAM:
+        if MIN_INIT_BYTES + self.admission.max_pass_bytes <= len(datagram) <= MAX_DATAGRAM_BYTES:
             for own in self._peers.ring:  # inlined, because a forged INIT must cost no more than this
                 if is_init_of_team(own, datagram):
                     break
@@ -467,122 +471,134 @@ class Endpoint:
             self.counters["forged"] += 1
             return
         now = self._clock.seconds()
-        if not self._cookies.is_lawful(datagram, source, now):
+        if not self._cookies.is_valid(datagram, source, now):
             self.counters["forged"] += 1
             return
-        known = self._half_open.response(datagram, now)
+        known = self._half_open.find_response(datagram, now)
         if known is not None:  # the RESP was lost, or the INIT is a replay: neither costs a key exchange
             self.counters["repeated"] += 1
             self._network.send(known, source)
             return
         if not self._cookies.admits(datagram, source, now):
             self.counters["crowded"] += 1
-            self._network.send(self._cookies.reply(datagram, source, now, own.cookie_key), source)
+            self._network.send(self._cookies.pack_cookie(datagram, source, now, own.cookie_key), source)
             return
         try:
-            acceptance = Acceptance(own, datagram, self._rng.randbytes(32))
+            acceptance = ResponderHandshake(own, datagram, self._rng.randbytes(32))
         except Forged:
             self.counters["forged"] += 1
             return
-        response = self._response_to(acceptance, source, now)
+        response = self._make_response(acceptance, source, now)
         if response and self.is_running:
-            self._half_open.answered(datagram, response, now)
+            self._half_open.store_response(datagram, response, now)
             self._network.send(response, source)
 
-    def _response_to(self, acceptance: Acceptance, source: Address, now: float) -> bytes:
+    def _make_response(self, acceptance: ResponderHandshake, source: Address, now: float) -> bytes:
         """Return the RESP for an INIT that proved its sender's key; nothing for a replay or a malformed message."""
-        contact, hello = self._peers.contact(acceptance.public, source), self._peers.hello
-        code = self._find_refusal(contact.public, acceptance.shown, acceptance.life, self.door.judge)
+        contact, hello = self._peers.make_contact(acceptance.public, source), self._peers.hello
+        code = self._find_refusal(
+            contact.public, acceptance.peer_pass, acceptance.incarnation, self.admission.find_refusal
+        )
         if code:  # no further effects: the INIT may be a replay, with a pass that was replaced since
             self.counters["refused"] += 1
-            self._log_refusal(contact, code)
+            self._log_rejection(contact, code)
             if code not in (DOUBLED, SUPERSEDED):  # a replay must not make operators look for a copied identity
                 self._record_rejection("we", contact, code)
-            return acceptance.refuse(code, source, hello.life)
-        if not self._stamps.take(contact.public, acceptance.life, acceptance.stamp):
+            return acceptance.refuse(code, source, hello.incarnation)
+        if not self._timestamps.accept(contact.public, acceptance.incarnation, acceptance.timestamp):
             self.counters["replayed"] += 1
             return b""
         try:
-            rider = decoded(acceptance.rider) if acceptance.rider else None
+            rider = decode(acceptance.early_message) if acceptance.early_message else None
         except Malformed:
             self.counters["malformed"] += 1
             return b""
         answer = b""
-        if isinstance(rider, Question):
-            answer = self._answerer.ride(rider, contact, acceptance.answer_room(hello))
+        if isinstance(rider, Request):
+            answer = self._dispatcher.answer_early(rider, contact, acceptance.max_answer_bytes(hello))
         if not self.is_running:
             return b""  # the method stopped the endpoint
         index = self._peers.new_index()
         response, keys = acceptance.accept(index, answer, source, hello)
-        session = Session(contact, index, acceptance.remote_index, keys, now, is_confirmed=False, life=acceptance.life)
-        session.shown = acceptance.shown
+        session = Session(
+            contact, index, acceptance.remote_index, keys, now, is_confirmed=False, life=acceptance.incarnation
+        )
+        session.peer_pass = acceptance.peer_pass
         self._half_open.add(session, now)
         return response
 
     def _on_resp(self, datagram: bytes, source: Address) -> None:
-        if len(datagram) < RESP_LEAST:
+        if len(datagram) < MIN_RESP_BYTES:
             self.counters["malformed"] += 1
             return
-        opening = self._peers.opening(index_of(datagram))
+        opening = self._peers.find_handshake(read_index(datagram))
         if opening is None:
             self.counters["stale"] += 1
             return
-        if source not in opening.doors:
+        if source not in opening.cookies:
             self.counters["misdirected"] += 1
             return
         try:
-            reply = opening.invitation.accepted(datagram)
+            reply = opening.initiator.read_response(datagram)
         except Forged:
             self.counters["forged"] += 1
             return
-        contact = self._peers.contact(opening.peer.public, source)
-        index = opening.invitation.local_index
-        self._peers.accepted(opening)
+        contact = self._peers.make_contact(opening.peer.public, source)
+        index = opening.initiator.local_index
+        self._peers.finish(opening)
         if reply.refusal:
-            self._record_refusal(contact, reply.refusal)
+            self._handle_refusal(contact, reply.refusal)
             return
         session = Session(
-            contact, index, reply.remote_index, reply.keys, self._clock.seconds(), is_confirmed=True, life=reply.life
+            contact,
+            index,
+            reply.remote_index,
+            reply.keys,
+            self._clock.seconds(),
+            is_confirmed=True,
+            life=reply.incarnation,
         )
-        code = self._find_refusal(contact.public, reply.shown, reply.life, self.door.admit)
+        code = self._find_refusal(contact.public, reply.peer_pass, reply.incarnation, self.admission.admit)
         if code:
-            self._refuse(session, code)
+            self._reject(session, code)
             return
         self._sessions[index] = session
         self.on_contact(contact)
-        if reply.seen is not None:
-            self.on_seen(contact, reply.seen)
+        if reply.observed_address is not None:
+            self.on_seen(contact, reply.observed_address)
         message: object = None
         if reply.message:
             try:
-                message = decoded(reply.message)
+                message = decode(reply.message)
             except Malformed:
                 self.counters["malformed"] += 1
         if isinstance(message, Answer | Failure):
-            self._asker.resolve(message, contact.public)
+            self._requester.resolve(message, contact.public)
         if self.is_running:
-            self._established(session, is_owed=True)
+            self._add_session(session, is_owed=True)
 
     # -- admission --------------------------------------------------------------------------------------------------
 
-    def _find_refusal(self, public: bytes, shown: bytes, life: Life, judge: Callable[[bytes, bytes], str]) -> str:
-        if len(shown) > self.door.room:
+    def _find_refusal(
+        self, public: bytes, shown: bytes, life: Incarnation, judge: Callable[[bytes, bytes], str]
+    ) -> str:
+        if len(shown) > self.admission.max_pass_bytes:
             return FOREIGN
-        return self._lives.judge(public, life) or judge(public, shown)
+        return self._incarnations.find_refusal(public, life) or judge(public, shown)
 
-    def _refuse(self, session: Session, code: str) -> None:
+    def _reject(self, session: Session, code: str) -> None:
         """Notify a peer on ``session`` that it is rejected, and close its sessions."""
         contact = session.contact
         self._send(session, _REFUSAL + code.encode("ascii"))
         self.counters["refused"] += 1
-        self._log_refusal(contact, code)
+        self._log_rejection(contact, code)
         self._record_rejection("we", contact, code)
-        self.on_refusing(contact, code)
+        self.on_rejecting(contact, code)
         self._half_open.forget(session)
         self._peers.drop(session)
-        peer = self._peers.known(contact.public)
+        peer = self._peers.get(contact.public)
         if code not in (DOUBLED, SUPERSEDED) or peer is None or not peer.sessions:
-            self._disconnect(contact.public, f"{contact.address} is rejected: {meaning(code)}", code)
+            self._disconnect(contact.public, f"{contact.address} is rejected: {explain(code)}", code)
 
     def _on_refusal(self, session: Session, said: bytes) -> None:
         """Process the notification of a peer that it rejects this node."""
@@ -591,42 +607,42 @@ class Endpoint:
             self.counters["malformed"] += 1
             return
         self._peers.drop(session)
-        self._record_refusal(session.contact, code)
+        self._handle_refusal(session.contact, code)
 
-    def _record_refusal(self, contact: Contact, code: str) -> None:
-        text = f"{contact.address} rejects this node: {meaning(code)}"
+    def _handle_refusal(self, contact: Contact, code: str) -> None:
+        text = f"{contact.address} rejects this node: {explain(code)}"
         self._record_rejection("they", contact, code)
-        if self._is_new_to_log(contact.public, code, True):
+        if self._should_log(contact.public, code, True):
             self._log.warn("{text}", text=text, code=code)
         self._disconnect(contact.public, text, code)
-        keep(self.refusals, contact.public, (contact, code), MAX_REFUSALS)
-        self.on_refused(contact, code)
+        put_bounded(self.refusals, contact.public, (contact, code), MAX_REJECTING_PEERS)
+        self.on_rejected(contact, code)
 
     def _disconnect(self, public: bytes, text: str, code: str) -> None:
         """Forget the sessions and messages of a peer, and fail the requests to it."""
-        self._half_open.drop(public)
-        self._answerer.evict(public)
-        peer = self._peers.known(public)
+        self._half_open.forget_peer(public)
+        self._dispatcher.evict(public)
+        peer = self._peers.get(public)
         if peer is not None:
             self._peers.evict(peer)
-            self._asker.refused(peer, lambda: NotAdmitted(text, code))
-        self._courier.evict(public)
+            self._requester.fail_requests(peer, lambda: NotAdmitted(text, code))
+        self._fragmenter.evict(public)
 
     def _record_rejection(self, side: Side, contact: Contact, code: str) -> None:
-        self.rebuffs.met(contact.public, str(contact.address), side, code, meaning(code), self._clock.seconds())
+        self.rejections.record(contact.public, str(contact.address), side, code, explain(code), self._clock.seconds())
 
-    def _log_refusal(self, contact: Contact, code: str) -> None:
-        if self._is_new_to_log(contact.public, code):
-            who, why = contact.public.hex()[:16], meaning(code)
+    def _log_rejection(self, contact: Contact, code: str) -> None:
+        if self._should_log(contact.public, code):
+            who, why = contact.public.hex()[:16], explain(code)
             self._log.warn("{who} at {at} is rejected: {why}", who=who, at=contact.address, why=why, code=code)
 
-    def _is_new_to_log(self, *what: object) -> bool:
-        return self._noted.is_new(self._clock.seconds(), *what)
+    def _should_log(self, *what: object) -> bool:
+        return self._log_limiter.should_log(self._clock.seconds(), *what)
 
-    def _refuse_call(self, peer: Contact, method: str) -> None:
+    def _record_refused_call(self, peer: Contact, method: str) -> None:
         self._record_rejection("call", peer, ROLE)
-        if self._is_new_to_log(peer.public, ROLE):
-            who, why = peer.public.hex()[:16], meaning(ROLE)
+        if self._should_log(peer.public, ROLE):
+            who, why = peer.public.hex()[:16], explain(ROLE)
             self._log.warn(
                 "{who} at {at} may not call {method}: {why}",
                 who=who,
@@ -640,14 +656,14 @@ class Endpoint:
 
     def _send(self, session: Session, message: bytes) -> None:
         if self.is_running:
-            self._network.send(self._sealed(session, message), session.contact.address)
+            self._network.send(self._seal(session, message), session.contact.address)
 
-    def _sealed(self, session: Session, message: bytes) -> bytes:
-        self._peers.renew(session)
+    def _seal(self, session: Session, message: bytes) -> bytes:
+        self._peers.renew_if_old(session)
         return session.seal(message)
 
     def _send_to(self, public: bytes, message: bytes) -> None:
         """Send in the newest session with a peer; without a session the message is lost, as any datagram may be."""
-        peer = self._peers.known(public)
+        peer = self._peers.get(public)
         if peer is not None and peer.session is not None:
             self._send(peer.session, message)

@@ -9,29 +9,33 @@ from itertools import islice
 from twisted.internet.interfaces import IDelayedCall, IReactorTime
 
 from middleware.entangled.background import cancel
-from middleware.entangled.wire.congestion import BACK_OFF, LONGEST, RoundTrip, Window
+from middleware.entangled.wire.congestion import BACKOFF_FACTOR, MAX_TIMEOUT_S, CongestionWindow, RoundTrip
 from middleware.entangled.wire.message import (
-    MAX_PARTS,
-    OF_ANSWER,
+    FRAGMENT_BYTES,
+    IS_ANSWER,
+    MAX_FRAGMENTS,
     PART,
-    PART_BYTES,
-    WANTED,
-    Key,
+    WANTS_RECEIPT,
+    MessageKey,
     Receipt,
-    part_count,
+    count_fragments,
 )
 
-IDLE_S = 10.0
-TURNS = 4  # messages to one peer that are sent in turn; the others wait, or each would occupy memory at the receiver
+IDLE_TIMEOUT_S = 10.0
+MAX_PARALLEL_MESSAGES = (
+    4  # messages to one peer that are sent in turn; the others wait, or each would occupy memory at the receiver
+)
 RECEIPT_EVERY = 4
-GAP = 3  # a fragment is lost if one sent this much later has arrived (RFC 9002, 6.1.1), after a round trip
-SHORTEST_WAIT = 0.02
-PROBES = 2
-LONGEST_PROBE = 0.25
-REST_S = 1.0
+REORDERING_THRESHOLD = (
+    3  # a fragment is lost if one sent this much later has arrived (RFC 9002, 6.1.1), after a round trip
+)
+MIN_TIMEOUT_S = 0.02
+PROBE_FRAGMENTS = 2
+MAX_PROBE_TIMEOUT_S = 0.25
+IDLE_RESTART_S = 1.0
 
 
-class Parcel:
+class FragmentedMessage:
     """An outgoing message, until every fragment is acknowledged.
 
     ``progress_at`` is the time of the last newly acknowledged fragment.
@@ -41,83 +45,83 @@ class Parcel:
         "key",
         "data",
         "count",
-        "here",
+        "acknowledged",
         "progress_at",
-        "room",
-        "orders",
-        "repeated",
+        "window_end",
+        "send_orders",
+        "retransmitted",
         "_sent",
         "_next",
-        "_lost_parts",
-        "_head",
+        "_lost_fragments",
+        "_header",
     )
 
-    def __init__(self, key: Key, data: bytes, now: float) -> None:
+    def __init__(self, key: MessageKey, data: bytes, now: float) -> None:
         self.key = key
         self.data = data
-        self.count = part_count(len(data))
-        self.here = 0  # bit n: fragment n is acknowledged
-        self.room = MAX_PARTS
+        self.count = count_fragments(len(data))
+        self.acknowledged = 0  # bit n: fragment n is acknowledged
+        self.window_end = MAX_FRAGMENTS
         self.progress_at = now
-        self.orders: dict[int, int] = {}  # of the fragments under way: the place in the order of sending
-        self.repeated = 0  # bit n: fragment n was sent more than once, so its receipt is no measurement (Karn)
+        self.send_orders: dict[int, int] = {}  # of the fragments under way: the place in the order of sending
+        self.retransmitted = 0  # bit n: fragment n was sent more than once, so its receipt is no measurement (Karn)
         self._sent = 0
         self._next = 0
-        self._lost_parts: deque[int] = deque()
-        self._head = key.id.to_bytes(8, "little") + len(data).to_bytes(4, "little")
+        self._lost_fragments: deque[int] = deque()
+        self._header = key.id.to_bytes(8, "little") + len(data).to_bytes(4, "little")
 
     @property
     def is_done(self) -> bool:
         """Whether every fragment is acknowledged."""
-        return self.here == (1 << self.count) - 1
+        return self.acknowledged == (1 << self.count) - 1
 
-    def due(self, limit: int | None = None) -> int | None:
+    def next_fragment(self, limit: int | None = None) -> int | None:
         """Return the next fragment to send, lost ones first; None if all are under way or the receiver has no room."""
-        here, most = self.here, self.room if limit is None else limit
-        while self._lost_parts and here >> self._lost_parts[0] & 1:
-            self._lost_parts.popleft()
+        here, most = self.acknowledged, self.window_end if limit is None else limit
+        while self._lost_fragments and here >> self._lost_fragments[0] & 1:
+            self._lost_fragments.popleft()
         while self._next < self.count and here >> self._next & 1:
             self._next += 1
-        number = self._lost_parts[0] if self._lost_parts else self._next
+        number = self._lost_fragments[0] if self._lost_fragments else self._next
         return number if number < min(self.count, most) else None
 
-    def sent(self, number: int, order: int) -> None:
+    def mark_sent(self, number: int, order: int) -> None:
         """Record that a due fragment was sent."""
-        if self._lost_parts and self._lost_parts[0] == number:
-            self._lost_parts.popleft()
+        if self._lost_fragments and self._lost_fragments[0] == number:
+            self._lost_fragments.popleft()
         else:
             self._next = number + 1
-        self.orders[number] = order
+        self.send_orders[number] = order
 
-    def lost(self, number: int) -> None:
+    def mark_lost(self, number: int) -> None:
         """Schedule a lost fragment for retransmission."""
-        self.orders.pop(number, None)
-        self.repeated |= 1 << number
-        self._lost_parts.append(number)
+        self.send_orders.pop(number, None)
+        self.retransmitted |= 1 << number
+        self._lost_fragments.append(number)
 
     def restart(self) -> None:
         """Restart, because the receiver may have lost its fragments; if it has not, its first receipt shows them."""
-        self.repeated |= (1 << self._next) - 1
-        self.here, self._next, self.room = 0, 0, MAX_PARTS
-        self._lost_parts.clear()
-        self.orders.clear()
+        self.retransmitted |= (1 << self._next) - 1
+        self.acknowledged, self._next, self.window_end = 0, 0, MAX_FRAGMENTS
+        self._lost_fragments.clear()
+        self.send_orders.clear()
 
-    def is_turn(self) -> bool:
+    def requests_receipt(self) -> bool:
         """Return whether the fragment that is sent now requests a receipt: every fourth one does."""
         self._sent += 1
         return self._sent % RECEIPT_EVERY == 0
 
-    def part(self, number: int, is_wanted: bool) -> bytes:
+    def make_fragment(self, number: int, is_wanted: bool) -> bytes:
         """Return the PART with that number."""
-        flags = self.key.is_answer * OF_ANSWER | is_wanted * WANTED
-        head = bytes([PART, flags]) + self._head + number.to_bytes(2, "little")
-        return head + self.data[number * PART_BYTES : (number + 1) * PART_BYTES]
+        flags = self.key.is_answer * IS_ANSWER | is_wanted * WANTS_RECEIPT
+        head = bytes([PART, flags]) + self._header + number.to_bytes(2, "little")
+        return head + self.data[number * FRAGMENT_BYTES : (number + 1) * FRAGMENT_BYTES]
 
-    def taken(self, receipt: Receipt, now: float) -> list[int]:
+    def process_receipt(self, receipt: Receipt, now: float) -> list[int]:
         """Return the fragments that a receipt acknowledges for the first time."""
-        self.room = receipt.next + receipt.room
-        new = receipt.here & ((1 << self.count) - 1) & ~self.here
-        self.here |= new
+        self.window_end = receipt.next + receipt.room
+        new = receipt.received & ((1 << self.count) - 1) & ~self.acknowledged
+        self.acknowledged |= new
         numbers = []
         while new:
             lowest = new & -new
@@ -136,20 +140,24 @@ class Flow:
     """
 
     def __init__(
-        self, clock: IReactorTime, send: Callable[[bytes], None], ended: Callable[[Parcel], None], first_wait: float
+        self,
+        clock: IReactorTime,
+        send: Callable[[bytes], None],
+        ended: Callable[[FragmentedMessage], None],
+        first_wait: float,
     ) -> None:
-        self.parcels: OrderedDict[Key, Parcel] = OrderedDict()
+        self.messages: OrderedDict[MessageKey, FragmentedMessage] = OrderedDict()
         self._clock = clock
-        self._send = send
-        self._ended = ended
-        self._window = Window()
-        self._round_trip = RoundTrip(first_wait, SHORTEST_WAIT)
-        self._turns: deque[Parcel] = deque()
-        self._under_way: dict[int, tuple[Parcel, int, float]] = {}  # in the order of sending
+        self._send_sealed = send
+        self._on_ended = ended
+        self._window = CongestionWindow()
+        self._round_trip = RoundTrip(first_wait, MIN_TIMEOUT_S)
+        self._rotation: deque[FragmentedMessage] = deque()
+        self._in_flight: dict[int, tuple[FragmentedMessage, int, float]] = {}  # in the order of sending
         self._order = 0
-        self._newest_taken = -1
-        self._silences = 0
-        self.told_at = -1.0
+        self._newest_acknowledged = -1
+        self._silent_probes = 0
+        self.progress_reported_at = -1.0
         self._sent_at = 0.0
         self._timer: IDelayedCall | None = None
 
@@ -157,79 +165,79 @@ class Flow:
         """Cancel the timer."""
         cancel(self._timer)
 
-    def post(self, key: Key, message: bytes) -> None:
+    def send(self, key: MessageKey, message: bytes) -> None:
         """Send a message."""
         now = self._clock.seconds()
-        if now - self._sent_at > REST_S:
-            self._window.rested()
-        self.parcels[key] = Parcel(key, message, now)
-        self._pump(now)
+        if now - self._sent_at > IDLE_RESTART_S:
+            self._window.shrink_after_idle()
+        self.messages[key] = FragmentedMessage(key, message, now)
+        self._send_fragments(now)
 
-    def drop(self, key: Key) -> None:
+    def drop(self, key: MessageKey) -> None:
         """Stop sending a message."""
-        parcel = self.parcels.get(key)
+        parcel = self.messages.get(key)
         if parcel is not None:
             self._end(parcel)
-            self._pump(self._clock.seconds())
+            self._send_fragments(self._clock.seconds())
 
     def restart(self) -> None:
         """Restart every message, because the peer may have lost its fragments."""
-        self._under_way.clear()
-        for parcel in self.parcels.values():
+        self._in_flight.clear()
+        for parcel in self.messages.values():
             parcel.restart()
-        self._pump(self._clock.seconds())
+        self._send_fragments(self._clock.seconds())
 
-    def take(self, receipt: Receipt) -> None:
+    def process_receipt(self, receipt: Receipt) -> None:
         """Process a receipt."""
-        parcel = self.parcels.get(receipt.key)
+        parcel = self.messages.get(receipt.key)
         if parcel is None:
             return  # a late receipt
         now = self._clock.seconds()
-        self._silences = 0
+        self._silent_probes = 0
         count, newest, round_trip = 0, -1, None
-        for number in parcel.taken(receipt, now):
-            order = parcel.orders.pop(number, -1)
+        for number in parcel.process_receipt(receipt, now):
+            order = parcel.send_orders.pop(number, -1)
             if order < 0:
-                self._window.lost(-1)  # it was considered lost, and arrived after all
+                self._window.count_losses(-1)  # it was considered lost, and arrived after all
                 continue
-            _, _, sent_at = self._under_way.pop(order)
+            _, _, sent_at = self._in_flight.pop(order)
             count += 1
             newest = max(newest, order)
-            if number == receipt.cause and not parcel.repeated >> number & 1:
+            if number == receipt.cause and not parcel.retransmitted >> number & 1:
                 round_trip = now - sent_at
         if round_trip is not None:
-            self._round_trip.measured(round_trip)
+            self._round_trip.add_sample(round_trip)
         if count:
-            self._newest_taken = max(self._newest_taken, newest)
-            self._window.taken(count, newest, self._order, round_trip, now)
+            self._newest_acknowledged = max(self._newest_acknowledged, newest)
+            self._window.acknowledge(count, newest, self._order, round_trip, now)
         if receipt.is_done or parcel.is_done:
             self._end(parcel)
         elif not receipt.room:
-            self._mark_lost([order for order, (owner, _, _) in self._under_way.items() if owner is parcel])
+            self._mark_lost([order for order, (owner, _, _) in self._in_flight.items() if owner is parcel])
         self._detect_losses(now)
-        self._pump(now)
+        self._send_fragments(now)
 
     def _detect_losses(self, now: float) -> None:
         lost = []
-        latest = now - self._round_trip.usual
-        for order, (_, _, sent_at) in self._under_way.items():
-            if order > self._newest_taken - GAP or sent_at > latest:
+        latest = now - self._round_trip.nearly_all
+        for order, (_, _, sent_at) in self._in_flight.items():
+            if order > self._newest_acknowledged - REORDERING_THRESHOLD or sent_at > latest:
                 break
             lost.append(order)
         self._mark_lost(lost)
-        self._window.lost(len(lost))
+        self._window.count_losses(len(lost))
 
     def _mark_lost(self, orders: list[int]) -> None:
         for order in orders:
-            parcel, number, _ = self._under_way.pop(order)
-            parcel.lost(number)
+            parcel, number, _ = self._in_flight.pop(order)
+            parcel.mark_lost(number)
 
-    def _pump(self, now: float) -> None:
+    def _send_fragments(self, now: float) -> None:
         """Send the fragments that the window allows, and set the timer."""
-        picked: list[tuple[Parcel, int]] = []
-        free = int(self._window.size) - len(self._under_way)
+        picked: list[tuple[FragmentedMessage, int]] = []
+        free = int(self._window.size) - len(self._in_flight)
         while len(picked) < free:
-            parcel, number = self._next_in_turn()
+            parcel, number = self._pick_next()
             if parcel is None:
                 break
             self._mark_sent(parcel, number, now)
@@ -237,48 +245,50 @@ class Flow:
         # Each message requests its own receipts: for its last fragment in the burst, and for some in between.
         last = {parcel.key: place for place, (parcel, _) in enumerate(picked)}
         for place, (parcel, number) in enumerate(picked):
-            self._send(parcel.part(number, parcel.is_turn() or place == last[parcel.key]))
+            self._send_sealed(parcel.make_fragment(number, parcel.requests_receipt() or place == last[parcel.key]))
         self._set_timer(now)
 
-    def _next_in_turn(self) -> tuple[Parcel | None, int]:
+    def _pick_next(self) -> tuple[FragmentedMessage | None, int]:
         """Return the next message in turn and its fragment to send."""
-        turns = self._turns
-        self._fill_turns()
+        turns = self._rotation
+        self._fill_rotation()
         for _ in range(len(turns)):
             parcel = turns[0]
             turns.rotate(-1)
-            number = parcel.due()
+            number = parcel.next_fragment()
             if number is not None:
                 return parcel, number
         return None, 0
 
-    def _fill_turns(self) -> None:
-        turns = self._turns
-        if len(turns) < TURNS and len(turns) < len(self.parcels):
-            others = (one for one in self.parcels.values() if one not in turns)
-            turns.extend(islice(others, TURNS - len(turns)))
+    def _fill_rotation(self) -> None:
+        turns = self._rotation
+        if len(turns) < MAX_PARALLEL_MESSAGES and len(turns) < len(self.messages):
+            others = (one for one in self.messages.values() if one not in turns)
+            turns.extend(islice(others, MAX_PARALLEL_MESSAGES - len(turns)))
 
-    def _mark_sent(self, parcel: Parcel, number: int, now: float) -> None:
-        parcel.sent(number, self._order)
-        self._under_way[self._order] = (parcel, number, now)
+    def _mark_sent(self, parcel: FragmentedMessage, number: int, now: float) -> None:
+        parcel.mark_sent(number, self._order)
+        self._in_flight[self._order] = (parcel, number, now)
         self._order += 1
         self._sent_at = now
 
     def _due_at(self) -> float:
         """Return the time of the next action if nothing is received before."""
-        if not self._under_way:
-            return self._sent_at + min(LONGEST_PROBE, self._patience())
-        order, (_, _, sent_at) = next(iter(self._under_way.items()))
-        if order <= self._newest_taken - GAP:
-            return sent_at + self._round_trip.usual
-        return self._sent_at + self._patience()
+        if not self._in_flight:
+            return self._sent_at + min(MAX_PROBE_TIMEOUT_S, self._probe_timeout())
+        order, (_, _, sent_at) = next(iter(self._in_flight.items()))
+        if order <= self._newest_acknowledged - REORDERING_THRESHOLD:
+            return sent_at + self._round_trip.nearly_all
+        return self._sent_at + self._probe_timeout()
 
-    def _patience(self) -> float:
-        wait = self._round_trip.wait
-        return min(LONGEST, max(wait, min(LONGEST_PROBE, wait * BACK_OFF ** min(self._silences, 8))))
+    def _probe_timeout(self) -> float:
+        wait = self._round_trip.timeout
+        return min(
+            MAX_TIMEOUT_S, max(wait, min(MAX_PROBE_TIMEOUT_S, wait * BACKOFF_FACTOR ** min(self._silent_probes, 8)))
+        )
 
     def _set_timer(self, now: float) -> None:
-        if not self.parcels:
+        if not self.messages:
             cancel(self._timer)
             return
         at = max(now, self._due_at())
@@ -290,38 +300,38 @@ class Flow:
 
     def _on_timer(self) -> None:
         now = self._clock.seconds()
-        for parcel in list(self.parcels.values()):
-            if now - parcel.progress_at >= IDLE_S:
+        for parcel in list(self.messages.values()):
+            if now - parcel.progress_at >= IDLE_TIMEOUT_S:
                 self._end(parcel)
-        if self.parcels and now >= self._due_at():
-            before = len(self._under_way)
+        if self.messages and now >= self._due_at():
+            before = len(self._in_flight)
             self._detect_losses(now)
-            if len(self._under_way) == before:
+            if len(self._in_flight) == before:
                 self._probe(now)
-        self._pump(now)
+        self._send_fragments(now)
 
     def _probe(self, now: float) -> None:
         """Send probes after a long silence, regardless of window and room; from the third probe on, restart slowly."""
-        self._silences += 1
-        if self._silences > 2:
+        self._silent_probes += 1
+        if self._silent_probes > 2:
             self._window.collapse()
-            self._mark_lost(list(self._under_way))
-        elif self._under_way:
-            self._mark_lost(list(self._under_way)[:PROBES])
-        self._fill_turns()
-        parcel = self._turns[0]
-        self._turns.rotate(-1)
-        for _ in range(PROBES):
-            number = parcel.due(parcel.count)
+            self._mark_lost(list(self._in_flight))
+        elif self._in_flight:
+            self._mark_lost(list(self._in_flight)[:PROBE_FRAGMENTS])
+        self._fill_rotation()
+        parcel = self._rotation[0]
+        self._rotation.rotate(-1)
+        for _ in range(PROBE_FRAGMENTS):
+            number = parcel.next_fragment(parcel.count)
             if number is None:
                 break
             self._mark_sent(parcel, number, now)
-            self._send(parcel.part(number, True))
+            self._send_sealed(parcel.make_fragment(number, True))
 
-    def _end(self, parcel: Parcel) -> None:
-        del self.parcels[parcel.key]
-        for order in parcel.orders.values():
-            del self._under_way[order]
-        if parcel in self._turns:
-            self._turns.remove(parcel)
-        self._ended(parcel)
+    def _end(self, parcel: FragmentedMessage) -> None:
+        del self.messages[parcel.key]
+        for order in parcel.send_orders.values():
+            del self._in_flight[order]
+        if parcel in self._rotation:
+            self._rotation.remove(parcel)
+        self._on_ended(parcel)

@@ -20,11 +20,11 @@ from typing import NamedTuple, NoReturn
 import msgpack
 
 from middleware.entangled.errors import Malformed
-from middleware.entangled.network.network import MAX_DATAGRAM
-from middleware.entangled.wire.session import MAX_PLAIN
+from middleware.entangled.network.network import MAX_DATAGRAM_BYTES
+from middleware.entangled.wire.session import MAX_PLAIN_BYTES
 
 # A record of 1 MiB, and room for its other fields and for the fields of the request that carries it.
-MAX_MESSAGE = 2**20 + 4096
+MAX_MESSAGE_BYTES = 2**20 + 4096
 MAX_METHOD = 64
 MAX_CODE = 64
 MAX_TEXT = 300
@@ -34,24 +34,24 @@ MAX_ITEMS = 2**17
 NO_LIMIT_MS = 2**32 - 1
 REFUSED, UNKNOWN_METHOD, BAD_ARGUMENTS = "refused", "unknown-method", "bad-arguments"
 INTERNAL, CANCELLED, GONE, BUSY = "internal", "cancelled", "gone", "busy"
-_QUESTION, _ANSWER, _FAILURE, _TOLD, _CANCEL = range(5)
+_REQUEST, _ANSWER, _FAILURE, _NOTIFICATION, _CANCEL = range(5)
 _UINT32 = b"\xce"
 
 PART, RECEIPT = 0x01, 0x02
 REFUSAL = 0x04
 """Followed by the refusal code: the sender rejects the peer and forgets the session."""
-OF_ANSWER = 0x01  # flag of both: the message is the answer to the request with this id, otherwise the request
-WANTED = 0x02  # flag of PART: the sender wants a receipt now
+IS_ANSWER = 0x01  # flag of both: the message is the answer to the request with this id, otherwise the request
+WANTS_RECEIPT = 0x02  # flag of PART: the sender wants a receipt now
 DONE = 0x02  # flag of RECEIPT: stop sending; all fragments are here, or the message is no longer needed
-_PART_HEAD = 16
-_RECEIPT_HEAD = 16
-PART_BYTES = MAX_PLAIN - _PART_HEAD
-MAX_PARTS = -(-MAX_MESSAGE // PART_BYTES)
-MAX_BITMAP = -(-MAX_PARTS // 8)
+_FRAGMENT_HEADER_BYTES = 16
+_RECEIPT_HEADER_BYTES = 16
+FRAGMENT_BYTES = MAX_PLAIN_BYTES - _FRAGMENT_HEADER_BYTES
+MAX_FRAGMENTS = -(-MAX_MESSAGE_BYTES // FRAGMENT_BYTES)
+MAX_BITMAP_BYTES = -(-MAX_FRAGMENTS // 8)
 
 
 @dataclass(frozen=True, slots=True)
-class Question:
+class Request:
     """Calls ``method``; the requester's ``id`` (64 bits) distinguishes a repeated request from a new one.
 
     The requester no longer waits for its requests to this peer with ids of more than ``behind`` below this one.
@@ -83,7 +83,7 @@ class Failure:
 
 
 @dataclass(frozen=True, slots=True)
-class Told:
+class Notification:
     """A notification: calls ``method`` without an answer."""
 
     method: str
@@ -97,45 +97,45 @@ class Cancel:
     id: int
 
 
-Message = Question | Answer | Failure | Told | Cancel
+Message = Request | Answer | Failure | Notification | Cancel
 
 
-def encoded(message: Message) -> bytes:
+def encode(message: Message) -> bytes:
     """Encode ``message``; raise ``TypeError``, ``ValueError`` or ``OverflowError`` if it cannot be packed."""
     match message:
-        case Question(id=number, method=method, arguments=arguments, left_ms=left_ms, behind=behind):
+        case Request(id=number, method=method, arguments=arguments, left_ms=left_ms, behind=behind):
             # The remaining time is last and always has four bytes, so that ``aged`` can replace it.
-            head = bytes(msgpack.packb([_QUESTION, number, behind, method, arguments]))
+            head = bytes(msgpack.packb([_REQUEST, number, behind, method, arguments]))
             return b"\x96" + head[1:] + _UINT32 + left_ms.to_bytes(4, "big")
         case Answer(id=number, value=value):
             fields = [_ANSWER, number, value]
         case Failure(id=number, code=code, text=text):
             fields = [_FAILURE, number, code, text[:MAX_TEXT].encode(errors="replace").decode()]
-        case Told(method=method, arguments=arguments):
-            fields = [_TOLD, method, arguments]
+        case Notification(method=method, arguments=arguments):
+            fields = [_NOTIFICATION, method, arguments]
         case Cancel(id=number):
             fields = [_CANCEL, number]
     return bytes(msgpack.packb(fields))
 
 
-def aged(question: bytes, seconds: float) -> bytes:
+def set_remaining_time(question: bytes, seconds: float) -> bytes:
     """Return an encoded request with another remaining time of ``seconds``."""
     left_ms = min(NO_LIMIT_MS, max(0, round(seconds * 1000)))
     return question[:-4] + left_ms.to_bytes(4, "big")
 
 
-def decoded(data: bytes) -> Message:
+def decode(data: bytes) -> Message:
     """Decode a message; raise ``Malformed`` and nothing else."""
-    is_large = len(data) > MAX_DATAGRAM
-    longest = MAX_MESSAGE if is_large else MAX_DATAGRAM
-    budget = _Budget() if is_large else None
+    is_large = len(data) > MAX_DATAGRAM_BYTES
+    longest = MAX_MESSAGE_BYTES if is_large else MAX_DATAGRAM_BYTES
+    budget = _ItemLimit() if is_large else None
     try:
         fields = msgpack.unpackb(
             data,
             strict_map_key=True,
-            ext_hook=_no_extension,
-            list_hook=budget and budget.spend,
-            object_hook=budget and budget.spend,
+            ext_hook=_reject_extension,
+            list_hook=budget and budget.count,
+            object_hook=budget and budget.count,
             max_str_len=longest,
             max_bin_len=longest,
             max_array_len=min(longest, MAX_ITEMS),
@@ -147,24 +147,24 @@ def decoded(data: bytes) -> Message:
     if type(fields) is not list or not fields or type(fields[0]) is not int:  # True and 1.0 are equal to 1, too
         raise Malformed("the message does not start with a list and its kind")
     kind, size = fields[0], len(fields)
-    if kind == _QUESTION and size == 6:
+    if kind == _REQUEST and size == 6:
         _, id_, behind, method, arguments, left = fields
         is_numbered = _is_id(id_) and _is_id(behind) and behind <= id_
         is_timed = type(left) is int and 0 <= left <= NO_LIMIT_MS
-        if is_numbered and is_timed and _is_method(method) and type(arguments) is list and _is_flat(arguments):
-            return Question(id_, method, tuple(arguments), left, behind)
+        if is_numbered and is_timed and _is_method(method) and type(arguments) is list and _is_plain_data(arguments):
+            return Request(id_, method, tuple(arguments), left, behind)
     elif kind == _ANSWER and size == 3:
         _, id_, value = fields
-        if _is_id(id_) and _is_flat(value):
+        if _is_id(id_) and _is_plain_data(value):
             return Answer(id_, value)
     elif kind == _FAILURE and size == 4:
         _, id_, code, text = fields
         if _is_id(id_) and is_code(code) and type(text) is str and len(text) <= MAX_TEXT:
             return Failure(id_, code, text)
-    elif kind == _TOLD and size == 3:
+    elif kind == _NOTIFICATION and size == 3:
         _, method, arguments = fields
-        if _is_method(method) and type(arguments) is list and _is_flat(arguments):
-            return Told(method, tuple(arguments))
+        if _is_method(method) and type(arguments) is list and _is_plain_data(arguments):
+            return Notification(method, tuple(arguments))
     elif kind == _CANCEL and size == 2 and _is_id(fields[1]):
         return Cancel(fields[1])
     raise Malformed("the fields do not match any kind of message")
@@ -175,13 +175,13 @@ def is_code(value: object) -> bool:
     return isinstance(value, str) and 0 < len(value) <= MAX_CODE and value.isascii() and value.isprintable()
 
 
-class _Budget:
+class _ItemLimit:
     """Counts the items of the lists and maps of one message while they are decoded."""
 
     def __init__(self) -> None:
         self._left = MAX_ITEMS
 
-    def spend(self, items: object) -> object:
+    def count(self, items: object) -> object:
         assert isinstance(items, list | dict)
         self._left -= 1 + len(items)
         if self._left < 0:
@@ -189,7 +189,7 @@ class _Budget:
         return items
 
 
-def _no_extension(code: int, data: bytes) -> NoReturn:
+def _reject_extension(code: int, data: bytes) -> NoReturn:
     raise Malformed("extension types are not part of the protocol")
 
 
@@ -201,7 +201,7 @@ def _is_method(value: object) -> bool:
     return type(value) is str and 0 < len(value) <= MAX_METHOD
 
 
-def _is_flat(value: object) -> bool:
+def _is_plain_data(value: object) -> bool:
     """Return whether nothing is nested deeper than ``MAX_DEPTH``, and all types are part of the protocol."""
     # The unpacker creates exactly these types and no subclasses.
     level: list[object] = [value]
@@ -221,18 +221,18 @@ def _is_flat(value: object) -> bool:
     return False
 
 
-class Key(NamedTuple):
+class MessageKey(NamedTuple):
     """Identifies a fragmented message of a peer: the request ``id``, or the answer to it."""
 
     is_answer: bool
     id: int
 
 
-class Part(NamedTuple):
+class Fragment(NamedTuple):
     """The content of a PART."""
 
-    key: Key
-    is_wanted: bool
+    key: MessageKey
+    wants_receipt: bool
     total: int
     number: int
     data: bytes
@@ -241,48 +241,50 @@ class Part(NamedTuple):
 class Receipt(NamedTuple):
     """The content of a RECEIPT; bit n of ``here`` is set if the receiver has fragment n."""
 
-    key: Key
+    key: MessageKey
     is_done: bool
     next: int
     room: int
     cause: int
-    here: int
+    received: int
 
 
-def part_count(total: int) -> int:
+def count_fragments(total: int) -> int:
     """Return the number of fragments of a message of ``total`` bytes."""
-    return -(-total // PART_BYTES)
+    return -(-total // FRAGMENT_BYTES)
 
 
-def part_of(plain: bytes) -> Part:
+def parse_fragment(plain: bytes) -> Fragment:
     """Decode a PART; raise ``Malformed``."""
-    flags, total = plain[1] if len(plain) > _PART_HEAD else 0xFF, int.from_bytes(plain[10:14], "little")
-    number, data = int.from_bytes(plain[14:16], "little"), plain[_PART_HEAD:]
-    if flags & ~(OF_ANSWER | WANTED) or not 0 < total <= MAX_MESSAGE or number >= part_count(total):
+    flags, total = plain[1] if len(plain) > _FRAGMENT_HEADER_BYTES else 0xFF, int.from_bytes(plain[10:14], "little")
+    number, data = int.from_bytes(plain[14:16], "little"), plain[_FRAGMENT_HEADER_BYTES:]
+    if flags & ~(IS_ANSWER | WANTS_RECEIPT) or not 0 < total <= MAX_MESSAGE_BYTES or number >= count_fragments(total):
         raise Malformed("a fragment with unknown flags, size or number")
-    if len(data) != min(PART_BYTES, total - number * PART_BYTES):
+    if len(data) != min(FRAGMENT_BYTES, total - number * FRAGMENT_BYTES):
         raise Malformed("a fragment of the wrong length for its number")
-    return Part(_key(plain), bool(flags & WANTED), total, number, data)
+    return Fragment(_parse_key(plain), bool(flags & WANTS_RECEIPT), total, number, data)
 
 
-def receipt_of(plain: bytes) -> Receipt:
+def parse_receipt(plain: bytes) -> Receipt:
     """Decode a RECEIPT; raise ``Malformed``."""
-    if not _RECEIPT_HEAD <= len(plain) <= _RECEIPT_HEAD + MAX_BITMAP or plain[1] & ~(OF_ANSWER | DONE):
+    if not _RECEIPT_HEADER_BYTES <= len(plain) <= _RECEIPT_HEADER_BYTES + MAX_BITMAP_BYTES or plain[1] & ~(
+        IS_ANSWER | DONE
+    ):
         raise Malformed("a receipt of the wrong length, or with unknown flags")
     first = int.from_bytes(plain[10:12], "little")
     room, cause = int.from_bytes(plain[12:14], "little"), int.from_bytes(plain[14:16], "little")
-    here = int.from_bytes(plain[_RECEIPT_HEAD:], "little") << (first + 1) | (1 << first) - 1
-    return Receipt(_key(plain), bool(plain[1] & DONE), first, room, cause, here)
+    here = int.from_bytes(plain[_RECEIPT_HEADER_BYTES:], "little") << (first + 1) | (1 << first) - 1
+    return Receipt(_parse_key(plain), bool(plain[1] & DONE), first, room, cause, here)
 
 
-def packed_receipt(key: Key, is_done: bool, room: int, cause: int, here: int) -> bytes:
+def pack_receipt(key: MessageKey, is_done: bool, room: int, cause: int, here: int) -> bytes:
     """Return the RECEIPT for a message of which the fragments in ``here`` have arrived, ``cause`` being the latest."""
     first = ((here + 1) & ~here).bit_length() - 1  # the lowest bit that is not set
     bitmap = here >> (first + 1)
-    head = bytes([RECEIPT, key.is_answer * OF_ANSWER | is_done * DONE]) + key.id.to_bytes(8, "little")
+    head = bytes([RECEIPT, key.is_answer * IS_ANSWER | is_done * DONE]) + key.id.to_bytes(8, "little")
     head += first.to_bytes(2, "little") + room.to_bytes(2, "little") + cause.to_bytes(2, "little")
     return head + bitmap.to_bytes(-(-bitmap.bit_length() // 8), "little")
 
 
-def _key(plain: bytes) -> Key:
-    return Key(bool(plain[1] & OF_ANSWER), int.from_bytes(plain[2:10], "little"))
+def _parse_key(plain: bytes) -> MessageKey:
+    return MessageKey(bool(plain[1] & IS_ANSWER), int.from_bytes(plain[2:10], "little"))

@@ -26,17 +26,17 @@ from middleware.entangled.errors import Refused
 from middleware.entangled.wire.message import BAD_ARGUMENTS, CANCELLED, Failure, is_code
 from middleware.entangled.wire.session import Session
 
-KEPT_S = 30.0
+KEEP_ANSWER_S = 30.0
 MAX_PER_PEER = 4096
-LIFE_BITS = 32
+SEQUENCE_BITS = 32
 """The low bits of a request id, which a requester increments; the bits above are random and new after each restart."""
-MAX_LIVES = 4
+MAX_INCARNATIONS = 4
 """The number of restarts of one peer within ``KEPT_S`` for which ``settled`` is kept."""
 MAX_ENTRIES = 16384
-MAX_ACCOUNTS = 4096
-_PLAIN = (int, float, bool, str, bytes, list, dict, type(None))
-_BY_NAME: dict[str, tuple[type, ...]] = {kind.__name__: (kind,) for kind in _PLAIN}
-_BY_NAME |= {"None": (type(None),), "float": (float, int)}
+MAX_REQUESTERS = 4096
+_PLAIN_TYPES = (int, float, bool, str, bytes, list, dict, type(None))
+_TYPES_BY_NAME: dict[str, tuple[type, ...]] = {kind.__name__: (kind,) for kind in _PLAIN_TYPES}
+_TYPES_BY_NAME |= {"None": (type(None),), "float": (float, int)}
 _TYPE_ARGUMENTS = re.compile(r"\[[^\[\]]*\]")
 
 
@@ -46,16 +46,16 @@ class BadArguments(Refused):
     code = BAD_ARGUMENTS
 
 
-class _Form(NamedTuple):
+class _Signature(NamedTuple):
     """The parameters of a function besides the peer: their number, their types (None: any), and a deadline."""
 
-    least: int
-    most: float
-    kinds: tuple[tuple[type, ...] | None, ...]
+    min_arguments: int
+    max_arguments: float
+    types: tuple[tuple[type, ...] | None, ...]
     wants_deadline: bool
 
 
-_FORMS: WeakKeyDictionary[Callable[..., object], _Form] = WeakKeyDictionary()
+_SIGNATURES: WeakKeyDictionary[Callable[..., object], _Signature] = WeakKeyDictionary()
 """The parameters of methods of classes: the same for all nodes of a process."""
 
 
@@ -76,42 +76,42 @@ class Method:
     changes: bool = False
     is_idempotent: bool = False
     is_early: bool = False
-    _cached_form: _Form | None = field(default=None, init=False, repr=False, compare=False)
+    _cached_signature: _Signature | None = field(default=None, init=False, repr=False, compare=False)
 
     def __post_init__(self) -> None:
         if self.is_early and self.changes:
             raise ValueError(f"{self.name}: a method that changes something cannot be early")
 
     @property
-    def _form(self) -> _Form:
+    def _signature(self) -> _Signature:
         """The parameters, inspected at the first call: inspecting all methods takes half the time to create a node."""
-        form = self._cached_form
+        form = self._cached_signature
         if form is None:
             answer = inspect.unwrap(self.answer)
             function = answer.__func__ if isinstance(answer, types.MethodType) else None
-            form = _FORMS.get(function) if function is not None else None
+            form = _SIGNATURES.get(function) if function is not None else None
             if form is None:
                 form = self._inspect()
                 if function is not None:
-                    _FORMS[function] = form
-            object.__setattr__(self, "_cached_form", form)
+                    _SIGNATURES[function] = form
+            object.__setattr__(self, "_cached_signature", form)
         return form
 
-    def _inspect(self) -> _Form:
+    def _inspect(self) -> _Signature:
         signature = inspect.signature(self.answer)
         positional = (inspect.Parameter.POSITIONAL_ONLY, inspect.Parameter.POSITIONAL_OR_KEYWORD)
         parameters = [parameter for parameter in signature.parameters.values() if parameter.kind in positional]
         is_open = any(p.kind is inspect.Parameter.VAR_POSITIONAL for p in signature.parameters.values())
         required = sum(1 for parameter in parameters if parameter.default is inspect.Parameter.empty)
         deadline = signature.parameters.get("deadline")
-        return _Form(
+        return _Signature(
             max(0, required - 1),  # the first parameter is the peer
             math.inf if is_open else len(parameters) - 1,
-            self._kinds(parameters[1:]),
+            self._find_types(parameters[1:]),
             deadline is not None and deadline.kind is inspect.Parameter.KEYWORD_ONLY,
         )
 
-    def _kinds(self, parameters: list[inspect.Parameter]) -> tuple[tuple[type, ...] | None, ...]:
+    def _find_types(self, parameters: list[inspect.Parameter]) -> tuple[tuple[type, ...] | None, ...]:
         """Return the types that the annotations allow; most are plain names, which need not be compiled."""
         named = [_types_in_annotation(parameter.annotation) for parameter in parameters]
         if all(named):
@@ -120,16 +120,16 @@ class Method:
             hints = typing.get_type_hints(self.answer)
         except Exception:  # annotations may raise anything: names imported for type checkers only, partials, callables
             hints = {}
-        return tuple(_kinds(hints.get(parameter.name)) for parameter in parameters)
+        return tuple(_types_of_hint(hints.get(parameter.name)) for parameter in parameters)
 
     @property
-    def is_once(self) -> bool:
+    def runs_once(self) -> bool:
         """Whether it may run only once per request."""
         return self.changes and not self.is_idempotent
 
     def run(self, peer: Contact, arguments: tuple[object, ...], deadline: float = math.inf) -> object:
         """Call the function; raise ``BadArguments`` if the arguments do not match, or the function's exception."""
-        least, most, all_kinds, wants_deadline = self._form
+        least, most, all_kinds, wants_deadline = self._signature
         if not least <= len(arguments) <= most:
             count = f"{least}" if least == most else f"{least} to {most}"
             raise BadArguments(f"{self.name}: takes {count} arguments, got {len(arguments)}")
@@ -148,17 +148,17 @@ def _types_in_annotation(annotation: object) -> tuple[type, ...]:
         return ()
     while (bare := _TYPE_ARGUMENTS.sub("", annotation)) != annotation:
         annotation = bare
-    kinds = [_BY_NAME.get(name.strip(), ()) for name in annotation.split("|")]
+    kinds = [_TYPES_BY_NAME.get(name.strip(), ()) for name in annotation.split("|")]
     return sum(kinds, ()) if all(kinds) else ()
 
 
-def _kinds(hint: object) -> tuple[type, ...] | None:
+def _types_of_hint(hint: object) -> tuple[type, ...] | None:
     """Return the plain types that a type hint allows, or None if plain types cannot express it."""
     origin = typing.get_origin(hint)
     if origin in (typing.Union, types.UnionType):
         kinds: list[type] = []
         for part in typing.get_args(hint):
-            inner = _kinds(part)
+            inner = _types_of_hint(part)
             if inner is None:
                 return None
             kinds += inner
@@ -166,10 +166,10 @@ def _kinds(hint: object) -> tuple[type, ...] | None:
     plain = origin or hint
     if plain is float:
         return (float, int)
-    return (plain,) if plain in _PLAIN else None
+    return (plain,) if plain in _PLAIN_TYPES else None
 
 
-def failure_of(number: int, trouble: Trouble) -> Failure | None:
+def make_failure(number: int, trouble: Trouble) -> Failure | None:
     """Return the failure that reports an error to the requester of ``number``; None for an internal error."""
     error = trouble.value
     if isinstance(error, Refused):
@@ -179,17 +179,17 @@ def failure_of(number: int, trouble: Trouble) -> Failure | None:
     return None
 
 
-def error_of(failure: Failure) -> Refused:
+def make_error(failure: Failure) -> Refused:
     """Return the exception that a failure represents."""
     return BadArguments(failure.text) if failure.code == BAD_ARGUMENTS else Refused(failure.text, failure.code)
 
 
 @dataclass(slots=True)
-class Entry:
+class RequestEntry:
     """One request; ``answer`` is None while it runs, the answer is sent in ``session`` (None: discarded)."""
 
     session: Session | None
-    is_bulky: bool = False
+    is_fragmented: bool = False
     work: Deferred[object] | None = None
     timer: IDelayedCall | None = None
     answer: bytes | None = None
@@ -197,16 +197,16 @@ class Entry:
 
 
 @dataclass(slots=True)
-class _Account:
+class _PeerRequests:
     """The requests of one peer; ``settled`` has, for each incarnation of the peer, the id below which none is open."""
 
-    running: dict[int, Entry] = field(default_factory=dict)
-    ended: dict[int, Entry] = field(default_factory=dict)
-    settled: dict[int, int] = field(default_factory=dict)
-    heard_at: float = 0.0
+    running: dict[int, RequestEntry] = field(default_factory=dict)
+    finished: dict[int, RequestEntry] = field(default_factory=dict)
+    lowest_open: dict[int, int] = field(default_factory=dict)
+    last_received_at: float = 0.0
 
 
-class Ledger:
+class RequestHistory:
     """The running requests, and the ones that ended in the last ``KEPT_S`` seconds, by public key and request id.
 
     A requester includes in each request the oldest one that it still waits for: older ones are forgotten at once, and
@@ -215,50 +215,56 @@ class Ledger:
     """
 
     def __init__(self) -> None:
-        self._accounts: dict[bytes, _Account] = {}
+        self._peers: dict[bytes, _PeerRequests] = {}
         self._count = 0
 
     def __len__(self) -> int:
         return self._count
 
-    def entry(self, public: bytes, question: int) -> Entry | None:
+    def get(self, public: bytes, question: int) -> RequestEntry | None:
         """Return the entry of a request."""
-        account = self._accounts.get(public)
-        return None if account is None else account.running.get(question) or account.ended.get(question)
+        account = self._peers.get(public)
+        return None if account is None else account.running.get(question) or account.finished.get(question)
 
     def is_settled(self, public: bytes, question: int) -> bool:
         """Return whether the requester no longer waits for this request."""
-        account = self._accounts.get(public)
-        return account is not None and question < account.settled.get(question >> LIFE_BITS, 0)
+        account = self._peers.get(public)
+        return account is not None and question < account.lowest_open.get(question >> SEQUENCE_BITS, 0)
 
-    def settle(self, public: bytes, oldest: int, now: float) -> None:
+    def forget_before(self, public: bytes, oldest: int, now: float) -> None:
         """Forget the ended requests of a peer before ``oldest``: it has those answers, or gave them up."""
-        account = self._account(public, now)
+        account = self._get_or_create(public, now)
         if account is None:
             return  # ``begin`` will reject the request
-        life = oldest >> LIFE_BITS
-        before = account.settled.get(life)
-        if before is None and len(account.settled) >= MAX_LIVES:
-            del account.settled[next(iter(account.settled))]
+        life = oldest >> SEQUENCE_BITS
+        before = account.lowest_open.get(life)
+        if before is None and len(account.lowest_open) >= MAX_INCARNATIONS:
+            del account.lowest_open[next(iter(account.lowest_open))]
         if before is None or before < oldest:
-            account.settled[life] = oldest
-            had = [number for number in account.ended if number < oldest and number >> LIFE_BITS == life]
+            account.lowest_open[life] = oldest
+            had = [number for number in account.finished if number < oldest and number >> SEQUENCE_BITS == life]
             for number in had:
-                del account.ended[number]
+                del account.finished[number]
             self._count -= len(had)
 
-    def begin(self, public: bytes, question: int, session: Session | None, now: float, is_bulky: bool) -> Entry | None:
+    def begin(
+        self, public: bytes, question: int, session: Session | None, now: float, is_bulky: bool
+    ) -> RequestEntry | None:
         """Add a request that is about to run; return None if there is no room."""
-        account = self._account(public, now)
-        if account is None or self._count >= MAX_ENTRIES or len(account.running) + len(account.ended) >= MAX_PER_PEER:
+        account = self._get_or_create(public, now)
+        if (
+            account is None
+            or self._count >= MAX_ENTRIES
+            or len(account.running) + len(account.finished) >= MAX_PER_PEER
+        ):
             return None
-        entry = account.running[question] = Entry(session, is_bulky)
+        entry = account.running[question] = RequestEntry(session, is_bulky)
         self._count += 1
         return entry
 
-    def end(self, public: bytes, question: int, answer: bytes | None, now: float) -> None:
+    def finish(self, public: bytes, question: int, answer: bytes | None, now: float) -> None:
         """Store the ``answer`` of a request that ran, or forget the request if it is None and may run again."""
-        account = self._accounts.get(public)
+        account = self._peers.get(public)
         entry = account.running.pop(question, None) if account is not None else None
         if account is None or entry is None:
             return
@@ -268,62 +274,62 @@ class Ledger:
             self._count -= 1
         else:
             entry.answer, entry.ended_at, entry.session = answer, now, None
-            account.ended[question] = entry
+            account.finished[question] = entry
 
     def evict(self, public: bytes) -> list[Deferred[object]]:
         """Forget the requests of a peer; return the running work, which the caller cancels."""
-        account = self._accounts.pop(public, None)
+        account = self._peers.pop(public, None)
         if account is None:
             return []
-        self._count -= len(account.running) + len(account.ended)
+        self._count -= len(account.running) + len(account.finished)
         for entry in account.running.values():
             cancel(entry.timer)
         return [entry.work for entry in account.running.values() if entry.work is not None]
 
     def clear(self) -> None:
         """Forget all requests and cancel the timers."""
-        for account in self._accounts.values():
+        for account in self._peers.values():
             for entry in account.running.values():
                 cancel(entry.timer)
-        self._accounts.clear()
+        self._peers.clear()
         self._count = 0
 
     def _make_room(self) -> bool:
         """Return whether there is room for one more peer, after deleting a peer without requests if necessary."""
-        if len(self._accounts) < MAX_ACCOUNTS:
+        if len(self._peers) < MAX_REQUESTERS:
             return True
-        idle = (public for public, account in self._accounts.items() if not (account.running or account.ended))
+        idle = (public for public, account in self._peers.items() if not (account.running or account.finished))
         found = next(idle, None)
         if found is not None:
-            del self._accounts[found]
+            del self._peers[found]
         return found is not None
 
-    def _account(self, public: bytes, now: float) -> _Account | None:
+    def _get_or_create(self, public: bytes, now: float) -> _PeerRequests | None:
         """Return the account of a peer without its expired requests; None if there is no room for another one.
 
         The account that was unused for longest is deleted if it has no requests and is older than ``KEPT_S``.
         """
-        account = self._accounts.pop(public, None)
+        account = self._peers.pop(public, None)
         if account is None:
             if not self._make_room():
                 return None
-            account = _Account()
-        self._accounts[public] = account  # the peer that was silent for longest stands first
-        account.heard_at = now
+            account = _PeerRequests()
+        self._peers[public] = account  # the peer that was silent for longest stands first
+        account.last_received_at = now
         self._expire(account, now)
-        oldest_public, oldest = next(iter(self._accounts.items()))
-        if oldest.heard_at <= now - KEPT_S:
+        oldest_public, oldest = next(iter(self._peers.items()))
+        if oldest.last_received_at <= now - KEEP_ANSWER_S:
             self._expire(oldest, now)
-            if oldest.running or oldest.ended:
-                self._accounts[oldest_public] = self._accounts.pop(oldest_public)
+            if oldest.running or oldest.finished:
+                self._peers[oldest_public] = self._peers.pop(oldest_public)
             else:
-                del self._accounts[oldest_public]
+                del self._peers[oldest_public]
         return account
 
-    def _expire(self, account: _Account, now: float) -> None:
-        while account.ended:
-            number, entry = next(iter(account.ended.items()))
-            if entry.ended_at > now - KEPT_S:
+    def _expire(self, account: _PeerRequests, now: float) -> None:
+        while account.finished:
+            number, entry = next(iter(account.finished.items()))
+            if entry.ended_at > now - KEEP_ANSWER_S:
                 return
-            del account.ended[number]
+            del account.finished[number]
             self._count -= 1

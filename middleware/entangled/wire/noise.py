@@ -17,10 +17,10 @@ from nacl.exceptions import CryptoError
 
 from middleware.entangled.errors import Forged
 
-KEY = 32
-TAG = 16
-FIRST_OVERHEAD = KEY + KEY + TAG + TAG
-SECOND_OVERHEAD = KEY + TAG
+KEY_BYTES = 32
+TAG_BYTES = 16
+FIRST_OVERHEAD_BYTES = KEY_BYTES + KEY_BYTES + TAG_BYTES + TAG_BYTES
+SECOND_OVERHEAD_BYTES = KEY_BYTES + TAG_BYTES
 _ZERO4 = bytes(4)
 _BLOCK = 64
 _INNER = bytes(byte ^ 0x36 for byte in range(256))
@@ -39,7 +39,7 @@ class KeyPair(NamedTuple):
     public: bytes
 
 
-def key_pair(secret: bytes) -> KeyPair:
+def make_key_pair(secret: bytes) -> KeyPair:
     """Return the key pair of 32 secret bytes."""
     return KeyPair(secret, bindings.crypto_scalarmult_base(secret))
 
@@ -52,15 +52,15 @@ class TransportKeys(NamedTuple):
     handshake_hash: bytes
 
 
-def sealed(key: bytes, counter: int, plaintext: bytes, ad: bytes) -> bytes:
+def seal(key: bytes, counter: int, plaintext: bytes, ad: bytes) -> bytes:
     """Encrypt ``plaintext`` with ChaCha20-Poly1305 and Noise's nonce (section 12); the result is 16 bytes longer.
 
     It calls libsodium directly: the argument checks of PyNaCl's wrapper take three quarters of the time.  The check of
     the key length is the only one that memory safety requires.
     """
-    if len(key) != KEY:
-        raise ValueError(f"a key must have {KEY} bytes, not {len(key)}")
-    size = len(plaintext) + TAG
+    if len(key) != KEY_BYTES:
+        raise ValueError(f"a key must have {KEY_BYTES} bytes, not {len(key)}")
+    size = len(plaintext) + TAG_BYTES
     out = _new(_BYTES, size)
     nonce = _ZERO4 + counter.to_bytes(8, "little")
     _encrypt(out, _NULL, plaintext, len(plaintext), ad, len(ad), _NULL, nonce, key)
@@ -68,11 +68,11 @@ def sealed(key: bytes, counter: int, plaintext: bytes, ad: bytes) -> bytes:
     return result
 
 
-def opened(key: bytes, counter: int, ciphertext: bytes, ad: bytes) -> bytes:
+def open_sealed(key: bytes, counter: int, ciphertext: bytes, ad: bytes) -> bytes:
     """Decrypt the result of ``sealed``; raise ``Forged`` if anything was changed."""
-    if len(key) != KEY:
-        raise ValueError(f"a key must have {KEY} bytes, not {len(key)}")
-    size = len(ciphertext) - TAG
+    if len(key) != KEY_BYTES:
+        raise ValueError(f"a key must have {KEY_BYTES} bytes, not {len(key)}")
+    size = len(ciphertext) - TAG_BYTES
     if size < 0:
         raise Forged("the ciphertext is too short")
     out = _new(_BYTES, size or 1)
@@ -129,13 +129,13 @@ class _Transcript:
         self.counter = 0
 
     def seal(self, plaintext: bytes) -> bytes:
-        ciphertext = sealed(self.key, self.counter, plaintext, self.hash)
+        ciphertext = seal(self.key, self.counter, plaintext, self.hash)
         self.counter += 1
         self.mix_hash(ciphertext)
         return ciphertext
 
     def open(self, ciphertext: bytes) -> bytes:
-        plaintext = opened(self.key, self.counter, ciphertext, self.hash)
+        plaintext = open_sealed(self.key, self.counter, ciphertext, self.hash)
         self.counter += 1
         self.mix_hash(ciphertext)
         return plaintext
@@ -192,7 +192,7 @@ class Initiator(_Side):
 
     def write(self, payload: bytes) -> bytes:
         """Return the first message (tokens e, es, s, ss and psk): 96 bytes longer than ``payload``."""
-        ephemeral = key_pair(self._ephemeral_secret)
+        ephemeral = make_key_pair(self._ephemeral_secret)
         transcript = self._transcript
         self._mix_ephemeral(ephemeral.public)
         transcript.mix_key(_exchange(ephemeral.secret, self._remote_static))
@@ -203,14 +203,14 @@ class Initiator(_Side):
 
     def read(self, message: bytes) -> tuple[bytes, TransportKeys]:
         """Return the payload of the second message (tokens e, ee, se), and the keys; raise ``Forged``."""
-        if len(message) < SECOND_OVERHEAD:
+        if len(message) < SECOND_OVERHEAD_BYTES:
             raise Forged("the second message is too short")
         transcript = self._transcript
-        ephemeral = message[:KEY]
+        ephemeral = message[:KEY_BYTES]
         self._mix_ephemeral(ephemeral)
         transcript.mix_key(_exchange(self._ephemeral_secret, ephemeral))
         transcript.mix_key(_exchange(self._static.secret, ephemeral))
-        payload = transcript.open(message[KEY:])
+        payload = transcript.open(message[KEY_BYTES:])
         sending, receiving = transcript.split()
         return payload, TransportKeys(sending, receiving, transcript.hash)
 
@@ -228,20 +228,20 @@ class Responder(_Side):
 
     def read(self, message: bytes) -> tuple[bytes, bytes]:
         """Return the payload of the first message and the verified static key of its sender; raise ``Forged``."""
-        if len(message) < FIRST_OVERHEAD:
+        if len(message) < FIRST_OVERHEAD_BYTES:
             raise Forged("the first message is too short")
         transcript = self._transcript
-        self._remote_ephemeral = message[:KEY]
+        self._remote_ephemeral = message[:KEY_BYTES]
         self._mix_ephemeral(self._remote_ephemeral)
         transcript.mix_key(_exchange(self._static.secret, self._remote_ephemeral))
-        self._remote_static = transcript.open(message[KEY : KEY + KEY + TAG])
+        self._remote_static = transcript.open(message[KEY_BYTES : KEY_BYTES + KEY_BYTES + TAG_BYTES])
         transcript.mix_key(_exchange(self._static.secret, self._remote_static))
         self._mix_psk()
-        return transcript.open(message[KEY + KEY + TAG :]), self._remote_static
+        return transcript.open(message[KEY_BYTES + KEY_BYTES + TAG_BYTES :]), self._remote_static
 
     def write(self, payload: bytes) -> tuple[bytes, TransportKeys]:
         """Return the second message, 48 bytes longer than ``payload``, and the keys."""
-        ephemeral = key_pair(self._ephemeral_secret)
+        ephemeral = make_key_pair(self._ephemeral_secret)
         transcript = self._transcript
         self._mix_ephemeral(ephemeral.public)
         transcript.mix_key(_exchange(ephemeral.secret, self._remote_ephemeral))

@@ -16,36 +16,36 @@ from twisted.internet.interfaces import IDelayedCall, IReactorTime
 
 from middleware.entangled.background import cancel
 from middleware.entangled.contact import Contact
-from middleware.entangled.identity import exchange_key
+from middleware.entangled.identity import derive_exchange_key
 from middleware.entangled.listeners import Listeners
 from middleware.entangled.network.network import Address, Network, is_relayed
-from middleware.entangled.wire.congestion import BACK_OFF, FIRST_GUESS, LONGEST, Loss, RoundTrip
-from middleware.entangled.wire.door import OPEN, Door
-from middleware.entangled.wire.session import INDEX_BYTES, Credentials, Hello, Invitation, Session
+from middleware.entangled.wire.admission_check import OPEN_ADMISSION, AdmissionCheck
+from middleware.entangled.wire.congestion import BACKOFF_FACTOR, INITIAL_TIMEOUT_S, MAX_TIMEOUT_S, LossRate, RoundTrip
+from middleware.entangled.wire.session import INDEX_BYTES, Credentials, HandshakeFields, InitiatorHandshake, Session
 
-STRANGER_WAIT = 0.3
+UNKNOWN_PEER_TIMEOUT_S = 0.3
 MAX_TRIES = 4
-DOUBTS = 2
+MIN_CHECK_TRIES = 2
 """The minimum number of INITs to a peer that may have lost its session with this node."""
 MAX_PEERS = 4096
-MAX_OPENINGS = 1024
+MAX_HANDSHAKES = 1024
 MAX_SESSIONS = 3
-OPENING_S = 1.5
-MAX_DOORS = 12
+HANDSHAKE_S = 1.5
+MAX_TARGETS = 12
 """The number of addresses to which one handshake sends its INIT."""
-MOST_GUESSED = 0.5
+MAX_INITIAL_TIMEOUT_S = 0.5
 """The maximum timeout of the first try to an unknown peer, in seconds."""
-HELP_S = 0.2
+HELP_AFTER_S = 0.2
 """Seconds without an answer after which other nodes are asked for a path to a distant peer."""
-KNOCK_S, KNOCKS = 0.1, 16
+PUNCH_INTERVAL_S, FAST_PUNCHES = 0.1, 16
 """The seconds between INITs during hole punching, and the number of them after which the interval grows."""
-LIVELY_S = 3.0
-IN_TOUCH = 105.0
+LIVE_S = 3.0
+SESSION_SILENCE_S = 105.0
 """Seconds of silence up to which the other side of a session still has it, in a wide network.  It is shorter than the
 time after which a session is forgotten; the margin covers the difference between the last datagrams of both sides."""
 SESSION_LIFE_S = 120.0
 """The age in seconds at which a session is replaced when something is sent in it."""
-SECOND_S = 30.0
+RENEWAL_DELAY_S = 30.0
 """The seconds by which the peer with the higher key delays, so that the other one replaces the session."""
 SESSION_END_S = 180.0
 """The age in seconds at which the keys of a session are deleted."""
@@ -54,7 +54,7 @@ SWEEP_S = 1.0
 SESSION_DATAGRAMS = 2**32
 
 
-NONE: Mapping[int, None] = MappingProxyType({})
+NO_NUMBERS: Mapping[int, None] = MappingProxyType({})
 """An empty table, shared by all peers without pending requests, which are the majority."""
 
 
@@ -68,11 +68,11 @@ def _add_number(numbers: Mapping[int, None], number: int) -> Mapping[int, None]:
 def _remove_number(numbers: Mapping[int, None], number: int) -> Mapping[int, None]:
     if isinstance(numbers, dict):
         numbers.pop(number, None)
-    return numbers or NONE
+    return numbers or NO_NUMBERS
 
 
 @dataclass(slots=True, eq=False)
-class Opening:
+class OutgoingHandshake:
     """A handshake of this node that waits for its RESP.
 
     It was begun at ``address``.  ``doors`` maps every address to which the INIT is sent to the cookie that was
@@ -82,19 +82,19 @@ class Opening:
     waits for a late RESP.
     """
 
-    invitation: Invitation
+    initiator: InitiatorHandshake
     peer: Peer
     address: Address
     started_at: float
-    doors: dict[Address, bytes]
-    within: float
+    cookies: dict[Address, bytes]
+    timeout_s: float
     tries: int = 0
-    knocks: int = 0
+    punches: int = 0
     held_until: float = 0.0
-    is_wanted: bool = True
-    is_resting: bool = False
+    has_request: bool = True
+    is_waiting: bool = False
     timer: IDelayedCall | None = None
-    helper: IDelayedCall | None = None
+    help_timer: IDelayedCall | None = None
 
 
 @dataclass(slots=True, eq=False)
@@ -106,13 +106,17 @@ class Peer:
 
     contact: Contact
     sessions: tuple[Session, ...] = ()
-    opening: Opening | None = None
+    handshake: OutgoingHandshake | None = None
     round_trip: RoundTrip = field(default_factory=RoundTrip)
-    tells: tuple[bytes, ...] = ()
-    inquiries: Mapping[int, None] = field(default_factory=lambda: NONE)  # the ids of pending requests to it, in order
-    queue: Mapping[int, None] = field(default_factory=lambda: NONE)  # the pending requests that have not been sent yet
+    notifications: tuple[bytes, ...] = ()
+    requests: Mapping[int, None] = field(
+        default_factory=lambda: NO_NUMBERS
+    )  # the ids of pending requests to it, in order
+    queue: Mapping[int, None] = field(
+        default_factory=lambda: NO_NUMBERS
+    )  # the pending requests that have not been sent yet
     in_flight: int = 0
-    own: Credentials | None = None
+    credentials: Credentials | None = None
 
     @property
     def public(self) -> bytes:
@@ -129,30 +133,30 @@ class Peer:
         """The newest session that is not relayed."""
         return next((session for session in reversed(self.sessions) if not is_relayed(session.contact.address)), None)
 
-    def oldest(self, number: int) -> int:
+    def oldest_request(self, number: int) -> int:
         """Return the id of its oldest pending request, or ``number`` if there is none."""
-        return next(iter(self.inquiries), number)
+        return next(iter(self.requests), number)
 
-    def began(self, number: int) -> None:
+    def add_request(self, number: int) -> None:
         """Record a request to it."""
-        self.inquiries = _add_number(self.inquiries, number)
+        self.requests = _add_number(self.requests, number)
 
-    def ended(self, number: int) -> None:
+    def remove_request(self, number: int) -> None:
         """Record that no caller waits for the answer to a request any longer."""
-        self.inquiries = _remove_number(self.inquiries, number)
+        self.requests = _remove_number(self.requests, number)
 
-    def put_off(self, number: int) -> None:
+    def enqueue(self, number: int) -> None:
         """Record that a request waits in the queue."""
         self.queue = _add_number(self.queue, number)
 
-    def taken_up(self, number: int) -> None:
+    def dequeue(self, number: int) -> None:
         """Record that a request left the queue."""
         self.queue = _remove_number(self.queue, number)
 
     @property
     def is_idle(self) -> bool:
         """Whether no request or handshake with this peer is pending."""
-        return self.opening is None and not self.inquiries
+        return self.handshake is None and not self.requests
 
 
 class Peers:
@@ -176,51 +180,51 @@ class Peers:
         rng: random.Random,
         network: Network,
         counters: Counter[str],
-        door: Door = OPEN,
+        door: AdmissionCheck = OPEN_ADMISSION,
     ) -> None:
         self.ring = ring
-        self.door = door
+        self.admission = door
         self.sessions: dict[int, Session] = {}
-        self.on_unheard = Listeners[[Opening]]()
+        self.on_handshake_failed = Listeners[[OutgoingHandshake]]()
         self.is_far: Callable[[Address], bool] = lambda address: False
-        self.on_silence = Listeners[[Opening]]()
+        self.on_slow_handshake = Listeners[[OutgoingHandshake]]()
         self.on_established = Listeners[[Session]]()
         self.on_moved = Listeners[[Session]]()
         self._clock = clock
         self._rng = rng
         self._network = network
         self._counters = counters
-        self.usual = RoundTrip()
-        self.loss = Loss()
-        self.is_wide = False
+        self.overall_round_trip = RoundTrip()
+        self.loss = LossRate()
+        self.is_large = False
         self._peers: dict[bytes, Peer] = {}
-        self._openings: dict[int, Opening] = {}
-        self._stamp = 0
+        self._handshakes: dict[int, OutgoingHandshake] = {}
+        self._timestamp = 0
         self._sweeper: IDelayedCall | None = None
-        self._by_mac: dict[bytes, Opening] = {}
+        self._by_mac: dict[bytes, OutgoingHandshake] = {}
 
-    def known(self, public: bytes) -> Peer | None:
+    def get(self, public: bytes) -> Peer | None:
         """Return the peer with that key, if it is known."""
         return self._peers.get(public)
 
-    def contact(self, public: bytes, address: Address) -> Contact:
+    def make_contact(self, public: bytes, address: Address) -> Contact:
         """Return the contact with that key and address, reusing an existing object."""
         peer = self._peers.get(public)
         if peer is not None and peer.contact.address == address:
             return peer.contact
         return Contact(public, address)
 
-    def session(self, public: bytes) -> Session | None:
+    def find_session(self, public: bytes) -> Session | None:
         """Return the newest session with the peer of that key."""
         peer = self._peers.get(public)
         return peer.session if peer is not None else None
 
-    def direct_session(self, public: bytes) -> Session | None:
+    def find_direct_session(self, public: bytes) -> Session | None:
         """Return the newest session with the peer of that key that is not relayed."""
         peer = self._peers.get(public)
         return peer.direct_session if peer is not None else None
 
-    def peer(self, contact: Contact) -> Peer:
+    def get_or_create(self, contact: Contact) -> Peer:
         """Return the peer of that contact, creating it if needed; raise ``ValueError`` if its public key is invalid."""
         peer = self._peers.get(contact.public)
         if peer is not None:
@@ -228,33 +232,33 @@ class Peers:
             self._peers[contact.public] = self._peers.pop(contact.public)
             peer.contact = contact
             return peer
-        exchange_key(contact.public)  # raises ValueError for an invalid key
+        derive_exchange_key(contact.public)  # raises ValueError for an invalid key
         peer = self._peers[contact.public] = Peer(contact)
-        if self.is_wide:
-            peer.round_trip = RoundTrip(self.guess)
+        if self.is_large:
+            peer.round_trip = RoundTrip(self.initial_timeout)
         if len(self._peers) > MAX_PEERS:
             idle = next((other for other in self._peers.values() if other.is_idle and other is not peer), None)
             if idle is not None:
                 del self._peers[idle.public]
-                self._end(idle.sessions)
+                self._delete_sessions(idle.sessions)
         return peer
 
     @property
-    def guess(self) -> float:
+    def initial_timeout(self) -> float:
         """The timeout of the first request to an unknown peer in seconds, estimated from all peers."""
-        return max(FIRST_GUESS, min(self.usual.wait, MOST_GUESSED))
+        return max(INITIAL_TIMEOUT_S, min(self.overall_round_trip.timeout, MAX_INITIAL_TIMEOUT_S))
 
-    def wait_for(self, public: bytes) -> float:
+    def find_timeout(self, public: bytes) -> float:
         """Return the retransmission timeout of a peer in seconds."""
         peer = self._peers.get(public)
-        return peer.round_trip.wait if peer is not None and peer.round_trip.is_measured else STRANGER_WAIT
+        return peer.round_trip.timeout if peer is not None and peer.round_trip.is_measured else UNKNOWN_PEER_TIMEOUT_S
 
     @property
     def tries(self) -> int:
         """The number of tries of a request or handshake: the usual number, or more if the loss rate is high."""
         return max(MAX_TRIES, self.loss.tries)
 
-    def spacing(self, round_trip: RoundTrip, tries: int, within: float) -> float:
+    def retry_interval(self, round_trip: RoundTrip, tries: int, within: float) -> float:
         """Return the seconds between the try number ``tries`` and the next one.
 
         ``within`` is the time in seconds in which the request should succeed.  Each interval is longer than the one
@@ -262,11 +266,11 @@ class Peers:
         fit the required number, but none is sent before most answers would have arrived.  The estimate for an unknown
         peer, which may be near or far, is the mean over all peers.
         """
-        wait = round_trip.wait * BACK_OFF ** (min(tries, MAX_TRIES) - 1)
-        likely = round_trip.likely if round_trip.is_measured else self.usual.mean
+        wait = round_trip.timeout * BACKOFF_FACTOR ** (min(tries, MAX_TRIES) - 1)
+        likely = round_trip.most if round_trip.is_measured else self.overall_round_trip.mean
         return wait if likely is None else min(wait, max(likely, within / self.loss.tries))
 
-    def usable(self, peer: Peer) -> Session | None:
+    def find_usable_session(self, peer: Peer) -> Session | None:
         """Return the session to send in, after dropping the peer's sessions at their datagram limit.
 
         The sessions with an idle peer that may have forgotten them are dropped too.
@@ -274,49 +278,49 @@ class Peers:
         session = peer.session
         if session is None:
             return None
-        if (peer.is_idle and not self.is_in_touch(peer)) or session.sent > 2 * SESSION_DATAGRAMS:
-            self._end(peer.sessions)
+        if (peer.is_idle and not self.has_live_session(peer)) or session.sent > 2 * SESSION_DATAGRAMS:
+            self._delete_sessions(peer.sessions)
             peer.sessions = ()
             return None
         return session
 
-    def renew(self, session: Session) -> None:
+    def renew_if_old(self, session: Session) -> None:
         """Open a successor of a session before something is sent in it, if it is old or near its datagram limit.
 
         Of two peers the one with the lower key does so first, so that there are not two successors.
         """
         public = session.contact.public
-        life = SESSION_LIFE_S if self.ring[0].public < public else SESSION_LIFE_S + SECOND_S
+        life = SESSION_LIFE_S if self.ring[0].public < public else SESSION_LIFE_S + RENEWAL_DELAY_S
         if self._clock.seconds() - session.opened_at < life and session.sent < SESSION_DATAGRAMS:
             return
         peer = self._peers.get(public)
         if peer is not None and session in (peer.session, peer.direct_session):
             self.open(peer, session.contact.address)
 
-    def is_in_touch(self, peer: Peer) -> bool:
+    def has_live_session(self, peer: Peer) -> bool:
         """Return whether there is a session that the other side, if it is alive, still has.
 
         In a wide network each node forgets the sessions with a silent peer without notification, at a time that the
         peer does not know; datagrams that the peer sends in them afterwards are lost.
         """
-        since = self._clock.seconds() - IN_TOUCH if self.is_wide else float("-inf")
-        return any(session.heard_at >= since for session in peer.sessions)
+        since = self._clock.seconds() - SESSION_SILENCE_S if self.is_large else float("-inf")
+        return any(session.last_received_at >= since for session in peer.sessions)
 
-    def established(self, session: Session) -> Peer:
+    def add_session(self, session: Session) -> Peer:
         """Use a session for sending from now on; return its peer."""
-        peer = self.peer(session.contact)
+        peer = self.get_or_create(session.contact)
         is_carried = is_relayed(session.contact.address)
         newest = peer.session
-        if is_carried and newest is not None and self._is_lively_and_direct(newest):
+        if is_carried and newest is not None and self._is_live_and_direct(newest):
             # a relayed session does not replace a live direct one
             peer.sessions = (*peer.sessions[:-1], session, newest)
         else:
             peer.sessions = (*peer.sessions, session)
         if len(peer.sessions) > MAX_SESSIONS:
-            self._end(peer.sessions[:1])
+            self._delete_sessions(peer.sessions[:1])
             peer.sessions = peer.sessions[1:]
-        if peer.opening is not None and peer.opening.knocks and not is_carried:
-            self.close(peer.opening)  # the peer's own handshake of the hole punching succeeded first
+        if peer.handshake is not None and peer.handshake.punches and not is_carried:
+            self.close(peer.handshake)  # the peer's own handshake of the hole punching succeeded first
         if self._sweeper is None:
             self._sweep()
         self.on_established(session)
@@ -333,31 +337,31 @@ class Peers:
                 return
             self.drop(oldest)
 
-    def confirmed(self, session: Session) -> None:
+    def measure_confirmation(self, session: Session) -> None:
         """Measure the round trip of a peer that confirmed its session: one round trip after the RESP.
 
         Otherwise the first request to it would be retransmitted too soon, and a long path be mistaken for a restart.
         """
-        peer = self.peer(session.contact)
+        peer = self.get_or_create(session.contact)
         if not peer.round_trip.is_measured:
-            self.answered(peer, 1, self._clock.seconds() - session.opened_at)
+            self.record_answer(peer, 1, self._clock.seconds() - session.opened_at)
 
-    def answered(self, peer: Peer, tries: int, seconds: float) -> None:
+    def record_answer(self, peer: Peer, tries: int, seconds: float) -> None:
         """Update the estimates with an answer to the last of ``tries`` tries, ``seconds`` after the first."""
-        for round_trip in (peer.round_trip, self.usual):
+        for round_trip in (peer.round_trip, self.overall_round_trip):
             if tries == 1:
-                round_trip.measured(seconds)
+                round_trip.add_sample(seconds)
             else:
-                round_trip.ambiguous(seconds)
+                round_trip.lengthen(seconds)
 
-    def doubtful(self, peer: Peer) -> int:
+    def tries_before_check(self, peer: Peer) -> int:
         """Return the number of unanswered tries after which a peer may have lost the session.
 
         With an unknown round trip or a high loss rate a single unanswered try is no evidence.
         """
         return 1 if peer.round_trip.is_measured and self.loss.tries == 1 else 2
 
-    def moved(self, session: Session) -> None:
+    def record_move(self, session: Session) -> None:
         """Record that a peer's newest datagram came from another address."""
         peer = self._peers.get(session.contact.public)
         if peer is not None:
@@ -369,62 +373,64 @@ class Peers:
         """Open handshakes under the first of ``ring`` from now on."""
         self.ring = ring
         for peer in self._peers.values():
-            peer.own = None
+            peer.credentials = None
 
-    def met_under(self, contact: Contact, own: Credentials) -> None:
+    def record_credentials(self, contact: Contact, own: Credentials) -> None:
         """Record under which of several secrets ``contact`` answered."""
         if len(self.ring) > 1:
             with suppress(ValueError):  # the key that it sent is invalid
-                self.peer(contact).own = own
+                self.get_or_create(contact).credentials = own
 
     def evict(self, peer: Peer) -> None:
         """Forget the sessions and the handshake with a peer."""
-        if peer.opening is not None:
-            self.close(peer.opening)
-        self._end(peer.sessions)
+        if peer.handshake is not None:
+            self.close(peer.handshake)
+        self._delete_sessions(peer.sessions)
         peer.sessions = ()
-        peer.tells = ()
+        peer.notifications = ()
 
-    def let_go(self, before: float) -> list[bytes]:
+    def forget_silent(self, before: float) -> list[bytes]:
         """Forget the idle peers from which nothing was received since ``before``; return their keys."""
         silent = [
             peer
             for peer in self._peers.values()
-            if peer.is_idle and not peer.tells and all(session.heard_at < before for session in peer.sessions)
+            if peer.is_idle
+            and not peer.notifications
+            and all(session.last_received_at < before for session in peer.sessions)
         ]
         for peer in silent:
-            self._end(peer.sessions)
+            self._delete_sessions(peer.sessions)
             del self._peers[peer.public]
         return [peer.public for peer in silent]
 
     def drop(self, session: Session) -> None:
         """Forget one session."""
-        self._end([session])
+        self._delete_sessions([session])
         peer = self._peers.get(session.contact.public)
         if peer is not None:
             peer.sessions = tuple(other for other in peer.sessions if other is not session)
 
     @property
-    def hello(self) -> Hello:
+    def hello(self) -> HandshakeFields:
         """The handshake fields of this node."""
-        door = self.door
-        return Hello(door.life, door.shown, door.room)
+        door = self.admission
+        return HandshakeFields(door.incarnation, door.own_pass, door.max_pass_bytes)
 
     def new_index(self) -> int:
         """Return an unused session index; never 0."""
         while True:
             index = self._rng.getrandbits(8 * INDEX_BYTES)
-            if index and index not in self.sessions and index not in self._openings:
+            if index and index not in self.sessions and index not in self._handshakes:
                 return index
 
     def stop(self) -> None:
         """Cancel every handshake and forget every peer."""
-        for opening in self._openings.values():
+        for opening in self._handshakes.values():
             cancel(opening.timer)
-            cancel(opening.helper)
+            cancel(opening.help_timer)
         cancel(self._sweeper)
         self._sweeper = None
-        self._openings.clear()
+        self._handshakes.clear()
         self._by_mac.clear()
         self._peers.clear()
         self.sessions.clear()
@@ -432,106 +438,108 @@ class Peers:
     # -- outgoing handshakes ----------------------------------------------------------------------------------------
 
     def open(
-        self, peer: Peer, address: Address, rider: bytes = b"", is_wanted: bool = True, within: float = OPENING_S
+        self, peer: Peer, address: Address, rider: bytes = b"", is_wanted: bool = True, within: float = HANDSHAKE_S
     ) -> bool:
         """Open a session, unless a handshake is under way; return False if there are too many handshakes.
 
         ``rider`` is a message for the INIT; it is omitted if it does not fit.  ``within`` is the time in seconds in
         which the session is needed.
         """
-        if peer.opening is not None:
-            if is_wanted and not peer.opening.is_wanted:
-                peer.opening.is_wanted = True
-                peer.opening.doors.setdefault(address, b"")
-                self._prepare_help(peer.opening, address)
-            if peer.opening.is_resting and not peer.sessions:
-                cancel(peer.opening.timer)
-                self._send_init(peer.opening, is_asked=True)
+        if peer.handshake is not None:
+            if is_wanted and not peer.handshake.has_request:
+                peer.handshake.has_request = True
+                peer.handshake.cookies.setdefault(address, b"")
+                self._schedule_help(peer.handshake, address)
+            if peer.handshake.is_waiting and not peer.sessions:
+                cancel(peer.handshake.timer)
+                self._send_init(peer.handshake, is_asked=True)
             return True
-        if len(self._openings) >= MAX_OPENINGS:
+        if len(self._handshakes) >= MAX_HANDSHAKES:
             self._counters["crowded"] += 1
             return False
-        own, hello = peer.own or self.ring[0], self.hello
-        rider = rider if len(rider) <= hello.rider_room else b""
+        own, hello = peer.credentials or self.ring[0], self.hello
+        rider = rider if len(rider) <= hello.max_early_bytes else b""
         now = self._clock.seconds()
-        self._stamp = max(self._stamp + 1, int(now * 1e6))
+        self._timestamp = max(self._timestamp + 1, int(now * 1e6))
         secret, index = self._rng.randbytes(32), self.new_index()
-        invitation = Invitation(own, exchange_key(peer.public), secret, index, rider, hello, self._stamp)
-        opening = Opening(invitation, peer, address, now, {address: b""}, within)
-        self._openings[invitation.local_index] = self._by_mac[invitation.mac] = peer.opening = opening
-        opening.is_wanted = is_wanted
+        invitation = InitiatorHandshake(
+            own, derive_exchange_key(peer.public), secret, index, rider, hello, self._timestamp
+        )
+        opening = OutgoingHandshake(invitation, peer, address, now, {address: b""}, within)
+        self._handshakes[invitation.local_index] = self._by_mac[invitation.mac] = peer.handshake = opening
+        opening.has_request = is_wanted
         if is_wanted:
-            self._prepare_help(opening, address)
+            self._schedule_help(opening, address)
         self._send_init(opening)
         return True
 
-    def hold(self, opening: Opening, until: float) -> None:
+    def extend(self, opening: OutgoingHandshake, until: float) -> None:
         """Continue a handshake until a time, because other nodes help; a time in the past restores the usual limit."""
-        if opening.peer.opening is opening:
+        if opening.peer.handshake is opening:
             opening.held_until = until
 
-    def knock_at(self, opening: Opening, addresses: Iterable[Address]) -> None:
+    def punch(self, opening: OutgoingHandshake, addresses: Iterable[Address]) -> None:
         """Send the INIT to further addresses too, immediately and at short intervals (hole punching)."""
-        if opening.peer.opening is not opening:
+        if opening.peer.handshake is not opening:
             return
         for address in addresses:
-            if len(opening.doors) < MAX_DOORS:
-                opening.doors.setdefault(address, b"")
-        opening.knocks = 1
+            if len(opening.cookies) < MAX_TARGETS:
+                opening.cookies.setdefault(address, b"")
+        opening.punches = 1
         cancel(opening.timer)
         self._send_init(opening)
 
-    def opening(self, index: int) -> Opening | None:
+    def find_handshake(self, index: int) -> OutgoingHandshake | None:
         """Return the outgoing handshake with this session index."""
-        return self._openings.get(index)
+        return self._handshakes.get(index)
 
-    def opening_of(self, mac: bytes) -> Opening | None:
+    def find_handshake_by_mac(self, mac: bytes) -> OutgoingHandshake | None:
         """Return the outgoing handshake with this hash in its INIT."""
         return self._by_mac.get(mac)
 
-    def paid(self, opening: Opening, cookie: bytes, source: Address) -> None:
+    def resend_with_cookie(self, opening: OutgoingHandshake, cookie: bytes, source: Address) -> None:
         """Resend the INIT immediately with the cookie that the responder requested at that address."""
-        if opening.doors.get(source) != cookie:
-            opening.doors[source] = cookie
-            self._network.send(opening.invitation.datagram(cookie), source)
+        if opening.cookies.get(source) != cookie:
+            opening.cookies[source] = cookie
+            self._network.send(opening.initiator.make_init(cookie), source)
 
-    def accepted(self, opening: Opening) -> None:
+    def finish(self, opening: OutgoingHandshake) -> None:
         """Close an outgoing handshake that got its RESP, and measure its round trip."""
         self.close(opening)
-        if not opening.knocks:  # otherwise the time includes hole punching
-            tries = opening.tries + any(opening.doors.values())  # a responder that requested a cookie got two INITs
-            self.answered(opening.peer, tries, self._clock.seconds() - opening.started_at)
+        if not opening.punches:  # otherwise the time includes hole punching
+            tries = opening.tries + any(opening.cookies.values())  # a responder that requested a cookie got two INITs
+            self.record_answer(opening.peer, tries, self._clock.seconds() - opening.started_at)
 
-    def _send_init(self, opening: Opening, is_asked: bool = False) -> None:
+    def _send_init(self, opening: OutgoingHandshake, is_asked: bool = False) -> None:
         """Send an INIT and schedule the next one, until the tries are used up or while a request waits.
 
         ``is_asked``: a new request waits for the session.
         """
-        left = opening.started_at + OPENING_S - self._clock.seconds()
-        opening.is_resting = not is_asked and opening.tries > 0 and self._is_enough(opening)
-        is_over = left <= 0 if opening.is_resting else opening.tries >= self.tries
+        left = opening.started_at + HANDSHAKE_S - self._clock.seconds()
+        opening.is_waiting = not is_asked and opening.tries > 0 and self._has_sent_enough(opening)
+        is_over = left <= 0 if opening.is_waiting else opening.tries >= self.tries
         if is_over and self._clock.seconds() >= opening.held_until:
             self.close(opening)
             if len(self.ring) > 1:  # the peer may not have the newest secret yet, or no longer have an older one
                 ring = list(self.ring)
-                tried = ring.index(opening.invitation.own) if opening.invitation.own in ring else -1
-                opening.peer.own = ring[(tried + 1) % len(ring)]
-            self.on_unheard(opening)
+                tried = ring.index(opening.initiator.credentials) if opening.initiator.credentials in ring else -1
+                opening.peer.credentials = ring[(tried + 1) % len(ring)]
+            self.on_handshake_failed(opening)
             return
-        if opening.is_resting:
+        if opening.is_waiting:
             opening.timer = self._clock.callLater(left, self._send_init, opening)
             return
         opening.tries += 1
-        for address, cookie in opening.doors.items():
-            self._network.send(opening.invitation.datagram(cookie), address)
-        if opening.knocks:
-            opening.knocks += 1
-            wait = min(KNOCK_S * BACK_OFF ** max(0, opening.knocks - KNOCKS), LONGEST)
+        for address, cookie in opening.cookies.items():
+            self._network.send(opening.initiator.make_init(cookie), address)
+        if opening.punches:
+            opening.punches += 1
+            wait = min(PUNCH_INTERVAL_S * BACKOFF_FACTOR ** max(0, opening.punches - FAST_PUNCHES), MAX_TIMEOUT_S)
         else:
-            wait = self._wait(opening)
+            wait = self._next_interval(opening)
         opening.timer = self._clock.callLater(wait, self._send_init, opening)
 
-    def _is_enough(self, opening: Opening) -> bool:
+    def _has_sent_enough(self, opening: OutgoingHandshake) -> bool:
         """Return whether enough INITs, the most expensive datagrams, were sent.
 
         A handshake for requests is repeated until none waits.  A handshake next to an existing session only checks
@@ -539,37 +547,37 @@ class Peers:
         one would retry the handshake.
         """
         peer = opening.peer
-        if not opening.is_wanted or opening.knocks or opening.held_until:
+        if not opening.has_request or opening.punches or opening.held_until:
             return False
         if peer.sessions:
-            return opening.tries >= max(DOUBTS, self.loss.tries)
-        return not (peer.inquiries or peer.tells)
+            return opening.tries >= max(MIN_CHECK_TRIES, self.loss.tries)
+        return not (peer.requests or peer.notifications)
 
-    def _wait(self, opening: Opening) -> float:
+    def _next_interval(self, opening: OutgoingHandshake) -> float:
         round_trip = opening.peer.round_trip
-        wait = self.spacing(round_trip, opening.tries, opening.within)
+        wait = self.retry_interval(round_trip, opening.tries, opening.timeout_s)
         if opening.tries == self.tries and not round_trip.is_measured:
             # Nothing is known of this peer: it may be distant instead of gone.
-            wait = max(wait, opening.started_at + OPENING_S - self._clock.seconds())
+            wait = max(wait, opening.started_at + HANDSHAKE_S - self._clock.seconds())
         return wait
 
-    def _prepare_help(self, opening: Opening, address: Address) -> None:
+    def _schedule_help(self, opening: OutgoingHandshake, address: Address) -> None:
         if self.is_far(address):
-            wait = 0.0 if is_relayed(address) else HELP_S
-            opening.helper = self._clock.callLater(wait, self.on_silence, opening)
+            wait = 0.0 if is_relayed(address) else HELP_AFTER_S
+            opening.help_timer = self._clock.callLater(wait, self.on_slow_handshake, opening)
 
-    def _is_lively_and_direct(self, session: Session) -> bool:
-        is_lively = self._clock.seconds() - session.heard_at < LIVELY_S
+    def _is_live_and_direct(self, session: Session) -> bool:
+        is_lively = self._clock.seconds() - session.last_received_at < LIVE_S
         return is_lively and not is_relayed(session.contact.address)
 
-    def close(self, opening: Opening) -> None:
+    def close(self, opening: OutgoingHandshake) -> None:
         """Forget an outgoing handshake."""
         cancel(opening.timer)
-        cancel(opening.helper)
-        self._openings.pop(opening.invitation.local_index, None)
-        self._by_mac.pop(opening.invitation.mac, None)
-        opening.peer.opening = None
+        cancel(opening.help_timer)
+        self._handshakes.pop(opening.initiator.local_index, None)
+        self._by_mac.pop(opening.initiator.mac, None)
+        opening.peer.handshake = None
 
-    def _end(self, sessions: Iterable[Session]) -> None:
+    def _delete_sessions(self, sessions: Iterable[Session]) -> None:
         for session in sessions:
             self.sessions.pop(session.local_index, None)

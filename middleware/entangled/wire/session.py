@@ -19,21 +19,21 @@ from typing import NamedTuple
 
 from middleware.entangled.contact import Contact
 from middleware.entangled.errors import Forged
-from middleware.entangled.identity import Identity, exchange_key
-from middleware.entangled.network.network import ADDRESS, MAX_DATAGRAM, Address, address_of, packed_address
-from middleware.entangled.wire.door import NONCE, UNCOUNTED, Life, is_refusal
+from middleware.entangled.identity import Identity, derive_exchange_key
+from middleware.entangled.network.network import ADDRESS_BYTES, MAX_DATAGRAM_BYTES, Address, pack_address, parse_address
+from middleware.entangled.wire.admission_check import NONCE_BYTES, UNNUMBERED, Incarnation, is_refusal
 from middleware.entangled.wire.noise import (
-    FIRST_OVERHEAD,
-    KEY,
-    SECOND_OVERHEAD,
-    TAG,
+    FIRST_OVERHEAD_BYTES,
+    KEY_BYTES,
+    SECOND_OVERHEAD_BYTES,
+    TAG_BYTES,
     Initiator,
     KeyPair,
     Responder,
     TransportKeys,
-    key_pair,
-    opened,
-    sealed,
+    make_key_pair,
+    open_sealed,
+    seal,
 )
 
 INIT = 0x11
@@ -41,34 +41,36 @@ RESP = 0x12
 DATA = 0x13
 PROLOGUE = b"swarm-wire-1"
 INDEX_BYTES = 4
-MAC = 16
-ANSWER_ROOM = 512
-_LIFE = 8 + NONCE
-STAMP = 8
-_INIT_PASS_AT = INDEX_BYTES + KEY + _LIFE  # before the pass of an INIT
-_RESP_PASS_AT = INDEX_BYTES + _LIFE + ADDRESS  # before the pass of a RESP
-_PAYLOAD = _INIT_PASS_AT + 2 + 2 + STAMP
-_INIT_BARE = 1 + FIRST_OVERHEAD + _PAYLOAD + 2 * MAC
-_RESP_BARE = 1 + INDEX_BYTES + SECOND_OVERHEAD + _RESP_PASS_AT + 2
-RESP_LEAST = _RESP_BARE
-INIT_LEAST = _RESP_BARE + ANSWER_ROOM
-MAX_RIDER = MAX_DATAGRAM - _INIT_BARE
+MAC_BYTES = 16
+MIN_ANSWER_BYTES = 512
+_INCARNATION_BYTES = 8 + NONCE_BYTES
+TIMESTAMP_BYTES = 8
+_INIT_PASS_AT = INDEX_BYTES + KEY_BYTES + _INCARNATION_BYTES  # before the pass of an INIT
+_RESP_PASS_AT = INDEX_BYTES + _INCARNATION_BYTES + ADDRESS_BYTES  # before the pass of a RESP
+_PAYLOAD_BYTES = _INIT_PASS_AT + 2 + 2 + TIMESTAMP_BYTES
+_INIT_FIXED_BYTES = 1 + FIRST_OVERHEAD_BYTES + _PAYLOAD_BYTES + 2 * MAC_BYTES
+_RESP_FIXED_BYTES = 1 + INDEX_BYTES + SECOND_OVERHEAD_BYTES + _RESP_PASS_AT + 2
+MIN_RESP_BYTES = _RESP_FIXED_BYTES
+MIN_INIT_BYTES = _RESP_FIXED_BYTES + MIN_ANSWER_BYTES
+MAX_EARLY_BYTES = MAX_DATAGRAM_BYTES - _INIT_FIXED_BYTES
 
-_HEADER = 1 + INDEX_BYTES + 8
-OVERHEAD = _HEADER + TAG
-MAX_PLAIN = MAX_DATAGRAM - OVERHEAD  # the capacity of one datagram; longer messages are sent in fragments
+_HEADER_BYTES = 1 + INDEX_BYTES + 8
+OVERHEAD_BYTES = _HEADER_BYTES + TAG_BYTES
+MAX_PLAIN_BYTES = (
+    MAX_DATAGRAM_BYTES - OVERHEAD_BYTES
+)  # the capacity of one datagram; longer messages are sent in fragments
 WINDOW = 1024
 MAX_UNCONFIRMED = 512
 UNCONFIRMED_S = 10.0
 MAX_RESPONSES = 512
 RESPONSES_S = 30.0
-_PACKED_UNCOUNTED = bytes(_LIFE)
+_PACKED_UNNUMBERED = bytes(_INCARNATION_BYTES)
 _WINDOW_MASK = (1 << WINDOW) - 1
 _pack = struct.Struct("<BIQ").pack
 """The header of a DATA datagram: its kind, the receiver's index, the counter."""
 
 
-def derived_key(team_key: bytes, purpose: bytes) -> bytes:
+def derive_key(team_key: bytes, purpose: bytes) -> bytes:
     """Derive the team's key for one purpose (32 bytes)."""
     return hashlib.blake2s(PROLOGUE + b" " + purpose, key=team_key).digest()
 
@@ -81,42 +83,42 @@ class Credentials:
     static: KeyPair = field(repr=False)
     psk: bytes = field(repr=False)
     mac_key: bytes = field(repr=False)
-    greet_key: bytes = field(repr=False)
+    discovery_key: bytes = field(repr=False)
     cookie_key: bytes = field(repr=False)
 
     @classmethod
-    def of(cls, identity: Identity, team_key: bytes) -> Credentials:
+    def derive(cls, identity: Identity, team_key: bytes) -> Credentials:
         """Return the credentials of ``identity`` in the team with ``team_key`` (32 bytes)."""
         purposes = (b"psk", b"mac", b"greet", b"cookie")
-        keys = [derived_key(team_key, purpose) for purpose in purposes]
-        return cls(identity.public, key_pair(identity.exchange_secret), *keys)
+        keys = [derive_key(team_key, purpose) for purpose in purposes]
+        return cls(identity.public, make_key_pair(identity.exchange_secret), *keys)
 
 
-class Hello(NamedTuple):
+class HandshakeFields(NamedTuple):
     """A node's fields of a handshake: its incarnation and its pass.
 
     ``room`` is the maximum length of the other side's pass.
     """
 
-    life: Life = UNCOUNTED
-    shown: bytes = b""
-    room: int = 0
+    incarnation: Incarnation = UNNUMBERED
+    own_pass: bytes = b""
+    max_pass_bytes: int = 0
 
     @property
-    def rider_room(self) -> int:
+    def max_early_bytes(self) -> int:
         """The maximum length of a message in an INIT with this pass, in bytes."""
-        return MAX_RIDER - len(self.shown)
+        return MAX_EARLY_BYTES - len(self.own_pass)
 
     @property
-    def init_least(self) -> int:
+    def min_init_bytes(self) -> int:
         """The length of the shortest INIT that may be answered with a pass and a message of ``ANSWER_ROOM`` bytes."""
-        return INIT_LEAST + self.room
+        return MIN_INIT_BYTES + self.max_pass_bytes
 
 
-OF_OPEN_TEAM = Hello()
+OPEN_TEAM_FIELDS = HandshakeFields()
 
 
-class Reply(NamedTuple):
+class Response(NamedTuple):
     """The content of a RESP: ``remote_index``, the responder's index, its incarnation, pass and message.
 
     ``seen`` is the source address of the INIT as the responder saw it (None: unknown).  With a ``refusal`` code the
@@ -124,15 +126,15 @@ class Reply(NamedTuple):
     """
 
     remote_index: int
-    life: Life
-    seen: Address | None
-    shown: bytes
+    incarnation: Incarnation
+    observed_address: Address | None
+    peer_pass: bytes
     message: bytes
     refusal: str
     keys: TransportKeys
 
 
-class Invitation:
+class InitiatorHandshake:
     """The initiator's half of a handshake; ``mac`` is the first of the two hashes in its INIT.
 
     ``stamp`` is the timestamp of the INIT: higher than in every earlier INIT of this incarnation.
@@ -145,43 +147,51 @@ class Invitation:
         ephemeral_secret: bytes,
         local_index: int,
         rider: bytes,
-        hello: Hello = OF_OPEN_TEAM,
+        hello: HandshakeFields = OPEN_TEAM_FIELDS,
         stamp: int = 0,
     ) -> None:
-        self.own = own
+        self.credentials = own
         self._noise = Initiator(own.static, remote_static, ephemeral_secret, PROLOGUE, own.psk)
         self.local_index = local_index
         index = local_index.to_bytes(INDEX_BYTES, "little")
-        payload = index + own.public + _pack_life(hello.life) + _with_length(hello.shown) + _with_length(rider)
-        payload += stamp.to_bytes(STAMP, "little")
-        payload = payload.ljust(_PAYLOAD + hello.init_least - _INIT_BARE, b"\0")
+        payload = (
+            index
+            + own.public
+            + _pack_incarnation(hello.incarnation)
+            + _prefix_length(hello.own_pass)
+            + _prefix_length(rider)
+        )
+        payload += stamp.to_bytes(TIMESTAMP_BYTES, "little")
+        payload = payload.ljust(_PAYLOAD_BYTES + hello.min_init_bytes - _INIT_FIXED_BYTES, b"\0")
         bare = bytes([INIT]) + self._noise.write(payload)
         self.mac = _keyed_hash(own.mac_key, bare)
         self._init_without_cookie = bare + self.mac
 
-    def datagram(self, cookie: bytes = b"") -> bytes:
+    def make_init(self, cookie: bytes = b"") -> bytes:
         """Return the INIT, which may be resent unchanged, or with a ``cookie`` that the responder requested."""
-        return self._init_without_cookie + (_keyed_hash(cookie, self._init_without_cookie) if cookie else bytes(MAC))
+        return self._init_without_cookie + (
+            _keyed_hash(cookie, self._init_without_cookie) if cookie else bytes(MAC_BYTES)
+        )
 
-    def accepted(self, datagram: bytes) -> Reply:
+    def read_response(self, datagram: bytes) -> Response:
         """Read a RESP and return it with the keys of the session; raise ``Forged``.
 
         Each reading works on a copy of the handshake state, because a forged RESP would corrupt the state.
         """
         payload, keys = self._noise.copy().read(datagram[1 + INDEX_BYTES :])
         index = int.from_bytes(payload[:INDEX_BYTES], "little")
-        life = _unpack_life(payload[INDEX_BYTES : INDEX_BYTES + _LIFE])
-        seen = address_of(payload[INDEX_BYTES + _LIFE : _RESP_PASS_AT])
-        shown, message = _split_counted(payload, _RESP_PASS_AT)
+        life = _unpack_incarnation(payload[INDEX_BYTES : INDEX_BYTES + _INCARNATION_BYTES])
+        seen = parse_address(payload[INDEX_BYTES + _INCARNATION_BYTES : _RESP_PASS_AT])
+        shown, message = _split_prefixed(payload, _RESP_PASS_AT)
         if index:
-            return Reply(index, life, seen, shown, message, "", keys)
+            return Response(index, life, seen, shown, message, "", keys)
         refusal = message.decode("ascii", errors="replace")
         if not is_refusal(refusal):
             raise Forged("the RESP has neither a session nor a refusal")
-        return Reply(0, life, seen, b"", b"", refusal, keys)
+        return Response(0, life, seen, b"", b"", refusal, keys)
 
 
-class Acceptance:
+class ResponderHandshake:
     """The responder's half of a handshake: reads an INIT, then builds its RESP.
 
     ``public`` is the initiator's verified Ed25519 key; ``life`` and ``shown`` are its incarnation and pass, ``rider``
@@ -190,78 +200,80 @@ class Acceptance:
 
     def __init__(self, own: Credentials, datagram: bytes, ephemeral_secret: bytes) -> None:
         self._noise = Responder(own.static, ephemeral_secret, PROLOGUE, own.psk)
-        payload, static = self._noise.read(datagram[1 : -2 * MAC])
+        payload, static = self._noise.read(datagram[1 : -2 * MAC_BYTES])
         self.remote_index = int.from_bytes(payload[:INDEX_BYTES], "little")
-        self.public = payload[INDEX_BYTES : INDEX_BYTES + KEY]
-        self.life = _unpack_life(payload[INDEX_BYTES + KEY : _INIT_PASS_AT])
+        self.public = payload[INDEX_BYTES : INDEX_BYTES + KEY_BYTES]
+        self.incarnation = _unpack_incarnation(payload[INDEX_BYTES + KEY_BYTES : _INIT_PASS_AT])
         try:
-            proved = exchange_key(self.public) == static
+            proved = derive_exchange_key(self.public) == static
         except (ValueError, RuntimeError, TypeError):
             proved = False
         if not proved:
             raise Forged("the key in the INIT does not match its static key")
-        self.shown, rest = _split_counted(payload, _INIT_PASS_AT)
-        self.rider, rest = _split_counted(rest, 0)
-        self.stamp = int.from_bytes(rest[:STAMP], "little")
-        self._room = len(datagram) - _RESP_BARE
+        self.peer_pass, rest = _split_prefixed(payload, _INIT_PASS_AT)
+        self.early_message, rest = _split_prefixed(rest, 0)
+        self.timestamp = int.from_bytes(rest[:TIMESTAMP_BYTES], "little")
+        self._room_bytes = len(datagram) - _RESP_FIXED_BYTES
 
-    def answer_room(self, hello: Hello) -> int:
+    def max_answer_bytes(self, hello: HandshakeFields) -> int:
         """Return the maximum length of a message in the RESP next to the pass, in bytes."""
-        return self._room - len(hello.shown)
+        return self._room_bytes - len(hello.own_pass)
 
     def accept(
-        self, local_index: int, answer: bytes, seen: Address, hello: Hello = OF_OPEN_TEAM
+        self, local_index: int, answer: bytes, seen: Address, hello: HandshakeFields = OPEN_TEAM_FIELDS
     ) -> tuple[bytes, TransportKeys]:
         """Return the RESP with ``answer`` (at most ``answer_room`` bytes), and the keys."""
         index = local_index.to_bytes(INDEX_BYTES, "little")
-        payload = index + _pack_life(hello.life) + packed_address(seen) + _with_length(hello.shown) + answer
+        payload = (
+            index + _pack_incarnation(hello.incarnation) + pack_address(seen) + _prefix_length(hello.own_pass) + answer
+        )
         message, keys = self._noise.write(payload)
         return bytes([RESP]) + self.remote_index.to_bytes(INDEX_BYTES, "little") + message, keys
 
-    def refuse(self, code: str, seen: Address, life: Life) -> bytes:
+    def refuse(self, code: str, seen: Address, life: Incarnation) -> bytes:
         """Return the RESP that rejects the initiator."""
-        return self.accept(0, code.encode("ascii"), seen, Hello(life))[0]
+        return self.accept(0, code.encode("ascii"), seen, HandshakeFields(life))[0]
 
 
 def is_init_of_team(own: Credentials, datagram: bytes) -> bool:
     """Return whether the sender of an INIT of valid size holds the team secret of ``own``."""
-    return hmac.compare_digest(_keyed_hash(own.mac_key, datagram[: -2 * MAC]), mac_of(datagram))
+    return hmac.compare_digest(_keyed_hash(own.mac_key, datagram[: -2 * MAC_BYTES]), read_mac(datagram))
 
 
-def mac_of(init: bytes) -> bytes:
+def read_mac(init: bytes) -> bytes:
     """Return the hash in an INIT that was made with the team's key."""
-    return init[-2 * MAC : -MAC]
+    return init[-2 * MAC_BYTES : -MAC_BYTES]
 
 
 def has_cookie(init: bytes, cookie: bytes) -> bool:
     """Return whether the INIT was made with ``cookie``."""
-    return hmac.compare_digest(_keyed_hash(cookie, init[:-MAC]), init[-MAC:])
+    return hmac.compare_digest(_keyed_hash(cookie, init[:-MAC_BYTES]), init[-MAC_BYTES:])
 
 
-def ephemeral_of(init: bytes) -> bytes:
+def read_ephemeral(init: bytes) -> bytes:
     """Return the initiator's ephemeral key, which identifies a repeated INIT."""
-    return init[1 : 1 + KEY]
+    return init[1 : 1 + KEY_BYTES]
 
 
 def _keyed_hash(key: bytes, data: bytes) -> bytes:
-    return hashlib.blake2s(data, key=key, digest_size=MAC).digest()
+    return hashlib.blake2s(data, key=key, digest_size=MAC_BYTES).digest()
 
 
-def _pack_life(life: Life) -> bytes:
+def _pack_incarnation(life: Incarnation) -> bytes:
     return life.number.to_bytes(8, "little") + life.nonce
 
 
-def _unpack_life(packed: bytes) -> Life:
-    if packed == _PACKED_UNCOUNTED:
-        return UNCOUNTED
-    return Life(int.from_bytes(packed[:8], "little"), packed[8:])
+def _unpack_incarnation(packed: bytes) -> Incarnation:
+    if packed == _PACKED_UNNUMBERED:
+        return UNNUMBERED
+    return Incarnation(int.from_bytes(packed[:8], "little"), packed[8:])
 
 
-def _with_length(data: bytes) -> bytes:
+def _prefix_length(data: bytes) -> bytes:
     return len(data).to_bytes(2, "little") + data
 
 
-def _split_counted(payload: bytes, start: int) -> tuple[bytes, bytes]:
+def _split_prefixed(payload: bytes, start: int) -> tuple[bytes, bytes]:
     """Return the length-prefixed bytes at ``start`` and the bytes after them; raise ``Forged`` if truncated."""
     begin = start + 2
     end = begin + int.from_bytes(payload[start:begin], "little")
@@ -282,14 +294,14 @@ class Session:
 
     __slots__ = (
         "contact",
-        "life",
-        "is_over",
-        "shown",
+        "incarnation",
+        "is_superseded",
+        "peer_pass",
         "local_index",
         "remote_index",
         "is_confirmed",
         "opened_at",
-        "heard_at",
+        "last_received_at",
         "_sending",
         "_receiving",
         "_sent",
@@ -305,17 +317,17 @@ class Session:
         keys: TransportKeys,
         now: float,
         is_confirmed: bool,
-        life: Life = UNCOUNTED,
+        life: Incarnation = UNNUMBERED,
     ) -> None:
         self.contact = contact
-        self.life = life
-        self.is_over = False
-        self.shown = b""
+        self.incarnation = life
+        self.is_superseded = False
+        self.peer_pass = b""
         self.local_index = local_index
         self.remote_index = remote_index
         self.is_confirmed = is_confirmed
         self.opened_at = now
-        self.heard_at = now
+        self.last_received_at = now
         self._sending = keys.sending
         self._receiving = keys.receiving
         self._sent = 0
@@ -327,7 +339,7 @@ class Session:
         counter = self._sent
         self._sent = counter + 1
         header = _pack(DATA, self.remote_index, counter)
-        return header + sealed(self._sending, counter, message, header)
+        return header + seal(self._sending, counter, message, header)
 
     @property
     def sent(self) -> int:
@@ -336,7 +348,7 @@ class Session:
 
     def is_replay(self, datagram: bytes) -> bool:
         """Return, without decryption, whether a DATA datagram's counter was received before or is below the window."""
-        behind = self._highest - int.from_bytes(datagram[5:_HEADER], "little")
+        behind = self._highest - int.from_bytes(datagram[5:_HEADER_BYTES], "little")
         return behind >= 0 and (behind >= WINDOW or bool(self._seen >> behind & 1))
 
     def open(self, datagram: bytes) -> tuple[bytes, int]:
@@ -344,11 +356,11 @@ class Session:
 
         Raises ``Forged`` if the datagram is not authentic or a replay; the session is then unchanged.
         """
-        if len(datagram) < OVERHEAD or self.is_replay(datagram):
+        if len(datagram) < OVERHEAD_BYTES or self.is_replay(datagram):
             raise Forged("the datagram is a replay, or too short")
-        header = datagram[:_HEADER]
+        header = datagram[:_HEADER_BYTES]
         counter = int.from_bytes(header[5:], "little")
-        message = opened(self._receiving, counter, datagram[_HEADER:], header)
+        message = open_sealed(self._receiving, counter, datagram[_HEADER_BYTES:], header)
         ahead = counter - self._highest
         if ahead > 0:
             # A counter may advance by up to 2**64: shifting by more than the window would only waste memory.
@@ -359,12 +371,12 @@ class Session:
         return message, ahead
 
 
-def index_of(datagram: bytes) -> int:
+def read_index(datagram: bytes) -> int:
     """Return the receiver's session index in a DATA or RESP datagram."""
     return int.from_bytes(datagram[1 : 1 + INDEX_BYTES], "little")
 
 
-class HalfOpen:
+class HalfOpenSessions:
     """Sessions that their initiators have not confirmed, and the RESPs of the last ``RESPONSES_S`` seconds.
 
     ``sessions`` is the endpoint's table, which also contains the unconfirmed sessions.
@@ -375,9 +387,9 @@ class HalfOpen:
         self._unconfirmed: dict[int, Session] = {}
         self._responses: dict[bytes, tuple[float, bytes]] = {}
 
-    def response(self, init: bytes, now: float) -> bytes | None:
+    def find_response(self, init: bytes, now: float) -> bytes | None:
         """Return the RESP that was sent for this INIT."""
-        made_at, response = self._responses.get(ephemeral_of(init), (-RESPONSES_S, None))
+        made_at, response = self._responses.get(read_ephemeral(init), (-RESPONSES_S, None))
         return response if made_at > now - RESPONSES_S else None
 
     def add(self, session: Session, now: float) -> None:
@@ -385,10 +397,10 @@ class HalfOpen:
         self._sessions[session.local_index] = self._unconfirmed[session.local_index] = session
         self.sweep(now)
 
-    def answered(self, init: bytes, response: bytes, now: float) -> None:
+    def store_response(self, init: bytes, response: bytes, now: float) -> None:
         """Store the RESP of an INIT, and delete surplus or expired entries."""
-        self._responses.pop(ephemeral_of(init), None)
-        self._responses[ephemeral_of(init)] = (now, response)
+        self._responses.pop(read_ephemeral(init), None)
+        self._responses[read_ephemeral(init)] = (now, response)
         self.sweep(now)
 
     def sweep(self, now: float) -> None:
@@ -416,7 +428,7 @@ class HalfOpen:
         if self._unconfirmed.pop(session.local_index, None) is not None:
             self._sessions.pop(session.local_index, None)
 
-    def drop(self, public: bytes) -> None:
+    def forget_peer(self, public: bytes) -> None:
         """Delete the sessions of one initiator."""
         for index in [index for index, session in self._unconfirmed.items() if session.contact.public == public]:
             del self._unconfirmed[index]

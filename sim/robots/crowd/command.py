@@ -12,17 +12,17 @@ from contextlib import contextmanager
 from dataclasses import asdict
 from pathlib import Path
 
-from sim.robots.crowd.controller import CONTROLLERS, Controller, Senses
+from sim.robots.crowd.controller import CONTROLLERS, Controller, Readings
 from sim.robots.crowd.crowd import Crowd
-from sim.robots.crowd.ground import ROOM, Ground, roomy
-from sim.robots.crowd.picture import drawn
-from sim.robots.crowd.search import Outcome, Team, kinds, search, table
+from sim.robots.crowd.picture import draw_svg
+from sim.robots.crowd.scene import AREA_M2, CrowdScene, make_square_scene
+from sim.robots.crowd.search import Outcome, SearchTeam, format_table, list_kinds, run_search
 from sim.robots.scene import SceneError
-from sim.robots.world import TICK, NotPossible
+from sim.robots.world import TICK_S, NotPossible
 
-MakeTeam = Callable[[int, int, Ground, Controller, Callable[[], float]], Team]
+MakeTeam = Callable[[int, int, CrowdScene, Controller, Callable[[], float]], SearchTeam]
 """Creates a team from seed, number of agents, ground, the controller of the other robots, and a stopwatch."""
-AT_IT = 0.6
+TARGET_DISTANCE_M = 0.6
 """Distance in metres from the centre of the target within which a robot counts as being at it."""
 
 
@@ -33,7 +33,7 @@ def main(arguments: Sequence[str], make_team: MakeTeam | None = None) -> int:
         description=(__doc__ or "").splitlines()[0],
     )
     parser.add_argument("--bodies", type=int, default=1000, help="number of robots (default %(default)s)")
-    parser.add_argument("--room", type=float, default=ROOM, help="square metres per robot (default %(default)g)")
+    parser.add_argument("--room", type=float, default=AREA_M2, help="square metres per robot (default %(default)g)")
     parser.add_argument("--agents", type=int, default=0, help="number of robots with their own node and agent")
     parser.add_argument("--controller", choices=sorted(CONTROLLERS), help="for the others (default: wander, or search)")
     parser.add_argument("--seed", type=int, default=1, help="seed of the random generators (default %(default)s)")
@@ -51,27 +51,29 @@ def main(arguments: Sequence[str], make_team: MakeTeam | None = None) -> int:
         if path is not None and not path.parent.is_dir():
             parser.error(f"{path} cannot be written: there is no folder {path.parent}; create it")
     try:
-        ground = roomy(args.bodies, args.room)
+        ground = make_square_scene(args.bodies, args.room)
         if args.agents and make_team is not None:
             return _run_search(args, ground, make_team)
-        return _run_alone(args, ground)
+        return _run_without_agents(args, ground)
     except (SceneError, NotPossible) as error:
         parser.error(str(error))
 
 
-def _run_search(args: argparse.Namespace, ground: Ground, make_team: MakeTeam) -> int:
-    if not 1 <= args.agents <= ground.bodies:
-        raise SceneError(f"--agents must be from 0 to {ground.bodies}, the robots here, not {args.agents}")
+def _run_search(args: argparse.Namespace, ground: CrowdScene, make_team: MakeTeam) -> int:
+    if not 1 <= args.agents <= ground.robots:
+        raise SceneError(f"--agents must be from 0 to {ground.robots}, the robots here, not {args.agents}")
     started_at = time.process_time()
     controller = CONTROLLERS[args.controller or "wander"]
     team = make_team(args.seed, args.agents, ground, controller, time.process_time)
     spent = time.process_time() - started_at
     _print(f"{args.agents} agents joined in {team.clock.seconds():.1f} virtual seconds, {spent:.1f} s of processor")
     with _interruptible() as is_over:
-        outcome = search(team, args.seed, args.seconds, time.process_time, _progress, is_over)
-    caption = f"{ground.bodies:,} robots, {args.agents} agents, seed {args.seed}, after {outcome.seconds:.0f} s"
-    _write_results(args, drawn(team.yard.crowd, caption, kinds(team, outcome), outcome.trail), asdict(outcome))
-    _print(table(outcome))
+        outcome = run_search(team, args.seed, args.seconds, time.process_time, _print_progress, is_over)
+    caption = f"{ground.robots:,} robots, {args.agents} agents, seed {args.seed}, after {outcome.seconds:.0f} s"
+    _write_results(
+        args, draw_svg(team.simulator.crowd, caption, list_kinds(team, outcome), outcome.trail), asdict(outcome)
+    )
+    _print(format_table(outcome))
     team.stop()
     return 0 if outcome.reach is not None else 1
 
@@ -96,22 +98,22 @@ def _interruptible() -> Iterator[Callable[[], bool]]:
         signal.signal(signal.SIGINT, usual)
 
 
-def _run_alone(args: argparse.Namespace, ground: Ground) -> int:
+def _run_without_agents(args: argparse.Namespace, ground: CrowdScene) -> int:
     name = args.controller or "search"
     crowd = Crowd(args.seed, ground)
     crowd.place_target_at_random()
     target = crowd.target
     assert target is not None
-    senses, started_at, largest_overlap = Senses(crowd), time.process_time(), 0.0
+    senses, started_at, largest_overlap = Readings(crowd), time.process_time(), 0.0
     with _interruptible() as is_over:
         while crowd.t < args.seconds and not is_over():
-            crowd.wish[:] = CONTROLLERS[name](senses)
+            crowd.commands[:] = CONTROLLERS[name](senses)
             crowd.step()
-            largest_overlap = max(largest_overlap, crowd.overlap())
+            largest_overlap = max(largest_overlap, crowd.measure_overlap())
     spent = time.process_time() - started_at
-    at_it = int((((crowd.x - target.x) ** 2 + (crowd.y - target.y) ** 2) ** 0.5 < AT_IT).sum())
+    at_it = int((((crowd.x - target.x) ** 2 + (crowd.y - target.y) ** 2) ** 0.5 < TARGET_DISTANCE_M).sum())
     rows = {
-        "robots": ground.bodies,
+        "robots": ground.robots,
         "controller": name,
         "virtual_s": round(crowd.t, 3),
         "ms_a_step": round(1e3 * spent / max(1, crowd.ticks), 3),
@@ -121,15 +123,15 @@ def _run_alone(args: argparse.Namespace, ground: Ground) -> int:
         "digest": crowd.digest(),
     }
     _write_results(
-        args, drawn(crowd, f"{ground.bodies:,} robots, {name}, seed {args.seed}, after {crowd.t:.0f} s"), rows
+        args, draw_svg(crowd, f"{ground.robots:,} robots, {name}, seed {args.seed}, after {crowd.t:.0f} s"), rows
     )
     for key, value in rows.items():
         _print(f"{key.replace('_', ' '):20}{value}")
     return 0 if at_it or name not in ("search", "climb") else 1
 
 
-def _progress(outcome: Outcome) -> None:
-    if outcome.seconds % 5.0 < TICK:
+def _print_progress(outcome: Outcome) -> None:
+    if outcome.seconds % 5.0 < TICK_S:
         found = f"{outcome.found} have found it" + (f", {outcome.by} goes" if outcome.by else "")
         _print(f"{outcome.seconds:5.0f} s  {found}, {outcome.datagrams:,} datagrams")
 

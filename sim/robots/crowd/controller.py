@@ -11,20 +11,20 @@ from collections.abc import Callable
 import numpy as np
 from numpy.typing import NDArray
 
-from sim.robots.crowd.crowd import REACH, Crowd
-from sim.robots.crowd.ground import Floats
-from sim.robots.scene import FOOTPRINT
+from sim.robots.crowd.crowd import RAY_LENGTH_M, Crowd
+from sim.robots.crowd.scene import Floats
+from sim.robots.scene import FOOTPRINT_RADIUS_M
 
-VIEW = math.radians(56.9) / 2
-SIGHT = 3.0
+HALF_VIEW_RAD = math.radians(56.9) / 2
+SIGHT_M = 3.0
 """Distance in metres at which a robot has_target the target, unless another robot hides it."""
-AWAY = 0.45
+OBSTACLE_DISTANCE_M = 0.45
 """Distance in metres from the centre within which something ahead is an obstacle."""
-ARRIVED = 0.35
-WALK, TURN = 0.16, 1.6
+ARRIVAL_DISTANCE_M = 0.35
+WALK_MPS, TURN_RADPS = 0.16, 1.6
 
 
-class Senses:
+class Readings:
     """Sensor values of the robots from number ``first`` on; contains nothing that a robot could not measure itself."""
 
     def __init__(self, crowd: Crowd, first: int = 0) -> None:
@@ -39,14 +39,14 @@ class Senses:
     @property
     def number(self) -> NDArray[np.int64]:
         """The number of each robot, which lets robots with equal sensor values differ."""
-        return np.arange(self._crowd.ground.bodies)[self._own]
+        return np.arange(self._crowd.scene.robots)[self._own]
 
     @property
     def ranges(self) -> Floats:
         """Metres from the centre along each ray, counter-clockwise from straight ahead; ``REACH`` for nothing."""
         return self._crowd.ranges[self._own]
 
-    def scent(self) -> tuple[Floats, Floats]:
+    def read_scent(self) -> tuple[Floats, Floats]:
         """Return the strength of the target's scent ahead on the left and the right: 1 at the target, 0 without it."""
         crowd, target = self._crowd, self._crowd.target
         x, y, heading = crowd.x[self._own], crowd.y[self._own], crowd.heading[self._own]
@@ -54,12 +54,12 @@ class Senses:
             return np.zeros_like(x), np.zeros_like(x)
         sides = []
         for side in (math.pi / 4, -math.pi / 4):
-            dx = x + FOOTPRINT * np.cos(heading + side) - target.x
-            dy = y + FOOTPRINT * np.sin(heading + side) - target.y
+            dx = x + FOOTPRINT_RADIUS_M * np.cos(heading + side) - target.x
+            dy = y + FOOTPRINT_RADIUS_M * np.sin(heading + side) - target.y
             sides.append(1.0 / (1.0 + dx * dx + dy * dy))
         return sides[0], sides[1]
 
-    def sight(self) -> tuple[Floats, Floats]:
+    def read_target(self) -> tuple[Floats, Floats]:
         """Return bearing (left positive) and distance of the target's axis from the centre; NaN if not in view."""
         crowd, target = self._crowd, self._crowd.target
         bearing = np.full(len(crowd.x), math.nan)
@@ -67,72 +67,72 @@ class Senses:
         if target is not None:
             dx, dy = target.x - crowd.x, target.y - crowd.y
             # A robot that hides the target from one within ``SIGHT`` is nearer, so it is in this set as well.
-            near = np.flatnonzero(dx * dx + dy * dy < SIGHT * SIGHT)
+            near = np.flatnonzero(dx * dx + dy * dy < SIGHT_M * SIGHT_M)
             dx, dy = dx[near], dy[near]
             far, towards = np.hypot(dx, dy), np.arctan2(dy, dx)
             off = np.remainder(towards - crowd.heading[near] + math.pi, math.tau) - math.pi
             # Seen from the target, a nearer robot hides those behind it within the angle that it covers.
             apart = np.abs(np.remainder(towards[:, None] - towards + math.pi, math.tau) - math.pi)
-            covers = np.arcsin(np.minimum(FOOTPRINT / far, 1.0))
+            covers = np.arcsin(np.minimum(FOOTPRINT_RADIUS_M / far, 1.0))
             is_hidden = ((apart < covers) & (far < far[:, None])).any(axis=1)
-            observers = (np.abs(off) < VIEW) & ~is_hidden
+            observers = (np.abs(off) < HALF_VIEW_RAD) & ~is_hidden
             bearing[near[observers]], distance[near[observers]] = off[observers], far[observers]
         return bearing[self._own], distance[self._own]
 
 
-Controller = Callable[[Senses], Floats]
+Controller = Callable[[Readings], Floats]
 """Returns the velocity of each robot: m/s forward and to the left, rad/s to the left."""
 
 
-def stand(senses: Senses) -> Floats:
+def stand(senses: Readings) -> Floats:
     """Stand still."""
     return np.zeros((len(senses.ranges), 3))
 
 
-def disperse(senses: Senses) -> Floats:
+def disperse(senses: Readings) -> Floats:
     """Move away from anything near; stand if nothing is."""
     ranges = senses.ranges
     angle = np.arange(ranges.shape[1]) * (math.tau / ranges.shape[1])
-    press = 1.0 - ranges / REACH
+    press = 1.0 - ranges / RAY_LENGTH_M
     ahead, left = -press @ np.cos(angle), -press @ np.sin(angle)
     bearing = np.arctan2(left, ahead)
     is_pressed = np.hypot(ahead, left) > 0.05
-    return _velocities(
-        np.where(is_pressed & (np.abs(bearing) < 0.8), WALK, 0.0), np.where(is_pressed, 2.0 * bearing, 0.0)
+    return _make_velocities(
+        np.where(is_pressed & (np.abs(bearing) < 0.8), WALK_MPS, 0.0), np.where(is_pressed, 2.0 * bearing, 0.0)
     )
 
 
-def climb(senses: Senses) -> Floats:
+def climb(senses: Readings) -> Floats:
     """Follow the scent of the target to its maximum; without a scent, wander."""
-    left, right = senses.scent()
+    left, right = senses.read_scent()
     both = left + right
     turn = 40.0 * (left - right) / np.maximum(both, 1e-9) * (1.0 + np.sqrt(2.0 / np.maximum(both, 1e-9)))
     velocities = wander(senses)
-    is_free = (both > 0.0) & (_ahead(senses.ranges) > AWAY)
-    velocities[is_free] = _velocities(np.where(np.abs(turn) < 2.0, WALK, WALK / 4), turn)[is_free]
+    is_free = (both > 0.0) & (_find_nearest_ahead(senses.ranges) > OBSTACLE_DISTANCE_M)
+    velocities[is_free] = _make_velocities(np.where(np.abs(turn) < 2.0, WALK_MPS, WALK_MPS / 4), turn)[is_free]
     return velocities
 
 
-def wander(senses: Senses) -> Floats:
+def wander(senses: Readings) -> Floats:
     """Drive straight, and turn to the more open side if something is ahead."""
     ranges = senses.ranges
     half = ranges.shape[1] // 2
     left, right = ranges[:, 1 : half + 1].sum(axis=1), ranges[:, -half:].sum(axis=1)
     # If both sides are equal, the number decides, or two robots would mirror each other for ever.
     side = np.where(left == right, np.where(senses.number % 2 == 0, 1.0, -1.0), np.sign(left - right))
-    is_free = _ahead(ranges) > AWAY
-    return _velocities(np.where(is_free, WALK, 0.0), np.where(is_free, 0.0, TURN * side))
+    is_free = _find_nearest_ahead(ranges) > OBSTACLE_DISTANCE_M
+    return _make_velocities(np.where(is_free, WALK_MPS, 0.0), np.where(is_free, 0.0, TURN_RADPS * side))
 
 
-def search(senses: Senses) -> Floats:
+def search(senses: Readings) -> Floats:
     """Wander until the target is in view, approach it, and stop in front of it."""
-    bearing, distance = senses.sight()
+    bearing, distance = senses.read_target()
     velocities = wander(senses)
     has_target = ~np.isnan(distance)
     is_aimed = has_target & (np.abs(bearing) < 0.3)
-    is_free = (distance < AWAY + 0.1) | (_ahead(senses.ranges) > FOOTPRINT * 2.2)
-    walk = np.where(is_aimed & is_free & (distance > ARRIVED), WALK, 0.0)
-    velocities[has_target] = _velocities(walk, 2.2 * bearing)[has_target]
+    is_free = (distance < OBSTACLE_DISTANCE_M + 0.1) | (_find_nearest_ahead(senses.ranges) > FOOTPRINT_RADIUS_M * 2.2)
+    walk = np.where(is_aimed & is_free & (distance > ARRIVAL_DISTANCE_M), WALK_MPS, 0.0)
+    velocities[has_target] = _make_velocities(walk, 2.2 * bearing)[has_target]
     return velocities
 
 
@@ -145,10 +145,10 @@ CONTROLLERS: dict[str, Controller] = {
 }
 
 
-def _ahead(ranges: Floats) -> Floats:
+def _find_nearest_ahead(ranges: Floats) -> Floats:
     """Return the smallest of the ray ahead and its two neighbours, which are shortened to the width of the robot."""
     return np.minimum(ranges[:, 0], np.minimum(ranges[:, 1], ranges[:, -1]) * 1.2)
 
 
-def _velocities(forward: Floats, turn: Floats) -> Floats:
-    return np.stack((forward, np.zeros_like(forward), np.clip(turn, -TURN, TURN)), axis=1)
+def _make_velocities(forward: Floats, turn: Floats) -> Floats:
+    return np.stack((forward, np.zeros_like(forward), np.clip(turn, -TURN_RADPS, TURN_RADPS)), axis=1)

@@ -13,24 +13,24 @@ import struct
 
 import numpy as np
 
-from sim.robots.crowd.ground import Floats, Ground
 from sim.robots.crowd.ray import Disc, Neighbours, Rays
-from sim.robots.dog import ACCELERATION, ANGULAR_ACCELERATION, BRAKING, LIMITS
-from sim.robots.scene import FOOTPRINT
-from sim.robots.world import TICK, NotPossible, Target
+from sim.robots.crowd.scene import CrowdScene, Floats
+from sim.robots.dog import ACCELERATION_MPS2, ANGULAR_ACCELERATION_RADPS2, BRAKING_MPS2, LIMITS
+from sim.robots.scene import FOOTPRINT_RADIUS_M
+from sim.robots.world import TICK_S, NotPossible, Target
 
 RAYS = 8
-REACH = 1.7
+RAY_LENGTH_M = 1.7
 """Length of a ray from the centre of a robot, in metres; slightly more than its far ranger reaches from the nose."""
-PUSHES = 12
+MAX_PUSHES = 12
 """Most iterations of pushing overlapping robots apart in one step; only dense crowds need more than one."""
-SHARE = 0.9
+CORRECTED_SHARE = 0.9
 """Fraction of an overlap that an iteration removes; in a dense crowd robots are pushed from all sides."""
-SLOP = 0.0001
+SLOP_M = 0.0001
 """Overlap in metres that is not corrected."""
-CLOSE = 2 * FOOTPRINT + 0.03
+CLOSE_M = 2 * FOOTPRINT_RADIUS_M + 0.03
 """Distance in metres between the centres of two robots that may overlap within one step."""
-SKIN = 0.1
+SKIN_M = 0.1
 _SPANS = [LIMITS[key] for key in ("base.vx", "base.vy", "base.wz")]
 
 
@@ -41,38 +41,38 @@ class Crowd:
     in the last step, ``wish`` their commanded velocities (forward, left, turn), ``ranges`` the length of each ray.
     """
 
-    def __init__(self, seed: int, ground: Ground) -> None:
-        self.ground = ground
+    def __init__(self, seed: int, ground: CrowdScene) -> None:
+        self.scene = ground
         self.target: Target | None = None
         self.ticks = 0
         self._rng = np.random.default_rng(seed)
-        self.x, self.y, self.heading = ground.places(self._rng)
-        count = ground.bodies
+        self.x, self.y, self.heading = ground.draw_poses(self._rng)
+        count = ground.robots
         self.vx, self.vy, self.wz = np.zeros(count), np.zeros(count), np.zeros(count)
         self.ax, self.ay = np.zeros(count), np.zeros(count)
-        self.wish = np.zeros((count, 3))
-        self._rays = Rays(ground.width, ground.height, RAYS, REACH)
-        self._neighbours = Neighbours(CLOSE, SKIN)
-        self.ranges = self.cast()
+        self.commands = np.zeros((count, 3))
+        self._rays = Rays(ground.width, ground.height, RAYS, RAY_LENGTH_M)
+        self._neighbours = Neighbours(CLOSE_M, SKIN_M)
+        self.ranges = self.cast_rays()
 
     @property
     def t(self) -> float:
         """Simulated time in seconds since the start."""
-        return self.ticks * TICK
+        return self.ticks * TICK_S
 
     def step(self) -> None:
         """Simulate ``TICK`` seconds."""
         before_x, before_y, before_vx, before_vy = self.x, self.y, self.vx, self.vy
         self._accelerate()
-        self.x, self.y = self.x + self.vx * TICK, self.y + self.vy * TICK
-        self.heading = np.remainder(self.heading + self.wz * TICK + math.pi, math.tau) - math.pi
+        self.x, self.y = self.x + self.vx * TICK_S, self.y + self.vy * TICK_S
+        self.heading = np.remainder(self.heading + self.wz * TICK_S + math.pi, math.tau) - math.pi
         self._resolve_overlaps()
-        self.vx, self.vy = (self.x - before_x) / TICK, (self.y - before_y) / TICK
-        self.ax, self.ay = (self.vx - before_vx) / TICK, (self.vy - before_vy) / TICK
-        self.ranges = self.cast()
+        self.vx, self.vy = (self.x - before_x) / TICK_S, (self.y - before_y) / TICK_S
+        self.ax, self.ay = (self.vx - before_vx) / TICK_S, (self.vy - before_vy) / TICK_S
+        self.ranges = self.cast_rays()
         self.ticks += 1
 
-    def cast(self) -> Floats:
+    def cast_rays(self) -> Floats:
         """Return the length of each ray of each robot."""
         target = self.target
         discs: list[Disc] = [] if target is None else [(target.x, target.y, target.radius)]
@@ -80,7 +80,7 @@ class Crowd:
 
     def place_target(self, x: float, y: float) -> None:
         """Move the target to this place; raise ``NotPossible`` if a robot or a wall is in the way."""
-        ground = self.ground
+        ground = self.scene
         radius = ground.target_radius
         if not (radius <= x <= ground.width - radius and radius <= y <= ground.height - radius):
             raise NotPossible(
@@ -88,33 +88,36 @@ class Crowd:
                 f"y {radius:g} to {ground.height - radius:g}"
             )
         gap = np.hypot(self.x - x, self.y - y)
-        if gap.min() < FOOTPRINT + radius:
+        if gap.min() < FOOTPRINT_RADIUS_M + radius:
             raise NotPossible(f"robot {int(gap.argmin())} stands at ({x:.2f}, {y:.2f}); choose a free place")
         self.target = Target(x, y, radius, ground.target_height)
-        self.ranges = self.cast()
+        self.ranges = self.cast_rays()
 
     def place_target_at_random(self) -> None:
         """Move the target to a free place near the centre; raise ``NotPossible`` if there is none."""
-        width, height = self.ground.width, self.ground.height
+        width, height = self.scene.width, self.scene.height
         for _ in range(1000):
             x, y = (float(self._rng.uniform(0.35, 0.65)) * side for side in (width, height))
-            if np.hypot(self.x - x, self.y - y).min() >= FOOTPRINT + 2 * self.ground.target_radius:
+            if np.hypot(self.x - x, self.y - y).min() >= FOOTPRINT_RADIUS_M + 2 * self.scene.target_radius:
                 return self.place_target(x, y)
         raise NotPossible("no place is free near the centre; give the robots more room")
 
     def move(self, body: int, x: float, y: float, heading: float) -> None:
         """Move a robot to this place, at rest; raise ``NotPossible`` if another robot or a wall is in the way."""
-        ground = self.ground
-        inside = FOOTPRINT <= x <= ground.width - FOOTPRINT and FOOTPRINT <= y <= ground.height - FOOTPRINT
+        ground = self.scene
+        inside = (
+            FOOTPRINT_RADIUS_M <= x <= ground.width - FOOTPRINT_RADIUS_M
+            and FOOTPRINT_RADIUS_M <= y <= ground.height - FOOTPRINT_RADIUS_M
+        )
         gap = np.hypot(self.x - x, self.y - y)
         gap[body] = math.inf
-        if not (inside and gap.min() >= 2 * FOOTPRINT and math.isfinite(heading)):
+        if not (inside and gap.min() >= 2 * FOOTPRINT_RADIUS_M and math.isfinite(heading)):
             raise NotPossible(f"robot {body} does not fit at ({x:.2f}, {y:.2f}); choose a free place")
         for row, value in ((self.x, x), (self.y, y), (self.heading, math.remainder(heading, math.tau))):
             row[body] = value
         for row in (self.vx, self.vy, self.wz, self.ax, self.ay):
             row[body] = 0.0
-        self.ranges = self.cast()
+        self.ranges = self.cast_rays()
 
     def digest(self) -> str:
         """Return a hash, in hex, of the time and of all poses and velocities; equal runs have equal hashes."""
@@ -123,39 +126,41 @@ class Crowd:
             state.update(np.ascontiguousarray(row).tobytes())
         return state.hexdigest()
 
-    def overlap(self) -> float:
+    def measure_overlap(self) -> float:
         """Return the largest overlap of two robots in metres; 0 without any."""
-        one, other = self._neighbours.pairs(self.x, self.y)
+        one, other = self._neighbours.find_pairs(self.x, self.y)
         gaps = np.hypot(self.x[other] - self.x[one], self.y[other] - self.y[one])
-        return max(0.0, 2 * FOOTPRINT - float(gaps.min(initial=math.inf)))
+        return max(0.0, 2 * FOOTPRINT_RADIUS_M - float(gaps.min(initial=math.inf)))
 
     def _accelerate(self) -> None:
         """Accelerate all robots towards their commands for one step, as ``Dog.strive`` does for one robot."""
-        forward, left, turn = (np.clip(self.wish[:, n], low, high) for n, (low, high) in enumerate(_SPANS))
+        forward, left, turn = (np.clip(self.commands[:, n], low, high) for n, (low, high) in enumerate(_SPANS))
         cos, sin = np.cos(self.heading), np.sin(self.heading)
         error_x, error_y = cos * forward - sin * left - self.vx, sin * forward + cos * left - self.vy
         error = np.hypot(error_x, error_y)
-        most = np.where((forward == 0.0) & (left == 0.0) & (turn == 0.0), BRAKING * TICK, ACCELERATION * TICK)
+        most = np.where(
+            (forward == 0.0) & (left == 0.0) & (turn == 0.0), BRAKING_MPS2 * TICK_S, ACCELERATION_MPS2 * TICK_S
+        )
         share = most / np.maximum(error, most)
         self.vx, self.vy = self.vx + share * error_x, self.vy + share * error_y
-        most_turn = ANGULAR_ACCELERATION * TICK
+        most_turn = ANGULAR_ACCELERATION_RADPS2 * TICK_S
         self.wz = self.wz + np.clip(turn - self.wz, -most_turn, most_turn)
 
     def _resolve_overlaps(self) -> None:
         """Push overlapping robots apart, away from the target and back from the walls; the walls take precedence."""
         x, y = self.x, self.y
-        one, other = self._neighbours.pairs(x, y)
-        close = np.flatnonzero((x[other] - x[one]) ** 2 + (y[other] - y[one]) ** 2 < CLOSE * CLOSE)
+        one, other = self._neighbours.find_pairs(x, y)
+        close = np.flatnonzero((x[other] - x[one]) ** 2 + (y[other] - y[one]) ** 2 < CLOSE_M * CLOSE_M)
         one, other = one[close], other[close]
-        for _ in range(PUSHES):
+        for _ in range(MAX_PUSHES):
             is_at_target = self._push_from_target()
             dx, dy = x[other] - x[one], y[other] - y[one]
             gap = np.hypot(dx, dy)
-            met = np.flatnonzero(gap < 2 * FOOTPRINT - SLOP)
+            met = np.flatnonzero(gap < 2 * FOOTPRINT_RADIUS_M - SLOP_M)
             if not len(met) and not is_at_target:
                 break
             gap = np.maximum(gap[met], 1e-9)
-            push = SHARE * (FOOTPRINT - gap / 2) / gap
+            push = CORRECTED_SHARE * (FOOTPRINT_RADIUS_M - gap / 2) / gap
             for row, part in ((x, dx), (y, dy)):
                 part = part[met] * push
                 row -= np.bincount(one[met], part, len(row))
@@ -168,8 +173,8 @@ class Crowd:
         if self.target is None:
             return False
         dx, dy = self.x - self.target.x, self.y - self.target.y
-        square, room = dx * dx + dy * dy, FOOTPRINT + self.target.radius
-        inside = np.flatnonzero(square < (room - SLOP) ** 2)
+        square, room = dx * dx + dy * dy, FOOTPRINT_RADIUS_M + self.target.radius
+        inside = np.flatnonzero(square < (room - SLOP_M) ** 2)
         if not len(inside):
             return False
         out = room / np.maximum(np.sqrt(square[inside]), 1e-9) - 1.0
@@ -178,5 +183,5 @@ class Crowd:
         return True
 
     def _keep_inside(self) -> None:
-        np.clip(self.x, FOOTPRINT, self.ground.width - FOOTPRINT, out=self.x)
-        np.clip(self.y, FOOTPRINT, self.ground.height - FOOTPRINT, out=self.y)
+        np.clip(self.x, FOOTPRINT_RADIUS_M, self.scene.width - FOOTPRINT_RADIUS_M, out=self.x)
+        np.clip(self.y, FOOTPRINT_RADIUS_M, self.scene.height - FOOTPRINT_RADIUS_M, out=self.y)

@@ -7,7 +7,7 @@ from collections.abc import Mapping, Sequence
 from html import escape
 
 from sim.robots.crowd.crowd import Crowd
-from sim.robots.scene import FOOTPRINT
+from sim.robots.scene import FOOTPRINT_RADIUS_M
 
 WIDTH, MARGIN, LINE = 900.0, 16.0, 20.0
 OTHER = "others, batch controller"
@@ -21,7 +21,7 @@ INK = {
 TARGET = "#d02228"
 
 
-def drawn(
+def draw_svg(
     crowd: Crowd, caption: str = "", kinds: Mapping[int, str] | None = None, trail: Sequence[tuple[float, float]] = ()
 ) -> str:
     """Draw the crowd with its target.
@@ -29,10 +29,10 @@ def drawn(
     ``kinds`` maps numbers of robots to keys of ``INK``; ``trail`` is the path of the selected robot.
     """
     kinds = kinds or {}
-    ground = crowd.ground
+    ground = crowd.scene
     scale = (WIDTH - 2 * MARGIN) / ground.width
     high = scale * ground.height
-    present_kinds = sorted({kinds.get(body, OTHER) for body in range(ground.bodies)}, key=list(INK).index)
+    present_kinds = sorted({kinds.get(body, OTHER) for body in range(ground.robots)}, key=list(INK).index)
 
     def at(x: float, y: float) -> str:
         return f"{MARGIN + scale * x:.1f} {MARGIN + high - scale * y:.1f}"
@@ -49,14 +49,15 @@ def drawn(
     rows = list(zip(crowd.x.tolist(), crowd.y.tolist(), crowd.heading.tolist(), strict=True))
     for kind in present_kinds:
         # One path per kind: a disc is a stroke of zero length with round ends, its nose a short line.
-        bodies = [rows[body] for body in range(ground.bodies) if kinds.get(body, OTHER) == kind]
+        bodies = [rows[body] for body in range(ground.robots) if kinds.get(body, OTHER) == kind]
         discs = "".join(f"M{at(x, y)}h0" for x, y, _ in bodies)
-        wide = f'stroke-width="{2 * FOOTPRINT * scale:.2f}" stroke-linecap="round"'
+        wide = f'stroke-width="{2 * FOOTPRINT_RADIUS_M * scale:.2f}" stroke-linecap="round"'
         parts.append(f'<path d="{discs}" stroke="{INK[kind]}" {wide}/>')
         noses = "".join(
-            f"M{at(x, y)}L{at(x + FOOTPRINT * math.cos(turn), y + FOOTPRINT * math.sin(turn))}" for x, y, turn in bodies
+            f"M{at(x, y)}L{at(x + FOOTPRINT_RADIUS_M * math.cos(turn), y + FOOTPRINT_RADIUS_M * math.sin(turn))}"
+            for x, y, turn in bodies
         )
-        parts.append(f'<path d="{noses}" stroke="white" stroke-width="{0.3 * FOOTPRINT * scale:.2f}"/>')
+        parts.append(f'<path d="{noses}" stroke="white" stroke-width="{0.3 * FOOTPRINT_RADIUS_M * scale:.2f}"/>')
     if crowd.target is not None:
         x, y = at(crowd.target.x, crowd.target.y).split()
         size = max(3.0, crowd.target.radius * scale)

@@ -8,11 +8,11 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from sim.robots.crowd.ground import Floats
-from sim.robots.scene import FOOTPRINT
+from sim.robots.crowd.scene import Floats
+from sim.robots.scene import FOOTPRINT_RADIUS_M
 
-Places = NDArray[np.int64]
-SKIN = 0.3
+Indices = NDArray[np.int64]
+SKIN_M = 0.3
 Disc = tuple[float, float, float]
 """A fixed round obstacle: x, y and radius in metres."""
 
@@ -30,35 +30,35 @@ class Rays:
         self._count = count
         self._reach = reach
         self._between = math.tau / count
-        self._neighbours = Neighbours(reach + FOOTPRINT, SKIN)
+        self._neighbours = Neighbours(reach + FOOTPRINT_RADIUS_M, SKIN_M)
 
     def cast(self, x: Floats, y: Floats, heading: Floats, discs: Sequence[Disc] = ()) -> Floats:
         """Return metres along each ray, a row per robot, counter-clockwise; ``reach`` if the ray meets nothing."""
         ranges = np.full((len(x), self._count), self._reach)
-        self._meet_walls(ranges, x, y, heading)
-        one, other = self._neighbours.pairs(x, y)
+        self._shorten_at_walls(ranges, x, y, heading)
+        one, other = self._neighbours.find_pairs(x, y)
         dx, dy = x[other] - x[one], y[other] - y[one]
         square = dx * dx + dy * dy
-        is_near = np.flatnonzero(square < (self._reach + FOOTPRINT) ** 2)
+        is_near = np.flatnonzero(square < (self._reach + FOOTPRINT_RADIUS_M) ** 2)
         one, other = one[is_near], other[is_near]
         distance, towards = np.sqrt(square[is_near]), np.arctan2(dy[is_near], dx[is_near])
         # Each pair is used in both directions.
-        self._meet(
+        self._shorten(
             ranges,
             np.concatenate((one, other)),
             np.concatenate((towards - heading[one], towards + math.pi - heading[other])),
             np.concatenate((distance, distance)),
-            FOOTPRINT,
+            FOOTPRINT_RADIUS_M,
         )
         for disc_x, disc_y, radius in discs:
             dx, dy = disc_x - x, disc_y - y
             square = dx * dx + dy * dy
             observers = np.flatnonzero(square < (self._reach + radius) ** 2)
             towards = np.arctan2(dy[observers], dx[observers]) - heading[observers]
-            self._meet(ranges, observers, towards, np.sqrt(square[observers]), radius)
+            self._shorten(ranges, observers, towards, np.sqrt(square[observers]), radius)
         return ranges
 
-    def _meet(self, ranges: Floats, observers: Places, bearing: Floats, distance: Floats, radius: float) -> None:
+    def _shorten(self, ranges: Floats, observers: Indices, bearing: Floats, distance: Floats, radius: float) -> None:
         """Shorten the rays of ``observers`` that meet one disc each, at ``bearing`` (0 is ahead) and ``distance``."""
         half = np.arcsin(np.minimum(radius / distance, 1.0)) / self._between
         middle = bearing / self._between
@@ -78,7 +78,7 @@ class Rays:
             nth += 1
             met = met[count[met] > nth]
 
-    def _meet_walls(self, ranges: Floats, x: Floats, y: Floats, heading: Floats) -> None:
+    def _shorten_at_walls(self, ranges: Floats, x: Floats, y: Floats, heading: Floats) -> None:
         gap = np.minimum(np.minimum(x, self._width - x), np.minimum(y, self._height - y))
         close = np.flatnonzero(gap < self._reach)
         if not len(close):
@@ -102,21 +102,21 @@ class Neighbours:
     def __init__(self, reach: float, skin: float) -> None:
         self._reach = reach
         self._skin = skin
-        self._cached_pairs: tuple[Floats, Floats, Places, Places] | None = None
+        self._cached_pairs: tuple[Floats, Floats, Indices, Indices] | None = None
 
-    def pairs(self, x: Floats, y: Floats) -> tuple[Places, Places]:
+    def find_pairs(self, x: Floats, y: Floats) -> tuple[Indices, Indices]:
         """Return each pair once, as two rows of numbers; some may be farther apart than ``reach``."""
         if self._cached_pairs is not None:
             then_x, then_y, one, other = self._cached_pairs
             moved = (x - then_x) ** 2 + (y - then_y) ** 2
             if moved.max() <= (self._skin / 2) ** 2:
                 return one, other
-        one, other = near(x, y, self._reach + self._skin)
+        one, other = find_near_pairs(x, y, self._reach + self._skin)
         self._cached_pairs = x.copy(), y.copy(), one, other
         return one, other
 
 
-def near(x: Floats, y: Floats, reach: float) -> tuple[Places, Places]:
+def find_near_pairs(x: Floats, y: Floats, reach: float) -> tuple[Indices, Indices]:
     """Return the pairs within ``reach``, each once."""
     # In an array sorted by cells of that size, candidates lie in two runs: the rest of the cell with the next one
     # above, and the three adjacent cells in the next column.

@@ -12,39 +12,39 @@ from typing import Any, Protocol
 
 import numpy as np
 
-from sim.robots.crowd.yard import CrowdYard
+from sim.robots.crowd.simulator import CrowdSimulator
 
-LOOK_S = 0.5
+POLL_S = 0.5
 """Interval between two measurements in virtual seconds."""
 SLICES = 10
-PLACING_S = 5.0
+PLACE_TARGET_S = 5.0
 """Seconds after the task's assignment at which the target is placed, during the search."""
-SLACK = 0.1
+SLACK_M = 0.1
 """Fraction by which another agent may be nearer than the selected one: reports contain measurement errors."""
 
 
 @dataclass(frozen=True)
-class Word:
+class AgentStatus:
     """The statement of one agent: its distance to the target (None if unknown), and the name of the assigned agent."""
 
     cost: float | None
     assigned: str
 
 
-class Team(Protocol):
+class SearchTeam(Protocol):
     """Agents with robots in a crowd, on one clock in virtual time."""
 
     clock: Any
-    board: Any
-    yard: CrowdYard
+    switchboard: Any
+    simulator: CrowdSimulator
 
     def assign(self) -> None:
         """Assign the task to all able agents."""
 
-    def words(self) -> Mapping[str, Word]:
+    def get_statuses(self) -> Mapping[str, AgentStatus]:
         """Return the statement of each participating agent, by its name."""
 
-    def done_by(self) -> str | None:
+    def find_finisher(self) -> str | None:
         """Return the agent that completed the task, None while it is open."""
 
     def stop(self) -> None:
@@ -78,8 +78,8 @@ class Outcome:
     trail: list[tuple[float, float]] = field(default_factory=list)
 
 
-def search(
-    team: Team,
+def run_search(
+    team: SearchTeam,
     seed: int,
     limit: float,
     stopwatch: Callable[[], float],
@@ -90,29 +90,29 @@ def search(
 
     ``show`` is called after each measurement; when ``is_over`` returns True, the search ends with the results so far.
     """
-    yard = team.yard
-    outcome = Outcome(seed, len(yard.names), yard.crowd.ground.bodies)
-    started_at, sent = team.clock.seconds(), team.board.counters["sent"]
-    before = stopwatch(), yard.moving, yard.telling
+    yard = team.simulator
+    outcome = Outcome(seed, len(yard.names), yard.crowd.scene.robots)
+    started_at, sent = team.clock.seconds(), team.switchboard.counters["sent"]
+    before = stopwatch(), yard.moving_s, yard.reporting_s
     team.assign()
     while outcome.seconds < limit and outcome.reach is None and not is_over():
         for _ in range(SLICES):
             if not is_over():  # half a second of a large team may take a minute
-                team.clock.advance(LOOK_S / SLICES)
+                team.clock.advance(POLL_S / SLICES)
         outcome.seconds = round(team.clock.seconds() - started_at, 3)
-        outcome.datagrams = team.board.counters["sent"] - sent
-        if yard.crowd.target is None and outcome.seconds >= PLACING_S:
+        outcome.datagrams = team.switchboard.counters["sent"] - sent
+        if yard.crowd.target is None and outcome.seconds >= PLACE_TARGET_S:
             yard.crowd.place_target_at_random()
         _measure(outcome, team)
         show(outcome)
-    spent, moving, telling = stopwatch() - before[0], yard.moving - before[1], yard.telling - before[2]
+    spent, moving, telling = stopwatch() - before[0], yard.moving_s - before[1], yard.reporting_s - before[2]
     outcome.cost = {"moving": moving, "telling": telling, "agents": spent - moving - telling}
-    outcome.digest = f"{team.board.digest()[:16]}-{yard.crowd.digest()[:16]}"
+    outcome.digest = f"{team.switchboard.digest()[:16]}-{yard.crowd.digest()[:16]}"
     return outcome
 
 
-def _measure(outcome: Outcome, team: Team) -> None:
-    words, now = team.words(), outcome.seconds
+def _measure(outcome: Outcome, team: SearchTeam) -> None:
+    words, now = team.get_statuses(), outcome.seconds
     if outcome.engaged is None and len(words) == outcome.agents:
         outcome.engaged = now
     finders = [name for name, word in words.items() if word.cost is not None]
@@ -122,30 +122,30 @@ def _measure(outcome: Outcome, team: Team) -> None:
     if outcome.agree is None:
         outcome.found = len(finders)
         if len(words) == outcome.agents and len(named) == 1 and "" not in named:
-            outcome.agree, outcome.right = now, _is_nearest(team.yard, next(iter(named)), finders)
+            outcome.agree, outcome.right = now, _is_nearest(team.simulator, next(iter(named)), finders)
     before = outcome.by
     if outcome.agree is not None and len(named) == 1 and "" not in named:
         outcome.by = named.pop()
-    done = team.done_by()
+    done = team.find_finisher()
     if done is not None:
         outcome.reach, outcome.by = now, done
     if outcome.by != before:
         outcome.trail.clear()  # another robot was selected
     if outcome.by:
-        body = team.yard.names.index(outcome.by)
-        outcome.trail.append((float(team.yard.crowd.x[body]), float(team.yard.crowd.y[body])))
+        body = team.simulator.names.index(outcome.by)
+        outcome.trail.append((float(team.simulator.crowd.x[body]), float(team.simulator.crowd.y[body])))
 
 
-def _is_nearest(yard: CrowdYard, chosen: str, finders: list[str]) -> bool:
+def _is_nearest(yard: CrowdSimulator, chosen: str, finders: list[str]) -> bool:
     crowd, target = yard.crowd, yard.crowd.target
     if target is None:
         return False
     gaps = np.hypot(crowd.x - target.x, crowd.y - target.y)
     least = min((float(gaps[yard.names.index(name)]) for name in finders), default=math.inf)
-    return bool(gaps[yard.names.index(chosen)] <= least * (1.0 + SLACK) + SLACK)
+    return bool(gaps[yard.names.index(chosen)] <= least * (1.0 + SLACK_M) + SLACK_M)
 
 
-def table(outcome: Outcome) -> str:
+def format_table(outcome: Outcome) -> str:
     """Return the results as text, one line each."""
 
     def at(moment: float | None) -> str:
@@ -175,9 +175,9 @@ def table(outcome: Outcome) -> str:
     return "\n".join(f"{name:38}{value}" for name, value in rows)
 
 
-def kinds(team: Team, outcome: Outcome) -> dict[int, str]:
+def list_kinds(team: SearchTeam, outcome: Outcome) -> dict[int, str]:
     """Return the kind of each robot that has an agent, for the map."""
-    words, names = team.words(), team.yard.names
+    words, names = team.get_statuses(), team.simulator.names
     found = {name for name, word in words.items() if word.cost is not None}
     every = {
         body: "agents that have found it" if name in found else "agents that search" for body, name in enumerate(names)

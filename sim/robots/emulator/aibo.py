@@ -10,11 +10,11 @@ from twisted.internet.defer import Deferred, gatherResults, maybeDeferred
 from twisted.internet.error import CannotListenError
 from twisted.internet.protocol import DatagramProtocol
 
-from drivers.aibo.option import checked
+from drivers.aibo.option import parse_options
 from drivers.link import TcpLinkFactory
 from sim.robots.emulator.aibo_dog import AiboEmulator
-from sim.robots.emulator.body import Body
-from sim.robots.emulator.wire import Table, Wire
+from sim.robots.emulator.simulated_robot import SimulatedRobot
+from sim.robots.emulator.transport import EmulatorServer, Table
 
 RETRY_S = 0.1
 """Seconds until the next attempt to open a port that another program uses temporarily."""
@@ -38,7 +38,7 @@ class AiboServer:
         """Start the dog and open its initial ports; raise ``CannotListenError`` if a port is in use."""
         self._udp = self._reactor.listenUDP(self._dog.ports["camera"], _Camera(self._dog), self._interface, 65536)
         for number in self._dog.ports.values():
-            if self._dog.listens(number):
+            if self._dog.is_listening(number):
                 self._listen(number)
         self._dog.start()
 
@@ -66,7 +66,7 @@ class AiboServer:
         if self._udp is None:
             return
         for number in self._dog.ports.values():
-            listens = self._dog.listens(number)
+            listens = self._dog.is_listening(number)
             if not listens and number in self._open:
                 closed = self._closing[number] = maybeDeferred(self._open.pop(number).stopListening)
                 closed.addCallback(self._on_closed, number)
@@ -93,15 +93,15 @@ class _Camera(DatagramProtocol):
         self._dog = dog
 
     def datagramReceived(self, datagram: bytes, addr: Any) -> None:
-        self._dog.datagram(datagram, partial(self._answer, addr))
+        self._dog.on_datagram(datagram, partial(self._answer, addr))
 
     def _answer(self, addr: Any, data: bytes) -> None:
         if self.transport is not None:
             self.transport.write(data, addr)
 
 
-def serve(reactor: Any, body: Body, rng: random.Random, options: Table, dialect: str) -> Wire:
+def serve(reactor: Any, body: SimulatedRobot, rng: random.Random, options: Table, dialect: str) -> EmulatorServer:
     """Return the server of an AIBO; ``dialect`` is its version of Tekkotsu, "T4" or "T2"."""
-    chosen = checked(options)
+    chosen = parse_options(options)
     dog = AiboEmulator(reactor, body, rng, dialect, dict(chosen.ports) | {"gains": 0})
     return AiboServer(reactor, dog, chosen.host)

@@ -13,25 +13,25 @@ from typing import Any
 
 from twisted.internet.interfaces import IReactorTime
 
-from drivers.aibo import picture, sense
-from drivers.aibo.codec import T2, T4, CommandReader, LineReader, encoded, encoded_gains
-from drivers.aibo.option import ASIDE, BACKWARD, FORWARD, PORTS, TURN
+from drivers.aibo import picture, sensors
+from drivers.aibo.codec import T2, T4, CommandReader, LineReader, encode_gains, encode_state
+from drivers.aibo.option import MAX_BACKWARD_MPS, MAX_FORWARD_MPS, MAX_STRAFE_MPS, MAX_TURN_RADPS, PORTS
 from drivers.link import Link, MemoryConnector, Receiver
 from drivers.timer import Timer
 from middleware.entangled.listeners import Listeners
 from middleware.faults.stream import StreamFaults
 from sim.robots.emulator.aibo_menu import AiboMenu
-from sim.robots.emulator.body import Body
-from sim.robots.emulator.outlet import Outlet
+from sim.robots.emulator.output import FaultyOutput
+from sim.robots.emulator.simulated_robot import SimulatedRobot
 
 FRAME_S = 0.032
 CAMERA_S = 1.0 / 30.0
 DEAD_MAN_S = 3.0
-NATIVE = (208, 160)
+NATIVE_SIZE = (208, 160)
 """Native size of the camera; the default is half the width and height."""
-DARK = b"\xff\xd8\xff\xc0\x00\x0b\x08\x00\x50\x00\x68\x01\x01\x11\x00" + bytes(64) + b"\xff\xd9"
+DARK_JPEG = b"\xff\xd8\xff\xc0\x00\x0b\x08\x00\x50\x00\x68\x01\x01\x11\x00" + bytes(64) + b"\xff\xd9"
 """The picture of a simulated robot without a camera: the header of a JPEG of 104 x 80 pixels."""
-EMULATED = {**PORTS, "gains": 10032}
+EMULATED_PORTS = {**PORTS, "gains": 10032}
 
 
 class AiboEmulator:
@@ -43,23 +43,23 @@ class AiboEmulator:
     def __init__(
         self,
         clock: IReactorTime,
-        body: Body,
+        body: SimulatedRobot,
         rng: random.Random,
         dialect: str = T4,
         ports: dict[str, int] | None = None,
     ) -> None:
         self.faults = StreamFaults()
-        self.ports = {**EMULATED, **(ports or {})}
+        self.ports = {**EMULATED_PORTS, **(ports or {})}
         self.on_ports = Listeners[[]]()
         self.is_engaged = True
         self.clients: dict[str, _Client] = {}
         self.menu = AiboMenu(self.ports, dialect == T2, self._on_server, self._on_setting)
         self.head = {"p": 0.0, "t": 0.0, "r": 0.0}
-        self.heard: list[tuple[str, float]] = []
+        self.received_commands: list[tuple[str, float]] = []
         """The newest walk commands, for tests."""
         self.start_ms = 0
         self._clock = clock
-        self._body = body
+        self._robot = body
         self._rng = rng
         self._dialect = dialect
         self._walk = {"f": 0.0, "s": 0.0, "r": 0.0}
@@ -93,13 +93,13 @@ class AiboEmulator:
         self.on_ports()
         self.start()
 
-    def press(self) -> None:
+    def press_back_button(self) -> None:
         """Press its back button twice, which toggles the emergency stop."""
         self._set_engaged(not self.is_engaged)
 
-    def listens(self, port: int) -> bool:
+    def is_listening(self, port: int) -> bool:
         """Return whether a connection to this port would be accepted now."""
-        return self._service(port) is not None
+        return self._find_service(port) is not None
 
     def connector(self, delay: float = 0.0005) -> MemoryPorts:
         """Return a connector to this dog in memory."""
@@ -107,18 +107,18 @@ class AiboEmulator:
 
     def accept(self, port: int, link: Link) -> Receiver:
         """Accept a link to ``port``; close it at once if the port does not listen."""
-        service = self._service(port)
-        client = _Client(self, service or "", Outlet(self._clock, self._rng, self.faults, link), link)
+        service = self._find_service(port)
+        client = _Client(self, service or "", FaultyOutput(self._clock, self._rng, self.faults, link), link)
         if service is None:
             link.close()
             return client
         self.clients[service] = client
         if service == "main":
-            self.menu.client()
+            self.menu.add_client()
         self.on_ports()
         return client
 
-    def datagram(self, data: bytes, answer: Callable[[bytes], None]) -> None:
+    def on_datagram(self, data: bytes, answer: Callable[[bytes], None]) -> None:
         """Process a datagram to the camera's port; ``answer`` sends one back."""
         if data == picture.REQUEST and self._is_udp and "camera" in self.menu.running and not self.faults.half_open:
             self._peer = answer
@@ -131,7 +131,7 @@ class AiboEmulator:
             return
         match client.service:
             case "main":
-                self._send(client, self.menu.answers(data))
+                self._send(client, self.menu.make_answer(data))
             case "estop":
                 for line in client.lines.read(data):
                     self._on_estop(client, line)
@@ -143,7 +143,7 @@ class AiboEmulator:
                     if letter in self.head:
                         self.head[letter] = max(-1.0, min(value, 1.0))
 
-    def on_gone(self, client: _Client) -> None:
+    def on_client_lost(self, client: _Client) -> None:
         """Handle the loss of a client: its port listens again, and its walk continues until the time-out."""
         if self.clients.get(client.service) is client:
             del self.clients[client.service]
@@ -166,14 +166,14 @@ class AiboEmulator:
             self._send(client, b"on\n" if is_engaged else b"off\n")
 
     def _on_walk(self, letter: str, value: float) -> None:
-        self.heard = [*self.heard[-99:], (letter, value)]
+        self.received_commands = [*self.received_commands[-99:], (letter, value)]
         if self.is_engaged or letter not in "fsr0":
             return
         if letter != "0":
             # Treat NaN and infinity as 0.
             self._walk[letter] = value if math.isfinite(value) else 0.0
         f, s, r = self._walk.values()
-        self._body.drive(f * (FORWARD if f > 0 else BACKWARD), s * ASIDE, r * TURN)
+        self._robot.drive(f * (MAX_FORWARD_MPS if f > 0 else MAX_BACKWARD_MPS), s * MAX_STRAFE_MPS, r * MAX_TURN_RADPS)
         self._walk_timeout.cancel()
         if any(self._walk.values()):
             self._walk_timeout.set(DEAD_MAN_S, self._stop_walk)
@@ -181,7 +181,7 @@ class AiboEmulator:
     def _stop_walk(self) -> None:
         self._walk_timeout.cancel()
         self._walk = dict.fromkeys(self._walk, 0.0)
-        self._body.halt()
+        self._robot.halt()
 
     # -- to the clients ---------------------------------------------------------------------------------------------
 
@@ -190,10 +190,13 @@ class AiboEmulator:
         client, gains = self.clients.get("state"), self.clients.get("gains")
         if client is not None and not client.link.is_busy:
             self._send(
-                client, encoded(sense.state(self._body.sense(), self._joints(), self._dialect, self._ms, self._frame))
+                client,
+                encode_state(
+                    sensors.make_state(self._robot.sense(), self._make_joints(), self._dialect, self._ms, self._frame)
+                ),
             )
         if gains is not None and not gains.link.is_busy:
-            self._send(gains, encoded_gains(self._ms, ((10.0, 4.0, 2.0),) * 18))
+            self._send(gains, encode_gains(self._ms, ((10.0, 4.0, 2.0),) * 18))
 
     def _send_picture(self) -> None:
         client = self.clients.get("camera")
@@ -203,7 +206,7 @@ class AiboEmulator:
         data = self._encode_picture()
         if self._is_udp:
             if self._peer is not None:
-                for piece in StreamFaults(self.faults.drop, self.faults.garbage, half_open=self.faults.half_open).wire(
+                for piece in StreamFaults(self.faults.drop, self.faults.garbage, half_open=self.faults.half_open).apply(
                     data, self._rng
                 ):
                     self._peer(piece)
@@ -212,21 +215,21 @@ class AiboEmulator:
 
     def _encode_picture(self) -> bytes:
         is_halved = self.menu.settings.get("vision.rawcam.y_skip", "2") != "1"
-        width, height = (side // 2 if is_halved else side for side in NATIVE)
-        head = picture.header(picture.COLOUR, 1, width, height, self._ms, self._picture)
-        jpeg = self._body.picture(is_halved) or DARK
-        return head + picture.block(picture.Block(width, height, "JPEGColor", jpeg))
+        width, height = (side // 2 if is_halved else side for side in NATIVE_SIZE)
+        head = picture.encode_header(picture.COLOUR, 1, width, height, self._ms, self._picture)
+        jpeg = self._robot.picture(is_halved) or DARK_JPEG
+        return head + picture.encode_block(picture.Block(width, height, "JPEGColor", jpeg))
 
-    def _joints(self) -> list[float]:
-        joints = [0.0] * len(sense.JOINTS)
-        for at, letter, (low, high) in ((12, "t", sense.TILT), (13, "p", sense.PAN), (14, "r", sense.NOD)):
+    def _make_joints(self) -> list[float]:
+        joints = [0.0] * len(sensors.JOINTS)
+        for at, letter, (low, high) in ((12, "t", sensors.TILT), (13, "p", sensors.PAN), (14, "r", sensors.NOD)):
             value = self.head[letter]
             joints[at] = value * high if value > 0 else -value * low
         return joints
 
     def _send(self, client: _Client, data: bytes) -> None:
         if data:
-            client.outlet.send(data)
+            client.output.send(data)
 
     @property
     def _ms(self) -> int:
@@ -236,7 +239,7 @@ class AiboEmulator:
     def _is_udp(self) -> bool:
         return self.menu.settings.get("vision.rawcam.transport", "UDP").upper() == "UDP"
 
-    def _service(self, port: int) -> str | None:
+    def _find_service(self, port: int) -> str | None:
         for service, number in self.ports.items():
             runs = service == "main" or ("state" if service == "gains" else service) in self.menu.running
             if number == port and runs and service not in self.clients and not (service == "camera" and self._is_udp):
@@ -280,19 +283,19 @@ class AiboEmulator:
 
 
 class _Client:
-    def __init__(self, dog: AiboEmulator, service: str, outlet: Outlet, link: Link) -> None:
+    def __init__(self, dog: AiboEmulator, service: str, outlet: FaultyOutput, link: Link) -> None:
         self.service = service
-        self.outlet = outlet
+        self.output = outlet
         self.link = link
         self.lines = LineReader()
         self.commands = CommandReader()
         self._dog = dog
 
-    def received(self, data: bytes) -> None:
+    def data_received(self, data: bytes) -> None:
         self._dog.on_bytes(self, data)
 
     def link_down(self) -> None:
-        self._dog.on_gone(self)
+        self._dog.on_client_lost(self)
 
 
 class MemoryPorts:
@@ -305,11 +308,11 @@ class MemoryPorts:
         self._delay = delay
         self._ports: dict[int, _MemoryPort] = {}
 
-    def call(self, host: str, port: int, caller: Any) -> Any:
+    def connect(self, host: str, port: int, caller: Any) -> Any:
         """Keep ``caller`` connected, with back-off, until ``hang_up``."""
         if port not in self._ports:
             self._ports[port] = _MemoryPort(self._clock, self, port, self._delay)
-        return self._ports[port].call(host, port, caller)
+        return self._ports[port].connect(host, port, caller)
 
     def cut(self, port: int | None = None) -> None:
         """Break the links to ``port``, or all links."""
@@ -317,9 +320,9 @@ class MemoryPorts:
             if port in (None, number):
                 one.cut()
 
-    def takes(self, port: int) -> bool:
+    def can_connect(self, port: int) -> bool:
         """Return whether a connection would be accepted."""
-        return self.is_open and self._dog.listens(port)
+        return self.is_open and self._dog.is_listening(port)
 
     def accept(self, port: int, link: Link) -> Receiver:
         """Pass a link to the dog."""
@@ -329,7 +332,7 @@ class MemoryPorts:
 class _MemoryPort(MemoryConnector):
     def __init__(self, clock: IReactorTime, ports: MemoryPorts, port: int, delay: float) -> None:
         super().__init__(clock, lambda link: ports.accept(port, link), delay)
-        self._is_accepting = lambda: ports.takes(port)
+        self._is_accepting = lambda: ports.can_connect(port)
 
-    def opened(self, caller: Receiver) -> Any:
-        return super().opened(caller) if self._is_accepting() else None
+    def open_pair(self, caller: Receiver) -> Any:
+        return super().open_pair(caller) if self._is_accepting() else None

@@ -6,7 +6,19 @@ import shlex
 from collections.abc import Callable
 
 from drivers.aibo.codec import LineReader
-from drivers.aibo.menu import EMPTY_SLOT, Close, Hello, Item, Load, Message, Refresh, Stack, Status, Word, encoded
+from drivers.aibo.menu import (
+    EMPTY_SLOT,
+    Close,
+    Hello,
+    Item,
+    Load,
+    Message,
+    OneWordMessage,
+    Refresh,
+    Stack,
+    Status,
+    encode_message,
+)
 
 CLASSES = {
     "estop": ("", ""),
@@ -38,7 +50,7 @@ class AiboMenu:
     ) -> None:
         self.running: set[str] = set()
         self.settings: dict[str, str] = {}
-        self.played: list[str] = []
+        self.played_sounds: list[str] = []
         self.clients = 0
         self._ports = ports
         self._is_old = is_old
@@ -53,16 +65,16 @@ class AiboMenu:
         self.running = set() if self._is_old else {"estop"}
         self.settings.clear()
 
-    def client(self) -> None:
+    def add_client(self) -> None:
         """Count a new client."""
         self._lines = LineReader()
         self.clients += 1
 
-    def answers(self, data: bytes) -> bytes:
+    def make_answer(self, data: bytes) -> bytes:
         """Return the answer to these bytes."""
         output = b""
         for line in self._lines.read(data):
-            output += b"".join(encoded(message, self._is_old) for message in self._answer(line))
+            output += b"".join(encode_message(message, self._is_old) for message in self._answer(line))
         return output
 
     def _answer(self, line: str) -> list[Message]:
@@ -97,13 +109,13 @@ class AiboMenu:
                     transport = self.settings.get("vision.rawcam.transport", "udp").lower()
                     arguments = f'"raw" "{self._ports[service]}" "{transport}"' if service == "camera" else ""
                     loads = [Load(java, instance, self._ports[service], arguments)]
-                return [Word("push"), *loads, Word("pop"), self._make_menu(), self._make_menu()]
+                return [OneWordMessage("push"), *loads, OneWordMessage("pop"), self._make_menu(), self._make_menu()]
             if name == "#" + title and service in self.running:
                 self.running.discard(service)
                 self._on_server(service, False)
                 return [Close(instance), self._make_menu()]
         if name.endswith((".WAV", ".MOT")):
-            self.played.append(name)
+            self.played_sounds.append(name)
         return [self._make_menu()]
 
     def _make_menu(self) -> Refresh:
@@ -112,5 +124,8 @@ class AiboMenu:
             shown = ("#" if service in self.running else "") + title
             items.append(Item(0, False, shown, f"serves port {self._ports[service]}"))
         if self._is_old:
-            items = [Item(item.items, item.is_lit, item.title, item.description.replace("\n", " ")) for item in items]
+            items = [
+                Item(item.item_count, item.is_highlighted, item.title, item.description.replace("\n", " "))
+                for item in items
+            ]
         return Refresh("TekkotsuMon", tuple(items))

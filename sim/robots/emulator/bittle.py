@@ -14,14 +14,14 @@ from twisted.internet.interfaces import IReactorTime
 
 from drivers.bittle.codec import END_BYTES, END_TEXT
 from drivers.bittle.gait import GAITS, Velocity
-from drivers.bittle.option import BEHAVIOURS, POSTURES, checked
+from drivers.bittle.option import BEHAVIOURS, POSTURES, parse_options
 from drivers.link import Link
 from drivers.reading import Value
 from drivers.timer import Timer
 from middleware.faults.stream import StreamFaults
-from sim.robots.emulator.body import Body
-from sim.robots.emulator.outlet import Outlet
-from sim.robots.emulator.wire import CableWire, Table, TcpWire, Wire
+from sim.robots.emulator.output import FaultyOutput
+from sim.robots.emulator.simulated_robot import SimulatedRobot
+from sim.robots.emulator.transport import EmulatorServer, PtyEmulatorServer, Table, TcpEmulatorServer
 
 VERSIONS = {"biboard": "B10_250712", "nyboard": "N_250224"}
 UNFINISHED_S = 0.01
@@ -30,12 +30,12 @@ BOOT_S = 1.5
 POSTURE_S, BEHAVIOUR_S = 0.1, 1.0
 NYBOARD_S = 0.04
 """Seconds of output that the web server of a NyBoard returns."""
-MAX_REQUEST = 4096
+MAX_REQUEST_BYTES = 4096
 MAX_TASKS = 50
 """Number of tasks that the board stores; a query for an older one is an error."""
 FAR_DEGREES = 270
 """Limit of joint angles; the firmware clips commands."""
-NEVER = frozenset("csa!")
+UNSUPPORTED_TOKENS = frozenset("csa!")
 """Tokens that change the robot permanently, which a driver never sends."""
 
 
@@ -48,7 +48,7 @@ class Bittle:
 
     def __init__(
         self,
-        body: Body,
+        body: SimulatedRobot,
         clock: IReactorTime,
         rng: random.Random,
         board: str = "biboard",
@@ -57,25 +57,25 @@ class Bittle:
     ) -> None:
         self.faults = StreamFaults()
         self.board = board
-        self.heard: list[bytes] = []
+        self.received_commands: list[bytes] = []
         self.joints = [0] * 16
         self.tasks: dict[str, list[str]] = {}
-        self.begun = 0
-        self.said: list[str] = []
+        self.task_count = 0
+        self.task_output: list[str] = []
         self.is_limp = True
         self.clock = clock
-        self._body = body
+        self._robot = body
         self._rng = rng
         self._resets = resets
         self._gaits = gaits
-        self._outlet = Outlet(clock, rng, self.faults)
+        self._output = FaultyOutput(clock, rng, self.faults)
         self._rest = bytearray()
         self._unfinished_timer, self._boot_timer, self._busy_timer = Timer(clock), Timer(clock), Timer(clock)
         self._queue: deque[tuple[bytes, Callable[[str], None]]] = deque()
 
     def accept(self, link: Link) -> Bittle:
         """Connect a cable."""
-        self._outlet.link = link
+        self._output.link = link
         if self._resets:
             self.reboot()
         return self
@@ -84,7 +84,7 @@ class Bittle:
         """Accept a connection to the web server."""
         return BittlePage(self, link, self._rng)
 
-    def received(self, data: bytes) -> None:
+    def data_received(self, data: bytes) -> None:
         """Process data from the cable."""
         if self._boot_timer.is_set:
             return
@@ -102,7 +102,7 @@ class Bittle:
 
     def link_down(self) -> None:
         """Disconnect the cable; a gait continues."""
-        self._outlet.link = None
+        self._output.link = None
 
     def reboot(self) -> None:
         """Restart: lie down at once, ignore data during ``BOOT_S``, and send the banner."""
@@ -113,7 +113,7 @@ class Bittle:
 
     def stop(self) -> None:
         """Stop, and cancel all timers."""
-        self._body.halt()
+        self._robot.halt()
         self.is_limp = True
         for timer in (self._unfinished_timer, self._boot_timer, self._busy_timer):
             timer.cancel()
@@ -136,13 +136,13 @@ class Bittle:
             self._send_line(line)
 
     def _send_line(self, line: str) -> None:
-        self._outlet.send(line.encode() + b"\r\n")
+        self._output.send(line.encode() + b"\r\n")
 
     def _execute_next(self) -> None:
         while self._queue and not self._busy_timer.is_set:
             command, say = self._queue.popleft()
             if command:
-                self.heard.append(command)
+                self.received_commands.append(command)
                 self._execute_now(chr(command[0]), command[1:], say)
 
     def _finish_later(self, seconds: float, say: Callable[[str], None], *lines: str) -> None:
@@ -159,7 +159,7 @@ class Bittle:
             self._execute_skill(argument.decode("latin-1").strip(), say)
             return
         if token == "d":
-            self._body.halt()
+            self._robot.halt()
             self.is_limp = True
             self._finish_later(POSTURE_S, say, "g", "d")
             return
@@ -179,10 +179,10 @@ class Bittle:
         elif (token == "g" and argument == b"p") or (token == "v" and self.board == "nyboard"):
             answer = [self._format_attitude()]
         elif token == "P" and self.board == "biboard":
-            level = float(self._body.sense().get("power.level", 1.0))
+            level = float(self._robot.sense().get("power.level", 1.0))
             answer = [f"Voltage: {6.8 + 1.6 * level:.2f} V"]
         elif token == "X" and argument[:1] == b"U":
-            distance = float(self._body.sense().get("range.near", math.nan))
+            distance = float(self._robot.sense().get("range.near", math.nan))
             answer = ["=", f"{min(200, distance * 100):.0f}" if math.isfinite(distance) else "0"]
         elif token == "?":
             answer = ["Bittle", f"Software version: {VERSIONS[self.board]}"]
@@ -193,16 +193,16 @@ class Bittle:
         velocity = self._gaits.get(name)
         if velocity is not None:
             self.is_limp = False
-            self._body.drive(velocity.vx, 0.0, velocity.wz)
+            self._robot.drive(velocity.vx, 0.0, velocity.wz)
             say(name)
             say("k")
         elif name in POSTURES:
             self.is_limp = False
-            self._body.halt()
+            self._robot.halt()
             self._finish_later(POSTURE_S, say, name, "k")
         elif name in BEHAVIOURS:
             self.is_limp = False
-            self._body.halt()
+            self._robot.halt()
             self._finish_later(BEHAVIOUR_S, say, name, "k")
         else:
             say(f"?{name}?")
@@ -214,7 +214,7 @@ class Bittle:
         return ["=", numbers, angles] if self.board == "biboard" else [f"={numbers}", angles]
 
     def _format_attitude(self) -> str:
-        sensed = self._body.sense()
+        sensed = self._robot.sense()
 
         def degrees(key: str) -> float:
             value: Value = sensed.get(key, 0.0)
@@ -235,11 +235,11 @@ class BittlePage:
         self._rng = rng
         self._data = b""
 
-    def received(self, data: bytes) -> None:
+    def data_received(self, data: bytes) -> None:
         """Process a request."""
         self._data += data
         if b"\r\n\r\n" not in self._data:
-            if len(self._data) > MAX_REQUEST:
+            if len(self._data) > MAX_REQUEST_BYTES:
                 self._link.close()
             return
         words, self._data = self._data.split(b" ", 2), b""
@@ -265,20 +265,20 @@ class BittlePage:
 
     def _run_command(self, command: bytes) -> None:
         # Later output stays in the dongle until the next request.
-        output = self._robot.said
+        output = self._robot.task_output
         self._robot.execute(command.removesuffix(END_BYTES), output.append)
         self._robot.clock.callLater(NYBOARD_S, self._respond_output)
 
     def _respond_output(self) -> None:
-        output = self._robot.said
+        output = self._robot.task_output
         text = "\r\n".join([*output, ""])
         output.clear()
         self._respond("200 OK", text)
 
     def _start_task(self, command: bytes) -> None:
         tasks = self._robot.tasks
-        number = str(1000 + self._robot.begun)
-        self._robot.begun += 1
+        number = str(1000 + self._robot.task_count)
+        self._robot.task_count += 1
         lines: list[str] = []
         tasks[number] = lines
         if len(tasks) > MAX_TASKS:
@@ -306,15 +306,15 @@ class BittlePage:
         head = (
             f"HTTP/1.1 {status}\r\nContent-Type: text/plain\r\nContent-Length: {len(text)}\r\nConnection: close\r\n\r\n"
         )
-        for piece in self._robot.faults.wire((head + text).encode(), self._rng):
+        for piece in self._robot.faults.apply((head + text).encode(), self._rng):
             self._link.send(piece)
 
 
-def serve(reactor: Any, body: Body, rng: random.Random, options: Table, dialect: str) -> Wire:
+def serve(reactor: Any, body: SimulatedRobot, rng: random.Random, options: Table, dialect: str) -> EmulatorServer:
     """Return the server of a Bittle: a pseudo-terminal, or HTTP."""
-    chosen = checked(options)
+    chosen = parse_options(options)
     board = "biboard" if chosen.board == "auto" else chosen.board
     dog = Bittle(body, reactor, rng, board=board, gaits=dict(chosen.gaits))
     if chosen.port:
-        return CableWire(reactor, dog, chosen.port)
-    return TcpWire(reactor, dog, dog.accept_http, chosen.host, chosen.http_port)
+        return PtyEmulatorServer(reactor, dog, chosen.port)
+    return TcpEmulatorServer(reactor, dog, dog.accept_http, chosen.host, chosen.http_port)

@@ -8,34 +8,34 @@ from typing import Any
 from twisted.internet.interfaces import IReactorTime
 
 from drivers.camera import codec
-from drivers.camera.option import checked, place_of
+from drivers.camera.option import parse_options, parse_url
 from drivers.errors import UsageError
 from drivers.link import Link
-from sim.robots.emulator.body import Body
-from sim.robots.emulator.outlet import Broadcast, Client, Outlet
-from sim.robots.emulator.wire import Table, TcpWire, Wire
+from sim.robots.emulator.output import Broadcast, Client, FaultyOutput
+from sim.robots.emulator.simulated_robot import SimulatedRobot
+from sim.robots.emulator.transport import EmulatorServer, Table, TcpEmulatorServer
 
-MOST_REQUEST = 8192
+MAX_REQUEST_BYTES = 8192
 """Largest request in bytes."""
 
 
 class _Client(Client):
-    def __init__(self, device: Broadcast[Client], link: Link, outlet: Outlet) -> None:
+    def __init__(self, device: Broadcast[Client], link: Link, outlet: FaultyOutput) -> None:
         super().__init__(device, link, outlet)
         self.is_watching = False
         self._camera: Any = device
         self._request: bytes | None = b""
 
-    def received(self, data: bytes) -> None:
+    def data_received(self, data: bytes) -> None:
         """Process a request; further data is ignored."""
         if self._request is None:
             return
         self._request += data
-        method = codec.method_of(self._request)
+        method = codec.parse_method(self._request)
         if method is not None:
             self._request = None
             self._camera.answer(self, method)
-        elif len(self._request) > MOST_REQUEST:
+        elif len(self._request) > MAX_REQUEST_BYTES:
             self.link.close()
 
 
@@ -49,10 +49,10 @@ class MjpegCamera(Broadcast[_Client]):
 
     make_client = _Client
 
-    def __init__(self, clock: IReactorTime, body: Body, fps: float = 15.0) -> None:
+    def __init__(self, clock: IReactorTime, body: SimulatedRobot, fps: float = 15.0) -> None:
         super().__init__(clock, body, fps)
         self.status = "200 OK"
-        self.kind = f"{codec.KIND};boundary={codec.BOUNDARY}"
+        self.kind = f"{codec.CONTENT_TYPE};boundary={codec.BOUNDARY}"
         self.has_length = True
         self.is_chunked = False
         self.dropped = 0
@@ -60,32 +60,32 @@ class MjpegCamera(Broadcast[_Client]):
     def answer(self, client: _Client, method: str) -> None:
         """Answer a request; called by the client."""
         if method != "GET":
-            client.outlet.send(codec.answer("text/plain", "405 Method Not Allowed"))
+            client.output.send(codec.encode_answer_header("text/plain", "405 Method Not Allowed"))
         elif self.status != "200 OK":
-            client.outlet.send(codec.answer("text/plain", self.status))
+            client.output.send(codec.encode_answer_header("text/plain", self.status))
         else:
-            client.outlet.send(codec.answer(self.kind, is_chunked=self.is_chunked))
+            client.output.send(codec.encode_answer_header(self.kind, is_chunked=self.is_chunked))
             client.is_watching = True
 
     def _broadcast(self) -> None:
         watching = [client for client in self.clients if client.is_watching]
-        jpeg = self._body.picture() if watching else None
+        jpeg = self._robot.picture() if watching else None
         if jpeg is None:
             return
-        data = codec.part(jpeg, self.has_length)
-        data = codec.chunk(data) if self.is_chunked else data
+        data = codec.encode_part(jpeg, self.has_length)
+        data = codec.encode_chunk(data) if self.is_chunked else data
         for client in watching:
             if client.link.is_busy:
                 self.dropped += 1
             else:
-                client.outlet.send(data)
+                client.output.send(data)
 
 
-def serve(reactor: Any, body: Body, rng: random.Random, options: Table, dialect: str) -> Wire:
+def serve(reactor: Any, body: SimulatedRobot, rng: random.Random, options: Table, dialect: str) -> EmulatorServer:
     """Return the server of a camera; raise ``UsageError`` if ``options`` have no url."""
-    chosen = checked(options)
+    chosen = parse_options(options)
     if not chosen.url:
         raise UsageError('an emulated camera needs the option url, as in url = "http://127.0.0.1:8081/"')
-    place = place_of(chosen.url)
+    place = parse_url(chosen.url)
     camera = MjpegCamera(reactor, body, float(options.get("fps", 15.0)))
-    return TcpWire(reactor, camera, camera.accept, place.host, place.port)
+    return TcpEmulatorServer(reactor, camera, camera.accept, place.host, place.port)

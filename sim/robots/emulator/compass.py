@@ -8,11 +8,11 @@ from typing import Any
 
 from twisted.internet.interfaces import IReactorTime
 
-from drivers.compass.codec import eastward, sentence
-from drivers.compass.option import checked
-from sim.robots.emulator.body import Body
-from sim.robots.emulator.outlet import Broadcast, Client
-from sim.robots.emulator.wire import CableWire, Table, TcpWire, Wire
+from drivers.compass.codec import encode_sentence, format_angle
+from drivers.compass.option import parse_options
+from sim.robots.emulator.output import Broadcast, Client
+from sim.robots.emulator.simulated_robot import SimulatedRobot
+from sim.robots.emulator.transport import EmulatorServer, PtyEmulatorServer, Table, TcpEmulatorServer
 
 
 class NmeaCompass(Broadcast[Client]):
@@ -25,33 +25,33 @@ class NmeaCompass(Broadcast[Client]):
 
     make_client = Client
 
-    def __init__(self, clock: IReactorTime, body: Body, rate: float = 10.0) -> None:
+    def __init__(self, clock: IReactorTime, body: SimulatedRobot, rate: float = 10.0) -> None:
         super().__init__(clock, body, rate)
         self.kinds: tuple[str, ...] = ("HDG",)
         self.deviation = 0.0
         self.variation = 0.0
 
     def _broadcast(self) -> None:
-        heading = self._body.sense().get("compass.heading")
+        heading = self._robot.sense().get("compass.heading")
         true = math.nan if heading is None else 90.0 - math.degrees(float(heading))
-        sentences = b"".join(self._sentence(kind, true) for kind in self.kinds)
+        sentences = b"".join(self._make_sentence(kind, true) for kind in self.kinds)
         for client in self.clients:
             if not client.link.is_busy:
-                client.outlet.send(sentences)
+                client.output.send(sentences)
 
-    def _sentence(self, kind: str, true: float) -> bytes:
+    def _make_sentence(self, kind: str, true: float) -> bytes:
         off = {"HDG": self.variation + self.deviation, "HDM": self.variation}.get(kind, 0.0)
         # Round first, so that 359.96 becomes 0.0 and not 360.0.
         degrees = "" if math.isnan(true) else f"{round(true - off, 1) % 360.0:.1f}"
         if kind == "HDG":
-            return sentence("HCHDG", degrees, *eastward(self.deviation), *eastward(self.variation))
-        return sentence(f"HC{kind}", degrees, kind[2])
+            return encode_sentence("HCHDG", degrees, *format_angle(self.deviation), *format_angle(self.variation))
+        return encode_sentence(f"HC{kind}", degrees, kind[2])
 
 
-def serve(reactor: Any, body: Body, rng: random.Random, options: Table, dialect: str) -> Wire:
+def serve(reactor: Any, body: SimulatedRobot, rng: random.Random, options: Table, dialect: str) -> EmulatorServer:
     """Return the server of a compass: a pseudo-terminal, or TCP."""
-    chosen = checked(options)
+    chosen = parse_options(options)
     compass = NmeaCompass(reactor, body)
     if chosen.device:
-        return CableWire(reactor, compass, chosen.device)
-    return TcpWire(reactor, compass, compass.accept, chosen.host, chosen.port)
+        return PtyEmulatorServer(reactor, compass, chosen.device)
+    return TcpEmulatorServer(reactor, compass, compass.accept, chosen.host, chosen.port)

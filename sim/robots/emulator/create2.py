@@ -10,22 +10,22 @@ from typing import Any
 from twisted.internet.interfaces import IReactorTime
 
 from drivers.create2 import codec
-from drivers.create2.odometry import MM_PER_COUNT, WHEEL_BASE
-from drivers.create2.option import checked
+from drivers.create2.odometry import MM_PER_COUNT, WHEEL_BASE_MM
+from drivers.create2.option import parse_options
 from drivers.link import Link
 from drivers.reading import Value
 from drivers.timer import Timer
 from middleware.faults.stream import StreamFaults
-from sim.robots.emulator.body import Body
-from sim.robots.emulator.outlet import Outlet
-from sim.robots.emulator.wire import CableWire, Table, Wire
+from sim.robots.emulator.output import FaultyOutput
+from sim.robots.emulator.simulated_robot import SimulatedRobot
+from sim.robots.emulator.transport import EmulatorServer, PtyEmulatorServer, Table
 
-CAPACITY = 2696
+CAPACITY_MAH = 2696
 BOOT_S = 1.0
 BOOT_TEXT = b"bl-start\r\nSTR730\r\nbootloader id: #x47175347 6C7C0BFF\r\nr3_robot/tags/release-3.5.4\r\n"
-LIGHT_REACH = 0.35
+LIGHT_REACH_M = 0.35
 """Range of the light bumpers in metres."""
-DOCKING_SPEED = 0.1
+DOCKING_SPEED_MPS = 0.1
 OFF, PASSIVE, SAFE, FULL = range(4)
 
 
@@ -35,13 +35,13 @@ class Create2:
     ``faults`` corrupts its output; ``reboot`` is a power cut; ``left`` and ``right`` are its wheel encoders, in counts.
     """
 
-    def __init__(self, body: Body, clock: IReactorTime, rng: random.Random) -> None:
+    def __init__(self, body: SimulatedRobot, clock: IReactorTime, rng: random.Random) -> None:
         self.faults = StreamFaults()
         self.mode = OFF
         self.left = self.right = 0.0
-        self.played: list[int] = []
-        self._body = body
-        self._outlet = Outlet(clock, rng, self.faults)
+        self.played_songs: list[int] = []
+        self._robot = body
+        self._output = FaultyOutput(clock, rng, self.faults)
         self._reader = codec.CommandReader()
         self._ids: tuple[int, ...] = ()
         self._is_streaming = False
@@ -54,10 +54,10 @@ class Create2:
 
     def accept(self, link: Link) -> Create2:
         """Connect a cable."""
-        self._outlet.link = link
+        self._output.link = link
         return self
 
-    def received(self, data: bytes) -> None:
+    def data_received(self, data: bytes) -> None:
         """Process data from the cable."""
         if not self._boot_timer.is_set:
             for command in self._reader.read(data):
@@ -65,7 +65,7 @@ class Create2:
 
     def link_down(self) -> None:
         """Disconnect the cable."""
-        self._outlet.link = None
+        self._output.link = None
 
     def reboot(self) -> None:
         """Interrupt its power: it stops, sends its boot text, is off, and forgets its stream."""
@@ -73,7 +73,7 @@ class Create2:
         self.mode, self._ids, self._is_streaming = OFF, (), False
         self.left = self.right = 0.0
         self._reader = codec.CommandReader()
-        self._boot_timer.set(BOOT_S, self._outlet.send, BOOT_TEXT)
+        self._boot_timer.set(BOOT_S, self._output.send, BOOT_TEXT)
 
     def stop(self) -> None:
         """Stop, and cancel all timers."""
@@ -95,7 +95,7 @@ class Create2:
             case 130 | codec.SAFE:
                 self._halt()
                 self.mode = SAFE
-                self._check_safety(self._body.sense())
+                self._check_safety(self._robot.sense())
             case codec.FULL:
                 self._halt()
                 self.mode = FULL
@@ -105,7 +105,7 @@ class Create2:
             case codec.DOCK:
                 self._halt()
                 self.mode, self._is_docking = PASSIVE, True
-                self._body.drive(DOCKING_SPEED, 0.0, 0.0)
+                self._robot.drive(DOCKING_SPEED_MPS, 0.0, 0.0)
             case 133 | 134 | codec.CLEAN | 136:
                 self._halt()
                 self.mode = PASSIVE
@@ -128,42 +128,42 @@ class Create2:
             self._drive_wheels(*command.words)
         elif command.opcode == codec.DRIVE:
             velocity, radius = command.words
-            if radius in (codec.STRAIGHT, 0x7FFF):
+            if radius in (codec.STRAIGHT_RADIUS, 0x7FFF):
                 self._drive_wheels(velocity, velocity)
             elif radius in (1, -1):
                 self._drive_wheels(velocity * radius, -velocity * radius)
             elif radius:
-                bend = WHEEL_BASE / 2.0 / radius
+                bend = WHEEL_BASE_MM / 2.0 / radius
                 self._drive_wheels(round(velocity * (1.0 + bend)), round(velocity * (1.0 - bend)))
         elif command.opcode == codec.PLAY and command.data[0] in self._songs:
-            self.played.append(command.data[0])
+            self.played_songs.append(command.data[0])
 
     def _drive_wheels(self, right: int, left: int) -> None:
-        top = codec.TOP_SPEED
+        top = codec.MAX_WHEEL_SPEED_MMPS
         right, left = (min(max(wheel, -top), top) for wheel in (right, left))
         self._wheels = (right, left)
-        self._body.drive((right + left) / 2000.0, 0.0, (right - left) / WHEEL_BASE)
-        self._check_safety(self._body.sense())
+        self._robot.drive((right + left) / 2000.0, 0.0, (right - left) / WHEEL_BASE_MM)
+        self._check_safety(self._robot.sense())
 
     def _halt(self) -> None:
         self._wheels = (0, 0)
         self._is_docking = False
-        self._body.halt()
+        self._robot.halt()
 
     def _answer(self, ids: bytes) -> None:
         known = [one for one in ids if one in codec.PACKETS or one in codec.GROUPS]
-        packets = self._packets(self._body.sense())
-        self._outlet.send(b"".join(codec.packed(one, packets) for one in known))
+        packets = self._make_packets(self._robot.sense())
+        self._output.send(b"".join(codec.encode_packet(one, packets) for one in known))
 
     def _on_tick(self) -> None:
         self._tick_timer.set(codec.FRAME_S, self._on_tick)
         self._update_encoders()
-        sensed = self._body.sense()
+        sensed = self._robot.sense()
         self._check_safety(sensed)
         if self._is_docking and sensed.get("power.charging", False):
             self._halt()
         if self._is_streaming and not self._boot_timer.is_set:
-            self._outlet.send(codec.stream_frame(self._ids, self._packets(sensed)))
+            self._output.send(codec.encode_stream_frame(self._ids, self._make_packets(sensed)))
 
     def _check_safety(self, sensed: Mapping[str, Value]) -> None:
         """Leave safe mode like the real robot: a cliff ahead, a lifted wheel, a charger."""
@@ -177,7 +177,7 @@ class Create2:
             self.mode = PASSIVE
 
     def _read_pose(self) -> tuple[float, float, float]:
-        sensed = self._body.sense()
+        sensed = self._robot.sense()
         x, y, yaw = (float(sensed.get(key, 0.0)) for key in ("odom.x", "odom.y", "odom.yaw"))
         return x, y, yaw
 
@@ -188,10 +188,10 @@ class Create2:
         turn = math.remainder(yaw - old_yaw, math.tau)
         middle = old_yaw + turn / 2.0
         ahead = 1000.0 * ((x - old_x) * math.cos(middle) + (y - old_y) * math.sin(middle))
-        self.left += (ahead - turn * WHEEL_BASE / 2.0) / MM_PER_COUNT
-        self.right += (ahead + turn * WHEEL_BASE / 2.0) / MM_PER_COUNT
+        self.left += (ahead - turn * WHEEL_BASE_MM / 2.0) / MM_PER_COUNT
+        self.right += (ahead + turn * WHEEL_BASE_MM / 2.0) / MM_PER_COUNT
 
-    def _packets(self, sensed: Mapping[str, Value]) -> dict[str, int]:
+    def _make_packets(self, sensed: Mapping[str, Value]) -> dict[str, int]:
         def flag(key: str) -> int:
             return int(bool(sensed.get(key, False)))
 
@@ -206,8 +206,8 @@ class Create2:
             "voltage": 15200,
             "current": 600 if charging else -300,
             "temperature": 25,
-            "charge": round(CAPACITY * float(sensed.get("power.level", 1.0))),
-            "capacity": CAPACITY,
+            "charge": round(CAPACITY_MAH * float(sensed.get("power.level", 1.0))),
+            "capacity": CAPACITY_MAH,
             "mode": self.mode,
             "left_encoder": math.floor(self.left) & 0xFFFF,
             "right_encoder": math.floor(self.right) & 0xFFFF,
@@ -218,12 +218,12 @@ class Create2:
             packets[f"cliff_{name}"] = flag(f"cliff.{name}")
             packets[f"cliff_{name}_signal"] = 0 if flag(f"cliff.{name}") else 2500
         distance = float(sensed.get("range.near", math.nan))
-        if distance < LIGHT_REACH:
-            strength = round(4095 * (1.0 - max(distance, 0.0) / LIGHT_REACH))
+        if distance < LIGHT_REACH_M:
+            strength = round(4095 * (1.0 - max(distance, 0.0) / LIGHT_REACH_M))
             packets |= {"light_center_left": strength, "light_center_right": strength, "light_bumper": 0b001100}
         return packets
 
 
-def serve(reactor: Any, body: Body, rng: random.Random, options: Table, dialect: str) -> Wire:
+def serve(reactor: Any, body: SimulatedRobot, rng: random.Random, options: Table, dialect: str) -> EmulatorServer:
     """Return the server of a Create 2, a pseudo-terminal."""
-    return CableWire(reactor, Create2(body, reactor, rng), checked(options).port)
+    return PtyEmulatorServer(reactor, Create2(body, reactor, rng), parse_options(options).port)

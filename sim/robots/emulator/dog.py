@@ -11,17 +11,17 @@ from sim.robots.dog import Dog, Motion
 from sim.robots.sensor import Sensors
 from sim.robots.world import World
 
-BESIDE = math.radians(10.0)
+BUMPER_OVERLAP_RAD = math.radians(10.0)
 """Angle in radians: contacts within it on either side of the centre press both halves of a bumper."""
 
 
-class DogBody:
+class SimulatedDog:
     """``dog`` of ``world``, with its sensors and its camera; without a gate, like a robot that does not know tokens."""
 
     def __init__(self, world: World, dog: Dog, senses: Sensors, camera: Camera) -> None:
         self._world = world
         self._dog = dog
-        self._senses = senses
+        self._sensors = senses
         self._camera = camera
 
     def drive(self, vx: float, vy: float, wz: float) -> None:
@@ -40,10 +40,13 @@ class DogBody:
 
     def sense(self) -> Mapping[str, Value]:
         """Return the sensor values, with ``bump.left`` and ``bump.right`` for contacts at the front."""
-        touches = [angle for angle in self._dog.touches if abs(angle) < math.pi / 2]
-        left, right = any(angle > -BESIDE for angle in touches), any(angle < BESIDE for angle in touches)
-        return {**self._senses.values(), "bump.left": left, "bump.right": right}
+        touches = [angle for angle in self._dog.contact_directions if abs(angle) < math.pi / 2]
+        left, right = (
+            any(angle > -BUMPER_OVERLAP_RAD for angle in touches),
+            any(angle < BUMPER_OVERLAP_RAD for angle in touches),
+        )
+        return {**self._sensors.values(), "bump.left": left, "bump.right": right}
 
     def picture(self, is_halved: bool = False) -> bytes | None:
         """Return the camera picture as a JPEG, 208x160 pixels, or 104x80 if ``is_halved``."""
-        return self._camera.jpeg(self._dog, is_halved)
+        return self._camera.render_jpeg(self._dog, is_halved)

@@ -12,9 +12,9 @@ from twisted.python.failure import Failure
 
 from drivers.link import Accept, Receiver
 
-BACKLOG = 512
+MAX_BACKLOG_BYTES = 512
 """Number of unread bytes above which the port is busy; about the buffer of a real adapter."""
-TERMINALS = "/dev/pts/"
+PTY_FOLDER = "/dev/pts/"
 """Target of links left behind by a port that could not remove them."""
 
 
@@ -51,7 +51,7 @@ class PtyPort(abstract.FileDescriptor):
     @property
     def is_busy(self) -> bool:
         """Whether too much output is unread."""
-        return len(self.dataBuffer) + self._tempDataLen > BACKLOG
+        return len(self.dataBuffer) + self._tempDataLen > MAX_BACKLOG_BYTES
 
     def send(self, data: bytes) -> None:
         """Send data; it is lost while the port is busy, as on a cable."""
@@ -69,7 +69,7 @@ class PtyPort(abstract.FileDescriptor):
         return self._master if self.connected else -1
 
     def doRead(self) -> Any:  # noqa: D102, N802 (Twisted's)
-        return fdesc.readFromFD(self._master, self._heard)
+        return fdesc.readFromFD(self._master, self._on_data)
 
     def writeSomeData(self, data: bytes) -> Any:  # noqa: D102, N802 (Twisted's)
         return fdesc.writeToFD(self._master, data)
@@ -86,13 +86,13 @@ class PtyPort(abstract.FileDescriptor):
             receiver.link_down()
 
     def _make_link(self) -> None:
-        if _read_link(self._link).startswith(TERMINALS):
+        if _read_link(self._link).startswith(PTY_FOLDER):
             os.unlink(self._link)
         os.symlink(self._device, self._link)
 
-    def _heard(self, data: bytes) -> None:
+    def _on_data(self, data: bytes) -> None:
         if self._receiver is not None:
-            self._receiver.received(data)
+            self._receiver.data_received(data)
 
 
 def _read_link(link: str) -> str:

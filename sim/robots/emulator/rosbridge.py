@@ -14,23 +14,23 @@ from twisted.internet.interfaces import IReactorTime
 
 from drivers.link import Link, Receiver
 from drivers.reading import Value
-from drivers.rosbridge.option import checked
+from drivers.rosbridge.option import parse_options
 from drivers.rosbridge.websocket import WebSocket
 from drivers.timer import Timer
 from middleware.faults.stream import StreamFaults
-from sim.robots.emulator.body import Body
-from sim.robots.emulator.outlet import Outlet
-from sim.robots.emulator.wire import Table, TcpWire, Wire
+from sim.robots.emulator.output import FaultyOutput
+from sim.robots.emulator.simulated_robot import SimulatedRobot
+from sim.robots.emulator.transport import EmulatorServer, Table, TcpEmulatorServer
 
-BASE_STOPS_S = 0.5
+COMMAND_TIMEOUT_S = 0.5
 """Seconds without a velocity after which the base stops, like most robots' bases."""
 TICK_S = 0.02
 TYPE_SERVICE = "/rosapi/topic_type"
 BEAMS = 24
 RANGE_MIN, RANGE_MAX = 0.05, 3.5
-ASIDE = {"left": math.pi / 2, "right": -math.pi / 2, "back": math.pi}
+RANGER_BEARINGS = {"left": math.pi / 2, "right": -math.pi / 2, "back": math.pi}
 """Directions of a simulated robot's rangers by name; others point ahead."""
-DOWN = "chest"
+FLOOR_RANGER = "chest"
 """A ranger that points at the floor and is not part of the scan."""
 TOPICS: Mapping[str, tuple[str, float]] = {
     "/odom": ("nav_msgs/Odometry", 25.0),
@@ -53,7 +53,7 @@ class RosbridgeRobot:
     def __init__(
         self,
         clock: IReactorTime,
-        body: Body,
+        body: SimulatedRobot,
         rng: Random,
         velocity_type: str = "geometry_msgs/msg/Twist",
     ) -> None:
@@ -62,10 +62,10 @@ class RosbridgeRobot:
         self.has_rosapi = True
         self.rosapi_s = 0.0
         self.has_motor_power = True
-        self.ignored = 0
-        self.heard: list[dict[str, Any]] = []
+        self.ignored_count = 0
+        self.received_messages: list[dict[str, Any]] = []
         self._clock = clock
-        self._body = body
+        self._robot = body
         self._rng = rng
         self._clients: list[_Client] = []
         self._ticks = 0
@@ -89,51 +89,51 @@ class RosbridgeRobot:
 
     def accept(self, link: Link) -> Receiver:
         """Accept a client; several are possible."""
-        client = _Client(self, Outlet(self._clock, self._rng, self.faults, link))
+        client = _Client(self, FaultyOutput(self._clock, self._rng, self.faults, link))
         self._clients.append(client)
         return client
 
     # -- for its clients --------------------------------------------------------------------------------------------
 
-    def call(self, client: _Client, name: str, arguments: Any, number: object) -> None:
+    def call_service(self, client: _Client, name: str, arguments: Any, number: object) -> None:
         """Answer a service call after the service's delay."""
 
         def answer() -> None:
-            is_done, values = self.service(name, arguments)
+            is_done, values = self.run_service(name, arguments)
             response = {"op": "service_response", "service": name, "values": values, "result": is_done}
-            client.say(response if number is None else {**response, "id": number})
+            client.send(response if number is None else {**response, "id": number})
 
         if name == TYPE_SERVICE and self.rosapi_s > 0:
             self._clock.callLater(self.rosapi_s, answer)
         else:
             answer()
 
-    def forget(self, client: _Client) -> None:
+    def remove_client(self, client: _Client) -> None:
         """Remove a client; the base is not notified."""
         if client in self._clients:
             self._clients.remove(client)
 
-    def command(self, topic: str, kind: str, message: Mapping[str, Any]) -> None:
+    def on_command(self, topic: str, kind: str, message: Mapping[str, Any]) -> None:
         """Process a message of type ``kind`` from a client."""
         if topic != "/cmd_vel" or kind.replace("/msg/", "/") != self.velocity_type.replace("/msg/", "/"):
-            self.ignored += 1
+            self.ignored_count += 1
             return
         twist = message.get("twist", {}) if kind.endswith("TwistStamped") else message
         try:
             linear, angular = twist["linear"], twist["angular"]
             vx, vy, wz = float(linear["x"]), float(linear.get("y", 0.0)), float(angular["z"])
         except (KeyError, TypeError, ValueError, AttributeError):
-            self.ignored += 1
+            self.ignored_count += 1
             return
         self._stop_timer.cancel()
         if not self.has_motor_power or not all(map(math.isfinite, (vx, vy, wz))):
-            self._body.halt()
+            self._robot.halt()
             return
-        self._body.drive(vx, vy, wz)
+        self._robot.drive(vx, vy, wz)
         if vx or vy or wz:
-            self._stop_timer.set(BASE_STOPS_S, self._on_no_command)
+            self._stop_timer.set(COMMAND_TIMEOUT_S, self._on_no_command)
 
-    def service(self, name: str, arguments: Any) -> tuple[bool, Any]:
+    def run_service(self, name: str, arguments: Any) -> tuple[bool, Any]:
         """Run a service; return whether it succeeded, and its values."""
         if name == TYPE_SERVICE and self.has_rosapi:
             topic = str(arguments.get("topic")) if isinstance(arguments, dict) else ""
@@ -143,7 +143,7 @@ class RosbridgeRobot:
         if name == "/motor_power":
             self.has_motor_power = bool(isinstance(arguments, dict) and arguments.get("data"))
             if not self.has_motor_power:
-                self._body.halt()
+                self._robot.halt()
             return True, {"success": True, "message": ""}
         if name == "/dock":
             return True, {"success": True, "message": "docked"}
@@ -151,12 +151,12 @@ class RosbridgeRobot:
 
     def _close_clients(self) -> None:
         self._stop_timer.cancel()
-        self._body.halt()
+        self._robot.halt()
         for client in list(self._clients):
             client.close()
 
     def _on_no_command(self) -> None:
-        self._body.halt()
+        self._robot.halt()
 
     def _on_tick(self) -> None:
         self._pending.set(TICK_S, self._on_tick)
@@ -164,51 +164,53 @@ class RosbridgeRobot:
         for topic, (_, rate) in TOPICS.items():
             every = round(1 / rate / TICK_S)
             if self._ticks % every == 0 or (self._ticks == 1 and rate <= 1):
-                subscribers = [client for client in self._clients if client.wants(topic, self._clock.seconds())]
-                if subscribers and (message := self._message(topic)) is not None:
+                subscribers = [client for client in self._clients if client.is_due(topic, self._clock.seconds())]
+                if subscribers and (message := self._make_message(topic)) is not None:
                     for client in subscribers:
-                        client.say({"op": "publish", "topic": topic, "msg": message})
+                        client.send({"op": "publish", "topic": topic, "msg": message})
 
-    def _message(self, topic: str) -> dict[str, Any] | None:
-        sensed = self._body.sense()
+    def _make_message(self, topic: str) -> dict[str, Any] | None:
+        sensed = self._robot.sense()
         nanos = round((self._clock.seconds() - self._booted_at) * 1e9)
         header = {"stamp": {"sec": nanos // 10**9, "nanosec": nanos % 10**9}, "frame_id": topic[1:5]}
         match topic:
             case "/odom":
-                return {"header": header, "child_frame_id": "base_footprint", **_odometry(sensed)}
+                return {"header": header, "child_frame_id": "base_footprint", **_make_odometry(sensed)}
             case "/scan":
-                return {"header": header, **_scan(sensed)}
+                return {"header": header, **_make_scan(sensed)}
             case "/imu":
-                acceleration = {axis: _real(sensed.get(f"imu.a{axis}"), 9.8 if axis == "z" else 0.0) for axis in "xyz"}
-                turn = {"x": 0.0, "y": 0.0, "z": _real(sensed.get("base.wz"))}
-                attitude = _quaternion(_real(sensed.get("odom.yaw")))
+                acceleration = {
+                    axis: _read_number(sensed.get(f"imu.a{axis}"), 9.8 if axis == "z" else 0.0) for axis in "xyz"
+                }
+                turn = {"x": 0.0, "y": 0.0, "z": _read_number(sensed.get("base.wz"))}
+                attitude = _make_quaternion(_read_number(sensed.get("odom.yaw")))
                 return {"header": header, "orientation": attitude, "orientation_covariance": [0.0] * 9} | {
                     "angular_velocity": turn,
                     "linear_acceleration": acceleration,
                 }
             case "/battery_state":
-                level = _real(sensed.get("power.level"), 1.0)
-                volts = _real(sensed.get("power.volts"), 11.0 + 1.6 * level)
+                level = _read_number(sensed.get("power.level"), 1.0)
+                volts = _read_number(sensed.get("power.volts"), 11.0 + 1.6 * level)
                 # The current is not measured: NaN, which rosbridge sends as null.
                 return {"header": header, "voltage": volts, "current": None, "percentage": level} | {
                     "power_supply_status": 1 if sensed.get("power.charging") else 2,
                     "present": True,
                 }
-        jpeg = self._body.picture()
+        jpeg = self._robot.picture()
         if jpeg is None:
             return None
         return {"header": header, "format": "bgr8; jpeg compressed bgr8", "data": base64.b64encode(jpeg).decode()}
 
 
 class _Client:
-    def __init__(self, robot: RosbridgeRobot, outlet: Outlet) -> None:
-        self.outlet = outlet
+    def __init__(self, robot: RosbridgeRobot, outlet: FaultyOutput) -> None:
+        self.output = outlet
         self._robot = robot
         self._socket = WebSocket()
         self._topics: dict[str, dict[str, tuple[float, float]]] = {}
         self._types: dict[str, str] = {}
 
-    def wants(self, topic: str, now: float) -> bool:
+    def is_due(self, topic: str, now: float) -> bool:
         due = False
         for sid, (period, next_at) in self._topics.get(topic, {}).items():
             if now >= next_at - 1e-6:
@@ -216,38 +218,38 @@ class _Client:
                 due = True
         return due
 
-    def say(self, message: Mapping[str, Any]) -> None:
-        self.outlet.send(self._socket.text(json.dumps(message).encode()))
+    def send(self, message: Mapping[str, Any]) -> None:
+        self.output.send(self._socket.encode_text(json.dumps(message).encode()))
 
-    def received(self, data: bytes) -> None:
+    def data_received(self, data: bytes) -> None:
         if self._robot.faults.half_open:
             return
-        messages, reply = self._socket.received(data)
+        messages, reply = self._socket.receive_data(data)
         if reply:
-            self.outlet.send(reply)
+            self.output.send(reply)
         for message in messages:
-            for answer in self._answers(message):
-                self.say(answer)
+            for answer in self._handle_payload(message):
+                self.send(answer)
         if self._socket.fault:
             self.close()
 
     def close(self) -> None:
-        if self.outlet.link is not None:
-            self.outlet.link.close()
+        if self.output.link is not None:
+            self.output.link.close()
 
     def link_down(self) -> None:
-        self.outlet.link = None
-        self._robot.forget(self)
+        self.output.link = None
+        self._robot.remove_client(self)
 
-    def _answers(self, payload: bytes) -> Iterator[dict[str, Any]]:
+    def _handle_payload(self, payload: bytes) -> Iterator[dict[str, Any]]:
         try:
             operation = json.loads(payload)
             op = operation["op"]
         except (ValueError, KeyError, TypeError, RecursionError):
             yield {"op": "status", "level": "error", "msg": f"Unable to deserialize message: {payload[:60]!r}"}
             return
-        self._robot.heard.append(operation)
-        del self._robot.heard[:-1000]
+        self._robot.received_messages.append(operation)
+        del self._robot.received_messages[:-1000]
         topic, sid = str(operation.get("topic", "")), str(operation.get("id", ""))
         match op:
             case "advertise":
@@ -256,9 +258,9 @@ class _Client:
                 self._types.pop(topic, None)
             case "publish":
                 message = operation.get("msg")
-                self._robot.command(topic, self._types.get(topic, ""), message if isinstance(message, dict) else {})
+                self._robot.on_command(topic, self._types.get(topic, ""), message if isinstance(message, dict) else {})
             case "subscribe":
-                period = _real(operation.get("throttle_rate")) / 1000
+                period = _read_number(operation.get("throttle_rate")) / 1000
                 self._topics.setdefault(topic, {})[sid] = (period, 0.0)
             case "unsubscribe":
                 if sid:
@@ -266,18 +268,20 @@ class _Client:
                 else:
                     self._topics.pop(topic, None)
             case "call_service":
-                self._robot.call(self, str(operation.get("service", "")), operation.get("args"), operation.get("id"))
+                self._robot.call_service(
+                    self, str(operation.get("service", "")), operation.get("args"), operation.get("id")
+                )
             case "set_level" | "status" | "auth":
                 pass
             case _:
                 yield {"op": "status", "level": "error", "msg": f"Unknown operation: {str(op)[:40]}.  Ignoring it."}
 
 
-def _odometry(sensed: Mapping[str, Value]) -> dict[str, Any]:
-    place = {"x": _real(sensed.get("odom.x")), "y": _real(sensed.get("odom.y")), "z": 0.0}
-    linear = {"x": _real(sensed.get("base.vx")), "y": _real(sensed.get("base.vy")), "z": 0.0}
-    turn = {"x": 0.0, "y": 0.0, "z": _real(sensed.get("base.wz"))}
-    pose = {"position": place, "orientation": _quaternion(_real(sensed.get("odom.yaw")))}
+def _make_odometry(sensed: Mapping[str, Value]) -> dict[str, Any]:
+    place = {"x": _read_number(sensed.get("odom.x")), "y": _read_number(sensed.get("odom.y")), "z": 0.0}
+    linear = {"x": _read_number(sensed.get("base.vx")), "y": _read_number(sensed.get("base.vy")), "z": 0.0}
+    turn = {"x": 0.0, "y": 0.0, "z": _read_number(sensed.get("base.wz"))}
+    pose = {"position": place, "orientation": _make_quaternion(_read_number(sensed.get("odom.yaw")))}
     unknown = [0.0] * 36
     return {
         "pose": {"pose": pose, "covariance": unknown},
@@ -285,14 +289,14 @@ def _odometry(sensed: Mapping[str, Value]) -> dict[str, Any]:
     }
 
 
-def _scan(sensed: Mapping[str, Value]) -> dict[str, Any]:
+def _make_scan(sensed: Mapping[str, Value]) -> dict[str, Any]:
     beams = [math.inf] * BEAMS
     step = math.tau / BEAMS
     for key, value in sensed.items():
         name = key.removeprefix("range.")
-        if name in (key, DOWN) or math.isnan(far := _real(value, math.nan)):
+        if name in (key, FLOOR_RANGER) or math.isnan(far := _read_number(value, math.nan)):
             continue
-        place = round(ASIDE.get(name, 0.0) / step) % BEAMS
+        place = round(RANGER_BEARINGS.get(name, 0.0) / step) % BEAMS
         beams[place] = min(beams[place], far)
     return {
         "angle_min": 0.0,
@@ -307,16 +311,16 @@ def _scan(sensed: Mapping[str, Value]) -> dict[str, Any]:
     }
 
 
-def _quaternion(yaw: float) -> dict[str, float]:
+def _make_quaternion(yaw: float) -> dict[str, float]:
     return {"x": 0.0, "y": 0.0, "z": math.sin(yaw / 2), "w": math.cos(yaw / 2)}
 
 
-def _real(value: object, default: float = 0.0) -> float:
+def _read_number(value: object, default: float = 0.0) -> float:
     return float(value) if isinstance(value, (int, float)) and not isinstance(value, bool) else default
 
 
-def serve(reactor: Any, body: Body, rng: random.Random, options: Table, dialect: str) -> Wire:
+def serve(reactor: Any, body: SimulatedRobot, rng: random.Random, options: Table, dialect: str) -> EmulatorServer:
     """Return the server of a rosbridge."""
-    chosen = checked(options)
+    chosen = parse_options(options)
     robot = RosbridgeRobot(reactor, body, rng)
-    return TcpWire(reactor, robot, robot.accept, chosen.host, chosen.port)
+    return TcpEmulatorServer(reactor, robot, robot.accept, chosen.host, chosen.port)

@@ -6,7 +6,7 @@ from collections.abc import Callable
 from functools import partial
 
 from middleware.entangled.network.switchboard import Barrier
-from sim.team.disk import Disk
+from sim.team.disk import SimulatedDisk
 from sim.team.faults import barrier
 from sim.team.faults.settings import Fault
 from sim.team.team import Node, Team
@@ -24,10 +24,10 @@ class TeamFaults:
     def __init__(self, team: Team) -> None:
         self._team = team
         self._sessions = team.scenario.sessions
-        self._rng = team.generator("trouble")
-        self._session_rng = team.generator("sessions")
+        self._rng = team.make_rng("trouble")
+        self._session_rng = team.make_rng("sessions")
         self._is_on = False
-        self._undo: dict[int, Callable[[], None]] = {}
+        self._pending_undos: dict[int, Callable[[], None]] = {}
         self._number = 0
         self._away: dict[int, int] = {}
         """Places whose nodes will restart, each with the number of the life that ended."""
@@ -35,9 +35,9 @@ class TeamFaults:
             "crash": partial(self._end_lives, kill=True),
             "leave": partial(self._end_lives, kill=False),
             "freeze": self._freeze,
-            "cut": partial(self._add_barrier, barrier.cut),
-            "deaf": partial(self._add_barrier, barrier.deaf),
-            "mute": partial(self._add_barrier, barrier.mute),
+            "cut": partial(self._add_barrier, barrier.isolate),
+            "deaf": partial(self._add_barrier, barrier.block_incoming),
+            "mute": partial(self._add_barrier, barrier.block_outgoing),
             "clog": self._clog,
             "pairs": self._pairs,
             "step": self._step,
@@ -50,51 +50,51 @@ class TeamFaults:
 
     def begin(self) -> None:
         """Start the sessions of a complete team, and schedule the faults."""
-        team, stays = self._team, self._sessions.stays
+        team, stays = self._team, self._sessions.session_durations
         self._is_on = True
         if stays is not None:
             for place in team.alive():
-                self._plan_end(place, stays.left(self._session_rng))
+                self._plan_end(place, stays.draw_remaining(self._session_rng))
             team.on_birth.append(self._on_birth)
         for number, fault in enumerate(team.scenario.faults, 1):
-            team.at(fault.at, partial(self._start_fault, fault, number))
+            team.schedule(fault.at, partial(self._start_fault, fault, number))
 
     def end(self) -> None:
         """End every fault, restart the nodes that are due, and stop."""
         team = self._team
         self._is_on = False
-        for number in list(self._undo):
+        for number in list(self._pending_undos):
             self._undo_fault(number)
-        team.board.barriers.clear()
+        team.switchboard.barriers.clear()
         for place, life in sorted(self._away.items()):
-            self._return(place, life)
-        team.tell("healed")
+            self._restart_away(place, life)
+        team.report_event("healed")
 
     # -- sessions ---------------------------------------------------------------------------------------------------
 
     def _on_birth(self, place: int, node: Node) -> None:
-        stays = self._sessions.stays
+        stays = self._sessions.session_durations
         if self._is_on and stays is not None:
-            self._plan_end(place, stays.drawn(self._session_rng))
+            self._plan_end(place, stays.draw(self._session_rng))
 
     def _plan_end(self, place: int, seconds: float) -> None:
-        self._team.at(seconds, partial(self._session_over, place, self._team.life[place]))
+        self._team.schedule(seconds, partial(self._session_over, place, self._team.life_numbers[place]))
 
     def _session_over(self, place: int, life: int) -> None:
         team, sessions, rng = self._team, self._sessions, self._session_rng
-        if not self._is_on or not self._lives(place, life):
+        if not self._is_on or not self._is_present(place, life):
             return
         if len(team.living) <= FEW:
-            self._plan_end(place, sessions.breaks.drawn(rng))
+            self._plan_end(place, sessions.absence_durations.draw(rng))
             return
         if rng.random() < sessions.goodbye:
             team.leave(place)
         else:
             team.kill(place)
         self._away[place] = life
-        team.at(sessions.breaks.drawn(rng), partial(self._return, place, life))
+        team.schedule(sessions.absence_durations.draw(rng), partial(self._restart_away, place, life))
 
-    def _return(self, place: int, life: int) -> None:
+    def _restart_away(self, place: int, life: int) -> None:
         if self._away.get(place) != life:
             return
         del self._away[place]
@@ -102,19 +102,19 @@ class TeamFaults:
             self._team.replace(place)
         self._team.start(place)
 
-    def _lives(self, place: int, life: int) -> bool:
-        return place in self._team.living and self._team.life[place] == life
+    def _is_present(self, place: int, life: int) -> bool:
+        return place in self._team.living and self._team.life_numbers[place] == life
 
     # -- faults -----------------------------------------------------------------------------------------------------
 
     def _start_fault(self, fault: Fault, number: int) -> None:
         if self._is_on:
-            self._team.tell("fault", -1, f"{number}: {fault}")
+            self._team.report_event("fault", -1, f"{number}: {fault}")
             self._handlers[fault.kind](fault)
 
     def _draw_places(self, fault: Fault) -> list[int]:
         """Draw the nodes that a fault affects, in the order of its spread."""
-        here = sorted(self._team.inside())
+        here = sorted(self._team.get_joined())
         if fault.places:
             return [place for place in fault.places if place in self._team.living]
         count = fault.count or round(fault.share * len(here))
@@ -124,29 +124,29 @@ class TeamFaults:
         """Run all of ``work``, spread over the duration ``fault.over``."""
         for turn, each in enumerate(work):
             if fault.over:
-                self._team.at(turn * fault.over / len(work), partial(self._if_on, each))
+                self._team.schedule(turn * fault.over / len(work), partial(self._run_if_active, each))
             else:
                 each()
 
-    def _if_on(self, work: Callable[[], None]) -> None:
+    def _run_if_active(self, work: Callable[[], None]) -> None:
         if self._is_on:
             work()
 
     def _undo_after(self, seconds: float, undo: Callable[[], None]) -> None:
         """Call ``undo`` after ``seconds``, or earlier by ``end``."""
         self._number += 1
-        self._undo[self._number] = undo
-        self._team.at(seconds, partial(self._undo_fault, self._number))
+        self._pending_undos[self._number] = undo
+        self._team.schedule(seconds, partial(self._undo_fault, self._number))
 
     def _undo_fault(self, number: int) -> None:
-        undo = self._undo.pop(number, None)
+        undo = self._pending_undos.pop(number, None)
         if undo is not None:
             undo()
 
-    def _hosts(self, places: list[int]) -> list[str]:
+    def _list_hosts(self, places: list[int]) -> list[str]:
         """Return the addresses at which other nodes see these places."""
-        here = [self._team.place(place) for place in places]
-        return [place.address.host if place.home is None else place.home.host for place in here]
+        here = [self._team.get_state(place) for place in places]
+        return [place.address.host if place.nat is None else place.nat.host for place in here]
 
     def _end_lives(self, fault: Fault, kill: bool) -> None:
         self._spread(fault, [partial(self._end_life, place, fault.lasts, kill) for place in self._draw_places(fault)])
@@ -155,14 +155,14 @@ class TeamFaults:
         team = self._team
         if place not in team.living:
             return
-        life = team.life[place]
+        life = team.life_numbers[place]
         if kill:
             team.kill(place)
         else:
             team.leave(place)
         if lasts:
             self._away[place] = life
-            team.at(lasts, partial(self._restart, place, life))
+            team.schedule(lasts, partial(self._restart, place, life))
 
     def _restart(self, place: int, life: int) -> None:
         if self._away.get(place) == life:
@@ -174,32 +174,32 @@ class TeamFaults:
 
     def _freeze_one(self, place: int, lasts: float) -> None:
         team = self._team
-        machine = team.place(place).machine
-        if place not in team.living or machine is None or machine.is_still:
+        machine = team.get_state(place).machine
+        if place not in team.living or machine is None or machine.is_frozen:
             return
-        life = team.life[place]
+        life = team.life_numbers[place]
         team.freeze(place)
-        self._undo_after(lasts, lambda: team.thaw(place) if self._lives(place, life) else None)
+        self._undo_after(lasts, lambda: team.thaw(place) if self._is_present(place, life) else None)
 
     def _add_barrier(self, make_barrier: Callable[[list[str]], Barrier], fault: Fault) -> None:
-        self._block(make_barrier(self._hosts(self._draw_places(fault))), fault.lasts)
+        self._block(make_barrier(self._list_hosts(self._draw_places(fault))), fault.lasts)
 
     def _clog(self, fault: Fault) -> None:
-        hosts = self._hosts(self._draw_places(fault))
-        self._spread(fault, [partial(self._block, barrier.clog(host), fault.lasts) for host in hosts])
+        hosts = self._list_hosts(self._draw_places(fault))
+        self._spread(fault, [partial(self._block, barrier.block_host(host), fault.lasts) for host in hosts])
 
     def _pairs(self, fault: Fault) -> None:
-        self._block(barrier.pairs(fault.share, str(self._rng.random())), fault.lasts)
+        self._block(barrier.block_pairs(fault.share, str(self._rng.random())), fault.lasts)
 
     def _block(self, rule: Barrier, lasts: float) -> None:
-        barriers = self._team.board.barriers
+        barriers = self._team.switchboard.barriers
         barriers.append(rule)
         self._undo_after(lasts, lambda: barriers.remove(rule))
 
     def _step(self, fault: Fault) -> None:
         def step(seconds: float) -> None:
             for place in affected:
-                self._team.place(place).step += seconds
+                self._team.get_state(place).wall_error += seconds
 
         affected = self._draw_places(fault)
         step(fault.amount)
@@ -209,7 +209,7 @@ class TeamFaults:
     def _rate(self, fault: Fault) -> None:
         def run(factor: float) -> None:
             for place in affected:
-                here = self._team.place(place)
+                here = self._team.get_state(place)
                 here.rate *= factor
                 if here.machine is not None:
                     here.machine.set_rate(here.rate)
@@ -221,8 +221,8 @@ class TeamFaults:
     def _full(self, fault: Fault) -> None:
         def fill(is_full: bool) -> None:
             for place in affected:
-                store = self._team.place(place).store
-                if isinstance(store, Disk):
+                store = self._team.get_state(place).store
+                if isinstance(store, SimulatedDisk):
                     store.is_full = is_full
 
         affected = self._draw_places(fault)
@@ -233,25 +233,25 @@ class TeamFaults:
         def come() -> None:
             place = self._team.add()
             if fault.lasts:
-                self._team.at(fault.lasts, partial(self._end_life_of, place, self._team.life[place]))
+                self._team.schedule(fault.lasts, partial(self._end_life_of, place, self._team.life_numbers[place]))
 
         self._spread(fault, [come] * fault.count)
 
     def _end_life_of(self, place: int, life: int) -> None:
-        if self._is_on and self._lives(place, life):
+        if self._is_on and self._is_present(place, life):
             self._team.leave(place)
 
     def _weather(self, fault: Fault) -> None:
         link = self._team.link
-        link.worse += fault.amount
+        link.extra_loss += fault.amount
 
         def clear() -> None:
-            link.worse -= fault.amount
+            link.extra_loss -= fault.amount
 
         self._undo_after(fault.lasts, clear)
 
     def _rebind(self, fault: Fault) -> None:
         for place in self._draw_places(fault):
-            home = self._team.place(place).home
+            home = self._team.get_state(place).nat
             if home is not None:
                 home.rebind()

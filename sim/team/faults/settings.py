@@ -9,28 +9,28 @@ from msgspec import Meta
 
 from formats.convert import UNIQUE, Unit, one_of
 
-_WHOM = ("count", "share", "places")
-TAKES: dict[str, tuple[str, ...]] = {
-    "crash": (*_WHOM, "lasts", "over"),
-    "leave": (*_WHOM, "lasts", "over"),
-    "freeze": (*_WHOM, "lasts", "over"),
-    "cut": (*_WHOM, "lasts"),
-    "deaf": (*_WHOM, "lasts"),
-    "mute": (*_WHOM, "lasts"),
-    "clog": (*_WHOM, "lasts", "over"),
+_AFFECTED_KEYS = ("count", "share", "places")
+KEYS_BY_KIND: dict[str, tuple[str, ...]] = {
+    "crash": (*_AFFECTED_KEYS, "lasts", "over"),
+    "leave": (*_AFFECTED_KEYS, "lasts", "over"),
+    "freeze": (*_AFFECTED_KEYS, "lasts", "over"),
+    "cut": (*_AFFECTED_KEYS, "lasts"),
+    "deaf": (*_AFFECTED_KEYS, "lasts"),
+    "mute": (*_AFFECTED_KEYS, "lasts"),
+    "clog": (*_AFFECTED_KEYS, "lasts", "over"),
     "pairs": ("share", "lasts"),
-    "step": (*_WHOM, "lasts", "amount"),
-    "rate": (*_WHOM, "lasts", "amount"),
-    "full": (*_WHOM, "lasts"),
+    "step": (*_AFFECTED_KEYS, "lasts", "amount"),
+    "rate": (*_AFFECTED_KEYS, "lasts", "amount"),
+    "full": (*_AFFECTED_KEYS, "lasts"),
     "crowd": ("count", "lasts", "over"),
     "weather": ("lasts", "amount"),
-    "rebind": _WHOM,
+    "rebind": _AFFECTED_KEYS,
 }
 """The kinds of faults, with the further keys that each accepts."""
-KINDS = tuple(TAKES)
+KINDS = tuple(KEYS_BY_KIND)
 LASTING = ("cut", "deaf", "mute", "clog", "pairs", "freeze", "rate", "full", "weather")
 """The kinds that require a duration."""
-WHOM = tuple(kind for kind, taken in TAKES.items() if "places" in taken)
+KINDS_WITH_PLACES = tuple(kind for kind, taken in KEYS_BY_KIND.items() if "places" in taken)
 """The kinds that affect selected nodes."""
 
 
@@ -79,18 +79,18 @@ class Fault:
 Problem = tuple[str, str, str]
 
 
-def fault_problem(fault: Fault, nodes: int, seconds: float) -> Problem | None:
+def find_problem(fault: Fault, nodes: int, seconds: float) -> Problem | None:
     """Return the error of a fault in such a team, as key, problem and remedy; None if it is valid."""
     chosen = sum(map(bool, (fault.count, fault.share, fault.places)))
     kind = fault.kind
-    for key in (*_WHOM, "lasts", "over", "amount"):
-        if getattr(fault, key) and key not in TAKES[kind]:
-            return key, f"is not valid for {kind}", f"leave it out; {kind} takes {', '.join(TAKES[kind])}"
+    for key in (*_AFFECTED_KEYS, "lasts", "over", "amount"):
+        if getattr(fault, key) and key not in KEYS_BY_KIND[kind]:
+            return key, f"is not valid for {kind}", f"leave it out; {kind} takes {', '.join(KEYS_BY_KIND[kind])}"
     if fault.at > seconds:
         return "at", f"is after the end, {seconds:g} s", "increase seconds, or decrease at"
     if kind in LASTING and not fault.lasts:
         return "lasts", f"is required for {kind}", "write lasts = 10"
-    if kind in WHOM and chosen != 1:
+    if kind in KINDS_WITH_PLACES and chosen != 1:
         return "kind", f"{kind} needs one of count, share and places", "write share = 0.5, or count = 1"
     if kind == "pairs" and not 0 < fault.share < 1:
         return "share", "must be the share of blocked pairs", "write share = 0.05"
@@ -98,7 +98,7 @@ def fault_problem(fault: Fault, nodes: int, seconds: float) -> Problem | None:
         return "count", "must be the number of newcomers", "write count = 100"
     if any(place >= nodes for place in fault.places):
         return "places", f"names {max(fault.places)}, but there are 0 to {nodes - 1}", "leave it out"
-    if kind in WHOM and fault.count > nodes:
+    if kind in KINDS_WITH_PLACES and fault.count > nodes:
         return "count", f"is more than the {nodes} nodes", "use a smaller number"
     if kind == "crash" and not fault.lasts and (fault.count == nodes or fault.share == 1.0):
         return "share", "leaves no node", "use a smaller number, or restart the nodes: lasts = 10"

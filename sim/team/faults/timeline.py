@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
-from sim.team.shrink import Trim
+from sim.team.reduction import Reduction
 
 
 @dataclass(frozen=True)
@@ -24,15 +24,15 @@ class TimedFault:
 class Timeline:
     """The starts and ends of the ``faults`` that ``trim`` keeps; at equal times starts come first."""
 
-    def __init__(self, faults: Sequence[TimedFault], trim: Trim) -> None:
+    def __init__(self, faults: Sequence[TimedFault], trim: Reduction) -> None:
         kept = [(number, fault) for number, fault in enumerate(faults) if trim.keeps(number)]
         ends = [(fault.until, True, number, fault) for number, fault in kept]
-        self._ahead = sorted(
+        self._pending = sorted(
             [(fault.at, False, number, fault) for number, fault in kept] + ends, key=lambda one: one[:3]
         )
 
-    def due(self, now: float) -> Iterator[tuple[TimedFault, bool]]:
+    def pop_due(self, now: float) -> Iterator[tuple[TimedFault, bool]]:
         """Yield each fault that starts (False) or ends (True) until ``now``, once."""
-        while self._ahead and self._ahead[0][0] <= now:
-            _, is_end, _, fault = self._ahead.pop(0)
+        while self._pending and self._pending[0][0] <= now:
+            _, is_end, _, fault = self._pending.pop(0)
             yield fault, is_end

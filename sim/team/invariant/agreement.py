@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from collections.abc import Hashable, Iterable, Iterator
 
-from sim.team.event import Asked, Born, Calm, Concluded, Decided, Engaged, Event, Expired, Open
+from sim.team.event import ActiveTasks, Asked, Born, Decided, Event, FaultFree, OpenTask, OutcomeExpired, OutcomeStored
 
-KINDS = Asked, Born, Calm, Engaged, Concluded, Expired, Open, Decided
+KINDS = Asked, Born, FaultFree, ActiveTasks, OutcomeStored, OutcomeExpired, OpenTask, Decided
 """The events that these invariants use."""
 RECENT = 1.0
 """E7: seconds between two decisions of an agent within which it must not use an older report of the same agent."""
@@ -21,13 +21,13 @@ def e4(events: Iterable[Event]) -> Iterator[str]:
         match event:
             case Asked(_, _, _, "submit", task):
                 submitted[task] = None
-            case Expired(_, task):
+            case OutcomeExpired(_, task):
                 over.add(task)
-            case Engaged(_, _, acting):
+            case ActiveTasks(_, _, acting):
                 for task in acting:
                     if task in over:
                         yield f"{task} is over and is begun again"
-            case Open(_, task, place, state, is_docketed):
+            case OpenTask(_, task, place, state, is_docketed):
                 if state:
                     states.setdefault(task, {})[place] = state
                 if is_docketed:
@@ -40,14 +40,14 @@ def e4(events: Iterable[Event]) -> Iterator[str]:
 def e5(events: Iterable[Event]) -> Iterator[str]:
     """No ghost among agents: in a calm network no agent continues a task after it must have learned of its end."""
     within: float | None = None
-    ended: dict[str, Concluded] = {}
+    ended: dict[str, OutcomeStored] = {}
     for event in events:
         match event:
-            case Calm():
+            case FaultFree():
                 within = event.within
-            case Concluded():
+            case OutcomeStored():
                 ended[event.task] = event
-            case Engaged(at, _, acting) if within is not None:
+            case ActiveTasks(at, _, acting) if within is not None:
                 for task in acting:
                     if task in ended and at > ended[task].at + within:
                         yield f"{task} is executed although it ended {ended[task].outcome}"

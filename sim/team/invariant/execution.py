@@ -5,29 +5,43 @@ from __future__ import annotations
 from collections.abc import Iterable, Iterator
 
 from sim.team.event import (
+    ActiveTasks,
     Answered,
     Asked,
-    Awaited,
-    Commanded,
+    Assumptions,
+    CommandExpected,
+    CommandReceived,
+    CommandSent,
     Died,
-    Engaged,
     Event,
-    Halted,
-    Held,
-    Issued,
-    Reached,
-    Terms,
+    LeaseHeld,
+    LeaseWon,
+    MajorityReachable,
+    RobotStopped,
     Unanswered,
-    Won,
 )
 
-KINDS = Asked, Answered, Unanswered, Terms, Died, Won, Held, Issued, Commanded, Halted, Reached, Awaited, Engaged
+KINDS = (
+    Asked,
+    Answered,
+    Unanswered,
+    Assumptions,
+    Died,
+    LeaseWon,
+    LeaseHeld,
+    CommandSent,
+    CommandReceived,
+    RobotStopped,
+    MajorityReachable,
+    CommandExpected,
+    ActiveTasks,
+)
 """The events that these invariants use."""
 ROUGH = 0.06
 """E1: tolerance as a share of the ttl for durations measured by a device's clock that is 5 % off."""
 BOUNDED = 0.01
 """Maximum clock drift for which E2 and E5 must hold; E1 holds for any drift."""
-A_MOMENT = 1e-6
+EPSILON_S = 1e-6
 
 
 def e1(events: Iterable[Event]) -> Iterator[str]:
@@ -40,16 +54,16 @@ def e1(events: Iterable[Event]) -> Iterator[str]:
     ttl, forgot = 0.0, False
     for event in events:
         match event:
-            case Terms():
+            case Assumptions():
                 ttl = event.ttl
             case Died(forgets=True):
                 forgot = True
-            case Won(_, task, place, token):
+            case LeaseWon(_, task, place, token):
                 highest = granted.get(task, 0)
                 if token <= highest and not forgot:
                     yield f"token {token} of {task} is granted to {place} after {highest}"
                 granted[task] = max(highest, token)
-            case Commanded(at, task, _, token, True, _, truly):
+            case CommandReceived(at, task, _, token, True, _, truly):
                 if token < taken.get(task, 0):
                     yield f"the device of {task} takes token {token} after {taken[task]}"
                 if at > truly + ROUGH * ttl:
@@ -66,27 +80,27 @@ def e2(events: Iterable[Event]) -> Iterator[str]:
     is_bounded, stop_time = True, 0.0
     for event in events:
         match event:
-            case Terms():
+            case Assumptions():
                 is_bounded, stop_time = event.drift <= BOUNDED, event.stop_time
-            case Commanded(_, task, place, _, True, until, _):
+            case CommandReceived(_, task, place, _, True, until, _):
                 still[task, place] = until + stop_time
-            case Halted(_, task, place, rest_at):
+            case RobotStopped(_, task, place, rest_at):
                 still[task, place] = min(still.get((task, place), 0.0), rest_at)
-            case Held(at, task, place, others) if is_bounded:
+            case LeaseHeld(at, task, place, others) if is_bounded:
                 for other in others:
                     yield f"{place} and {other} hold {task} at {at:.2f}"
                 for (moving, other), until in still.items():
-                    if moving == task and other != place and until > at + A_MOMENT:
+                    if moving == task and other != place and until > at + EPSILON_S:
                         yield f"the robot of {other} moves for {task} at {at:.2f}, {place} holds it"
 
 
 def e3(events: Iterable[Event]) -> Iterator[str]:
     """Takeover: after a failure that leaves the rest intact, a command with a higher token is accepted in time."""
-    waited: list[Awaited] = []
+    waited: list[CommandExpected] = []
     for event in events:
-        if isinstance(event, Awaited):
+        if isinstance(event, CommandExpected):
             waited.append(event)
-        elif isinstance(event, Commanded) and event.is_accepted and waited:
+        elif isinstance(event, CommandReceived) and event.is_accepted and waited:
             heard = [one for one in waited if one.task == event.task and event.token > one.above]
             for one in heard:
                 waited.remove(one)
@@ -107,7 +121,7 @@ def e5(events: Iterable[Event]) -> Iterator[str]:
     tolerance = 0.0
     for event in events:
         match event:
-            case Terms():
+            case Assumptions():
                 tolerance = 2.0 * event.drift * event.ttl if event.drift > BOUNDED else 0.0
             case Asked(_, number, _, "close", str(task)):
                 closing[number] = task
@@ -115,7 +129,7 @@ def e5(events: Iterable[Event]) -> Iterator[str]:
                 over.setdefault(closing.pop(number), at)
             case Unanswered(_, number, why) if number in closing:
                 yield f"the end of {closing.pop(number)} is not recorded: {why}"
-            case Commanded(at, task, place, _, True) if task in over and at > over[task] + tolerance:
+            case CommandReceived(at, task, place, _, True) if task in over and at > over[task] + tolerance:
                 yield f"the device of {task} obeys {place} at {at:.2f}, it ended at {over[task]:.2f}"
     for task in closing.values():
         yield f"the end of {task} is never acknowledged"
@@ -123,37 +137,37 @@ def e5(events: Iterable[Event]) -> Iterator[str]:
 
 def e8(events: Iterable[Event]) -> Iterator[str]:
     """No zombie: no agent sends a command under an expired lease, or acts on or holds two tasks at once."""
-    terms = Terms(0.0, 0.0, 0.0, 0.0, 0.0)
+    terms = Assumptions(0.0, 0.0, 0.0, 0.0, 0.0)
     for event in events:
         match event:
-            case Terms():
+            case Assumptions():
                 terms = event
-            case Issued(at, task, place, ends, truly):
-                is_late = terms.drift <= BOUNDED and at > max(ends, truly) + A_MOMENT
+            case CommandSent(at, task, place, ends, truly):
+                is_late = terms.drift <= BOUNDED and at > max(ends, truly) + EPSILON_S
                 if is_late or at > truly + ROUGH * terms.ttl:
                     yield f"{place} commands for {task} at {at:.2f}, its lease ended at {truly:.2f}"
-            case Engaged(_, place, acting, holding) if len(acting) > 1 or len(holding) > 1:
+            case ActiveTasks(_, place, acting, holding) if len(acting) > 1 or len(holding) > 1:
                 yield f"dog{place} acts on {list(acting)} and holds the leases of {list(holding)}"
 
 
 def e9(events: Iterable[Event]) -> Iterator[str]:
     """Minority: an agent without a connection to the majority wins no lease, and stops by the end of its lease."""
     cut: dict[tuple[str, int], float] = {}
-    terms = Terms(0.0, 0.0, 0.0, 0.0, 0.0)
+    terms = Assumptions(0.0, 0.0, 0.0, 0.0, 0.0)
     for event in events:
         match event:
-            case Terms():
+            case Assumptions():
                 terms = event
-            case Reached(at, task, place, is_reached):
+            case MajorityReachable(at, task, place, is_reached):
                 if is_reached:
                     cut.pop((task, place), None)
                 else:
                     cut.setdefault((task, place), at)
-            case Won(at, task, place) if (task, place) in cut:
+            case LeaseWon(at, task, place) if (task, place) in cut:
                 since = cut[task, place]
-                if at > since + terms.ttl / 3 + terms.slowest + 0.1:
+                if at > since + terms.ttl / 3 + terms.max_delay + 0.1:
                     yield f"{place} wins {task} at {at:.2f}, cut from the majority since {since:.2f}"
-            case Commanded(at, task, place, _, True) if (task, place) in cut:
+            case CommandReceived(at, task, place, _, True) if (task, place) in cut:
                 since = cut[task, place]
-                if at > since + terms.ttl * 1.1 + terms.slowest:
+                if at > since + terms.ttl * 1.1 + terms.max_delay:
                     yield f"{place} acts on {task} at {at:.2f}, cut from the majority since {since:.2f}"

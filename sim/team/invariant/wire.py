@@ -5,16 +5,16 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Iterable, Iterator
 
-from sim.team.event import Answered, Asked, Event, Ran, Shot, Size, Strange
+from sim.team.event import Answered, Asked, Event, InvalidDatagram, RequestExecuted, TableSize, UnvalidatedTraffic
 
-KINDS = Asked, Answered, Shot, Ran, Strange, Size
+KINDS = Asked, Answered, InvalidDatagram, RequestExecuted, UnvalidatedTraffic, TableSize
 """The events that these invariants use."""
 
 
 def r1(events: Iterable[Event]) -> Iterator[str]:
     """Counters only: an invalid datagram changes no other state of a node, and causes no log entry or error."""
     for event in events:
-        if not isinstance(event, Shot):
+        if not isinstance(event, InvalidDatagram):
             continue
         if event.raised:
             yield f"a {event.kind} datagram raises {event.raised}"
@@ -31,7 +31,7 @@ def r2(events: Iterable[Event]) -> Iterator[str]:
     asked: dict[int, Asked] = {}
     for event in events:
         match event:
-            case Ran(_, place, life, question):
+            case RequestExecuted(_, place, life, question):
                 lives[place] = max(life, lives.get(place, 0))
                 runs[place, life, question] += 1
             case Asked(_, number, _, "run"):
@@ -48,17 +48,17 @@ def r2(events: Iterable[Event]) -> Iterator[str]:
 def r3(events: Iterable[Event]) -> Iterator[str]:
     """No amplification: an unvalidated address gets no more bytes than it sent, and other addresses get none."""
     for event in events:
-        if isinstance(event, Shot):
+        if isinstance(event, InvalidDatagram):
             size = len(event.datagram)
             is_elsewhere = any(not is_back for is_back, _ in event.answers)
             if is_elsewhere or sum(answer for _, answer in event.answers) > size:
                 yield f"a {event.kind} datagram of {size} bytes is answered with {list(event.answers)}"
-        elif isinstance(event, Strange) and event.sent > event.got:
-            yield f"{event.sent} bytes to an unvalidated address that sent {event.got}"
+        elif isinstance(event, UnvalidatedTraffic) and event.sent > event.received:
+            yield f"{event.sent} bytes to an unvalidated address that sent {event.received}"
 
 
 def r4(events: Iterable[Event]) -> Iterator[str]:
     """Caps: no table exceeds its limit."""
     for event in events:
-        if isinstance(event, Size) and event.size > event.cap:
+        if isinstance(event, TableSize) and event.size > event.cap:
             yield f"node {event.place} remembers {event.size} {event.what}, {event.cap} are allowed"

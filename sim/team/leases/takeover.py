@@ -11,70 +11,70 @@ import math
 import random
 import sys
 
-from sim.team.leases.radio import Air
+from sim.team.leases.radio_link import LinkQuality
 from sim.team.leases.team import LeaseTeam
 
 TASK = "t0"
 DELAY, JITTER, DRIFT = 0.02, 0.01, 0.01
-NEVER = 1e12
+NEVER_S = 1e12
 
 
-def standing(seed: int, loss: float, ttl: float, stand_bys: int = 2) -> LeaseTeam:
+def make_team(seed: int, loss: float, ttl: float, stand_bys: int = 2) -> LeaseTeam:
     """Return a team of three council members and of agents, the first of which holds the lease."""
     rng = random.Random(f"takeover/{seed}")
     agents = 1 + stand_bys
     rates = [1.0 + rng.uniform(-DRIFT, DRIFT) for _ in range(agents + 3)]
-    team = LeaseTeam(f"takeover/{seed}", rates, agents, ttl, tick=NEVER)
-    team.radio.air = Air(DELAY, JITTER, loss)
+    team = LeaseTeam(f"takeover/{seed}", rates, agents, ttl, tick=NEVER_S)
+    team.radio.quality = LinkQuality(DELAY, JITTER, loss)
     team.add_task(TASK, range(agents, agents + 3))
     team.clock.advance(ttl + 0.1)
-    team.bidders[0].lessee(TASK).want()
-    while team.bidders[0].lessee(TASK).lease is None:
+    team.nodes[0].get_lease_client(TASK).claim()
+    while team.nodes[0].get_lease_client(TASK).lease is None:
         team.clock.advance(0.05)
     for rank in range(1, agents):
-        team.bidders[rank].lessee(TASK).stand_by(rank)
+        team.nodes[rank].get_lease_client(TASK).stand_by(rank)
     team.clock.advance(ttl + rng.uniform(0.0, ttl))
     return team
 
 
-def holder_of(team: LeaseTeam) -> int | None:
+def find_holder(team: LeaseTeam) -> int | None:
     """Return the living holder of the lease by its own clock."""
     for place in team.agents:
-        if team.bidders[place].machine.is_alive and team.bidders[place].lessee(TASK).lease is not None:
+        if team.nodes[place].machine.is_alive and team.nodes[place].get_lease_client(TASK).lease is not None:
             return place
     return None
 
 
-def takeover(seed: int, loss: float = 0.1, ttl: float = 1.5, is_polite: bool = False) -> float:
+def measure_takeover(seed: int, loss: float = 0.1, ttl: float = 1.5, is_polite: bool = False) -> float:
     """Return the virtual seconds from the holder's death (or leave) until another agent holds the lease."""
-    team = standing(seed, loss, ttl)
-    gone = holder_of(team) or 0
+    team = make_team(seed, loss, ttl)
+    gone = find_holder(team) or 0
     began = team.clock.seconds()
     if is_polite:
-        team.bidders[gone].leave(TASK, [place for place in team.agents if place != gone])
+        team.nodes[gone].leave(TASK, [place for place in team.agents if place != gone])
     else:
         team.kill(gone)
-    while holder_of(team) in (None, gone):
+    while find_holder(team) in (None, gone):
         team.clock.advance(0.001)
         if team.clock.seconds() - began > 40 * ttl:
             break
     return team.clock.seconds() - began
 
 
-def false_takeovers(seed: int, hours: float, loss: float = 0.2, ttl: float = 1.5) -> tuple[int, float]:
+def count_false_takeovers(seed: int, hours: float, loss: float = 0.2, ttl: float = 1.5) -> tuple[int, float]:
     """Return how often a healthy holder lost its lease in ``hours``, and the datagrams per second."""
-    team = standing(seed, loss, ttl)
-    before, sent = team.referee.wins, team.board.counters["sent"]
+    team = make_team(seed, loss, ttl)
+    before, sent = team.recorder.wins, team.switchboard.counters["sent"]
     team.clock.advance(3600.0 * hours)
-    return team.referee.wins - before, (team.board.counters["sent"] - sent) / (3600.0 * hours)
+    return team.recorder.wins - before, (team.switchboard.counters["sent"] - sent) / (3600.0 * hours)
 
 
-def upkeep(ttl: float = 1.5) -> float:
+def measure_upkeep(ttl: float = 1.5) -> float:
     """Return the datagrams per second, requests and answers, of a single holder on a link without losses."""
-    team = standing(1, 0.0, ttl, stand_bys=0)
-    sent = team.board.counters["sent"]
+    team = make_team(1, 0.0, ttl, stand_bys=0)
+    sent = team.switchboard.counters["sent"]
     team.clock.advance(60.0)
-    return (team.board.counters["sent"] - sent) / 60.0
+    return (team.switchboard.counters["sent"] - sent) / 60.0
 
 
 CASES = (
@@ -85,7 +85,7 @@ CASES = (
     ("executor leaves, loss 10 %", 0.1, 1.5, True, (0.2, math.inf)),
 )
 """The cases: loss, ttl, whether the holder leaves gracefully, and the targets of p50 and p99 in seconds."""
-MOST_MESSAGES = 12.0
+MAX_MESSAGES_PER_S = 12.0
 
 
 def main(arguments: list[str]) -> int:
@@ -96,18 +96,18 @@ def main(arguments: list[str]) -> int:
     given = parser.parse_args(arguments)
     missed = 0
     for case, loss, ttl, is_polite, (most50, most99) in CASES:
-        took = sorted(takeover(seed, loss, ttl, is_polite) for seed in range(1, given.trials + 1))
+        took = sorted(measure_takeover(seed, loss, ttl, is_polite) for seed in range(1, given.trials + 1))
         p50, p95, p99 = (took[max(0, math.ceil(share * len(took)) - 1)] for share in (0.5, 0.95, 0.99))
         reached = p50 <= most50 and p99 <= most99
         missed += not reached
         limits = ", ".join(f"{name} {most:g}" for name, most in (("p50", most50), ("p99", most99)) if most < math.inf)
         wanted = f"{limits}: {'yes' if reached else 'no'}" if limits else "no target"
         sys.stdout.write(f"{case:36}{p50:7.3f}{p95:7.3f}{p99:7.3f}{took[-1]:7.3f} s  {wanted}\n")
-    false = sum(false_takeovers(seed, 1.0, 0.2)[0] for seed in range(1, given.hours + 1))
-    messages = upkeep()
+    false = sum(count_false_takeovers(seed, 1.0, 0.2)[0] for seed in range(1, given.hours + 1))
+    messages = measure_upkeep()
     sys.stdout.write(f"false takeovers in {given.hours} h at 20 % loss: {false}\n")
-    sys.stdout.write(f"upkeep of a lease: {messages:.1f} datagrams a second, at most {MOST_MESSAGES:g}\n")
-    return int(bool(missed or false or messages > MOST_MESSAGES))
+    sys.stdout.write(f"upkeep of a lease: {messages:.1f} datagrams a second, at most {MAX_MESSAGES_PER_S:g}\n")
+    return int(bool(missed or false or messages > MAX_MESSAGES_PER_S))
 
 
 if __name__ == "__main__":

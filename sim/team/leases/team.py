@@ -14,10 +14,10 @@ from twisted.internet.defer import Deferred, maybeDeferred
 from drivers.driver import Permit
 from drivers.errors import StaleCommand
 from drivers.gate import Gate
-from middleware.consensus.lease.charter import Charter, Judge, pin
-from middleware.consensus.lease.council import Council
-from middleware.consensus.lease.desk import Desk
-from middleware.consensus.lease.lessee import Lessee
+from middleware.consensus.lease.charter import Charter, CharterVerifier, create_charter
+from middleware.consensus.lease.lease_client import LeaseClient
+from middleware.consensus.lease.lease_proposer import LeaseProposer
+from middleware.consensus.lease.lease_service import LeaseService
 from middleware.entangled.contact import Contact
 from middleware.entangled.data.store import Store
 from middleware.entangled.errors import Refused
@@ -25,19 +25,29 @@ from middleware.entangled.identity import Identity
 from middleware.entangled.network.network import Address
 from middleware.entangled.network.switchboard import Switchboard
 from middleware.entangled.quorum.ballot import majority
-from sim.team.checker import check
-from sim.team.event import Born, Commanded, Died, Halted, Held, Issued, Reached, Terms, Won
-from sim.team.leases.radio import Radio
+from sim.team.checker import find_violations
+from sim.team.event import (
+    Assumptions,
+    Born,
+    CommandReceived,
+    CommandSent,
+    Died,
+    LeaseHeld,
+    LeaseWon,
+    MajorityReachable,
+    RobotStopped,
+)
+from sim.team.leases.radio_link import RadioLink
 from sim.team.machine import Machine
-from sim.team.world import World
+from sim.team.simulation import Simulation
 
-TICK = 0.1
-ACT = 0.002
+TICK_S = 0.1
+SEND_DELAY_S = 0.002
 """Seconds from an agent's check of its lease until its command is sent."""
-WIRE = 0.001
+LINK_DELAY_S = 0.001
 
 
-class Bidder:
+class LeaseNode:
     """One life of a place: its acceptor, its lease clients, its robot."""
 
     def __init__(self, world: LeaseTeam, place: int, machine: Machine, store: Store, rng: random.Random) -> None:
@@ -45,20 +55,28 @@ class Bidder:
         self.place = place
         self.machine = machine
         identity, born_at = world.identities[place], machine.seconds()
-        self._desk = Desk(self, identity, store, machine, born_at, world.judge, lambda public: True)  # type: ignore[arg-type]
-        self.acceptor = self._desk._acceptor
-        self.lessees: dict[str, Lessee] = {}
+        self._service = LeaseService(
+            self,  # type: ignore[arg-type]
+            identity,
+            store,
+            machine,
+            born_at,
+            world.charter_verifier,
+            lambda public: True,
+        )
+        self.acceptor = self._service._acceptor
+        self.lease_clients: dict[str, LeaseClient] = {}
         self._gates: dict[str, Gate] = {}
         self._rng = rng
         machine.callLater(rng.random() * world.tick, self._tick)
 
     # -- the agent --------------------------------------------------------------------------------------------------
 
-    def lessee(self, task_id: str) -> Lessee:
+    def get_lease_client(self, task_id: str) -> LeaseClient:
         """Return this agent's lease client for a task."""
-        if task_id not in self.lessees:
-            charter = self.world.council_for(self.place, task_id)
-            council = Council(
+        if task_id not in self.lease_clients:
+            charter = self.world.get_charter(self.place, task_id)
+            council = LeaseProposer(
                 task_id,
                 self.world.contacts[self.place].node_id.hex(),
                 self.world.ttl,
@@ -67,42 +85,44 @@ class Bidder:
                 self.machine,
                 self._rng,
                 charter,
-                self.world.judge.read,
+                self.world.charter_verifier.parse,
                 charter.configuration,
-                self.world.referee.floor(self.place, task_id),
+                self.world.recorder.get_highest_token(self.place, task_id),
             )
-            council.moved = lambda: self.world.moved(task_id, council)
-            changed = lambda: self.world.referee.on_change(self, task_id)  # noqa: E731
-            self.lessees[task_id] = Lessee(council, self.machine, self._rng, changed, self.world.stop_time)
-            self._desk.enter(self.lessees[task_id])
+            council.on_change = lambda: self.world.on_council_changed(task_id, council)
+            changed = lambda: self.world.recorder.on_lease_change(self, task_id)  # noqa: E731
+            self.lease_clients[task_id] = LeaseClient(council, self.machine, self._rng, changed, self.world.stop_time)
+            self._service.register(self.lease_clients[task_id])
             self._gates[task_id] = Gate()
-        return self.lessees[task_id]
+        return self.lease_clients[task_id]
 
-    def holds(self, task_id: str) -> bool:
+    def has_lease(self, task_id: str) -> bool:
         """Return whether this agent lives and believes that it holds the lease."""
-        lessee = self.lessees.get(task_id)
+        lessee = self.lease_clients.get(task_id)
         return lessee is not None and lessee.lease is not None and self.machine.is_alive
 
     def leave(self, task_id: str, heirs: Sequence[int] = ()) -> None:
         """Stop the robot, then release the lease."""
-        self.world.referee.stop(self.place, task_id)
-        lessee = self.lessees.get(task_id)
+        self.world.recorder.stop_robot(self.place, task_id)
+        lessee = self.lease_clients.get(task_id)
         if lessee is not None:
             lessee.release([self.world.contacts[heir] for heir in heirs])
 
     def _tick(self) -> None:
-        for task_id, lessee in self.lessees.items():
+        for task_id, lessee in self.lease_clients.items():
             lease = lessee.lease
             if lease is not None:
                 now = self.machine.seconds()
                 permit = Permit(lease.token, lease.deadline)
                 # As in a driver: the device's last known time, and the remaining duration of the lease.
                 device_time = self.world.clock.seconds() - self._rng.random() * 0.02
-                self.machine.callLater(ACT, self._act, task_id, permit, device_time, lease.deadline - now)
+                self.machine.callLater(
+                    SEND_DELAY_S, self._send_command, task_id, permit, device_time, lease.deadline - now
+                )
         self.machine.callLater(self.world.tick, self._tick)
 
-    def _act(self, task_id: str, permit: Permit, device_time: float, remaining: float) -> None:
-        lessee = self.lessees[task_id]
+    def _send_command(self, task_id: str, permit: Permit, device_time: float, remaining: float) -> None:
+        lessee = self.lease_clients[task_id]
         gate = self._gates[task_id]
         try:
             gate.admit(permit, self.machine.seconds())
@@ -110,14 +130,16 @@ class Bidder:
             return
         if lessee.lease is None and not lessee.token:
             return  # the lease was released meanwhile
-        self.world.referee.on_issue(self, task_id, permit)
-        self.world.clock.callLater(WIRE, self.world.referee.on_command, self, task_id, permit, device_time, remaining)
+        self.world.recorder.on_command_sent(self, task_id, permit)
+        self.world.clock.callLater(
+            LINK_DELAY_S, self.world.recorder.on_command, self, task_id, permit, device_time, remaining
+        )
 
     # -- the wire ---------------------------------------------------------------------------------------------------
 
     def _ask(self, member: Contact, method: str, arguments: tuple[Any, ...]) -> Deferred[Any]:
         answered: Deferred[Any] = Deferred()
-        to = self.world.place_of(member)
+        to = self.world.get_place(member)
         if to == self.place:
             maybeDeferred(self.answer, self.place, method, arguments).chainDeferred(answered)
             return answered
@@ -134,107 +156,109 @@ class Bidder:
             self.machine.callLater(0.15, ask)
         return answered
 
-    def tell(self, contact: Contact, method: str, *arguments: Any) -> None:
+    def notify(self, contact: Contact, method: str, *arguments: Any) -> None:
         """Send a notification to a peer, like ``Endpoint``."""
-        self.world.tell(self.place, contact, method, arguments)
+        self.world.notify(self.place, contact, method, arguments)
 
     def answer(self, source: int, method: str, arguments: tuple[Any, ...]) -> object:
         """Answer a peer's request; a pending answer is a Deferred, a refused one None."""
         try:
-            reply = self._desk.answer(method, self.world.contacts[source], arguments)
+            reply = self._service.answer(method, self.world.contacts[source], arguments)
         except Refused:
             return None
         return reply.result if isinstance(reply, Deferred) and reply.called else reply
 
 
-class Referee:
+class LeaseRecorder:
     """The history of a team, and for each task its device's gate, the accepted commands, and the number of wins."""
 
     def __init__(self, world: LeaseTeam) -> None:
         self.history = world.history
-        self.gates: dict[str, Gate] = {}
+        self.device_gates: dict[str, Gate] = {}
         self.accepted: dict[str, list[tuple[float, int, int]]] = {}
         self.wins = 0
         self._world = world
         self._won: dict[tuple[str, int], tuple[int, int]] = {}
-        self._is_cut: set[tuple[str, int]] = set()
+        self._unreachable: set[tuple[str, int]] = set()
 
     @property
-    def found(self) -> list[str]:
+    def violations(self) -> list[str]:
         """All violations so far, one line each."""
-        return check(self.history)
+        return find_violations(self.history)
 
-    def agree(self) -> None:
+    def record_assumptions(self) -> None:
         """Record the assumptions that apply from now on."""
         world = self._world
-        self.history.note(Terms, world.ttl, world.drift, world.stop_time, world.radio.longest_way)
+        self.history.record(Assumptions, world.ttl, world.drift, world.stop_time, world.radio.max_delay)
 
-    def add(self, task_id: str) -> None:
+    def add_task(self, task_id: str) -> None:
         """Add a task."""
-        self.gates[task_id] = Gate()
+        self.device_gates[task_id] = Gate()
         self.accepted[task_id] = []
 
-    def on_change(self, bidder: Bidder, task_id: str) -> None:
+    def on_lease_change(self, bidder: LeaseNode, task_id: str) -> None:
         """Record a won or renewed lease, with the other agents that hold it by their own clocks."""
-        lease = bidder.lessees[task_id].lease
+        lease = bidder.lease_clients[task_id].lease
         if lease is None:
             return
         key = (task_id, bidder.place)
         is_new = self._won.get(key) != (lease.token, id(bidder))
         self._won[key] = lease.token, id(bidder)
-        others = [other.place for other in self._world.bidders if other is not bidder and other.holds(task_id)]
-        self.history.note(Held, task_id, bidder.place, tuple(others))
+        others = [other.place for other in self._world.nodes if other is not bidder and other.has_lease(task_id)]
+        self.history.record(LeaseHeld, task_id, bidder.place, tuple(others))
         if is_new:
             self.wins += 1
-            self.history.note(Won, task_id, bidder.place, lease.token)
+            self.history.record(LeaseWon, task_id, bidder.place, lease.token)
 
-    def on_issue(self, bidder: Bidder, task_id: str, permit: Permit) -> None:
+    def on_command_sent(self, bidder: LeaseNode, task_id: str, permit: Permit) -> None:
         """Record a command that an agent sends under its lease, possibly just after it was frozen."""
-        truly = bidder.machine.unstopped_at(permit.deadline)
-        self.history.note(Issued, task_id, bidder.place, bidder.machine.at(permit.deadline), truly)
+        truly = bidder.machine.to_unsuspended_time(permit.deadline)
+        self.history.record(
+            CommandSent, task_id, bidder.place, bidder.machine.to_simulator_time(permit.deadline), truly
+        )
 
-    def on_command(self, bidder: Bidder, task_id: str, permit: Permit, device_time: float, remaining: float) -> None:
+    def on_command(self, bidder: LeaseNode, task_id: str, permit: Permit, device_time: float, remaining: float) -> None:
         """Let the device, which all agents share, accept or refuse a command."""
-        now, gate = self._world.clock.seconds(), self.gates[task_id]
+        now, gate = self._world.clock.seconds(), self.device_gates[task_id]
         deadline = min(device_time, now) + remaining
-        truly, is_accepted = bidder.machine.unstopped_at(permit.deadline), True
+        truly, is_accepted = bidder.machine.to_unsuspended_time(permit.deadline), True
         try:
             gate.admit(Permit(permit.token, deadline), now)
         except StaleCommand:
             is_accepted = False
             if gate.token is not None and permit.token < gate.token and bidder.machine.is_alive:
-                bidder.machine.take(bidder.lessees[task_id].outrank, gate.token)
+                bidder.machine.deliver_datagram(bidder.lease_clients[task_id].on_higher_token, gate.token)
         else:
             self.accepted[task_id].append((now, permit.token, bidder.place))
-        self.history.note(Commanded, task_id, bidder.place, permit.token, is_accepted, deadline, truly)
+        self.history.record(CommandReceived, task_id, bidder.place, permit.token, is_accepted, deadline, truly)
 
-    def floor(self, place: int, task_id: str) -> int:
+    def get_highest_token(self, place: int, task_id: str) -> int:
         """Return the highest token that the robot of a place has obeyed, as it reports to its agent."""
         return max((token for _, token, one in self.accepted[task_id] if one == place), default=0)
 
-    def stop(self, place: int, task_id: str) -> None:
+    def stop_robot(self, place: int, task_id: str) -> None:
         """Stop the robot of an agent; a stop does not overtake a command on the link."""
-        self._world.clock.callLater(WIRE, self._stop, place, task_id)
+        self._world.clock.callLater(LINK_DELAY_S, self._record_stop, place, task_id)
 
-    def _stop(self, place: int, task_id: str) -> None:
-        self.history.note(Halted, task_id, place, self._world.clock.seconds() + self._world.stop_time)
+    def _record_stop(self, place: int, task_id: str) -> None:
+        self.history.record(RobotStopped, task_id, place, self._world.clock.seconds() + self._world.stop_time)
 
-    def look_at_cuts(self) -> None:
+    def record_reachability(self) -> None:
         """Record which agents lost or regained the connection to a majority of the council, in both directions."""
-        for task_id, charter in self._world.councils.items():
-            places = [self._world.place_of(member) for member in charter.members]
+        for task_id, charter in self._world.charters.items():
+            places = [self._world.get_place(member) for member in charter.members]
             for agent in self._world.agents:
                 near = [p for p in places if not {(agent, p), (p, agent)} & self._world.radio.cut]
                 is_reached, key = len(near) >= majority(len(places)), (task_id, agent)
-                if is_reached == (key in self._is_cut):
-                    self._is_cut ^= {key}
-                    self.history.note(Reached, *key, is_reached)
+                if is_reached == (key in self._unreachable):
+                    self._unreachable ^= {key}
+                    self.history.record(MajorityReachable, *key, is_reached)
 
 
-class _Call(bytes):
+class _CallDatagram(bytes):
     """A datagram that carries a call for the receiver."""
 
-    def __new__(cls, call: Callable[[], object]) -> _Call:
+    def __new__(cls, call: Callable[[], object]) -> _CallDatagram:
         made = super().__new__(cls)
         made.call = call
         return made
@@ -242,7 +266,7 @@ class _Call(bytes):
     call: Callable[[], object]
 
 
-class LeaseTeam(World):
+class LeaseTeam(Simulation):
     """Places whose clocks run at ``rates``; the first ``agents`` of them have agents.  ``seed`` seeds all generators.
 
     ``stop_time`` is the time that a robot needs to stand still, ``drift`` the maximum error of a clock.
@@ -257,7 +281,7 @@ class LeaseTeam(World):
         stop_time: float = 0.0,
         drift: float = 0.01,
         has_stores: bool = True,
-        tick: float = TICK,
+        tick: float = TICK_S,
     ) -> None:
         super().__init__(seed)
         self.ttl = ttl
@@ -267,61 +291,61 @@ class LeaseTeam(World):
         self.n = len(rates)
         self.agents = list(range(agents))
         self.has_stores = has_stores
-        self.radio = Radio()
-        self.board = Switchboard(self.clock, self.generator("radio"))
-        self.board.link = self.radio
+        self.radio = RadioLink()
+        self.switchboard = Switchboard(self.clock, self.make_rng("radio"))
+        self.switchboard.link_model = self.radio
         self._ports = [self.network(place) for place in range(self.n)]
         for port in self._ports:
-            port.listen(_run)
-        self.referee = Referee(self)
-        self.referee.agree()
-        keys = self.generator("keys")
+            port.listen(_run_call)
+        self.recorder = LeaseRecorder(self)
+        self.recorder.record_assumptions()
+        keys = self.make_rng("keys")
         self.identities = [Identity(keys.randbytes(32)) for _ in range(self.n)]
         self.operator = Identity(keys.randbytes(32))
-        self.judge = Judge(lambda public, task_id: public == self.operator.public)
+        self.charter_verifier = CharterVerifier(lambda public, task_id: public == self.operator.public)
         self.contacts = [Contact(one.public, self.address(place)) for place, one in enumerate(self.identities)]
-        self.councils: dict[str, Charter] = {}
+        self.charters: dict[str, Charter] = {}
         self._rates = rates
         self._places = {contact.public: n for n, contact in enumerate(self.contacts)}
-        self.bidders = [self.born(place) for place in range(self.n)]
+        self.nodes = [self.start_life(place) for place in range(self.n)]
 
     def add_task(self, task_id: str, council: Sequence[int]) -> None:
         """Add a task with a pinned council."""
         members = tuple(self.contacts[place] for place in council)
-        self.councils[task_id] = pin(self.operator, task_id, members)
-        self.referee.add(task_id)
+        self.charters[task_id] = create_charter(self.operator, task_id, members)
+        self.recorder.add_task(task_id)
 
     # -- services for bidders ---------------------------------------------------------------------------------------
 
-    def place_of(self, contact: Contact) -> int:
+    def get_place(self, contact: Contact) -> int:
         """Return the place of a contact."""
         return self._places[contact.public]
 
-    def council_for(self, place: int, task_id: str) -> Charter:
+    def get_charter(self, place: int, task_id: str) -> Charter:
         """Return the council that the task's records prove."""
-        return self.councils[task_id]
+        return self.charters[task_id]
 
-    def moved(self, task_id: str, council: Council) -> None:
+    def on_council_changed(self, task_id: str, council: LeaseProposer) -> None:
         """Record a newer council of a task."""
-        if council.charter is not None and council.configuration > self.councils[task_id].configuration:
-            self.councils[task_id] = council.charter
-            self.referee.look_at_cuts()
+        if council.charter is not None and council.configuration > self.charters[task_id].configuration:
+            self.charters[task_id] = council.charter
+            self.recorder.record_reachability()
 
     def send(self, source: int, to: int, call: Callable[[], object]) -> None:
         """Make a call at the receiver, if the link delivers it."""
-        self._ports[source].send(_Call(call), self.address(to))
+        self._ports[source].send(_CallDatagram(call), self.address(to))
 
     def ask(
-        self, me: Bidder, to: int, method: str, arguments: tuple[Any, ...], answered: Callable[[object], object]
+        self, me: LeaseNode, to: int, method: str, arguments: tuple[Any, ...], answered: Callable[[object], object]
     ) -> None:
         """Carry a request and its answer."""
 
         def arrive() -> None:
-            peer = self.bidders[to]
+            peer = self.nodes[to]
 
             def reply(answer: object) -> None:
                 if answer is not None:
-                    self.send(to, me.place, lambda: me.machine.take(answered, answer))
+                    self.send(to, me.place, lambda: me.machine.deliver_datagram(answered, answer))
 
             def run() -> None:
                 answer = peer.answer(me.place, method, arguments)
@@ -330,16 +354,16 @@ class LeaseTeam(World):
                 else:
                     reply(answer)
 
-            peer.machine.take(run)
+            peer.machine.deliver_datagram(run)
 
         self.send(me.place, to, arrive)
 
-    def tell(self, source: int, contact: Contact, method: str, arguments: tuple[Any, ...]) -> None:
+    def notify(self, source: int, contact: Contact, method: str, arguments: tuple[Any, ...]) -> None:
         """Carry a notification."""
-        to = self.place_of(contact)
+        to = self.get_place(contact)
 
         def arrive() -> None:
-            self.bidders[to].machine.take(self.bidders[to].answer, source, method, arguments)
+            self.nodes[to].machine.deliver_datagram(self.nodes[to].answer, source, method, arguments)
 
         self.send(source, to, arrive)
 
@@ -347,23 +371,23 @@ class LeaseTeam(World):
 
     def is_up(self, place: int) -> bool:
         """Return whether a machine runs."""
-        return self.bidders[place].machine.is_alive and not self.bidders[place].machine.is_still
+        return self.nodes[place].machine.is_alive and not self.nodes[place].machine.is_frozen
 
     def kill(self, place: int) -> None:
         """Kill a machine like a loss of power; its store remains."""
-        self.bidders[place].machine.die()
+        self.nodes[place].machine.die()
         if not self.has_stores:
             self.stores.pop(place, None)
-        self.history.note(Died, place, not self.has_stores)
+        self.history.record(Died, place, not self.has_stores)
 
-    def born(self, place: int) -> Bidder:
+    def start_life(self, place: int) -> LeaseNode:
         """Return the next life at a place."""
-        rng = self.rng(place)
-        self.history.note(Born, place, self.lives)
+        rng = self.make_life_rng(place)
+        self.history.record(Born, place, self.life_count)
         machine = Machine(self.clock, self._rates[place], rng.uniform(0.0, 1e4))
-        return Bidder(self, place, machine, self.store(place), rng)
+        return LeaseNode(self, place, machine, self.store(place), rng)
 
 
-def _run(datagram: bytes, source: Address) -> None:
-    assert isinstance(datagram, _Call)
+def _run_call(datagram: bytes, source: Address) -> None:
+    assert isinstance(datagram, _CallDatagram)
     datagram.call()

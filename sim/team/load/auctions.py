@@ -14,10 +14,10 @@ from twisted.internet.defer import Deferred
 
 from formats.convert import Unit
 from middleware.tasks.task import Task
-from sim.team.figure import Figure, mean, share, spread
-from sim.team.load.contest import Contest
-from sim.team.load.deputies import Deputy, deputies_of
-from sim.team.load.residents import Load
+from sim.team.load.allocation import TaskAllocation
+from sim.team.load.bidding_agents import BiddingAgent, get_bidding_agents
+from sim.team.load.client_workload import ClientWorkload
+from sim.team.metric import Metric, make_percentiles, make_share, mean
 from sim.team.team import Team
 
 
@@ -38,24 +38,24 @@ class AuctionSettings:
     """Interval in seconds within which all agents bid."""
 
 
-class Auctions(Load):
+class Auctions(ClientWorkload):
     """The workload ``auctions``."""
 
     def __init__(self, team: Team, settings: AuctionSettings) -> None:
         super().__init__(team, "auctions")
         self._settings = settings
-        self._deputies = deputies_of(team)
-        self._contest: Contest | None = None
+        self._agents = get_bidding_agents(team)
+        self._allocation: TaskAllocation | None = None
         self._begun = 0
         self._before: dict[int, tuple[int, int, int]] = {}
         self._next_at = -math.inf
-        self.right: list[float] = []
-        self.agreed: list[float] = []
-        self.last: list[float] = []
+        self.right_shares: list[float] = []
+        self.agreement_times: list[float] = []
+        self.last_agreement_times: list[float] = []
         self.messages: list[float] = []
         self.busiest: list[float] = []
         self.bytes: list[float] = []
-        self.trouble: list[str] = []
+        self.start_failures: list[str] = []
 
     def step(self) -> None:
         """Evaluate an auction at its end, and start the next one."""
@@ -66,68 +66,68 @@ class Auctions(Load):
                 self._start_auction()
             self._next_at = now + self._settings.every
 
-    def settled(self) -> None:
+    def make_final_requests(self) -> None:
         """Evaluate the last auction."""
         self._evaluate_auction()
 
-    def verdict(self) -> list[str]:
+    def find_violations(self) -> list[str]:
         """Return the auctions that could not start."""
-        return self.trouble
+        return self.start_failures
 
-    def figures(self) -> list[Figure]:
+    def collect_metrics(self) -> list[Metric]:
         """Return the share of agents that are right, the time until then, and the number of messages."""
-        n = len(self.right)
+        n = len(self.right_shares)
         return [
-            Figure("auctions.right", mean(self.right), "share", n=n),
-            share("auctions.unanimous", sum(part == 1.0 for part in self.right), n),
-            *spread("auctions.agree", self.agreed, "s", (0.5, 0.95, 0.99)),
-            Figure("auctions.last", mean(self.last), "s", n=n),
-            Figure("auctions.messages", mean(self.messages), "datagrams a node", n=n),
-            Figure("auctions.bytes", mean(self.bytes), "B a node in questions", n=n),
-            Figure("auctions.busiest", max(self.busiest, default=None), "datagrams", n=n),
+            Metric("auctions.right", mean(self.right_shares), "share", n=n),
+            make_share("auctions.unanimous", sum(part == 1.0 for part in self.right_shares), n),
+            *make_percentiles("auctions.agree", self.agreement_times, "s", (0.5, 0.95, 0.99)),
+            Metric("auctions.last", mean(self.last_agreement_times), "s", n=n),
+            Metric("auctions.messages", mean(self.messages), "datagrams a node", n=n),
+            Metric("auctions.bytes", mean(self.bytes), "B a node in questions", n=n),
+            Metric("auctions.busiest", max(self.busiest, default=None), "datagrams", n=n),
         ]
 
     # -- inside -----------------------------------------------------------------------------------------------------
 
     def _start_auction(self) -> None:
         self._begun += 1
-        self._before = {deputy.place: _counts(deputy) for deputy in self._deputies.present()}
+        self._before = {deputy.place: _read_counts(deputy) for deputy in self._agents.list_present()}
         task = Task(f"auction {self._begun}", "none", "nothing", waiting_period=self._settings.waiting)
-        rng = self._team.generator(f"auction/{self._begun}")
-        places = self._residents.places()
+        rng = self._team.make_rng(f"auction/{self._begun}")
+        places = self._joined.list_places()
         rng.shuffle(places)  # the first one requests the council
-        contest = Contest(task, self._deputies, places, self._clock, rng, self._settings.spread)
-        self._contest = contest
+        contest = TaskAllocation(task, self._agents, places, self._clock, rng, self._settings.spread)
+        self._allocation = contest
         Deferred.fromCoroutine(contest.begin())
 
     def _evaluate_auction(self) -> None:
-        contest, self._contest = self._contest, None
+        contest, self._allocation = self._allocation, None
         if contest is None:
             return
-        if contest.trouble:
-            self.trouble.append(f"{contest.task.task_id} did not begin: {contest.trouble}")
+        if contest.start_failure:
+            self.start_failures.append(f"{contest.task.task_id} did not begin: {contest.start_failure}")
             return
-        present, best = contest.present(), contest.best()
-        traffic = [self._traffic_since_start(deputy) for deputy in self._deputies.present()]
+        present, best = contest.list_present(), contest.find_best()
+        traffic = [self._traffic_since_start(deputy) for deputy in self._agents.list_present()]
         n = max(1, len(present))
         self.messages.append(sum(sent for sent, _, _ in traffic) / n)
         self.busiest.append(max((handled for _, handled, _ in traffic), default=0))
         self.bytes.append(sum(volume for _, _, volume in traffic) / n)
         right = [bidder for bidder in present if bidder.assigned == best]
-        delays = [max(0.0, bidder.changed_at - contest.over_at) for bidder in right]
-        self.right.append(len(right) / n)
-        self.agreed += delays
-        self.last.append(max(delays) if len(right) == len(present) and delays else math.inf)
+        delays = [max(0.0, bidder.changed_at - contest.waiting_ends_at) for bidder in right]
+        self.right_shares.append(len(right) / n)
+        self.agreement_times += delays
+        self.last_agreement_times.append(max(delays) if len(right) == len(present) and delays else math.inf)
         contest.end()
 
-    def _traffic_since_start(self, deputy: Deputy) -> tuple[int, int, int]:
+    def _traffic_since_start(self, deputy: BiddingAgent) -> tuple[int, int, int]:
         """Return a node's datagrams sent and handled since the auction started, and its bytes of requests."""
         sent, handled, volume = self._before.get(deputy.place, (0, 0, 0))
-        now_sent, now_handled, now_volume = _counts(deputy)
+        now_sent, now_handled, now_volume = _read_counts(deputy)
         if now_handled < handled:  # another life
             return now_sent, now_handled, now_volume
         return now_sent - sent, now_handled - handled, now_volume - volume
 
 
-def _counts(deputy: Deputy) -> tuple[int, int, int]:
-    return deputy.tally.sent, deputy.tally.handled, deputy.tally.bytes
+def _read_counts(deputy: BiddingAgent) -> tuple[int, int, int]:
+    return deputy.counter.sent, deputy.counter.handled_count, deputy.counter.bytes

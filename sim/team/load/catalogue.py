@@ -11,16 +11,16 @@ from sim.team.load.tasks import Tasks, TaskSettings
 from sim.team.load.traffic import Traffic, TrafficSettings
 from sim.team.load.values import Values, ValueSettings
 from sim.team.load.watches import Watches, WatchSettings
-from sim.team.workload import Kind, Kinds
+from sim.team.workload import WorkloadKind, WorkloadKinds
 
-LOADS: Kinds = {
-    "auctions": Kind(AuctionSettings, Auctions),
-    "directory": Kind(DirectorySettings, Directory),
-    "lookups": Kind(LookupSettings, Lookups),
-    "records": Kind(RecordSettings, Records),
-    "takeovers": Kind(TakeoverSettings, Takeovers),
-    "tasks": Kind(TaskSettings, Tasks),
-    "traffic": Kind(TrafficSettings, Traffic),
-    "values": Kind(ValueSettings, Values),
-    "watches": Kind(WatchSettings, Watches),
+LOADS: WorkloadKinds = {
+    "auctions": WorkloadKind(AuctionSettings, Auctions),
+    "directory": WorkloadKind(DirectorySettings, Directory),
+    "lookups": WorkloadKind(LookupSettings, Lookups),
+    "records": WorkloadKind(RecordSettings, Records),
+    "takeovers": WorkloadKind(TakeoverSettings, Takeovers),
+    "tasks": WorkloadKind(TaskSettings, Tasks),
+    "traffic": WorkloadKind(TrafficSettings, Traffic),
+    "values": WorkloadKind(ValueSettings, Values),
+    "watches": WorkloadKind(WatchSettings, Watches),
 }

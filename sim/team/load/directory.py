@@ -13,11 +13,11 @@ from typing import Annotated
 from msgspec import Meta
 
 from formats.convert import Unit
-from middleware.directory.presence import device_of, devices_of
+from middleware.directory.presence import parse_device, parse_devices
 from middleware.entangled.record import Record
 from middleware.node import SwarmNode
-from sim.team.figure import Figure, mean, share, spread
-from sim.team.load.residents import Load
+from sim.team.load.client_workload import ClientWorkload
+from sim.team.metric import Metric, make_percentiles, make_share, mean
 from sim.team.team import Team
 
 
@@ -32,7 +32,7 @@ class DirectorySettings:
     """Time limit of each reader in seconds."""
 
 
-class Directory(Load):
+class Directory(ClientWorkload):
     """The workload ``directory``."""
 
     def __init__(self, team: Team, settings: DirectorySettings) -> None:
@@ -42,8 +42,8 @@ class Directory(Load):
         self._next_at = -math.inf
         self._stop: Callable[[], object] = lambda: None
         self.seconds: list[float] = []
-        self.listed: list[float] = []
-        self._most = 0
+        self.listed_shares: list[float] = []
+        self._max_listed = 0
 
     def step(self) -> None:
         """Let the next reader list all devices, if it is time."""
@@ -51,55 +51,57 @@ class Directory(Load):
         if now < self._next_at:
             return
         self._end()
-        chosen = self._residents.any(self._rng) if self._begun < self._settings.readers else []
+        chosen = self._joined.any(self._rng) if self._begun < self._settings.readers else []
         if not chosen:
             self._next_at = math.inf
             return
         self._begun += 1
         self._next_at = now + self._settings.every
-        self._list(chosen[0])
+        self._start_listing(chosen[0])
 
-    def settled(self) -> None:
+    def make_final_requests(self) -> None:
         """End the last reader."""
         self._end()
 
-    def figures(self) -> list[Figure]:
+    def collect_metrics(self) -> list[Metric]:
         """Return the devices per node, the share of the busiest node, and the readers' times and completeness."""
         held = []
         for place in self._team.alive():
-            store = self._team.entangled(place).store
-            held.append(len({record.owner for record in store.records() if device_of(record) is not None}))
+            store = self._team.get_entangled(place).store
+            held.append(len({record.owner for record in store.records() if parse_device(record) is not None}))
         n = len(held)
         most = max(held, default=0)
         return [
-            Figure("directory.devices", float(n), "devices"),
-            Figure("directory.held.mean", mean([float(count) for count in held]), "devices a node", n=n),
-            Figure("directory.held.max", float(most), "devices", n=n),
-            Figure("directory.busiest", most / n if n else None, "share of all", n=n),
-            share("directory.listed_whole", sum(part >= 1.0 for part in self.listed), len(self.listed)),
-            Figure("directory.listed", mean(self.listed), "share", n=len(self.listed)),
-            *spread("directory.seconds", self.seconds, "s", (0.5,)),
+            Metric("directory.devices", float(n), "devices"),
+            Metric("directory.held.mean", mean([float(count) for count in held]), "devices a node", n=n),
+            Metric("directory.held.max", float(most), "devices", n=n),
+            Metric("directory.busiest", most / n if n else None, "share of all", n=n),
+            make_share(
+                "directory.listed_whole", sum(part >= 1.0 for part in self.listed_shares), len(self.listed_shares)
+            ),
+            Metric("directory.listed", mean(self.listed_shares), "share", n=len(self.listed_shares)),
+            *make_percentiles("directory.seconds", self.seconds, "s", (0.5,)),
         ]
 
     # -- inside -----------------------------------------------------------------------------------------------------
 
-    def _list(self, place: int) -> None:
+    def _start_listing(self, place: int) -> None:
         node = self._team.node(place)
         if not isinstance(node, SwarmNode):
             return
-        began, wanted = self._clock.seconds(), len(self._team.inside())
-        self._most = 0
+        began, wanted = self._clock.seconds(), len(self._team.get_joined())
+        self._max_listed = 0
 
         def changed(records: list[Record]) -> None:
-            before, self._most = self._most, max(self._most, len(devices_of(records)))
-            if before < wanted <= self._most:
+            before, self._max_listed = self._max_listed, max(self._max_listed, len(parse_devices(records)))
+            if before < wanted <= self._max_listed:
                 self.seconds.append(self._clock.seconds() - began)
 
         watch = node.watch_devices(changed)
 
         def end() -> None:
             watch.stop()
-            self.listed.append(min(1.0, self._most / wanted))
+            self.listed_shares.append(min(1.0, self._max_listed / wanted))
 
         self._stop = end
 

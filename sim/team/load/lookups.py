@@ -26,11 +26,11 @@ from middleware.entangled.errors import EntangledError
 from middleware.entangled.identity import ID_BYTES
 from middleware.entangled.kademlia.overlay import K
 from middleware.entangled.node import EntangledNode
-from sim.team.figure import Figure, at_most, mean, share, spread
-from sim.team.load.residents import Load, Pace
+from sim.team.load.client_workload import ClientWorkload, Pacer
+from sim.team.metric import Metric, make_maximum, make_percentiles, make_share, mean
 from sim.team.team import Team
 
-LISTED = 20
+MAX_LISTED = 20
 """Maximum number of violations listed individually."""
 
 
@@ -49,7 +49,7 @@ class LookupSettings:
 
 
 @dataclass
-class Trial:
+class LookupTrial:
     """One lookup: the searching node, its life, the target, and the start time."""
 
     place: int
@@ -58,20 +58,20 @@ class Trial:
     began: float
 
 
-class Lookups(Load):
+class Lookups(ClientWorkload):
     """The workload ``lookups``."""
 
     def __init__(self, team: Team, settings: LookupSettings) -> None:
         super().__init__(team, "lookups")
         self._settings = settings
-        self._pace = Pace(team.clock, settings.rate)
-        self._open: dict[int, Trial] = {}
+        self._pace = Pacer(team.clock, settings.rate)
+        self._open: dict[int, LookupTrial] = {}
         self._begun = 0
         self.found = self.missed = self.late = self.void = 0
         self.hops: list[float] = []
-        self.asked: list[float] = []
+        self.requests: list[float] = []
         self.seconds: list[float] = []
-        self.reached: list[float] = []
+        self.reach_times: list[float] = []
         self.exact = self.inexact = 0
         self._violations: list[str] = []
         self._is_settled = False
@@ -79,58 +79,60 @@ class Lookups(Load):
     def step(self) -> None:
         """Start the lookups that are due."""
         self._count_late()
-        for _ in range(self._pace.due()):
-            pair = self._residents.any(self._rng, 2)
+        for _ in range(self._pace.take_due()):
+            pair = self._joined.any(self._rng, 2)
             if len(pair) == 2:
                 self._start_lookup(*pair)
 
-    def settled(self) -> None:
+    def make_final_requests(self) -> None:
         """Look up random keys, with exact results required."""
         self._count_late()
         self._is_settled = True
-        for _ in range(self._settings.exact if len(self._residents) > 1 else 0):
-            place = self._residents.any(self._rng)[0]
-            life = self._residents.node(place)
+        for _ in range(self._settings.exact if len(self._joined) > 1 else 0):
+            place = self._joined.any(self._rng)[0]
+            life = self._joined.node(place)
             key = self._rng.randbytes(ID_BYTES)
-            truth = self._residents.census.closest(key, K, life.identity.node_id)
-            life.find_node(key).addCallbacks(self._compared, self._not_compared, (place, key, truth), {}, (place,))
+            truth = self._joined.id_index.find_closest(key, K, life.identity.node_id)
+            life.find_node(key).addCallbacks(self._compare, self._on_exact_failure, (place, key, truth), {}, (place,))
 
-    def verdict(self) -> list[str]:
+    def find_violations(self) -> list[str]:
         """Return the inexact lookups in a quiet network."""
         more = self.inexact - len(self._violations)
         return self._violations + ([f"D6: {more} more lookups are not exact"] if more > 0 else [])
 
-    def figures(self) -> list[Figure]:
+    def collect_metrics(self) -> list[Metric]:
         """Return success, exactness, hops, requests and times."""
         self._count_late()
         n = self.found + self.missed + self.late
         # Two hops at least: the first names the target, and the second confirms that it is alive.
-        most = max(2.0, math.log2(max(2, len(self._residents))) / 2)
+        most = max(2.0, math.log2(max(2, len(self._joined))) / 2)
         figures = [
-            share("lookups.success", self.found, n),
-            Figure("lookups.late", float(self.late), "lookups", n=n),
-            Figure("lookups.wrong", float(self.missed), "lookups", n=n),
-            Figure("lookups.void", float(self.void), "lookups"),
-            at_most("lookups.hops.mean", mean(self.hops), "hops", most, n=len(self.hops)),
-            Figure("lookups.hops.max", max(self.hops, default=None), "hops", n=len(self.hops)),
-            Figure("lookups.asked.mean", mean(self.asked), "nodes", n=len(self.asked)),
-            *spread("lookups.seconds", self.seconds, "s", (0.5, 0.95, 0.99)),
-            *spread("lookups.reached", self.reached, "s", (0.5, 0.95)),
+            make_share("lookups.success", self.found, n),
+            Metric("lookups.late", float(self.late), "lookups", n=n),
+            Metric("lookups.wrong", float(self.missed), "lookups", n=n),
+            Metric("lookups.void", float(self.void), "lookups"),
+            make_maximum("lookups.hops.mean", mean(self.hops), "hops", most, n=len(self.hops)),
+            Metric("lookups.hops.max", max(self.hops, default=None), "hops", n=len(self.hops)),
+            Metric("lookups.asked.mean", mean(self.requests), "nodes", n=len(self.requests)),
+            *make_percentiles("lookups.seconds", self.seconds, "s", (0.5, 0.95, 0.99)),
+            *make_percentiles("lookups.reached", self.reach_times, "s", (0.5, 0.95)),
         ]
         if self._settings.exact:
-            figures.append(share("lookups.exact", self.exact, self.exact + self.inexact))
+            figures.append(make_share("lookups.exact", self.exact, self.exact + self.inexact))
         return figures
 
     # -- inside -----------------------------------------------------------------------------------------------------
 
     def _start_lookup(self, place: int, other: int) -> None:
-        life, sought = self._residents.node(place), self._residents.node(other)
+        life, sought = self._joined.node(place), self._joined.node(other)
         self._begun += 1
         number = self._begun
-        self._open[number] = Trial(place, life, sought.identity.node_id, self._clock.seconds())
-        life.find_node(sought.identity.node_id).addCallbacks(self._answered, self._failed, (number,), {}, (number,))
+        self._open[number] = LookupTrial(place, life, sought.identity.node_id, self._clock.seconds())
+        life.find_node(sought.identity.node_id).addCallbacks(
+            self._on_answer, self._on_failure, (number,), {}, (number,)
+        )
 
-    def _answered(self, contacts: list[Contact], number: int) -> None:
+    def _on_answer(self, contacts: list[Contact], number: int) -> None:
         trial = self._open.pop(number, None)
         if trial is None:
             return  # it exceeded the time limit
@@ -145,13 +147,13 @@ class Lookups(Load):
             self.found += 1
             self.seconds.append(took)
             # The target answered this lookup, or was heard up to a tenth of a second before (``overlay.FRESH``).
-            self.reached.append(took - min(took, trial.life.overlay.silence(contacts[0])))
+            self.reach_times.append(took - min(took, trial.life.overlay.silence(contacts[0])))
             looked = next((one for one in reversed(trial.life.overlay.lookups) if one.key == trial.target), None)
             if looked is not None:
                 self.hops.append(float(looked.hops))
-                self.asked.append(float(looked.asked))
+                self.requests.append(float(looked.asked))
 
-    def _failed(self, failure: Failure, number: int) -> None:
+    def _on_failure(self, failure: Failure, number: int) -> None:
         failure.trap(EntangledError)
         trial = self._open.pop(number, None)
         if trial is not None:
@@ -172,21 +174,21 @@ class Lookups(Load):
             else:
                 self.late += 1
 
-    def _is_void(self, trial: Trial) -> bool:
-        return not (self._residents.lives(trial.place, trial.life) and trial.target in self._residents.census)
+    def _is_void(self, trial: LookupTrial) -> bool:
+        return not (self._joined.is_alive(trial.place, trial.life) and trial.target in self._joined.id_index)
 
-    def _compared(self, contacts: list[Contact], place: int, key: bytes, truth: list[bytes]) -> None:
+    def _compare(self, contacts: list[Contact], place: int, key: bytes, truth: list[bytes]) -> None:
         if [contact.node_id for contact in contacts] == truth:
             self.exact += 1
         else:
             right = len({contact.node_id for contact in contacts} & set(truth))
-            self._inexact(f"D6: node {place} finds {right} of the {len(truth)} closest to {key.hex()[:8]}")
+            self._record_inexact(f"D6: node {place} finds {right} of the {len(truth)} closest to {key.hex()[:8]}")
 
-    def _not_compared(self, failure: Failure, place: int) -> None:
+    def _on_exact_failure(self, failure: Failure, place: int) -> None:
         failure.trap(EntangledError)
-        self._inexact(f"D6: node {place} finds nobody: {failure.getErrorMessage()}")
+        self._record_inexact(f"D6: node {place} finds nobody: {failure.getErrorMessage()}")
 
-    def _inexact(self, line: str) -> None:
+    def _record_inexact(self, line: str) -> None:
         self.inexact += 1
-        if len(self._violations) < LISTED:
+        if len(self._violations) < MAX_LISTED:
             self._violations.append(line)

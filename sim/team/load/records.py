@@ -11,16 +11,16 @@ from typing import Annotated
 
 from msgspec import Meta
 
-from middleware.entangled.record import hashed_key
+from middleware.entangled.record import hash_key
 from sim.team.clients import READ, REMOVE, WRITE, Clients
-from sim.team.figure import Figure, share
-from sim.team.load.residents import Load, Pace
+from sim.team.load.client_workload import ClientWorkload, Pacer
+from sim.team.metric import Metric, make_share
 from sim.team.team import Team
 
 NAME = "r"
 """Name of the slot that each node has under a key."""
-ACTS = (WRITE, WRITE, REMOVE, READ, READ, READ)
-MOST_READERS = 32
+OPERATIONS = (WRITE, WRITE, REMOVE, READ, READ, READ)
+MAX_READERS = 32
 """Number of nodes that read everything at the end; not all, in a network of thousands."""
 
 
@@ -35,40 +35,40 @@ class RecordSettings:
     """Total number of writes, removals and reads per second."""
 
 
-class Records(Load):
+class Records(ClientWorkload):
     """The workload ``records``."""
 
     def __init__(self, team: Team, settings: RecordSettings) -> None:
         super().__init__(team, "records")
-        self._pace = Pace(team.clock, settings.rate)
-        self._keys = [hashed_key(f"records {number}") for number in range(settings.keys)]
+        self._pace = Pacer(team.clock, settings.rate)
+        self._keys = [hash_key(f"records {number}") for number in range(settings.keys)]
         self._clients = Clients(team.history)
 
     def step(self) -> None:
         """Run the operations that are due, each at a random node."""
-        for _ in range(self._pace.due()):
-            for place in self._residents.any(self._rng):
-                act, key = self._rng.choice(ACTS), self._rng.choice(self._keys)
+        for _ in range(self._pace.take_due()):
+            for place in self._joined.any(self._rng):
+                act, key = self._rng.choice(OPERATIONS), self._rng.choice(self._keys)
                 if act == READ:
                     self._read(place, key)
                 else:
-                    self._clients.write(place, self._residents.node(place), key, NAME, act=act)
+                    self._clients.write(place, self._joined.node(place), key, NAME, act=act)
 
-    def settled(self) -> None:
+    def make_final_requests(self) -> None:
         """Let many nodes read everything."""
-        for place in self._residents.any(self._rng, MOST_READERS):
+        for place in self._joined.any(self._rng, MAX_READERS):
             for key in self._keys:
                 self._read(place, key)
 
-    def figures(self) -> list[Figure]:
+    def collect_metrics(self) -> list[Metric]:
         """Return the shares of answered requests; the others may have been carried out."""
-        asked, answered = self._clients.asked, self._clients.answered
+        asked, answered = self._clients.request_counts, self._clients.answer_counts
         return [
-            share("records.acknowledged", answered[WRITE] + answered[REMOVE], asked[WRITE] + asked[REMOVE]),
-            share("records.read", answered[READ], asked[READ]),
+            make_share("records.acknowledged", answered[WRITE] + answered[REMOVE], asked[WRITE] + asked[REMOVE]),
+            make_share("records.read", answered[READ], asked[READ]),
         ]
 
     # -- inside -----------------------------------------------------------------------------------------------------
 
     def _read(self, place: int, key: bytes) -> None:
-        self._clients.read(place, self._team.life[place], self._residents.node(place), key)
+        self._clients.read(place, self._team.life_numbers[place], self._joined.node(place), key)

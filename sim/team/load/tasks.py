@@ -14,11 +14,11 @@ from twisted.internet.defer import Deferred
 
 from formats.convert import Unit
 from middleware.tasks.task import Task
-from sim.team.figure import Figure, at_most, share, spread
-from sim.team.load.contest import Contest
-from sim.team.load.deputies import deputies_of
-from sim.team.load.lookups import LISTED
-from sim.team.load.residents import Load
+from sim.team.load.allocation import TaskAllocation
+from sim.team.load.bidding_agents import get_bidding_agents
+from sim.team.load.client_workload import ClientWorkload
+from sim.team.load.lookups import MAX_LISTED
+from sim.team.metric import Metric, make_maximum, make_percentiles, make_share
 from sim.team.team import Team
 
 
@@ -42,15 +42,15 @@ class TaskSettings:
     """Seconds from the first step until the tasks are published."""
 
 
-class Tasks(Load):
+class Tasks(ClientWorkload):
     """The workload ``tasks``."""
 
     def __init__(self, team: Team, settings: TaskSettings) -> None:
         super().__init__(team, "tasks")
         self._settings = settings
-        self._deputies = deputies_of(team)
+        self._agents = get_bidding_agents(team)
         self._due_at: float | None = None
-        self._contests: list[Contest] = []
+        self._allocations: list[TaskAllocation] = []
         self._counted: list[int] = []
         self._right = 0
 
@@ -59,48 +59,52 @@ class Tasks(Load):
         now = self._clock.seconds()
         if self._due_at is None:
             self._due_at = now + self._settings.after
-        if now < self._due_at or self._contests:
+        if now < self._due_at or self._allocations:
             return
         for number in range(1, self._settings.count + 1):
             waiting, ttl = self._settings.waiting, self._settings.ttl
             task = Task(f"task {number}", "none", "nothing", waiting_period=waiting, lease_ttl=ttl)
-            places = self._residents.any(self._rng, self._settings.bidders)
-            contest = Contest(task, self._deputies, places, self._clock, self._rng, claims=True)
-            self._contests.append(contest)
+            places = self._joined.any(self._rng, self._settings.bidders)
+            contest = TaskAllocation(task, self._agents, places, self._clock, self._rng, claims=True)
+            self._allocations.append(contest)
             if contest.bidders:
                 Deferred.fromCoroutine(contest.begin())
 
-    def settled(self) -> None:
+    def make_final_requests(self) -> None:
         """Count the holders of each task, and end the contests."""
-        self._counted = [len(contest.holders()) for contest in self._contests]
-        self._right = self._nearest()
-        for contest in self._contests:
+        self._counted = [len(contest.find_holders()) for contest in self._allocations]
+        self._right = self._count_nearest_holders()
+        for contest in self._allocations:
             contest.end()
 
-    def verdict(self) -> list[str]:
+    def find_violations(self) -> list[str]:
         """Return tasks without a holder, and tasks held by two agents at once (E2)."""
-        found = [f"E2: two held {c.task.task_id} at once" for c in self._contests if c.overlaps]
+        found = [f"E2: two held {c.task.task_id} at once" for c in self._allocations if c.overlaps]
         found += [
-            f"{contest.task.task_id} is held by {held} agents{': ' if contest.trouble else ''}{contest.trouble}"
-            for contest, held in zip(self._contests, self._counted, strict=False)
-            if held != 1 and contest.present()
+            f"{contest.task.task_id} is held by {held} agents{': ' if contest.start_failure else ''}{contest.start_failure}"
+            for contest, held in zip(self._allocations, self._counted, strict=False)
+            if held != 1 and contest.list_present()
         ]
-        more = len(found) - LISTED
-        return found[:LISTED] + ([f"and {more} more tasks"] if more > 0 else [])
+        more = len(found) - MAX_LISTED
+        return found[:MAX_LISTED] + ([f"and {more} more tasks"] if more > 0 else [])
 
-    def figures(self) -> list[Figure]:
+    def collect_metrics(self) -> list[Metric]:
         """Return the share of tasks with exactly one holder, and the times until they had one."""
-        n = len(self._contests)
-        held = self._counted or [len(contest.holders()) for contest in self._contests]
-        right = self._right if self._counted else self._nearest()
-        took = [contest.held_at - contest.over_at for contest in self._contests if contest.held_at != math.inf]
+        n = len(self._allocations)
+        held = self._counted or [len(contest.find_holders()) for contest in self._allocations]
+        right = self._right if self._counted else self._count_nearest_holders()
+        took = [
+            contest.held_at - contest.waiting_ends_at for contest in self._allocations if contest.held_at != math.inf
+        ]
         return [
-            share("tasks.held_once", sum(count == 1 for count in held), n),
-            at_most("tasks.overlaps", float(sum(c.overlaps for c in self._contests)), "leases", 0.0, n=n),
-            share("tasks.by_the_nearest", right, n),
-            *spread("tasks.seconds", took, "s", (0.5, 0.99)),
+            make_share("tasks.held_once", sum(count == 1 for count in held), n),
+            make_maximum("tasks.overlaps", float(sum(c.overlaps for c in self._allocations)), "leases", 0.0, n=n),
+            make_share("tasks.by_the_nearest", right, n),
+            *make_percentiles("tasks.seconds", took, "s", (0.5, 0.99)),
         ]
 
-    def _nearest(self) -> int:
+    def _count_nearest_holders(self) -> int:
         """Return the number of tasks held by the nearest living agent."""
-        return sum(any(b.deputy.uuid == contest.best() for b in contest.holders()) for contest in self._contests)
+        return sum(
+            any(b.agent.uuid == contest.find_best() for b in contest.find_holders()) for contest in self._allocations
+        )

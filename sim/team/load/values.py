@@ -20,19 +20,19 @@ from twisted.python.failure import Failure
 from formats.convert import Unit, one_of
 from middleware.entangled.contact import Contact
 from middleware.entangled.errors import EntangledError
-from middleware.entangled.identity import node_id
+from middleware.entangled.identity import derive_node_id
 from middleware.entangled.kademlia.distance import distance
 from middleware.entangled.kademlia.overlay import K
 from middleware.entangled.node import EntangledNode
-from middleware.entangled.record import Record, Slot, hashed_key
+from middleware.entangled.record import Record, Slot, hash_key
 from middleware.entangled.replication.owner import Stored
-from sim.team.figure import Figure, at_most, mean, share, spread
-from sim.team.load.lookups import LISTED
-from sim.team.load.residents import Load, Pace
+from sim.team.load.client_workload import ClientWorkload, Pacer
+from sim.team.load.lookups import MAX_LISTED
+from sim.team.metric import Metric, make_maximum, make_percentiles, make_share, mean
 from sim.team.team import Team
 
 QUORUM, NONE = "quorum", "none"
-AGAIN = 2.0
+RETRY_S = 2.0
 """Seconds between two attempts to read an unavailable value."""
 NAME = "value"
 
@@ -79,16 +79,16 @@ class Value:
         return b"value %d" % self.number
 
 
-class Values(Load):
+class Values(ClientWorkload):
     """The workload ``values``."""
 
     def __init__(self, team: Team, settings: ValueSettings) -> None:
         super().__init__(team, "values")
         self._settings = settings
-        self._pace = Pace(team.clock, settings.rate, settings.count)
+        self._pace = Pacer(team.clock, settings.rate, settings.count)
         self._begun = 0
         self._waiting: list[Value] = []
-        self.refused = 0
+        self.failed_puts = 0
         self.put_seconds: list[float] = []
         self.get_seconds: list[float] = []
         self.outages: list[float] = []
@@ -99,58 +99,58 @@ class Values(Load):
 
     def step(self) -> None:
         """Store the values that are due."""
-        for _ in range(self._pace.due()):
-            place = self._residents.any(self._rng)
+        for _ in range(self._pace.take_due()):
+            place = self._joined.any(self._rng)
             if place:
                 self._put(place[0])
 
-    def settled(self) -> None:
+    def make_final_requests(self) -> None:
         """Read the values that have not been read yet."""
         waiting, self._waiting = self._waiting, []
         for value in waiting:
             self._count_holders(value)
             self._read(value)
 
-    def verdict(self) -> list[str]:
+    def find_violations(self) -> list[str]:
         """Return lost values and wrong "not found" answers; with "none" the faults may exceed the tolerance."""
         return self._violations if self._settings.deaths == QUORUM else []
 
-    def figures(self) -> list[Figure]:
+    def collect_metrics(self) -> list[Metric]:
         """Return durability, times, and the share of holders that a reader finds."""
         over = self.read + self.lost
         figures = [
-            Figure("values.acknowledged", float(self._begun - self.refused), "values", n=self._begun),
-            *spread("values.put", self.put_seconds, "s", (0.5, 0.99)),
-            *spread("values.get", self.get_seconds, "s", (0.5, 0.99)),
-            share("values.read", self.read, over),
-            share("values.read_at_once", self.read - len(self.outages), over),
-            Figure("values.outage.max", max(self.outages, default=0.0), "s", n=len(self.outages)),
-            Figure("values.missing", float(self.missing), "answers", n=over),
-            Figure("values.open", float(self.unread), "values"),
+            Metric("values.acknowledged", float(self._begun - self.failed_puts), "values", n=self._begun),
+            *make_percentiles("values.put", self.put_seconds, "s", (0.5, 0.99)),
+            *make_percentiles("values.get", self.get_seconds, "s", (0.5, 0.99)),
+            make_share("values.read", self.read, over),
+            make_share("values.read_at_once", self.read - len(self.outages), over),
+            Metric("values.outage.max", max(self.outages, default=0.0), "s", n=len(self.outages)),
+            Metric("values.missing", float(self.missing), "answers", n=over),
+            Metric("values.open", float(self.unread), "values"),
         ]
         if self._settings.deaths == QUORUM:
-            lost = at_most("values.lost", float(self.lost), "values", 0.0, n=over)
-            return [*figures, lost, Figure("values.killed", float(self.kills), "nodes")]
+            lost = make_maximum("values.lost", float(self.lost), "values", 0.0, n=over)
+            return [*figures, lost, Metric("values.killed", float(self.kills), "nodes")]
         figures += [
-            Figure("values.holders_found", mean(self.holders), "share", n=len(self.holders)),
-            Figure("values.copies", mean(self.copies), "nodes", n=len(self.copies)),
+            Metric("values.holders_found", mean(self.holders), "share", n=len(self.holders)),
+            Metric("values.copies", mean(self.copies), "nodes", n=len(self.copies)),
         ]
-        return [*figures, Figure("values.lost", self.lost / over if over else None, "share", n=over)]
+        return [*figures, Metric("values.lost", self.lost / over if over else None, "share", n=over)]
 
     # -- inside -----------------------------------------------------------------------------------------------------
 
     def _put(self, place: int) -> None:
-        life = self._residents.node(place)
+        life = self._joined.node(place)
         self._begun += 1
-        key = hashed_key(f"{NAME} {self._begun}")
+        key = hash_key(f"{NAME} {self._begun}")
         value = Value(self._begun, key, Slot(key, life.identity.public, NAME), self._clock.seconds())
-        life.put(key, NAME, value.content).addCallbacks(self._stored, self._not_stored, (value,))
+        life.put(key, NAME, value.content).addCallbacks(self._on_stored, self._on_put_failed, (value,))
 
-    def _not_stored(self, failure: Failure) -> None:
+    def _on_put_failed(self, failure: Failure) -> None:
         failure.trap(EntangledError)
-        self.refused += 1
+        self.failed_puts += 1
 
-    def _stored(self, stored: Stored, value: Value) -> None:
+    def _on_stored(self, stored: Stored, value: Value) -> None:
         value.acknowledged = int(stored)
         self.put_seconds.append(self._clock.seconds() - value.began)
         if self._settings.deaths == QUORUM:
@@ -159,42 +159,42 @@ class Values(Load):
         else:
             self._waiting.append(value)
 
-    def _holder_places(self, value: Value) -> list[int]:
+    def _find_holders(self, value: Value) -> list[int]:
         """Return the places of living nodes that hold the value."""
         holders = []
-        for place in self._residents.places():
-            held = self._residents.node(place).store.slot(value.slot)
+        for place in self._joined.list_places():
+            held = self._joined.node(place).store.get_slot(value.slot)
             if held is not None and held.value == value.content:
                 holders.append(place)
         return holders
 
     def _kill(self, value: Value) -> None:
         """Kill as many of the nodes that acknowledged the value as it must survive."""
-        held = self._holder_places(value)
+        held = self._find_holders(value)
         dying = self._rng.sample(held, min(value.acknowledged - 1, len(held) - 1)) if held else []
         for place in dying:
             self.kills += 1
             value.killed += 1
             self._team.kill(place)
-            self._clock.callLater(self._settings.away, self._return, place)
+            self._clock.callLater(self._settings.away, self._replace_node, place)
 
-    def _return(self, place: int) -> None:
+    def _replace_node(self, place: int) -> None:
         if place not in self._team.living:
             self._team.replace(place)
             self._team.start(place)
 
     def _count_holders(self, value: Value) -> None:
         """Let a random node look up the holders, and count those that it finds."""
-        held = [self._residents.node(place) for place in self._holder_places(value)]
-        life = self._reader()
+        held = [self._joined.node(place) for place in self._find_holders(value)]
+        life = self._choose_reader()
         if life is None or not held:
             return
         self.copies.append(float(len(held)))
         ids = sorted((one.identity.node_id for one in held), key=lambda id_: distance(id_, value.key))[:K]
-        life.find_node(value.key).addCallbacks(self._counted, _ignore_failure, (ids, life))
+        life.find_node(value.key).addCallbacks(self._on_holders_found, _ignore_failure, (ids, life))
 
-    def _counted(self, contacts: list[Contact], ids: list[bytes], reader: EntangledNode) -> None:
-        seen = {contact.node_id for contact in contacts} | {node_id(reader.identity.public)}
+    def _on_holders_found(self, contacts: list[Contact], ids: list[bytes], reader: EntangledNode) -> None:
+        seen = {contact.node_id for contact in contacts} | {derive_node_id(reader.identity.public)}
         self.holders.append(sum(id_ in seen for id_ in ids) / len(ids))
 
     def _read(self, value: Value) -> None:
@@ -202,17 +202,17 @@ class Values(Load):
         if not value.asked_since:
             value.asked_since = now
             self.unread += 1
-        life = self._reader()
+        life = self._choose_reader()
         if life is None:
             self._retry_or_give_up(value)
             return
-        life.get(value.key).addCallbacks(self._answered, self._unavailable, (value, now), {}, (value,))
+        life.get(value.key).addCallbacks(self._on_read, self._on_unavailable, (value, now), {}, (value,))
 
-    def _reader(self) -> EntangledNode | None:
-        chosen = self._residents.any(self._rng)
-        return self._residents.node(chosen[0]) if chosen else None
+    def _choose_reader(self) -> EntangledNode | None:
+        chosen = self._joined.any(self._rng)
+        return self._joined.node(chosen[0]) if chosen else None
 
-    def _answered(self, records: list[Record], value: Value, asked_at: float) -> None:
+    def _on_read(self, records: list[Record], value: Value, asked_at: float) -> None:
         if any(record.slot == value.slot and record.value == value.content for record in records):
             now = self._clock.seconds()
             self.get_seconds.append(now - asked_at)
@@ -225,13 +225,13 @@ class Values(Load):
         self._add_violation(f"D1: value {value.number}, acknowledged by {value.acknowledged}, is reported as not found")
         self._retry_or_give_up(value)
 
-    def _unavailable(self, failure: Failure, value: Value) -> None:
+    def _on_unavailable(self, failure: Failure, value: Value) -> None:
         failure.trap(EntangledError)
         self._retry_or_give_up(value)
 
     def _retry_or_give_up(self, value: Value) -> None:
         if self._clock.seconds() - value.asked_since < self._settings.patience:
-            self._clock.callLater(AGAIN, self._read, value)
+            self._clock.callLater(RETRY_S, self._read, value)
             return
         self.lost += 1
         self.unread -= 1
@@ -239,7 +239,7 @@ class Values(Load):
         self._add_violation(f"D1: value {value.number} is lost {after}")
 
     def _add_violation(self, line: str) -> None:
-        if len(self._violations) < LISTED:
+        if len(self._violations) < MAX_LISTED:
             self._violations.append(line)
 
 

@@ -9,93 +9,99 @@ from functools import partial
 from pathlib import Path
 
 from middleware.errors import BadSetting
-from sim.team.command import ENDED, MISSED, Environment
-from sim.team.figure import Figure, table
-from sim.team.memory import check
-from sim.team.scale.apart import apart
+from sim.team.command import EXIT_INTERRUPTED, EXIT_MISSED, Environment
+from sim.team.memory import check_memory
+from sim.team.metric import Metric, format_table
 from sim.team.scale.curve import CURVES
-from sim.team.scale.drawing import drawn
-from sim.team.scale.page import page
-from sim.team.scale.record import Record
-from sim.team.scale.survey import Ended, Sized, SurveySettings, Watcher, surveyed
+from sim.team.scale.drawing import draw_svg
+from sim.team.scale.fork import run_in_fork
+from sim.team.scale.markdown import format_markdown
+from sim.team.scale.measurement import MeasurementStopped, ProgressCallbacks, SizeResult, SurveySettings, measure_size
+from sim.team.scale.measurement_file import MeasurementFile
 from sim.team.scenario import Scenario
 
 SIZES = "3,10,30,100,300,1000,3000,10000"
-LEAST, MOST = 3, 100_000
+MIN_NODES, MAX_NODES = 3, 100_000
 
 
-Measure = Callable[[int, SurveySettings, Watcher], Sized]
+Measure = Callable[[int, SurveySettings, ProgressCallbacks], SizeResult]
 
 
-def surveyed_apart(nodes: int, settings: SurveySettings, watcher: Watcher) -> Sized:
+def measure_in_fork(nodes: int, settings: SurveySettings, watcher: ProgressCallbacks) -> SizeResult:
     """Measure a team of that size in a separate process; raises ``Ended``.
 
     Memory freed by one team would otherwise be reused for the next one, which would then seem to need less.
     """
-    return apart(partial(surveyed, nodes, settings, watcher), Ended, is_stopped=watcher.is_stopped)
+    return run_in_fork(
+        partial(measure_size, nodes, settings, watcher), MeasurementStopped, is_stopped=watcher.is_stopped
+    )
 
 
-def scale(arguments: Sequence[str], world: Environment, measure: Measure = surveyed_apart) -> int:
+def run_scale(arguments: Sequence[str], world: Environment, measure: Measure = measure_in_fork) -> int:
     """Measure the sizes that are missing in the record, print and draw all; returns 1 if a target is missed.
 
     Raises ``BadSetting``.
     """
-    wanted = _parsed(arguments)
-    sizes = _sizes(wanted.nodes)
+    wanted = _parse_arguments(arguments)
+    sizes = _parse_sizes(wanted.nodes)
     out = Path(wanted.out)
     for key, value in (("--takeovers", wanted.takeovers), ("--swarm-most", wanted.swarm_most)):
         if value < 0:
             raise BadSetting("command line", key, f"must be 0 or more, is {value}", f"write {key} 100")
     settings = SurveySettings(seed=wanted.seed, takeovers=wanted.takeovers, swarm_most=wanted.swarm_most)
-    record = Record(out / "scale.json", settings)
+    record = MeasurementFile(out / "scale.json", settings)
     record.prepare()
     record.read()
-    watcher = Watcher(lambda line: _say(world, line), world.is_stopped)
+    watcher = ProgressCallbacks(lambda line: _say(world, line), world.is_stopped)
     for nodes in sizes:
-        check(Scenario(nodes=nodes), world.read)
+        check_memory(Scenario(nodes=nodes), world.read)
         if nodes in record.sizes:
             world.err.write(f"{nodes:,} nodes: already measured\n")
             continue
         try:
             sized = measure(nodes, settings, watcher)
-        except Ended:
+        except MeasurementStopped:
             break
         record.add(sized)
-        world.out.write(f"\n{nodes:,} nodes, {sized.cpu:,.0f} s of the processor\n{table(held(sized))}\n")
+        world.out.write(
+            f"\n{nodes:,} nodes, {sized.cpu:,.0f} s of the processor\n{format_table(apply_targets(sized))}\n"
+        )
         for line in sized.violations:
             world.out.write(f"violated  {line}\n")
         world.out.flush()
         _draw(out, record.sizes, settings)
     _draw(out, record.sizes, settings)
-    found = [figure for sized in record.sizes.values() for figure in held(sized)]
+    found = [figure for sized in record.sizes.values() for figure in apply_targets(sized)]
     missed = [figure for figure in found if figure.holds is False]
     world.out.write(f"\n{len(found)} figures, {len(missed)} missed; {out / 'scale.json'}, {out / 'scale.svg'}\n")
     if world.is_stopped():
-        return ENDED
-    return MISSED if missed or any(sized.violations for sized in record.sizes.values()) else 0
+        return EXIT_INTERRUPTED
+    return EXIT_MISSED if missed or any(sized.violations for sized in record.sizes.values()) else 0
 
 
-def held(sized: Sized) -> list[Figure]:
+def apply_targets(sized: SizeResult) -> list[Metric]:
     """Return the figures of one size with the targets for that size."""
-    targets = {curve.figure: curve.target(sized.nodes) for curve in CURVES}
-    return [figure.against(targets.get(figure.name)) for figure in sized.figures]
+    targets = {curve.metric: curve.get_target(sized.nodes) for curve in CURVES}
+    return [figure.with_target(targets.get(figure.name)) for figure in sized.metrics]
 
 
-def points(sizes: Mapping[int, Sized]) -> dict[str, list[tuple[int, float]]]:
+def collect_points(sizes: Mapping[int, SizeResult]) -> dict[str, list[tuple[int, float]]]:
     """Return the values of each figure at the measured sizes, by name."""
     found: dict[str, list[tuple[int, float]]] = {}
     for nodes in sorted(sizes):
-        for figure in sizes[nodes].figures:
+        for figure in sizes[nodes].metrics:
             if figure.value is not None and math.isfinite(figure.value):
                 found.setdefault(figure.name, []).append((nodes, figure.value))
     return found
 
 
-def _draw(out: Path, sizes: Mapping[int, Sized], settings: SurveySettings) -> None:
+def _draw(out: Path, sizes: Mapping[int, SizeResult], settings: SurveySettings) -> None:
     measured = ", ".join(f"{nodes:,}" for nodes in sorted(sizes))
     note = f"seed {settings.seed}; measured at {measured} nodes, all in one process in virtual time"
-    (out / "scale.svg").write_text(drawn(CURVES, points(sizes), note), encoding="utf-8")
-    (out / "table.md").write_text(f"# Scale: the figures\n\n{page(CURVES, points(sizes))}", encoding="utf-8")
+    (out / "scale.svg").write_text(draw_svg(CURVES, collect_points(sizes), note), encoding="utf-8")
+    (out / "table.md").write_text(
+        f"# Scale: the figures\n\n{format_markdown(CURVES, collect_points(sizes))}", encoding="utf-8"
+    )
 
 
 def _say(world: Environment, line: str) -> None:
@@ -103,18 +109,18 @@ def _say(world: Environment, line: str) -> None:
     world.err.flush()
 
 
-def _sizes(text: str) -> list[int]:
+def _parse_sizes(text: str) -> list[int]:
     try:
         sizes = [int(word) for word in text.split(",")]
     except ValueError:
         sizes = []
-    if not sizes or not all(LEAST <= nodes <= MOST for nodes in sizes):
-        problem = f"must be numbers from {LEAST} to {MOST:,}, is {text!r}"
+    if not sizes or not all(MIN_NODES <= nodes <= MAX_NODES for nodes in sizes):
+        problem = f"must be numbers from {MIN_NODES} to {MAX_NODES:,}, is {text!r}"
         raise BadSetting("command line", "--nodes", problem, f"write --nodes {SIZES}")
     return sorted(set(sizes))
 
 
-def _parsed(arguments: Sequence[str]) -> argparse.Namespace:
+def _parse_arguments(arguments: Sequence[str]) -> argparse.Namespace:
     default = SurveySettings()
     parser = argparse.ArgumentParser(prog="sim scale", description=__doc__)
     parser.add_argument("--nodes", default=SIZES, help="the sizes, separated by commas (default %(default)s)")

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-from sim.team.figure import Bound
+from sim.team.metric import Bound
 from sim.team.scale import theory
 from sim.team.scale.theory import Published, Theory
 
@@ -14,32 +14,32 @@ from sim.team.scale.theory import Published, Theory
 class Curve:
     """``figure`` under ``title`` in ``unit``; ``bound`` is its target, and ``at`` has other targets for some sizes."""
 
-    figure: str
+    metric: str
     title: str
     unit: str
     theory: Theory | None = None
-    says: str = ""
+    theory_label: str = ""
     """A description of the theoretical curve."""
     is_limit: bool = False
     """Whether the theoretical curve is the target."""
     bound: Bound | None = None
-    since: int = 0
+    min_nodes: int = 0
     """Number of nodes from which on the target applies."""
-    at: tuple[tuple[int, Bound], ...] = ()
+    bounds_by_size: tuple[tuple[int, Bound], ...] = ()
     published: Sequence[Published] = ()
 
-    def target(self, nodes: int) -> Bound | None:
+    def get_target(self, nodes: int) -> Bound | None:
         """Return the target for a team of that size."""
         if self.is_limit and self.theory is not None:
             return Bound(self.theory(nodes))
-        return dict(self.at).get(nodes, self.bound if nodes >= self.since else None)
+        return dict(self.bounds_by_size).get(nodes, self.bound if nodes >= self.min_nodes else None)
 
 
-LARGE = 1000
+LARGE_NODES = 1000
 """Number of nodes from which on the targets of cost apply."""
 
 CURVES = (
-    Curve("lookups.success", "Lookups that find their node within 4 s", "share", bound=Bound(0.999, most=False)),
+    Curve("lookups.success", "Lookups that find their node within 4 s", "share", bound=Bound(0.999, is_maximum=False)),
     Curve("lookups.hops.mean", "Hops of a lookup", "hops", theory.hops, "log2(n) / 2, the most that is wanted", True),
     Curve(
         "lookups.reached.p50",
@@ -52,22 +52,28 @@ CURVES = (
         ),
     ),
     Curve("lookups.seconds.p50", "... until all of the k closest have answered", "s"),
-    Curve("lookups.exact", "Lookups with exactly the k closest, in quiet", "share", bound=Bound(1.0, most=False)),
+    Curve("lookups.exact", "Lookups with exactly the k closest, in quiet", "share", bound=Bound(1.0, is_maximum=False)),
     Curve("traffic.datagrams", "Datagrams sent by a node, in quiet", "a second"),
     Curve(
         "traffic.bytes",
         "Bytes sent by a node, in quiet",
         "B/s",
         bound=Bound(200.0),
-        since=LARGE,
+        min_nodes=LARGE_NODES,
         published=(
             Published(1000, 900.0, "Bamboo, sessions of 1.4 min, Rhea et al. 2004"),
             Published(5000, 300.0, "Kademlia in OverSim, Heep 2010"),
         ),
     ),
     Curve("traffic.contacts", "Contacts of a node", "contacts", theory.contacts, "k out of each half of the ids"),
-    Curve("traffic.memory", "Memory of a node, simulated", "KiB", bound=Bound(200.0), since=LARGE),
-    Curve("traffic.cpu", "Processor of a node, simulated, in quiet", "ms a second", bound=Bound(0.5), since=LARGE),
+    Curve("traffic.memory", "Memory of a node, simulated", "KiB", bound=Bound(200.0), min_nodes=LARGE_NODES),
+    Curve(
+        "traffic.cpu",
+        "Processor of a node, simulated, in quiet",
+        "ms a second",
+        bound=Bound(0.5),
+        min_nodes=LARGE_NODES,
+    ),
     Curve(
         "auctions.agree.p95",
         "One task for all: seconds until 95 % of the agents agree, 10 % loss",
@@ -75,9 +81,9 @@ CURVES = (
         theory.agreement,
         "rounds of the simulation in docs/explanation/choosing-a-robot.md",
         bound=Bound(1.0),
-        at=((100, Bound(0.6)), (1000, Bound(0.8))),
+        bounds_by_size=((100, Bound(0.6)), (1000, Bound(0.8))),
     ),
-    Curve("auctions.right", "... the share of agents that is right", "share", bound=Bound(0.99, most=False)),
+    Curve("auctions.right", "... the share of agents that is right", "share", bound=Bound(0.99, is_maximum=False)),
     Curve(
         "auctions.messages",
         "... datagrams sent by an agent",
@@ -85,7 +91,7 @@ CURVES = (
         theory.tree,
         "4 (n - 1) / n: a tree, without loss",
         bound=Bound(6.0),
-        at=((3, Bound(10.0)), (10, Bound(10.0)), (30, Bound(10.0))),
+        bounds_by_size=((3, Bound(10.0)), (10, Bound(10.0)), (30, Bound(10.0))),
         published=(Published(100, 4.6, "acknowledged tree, simulated"),),
     ),
     Curve(
@@ -112,7 +118,7 @@ CURVES = (
         theory.share,
         "k / n: spread evenly",
         bound=Bound(0.01),
-        since=LARGE,
+        min_nodes=LARGE_NODES,
     ),
     Curve("directory.seconds.p50", "... seconds until somebody has listed all devices", "s"),
 )

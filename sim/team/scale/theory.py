@@ -19,7 +19,7 @@ class Published(NamedTuple):
 
     nodes: int
     value: float
-    who: str
+    source: str
 
 
 def hops(nodes: float) -> float:
@@ -44,20 +44,20 @@ def tree(nodes: float) -> float:
     return 4 * (nodes - 1) / nodes
 
 
-ROUND = 0.03
+ROUND_S = 0.03
 """Mean one-way delay in seconds on the link of these simulations."""
 _ROUNDS = {3: 3.2, 10: 5.8, 30: 10, 100: 15, 300: 19, 1000: 24, 3000: 29, 10_000: 32.5}
-_HOT = {3: 6, 10: 20, 30: 46, 100: 72, 300: 101, 1000: 126, 3000: 152, 10_000: 183}
+_BUSIEST = {3: 6, 10: 20, 30: 46, 100: 72, 300: 101, 1000: 126, 3000: 152, 10_000: 183}
 
 
 def agreement(nodes: float) -> float:
     """Return seconds until all agree at 10 % loss, by simulated rounds of bids along Kademlia's hops."""
-    return ROUND * _between(_ROUNDS, nodes)
+    return ROUND_S * _interpolate(_ROUNDS, nodes)
 
 
 def busiest(nodes: float) -> float:
     """Return the messages at the busiest node of the same simulation, without loss."""
-    return _between(_HOT, nodes)
+    return _interpolate(_BUSIEST, nodes)
 
 
 def takeover(nodes: float) -> float:
@@ -70,7 +70,7 @@ def share(nodes: float) -> float:
     return min(1.0, K / nodes)
 
 
-def _between(known: Mapping[int, float], nodes: float) -> float:
+def _interpolate(known: Mapping[int, float], nodes: float) -> float:
     """Interpolate between the known sizes by the logarithm of the size."""
     sizes = sorted(known)
     for low, high in zip(sizes, sizes[1:], strict=False):

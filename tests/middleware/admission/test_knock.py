@@ -12,10 +12,10 @@ from hypothesis import strategies as st
 from nacl import bindings
 from twisted.trial.unittest import SynchronousTestCase
 
-from middleware.admission import knock
-from middleware.admission.certificate import ROOM, is_proof
-from middleware.admission.code import Code, TermsContent, seal_terms
-from middleware.admission.knock import Hint, Reply, Signer, Welcome
+from middleware.admission import join_codec
+from middleware.admission.certificate import MAX_CERTIFICATE_BYTES, is_join_signature
+from middleware.admission.code import JoinCode, TermsContent, seal_terms
+from middleware.admission.join_codec import JoinReply, Signer, UnsignedRefusal, VerifiedReply
 from middleware.entangled.contact import Contact
 from middleware.entangled.errors import Forged, Malformed
 from middleware.entangled.network.network import Address
@@ -27,38 +27,38 @@ DOG = identity("dog").public
 SECRET = bytes(range(32))
 EPHEMERAL = bindings.crypto_scalarmult_base(SECRET)
 CONTACTS = tuple(Contact(identity(str(n)).public, Address("2001:db8::" + "1234:" * 3 + str(n), 7000)) for n in range(8))
-WELCOME = Welcome(b"p" * ROOM, ((2, b"s" * 32, 9), (1, b"t" * 32, 0)), CONTACTS)
+WELCOME = JoinReply(b"p" * MAX_CERTIFICATE_BYTES, ((2, b"s" * 32, 9), (1, b"t" * 32, 0)), CONTACTS)
 CONTENT = TermsContent(OPERATOR.public, "yard", {"lan": True})
-HEARD = knock.Knock(DOG, EPHEMERAL, "dog", b"")
+HEARD = join_codec.JoinRequest(DOG, EPHEMERAL, "dog", b"")
 
 
-def signer(name: str = "vaio", role: str = "bootstrap", code: Code = CODE) -> Signer:
+def signer(name: str = "vaio", role: str = "bootstrap", code: JoinCode = CODE) -> Signer:
     """Return the node ``name``, which answers with the terms of ``code``."""
     return Signer(identity(name), granted(OPERATOR, name, role), seal_terms(code, CONTENT, random.Random(3)))
 
 
 def welcomed(by: Signer | None = None) -> bytes:
     """Return a join reply (WELCOME), valid unless ``by`` is another node."""
-    return knock.welcome(INVITE.public, HEARD, WELCOME, by or signer(), random.Random(2))
+    return join_codec.make_reply(INVITE.public, HEARD, WELCOME, by or signer(), random.Random(2))
 
 
-def read(datagram: bytes, code: Code = CODE, secret: bytes = SECRET) -> Reply | Hint:
+def read(datagram: bytes, code: JoinCode = CODE, secret: bytes = SECRET) -> VerifiedReply | UnsignedRefusal:
     """Return the reply as the newcomer decodes it."""
-    return knock.opened_welcome(datagram, code, DOG, secret)
+    return join_codec.open_reply(datagram, code, DOG, secret)
 
 
 def knocked(wish: str = "dog") -> bytes:
-    return knock.knock(CODE.key, DOG, EPHEMERAL, wish, random.Random(1))
+    return join_codec.make_request(CODE.key, DOG, EPHEMERAL, wish, random.Random(1))
 
 
 class KnockTests(SynchronousTestCase):
     def test_knock_is_read_as_it_was_said(self) -> None:
         """A bootstrap node that knows the invitation decodes the newcomer's key, wish and proof."""
         said = knocked()
-        found = knock.opened_knock(said, INVITE.public)
-        self.assertEqual((found.public, found.ephemeral, found.wish), (DOG, EPHEMERAL, "dog"))
-        self.assertTrue(is_proof(INVITE.public, DOG, "dog", found.proof))
-        self.assertFalse(is_proof(INVITE.public, DOG, "cat", found.proof))
+        found = join_codec.open_request(said, INVITE.public)
+        self.assertEqual((found.public, found.ephemeral, found.requested_name), (DOG, EPHEMERAL, "dog"))
+        self.assertTrue(is_join_signature(INVITE.public, DOG, "dog", found.proof))
+        self.assertFalse(is_join_signature(INVITE.public, DOG, "cat", found.proof))
 
     def test_knock_hides_who_comes(self) -> None:
         """A join request (KNOCK) reveals neither key nor name, and always has the maximum size of a datagram."""
@@ -69,20 +69,22 @@ class KnockTests(SynchronousTestCase):
     def test_welcome_is_read_as_it_was_given(self) -> None:
         """The newcomer decodes the join reply; a full reply drops contacts to stay smaller than the request."""
         said = welcomed()
-        self.assertLessEqual(len(said), knock.KNOCK_BYTES)
+        self.assertLessEqual(len(said), join_codec.JOIN_REQUEST_BYTES)
         found = read(said)
-        assert isinstance(found, Reply) and isinstance(found.said, Welcome)
-        self.assertEqual((found.said.shown, found.said.secrets), (b"p" * ROOM, WELCOME.secrets))
+        assert isinstance(found, VerifiedReply) and isinstance(found.content, JoinReply)
+        self.assertEqual(
+            (found.content.certificate, found.content.secrets), (b"p" * MAX_CERTIFICATE_BYTES, WELCOME.secrets)
+        )
         self.assertEqual(found.terms, CONTENT)
-        self.assertEqual(found.said.contacts, CONTACTS[: len(found.said.contacts)])
-        self.assertGreater(len(found.said.contacts), 1)
+        self.assertEqual(found.content.contacts, CONTACTS[: len(found.content.contacts)])
+        self.assertGreater(len(found.content.contacts), 1)
 
     def test_welcome_is_for_one(self) -> None:
         """A join reply cannot be decrypted with another ephemeral key, code or newcomer."""
         other = invited(OPERATOR, seed=2)[0]
         self.assertRaises(Forged, read, welcomed(), CODE, b"x" * 32)
         self.assertRaises(Forged, read, welcomed(), other)
-        self.assertRaises(Forged, knock.opened_welcome, welcomed(), CODE, identity("cat").public, SECRET)
+        self.assertRaises(Forged, join_codec.open_reply, welcomed(), CODE, identity("cat").public, SECRET)
 
     def test_only_a_bootstrap_node_answers(self) -> None:
         """A reply from a member without the role bootstrap, or with the terms of another code, is forged."""
@@ -93,11 +95,11 @@ class KnockTests(SynchronousTestCase):
     def test_refusals_have_names(self) -> None:
         """A refusal arrives with its code, an unrecognized code as "unknown"; a hint is decoded as a hint."""
         for code, meant in (("used", "used"), ("silly", "unknown")):
-            said = knock.refusal(INVITE.public, HEARD, code, signer(), random.Random(2))
-            self.assertEqual(read(said), Reply(CONTENT, meant))
-        name = knock.id_of(knocked())
+            said = join_codec.make_refusal(INVITE.public, HEARD, code, signer(), random.Random(2))
+            self.assertEqual(read(said), VerifiedReply(CONTENT, meant))
+        name = join_codec.read_invitation_id(knocked())
         for code, meant in (("", "unknown"), ("role", "role"), ("silly", "unknown")):
-            self.assertEqual(read(knock.hint(name, code)), Hint(meant))
+            self.assertEqual(read(join_codec.make_unsigned_refusal(name, code)), UnsignedRefusal(meant))
 
     @given(st.integers(0, 1399), st.integers(1, 255), st.binary(max_size=1400))
     @settings(max_examples=200, deadline=None)
@@ -105,8 +107,8 @@ class KnockTests(SynchronousTestCase):
         """Random bytes and datagrams with one changed byte raise ``Forged`` or ``Malformed``."""
         said = bytearray(knocked())
         said[place] ^= change
-        self.assertRaises((Forged, Malformed), knock.opened_knock, bytes(said), INVITE.public)
-        self.assertRaises((Forged, Malformed), knock.opened_knock, b"\x17" + junk, INVITE.public)
+        self.assertRaises((Forged, Malformed), join_codec.open_request, bytes(said), INVITE.public)
+        self.assertRaises((Forged, Malformed), join_codec.open_request, b"\x17" + junk, INVITE.public)
         given = bytearray(welcomed())
         given[1 + place % (len(given) - 1)] ^= change
         self.assertRaises((Forged, Malformed), read, bytes(given))
@@ -115,8 +117,8 @@ class KnockTests(SynchronousTestCase):
     @settings(max_examples=200, deadline=None)
     def test_a_bootstrap_node_may_sign_anything(self, body: object) -> None:
         """A signed reply with any other content is a refusal or raises ``Malformed``."""
-        whole = knock._sign_body(INVITE.public, HEARD, msgpack.packb(body), signer())
-        said = knock._encrypt_reply(INVITE.public, EPHEMERAL, whole, random.Random(2))
+        whole = join_codec._sign_body(INVITE.public, HEARD, msgpack.packb(body), signer())
+        said = join_codec._encrypt_reply(INVITE.public, EPHEMERAL, whole, random.Random(2))
         with contextlib.suppress(Malformed):
             found = read(said)
-            self.assertTrue(isinstance(found, Reply) and isinstance(found.said, str))
+            self.assertTrue(isinstance(found, VerifiedReply) and isinstance(found.content, str))

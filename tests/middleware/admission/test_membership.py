@@ -18,7 +18,7 @@ from tests.middleware.admission.paper import NOW, operator
 class MembershipTests(SynchronousTestCase):
     def setUp(self) -> None:
         self.path = Path(self.mktemp())
-        self.membership = operator().founded("vaio", ("device", "bootstrap"), NOW, random.Random(1))
+        self.membership = operator().create_membership("vaio", ("device", "bootstrap"), NOW, random.Random(1))
 
     def refusal(self, path: Path) -> str:
         """Return the error for the membership file at ``path``."""
@@ -26,16 +26,16 @@ class MembershipTests(SynchronousTestCase):
 
     def test_read_as_it_was_kept(self) -> None:
         """A membership is unchanged after a write and a read, and its file is readable by its owner alone."""
-        membership.made(self.path, self.membership)
+        membership.create_membership_file(self.path, self.membership)
         self.assertEqual(MembershipFile(self.path).membership, self.membership)
         self.assertEqual(self.path.stat().st_mode & 0o777, 0o600)
 
     def test_what_is_no_membership(self) -> None:
         """A missing file, other content, another kind and another team's certificate are refused with the path."""
         self.assertIn("cannot be read", self.refusal(self.path))
-        foreign = operator(2).founded("vaio", ("device",), NOW, random.Random(1))
-        wrong = self.membership.packed() | {"pass": foreign.shown.hex()}
-        for content in (wrong, {"kind": "other"}, self.membership.packed() | {"secrets": []}):
+        foreign = operator(2).create_membership("vaio", ("device",), NOW, random.Random(1))
+        wrong = self.membership.to_json() | {"pass": foreign.certificate.hex()}
+        for content in (wrong, {"kind": "other"}, self.membership.to_json() | {"secrets": []}):
             keyfile.write(self.path, content)
             self.assertIn(str(self.path), self.refusal(self.path))
         self.path.write_text("not JSON")
@@ -43,21 +43,22 @@ class MembershipTests(SynchronousTestCase):
 
     def test_nothing_is_overwritten(self) -> None:
         """Creating a key file over an existing one is refused, which protects a team's key from a mistake."""
-        operators.made(self.path, operator())
-        self.assertRaises(BadKeyFile, operators.made, self.path, operator(2))
-        self.assertEqual(operators.load(self.path), operator())
+        operators.create_operator_file(self.path, operator())
+        self.assertRaises(BadKeyFile, operators.create_operator_file, self.path, operator(2))
+        self.assertEqual(operators.load_operator(self.path), operator())
 
     def test_replaced_whole(self) -> None:
         """A new secret replaces the file and leaves no temporary file; an unwritable folder is reported."""
-        membership.made(self.path, self.membership)
+        membership.create_membership_file(self.path, self.membership)
         kept = MembershipFile(self.path)
-        kept.keep(self.membership.with_secret(2, b"2" * 32, NOW + 60))
+        kept.save(self.membership.with_secret(2, b"2" * 32, NOW + 60))
         self.assertEqual(MembershipFile(self.path).membership, kept.membership)
         leftover = [name for name in os.listdir(self.path.parent) if name.startswith(f".{self.path.name}")]
         self.assertEqual(leftover, [])
         nowhere = Path(self.mktemp()) / "folder" / "file"
         self.assertIn(
-            "cannot be written", str(self.assertRaises(BadKeyFile, membership.made, nowhere, kept.membership))
+            "cannot be written",
+            str(self.assertRaises(BadKeyFile, membership.create_membership_file, nowhere, kept.membership)),
         )
 
     def test_old_secrets_run_out(self) -> None:
@@ -68,6 +69,6 @@ class MembershipTests(SynchronousTestCase):
             held: Membership = self.membership
             for each in order:
                 held = held.with_secret(*each)
-            self.assertEqual([s for _, s, _ in held.accepted(NOW)], [third[1], second[1], first])
-            self.assertEqual([s for _, s, _ in held.accepted(NOW + 60)], [third[1], second[1]])
-            self.assertEqual([s for _, s, _ in held.accepted(NOW + 90)], [third[1]])
+            self.assertEqual([s for _, s, _ in held.list_accepted_secrets(NOW)], [third[1], second[1], first])
+            self.assertEqual([s for _, s, _ in held.list_accepted_secrets(NOW + 60)], [third[1], second[1]])
+            self.assertEqual([s for _, s, _ in held.list_accepted_secrets(NOW + 90)], [third[1]])

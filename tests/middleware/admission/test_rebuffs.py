@@ -5,14 +5,14 @@ from __future__ import annotations
 from twisted.logger import capturedLogs, formatEvent
 
 from middleware.admission.errors import NotWelcome
-from middleware.entangled.wire.rebuff import Rebuff
+from middleware.entangled.wire.rejection import Rejection
 from tests.middleware.admission.village import House, VillageCase
 
 
 class RebuffTests(VillageCase):
-    def met(self, house: House, side: str) -> list[Rebuff]:
+    def met(self, house: House, side: str) -> list[Rejection]:
         """Return the refusals that ``house`` logged for ``side``."""
-        now = house.node.endpoint.rebuffs.newest(1e9, 1e10)
+        now = house.node.endpoint.rejections.list_recent(1e9, 1e10)
         return [each for each in now if each.side == side]
 
     def test_revoked_member(self) -> None:

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from twisted.internet.defer import Deferred, succeed
 
-from middleware.admission.certificate import member_of
-from middleware.admission.renewal import BATCH
-from middleware.admission.statement import YEAR
+from middleware.admission.certificate import verify_certificate
+from middleware.admission.renewal import MAX_RENEWALS_PER_SCAN
+from middleware.admission.statement import DEFAULT_LIFE_S
 from tests.middleware.admission.village import DAY, House, Village, VillageCase
 
 STEP_DAYS, STEP_S = 5, 12.0
@@ -24,7 +24,7 @@ class Years(Village):
 
     def end_of(self, house: House, at: int = 0) -> int:
         """Return the expiry of the certificate of ``house`` in the list of node number ``at``."""
-        member = self.houses[at].team.door.member(house.public)
+        member = self.houses[at].team.admission.find_member(house.public)
         assert member is not None
         return member.not_after
 
@@ -58,7 +58,7 @@ class YearAndAHalfTests(YearsCase):
         self.assertEqual([years.members(place) for place in range(4)], [["boot1", "cat", "dog", "vaio"]] * 4)
         self.assertEqual([house.public for house in years.houses], publics)
         for house in (vaio, boot, dog, cat):
-            self.assertGreater(years.end_of(house), years.wall() + YEAR / 3 - 20 * DAY)
+            self.assertGreater(years.end_of(house), years.wall() + DEFAULT_LIFE_S / 3 - 20 * DAY)
             self.assertEqual(self.refusal(years, house.node.call, years.houses[(house.place + 1) % 4], 3.0), "")
         self.assertEqual(self.refusal(years, pig.node.call, vaio, 3.0), "revoked")
 
@@ -73,7 +73,7 @@ class YearAndAHalfTests(YearsCase):
             years.open(house)
         years.live(250)
         self.assertEqual(years.members(1), ["cat", "cow", "dog", "pig", "vaio"])
-        self.assertEqual(years.houses[0].team.door.me.renewer, years.houses[0].public)
+        self.assertEqual(years.houses[0].team.admission.me.renewer, years.houses[0].public)
 
     def test_a_bootstrap_node_is_gone_for_good(self) -> None:
         """If one of two bootstrap nodes is lost, the other one renews all members and itself."""
@@ -92,10 +92,10 @@ class LargeTeamTests(YearsCase):
         vaio, dog, cat = years.houses[:3]
         years.close(cat, is_sudden=True)
         overlay = vaio.node.overlay
-        self.patch(overlay, "contact", lambda node_id: None)
+        self.patch(overlay, "find_contact", lambda node_id: None)
         answers: list[bool] = []
         for house in (dog, cat):
-            member = vaio.team.door.member(house.public)
+            member = vaio.team.admission.find_member(house.public)
             assert member is not None
             Deferred.fromCoroutine(vaio.team._is_reachable(member)).addCallback(answers.append)
             years.run(20.0)
@@ -107,18 +107,18 @@ class BatchTests(YearsCase):
     def test_a_few_at_once(self) -> None:
         """A bootstrap node signs at most ``BATCH`` renewals at a time, and continues until all are renewed."""
         years = self.years(bootstraps=1)
-        for number in range(BATCH + 3):
+        for number in range(MAX_RENEWALS_PER_SCAN + 3):
             years.tell(years.signer.grant(bytes([number]) * 32, f"p{number}", ("device",), years.wall()))
         team = years.houses[0].team
         self.patch(team, "_may_be_reachable", lambda member: True)
         self.patch(team, "_is_reachable", lambda member: succeed(True))
         years.days += 300
         years.run(6.0)
-        before = len([each for each in team.members() if each.renewer])
-        self.assertEqual(before, BATCH)
+        before = len([each for each in team.list_members() if each.renewer])
+        self.assertEqual(before, MAX_RENEWALS_PER_SCAN)
         years.days += 1
         years.run(6.0)
-        self.assertEqual({bool(each.renewer) for each in team.members()}, {True})
+        self.assertEqual({bool(each.renewer) for each in team.list_members()}, {True})
 
 
 class SleeperTests(YearsCase):
@@ -135,7 +135,7 @@ class SleeperTests(YearsCase):
         before = dog.kept.membership
         self.slept(years, dog)
         self.assertNotIn("dog", years.members())
-        known = [(each.name, why) for each, why in vaio.team.roll.remembered(years.wall()) if why]
+        known = [(each.name, why) for each, why in vaio.team.membership_list.list_known_members(years.wall()) if why]
         self.assertEqual(known, [("dog", "expired")])
         years.open(dog)
         years.run(10.0)
@@ -146,8 +146,10 @@ class SleeperTests(YearsCase):
         years.tell(years.signer.grant(dog.public, "dog", ("device",), years.wall()))
         years.run(30.0)
         self.assertEqual(self.refusal(years, dog.node.call, cat, 3.0), "")
-        self.assertEqual((dog.name, dog.team.door.me.trouble(years.wall())), ("dog", ""))
-        self.assertGreater(member_of(before.operator, dog.public, dog.kept.membership.shown).not_after, years.wall())
+        self.assertEqual((dog.name, dog.team.admission.me.check_dates(years.wall())), ("dog", ""))
+        self.assertGreater(
+            verify_certificate(before.operator, dog.public, dog.kept.membership.certificate).not_after, years.wall()
+        )
         self.assertEqual(years.members(dog.place), years.members())
 
     def test_renewed_while_it_sleeps(self) -> None:

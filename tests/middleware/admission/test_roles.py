@@ -18,24 +18,24 @@ from middleware.admission.roles import (
     OTHER,
     ROLES,
     VIEWER,
-    kind_of,
+    classify_slot,
     may_call,
     may_store,
 )
 from middleware.config.settings import Settings
-from middleware.consensus import verdict
+from middleware.consensus import decision_record
 from middleware.deployment.manifest import manifests_key
 from middleware.directory import presence
-from middleware.directory.prefix import places_of
+from middleware.directory.prefix import compute_places
 from middleware.entangled.identity import Identity
-from middleware.entangled.record import Slot, hashed_key
-from middleware.entangled.wire.door import Authority, OpenDoor
+from middleware.entangled.record import Slot, hash_key
+from middleware.entangled.wire.admission_check import Authority, OpenAdmission
 from middleware.node import SwarmNode
-from middleware.stop import halt
+from middleware.stop import stop_state
 from middleware.tasks import task as tasks
-from sim.demo.trials import trial
+from sim.demo.trials import run_trial
 from swarmnode import assembly, deploy
-from swarmnode.rehearsal import VirtualTeam
+from swarmnode.simulated_team import SimulatedTeam
 from tests.swarmnode.team import KEY, World
 from webnode import revocation
 
@@ -43,23 +43,23 @@ ABSENT = ("roll.", "reach.")
 """Prefixes of the methods that not every node exposes."""
 
 
-class RoleDoor(OpenDoor):
+class RoleDoor(OpenAdmission):
     """Admits every node, with ``roles`` by public key; ``refusals`` collects the denied calls and writes."""
 
     def __init__(self, known: dict[bytes, tuple[str, ...]], refusals: list[tuple[tuple[str, ...], str]]) -> None:
         self._known = known
         self._refusals = refusals
 
-    def may(self, public: bytes, method: str) -> bool:
+    def may_call(self, public: bytes, method: str) -> bool:
         return self._noted(may_call(self._known[public], method), public, method)
 
     def may_store(self, slot: Slot) -> bool:
-        return self._noted(may_store(self._known[slot.owner], slot), slot.owner, kind_of(slot))
+        return self._noted(may_store(self._known[slot.owner], slot), slot.owner, classify_slot(slot))
 
-    def may_stay(self, slot: Slot) -> bool:
+    def may_keep(self, slot: Slot) -> bool:
         return may_store(self._known[slot.owner], slot)
 
-    def authority(self, owner: bytes) -> Authority:
+    def find_authority(self, owner: bytes) -> Authority:
         return Authority("", self._known[owner])
 
     def _noted(self, is_allowed: bool, public: bytes, what: str) -> bool:
@@ -82,10 +82,10 @@ class TableTests(SynchronousTestCase):
             "faults": {"allow": True},
             "deployment": {"allow": True},
         }
-        made = assembly.assembled(Settings.from_mapping(tables, "test"), World().seams("a", 7000))
+        made = assembly.assemble_node(Settings.from_mapping(tables, "test"), World().seams("a", 7000))
         node = made.node
-        _ = node.entangled.seat, node.councils, node.dissemination
-        return set(node.entangled.endpoint._answerer.methods)
+        _ = node.entangled.take_acceptor, node.council_manager, node.auction_service
+        return set(node.entangled.endpoint._dispatcher.methods)
 
     def test_every_method_has_an_entry(self) -> None:
         """Each exposed method has an entry in the table, and each entry has an exposed method."""
@@ -105,21 +105,21 @@ class TableTests(SynchronousTestCase):
         keys = {
             presence.DEVICES: roles.PRESENCE,
             tasks.TASKS: roles.TASKS,
-            halt.HALT: roles.HALT,
+            stop_state.STOPS_KEY: roles.HALT,
             manifests_key(): roles.DEPLOYMENTS,
-            revocation.REVOKED: roles.SIGNED_OUT,
+            revocation.REVOKED_KEY: roles.SIGNED_OUT,
         }
         for key, kind in keys.items():
             for name in ("x", "order", "member"):
-                self.assertEqual(kind_of(slot(key, name)), kind)
+                self.assertEqual(classify_slot(slot(key, name)), kind)
 
     def test_presence_in_a_large_team(self) -> None:
         """In a large team a viewer writes its presence under its own directory prefixes only."""
         own, other = Identity(bytes(32)), Identity(b"1" * 32)
         for depth in range(presence.MAX_DEPTH + 1):
-            for key in places_of(own.node_id, depth):
+            for key in compute_places(own.node_id, depth):
                 self.assertTrue(may_store([VIEWER], Slot(key, own.public, "phone")))
-        strange = [key for key in places_of(other.node_id, 9) if key not in places_of(own.node_id, 9)]
+        strange = [key for key in compute_places(other.node_id, 9) if key not in compute_places(own.node_id, 9)]
         self.assertEqual([may_store([VIEWER], Slot(key, own.public, "phone")) for key in strange], [False] * 2)
 
     def test_kinds_by_name(self) -> None:
@@ -131,13 +131,13 @@ class TableTests(SynchronousTestCase):
             tasks.ORDER: roles.ORDER,
             tasks.COUNCIL: roles.COUNCIL,
             tasks.DONE: roles.ENDED,
-            verdict.slot_of(7): roles.VERDICT,
-            deploy.SOURCE: roles.SOURCE,
+            decision_record.make_slot_name(7): roles.DECISION_RECORD,
+            deploy.SOURCE_SLOT: roles.SOURCE,
             "0": OTHER,
             "orders": OTHER,
             "": OTHER,
         }
-        self.assertEqual({name: kind_of(slot(key, name)) for name in names}, names)
+        self.assertEqual({name: classify_slot(slot(key, name)) for name in names}, names)
 
     def test_a_viewer_changes_nothing(self) -> None:
         """A viewer publishes its presence and reads; it cannot act, order, bid or write anything else."""
@@ -161,9 +161,9 @@ class TableTests(SynchronousTestCase):
             self.assertEqual([role for role in ROLES if may_call((role,), method)], [OPERATOR, GATEWAY])
         for method in ("lease.propose", "lease.close"):
             self.assertEqual([role for role in ROLES if may_call((role,), method)], [DEVICE, GATEWAY])
-        for written in (slot(tasks.TASKS), slot(tasks.group_key("t"), tasks.RESULT), slot(halt.HALT)):
+        for written in (slot(tasks.TASKS), slot(tasks.group_key("t"), tasks.RESULT), slot(stop_state.STOPS_KEY)):
             self.assertEqual([role for role in ROLES if may_store((role,), written)], [OPERATOR, GATEWAY])
-        self.assertTrue(may_store((BOOTSTRAP,), slot(hashed_key("tuples/admission/2"))))
+        self.assertTrue(may_store((BOOTSTRAP,), slot(hash_key("tuples/admission/2"))))
 
     def test_several_roles_add_up(self) -> None:
         """A member with two roles has the rights of both; a member without roles has none."""
@@ -185,7 +185,7 @@ class TeamTests(SynchronousTestCase):
             return plain(device, identity, *rest, **{**more, "door": RoleDoor(known, refusals)})
 
         self.patch(assembly, "SwarmNode", make)
-        outcome = trial(partial(VirtualTeam, others=("looker",)), 2, 3)
+        outcome = run_trial(partial(SimulatedTeam, others=("looker",)), 2, 3)
         # The council may include the viewer, and its role forbids this method.
         self.assertEqual(set(refusals) - {((VIEWER,), "lease.freed")}, set())
         self.assertEqual((outcome.broken, bool(outcome.found)), ([], True))

@@ -8,9 +8,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from twisted.trial.unittest import SynchronousTestCase
 
-from middleware.admission.certificate import member_of, pass_of, renewed
-from middleware.admission.roll import MAX_SECRETS, Roll, invitation_id, packed_admission
-from middleware.admission.statement import REMEMBERED, YEAR
+from middleware.admission.certificate import renew_certificate, verify_certificate, wrap_grant
+from middleware.admission.membership_list import MAX_SECRETS, MembershipList, invitation_id, pack_admission
+from middleware.admission.statement import DEFAULT_LIFE_S, INVITATION_REMEMBERED_S
 from middleware.entangled.errors import Forged, Malformed
 from tests.middleware.admission.paper import LATER, NOW, admitted, granted, identity, invited, operator, roll
 
@@ -22,9 +22,9 @@ def entries() -> list[bytes]:
     """Return statements of every kind, some of them about the same key."""
     dice = random.Random(1)
     found = [granted(OPERATOR, "vaio", "bootstrap"), OPERATOR.grant(DOG, "dog", ("viewer",), NOW + 1)]
-    found += [granted(OPERATOR, "dog"), invited(OPERATOR)[1], packed_admission(DOG, admitted(OPERATOR, "dog"))]
+    found += [granted(OPERATOR, "dog"), invited(OPERATOR)[1], pack_admission(DOG, admitted(OPERATOR, "dog"))]
     found += [OPERATOR.revoke(DOG, "dog", NOW + n) for n in (5, 4)]
-    return found + [OPERATOR.rotate(n, [DOG], NOW, 60, dice) for n in range(1, MAX_SECRETS + 3)]
+    return found + [OPERATOR.rotate_secret(n, [DOG], NOW, 60, dice) for n in range(1, MAX_SECRETS + 3)]
 
 
 ENTRIES = entries()
@@ -33,15 +33,15 @@ ENTRIES = entries()
 class RollTests(SynchronousTestCase):
     def test_foreign_statements_are_refused(self) -> None:
         """Statements of another operator and random bytes are not added."""
-        mine = Roll(OPERATOR.public)
+        mine = MembershipList(OPERATOR.public)
         self.assertRaises(Forged, mine.add, granted(operator(2), "dog"), NOW)
-        self.assertRaises(Forged, mine.add, packed_admission(DOG, admitted(operator(2), "dog")), NOW)
+        self.assertRaises(Forged, mine.add, pack_admission(DOG, admitted(operator(2), "dog")), NOW)
         self.assertRaises(Malformed, mine.add, b"junk", NOW)
         self.assertEqual((len(mine), mine.digest), (0, bytes(8)))
 
     def test_known_is_not_new(self) -> None:
         """Adding a known statement again returns None, which stops its propagation."""
-        mine = Roll(OPERATOR.public)
+        mine = MembershipList(OPERATOR.public)
         self.assertIsNotNone(mine.add(ENTRIES[0], NOW))
         self.assertIsNone(mine.add(ENTRIES[0], NOW))
 
@@ -49,7 +49,7 @@ class RollTests(SynchronousTestCase):
         """The later of two grants for a key wins in either order; of two revocations the earlier time wins."""
         for order in (ENTRIES, ENTRIES[::-1]):
             mine = roll(OPERATOR, *order)
-            found, revocation = mine.granted(DOG), mine.revoked(DOG)
+            found, revocation = mine.find_grant(DOG), mine.find_revocation(DOG)
             assert found is not None and revocation is not None
             self.assertEqual((found[0].roles, revocation.at), (("viewer",), NOW + 4))
 
@@ -64,48 +64,48 @@ class RollTests(SynchronousTestCase):
     def test_order_of_renewals(self, order: list[int]) -> None:
         """Lists converge for any order of renewals, a later grant and a revocation, once they have been compared."""
         vaio, grant, later = identity("vaio"), granted(OPERATOR, "vaio", "bootstrap"), NOW + 300 * 86_400
-        found = [grant, packed_admission(CAT, admitted(OPERATOR, "cat")), granted(OPERATOR, "dog")]
+        found = [grant, pack_admission(CAT, admitted(OPERATOR, "cat")), granted(OPERATOR, "dog")]
         for name, shown, moment in (
-            ("dog", pass_of(found[2]), later - 99),
-            ("dog", pass_of(found[2]), later),
+            ("dog", wrap_grant(found[2]), later - 99),
+            ("dog", wrap_grant(found[2]), later),
             ("cat", admitted(OPERATOR, "cat"), later),
         ):
             public = identity(name).public
-            again = renewed(vaio, grant, member_of(OPERATOR.public, public, shown), shown, moment)
-            found.append(packed_admission(public, again))
-        found.append(OPERATOR.revoke(VAIO, "vaio", later, [CAT], [(DOG, later - 99 + YEAR)]))
+            again = renew_certificate(vaio, grant, verify_certificate(OPERATOR.public, public, shown), shown, moment)
+            found.append(pack_admission(public, again))
+        found.append(OPERATOR.revoke(VAIO, "vaio", later, [CAT], [(DOG, later - 99 + DEFAULT_LIFE_S)]))
         mine = roll(OPERATOR, *[found[place] for place in [*order, *order]], now=later)
-        ends = {each.name: each.not_after for each in mine.members(later)}
-        self.assertEqual(ends, {"cat": NOW + YEAR, "dog": later - 99 + YEAR})
+        ends = {each.name: each.not_after for each in mine.list_members(later)}
+        self.assertEqual(ends, {"cat": NOW + DEFAULT_LIFE_S, "dog": later - 99 + DEFAULT_LIFE_S})
         self.assertEqual(mine.digest, roll(OPERATOR, *found, *found, now=later).digest)
 
     def test_revoked_key(self) -> None:
         """A revoked key stays refused, whatever is granted to it later."""
         shown = admitted(OPERATOR, "dog")
-        member = member_of(OPERATOR.public, DOG, shown)
+        member = verify_certificate(OPERATOR.public, DOG, shown)
         mine = roll(OPERATOR, OPERATOR.revoke(DOG, "dog", NOW), OPERATOR.grant(DOG, "dog", ("device",), NOW + 9))
-        self.assertEqual(mine.refusal(member, NOW + 9), "revoked")
-        self.assertEqual(mine.members(NOW + 9), [])
+        self.assertEqual(mine.find_refusal(member, NOW + 9), "revoked")
+        self.assertEqual(mine.list_members(NOW + 9), [])
 
     def test_what_has_run_out_goes(self) -> None:
         """An expired invitation is kept for a week, to name the reason of a refusal, and then deleted."""
         _, packed, invite = invited(OPERATOR)
         mine = roll(OPERATOR, packed)
         name = invitation_id(invite.public)
-        self.assertEqual(mine.expire(NOW + LATER + REMEMBERED - 1), 0)
-        self.assertIsNotNone(mine.invited(name))
-        self.assertEqual(mine.expire(NOW + LATER + REMEMBERED), 1)
-        self.assertEqual((mine.invited(name), mine.digest), (None, bytes(8)))
-        self.assertIsNone(mine.add(packed, NOW + LATER + REMEMBERED))
+        self.assertEqual(mine.expire(NOW + LATER + INVITATION_REMEMBERED_S - 1), 0)
+        self.assertIsNotNone(mine.find_invitation(name))
+        self.assertEqual(mine.expire(NOW + LATER + INVITATION_REMEMBERED_S), 1)
+        self.assertEqual((mine.find_invitation(name), mine.digest), (None, bytes(8)))
+        self.assertIsNone(mine.add(packed, NOW + LATER + INVITATION_REMEMBERED_S))
 
     def test_newest_secrets_stay(self) -> None:
         """The list keeps only the newest secrets of the team."""
-        numbers = [secret.number for secret in roll(OPERATOR, *ENTRIES).secrets()]
+        numbers = [secret.number for secret in roll(OPERATOR, *ENTRIES).list_secrets()]
         self.assertEqual(numbers, [6, 5, 4, 3])
 
     def test_name_of_a_member(self) -> None:
         """A member's roles come from the operator's latest grant, and its admission is kept."""
-        mine = roll(OPERATOR, packed_admission(DOG, admitted(OPERATOR, "dog")))
+        mine = roll(OPERATOR, pack_admission(DOG, admitted(OPERATOR, "dog")))
         mine.add(OPERATOR.grant(DOG, "dog", ("device", "bootstrap"), NOW + 1), NOW)
-        [member] = mine.members(NOW + 2)
+        [member] = mine.list_members(NOW + 2)
         self.assertEqual((member.roles, member.admitter), (("device", "bootstrap"), VAIO))

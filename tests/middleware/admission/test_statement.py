@@ -11,15 +11,15 @@ from hypothesis import strategies as st
 from twisted.trial.unittest import SynchronousTestCase
 
 from middleware.admission.statement import (
-    MAX_LIFE,
-    MAX_SEALED,
+    MAX_LIFE_S,
+    MAX_SECRET_RECIPIENTS,
     Grant,
     Invite,
-    Revoke,
+    Revocation,
     Secret,
-    opened,
-    sealed_secret,
-    signed,
+    open_statement,
+    seal_secret,
+    sign_statement,
 )
 from middleware.entangled.errors import Forged, Malformed
 from tests.middleware.admission.paper import NOW, identity, operator
@@ -27,39 +27,39 @@ from tests.middleware.admission.paper import NOW, identity, operator
 DOG, CAT = identity("dog"), identity("cat")
 GRANT = Grant(DOG.public, "dog", ("device", "bootstrap"), NOW, NOW + 10)
 INVITE = Invite(DOG.public, "dog", ("viewer",), 3, NOW, NOW + 10, 1000)
-REVOKE = Revoke(DOG.public, "dog", NOW, NOW + MAX_LIFE)
+REVOKE = Revocation(DOG.public, "dog", NOW, NOW + MAX_LIFE_S)
 
 
 class StatementTests(SynchronousTestCase):
     def setUp(self) -> None:
         self.operator = operator().identity
-        self.secret = sealed_secret(b"s" * 32, 2, [DOG.public], NOW, 60, random.Random(1))
+        self.secret = seal_secret(b"s" * 32, 2, [DOG.public], NOW, 60, random.Random(1))
 
     def test_each_is_read_as_it_was_signed(self) -> None:
         """Every kind of statement survives packing and unpacking."""
         for each in (GRANT, INVITE, REVOKE, self.secret):
-            self.assertEqual(opened(self.operator.public, signed(self.operator, each)), each)
+            self.assertEqual(open_statement(self.operator.public, sign_statement(self.operator, each)), each)
 
     def test_only_this_operator_counts(self) -> None:
         """Statements of another operator, and statements with any changed bit, are refused."""
-        packed = signed(self.operator, GRANT)
-        self.assertRaises(Forged, opened, operator(2).public, packed)
+        packed = sign_statement(self.operator, GRANT)
+        self.assertRaises(Forged, open_statement, operator(2).public, packed)
         for place in range(len(packed)):
             changed = packed[:place] + bytes([packed[place] ^ 1]) + packed[place + 1 :]
-            self.assertRaises((Forged, Malformed), opened, self.operator.public, changed)
+            self.assertRaises((Forged, Malformed), open_statement, self.operator.public, changed)
 
     def test_secret_opens_for_those_that_stay(self) -> None:
         """The team's new secret can be decrypted only by the members for which it was sealed."""
-        self.assertEqual(self.secret.opened(DOG), b"s" * 32)
-        self.assertIsNone(self.secret.opened(CAT))
-        stolen = Secret(2, NOW, 60, NOW + 100, self.secret.mark, ((CAT.public, self.secret.sealed[0][1]),))
-        self.assertIsNone(stolen.opened(CAT))
+        self.assertEqual(self.secret.decrypt(DOG), b"s" * 32)
+        self.assertIsNone(self.secret.decrypt(CAT))
+        stolen = Secret(2, NOW, 60, NOW + 100, self.secret.fingerprint, ((CAT.public, self.secret.sealed[0][1]),))
+        self.assertIsNone(stolen.decrypt(CAT))
 
     def test_secret_for_many(self) -> None:
         """A secret sealed for the maximum number of members can be signed and read."""
-        keys = [identity(str(number)).public for number in range(MAX_SEALED)]
-        secret = sealed_secret(b"s" * 32, 2**40, keys, NOW, MAX_LIFE, random.Random(1))
-        self.assertEqual(opened(self.operator.public, signed(self.operator, secret)), secret)
+        keys = [identity(str(number)).public for number in range(MAX_SECRET_RECIPIENTS)]
+        secret = seal_secret(b"s" * 32, 2**40, keys, NOW, MAX_LIFE_S, random.Random(1))
+        self.assertEqual(open_statement(self.operator.public, sign_statement(self.operator, secret)), secret)
 
     def test_unlawful_is_not_signed(self) -> None:
         """Invalid statements are refused before signing: empty name, no role, no lifetime, too many uses."""
@@ -73,15 +73,15 @@ class StatementTests(SynchronousTestCase):
             Secret(1, NOW, 1, NOW + 1, bytes(16), ()),
         ]
         for each in wrong:
-            self.assertRaises(ValueError, signed, self.operator, each)
+            self.assertRaises(ValueError, sign_statement, self.operator, each)
 
     def test_one_form_only(self) -> None:
         """A non-canonical encoding of a statement is malformed, otherwise one statement had two digests."""
-        packed = signed(self.operator, REVOKE)
+        packed = sign_statement(self.operator, REVOKE)
         fields = msgpack.unpackb(packed)
         longer = b"\xdc" + len(fields).to_bytes(2) + packed[1:]
         self.assertEqual(msgpack.unpackb(longer), fields)
-        self.assertRaises(Malformed, opened, self.operator.public, longer)
+        self.assertRaises(Malformed, open_statement, self.operator.public, longer)
 
     @given(
         st.binary(max_size=300)
@@ -92,4 +92,4 @@ class StatementTests(SynchronousTestCase):
     @settings(max_examples=400, deadline=None)
     def test_reads_anything(self, packed: bytes) -> None:
         """Any bytes raise ``Malformed`` or ``Forged``, and no other error."""
-        self.assertRaises((Forged, Malformed), opened, operator().public, packed)
+        self.assertRaises((Forged, Malformed), open_statement, operator().public, packed)

@@ -16,7 +16,7 @@ class JoiningTests(VillageCase):
         """A newcomer with a code gets certificate, secret and contacts, and can then exchange messages with members."""
         village = self.village()
         dog = village.welcome("dog")
-        self.assertEqual((dog.name, dog.team.door.me.roles), ("dog", ("device",)))
+        self.assertEqual((dog.name, dog.team.admission.me.roles), ("dog", ("device",)))
         village.run(3.0)
         self.assertEqual(village.members(), ["dog", "vaio"])
         self.assertEqual(self.refusal(village, village.houses[0].node.call, dog), "")
@@ -29,7 +29,7 @@ class JoiningTests(VillageCase):
         for door in (0, 1):
             knocked = village.knock(code, (door,), seed=seed)
             village.run(3.0)
-            passes.append(self.successResultOf(knocked).shown)
+            passes.append(self.successResultOf(knocked).certificate)
         self.assertEqual(passes[0], passes[1])
 
     def test_expired_and_unknown_code(self) -> None:
@@ -73,7 +73,7 @@ class JoiningTests(VillageCase):
         village.run(3.0)
         cat = village.move_in(self.successResultOf(knocked))
         village.run(2.0)
-        self.assertEqual((cat.team.door.me.admitter, village.members()), (dog.public, ["cat", "dog", "vaio"]))
+        self.assertEqual((cat.team.admission.me.admitter, village.members()), (dog.public, ["cat", "dog", "vaio"]))
 
     def test_many_by_one_code(self) -> None:
         """A code for three uses admits three newcomers, named by wish or numbered, without duplicate names."""
@@ -106,15 +106,15 @@ class JoiningTests(VillageCase):
         code = village.invite(uses=2)
         village.run(2.0)
         sides = [[village.address(place) for place in side] for side in ((0, 1, 2), (3, 4))]
-        village.board.partition([*sides[0], *self._newcomers(1, 4)], [*sides[1], *self._newcomers(4, 7)])
-        village.lives = 0
+        village.switchboard.partition([*sides[0], *self._newcomers(1, 4)], [*sides[1], *self._newcomers(4, 7)])
+        village.life_count = 0
         knocks = [village.knock(code, (0,), timeout=8.0) for _ in range(3)]
         knocks += [village.knock(code, (4,), timeout=8.0) for _ in range(3)]
         came: list[str] = []
         for each in knocks:
             each.addCallbacks(lambda found: came.append("in"), lambda no: came.append(no.value.code))
         village.run(10.0)
-        village.board.heal()
+        village.switchboard.heal()
         village.run(10.0)
         more = [village.knock(code, (place,), timeout=8.0) for place in range(5)]
         for each in more:
@@ -137,7 +137,7 @@ class RevocationTests(VillageCase):
         village.run(2.0)
         pupil = village.move_in(self.successResultOf(knocked))
         village.run(2.0)
-        invitation = village.houses[0].team.roll.invites()[0].public
+        invitation = village.houses[0].team.membership_list.list_invitations()[0].public
         village.tell(village.signer.revoke(invitation, "pupil", village.wall()))
         village.run(2.0)
         again = village.knock(code)
@@ -151,8 +151,8 @@ class RotationTests(VillageCase):
         village = self.village()
         houses = [village.houses[0], village.welcome("dog"), village.welcome("cat")]
         village.run(3.0)
-        members = [member.public for member in houses[0].team.members()]
-        village.tell(village.signer.rotate(2, members, village.wall(), 60.0, village.dice))
+        members = [member.public for member in houses[0].team.list_members()]
+        village.tell(village.signer.rotate_secret(2, members, village.wall(), 60.0, village.dice))
         village.run(3.0)
         self.assertEqual({house.kept.membership.secrets[0][0] for house in houses}, {2})
         pig = village.welcome("pig", doors=(0,))
@@ -165,8 +165,8 @@ class RotationTests(VillageCase):
         dog = village.welcome("dog")
         village.run(2.0)
         village.close(dog)
-        members = [member.public for member in village.houses[0].team.members()]
-        village.tell(village.signer.rotate(2, members, village.wall(), grace, village.dice))
+        members = [member.public for member in village.houses[0].team.list_members()]
+        village.tell(village.signer.rotate_secret(2, members, village.wall(), grace, village.dice))
         village.run(seconds)
         village.open(dog)
         village.run(8.0)
@@ -181,7 +181,7 @@ class RotationTests(VillageCase):
         village = self.village()
         dog = village.welcome("dog")
         village.run(2.0)
-        village.tell(village.signer.rotate(2, [village.houses[0].public], village.wall(), 600.0, village.dice))
+        village.tell(village.signer.rotate_secret(2, [village.houses[0].public], village.wall(), 600.0, village.dice))
         village.run(12.0)
         self.assertEqual(dog.kept.membership.secrets, village.houses[0].kept.membership.secrets)
 
@@ -195,7 +195,7 @@ class StrangersTests(VillageCase):
         """A node with the team's secret but another operator's certificate is refused, and both nodes log it once."""
         village = self.village()
         first = village.houses[0].kept.membership
-        stranger = operator(9).founded("spy", ("device",), village.wall(), village.dice, first.secrets[0][1])
+        stranger = operator(9).create_membership("spy", ("device",), village.wall(), village.dice, first.secrets[0][1])
         with capturedLogs() as said:
             spy = village.move_in(stranger)
             for _ in range(5):
@@ -209,7 +209,7 @@ class StrangersTests(VillageCase):
         """A node without the team's secret gets no answer, and logs once that ``swarm doctor`` finds the reason."""
         village = self.village()
         with capturedLogs() as said:
-            village.move_in(operator(9).founded("spy", ("device",), village.wall(), village.dice))
+            village.move_in(operator(9).create_membership("spy", ("device",), village.wall(), village.dice))
             village.run(40.0)
         self.assertEqual(sum("swarm doctor SETTINGS" in formatEvent(event) for event in said), 1)
 
@@ -234,7 +234,7 @@ class StrangersTests(VillageCase):
     def test_expired_by_its_own_clock(self) -> None:
         """A node with an expired certificate logs it at its start, with both remedies."""
         village = self.village()
-        old = village.signer.founded("dog", ("device",), village.wall() - 366 * 86_400.0, village.dice)
+        old = village.signer.create_membership("dog", ("device",), village.wall() - 366 * 86_400.0, village.dice)
         with capturedLogs() as events:
             village.move_in(old)
         lines = [formatEvent(event) for event in events]

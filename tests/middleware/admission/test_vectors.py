@@ -9,11 +9,18 @@ from pathlib import Path
 from nacl import bindings
 from twisted.trial.unittest import SynchronousTestCase
 
-from middleware.admission import knock
-from middleware.admission.certificate import chained, guest_pass, member_of, pass_of, proof, renewed
-from middleware.admission.code import Code, TermsContent, seal_terms
-from middleware.admission.roll import digest_of, packed_admission
-from middleware.admission.statement import YEAR, Grant, Invite, Revoke, Terms, sealed_secret, signed
+from middleware.admission import join_codec
+from middleware.admission.certificate import (
+    issue_certificate,
+    issue_guest_certificate,
+    renew_certificate,
+    sign_join,
+    verify_certificate,
+    wrap_grant,
+)
+from middleware.admission.code import JoinCode, TermsContent, seal_terms
+from middleware.admission.membership_list import compute_digest, pack_admission
+from middleware.admission.statement import DEFAULT_LIFE_S, Grant, Invite, Revocation, Terms, seal_secret, sign_statement
 from middleware.entangled.contact import Contact
 from middleware.entangled.identity import Identity
 from middleware.entangled.network.network import Address
@@ -32,42 +39,42 @@ class Counted(random.Random):
 def made() -> dict[str, str]:
     """Return all vectors in hexadecimal, and the code as text."""
     operator, vaio, dog, phone = (Identity(bytes([number]) * 32) for number in (1, 2, 3, 4))
-    code, dice = Code(0x123456789ABCDEF0123, 0x7D3A1), Counted()
-    grant = signed(operator, Grant(vaio.public, "vaio", ("gateway", "bootstrap"), NOW, NOW + 1000))
+    code, dice = JoinCode(0x123456789ABCDEF0123, 0x7D3A1), Counted()
+    grant = sign_statement(operator, Grant(vaio.public, "vaio", ("gateway", "bootstrap"), NOW, NOW + 1000))
     invite = Invite(code.key.public, "dog", ("device",), 2, NOW, NOW + 100, 500)
-    packed = signed(operator, invite)
-    secret = sealed_secret(b"s" * 32, 2, [vaio.public], NOW, 60, dice)
-    came = (dog.public, "rex", proof(code.key, dog.public, "rex"))
-    chain = chained(vaio, grant, (packed, invite), came, "rex", NOW + 1)
+    packed = sign_statement(operator, invite)
+    secret = seal_secret(b"s" * 32, 2, [vaio.public], NOW, 60, dice)
+    came = (dog.public, "rex", sign_join(code.key, dog.public, "rex"))
+    chain = issue_certificate(vaio, grant, (packed, invite), came, "rex", NOW + 1)
     boot = Identity(bytes([5]) * 32)
-    anchor = signed(operator, Grant(boot.public, "boot", ("bootstrap",), NOW, NOW + YEAR))
-    lasting = signed(operator, Grant(vaio.public, "vaio", ("gateway",), NOW, NOW + YEAR))
-    held = member_of(operator.public, vaio.public, pass_of(lasting))
-    whole_year = Invite(code.key.public, "dog", ("device",), 2, NOW, NOW + 100, YEAR)
-    by_code = chained(vaio, grant, (signed(operator, whole_year), whole_year), came, "rex", NOW + 1)
-    came_in = member_of(operator.public, dog.public, by_code)
+    anchor = sign_statement(operator, Grant(boot.public, "boot", ("bootstrap",), NOW, NOW + DEFAULT_LIFE_S))
+    lasting = sign_statement(operator, Grant(vaio.public, "vaio", ("gateway",), NOW, NOW + DEFAULT_LIFE_S))
+    held = verify_certificate(operator.public, vaio.public, wrap_grant(lasting))
+    whole_year = Invite(code.key.public, "dog", ("device",), 2, NOW, NOW + 100, DEFAULT_LIFE_S)
+    by_code = issue_certificate(vaio, grant, (sign_statement(operator, whole_year), whole_year), came, "rex", NOW + 1)
+    came_in = verify_certificate(operator.public, dog.public, by_code)
     ephemeral = b"e" * 32
     shared = bindings.crypto_scalarmult_base(ephemeral)
     contact = Contact(vaio.public, Address("10.0.0.1", 7000))
     sealed = seal_terms(code, TermsContent(operator.public, "yard", {"lan": True}), dice)
-    given = knock.Welcome(chain, ((2, b"s" * 32, NOW + 60),), (contact,))
-    signer, heard = knock.Signer(vaio, grant, sealed), knock.Knock(dog.public, shared, "rex", b"")
+    given = join_codec.JoinReply(chain, ((2, b"s" * 32, NOW + 60),), (contact,))
+    signer, heard = join_codec.Signer(vaio, grant, sealed), join_codec.JoinRequest(dog.public, shared, "rex", b"")
     found = {
         "grant": grant,
         "invitation": packed,
-        "revocation": signed(operator, Revoke(dog.public, "rex", NOW, NOW + 2000)),
-        "secret": signed(operator, secret),
-        "pass by the operator": pass_of(grant),
+        "revocation": sign_statement(operator, Revocation(dog.public, "rex", NOW, NOW + 2000)),
+        "secret": sign_statement(operator, secret),
+        "pass by the operator": wrap_grant(grant),
         "pass by a code": chain,
-        "pass of a guest": guest_pass(vaio, pass_of(grant), phone.public, "phone", NOW),
-        "renewed pass by the operator": renewed(boot, anchor, held, pass_of(lasting), NOW + 9),
-        "renewed pass by a code": renewed(boot, anchor, came_in, by_code, NOW + 9),
-        "admission": packed_admission(dog.public, chain),
-        "digest of the admission": digest_of(packed_admission(dog.public, chain)),
-        "KNOCK": knock.knock(code.key, dog.public, shared, "rex", dice),
-        "terms": signed(operator, Terms(code.key.public, sealed, NOW, NOW + 100)),
-        "WELCOME": knock.welcome(code.key.public, heard, given, signer, dice),
-        "WELCOME that refuses": knock.refusal(code.key.public, heard, "used", signer, dice),
+        "pass of a guest": issue_guest_certificate(vaio, wrap_grant(grant), phone.public, "phone", NOW),
+        "renewed pass by the operator": renew_certificate(boot, anchor, held, wrap_grant(lasting), NOW + 9),
+        "renewed pass by a code": renew_certificate(boot, anchor, came_in, by_code, NOW + 9),
+        "admission": pack_admission(dog.public, chain),
+        "digest of the admission": compute_digest(pack_admission(dog.public, chain)),
+        "KNOCK": join_codec.make_request(code.key, dog.public, shared, "rex", dice),
+        "terms": sign_statement(operator, Terms(code.key.public, sealed, NOW, NOW + 100)),
+        "WELCOME": join_codec.make_reply(code.key.public, heard, given, signer, dice),
+        "WELCOME that refuses": join_codec.make_refusal(code.key.public, heard, "used", signer, dice),
     }
     return {"code": code.text, **{name: whole.hex() for name, whole in found.items()}}
 

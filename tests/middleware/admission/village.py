@@ -9,17 +9,17 @@ from typing import Any, TypeVar
 from twisted.internet.defer import Deferred
 from twisted.trial.unittest import SynchronousTestCase
 
-from middleware.admission.code import Code, read
+from middleware.admission.code import JoinCode, parse_code
+from middleware.admission.join_client import JoinClient
 from middleware.admission.membership import Membership, MemoryMembership
-from middleware.admission.newcomer import Newcomer
 from middleware.admission.operator import Operator
 from middleware.admission.team import Team
 from middleware.entangled.contact import Contact
 from middleware.entangled.errors import NotAdmitted, NotRunning
 from middleware.entangled.network.network import Address
-from middleware.entangled.network.switchboard import CALM, SwitchboardNetwork, Weather
+from middleware.entangled.network.switchboard import PERFECT, LinkConditions, SwitchboardNetwork
 from middleware.entangled.node import EntangledNode
-from tests.fleet import World
+from tests.fleet import Simulation
 from tests.middleware.admission.paper import NOW, operator
 
 FIRST = ("device", "operator", "gateway", "bootstrap")
@@ -55,14 +55,14 @@ class House:
 
     @property
     def name(self) -> str:
-        return self.team.door.me.name
+        return self.team.admission.me.name
 
     @property
     def public(self) -> bytes:
         return self.kept.membership.identity.public
 
 
-class Village(World):
+class Village(Simulation):
     """A closed team; ``signer`` is its operator, and the first node publishes the operator's statements by default.
 
     The wall clock is ``days`` ahead of the virtual clock; ``tape`` records the datagrams that nodes receive that are
@@ -72,15 +72,15 @@ class Village(World):
     days = 0.0
     tape: Tape | None = None
 
-    def __init__(self, seed: int = 1, weather: Weather = CALM, bootstraps: int = 1) -> None:
+    def __init__(self, seed: int = 1, weather: LinkConditions = PERFECT, bootstraps: int = 1) -> None:
         super().__init__(seed, weather)
         self.signer: Operator = operator(seed)
         self.houses: list[House] = []
         self.dice = random.Random(f"{seed}/village")
-        first = self.signer.founded("vaio", FIRST, self.wall(), self.dice)
+        first = self.signer.create_membership("vaio", FIRST, self.wall(), self.dice)
         for number in range(bootstraps):
             secret = first.secrets[0][1]
-            other = self.signer.founded(f"boot{number}", FIRST, self.wall(), self.dice, secret)
+            other = self.signer.create_membership(f"boot{number}", FIRST, self.wall(), self.dice, secret)
             self.move_in(other if number else first)
 
     def wall(self) -> float:
@@ -98,7 +98,7 @@ class Village(World):
     def paper(self, name: str, *which: str) -> Membership:
         """Return the membership of a node to which the operator granted these roles."""
         secret = self.houses[0].kept.membership.secrets[0][1]
-        return self.signer.founded(name, which or ("device",), self.wall(), self.dice, secret)
+        return self.signer.create_membership(name, which or ("device",), self.wall(), self.dice, secret)
 
     def enlist(self, name: str, *which: str) -> House:
         """Add a member to which the operator granted these roles."""
@@ -106,17 +106,17 @@ class Village(World):
 
     def open(self, house: House) -> None:
         place = house.place
-        house.team = Team(house.kept, self.store(place), self.wall, self.rng(place))
-        network = self.board.network(*self.address(place))
+        house.team = Team(house.kept, self.store(place), self.wall, self.make_life_rng(place))
+        network = self.switchboard.make_network(*self.address(place))
         house.node = EntangledNode(
             house.team.identity,
             house.team.secret,
             network,
             self.store(place),
             self.clock,
-            self.rng(place),
+            self.make_life_rng(place),
             wall=self.wall,
-            door=house.team.door,
+            door=house.team.admission,
         )
         house.team.attach(house.node, self.clock)
         house.node.start()
@@ -130,13 +130,13 @@ class Village(World):
     def close(self, house: House, is_sudden: bool = False) -> None:
         house.team.stop()
         if is_sudden:
-            house.node.vanish()
+            house.node.stop_silently()
         else:
             house.node.stop()
 
     def tell(self, packed: bytes, house: int = 0) -> Deferred[str]:
         """Publish a statement of the operator at a node."""
-        return Deferred.fromCoroutine(self.houses[house].team.tell(packed))
+        return Deferred.fromCoroutine(self.houses[house].team.publish(packed))
 
     def invite(self, name: str = "dog", uses: int = 1, expires: float = 3600.0, house: int = 0) -> str:
         """Return a code that is valid from now on."""
@@ -152,10 +152,10 @@ class Village(World):
         self, code: str, doors: Sequence[int] = (0,), wish: str = "", seed: bytes = b"", timeout: float = 20.0
     ) -> Deferred[Membership]:
         """Start a newcomer that sends join requests to these nodes."""
-        self.lives += 1
-        network = self.board.network("10.0.0.2", 9000 + self.lives)
-        read_code: Code = read(code)
-        newcomer = Newcomer(read_code, seed or self.dice.randbytes(32), network, self.clock, self.dice, wish)
+        self.life_count += 1
+        network = self.switchboard.make_network("10.0.0.2", 9000 + self.life_count)
+        read_code: JoinCode = parse_code(code)
+        newcomer = JoinClient(read_code, seed or self.dice.randbytes(32), network, self.clock, self.dice, wish)
         return newcomer.join([self.address(door) for door in doors], timeout)
 
     def welcome(self, name: str = "dog", doors: Sequence[int] = (0,)) -> House:
@@ -166,7 +166,7 @@ class Village(World):
         return self.move_in(found[0])
 
     def members(self, house: int = 0) -> list[str]:
-        return [member.name for member in self.houses[house].team.members()]
+        return [member.name for member in self.houses[house].team.list_members()]
 
     def address_of(self, house: House) -> Address:
         return self.address(house.place)

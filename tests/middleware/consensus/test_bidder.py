@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from twisted.trial.unittest import SynchronousTestCase
 
 from benchmarks.consensus.bidder import Bidder, Score, Statement
-from middleware.consensus.strategies.cbba import greedy
+from middleware.consensus.strategies.cbba import assign_greedily
 
 Costs = dict[str, dict[str, float]]
 
@@ -43,7 +43,7 @@ class Talk:
             sender, taker, said = self.way[number]
             if self.dice.random() < 0.8:  # else it is delivered again
                 del self.way[number]
-            corrections = self.bidders[taker].hear(sender, said)
+            corrections = self.bidders[taker].receive(sender, said)
             if corrections:
                 self.way.append((taker, sender, tuple(corrections)))
             self.delivered += 1
@@ -76,10 +76,10 @@ class BidderTests(SynchronousTestCase):
         bidders = {a: Bidder(a, goals, flat(costs[a]), capacity) for a in names}
         talk = Talk(seed, line(names, dice), bidders)
         talk.run()
-        expected = greedy(costs, dict.fromkeys(names, capacity))
+        expected = assign_greedily(costs, dict.fromkeys(names, capacity))
         self.assertEqual(talk.owners(), {task: [agent] for task, agent in expected.items()})
         for bidder in bidders.values():
-            winners = {t: w.agent for t in goals if (w := bidder.winner(t)) is not None}
+            winners = {t: w.agent for t in goals if (w := bidder.find_winner(t)) is not None}
             self.assertEqual(winners, expected)
 
     def test_warped(self) -> None:
@@ -98,5 +98,5 @@ class BidderTests(SynchronousTestCase):
             self.assertLess(talk.delivered, 5000)
             self.assertEqual([o for o in talk.owners().values() if len(o) > 1], [])
             for bidder in bidders.values():
-                bids = [w.bid for t in bidder.bundle if (w := bidder.winner(t)) is not None]
+                bids = [w.bid for t in bidder.bundle if (w := bidder.find_winner(t)) is not None]
                 self.assertEqual(bids, sorted(bids, reverse=True))

@@ -11,20 +11,20 @@ from typing import Any
 
 from twisted.trial.unittest import SynchronousTestCase
 
+from middleware.consensus.assignment import Item
 from middleware.consensus.conformance import CHECKS, Conformance, broken
-from middleware.consensus.guard import Guard
-from middleware.consensus.item import Item
+from middleware.consensus.guarded_strategy import GuardedStrategy
 from middleware.consensus.strategies.capability_cost import CapabilityCost
 from middleware.consensus.strategies.cbba import Cbba
 from middleware.consensus.strategies.nearest import Nearest
-from middleware.consensus.strategy import BUILT_IN, Consensus, Report, digest_of, strategy_for
+from middleware.consensus.strategy import BUILT_IN, Consensus, Report, digest_of, load_strategy
 from tests.replay import replayed
 
 ROOT = Path(__file__).resolve().parents[3]
 
 
 def _test_case(name: str) -> None:
-    make = type(strategy_for(name))
+    make = type(load_strategy(name))
     case = f"{make.__name__}Tests"
     globals()[case] = type(case, (Conformance, SynchronousTestCase), {"make": make, "__module__": __name__})
 
@@ -37,8 +37,8 @@ class GuardedTests(Conformance, SynchronousTestCase):
     """A guard around a conforming strategy conforms."""
 
     @staticmethod
-    def make() -> Guard:
-        return Guard(Nearest())
+    def make() -> GuardedStrategy:
+        return GuardedStrategy(Nearest())
 
 
 def point(order: Sequence[Report]) -> Consensus:
@@ -175,7 +175,7 @@ BREACHES: dict[str, tuple[Callable[[], Any], ...]] = {
 class ConformanceTests(SynchronousTestCase):
     def test_every_built_in_says_its_name(self) -> None:
         """The name of each built-in strategy is the name that selects it."""
-        self.assertEqual({name: strategy_for(name).name for name in BUILT_IN}, {name: name for name in BUILT_IN})
+        self.assertEqual({name: load_strategy(name).name for name in BUILT_IN}, {name: name for name in BUILT_IN})
 
     def test_each_breach_is_seen(self) -> None:
         """A strategy that breaks a rule fails the check of that rule."""

@@ -10,10 +10,10 @@ from statistics import fmean
 
 from twisted.trial.unittest import SynchronousTestCase
 
-from middleware.consensus.item import Item, exact
-from middleware.consensus.strategies.cbba import Cbba, exchanged, greedy
+from middleware.consensus.assignment import Item, to_millionths
+from middleware.consensus.strategies.cbba import Cbba, assign_greedily, improve_assignment
 from middleware.consensus.strategies.group_optimal import GroupOptimal
-from middleware.consensus.strategies.sequential import Sequential, length, ways_of
+from middleware.consensus.strategies.sequential import Sequential, compute_length, plan_routes
 from middleware.consensus.strategy import Consensus, Report
 
 Place = tuple[float, float]
@@ -110,10 +110,10 @@ class CbbaTests(SynchronousTestCase):
             reports, items = square(agents, 40, seed)
             costs: dict[str, dict[str, int]] = {}
             for report in reports:
-                costs.setdefault(report.agent, {})[report.task] = exact(report.cost)
+                costs.setdefault(report.agent, {})[report.task] = to_millionths(report.cost)
             room = {agent: math.ceil(40 / agents) for agent in costs}
-            before = greedy(costs, room)
-            after = exchanged(before, costs, room)
+            before = assign_greedily(costs, room)
+            after = improve_assignment(before, costs, room)
             sums = [sum(costs[a][t] for t, a in owner.items()) for owner in (before, after)]
             self.assertLessEqual(sums[1], sums[0])
             self.assertEqual(set(after), set(before))
@@ -133,8 +133,8 @@ class CbbaTests(SynchronousTestCase):
             costs = {f"a{n}": {t: dice.randrange(99) for t in tasks if dice.random() < 0.6} for n in range(6)}
             room = {agent: dice.randint(1, 3) for agent in costs}
             # Greedy with inverted costs gives a bad start.
-            worst = greedy({agent: {t: -c for t, c in row.items()} for agent, row in costs.items()}, room)
-            owner = exchanged(worst, costs, room)
+            worst = assign_greedily({agent: {t: -c for t, c in row.items()} for agent, row in costs.items()}, room)
+            owner = improve_assignment(worst, costs, room)
             held = Counter(owner.values())
             self.assertTrue(all(held[agent] <= room[agent] for agent in held))
             for task, agent in owner.items():
@@ -151,7 +151,7 @@ class SequentialTests(SynchronousTestCase):
         """Each task is on one route, no route exceeds the capacity, and the decisions match the routes."""
         for seed in range(10):
             reports, items = square(4, 10, seed, capacity=3)
-            ways = ways_of(reports, items) or {}
+            ways = plan_routes(reports, items) or {}
             self.assertEqual(sorted(t for way in ways.values() for t in way), [item.task for item in items])
             self.assertLessEqual(max(map(len, ways.values())), 3)
             found = Sequential().find_group(reports, items)
@@ -164,8 +164,8 @@ class SequentialTests(SynchronousTestCase):
             reports, items = square(2, 5, seed, capacity=5)
             starts = {r.agent: r.value for r in reports}
             places = {item.task: item.position for item in items}
-            ways = ways_of(reports, items) or {}
-            mine = sum(length(starts[a], [places[t] for t in way]) for a, way in ways.items())
+            ways = plan_routes(reports, items) or {}
+            mine = sum(compute_length(starts[a], [places[t] for t in way]) for a, way in ways.items())
             ratios.append(mine / self.best(list(starts.values()), list(places.values())))
         self.assertLessEqual(max(ratios), 2.0)
         self.assertLessEqual(fmean(ratios), 1.15)
@@ -199,6 +199,6 @@ class SequentialTests(SynchronousTestCase):
         """An agent that bids for named tasks gets no other; an agent that names no task may get any."""
         items = [Item("s", (0.0, 0.0)), Item("t", (1.0, 0.0))]
         near = Report("near", 0.0, task="s", value=(0.5, 0.0), capacity=2)
-        self.assertEqual(ways_of([near], items), {"near": ["s"]})
+        self.assertEqual(plan_routes([near], items), {"near": ["s"]})
         far = Report("far", 0.0, value=(9.0, 0.0), capacity=2)
         self.assertEqual(Sequential().find_group([near, far], items)[1].assigned_agent, "far")

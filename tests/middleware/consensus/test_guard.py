@@ -8,13 +8,13 @@ from dataclasses import replace
 
 from twisted.trial.unittest import SynchronousTestCase
 
-from middleware.consensus.deployed import Make
-from middleware.consensus.guard import SPAN, STRIKES, Guard, Lost
-from middleware.consensus.item import Item
-from middleware.consensus.selection import Strategies, guarded
+from middleware.consensus.assignment import Item
+from middleware.consensus.deployed_modules import Factory
+from middleware.consensus.guarded_strategy import LOSS_SPAN_CALLS, MAX_LOSSES, GuardedStrategy, StrategyLost
 from middleware.consensus.strategies.cbba import Cbba
 from middleware.consensus.strategies.nearest import Nearest
 from middleware.consensus.strategy import Consensus, Report
+from middleware.consensus.strategy_registry import StrategyRegistry, load_guarded_strategy
 from middleware.errors import UnknownStrategy
 
 TEAM = [Report("a", 3.0), Report("b", 1.0), Report("c", 2.0)]
@@ -78,7 +78,7 @@ class Slow(Nearest):
 
     def find(self, contacts: Sequence[Report]) -> Consensus:
         self.asked += 1
-        raise Lost("it did not answer in time")
+        raise StrategyLost("it did not answer in time")
 
 
 class Moments(Nearest):
@@ -93,7 +93,7 @@ class Moments(Nearest):
     def improves(self, current: Report, offer: Report, hysteresis: float) -> bool:
         self.asked += 1
         if self.asked % self.pause == 0:
-            raise Lost("it did not answer in time")
+            raise StrategyLost("it did not answer in time")
         return super().improves(current, offer, hysteresis)
 
 
@@ -110,7 +110,7 @@ class Inventing(Nearest):
 
 
 class GuardTests(SynchronousTestCase):
-    def assert_falls_back(self, guard: Guard, why: str) -> None:
+    def assert_falls_back(self, guard: GuardedStrategy, why: str) -> None:
         """Check that the nearest agent wins, the reason names the failure, and an error is logged."""
         found = guard.find(TEAM)
         self.assertEqual((found.assigned_agent, found.standby), ("b", ("c", "a")))
@@ -122,7 +122,7 @@ class GuardTests(SynchronousTestCase):
 
     def test_raising(self) -> None:
         """A strategy that raises is replaced by ``Nearest``; the reason names the exception, which is logged once."""
-        guard = Guard(Raising())
+        guard = GuardedStrategy(Raising())
         found = guard.find(TEAM)
         self.assertEqual(found.assigned_agent, "b")
         self.assertEqual(
@@ -135,7 +135,7 @@ class GuardTests(SynchronousTestCase):
 
     def test_raising_elsewhere(self) -> None:
         """``improves`` and ``merge`` of a strategy that raises also fall back to ``Nearest``."""
-        guard = Guard(Raising())
+        guard = GuardedStrategy(Raising())
         self.assertTrue(guard.improves(TEAM[0], TEAM[1], 0.1))
         self.assertFalse(guard.improves(TEAM[1], TEAM[0], 0.1))
         self.assertEqual(guard.merge(TEAM, TEAM), Nearest().merge(TEAM, ()))
@@ -155,45 +155,48 @@ class GuardTests(SynchronousTestCase):
             ("b", "str"),
             (None, "NoneType"),
         ):
-            self.assert_falls_back(Guard(Lying(lie)), why)
+            self.assert_falls_back(GuardedStrategy(Lying(lie)), why)
 
     def test_mutable_state(self) -> None:
         """A strategy with two results for equal reports is detected, at once or at the next call."""
-        self.assert_falls_back(Guard(Moody(), twice=True), "two results")
-        later = Guard(Moody())
+        self.assert_falls_back(GuardedStrategy(Moody(), twice=True), "two results")
+        later = GuardedStrategy(Moody())
         self.assertEqual(later.find(TEAM).assigned_agent, "b")
         self.assertIn("two results", later.find(TEAM).reason)
         self.flushLoggedErrors()
 
     def test_order(self) -> None:
         """A strategy that depends on the order of reports is detected, or gets them in a fixed order."""
-        self.assert_falls_back(Guard(OrderBound(), twice=True), "two results")
-        self.assertEqual(Guard(OrderBound()).find(TEAM), Guard(OrderBound()).find(TEAM[::-1]))
+        self.assert_falls_back(GuardedStrategy(OrderBound(), twice=True), "two results")
+        self.assertEqual(GuardedStrategy(OrderBound()).find(TEAM), GuardedStrategy(OrderBound()).find(TEAM[::-1]))
 
     def test_late(self) -> None:
         """A strategy that exceeds the timeout ``STRIKES`` times is not called again."""
         slow = Slow()
-        guard = Guard(slow)
+        guard = GuardedStrategy(slow)
         for _ in range(10):
             self.assertEqual(guard.find(TEAM).assigned_agent, "b")
-        self.assertEqual(slow.asked, STRIKES)
+        self.assertEqual(slow.asked, MAX_LOSSES)
         self.assertIn("not called again", guard.find(TEAM).reason)
         self.flushLoggedErrors()
 
     def test_late_now_and_then(self) -> None:
         """A strategy with fewer than ``STRIKES`` timeouts in ``SPAN`` calls stays in use; with more it does not."""
-        for pause, is_out in ((SPAN // (STRIKES - 1), False), (SPAN // (STRIKES - 1) - 1, True)):
+        for pause, is_out in (
+            (LOSS_SPAN_CALLS // (MAX_LOSSES - 1), False),
+            (LOSS_SPAN_CALLS // (MAX_LOSSES - 1) - 1, True),
+        ):
             moments = Moments(pause)
-            guard = Guard(moments)
-            for _ in range(10 * SPAN):
+            guard = GuardedStrategy(moments)
+            for _ in range(10 * LOSS_SPAN_CALLS):
                 guard.improves(TEAM[0], TEAM[1], 0.1)
-            self.assertEqual(moments.asked < 10 * SPAN, is_out, pause)
+            self.assertEqual(moments.asked < 10 * LOSS_SPAN_CALLS, is_out, pause)
             self.assertEqual(guard.find(TEAM).strategy, "nearest" if is_out else "moments")
         self.flushLoggedErrors()
 
     def test_inventing(self) -> None:
         """A summary with unknown reports, and a result of ``improves`` that is no bool, are rejected."""
-        guard = Guard(Inventing())
+        guard = GuardedStrategy(Inventing())
         self.assertEqual(guard.merge(TEAM, ()), Nearest().merge(TEAM, ()))
         self.assertTrue(guard.improves(TEAM[0], TEAM[1], 0.1))
         self.assertEqual(len(self.flushLoggedErrors()), 2)
@@ -203,8 +206,8 @@ class GuardTests(SynchronousTestCase):
         items = [Item("s"), Item("t")]
         bids = [Report(a, c, task=t) for a, c in (("a", 1.0), ("b", 2.0)) for t in "st"]
         good = Cbba().find_group(bids, items)
-        self.assertEqual(Guard(Cbba()).find_group(bids, items), good)
-        self.assertEqual([p.assigned_agent for p in Guard(Nearest()).find_group(bids, items)], ["a", "b"])
+        self.assertEqual(GuardedStrategy(Cbba()).find_group(bids, items), good)
+        self.assertEqual([p.assigned_agent for p in GuardedStrategy(Nearest()).find_group(bids, items)], ["a", "b"])
 
         class Bad(Cbba):
             answer: object = ()
@@ -222,7 +225,7 @@ class GuardTests(SynchronousTestCase):
         ):
             bad = Bad()
             bad.answer = answer
-            found = Guard(bad).find_group(bids, items)
+            found = GuardedStrategy(bad).find_group(bids, items)
             self.assertEqual([p.assigned_agent for p in found], ["a", "b"])
             self.assertIn(why, found[0].reason)
             self.flushLoggedErrors()
@@ -231,36 +234,36 @@ class GuardTests(SynchronousTestCase):
         """A guard passes only valid reports to its strategy."""
         bad = [Report("x", cost) for cost in (math.nan, math.inf, -1.0, 1e300)]
         bad += [Report("x", 0.0, age=3.0, valid_for=2.0), Report("x", 0.0, unmet=("has no camera",))]
-        guard = Guard(Nearest())
+        guard = GuardedStrategy(Nearest())
         self.assertEqual(guard.find([*bad, *TEAM]), guard.find(TEAM))
         for offer in bad:
-            self.assertFalse(Guard(Lying(None)).improves(TEAM[0], offer, 0.0))
+            self.assertFalse(GuardedStrategy(Lying(None)).improves(TEAM[0], offer, 0.0))
 
     def test_by_name(self) -> None:
         """Built-in strategies are guarded by name; an unknown name is an error."""
-        self.assertIsInstance(guarded("nearest").strategy, Nearest)
-        error = self.assertRaises(UnknownStrategy, guarded, "farthest")
+        self.assertIsInstance(load_guarded_strategy("nearest").strategy, Nearest)
+        error = self.assertRaises(UnknownStrategy, load_guarded_strategy, "farthest")
         self.assertIn("nearest", str(error))
-        self.assertRaises(UnknownStrategy, guarded, "this:s")
+        self.assertRaises(UnknownStrategy, load_guarded_strategy, "this:s")
 
 
 class StrategiesTests(SynchronousTestCase):
     def test_built_in(self) -> None:
         """Each task gets a new instance of a built-in strategy, also after ``stop``; an unknown name is an error."""
-        strategies = Strategies()
-        first, second = strategies.named("nearest", {}), strategies.named("nearest", {})
+        strategies = StrategyRegistry()
+        first, second = strategies.get("nearest", {}), strategies.get("nearest", {})
         self.assertIsInstance(first.strategy, Nearest)
         self.assertIsNot(first, second)
         strategies.stop()
-        self.assertIsInstance(strategies.named("cbba", {}).strategy, Cbba)
-        self.assertRaises(UnknownStrategy, strategies.named, "farthest", {})
+        self.assertIsInstance(strategies.get("cbba", {}).strategy, Cbba)
+        self.assertRaises(UnknownStrategy, strategies.get, "farthest", {})
 
     def test_deployed(self) -> None:
         """Each task gets the version deployed last; an earlier instance keeps its version."""
-        deployed: dict[tuple[str, str], Make] = {("strategy", "best"): Nearest}
-        strategies = Strategies()
-        before = strategies.named("deployed:best", deployed)
+        deployed: dict[tuple[str, str], Factory] = {("strategy", "best"): Nearest}
+        strategies = StrategyRegistry()
+        before = strategies.get("deployed:best", deployed)
         deployed["strategy", "best"] = Cbba
-        self.assertIsInstance(strategies.named("deployed:best", deployed).strategy, Cbba)
+        self.assertIsInstance(strategies.get("deployed:best", deployed).strategy, Cbba)
         self.assertIsInstance(before.strategy, Nearest)
-        self.assertRaises(UnknownStrategy, strategies.named, "deployed:best", {})
+        self.assertRaises(UnknownStrategy, strategies.get, "deployed:best", {})

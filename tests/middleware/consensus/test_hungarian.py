@@ -7,7 +7,7 @@ from itertools import permutations
 
 from twisted.trial.unittest import SynchronousTestCase
 
-from middleware.consensus.strategies.hungarian import assigned, solved
+from middleware.consensus.strategies.hungarian import find_optimum, solve
 
 
 class HungarianTests(SynchronousTestCase):
@@ -27,14 +27,14 @@ class HungarianTests(SynchronousTestCase):
                 (sum(row[c] for row, c in zip(costs, columns, strict=True)), columns)
                 for columns in permutations(range(len(costs[0])), len(costs))
             )
-            self.assertEqual(tuple(assigned(costs)), best[1], costs)
+            self.assertEqual(tuple(solve(costs)), best[1], costs)
 
     def test_prices_prove_it(self) -> None:
         """The prices prove the optimum: each row has its cheapest column, and unassigned columns have price 0."""
         dice = random.Random(2)
         for _ in range(200):
             costs = self.table(dice, 9)
-            columns, prices = solved(costs)
+            columns, prices = find_optimum(costs)
             self.assertEqual(len(set(columns)), len(costs))
             for row, column in zip(costs, columns, strict=True):
                 self.assertEqual(row[column] - prices[column], min(c - p for c, p in zip(row, prices, strict=True)))
@@ -43,6 +43,6 @@ class HungarianTests(SynchronousTestCase):
 
     def test_edges(self) -> None:
         """No rows, one cell and equal costs are handled."""
-        self.assertEqual(assigned([]), [])
-        self.assertEqual(assigned([[7]]), [0])
-        self.assertEqual(assigned([[5] * 4] * 3), [0, 1, 2])
+        self.assertEqual(solve([]), [])
+        self.assertEqual(solve([[7]]), [0])
+        self.assertEqual(solve([[5] * 4] * 3), [0, 1, 2])

@@ -10,9 +10,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from twisted.trial.unittest import SynchronousTestCase
 
-from middleware.consensus.conformance import team
-from middleware.consensus.strategies.nearest import KEPT
-from middleware.consensus.strategy import BUILT_IN, Report, strategy_for
+from middleware.consensus.conformance import make_team
+from middleware.consensus.strategies.nearest import SUMMARY_REPORTS
+from middleware.consensus.strategy import BUILT_IN, Report, load_strategy
 
 reports = st.builds(
     Report,
@@ -40,14 +40,14 @@ class LawTests(SynchronousTestCase):
         @settings(max_examples=60)
         @given(views, views, views, st.randoms(use_true_random=False))
         def laws(a: list[Report], b: list[Report], c: list[Report], dice: random.Random) -> None:
-            strategy = strategy_for(name)
+            strategy = load_strategy(name)
             ab = strategy.merge(a, b)
             self.assertEqual(ab, strategy.merge(b, a))
             self.assertEqual(strategy.merge(ab, c), strategy.merge(a, strategy.merge(b, c)))
             self.assertEqual(strategy.merge(ab, ab), ab)
             found = strategy.find([*a, *b])
             self.assertEqual(strategy.find(ab), found)
-            self.assertEqual(strategy_for(name).find(dice.sample([*b, *a], len(a) + len(b))), found)
+            self.assertEqual(load_strategy(name).find(dice.sample([*b, *a], len(a) + len(b))), found)
             self.assertEqual(strategy.find([*a, *b, *a]), found)
 
         laws()
@@ -55,14 +55,14 @@ class LawTests(SynchronousTestCase):
     def test_short_summaries(self) -> None:
         """A summary with only the best reports gives the same result as all reports, in any grouping."""
         for name in ("nearest", "capability_cost"):
-            strategy = strategy_for(name)
+            strategy = load_strategy(name)
             for seed in range(20):
                 dice = random.Random(seed)
-                contacts = team(dice, 100)
+                contacts = make_team(dice, 100)
                 summary: tuple[Report, ...] = ()
                 for start in range(0, len(contacts), 7):
                     summary = strategy.merge(strategy.merge((), contacts[start : start + 7]), summary)
-                self.assertLessEqual(len(summary), KEPT)
+                self.assertLessEqual(len(summary), SUMMARY_REPORTS)
                 self.assertEqual(strategy.find(summary), strategy.find(contacts))
 
 

@@ -8,7 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from twisted.trial.unittest import SynchronousTestCase
 
-from middleware.consensus.strategies.nearest import KEPT, Nearest
+from middleware.consensus.strategies.nearest import SUMMARY_REPORTS, Nearest
 from middleware.consensus.strategy import Report, refusal
 
 costs = st.one_of(st.floats(), st.sampled_from([0.0, -0.0, 1.0, 2.0]))
@@ -39,7 +39,7 @@ class NearestTests(SynchronousTestCase):
         self.assertEqual(self.nearest.find(mixed), found)
         named = [found.assigned_agent, *found.standby] if found.assigned_agent else []
         lawful = {r.agent for r in contacts if not refusal(r)}
-        self.assertEqual((len(named), len(set(named))), (min(KEPT, len(lawful)),) * 2)
+        self.assertEqual((len(named), len(set(named))), (min(SUMMARY_REPORTS, len(lawful)),) * 2)
         self.assertLessEqual(set(named), lawful)
 
     def test_improves(self) -> None:

@@ -10,7 +10,7 @@ from typing import Any
 from twisted.trial.unittest import SynchronousTestCase
 
 from middleware.consensus.strategies.nearest import Nearest
-from middleware.consensus.strategy import BUILT_IN, Report, digest_of, refusal, standing, strategy_for
+from middleware.consensus.strategy import BUILT_IN, Report, digest_of, load_strategy, refusal, standing
 from middleware.errors import UnknownStrategy
 
 
@@ -25,9 +25,9 @@ class StrategyTests(SynchronousTestCase):
     def test_dotted_only_on_demand(self) -> None:
         """Only local settings may name a module to import; a task from a peer may not."""
         sys.modules.pop("this", None)
-        self.assertRaises(UnknownStrategy, strategy_for, "this:s")
+        self.assertRaises(UnknownStrategy, load_strategy, "this:s")
         self.assertNotIn("this", sys.modules)
-        self.assertIsInstance(strategy_for("middleware.consensus.strategies.nearest:Nearest", dotted=True), Nearest)
+        self.assertIsInstance(load_strategy("middleware.consensus.strategies.nearest:Nearest", dotted=True), Nearest)
 
     def test_what_cannot_be_loaded(self) -> None:
         """A missing module, a missing class, an empty name and a broken class are unknown strategies."""
@@ -41,7 +41,7 @@ class StrategyTests(SynchronousTestCase):
             broken,
             "math:pi",
         ):
-            self.assertRaises(UnknownStrategy, strategy_for, name, dotted=True)
+            self.assertRaises(UnknownStrategy, load_strategy, name, dotted=True)
 
     def test_refused_by_name(self) -> None:
         """Each invalid report is refused with the reason."""
@@ -82,7 +82,7 @@ class StrategyTests(SynchronousTestCase):
 
     def test_what_counts_for_nothing_gives_way(self) -> None:
         """A holder with an invalid report is replaced by any agent with a valid one, for every strategy."""
-        strategies = [strategy_for(name) for name in BUILT_IN]
+        strategies = [load_strategy(name) for name in BUILT_IN]
         nonsense: list[Any] = [None, "1", True, [], -1.0, math.nan, math.inf, 1e300, 10**400, 10**5000]
         for cost in nonsense:
             for strategy in strategies:

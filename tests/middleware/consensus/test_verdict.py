@@ -1,4 +1,4 @@
-"""Tests of ``middleware.consensus.verdict``: writing and reading an agent's decision record."""
+"""Tests of ``middleware.consensus.decision_record``: writing and reading an agent's decision record."""
 
 from __future__ import annotations
 
@@ -8,19 +8,19 @@ from dataclasses import replace
 import msgpack
 from twisted.trial.unittest import SynchronousTestCase
 
+from middleware.consensus.decision_record import (
+    MAX_BEST_REPORTS,
+    MAX_RECORD_BYTES,
+    MAX_REPORTS,
+    DecisionRecord,
+    decision_records_key,
+    make_decision_record,
+    make_slot_name,
+    parse_decision_record,
+)
+from middleware.consensus.report_view import ReportView
 from middleware.consensus.strategies.nearest import Nearest
 from middleware.consensus.strategy import READABLE, Consensus, Report
-from middleware.consensus.verdict import (
-    BEST,
-    MANY,
-    MAX_VERDICT,
-    Verdict,
-    slot_of,
-    verdict_from,
-    verdict_of,
-    verdicts_key,
-)
-from middleware.consensus.view import View
 from middleware.directory.presence import EXECUTING, WAITING
 from middleware.entangled.identity import Identity
 from middleware.entangled.record import Record
@@ -37,20 +37,22 @@ def member(number: int, cost: float | None, status: str = WAITING) -> Member:
 
 def decided(
     number: int, members: list[Member], epoch: int = 1, version: str = "1", assigned: int | None = None
-) -> Verdict:
+) -> DecisionRecord:
     """Return the decision record of dog ``number`` that knows ``members``; ``assigned`` overrides the winner."""
     me = next(m for m in members if m.name == f"dog{number}")
     others = [m for m in members if m is not me]
     consensus = Nearest().find([Report(m.uuid, m.cost) for m in members if m.cost is not None])
     named = consensus.assigned_agent if assigned is None else identity(assigned).node_id.hex()
-    return verdict_from("t1", epoch, me, others, "nearest", version, consensus, named, 0.1)
+    return make_decision_record("t1", epoch, me, others, "nearest", version, consensus, named, 0.1)
 
 
-def record_of(number: int, verdict: Verdict, value: bytes | None = None, name: str = "") -> Record:
+def record_of(number: int, verdict: DecisionRecord, value: bytes | None = None, name: str = "") -> Record:
     """Return the signed record that dog ``number`` publishes."""
-    content = verdict.packed() if value is None else value
+    content = verdict.pack() if value is None else value
     slot = name or verdict.slot
-    return Record(verdicts_key("t1"), slot, identity(number).public, 1, "team", 60.0, content).signed(identity(number))
+    return Record(decision_records_key("t1"), slot, identity(number).public, 1, "team", 60.0, content).sign(
+        identity(number)
+    )
 
 
 THREE = [member(1, 1.5), member(2, 0.5), member(3, 1.0)]
@@ -60,33 +62,33 @@ class VerdictTests(SynchronousTestCase):
     def test_survives_the_wire(self) -> None:
         """A packed and signed decision record is unpacked unchanged, with the agent from the key of the signature."""
         verdict = replace(decided(1, THREE), token=7)
-        self.assertEqual(verdict_of(record_of(1, verdict)), verdict)
+        self.assertEqual(parse_decision_record(record_of(1, verdict)), verdict)
         self.assertEqual([r.name for r in verdict.reports], ["dog2", "dog3", "dog1"])
         self.assertEqual(verdict.winner, THREE[1].uuid)
         self.assertEqual(verdict.standby, (THREE[2].uuid, THREE[0].uuid))
 
     def test_nobody_testifies_for_another(self) -> None:
         """A copy of dog1's decision record in dog2's slot counts as dog2's."""
-        copied = verdict_of(record_of(2, decided(1, THREE)))
+        copied = parse_decision_record(record_of(2, decided(1, THREE)))
         self.assertEqual(copied is not None and copied.agent, identity(2).node_id.hex())
 
     def test_many_reports_are_the_best_and_a_count(self) -> None:
         """Up to thirty reports are all written, of more only the best eight and the count; the size is bounded."""
-        for n, written in ((MANY, MANY), (MANY + 1, BEST), (500, BEST)):
+        for n, written in ((MAX_REPORTS, MAX_REPORTS), (MAX_REPORTS + 1, MAX_BEST_REPORTS), (500, MAX_BEST_REPORTS)):
             members = [member(i, float(i)) for i in range(1, n + 1)]
             verdict = decided(1, members)
             self.assertEqual((len(verdict.reports), verdict.reported), (written, n))
-            self.assertEqual(verdict_of(record_of(1, verdict)), verdict)
-        long = [replace(member(i, float(i)), name="\N{SNOWMAN}" * 90) for i in range(1, MANY + 1)]
+            self.assertEqual(parse_decision_record(record_of(1, verdict)), verdict)
+        long = [replace(member(i, float(i)), name="\N{SNOWMAN}" * 90) for i in range(1, MAX_REPORTS + 1)]
         long += [replace(member(i, None), name="w" * 90) for i in range(100, 200)]
         consensus = Consensus(long[0].uuid, tuple(m.uuid for m in long), "d" * 90)
         given = ("t" * 64, 2**53, long[0], long, "r" * 90, "v" * 90, consensus, long[0].uuid, 0.1, 2**53)
-        self.assertLessEqual(len(verdict_from(*given).packed()), MAX_VERDICT)
+        self.assertLessEqual(len(make_decision_record(*given).pack()), MAX_RECORD_BYTES)
         minded = [replace(m, battery=0.123, load=2**53, value=(1e9,) * 8, choice="\N{SNOWMAN}" * 64) for m in long]
         agreed = replace(consensus, value=(1e9 / 7,) * 8, choice="\N{SNOWMAN}" * 64)
         given = ("t" * 64, 2**53, minded[0], minded, "r" * 90, "v" * 90, agreed, long[0].uuid, 0.1, 2**53)
-        packed = verdict_from(*given, View(READABLE)).packed()
-        self.assertLessEqual(len(packed), MAX_VERDICT)
+        packed = make_decision_record(*given, ReportView(READABLE)).pack()
+        self.assertLessEqual(len(packed), MAX_RECORD_BYTES)
 
     def test_what_counted_is_told(self) -> None:
         """The record contains the values that the strategy read and the agreed value, and no others."""
@@ -94,13 +96,13 @@ class VerdictTests(SynchronousTestCase):
         members.append(replace(member(3, 1.0), value=(1.0, 2.0)))
         found = Consensus(members[1].uuid, value=(1.0, 2.5), choice="red")
         given = ("t1", 1, members[0], members[1:], "any", "1", found, found.assigned_agent, 0.1, 0)
-        verdict = verdict_of(record_of(1, verdict_from(*given, View(READABLE))))
+        verdict = parse_decision_record(record_of(1, make_decision_record(*given, ReportView(READABLE))))
         assert verdict is not None
         self.assertEqual((verdict.value, verdict.choice), ((1.0, 2.5), "red"))
         told = {r.name: r.more for r in verdict.reports}
         self.assertEqual(told["dog1"], "battery 40%, 2 other tasks")
         self.assertEqual((told["dog2"], told["dog3"]), ("for red, weight 2", "at (1.00, 2.00)"))
-        self.assertEqual({r.more for r in verdict_from(*given, View()).reports}, {""})
+        self.assertEqual({r.more for r in make_decision_record(*given, ReportView()).reports}, {""})
 
     def test_hysteresis_is_told(self) -> None:
         """The record explains the effect of hysteresis on the previously acting agent."""
@@ -112,10 +114,12 @@ class VerdictTests(SynchronousTestCase):
             self.assertEqual(decided(3, acting, assigned=assigned).hysteresis, words)
         self.assertEqual(decided(1, THREE).hysteresis, "no agent acted before")
         found = Consensus(THREE[2].uuid, task="t1", reason="divided with 2 others among 3")
-        shared = verdict_from("t1", 1, THREE[0], THREE[1:], "group_optimal", "1", found, found.assigned_agent, 0.1)
+        shared = make_decision_record(
+            "t1", 1, THREE[0], THREE[1:], "group_optimal", "1", found, found.assigned_agent, 0.1
+        )
         self.assertEqual(shared.hysteresis, "no agent acted before; divided with 2 others among 3")
         open_ = Consensus(None, reason="no vote; more than half of 3 decides")
-        words = verdict_from("t1", 1, THREE[0], THREE[1:], "weighted_vote", "1", open_, None, 0.1).hysteresis
+        words = make_decision_record("t1", 1, THREE[0], THREE[1:], "weighted_vote", "1", open_, None, 0.1).hysteresis
         self.assertEqual(words, "no vote; more than half of 3 decides")
         self.assertIn("no agent is better", decided(2, [member(1, 0.5, EXECUTING), member(2, 0.7)]).hysteresis)
         self.assertEqual(decided(1, [member(1, None)]).hysteresis, "no report counts")
@@ -123,7 +127,7 @@ class VerdictTests(SynchronousTestCase):
     def test_decoder_is_total(self) -> None:
         """Any value of a record gives a decision record or None, and never raises."""
         good = decided(1, THREE)
-        content = msgpack.unpackb(good.packed())
+        content = msgpack.unpackb(good.pack())
         bad: dict[str, list[object]] = {
             "name": [None, 7, "a\x1b[2J"],
             "epoch": [-1, 2**60, 1.5, True, "1", 2],
@@ -140,29 +144,29 @@ class VerdictTests(SynchronousTestCase):
         for field, values in bad.items():
             for value in values:
                 packed = msgpack.packb({**content, field: value})
-                self.assertIsNone(verdict_of(record_of(1, good, packed)), f"{field} {value!r}")
-        for raw in (b"", b"\xc1", b"\x90", msgpack.packb({}), bytes(MAX_VERDICT + 1)):
-            self.assertIsNone(verdict_of(record_of(1, good, raw)))
-        self.assertIsNone(verdict_of(replace(record_of(1, good), value=None)))
-        self.assertIsNone(verdict_of(record_of(1, good, name="member")))
-        self.assertIsNone(verdict_of(record_of(1, good, name=slot_of(good.epoch + 1))))
+                self.assertIsNone(parse_decision_record(record_of(1, good, packed)), f"{field} {value!r}")
+        for raw in (b"", b"\xc1", b"\x90", msgpack.packb({}), bytes(MAX_RECORD_BYTES + 1)):
+            self.assertIsNone(parse_decision_record(record_of(1, good, raw)))
+        self.assertIsNone(parse_decision_record(replace(record_of(1, good), value=None)))
+        self.assertIsNone(parse_decision_record(record_of(1, good, name="member")))
+        self.assertIsNone(parse_decision_record(record_of(1, good, name=make_slot_name(good.epoch + 1))))
         rng = random.Random(5)
         for _ in range(500):
-            crafted = bytearray(good.packed())
+            crafted = bytearray(good.pack())
             for _ in range(rng.randint(1, 5)):
                 crafted[rng.randrange(len(crafted))] = rng.randrange(256)
-            verdict_of(record_of(1, good, bytes(crafted)))
+            parse_decision_record(record_of(1, good, bytes(crafted)))
 
     def test_name_of_another_spoils_nothing(self) -> None:
         """A member's name with terminal control characters is shown without them, and the record stays readable."""
         hostile = replace(member(2, 0.5), name="a\x1b[2J\ud800")
-        verdict = verdict_of(record_of(1, decided(1, [hostile, member(1, 1.0)])))
+        verdict = parse_decision_record(record_of(1, decided(1, [hostile, member(1, 1.0)])))
         self.assertIsNotNone(verdict)
         self.assertEqual(verdict and verdict.reports[0].name, "a?[2J?")
 
     def test_of_many_the_best_tell(self) -> None:
         """In a group of up to thirty all agents write records; in a larger one the best eight do."""
-        members = [member(i, float(i)) for i in range(1, MANY + 2)]
-        self.assertTrue(all(decided(n, members[:MANY]).is_witness for n in range(1, MANY + 1)))
-        told = [verdict for n in range(1, MANY + 2) if (verdict := decided(n, members)).is_witness]
-        self.assertEqual([verdict.name for verdict in told], [f"dog{n}" for n in range(1, BEST + 1)])
+        members = [member(i, float(i)) for i in range(1, MAX_REPORTS + 2)]
+        self.assertTrue(all(decided(n, members[:MAX_REPORTS]).is_publisher for n in range(1, MAX_REPORTS + 1)))
+        told = [verdict for n in range(1, MAX_REPORTS + 2) if (verdict := decided(n, members)).is_publisher]
+        self.assertEqual([verdict.name for verdict in told], [f"dog{n}" for n in range(1, MAX_BEST_REPORTS + 1)])

@@ -16,8 +16,8 @@ from typing import Any
 
 from twisted.trial.unittest import SynchronousTestCase
 
-from middleware.entangled.control.command import asked, main
-from middleware.entangled.control.place import NoControl, made
+from middleware.entangled.control.command import main, send_request
+from middleware.entangled.control.socket_path import NoControl, prepare_path
 
 RECORD = {"owner": "ab" * 32, "name": "", "sequence": 1, "lifetime": "team", "value": "red"}
 
@@ -28,7 +28,7 @@ class CommandTests(SynchronousTestCase):
         runtime = Path(tempfile.mkdtemp())
         self.addCleanup(shutil.rmtree, runtime)
         self.patch(os, "environ", {**os.environ, "XDG_RUNTIME_DIR": str(runtime)})
-        made("a").touch()
+        prepare_path("a").touch()
         self.requests: list[dict[str, Any]] = []
         self.replies: list[dict[str, Any]] = [{"answer": None}]
         self.said = ""
@@ -146,8 +146,8 @@ class CommandTests(SynchronousTestCase):
 
     def test_node_that_does_not_answer(self) -> None:
         """A socket without a server, and a server with another protocol, give an error that names the cause."""
-        path = made("gone")
-        said = str(self.assertRaises(NoControl, list, asked(path, {})))
+        path = prepare_path("gone")
+        said = str(self.assertRaises(NoControl, list, send_request(path, {})))
         self.assertIn("does not answer (No such file or directory); start it, or remove that file", said)
         server = socket.socket(socket.AF_UNIX)
         self.addCleanup(server.close)
@@ -162,5 +162,5 @@ class CommandTests(SynchronousTestCase):
 
         thread = threading.Thread(target=speak)
         thread.start()
-        self.assertIn("does not answer", str(self.assertRaises(NoControl, list, asked(path, {}))))
+        self.assertIn("does not answer", str(self.assertRaises(NoControl, list, send_request(path, {}))))
         thread.join()

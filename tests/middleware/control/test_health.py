@@ -8,21 +8,21 @@ from twisted.internet.defer import Deferred
 from twisted.trial.unittest import SynchronousTestCase
 
 from middleware.entangled.contact import Contact
-from middleware.entangled.control.health import ASKED, FEW, IDLE, Gauge, health, links
-from middleware.entangled.control.link import link
-from middleware.entangled.network.switchboard import Weather
-from tests.fleet import FleetCase, SwarmFleet
+from middleware.entangled.control.health import FEW_PEERS, IDLE_S, PINGS, LinkMetrics, measure_links, read_health
+from middleware.entangled.control.link_quality import compute_quality
+from middleware.entangled.network.switchboard import LinkConditions
+from tests.fleet import FleetCase, SwarmTeam
 
 
 class GaugeTests(FleetCase):
     def setUp(self) -> None:
         super().setUp()
-        self.team: SwarmFleet = self.swarm(3, weather=Weather(delay_s=0.01))
+        self.team: SwarmTeam = self.swarm(3, weather=LinkConditions(delay_s=0.01))
         self.team.run(3.0)
-        self.gauge: Gauge = self.team.nodes[0].gauge
+        self.gauge: LinkMetrics = self.team.nodes[0].link_metrics
 
     def measured(self) -> dict[str, dict[str, Any]]:
-        return {each["id"]: each for each in self.gauge.links()}
+        return {each["id"]: each for each in self.gauge.read()}
 
     def test_answer_at_once(self) -> None:
         """The first report lists the paths without measurements; a second later it has the results of ten probes."""
@@ -39,7 +39,7 @@ class GaugeTests(FleetCase):
         """Loss that starts during the measurement is visible within ten seconds."""
         self.measured()
         self.team.run(3.0)
-        self.team.board.weather = Weather(delay_s=0.01, loss=0.3)
+        self.team.switchboard.conditions = LinkConditions(delay_s=0.01, loss=0.3)
         losses = []
         for _ in range(5):
             self.team.run(2.0)
@@ -60,7 +60,7 @@ class GaugeTests(FleetCase):
         self.measured()
         self.team.run(10.0)
         self.assertGreater(len(asked), 2 * usual + 15)
-        self.team.run(IDLE)
+        self.team.run(IDLE_S)
         asked.clear()
         self.team.run(10.0)
         self.assertEqual(len(asked), usual)
@@ -68,7 +68,7 @@ class GaugeTests(FleetCase):
 
     def test_many_peers_cost_no_more(self) -> None:
         """A node sends at most 10 probes per second (100 initially), for any number of peers."""
-        large = self.swarm(24, weather=Weather(delay_s=0.003))
+        large = self.swarm(24, weather=LinkConditions(delay_s=0.003))
         large.run(3.0)
         asked: list[float] = []
 
@@ -76,14 +76,14 @@ class GaugeTests(FleetCase):
             asked.extend([large.clock.seconds()] * (peer.node_id.hex() == large.nodes[0].uuid))
             return said
 
-        gauge = large.nodes[0].gauge
-        peers = {each["id"] for each in gauge.links()}
-        self.assertGreater(len(peers), 2 * FEW)
+        gauge = large.nodes[0].link_metrics
+        peers = {each["id"] for each in gauge.read()}
+        self.assertGreater(len(peers), 2 * FEW_PEERS)
         for node in large.nodes[1:]:
             node.entangled.endpoint.expose("ping", answer, changes=True)
         for seconds, most in ((1.0, 100.0), (2.0, 100.0), (5.0, 10.0)):
             before = len(asked)
-            gauge.links()
+            gauge.read()
             large.run(seconds)
             self.assertLess(len(asked) - before, most * seconds + 2 * len(peers), seconds)
 
@@ -92,20 +92,20 @@ class HealthTests(FleetCase):
     def test_health(self) -> None:
         """The health report contains the contacts, the number of stored records and its limit, and no rejections."""
         fleet = self.fleet(3)
-        said = health(fleet.nodes[1])
+        said = read_health(fleet.nodes[1])
         self.assertEqual((said["contacts"], said["trouble"], said["refusals"]), (2, "", []))
         self.assertGreater(said["max_rows"], said["rows"])
         self.assertEqual(said["address"], str(fleet.address(1)))
 
     def test_links(self) -> None:
         """Each peer is timed with small requests; a failed peer answers none."""
-        fleet = self.fleet(3, weather=Weather(delay_s=0.02))
+        fleet = self.fleet(3, weather=LinkConditions(delay_s=0.02))
         fleet.run(3.0)
         fleet.kill(2)
-        asked = Deferred.fromCoroutine(links(fleet.nodes[0], fleet.clock))
+        asked = Deferred.fromCoroutine(measure_links(fleet.nodes[0], fleet.clock))
         found = {each["id"]: each for each in self.done(fleet, asked, 30.0)}
         live, dead = (found[fleet.nodes[place].identity.node_id.hex()] for place in (1, 2))
-        self.assertEqual(len(live["times"]), ASKED)
+        self.assertEqual(len(live["times"]), PINGS)
         self.assertEqual({round(seconds, 3) for seconds in live["times"]}, {0.04})
         self.assertEqual((set(dead["times"]), dead["relayed"]), ({None}, False))
 
@@ -119,22 +119,22 @@ class LinkTests(SynchronousTestCase):
             ([None] * 10, False, 0),
         ]
         for times, is_relayed, score in rows:
-            self.assertEqual(link(times, is_relayed).score, score)
-        self.assertEqual((link([None], False).loss, link([None], False).round_trip), (1.0, None))
+            self.assertEqual(compute_quality(times, is_relayed).score, score)
+        self.assertEqual((compute_quality([None], False).loss, compute_quality([None], False).round_trip), (1.0, None))
 
     def test_a_second_try_counts_as_a_loss(self) -> None:
         """A reply after a retransmission counts as a loss and is excluded from the round-trip time."""
-        found = link([0.002] * 8 + [0.055, 0.11], False)
+        found = compute_quality([0.002] * 8 + [0.055, 0.11], False)
         self.assertEqual((found.loss, found.round_trip), (0.2, 0.002))
-        found = link([0.1] * 8 + [0.26, None], False)
+        found = compute_quality([0.1] * 8 + [0.26, None], False)
         self.assertEqual((round(found.loss, 3), found.round_trip), (0.2, 0.1))
 
     def test_each_trouble_costs(self) -> None:
         """Loss, delay, jitter and a relay each lower the score, and more of each lowers it further."""
-        best = link([0.002] * 10, False).score
-        lossy = [link([0.002] * (10 - n) + [None] * n, False).score for n in (1, 2, 3)]
-        late = [link([seconds] * 10, False).score for seconds in (0.05, 0.1, 0.2)]
-        shaky = [link([0.02 - by, 0.02 + by] * 5, False).score for by in (0.005, 0.01)]
-        for scores in (lossy, late, shaky, [link([0.002] * 10, True).score]):
+        best = compute_quality([0.002] * 10, False).score
+        lossy = [compute_quality([0.002] * (10 - n) + [None] * n, False).score for n in (1, 2, 3)]
+        late = [compute_quality([seconds] * 10, False).score for seconds in (0.05, 0.1, 0.2)]
+        shaky = [compute_quality([0.02 - by, 0.02 + by] * 5, False).score for by in (0.005, 0.01)]
+        for scores in (lossy, late, shaky, [compute_quality([0.002] * 10, True).score]):
             self.assertEqual([best, *scores], sorted([best, *scores], reverse=True))
             self.assertLess(scores[0], best)

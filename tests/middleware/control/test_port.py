@@ -10,9 +10,9 @@ from twisted.internet.error import CannotListenError
 from twisted.internet.testing import StringTransport
 from twisted.trial.unittest import SynchronousTestCase
 
-from middleware.entangled.control.port import MAX_CONNECTIONS, MAX_REQUEST, ControlPort, ControlProtocol
-from middleware.entangled.control.verb import Verbs
-from tests.fleet import Fleet
+from middleware.entangled.control.request_handler import RequestHandler
+from middleware.entangled.control.server import MAX_CONNECTIONS, MAX_REQUEST_BYTES, ControlProtocol, ControlServer
+from tests.fleet import EntangledTeam
 
 
 class Listener:
@@ -35,17 +35,17 @@ class Listener:
 
 class ControlTests(SynchronousTestCase):
     def setUp(self) -> None:
-        self.fleet = Fleet(4)
+        self.fleet = EntangledTeam(4)
         self.fleet.run(1.0)
         self.made = 0
         self.listener = Listener()
-        self.port = ControlPort(self.listener, Path("/run/a.control"), self.verbs)
+        self.port = ControlServer(self.listener, Path("/run/a.control"), self.verbs)
         self.port.startService()
         self.addCleanup(self.port.stopService)
 
-    def verbs(self) -> Verbs:
+    def verbs(self) -> RequestHandler:
         self.made += 1
-        return Verbs.of(self.fleet.nodes[0], self.fleet.clock, self.fleet.rng(0))
+        return RequestHandler.create(self.fleet.nodes[0], self.fleet.clock, self.fleet.make_life_rng(0))
 
     def opened(self) -> tuple[ControlProtocol, StringTransport]:
         connection, transport = self.listener.factory.buildProtocol(None), StringTransport()
@@ -177,7 +177,7 @@ class ControlTests(SynchronousTestCase):
             connection.dataReceived(line)
             self.assertEqual(len(self.lines(transport)), 1)
         connection, transport = self.opened()
-        connection.dataReceived(b"x" * (MAX_REQUEST + 1))
+        connection.dataReceived(b"x" * (MAX_REQUEST_BYTES + 1))
         self.assertEqual([each["error"] for each in self.lines(transport)], ["BadRequest"])
 
     def test_request_in_pieces(self) -> None:
@@ -206,7 +206,7 @@ class ControlTests(SynchronousTestCase):
 
     def test_node_lives_without_a_socket(self) -> None:
         """If the path is in use, the node logs it and continues to run; a service that stops closes all connections."""
-        port = ControlPort(Listener(refuses=True), Path("/run/a.control"), self.verbs)
+        port = ControlServer(Listener(refuses=True), Path("/run/a.control"), self.verbs)
         port.startService()
         self.successResultOf(port.stopService())
         connection, transport = self.opened()

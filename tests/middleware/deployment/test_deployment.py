@@ -9,22 +9,22 @@ from pathlib import Path
 import msgpack
 
 from middleware.config.settings import DeploymentSettings
-from middleware.consensus.deployed import BEHAVIOUR, STRATEGY
-from middleware.consensus.strategy import strategy_for
-from middleware.deployment.deployment import RETRY, Author, Deployment
+from middleware.consensus.deployed_modules import BEHAVIOUR, STRATEGY
+from middleware.consensus.strategy import load_strategy
+from middleware.deployment.deployment import RETRY_S, Author, Deployment
 from middleware.deployment.manifest import (
-    MAX_SOURCE,
+    MAX_SOURCE_BYTES,
     Manifest,
+    make_next_manifest,
+    make_rollback,
     manifests_key,
-    pushed,
-    rolled_back,
     source_key,
 )
-from middleware.deployment.shelf import FileShelf, MemoryShelf, Shelf
-from middleware.entangled.record import Record, hashed_key
+from middleware.deployment.module_store import FileModuleStore, MemoryModuleStore, ModuleStore
+from middleware.entangled.record import Record, hash_key
 from middleware.errors import UnknownStrategy
 from middleware.node import SwarmNode
-from swarmnode.sandbox import simulated
+from swarmnode.sandbox import make_memory_channel
 from tests.fleet import FleetCase
 
 SOURCE = b"""
@@ -45,11 +45,11 @@ class DeploymentTests(FleetCase):
         self.addCleanup(lambda: [sys.modules.pop(name) for name in sorted(set(sys.modules) - before)])
         self.world = self.swarm(3)
         self.operator, self.stranger, self.dog = self.world.nodes
-        self.shelf = MemoryShelf()
+        self.shelf = MemoryModuleStore()
         self.author = Author("laptop", frozenset({"operator"}))
         self.deployment = self.allow()
 
-    def allow(self, shelf: Shelf | None = None, node: SwarmNode | None = None, **more: object) -> Deployment:
+    def allow(self, shelf: ModuleStore | None = None, node: SwarmNode | None = None, **more: object) -> Deployment:
         """Let the dog (or ``node``) accept "best" from the operator."""
         node = self.dog if node is None else node
         key = self.operator.entangled.identity.public.hex()
@@ -63,10 +63,10 @@ class DeploymentTests(FleetCase):
             allowed,
             shelf,
             lambda public: self.author,
-            simulated,
+            make_memory_channel,
             node.clock.seconds,
         )
-        made.open()
+        made.load_stored()
         made.follow()
         return made
 
@@ -74,18 +74,18 @@ class DeploymentTests(FleetCase):
         """Publish a manifest, and a source under the key that it names."""
         node = self.operator if by is None else by
         if source is not None:
-            self.done(self.world, node.entangled.put(hashed_key(source_key(manifest.digest)), "source", source), 1.0)
-        self.done(self.world, node.entangled.put(manifests_key(), manifest.name, manifest.packed()), 1.0)
+            self.done(self.world, node.entangled.put(hash_key(source_key(manifest.digest)), "source", source), 1.0)
+        self.done(self.world, node.entangled.put(manifests_key(), manifest.name, manifest.pack()), 1.0)
         self.world.run(1.0)
 
     def version(self, number: int, held: Manifest | None = None, name: str = "best") -> tuple[Manifest, bytes]:
         source = SOURCE + b"# %d\n" % number
-        return pushed(name, STRATEGY, source, held, number), source
+        return make_next_manifest(name, STRATEGY, source, held, number), source
 
     @property
     def running(self) -> int:
         """Return the version that runs, or 0."""
-        held = self.deployment.held.get("best")
+        held = self.deployment.running_manifests.get("best")
         return 0 if held is None else held.version
 
     def assert_refused(self, words: str, runs: int = 0) -> None:
@@ -102,14 +102,14 @@ class DeploymentTests(FleetCase):
         self.push(manifest, source)
         self.assertEqual(self.running, 1)
         self.assertIn(CANARY, sys.modules)
-        strategy = strategy_for("deployed:best", deployed=self.deployment.modules)
+        strategy = load_strategy("deployed:best", deployed=self.deployment.modules)
         self.assertEqual(strategy.name, "deployed:best")
         key = self.operator.entangled.identity.public.hex()
         told = f"1 {manifest.digest[:8]} by laptop {key[:8]} runs, not confined"
         self.assertEqual(self.dog.presence.device.deployed, {"best": told})
-        error = self.assertRaises(UnknownStrategy, strategy_for, "deployed:other", deployed=self.deployment.modules)
+        error = self.assertRaises(UnknownStrategy, load_strategy, "deployed:other", deployed=self.deployment.modules)
         self.assertIn("deployed: deployed:best", str(error))
-        self.assertRaises(UnknownStrategy, strategy_for, "deployed:best")
+        self.assertRaises(UnknownStrategy, load_strategy, "deployed:best")
 
     def test_objections(self) -> None:
         """Modules of a stranger, unlisted modules and oversized modules are refused before they are fetched."""
@@ -119,28 +119,28 @@ class DeploymentTests(FleetCase):
         self.push(*self.version(1, name="worst"))
         self.assert_refused("refuses worst 1: is not among this node's modules")
         self.assertNotIn("worst", self.dog.presence.device.deployed)
-        self.push(replace(manifest, size=MAX_SOURCE + 1), source)
-        self.assert_refused(f"has {MAX_SOURCE + 1} bytes, more than {MAX_SOURCE}")
+        self.push(replace(manifest, size=MAX_SOURCE_BYTES + 1), source)
+        self.assert_refused(f"has {MAX_SOURCE_BYTES + 1} bytes, more than {MAX_SOURCE_BYTES}")
 
     def test_bad_signature_is_refused(self) -> None:
         """A record in the operator's name without its signature is refused, even if a watcher receives it."""
         manifest, source = self.version(1)
-        self.done(self.world, self.operator.entangled.put(hashed_key(source_key(manifest.digest)), "source", source))
+        self.done(self.world, self.operator.entangled.put(hash_key(source_key(manifest.digest)), "source", source))
         owner = self.operator.entangled.identity.public
-        forged = Record(manifests_key(), "best", owner, 5, "team", 60.0, manifest.packed())
-        self.deployment._on_manifests([forged.signed(self.stranger.entangled.identity)])
+        forged = Record(manifests_key(), "best", owner, 5, "team", 60.0, manifest.pack())
+        self.deployment._on_manifests([forged.sign(self.stranger.entangled.identity)])
         self.world.run(1.0)
         self.assert_refused("is not signed by its operator")
 
     def test_wrong_kind_is_refused(self) -> None:
         """A strategy pushed as a behaviour is refused, and a name keeps its kind."""
         source = SOURCE + b"#"
-        self.push(pushed("best", BEHAVIOUR, source, None, 1), source)
+        self.push(make_next_manifest("best", BEHAVIOUR, source, None, 1), source)
         said = " ".join(text for _, text in self.dog.presence.device.messages)
         self.assertIn("a behaviour has to define Behaviour", said)
         manifest, source = self.version(2)
         self.push(manifest, source)
-        self.push(replace(pushed("best", BEHAVIOUR, source, manifest, 3), before=()), source)
+        self.push(replace(make_next_manifest("best", BEHAVIOUR, source, manifest, 3), before=()), source)
         self.assert_refused("is a strategy here, not a behaviour", runs=2)
 
     def test_lower_version_and_other_content_are_refused(self) -> None:
@@ -151,9 +151,9 @@ class DeploymentTests(FleetCase):
         self.push(first, source)
         self.assert_refused("version 1 is older than the 2 held", runs=2)
         other = SOURCE + b"# other\n"
-        self.push(pushed("best", STRATEGY, other, None, 2), other)
+        self.push(make_next_manifest("best", STRATEGY, other, None, 2), other)
         self.assert_refused("version 2 is held with other content", runs=2)
-        self.assertEqual(self.deployment.held["best"], second)
+        self.assertEqual(self.deployment.running_manifests["best"], second)
 
     def test_going_back_and_old_word_again(self) -> None:
         """After a rollback the withdrawn version is refused, even if its record arrives again."""
@@ -161,7 +161,7 @@ class DeploymentTests(FleetCase):
         self.push(first, source)
         second, source = self.version(2, first)
         self.push(second, source)
-        back = rolled_back(second)
+        back = make_rollback(second)
         assert back is not None
         self.push(back, None)
         self.assertEqual(self.running, 1)
@@ -172,14 +172,14 @@ class DeploymentTests(FleetCase):
         """A source that is missing, or differs from the signed digest, is requested again until it arrives."""
         manifest, source = self.version(1)
         wrong = source[:-2] + b"2\n"
-        key = hashed_key(source_key(manifest.digest))
+        key = hash_key(source_key(manifest.digest))
         self.done(self.world, self.stranger.entangled.put(key, "source", wrong))
         self.push(manifest, None)
-        self.world.run(RETRY)
+        self.world.run(RETRY_S)
         self.assertEqual(self.running, 0)
         self.assertNotIn(CANARY, sys.modules)
         self.done(self.world, self.operator.entangled.put(key, "source", source))
-        self.world.run(2 * RETRY)
+        self.world.run(2 * RETRY_S)
         self.assertEqual(self.running, 1)
 
     def test_nonsense_under_the_key(self) -> None:
@@ -198,7 +198,7 @@ class DeploymentTests(FleetCase):
             self.push(held, source)
         self.assertEqual(len(self.shelf.contents), 2)
         for node in (self.operator, self.stranger):
-            node.vanish()
+            node.stop_silently()
         self.deployment = self.allow()
         self.assertEqual(self.running, 3)
 
@@ -209,13 +209,13 @@ class DeploymentTests(FleetCase):
         sys.modules.pop(CANARY)
         for struck in ("operators", "modules"):
             made = self.allow(None, self.stranger, **{struck: ()})
-            self.assertEqual((dict(made.held), made.modules), ({}, {}))
+            self.assertEqual((dict(made.running_manifests), made.modules), ({}, {}))
             self.assertNotIn(CANARY, sys.modules)
 
     def test_damaged_files_never_run(self) -> None:
         """A truncated or changed file is skipped, and the previous edition runs."""
         folder = Path(self.mktemp())
-        self.deployment = self.allow(FileShelf(folder))
+        self.deployment = self.allow(FileModuleStore(folder))
         first, source = self.version(1)
         self.push(first, source)
         second, source = self.version(2, first)
@@ -227,12 +227,12 @@ class DeploymentTests(FleetCase):
             path.write_bytes(damaged)
             for node in (self.operator, self.stranger):
                 if node.running:
-                    node.vanish()
-            self.deployment = self.allow(FileShelf(folder))
+                    node.stop_silently()
+            self.deployment = self.allow(FileModuleStore(folder))
             self.assertEqual(self.running, 1)
         middle = len(whole) // 8
         path.write_bytes(whole[:middle] + bytes([whole[middle] ^ 1]) + whole[middle + 1 :])
-        self.deployment = self.allow(FileShelf(folder))
+        self.deployment = self.allow(FileModuleStore(folder))
         self.assertEqual(self.running, 1)
 
     def test_full_disk_is_told(self) -> None:
@@ -242,7 +242,7 @@ class DeploymentTests(FleetCase):
             raise OSError(28, "No space left on device")
 
         folder = Path(self.mktemp())
-        self.deployment = self.allow(FileShelf(folder, full))
+        self.deployment = self.allow(FileModuleStore(folder, full))
         manifest, source = self.version(1)
         self.push(manifest, source)
         self.assert_refused("cannot store best 1: No space left on device", runs=1)

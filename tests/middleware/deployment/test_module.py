@@ -1,4 +1,4 @@
-"""Tests of ``middleware.deployment.module``: loading an operator's source, or the reason why it is refused."""
+"""Tests of ``middleware.deployment.module_loader``: loading an operator's source, or the reason why it is refused."""
 
 from __future__ import annotations
 
@@ -6,10 +6,10 @@ import sys
 
 from twisted.trial.unittest import SynchronousTestCase
 
-from middleware.consensus.deployed import BEHAVIOUR, STRATEGY
+from middleware.consensus.deployed_modules import BEHAVIOUR, STRATEGY
 from middleware.consensus.strategy import Report
-from middleware.deployment.manifest import pushed
-from middleware.deployment.module import loaded
+from middleware.deployment.manifest import make_next_manifest
+from middleware.deployment.module_loader import load_module
 from middleware.errors import Undeployable
 
 GOOD = """
@@ -48,7 +48,7 @@ class ModuleTests(SynchronousTestCase):
         """Return the reason why a source is refused, and check that it leaves no module."""
         data = source.encode() if isinstance(source, str) else source
         before = set(sys.modules)
-        error = self.assertRaises(Undeployable, loaded, pushed("best", kind, data, None), data)
+        error = self.assertRaises(Undeployable, load_module, make_next_manifest("best", kind, data, None), data)
         self.assertEqual([name for name in set(sys.modules) - before if "deployed" in name], [])
         self.assertEqual(len(str(error).splitlines()), 1)
         return str(error.problem)
@@ -56,16 +56,16 @@ class ModuleTests(SynchronousTestCase):
     def test_strategy_decides_under_its_name_and_version(self) -> None:
         """Each call creates a new strategy, which decides and names its deployed name and version."""
         source = GOOD.encode()
-        manifest = pushed("best", STRATEGY, source, None)
-        strategy = loaded(manifest, source)()
+        manifest = make_next_manifest("best", STRATEGY, source, None)
+        strategy = load_module(manifest, source)()
         self.assertEqual(strategy.find([Report("a", 2.0), Report("b", 1.0)]).assigned_agent, "b")
         self.assertEqual((strategy.name, strategy.version), ("deployed:best", f"1 {manifest.digest[:8]}"))
-        self.assertIsNot(loaded(manifest, source)(), strategy)
+        self.assertIsNot(load_module(manifest, source)(), strategy)
 
     def test_behaviour_takes_parameters(self) -> None:
         """A behaviour is created from a task's parameters."""
         source = SPIN.encode()
-        made = loaded(pushed("spin", BEHAVIOUR, source, None), source)({"cost": 2}, None)
+        made = load_module(make_next_manifest("spin", BEHAVIOUR, source, None), source)({"cost": 2}, None)
         self.assertEqual(made.cost, 2.0)
 
     def test_what_cannot_run_is_refused(self) -> None:
@@ -107,8 +107,8 @@ class ModuleTests(SynchronousTestCase):
     def test_other_source_than_signed_never_runs(self) -> None:
         """A source with another digest or size than in the manifest is refused before it runs."""
         source = b"import sys; sys.modules['swarm_canary'] = sys"
-        manifest = pushed("best", STRATEGY, b"x" * len(source), None)
-        error = self.assertRaises(Undeployable, loaded, manifest, source)
+        manifest = make_next_manifest("best", STRATEGY, b"x" * len(source), None)
+        error = self.assertRaises(Undeployable, load_module, manifest, source)
         self.assertIn("not what was signed", str(error))
         self.assertNotIn("swarm_canary", sys.modules)
 

@@ -8,14 +8,14 @@ from typing import Any
 
 from twisted.trial.unittest import SynchronousTestCase
 
-from middleware.consensus.deployed import BEHAVIOUR, STRATEGY
-from middleware.consensus.guard import STRIKES, Lost, NoOpinion
+from middleware.consensus.deployed_modules import BEHAVIOUR, STRATEGY
+from middleware.consensus.guarded_strategy import MAX_LOSSES, StrategyError, StrategyLost
 from middleware.consensus.strategy import Report
-from middleware.deployment import frame
-from middleware.deployment.manifest import pushed
-from middleware.deployment.runner import MAX_PENDING, PATIENCE_S, START_S, PushedStrategy, Runner, State
+from middleware.deployment import module_channel
+from middleware.deployment.manifest import make_next_manifest
+from middleware.deployment.runner import MAX_PENDING, REPLY_TIMEOUT_S, START_TIMEOUT_S, PushedStrategy, Runner, State
 from middleware.errors import UnknownTask
-from swarmnode.sandbox import simulated
+from swarmnode.sandbox import make_memory_channel
 
 NEAREST = b"from middleware.consensus.strategies.nearest import Nearest as Strategy\n"
 ONE = [0, "find", []]
@@ -24,31 +24,31 @@ ONE = [0, "find", []]
 class Scripted:
     """A process with scripted answers."""
 
-    is_behind = False
+    has_unsent = False
 
     def __init__(self, answer: Callable[[int, str], bytes]) -> None:
         self.is_ended = False
         self.asked: list[str] = []
         self._answer = answer
-        self._splitter = frame.Splitter(frame.MAX_QUESTION)
+        self._splitter = module_channel.FrameSplitter(module_channel.MAX_REQUEST_BYTES)
         self._ready: list[bytes] = []
 
     def send(self, message: bytes) -> None:
         for question in self._splitter.feed(message):
-            number, verb, _ = frame.unpack_question(question)
+            number, verb, _ = module_channel.parse_request(question)
             self.asked.append(verb)
-            self._ready += frame.Splitter(frame.MAX_ANSWER).feed(self._answer(number, verb))
+            self._ready += module_channel.FrameSplitter(module_channel.MAX_REPLY_BYTES).feed(self._answer(number, verb))
 
     def receive(self, within_s: float) -> list[bytes]:
         ready, self._ready = self._ready, []
         return ready
 
-    def end(self) -> None:
+    def kill(self) -> None:
         self.is_ended = True
 
 
 def well(number: int, content: Any) -> bytes:
-    return frame.pack([number, True, content])
+    return module_channel.pack([number, True, content])
 
 
 class RunnerTests(SynchronousTestCase):
@@ -65,9 +65,11 @@ class RunnerTests(SynchronousTestCase):
             self.processes.append(Scripted(answer))
             return self.processes[-1]
 
-        runner = Runner(pushed("best", kind, NEAREST, None), NEAREST, spawn, lambda: self.now, lambda: self.objection)
+        runner = Runner(
+            make_next_manifest("best", kind, NEAREST, None), NEAREST, spawn, lambda: self.now, lambda: self.objection
+        )
         runner.start()
-        runner.look()
+        runner.poll()
         return runner
 
     def good(self, number: int, verb: str) -> bytes:
@@ -78,7 +80,7 @@ class RunnerTests(SynchronousTestCase):
         """After loading, the runner knows the limits and the fields read, and forwards calls."""
         runner = self.runner(self.good)
         self.assertEqual((runner.state, runner.limits, runner.reads), (State.READY, ("seccomp",), ("load",)))
-        self.assertEqual(runner.wait_for("call", ONE), 7)
+        self.assertEqual(runner.call("call", ONE), 7)
         self.assertEqual(PushedStrategy(runner).name, "deployed:best")
 
     def test_may_not_run(self) -> None:
@@ -88,36 +90,36 @@ class RunnerTests(SynchronousTestCase):
         self.assertEqual((runner.state, runner.why, self.processes), (State.OUT, "is revoked", []))
         self.objection = ""
         lost = self.runner(lambda number, verb: self.good(number, verb) if verb == "load" else b"")
-        self.assertRaises(Lost, lost.wait_for, "call", ONE)
+        self.assertRaises(StrategyLost, lost.call, "call", ONE)
         self.objection = "is revoked"
-        self.assertRaises(NoOpinion, lost.wait_for, "call", ONE)
+        self.assertRaises(StrategyError, lost.call, "call", ONE)
         self.assertEqual((lost.state, len(self.processes)), (State.OUT, 1))
 
     def test_silence_costs_the_process(self) -> None:
         """A process that does not answer is killed; after ``STRIKES`` of them no other is started."""
         runner = self.runner(lambda number, verb: self.good(number, verb) if verb == "load" else b"")
-        for _ in range(STRIKES):
-            self.assertRaises(Lost, runner.wait_for, "call", ONE)
+        for _ in range(MAX_LOSSES):
+            self.assertRaises(StrategyLost, runner.call, "call", ONE)
         self.assertIs(runner.state, State.OUT)
-        self.assertRaises(NoOpinion, runner.wait_for, "call", ONE)
-        self.assertEqual([each.is_ended for each in self.processes], [True] * STRIKES)
+        self.assertRaises(StrategyError, runner.call, "call", ONE)
+        self.assertEqual([each.is_ended for each in self.processes], [True] * MAX_LOSSES)
 
     def test_never_loaded(self) -> None:
         """A process that is not ready in time is killed."""
         runner = self.runner(lambda number, verb: b"")
-        self.assertRaises(NoOpinion, runner.wait_for, "call", ONE)
-        self.now = START_S + 1.0
-        runner.look()
+        self.assertRaises(StrategyError, runner.call, "call", ONE)
+        self.now = START_TIMEOUT_S + 1.0
+        runner.poll()
         self.assertEqual((runner.state, self.processes[0].is_ended), (State.LOST, True))
 
     def test_hostile_answers(self) -> None:
         """An invalid answer ends the process and raises only ``NoOpinion``."""
         for nonsense in (
-            frame.pack(7),
-            frame.pack([1]),
-            frame.pack([99, True, None]),
-            frame.pack(["1", True, None]),
-            frame.pack([2, 1, None]),
+            module_channel.pack(7),
+            module_channel.pack([1]),
+            module_channel.pack([99, True, None]),
+            module_channel.pack(["1", True, None]),
+            module_channel.pack([2, 1, None]),
             b"\0\0\0\1\xc1",
             b"\0\0\0\0",
         ):
@@ -126,7 +128,7 @@ class RunnerTests(SynchronousTestCase):
                 return self.good(number, verb) if verb == "load" else nonsense
 
             runner = self.runner(answer)
-            self.assertRaises(NoOpinion, runner.wait_for, "call", ONE)
+            self.assertRaises(StrategyError, runner.call, "call", ONE)
             self.assertIs(runner.state, State.LOST)
 
     def test_hostile_facts(self) -> None:
@@ -141,16 +143,16 @@ class RunnerTests(SynchronousTestCase):
         runner = self.runner(self.good, BEHAVIOUR)
         instance = runner.create({"turns": 1}, random.Random(1))
         answers: list[tuple[bool, Any]] = []
-        self.assertTrue(instance.ask("look", [], lambda is_well, content: answers.append((is_well, content))))
-        instance.look()
+        self.assertTrue(instance.send_request("look", [], lambda is_well, content: answers.append((is_well, content))))
+        instance.poll()
         self.assertEqual(answers, [(True, 7)])
         instance.close()
         self.assertEqual(self.processes[0].asked, ["load", "make", "call", "drop"])
         other = runner.create({}, random.Random(1))
         runner.stop("is revoked")
-        other.look()
+        other.poll()
         self.assertEqual((other.fault, runner.instances), ("is revoked", set()))
-        self.assertFalse(other.ask("look", [], lambda is_well, content: None))
+        self.assertFalse(other.send_request("look", [], lambda is_well, content: None))
         self.assertRaises(UnknownTask, runner.create, {}, random.Random(1))
 
     def test_late_behaviour_is_ended(self) -> None:
@@ -158,30 +160,30 @@ class RunnerTests(SynchronousTestCase):
         runner = self.runner(lambda number, verb: b"" if verb == "call" else self.good(number, verb), BEHAVIOUR)
         instance = runner.create({}, random.Random(1))
         answers: list[bool] = []
-        instance.ask("look", [], lambda is_well, content: answers.append(is_well))
-        self.now = PATIENCE_S
-        instance.look()
+        instance.send_request("look", [], lambda is_well, content: answers.append(is_well))
+        self.now = REPLY_TIMEOUT_S
+        instance.poll()
         self.assertEqual(answers, [])
-        self.now = PATIENCE_S + 0.01
-        instance.look()
+        self.now = REPLY_TIMEOUT_S + 0.01
+        instance.poll()
         self.assertEqual((answers, runner.state, bool(instance.fault)), ([False], State.LOST, True))
 
     def test_questions_are_bounded(self) -> None:
         """The number of pending calls is limited."""
         runner = self.runner(lambda number, verb: b"" if verb == "call" else self.good(number, verb), BEHAVIOUR)
         for _ in range(MAX_PENDING):
-            runner.ask("call", [], lambda is_well, content: None)
-        self.assertRaises(frame.Gone, runner.ask, "call", [], lambda is_well, content: None)
+            runner.send_request("call", [], lambda is_well, content: None)
+        self.assertRaises(module_channel.ProcessEnded, runner.send_request, "call", [], lambda is_well, content: None)
 
     def test_twin(self) -> None:
         """The in-memory runner loads, decides and refuses like a process."""
-        runner = Runner(pushed("best", STRATEGY, NEAREST, None), NEAREST, simulated, lambda: 0.0)
+        runner = Runner(make_next_manifest("best", STRATEGY, NEAREST, None), NEAREST, make_memory_channel, lambda: 0.0)
         runner.start()
-        runner.look()
+        runner.poll()
         found = PushedStrategy(runner).find([Report("a", 2.0), Report("b", 1.0)])
         self.assertEqual((found.assigned_agent, runner.limits), ("b", ("simulated",)))
-        wrong = Runner(pushed("best", STRATEGY, b"1 / 0", None), b"1 / 0", simulated, lambda: 0.0)
+        wrong = Runner(make_next_manifest("best", STRATEGY, b"1 / 0", None), b"1 / 0", make_memory_channel, lambda: 0.0)
         wrong.start()
-        wrong.look()
+        wrong.poll()
         self.assertEqual(wrong.state, State.OUT)
         self.assertIn("ZeroDivisionError", wrong.why)

@@ -1,4 +1,4 @@
-"""Tests of ``middleware.deployment.shelf``: a stored file is complete or absent."""
+"""Tests of ``middleware.deployment.module_store``: a stored file is complete or absent."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ from pathlib import Path
 
 from twisted.trial.unittest import SynchronousTestCase
 
-from middleware.deployment.shelf import FileShelf, MemoryShelf, Shelf
+from middleware.deployment.module_store import FileModuleStore, MemoryModuleStore, ModuleStore
 
 
 class FileShelfTests(SynchronousTestCase):
@@ -15,27 +15,27 @@ class FileShelfTests(SynchronousTestCase):
 
     def test_keeps_and_drops(self) -> None:
         """Both implementations list the stored entries in the order of their names, without the dropped ones."""
-        shelves: list[Shelf] = [FileShelf(self.folder), MemoryShelf()]
+        shelves: list[ModuleStore] = [FileModuleStore(self.folder), MemoryModuleStore()]
         for shelf in shelves:
-            self.assertEqual(shelf.everything(), [])
-            shelf.drop("a")
-            shelf.keep("b", b"2")
-            shelf.keep("a", b"1")
-            shelf.keep("b", b"3")
-            self.assertEqual(shelf.everything(), [("a", b"1"), ("b", b"3")])
-            shelf.drop("a")
-            self.assertEqual(shelf.everything(), [("b", b"3")])
+            self.assertEqual(shelf.list_modules(), [])
+            shelf.delete("a")
+            shelf.save("b", b"2")
+            shelf.save("a", b"1")
+            shelf.save("b", b"3")
+            self.assertEqual(shelf.list_modules(), [("a", b"1"), ("b", b"3")])
+            shelf.delete("a")
+            self.assertEqual(shelf.list_modules(), [("b", b"3")])
 
     def test_crash_in_the_middle_leaves_the_old(self) -> None:
         """After a crash during a write, the old file is read and the temporary file is removed."""
-        FileShelf(self.folder).keep("a", b"old")
+        FileModuleStore(self.folder).save("a", b"old")
         self.assertEqual(self.folder.stat().st_mode & 0o077, 0)
 
         def crash(source: Path, target: Path) -> None:
             source.write_bytes(b"ne")
             raise OSError("the power failed")
 
-        self.assertRaises(OSError, FileShelf(self.folder, crash).keep, "a", b"new")
+        self.assertRaises(OSError, FileModuleStore(self.folder, crash).save, "a", b"new")
         self.assertEqual(len(list(self.folder.iterdir())), 2)
-        self.assertEqual(FileShelf(self.folder).everything(), [("a", b"old")])
+        self.assertEqual(FileModuleStore(self.folder).list_modules(), [("a", b"old")])
         self.assertEqual(len(list(self.folder.iterdir())), 1)

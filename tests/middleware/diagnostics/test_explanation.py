@@ -7,8 +7,8 @@ from dataclasses import replace
 
 from twisted.trial.unittest import SynchronousTestCase
 
-from middleware.consensus.verdict import BEST, MANY
-from middleware.diagnostics.explanation import as_text, explained
+from middleware.consensus.decision_record import MAX_BEST_REPORTS, MAX_REPORTS
+from middleware.diagnostics.explanation import explain_decisions, format_explanation
 from tests.middleware.consensus.test_verdict import THREE, decided, member
 
 OWN = [decided(n, THREE) for n in (1, 2, 3)]
@@ -17,10 +17,10 @@ OWN = [decided(n, THREE) for n in (1, 2, 3)]
 class ExplanationTests(SynchronousTestCase):
     def test_all_agree(self) -> None:
         """Three agents with the same reports agree without differences."""
-        (ruling,) = explained([decided(n, THREE) for n in (1, 2, 3)]).epochs
+        (ruling,) = explain_decisions([decided(n, THREE) for n in (1, 2, 3)]).epochs
         self.assertEqual((ruling.chosen, ruling.agree, ruling.of), ("dog2", ("dog1", "dog2", "dog3"), 3))
         self.assertEqual(ruling.differ, ())
-        text = as_text(explained([decided(n, THREE) for n in (1, 2, 3)]))
+        text = format_explanation(explain_decisions([decided(n, THREE) for n in (1, 2, 3)]))
         self.assertTrue(text.startswith("epoch 1: dog2, 3 of 3 agree\n  by nearest 1 from reports "), text)
 
     def test_who_differs_and_in_what(self) -> None:
@@ -33,10 +33,10 @@ class ExplanationTests(SynchronousTestCase):
             (decided(3, [*THREE, member(4, 9.0)]), "knew a report of dog4"),
             (decided(3, THREE, version="2"), "decided by nearest 2, not nearest 1"),
         ):
-            (ruling,) = explained([decided(1, THREE), decided(2, THREE), other]).epochs
+            (ruling,) = explain_decisions([decided(1, THREE), decided(2, THREE), other]).epochs
             self.assertEqual([(d.name, d.what) for d in ruling.differ], [("dog3", what)])
             self.assertEqual(ruling.chosen, "dog2")
-        text = as_text(explained([decided(1, THREE), decided(2, THREE), decided(3, missed)]))
+        text = format_explanation(explain_decisions([decided(1, THREE), decided(2, THREE), decided(3, missed)]))
         self.assertIn("2 of 3 agree", text)
         self.assertIn("dog3 differs: names dog3; knew no report of dog2", text)
 
@@ -46,18 +46,18 @@ class ExplanationTests(SynchronousTestCase):
             replace(each, reports=(replace(each.reports[0], more="battery 40%"), *each.reports[1:])) for each in OWN
         ]
         agreed = [replace(each, choice="red") for each in known]
-        text = as_text(explained(agreed))
+        text = format_explanation(explain_decisions(agreed))
         self.assertIn("\n  agreed on red\n", text)
         self.assertIn("0.50  *  battery 40%\n", text)
-        (ruling,) = explained([*agreed[:2], replace(agreed[2], choice="", value=(1.0, 2.5))]).epochs
+        (ruling,) = explain_decisions([*agreed[:2], replace(agreed[2], choice="", value=(1.0, 2.5))]).epochs
         self.assertEqual([(d.name, d.what) for d in ruling.differ], [("dog3", "agreed on (1.00, 2.50)")])
         odd = replace(OWN[2], digest="other", choice="red")
-        (ruling,) = explained([*agreed[:2], odd]).epochs
+        (ruling,) = explain_decisions([*agreed[:2], odd]).epochs
         self.assertEqual([d.what for d in ruling.differ], ["knew dog2 with nothing more"])
 
     def test_silent_agent_is_named(self) -> None:
         """An agent that reported without a decision record does not count as agreeing."""
-        (ruling,) = explained([decided(1, THREE), decided(3, THREE)]).epochs
+        (ruling,) = explain_decisions([decided(1, THREE), decided(3, THREE)]).epochs
         self.assertEqual((len(ruling.agree), ruling.of), (2, 3))
         self.assertEqual([(d.name, d.what) for d in ruling.differ], [("dog2", "has no decision record")])
 
@@ -65,37 +65,37 @@ class ExplanationTests(SynchronousTestCase):
         """Any order of the decision records gives the same explanation, with the newest epoch first."""
         verdicts = [decided(n, THREE, epoch) for epoch in (1, 2, 3) for n in (1, 2, 3)]
         verdicts[4] = decided(2, THREE[:1] + [THREE[1]], 2)
-        expected = explained(verdicts)
+        expected = explain_decisions(verdicts)
         self.assertEqual([ruling.epoch for ruling in expected.epochs], [3, 2, 1])
         rng = random.Random(2)
         for _ in range(10):
             rng.shuffle(verdicts)
-            self.assertEqual(explained(verdicts), expected)
+            self.assertEqual(explain_decisions(verdicts), expected)
 
     def test_most_decide_whoever_dissents(self) -> None:
         """Two agents that agree outvote the third, for each of the three."""
         for lone in (1, 2, 3):
             verdicts = [decided(n, THREE, assigned=1 if n == lone else None) for n in (1, 2, 3)]
-            (ruling,) = explained(verdicts).epochs
+            (ruling,) = explain_decisions(verdicts).epochs
             self.assertEqual((ruling.chosen, len(ruling.agree)), ("dog2", 2))
             self.assertEqual([(d.name, d.what) for d in ruling.differ], [(f"dog{lone}", "names dog1")])
 
     def test_even_votes_give_the_lowest(self) -> None:
         """If two agents choose each other, the lower uuid wins and the other agent differs."""
         first, second = decided(1, THREE, assigned=1), decided(2, THREE, assigned=2)
-        (ruling,) = explained([first, second]).epochs
+        (ruling,) = explain_decisions([first, second]).epochs
         self.assertEqual(ruling.winner, min(first.winner, second.winner))
         self.assertEqual(len(ruling.agree), 1)
 
     def test_nothing_decided(self) -> None:
         """No decision record gives an empty explanation, and an epoch without a winner names "nobody"."""
-        self.assertEqual(as_text(explained([])), "")
-        (ruling,) = explained([decided(1, [member(1, None)])]).epochs
+        self.assertEqual(format_explanation(explain_decisions([])), "")
+        (ruling,) = explain_decisions([decided(1, [member(1, None)])]).epochs
         self.assertEqual((ruling.winner, ruling.chosen), ("", "nobody"))
 
     def test_of_many_the_best_are_asked(self) -> None:
         """In a group of more than thirty, only the eight agents that write their records are counted."""
-        members = [member(i, float(i)) for i in range(1, MANY + 2)]
-        told = [verdict for n in range(1, MANY + 2) if (verdict := decided(n, members)).is_witness]
-        (ruling,) = explained(told).epochs
-        self.assertEqual((len(ruling.agree), ruling.of, ruling.differ), (BEST, BEST, ()))
+        members = [member(i, float(i)) for i in range(1, MAX_REPORTS + 2)]
+        told = [verdict for n in range(1, MAX_REPORTS + 2) if (verdict := decided(n, members)).is_publisher]
+        (ruling,) = explain_decisions(told).epochs
+        self.assertEqual((len(ruling.agree), ruling.of, ruling.differ), (MAX_BEST_REPORTS, MAX_BEST_REPORTS, ()))

@@ -13,19 +13,19 @@ from twisted.internet.defer import Deferred, fail, succeed
 
 from middleware.directory.directory import Directory, Page
 from middleware.directory.listing import Listing
-from middleware.directory.prefix import WHOLE, prefix_of
-from middleware.directory.presence import DEVICES, Device, device_of, devices_of
+from middleware.directory.prefix import MAX_UNDIVIDED, compute_prefix
+from middleware.directory.presence import DEVICES, Device, parse_device, parse_devices
 from middleware.entangled.background import Background
 from middleware.entangled.clock import HeapClock
 from middleware.entangled.contact import Contact
 from middleware.entangled.errors import Unavailable
 from middleware.entangled.identity import Identity
-from middleware.entangled.kademlia.distance import closest
+from middleware.entangled.kademlia.distance import select_closest
 from middleware.entangled.network.network import Address
-from middleware.entangled.network.switchboard import Weather
+from middleware.entangled.network.switchboard import LinkConditions
 from middleware.entangled.node import EntangledNode
 from middleware.entangled.record import Record, Slot
-from tests.fleet import FleetCase, SwarmFleet
+from tests.fleet import FleetCase, SwarmTeam
 
 REVIEW = 10.0
 
@@ -82,7 +82,7 @@ class Neighbour:
     @property
     def is_large(self) -> bool:
         """Whether the team is too large to know every member."""
-        return len(self.seen()) >= WHOLE
+        return len(self.seen()) >= MAX_UNDIVIDED
 
     @property
     def is_complete(self) -> bool:
@@ -94,9 +94,9 @@ class Neighbour:
     def contacts(self) -> list[Contact]:
         """Return the nearest contacts; in a small team all."""
         seen = self.seen()
-        if len(seen) < WHOLE:
+        if len(seen) < MAX_UNDIVIDED:
             return seen
-        return closest(seen, self.identity.node_id, 8)
+        return select_closest(seen, self.identity.node_id, 8)
 
     def get(self, key: bytes, concern: str = "majority") -> Deferred[list[Record]]:
         return self.table.get(key, concern)
@@ -116,11 +116,11 @@ class Neighbour:
     def say(self) -> None:
         """Announce the device at its current depth."""
         device = Device(self.identity.node_id.hex(), "d", depth=self.directory.depth)
-        self.directory.announce("d", device.packed(), device.depth)
+        self.directory.announce("d", device.pack(), device.depth)
 
     def enter(self) -> None:
         """Join, and review the depth periodically."""
-        Deferred.fromCoroutine(self.directory.arrive())
+        Deferred.fromCoroutine(self.directory.choose_initial_depth())
         self.say()
         self.chores.later(self.town.dice.uniform(0.0, REVIEW), self.review)
         self.chores.every(0.8 * self.lease, self.beat)
@@ -129,7 +129,7 @@ class Neighbour:
         """Move if the size of the team has changed."""
         self.chores.later(REVIEW, self.review)
         before = self.directory.depth
-        if self.directory.review() != before:
+        if self.directory.update_depth() != before:
             self.say()
 
     def beat(self) -> None:
@@ -191,9 +191,9 @@ def result(case: FleetCase, work: Any) -> Any:
 class DirectoryTests(FleetCase):
     def listed(self, reader: Neighbour) -> list[bytes]:
         """Return the ids that ``reader`` lists, with duplicates."""
-        listing: Listing = result(self, reader.directory.listed())
+        listing: Listing = result(self, reader.directory.list_devices())
         self.assertTrue(listing.is_complete)
-        return [device_of(record).uuid for record in listing.records]  # type: ignore[union-attr, misc]
+        return [parse_device(record).uuid for record in listing.records]  # type: ignore[union-attr, misc]
 
     def all_there(self, town: Town, readers: int = 3, also: Iterable[Neighbour] = ()) -> None:
         """Check that ``readers`` list each present device once, and of the departed ones only those in ``also``."""
@@ -254,14 +254,14 @@ class DirectoryTests(FleetCase):
         town.come(150, 0.1)
         town.clock.advance(60.0)
         reader, before = town.neighbours[100], town.table.reads
-        around = result(self, reader.directory.around())
+        around = result(self, reader.directory.read_neighbourhood())
         self.assertEqual(town.table.reads - before, 1)
         self.assertIn(reader.identity.public, [record.owner for record in around])
         self.assertLess(len(around), 60)
         victim = town.neighbours[5]
-        key = prefix_of(victim.identity.node_id, victim.directory.depth).key
+        key = compute_prefix(victim.identity.node_id, victim.directory.depth).key
         town.table.silent.add(key)
-        listing: Listing = result(self, town.neighbours[0].directory.listed())
+        listing: Listing = result(self, town.neighbours[0].directory.list_devices())
         self.assertFalse(listing.is_complete)
         seen = {record.owner for record in listing.records}
         for neighbour in town.neighbours:
@@ -273,35 +273,35 @@ class DirectoryTests(FleetCase):
         town = Town(9)
         town.come(30, 0.1)
         reader, before = town.neighbours[7], town.table.reads
-        page: Page = result(self, reader.directory.some(5))
-        self.assertEqual((len(page.records), page.following, town.table.reads - before), (30, None, 1))
+        page: Page = result(self, reader.directory.find_devices(5))
+        self.assertEqual((len(page.records), page.next_id, town.table.reads - before), (30, None, 1))
         town.come(270, 0.1)
         town.clock.advance(60.0)
         before = town.table.reads
-        page = result(self, reader.directory.some(20))
+        page = result(self, reader.directory.find_devices(20))
         self.assertLess(town.table.reads - before, 20)
-        self.assertTrue(20 <= len(page.records) < 150 and page.is_complete and page.following)
+        self.assertTrue(20 <= len(page.records) < 150 and page.is_complete and page.next_id)
         self.assertIn(reader.identity.public, [record.owner for record in page.records])
         seen = {record.owner for record in page.records}
         for _ in range(40):
-            if page.following is None:
+            if page.next_id is None:
                 break
-            page = result(self, reader.directory.some(20, after=page.following))
+            page = result(self, reader.directory.find_devices(20, after=page.next_id))
             seen |= {record.owner for record in page.records}
-        self.assertIsNone(page.following)
+        self.assertIsNone(page.next_id)
         self.assertEqual(seen, {n.identity.public for n in town.neighbours})
         # A search continues until the device is found, and ends at the end of the directory or the read limit.
         sought = town.neighbours[120].identity.node_id.hex()
-        page = result(self, reader.directory.some(1, lambda device: device.uuid == sought))
-        self.assertEqual([device.uuid for device, _ in devices_of(page.records)], [sought])
-        page = result(self, reader.directory.some(1, lambda device: device.name == "nobody"))
-        self.assertEqual((page.records, page.following), ([], None))
-        page = result(self, reader.directory.some(1, lambda device: device.name == "nobody", most_reads=1))
-        self.assertIsNotNone(page.following)
+        page = result(self, reader.directory.find_devices(1, lambda device: device.uuid == sought))
+        self.assertEqual([device.uuid for device, _ in parse_devices(page.records)], [sought])
+        page = result(self, reader.directory.find_devices(1, lambda device: device.name == "nobody"))
+        self.assertEqual((page.records, page.next_id), ([], None))
+        page = result(self, reader.directory.find_devices(1, lambda device: device.name == "nobody", most_reads=1))
+        self.assertIsNotNone(page.next_id)
 
 
 class TeamTests(FleetCase):
-    def names(self, fleet: SwarmFleet, place: int) -> list[str]:
+    def names(self, fleet: SwarmTeam, place: int) -> list[str]:
         """Return the names of all devices that one node lists."""
         listing = self.done(fleet, fleet.nodes[place].list_devices(), 1.0)
         self.assertTrue(listing.is_complete)
@@ -309,7 +309,7 @@ class TeamTests(FleetCase):
 
     def test_apart_and_together_again(self) -> None:
         """Real nodes at the depth of a large team are listed and watched completely, until they return to one key."""
-        fleet = self.swarm(12, weather=Weather(0.01))
+        fleet = self.swarm(12, weather=LinkConditions(0.01))
         told: list[list[Record]] = []
         following = fleet.nodes[1].watch_devices(told.append)
         fleet.run(1.0)
@@ -321,20 +321,20 @@ class TeamTests(FleetCase):
         here = sorted(f"dog{n}" for n in range(12))
         self.assertEqual({n.presence.device.depth for n in fleet.nodes}, {3})
         self.assertEqual(self.names(fleet, 0), here)
-        fleet.nodes[4].vanish()
+        fleet.nodes[4].stop_silently()
         fleet.nodes[5].stopService()
         here = sorted(set(here) - {"dog4", "dog5"})
         fleet.run(9.0)
         while any(node.presence.device.depth for node in fleet.nodes if node.running):
             self.assertEqual(self.names(fleet, 7), here)
-            self.assertEqual(sorted(device.name for device, _ in devices_of(following.records)), here)
+            self.assertEqual(sorted(device.name for device, _ in parse_devices(following.records)), here)
         fleet.run(8.0)
         self.assertEqual(self.names(fleet, 7), here)
         records = self.done(fleet, fleet.nodes[8].entangled.get(DEVICES), 1.0)
-        self.assertEqual(sorted(device.name for device, _ in devices_of(records)), here)
-        self.assertEqual(sorted(device.name for device, _ in devices_of(following.records)), here)
+        self.assertEqual(sorted(device.name for device, _ in parse_devices(records)), here)
+        self.assertEqual(sorted(device.name for device, _ in parse_devices(following.records)), here)
         following.stop()
         before = len(told)
-        fleet.nodes[8].presence.say(1.0, "hello")
+        fleet.nodes[8].presence.add_message(1.0, "hello")
         fleet.run(5.0)
         self.assertEqual(len(told), before)

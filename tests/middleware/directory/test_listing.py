@@ -9,10 +9,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from twisted.trial.unittest import SynchronousTestCase
 
-from middleware.directory.listing import Listing, standing
-from middleware.directory.prefix import ROOT, places_of, prefix_of
+from middleware.directory.listing import Listing, select_listed
+from middleware.directory.prefix import ROOT, compute_places, compute_prefix
 from middleware.directory.presence import DEVICES, MAX_DEPTH, Device
-from middleware.entangled.identity import node_id
+from middleware.entangled.identity import derive_node_id
 from middleware.entangled.record import Record
 
 Places = dict[bytes, list[Record]]
@@ -25,7 +25,7 @@ def owners(count: int, seed: int = 1) -> list[bytes]:
 
 def record(key: bytes, owner: bytes, depth: int, sequence: int = 1) -> Record:
     """Return the record of a device at ``depth``, as written under ``key``."""
-    value = Device(node_id(owner).hex(), "d", depth=depth).packed()
+    value = Device(derive_node_id(owner).hex(), "d", depth=depth).pack()
     return Record(key, "d", owner, sequence, "leased", 1.0, value, bytes(64))
 
 
@@ -33,7 +33,7 @@ def announced(depths: Mapping[bytes, int]) -> Places:
     """Return the records under each key if every owner is at its depth."""
     places: Places = {}
     for owner, depth in depths.items():
-        for key in places_of(node_id(owner), depth):
+        for key in compute_places(derive_node_id(owner), depth):
             places.setdefault(key, []).append(record(key, owner, depth))
     return places
 
@@ -41,12 +41,12 @@ def announced(depths: Mapping[bytes, int]) -> Places:
 def listed(places: Places, listing: Listing, silent: frozenset[bytes] = frozenset()) -> Listing:
     """Run ``listing`` to its end; the keys in ``silent`` get no answer."""
     seen: list[bytes] = []
-    while (place := listing.next()) is not None:
+    while (place := listing.take_next()) is not None:
         seen.append(place.key)
         if place.key in silent:
-            listing.failed(place)
+            listing.on_failure(place)
         else:
-            listing.read(place, places.get(place.key, []))
+            listing.add_records(place, places.get(place.key, []))
     assert len(set(seen)) == len(seen), "a place was read twice"
     return listing
 
@@ -90,27 +90,27 @@ class ListingTests(SynchronousTestCase):
         """If most of 40 devices have returned to the root key, those up to two depths below are listed, too."""
         team = owners(40)
         for deep in (1, 2):
-            depths = {owner: deep if node_id(owner)[0] >> 7 != DEVICES[0] >> 7 else 0 for owner in team}
+            depths = {owner: deep if derive_node_id(owner)[0] >> 7 != DEVICES[0] >> 7 else 0 for owner in team}
             self.assertEqual(len(listed(announced(depths), Listing()).records), 40, deep)
 
     def test_a_place_that_does_not_answer(self) -> None:
         """An unread prefix makes the listing incomplete, and the listing names it."""
         depths = dict.fromkeys(owners(600), 5)
-        lost = prefix_of(node_id(next(iter(depths))), 5)
+        lost = compute_prefix(derive_node_id(next(iter(depths))), 5)
         listing = listed(announced(depths), Listing(), frozenset([lost.key]))
         self.assertFalse(listing.is_complete)
         (missed,) = listing.missed
         self.assertTrue(missed.has(lost.first))
         self.assertEqual(missed.key, lost.key)
         absent = set(depths) - {r.owner for r in listing.records}
-        self.assertTrue(absent and all(missed.has(node_id(owner)) for owner in absent))
+        self.assertTrue(absent and all(missed.has(derive_node_id(owner)) for owner in absent))
 
     def test_wrong_places(self) -> None:
         """A device under a prefix that does not match its id is not listed and causes no further reads."""
         team, liars = owners(20), owners(200, 9)
         places = announced(dict.fromkeys(team, 0))
         places[DEVICES] += [record(DEVICES, liar, 9) for liar in liars]
-        told = [liar for liar in liars if DEVICES in places_of(node_id(liar), 9)]
+        told = [liar for liar in liars if DEVICES in compute_places(derive_node_id(liar), 9)]
         self.assertLess(len(told), 5)
         listing = listed(places, Listing())
         self.assertEqual({r.owner for r in listing.records}, {*team, *told})
@@ -118,11 +118,11 @@ class ListingTests(SynchronousTestCase):
             self.assertEqual(listing.reads, 1)
         for strange in (-1, MAX_DEPTH + 1, 1.0, "1", True):
             crafted = record(DEVICES, team[0], strange)  # type: ignore[arg-type]
-            self.assertEqual(standing(DEVICES, [crafted]), [], strange)
+            self.assertEqual(select_listed(DEVICES, [crafted]), [], strange)
 
     def test_a_liar_costs_little(self) -> None:
         """A device that claims the maximum depth costs a reader at most one read for each depth."""
-        seed = next(s for s in range(10**6) if DEVICES[:2] == node_id(owners(1, s)[0])[:2])
+        seed = next(s for s in range(10**6) if DEVICES[:2] == derive_node_id(owners(1, s)[0])[:2])
         (liar,) = owners(1, seed)
         places = announced({**dict.fromkeys(owners(20), 0), liar: MAX_DEPTH})
         listing = listed(places, Listing())
@@ -131,21 +131,21 @@ class ListingTests(SynchronousTestCase):
     def test_only_below_a_prefix(self) -> None:
         """A listing of one prefix reads only the keys below it."""
         depths = dict.fromkeys(owners(600), 5)
-        under = prefix_of(node_id(next(iter(depths))), 3)
+        under = compute_prefix(derive_node_id(next(iter(depths))), 3)
         listing = listed(announced(depths), Listing(5, under))
         self.assertEqual(listing.reads, 4)
-        self.assertLessEqual({o for o in depths if under.has(node_id(o))}, {r.owner for r in listing.records})
+        self.assertLessEqual({o for o in depths if under.has(derive_node_id(o))}, {r.owner for r in listing.records})
 
     def test_what_is_open_is_not_over(self) -> None:
         """While an answer is pending, the listing is neither over nor complete."""
         listing = Listing(1)
         self.assertFalse(listing.is_over)
-        self.assertEqual(listing.next(), ROOT)
-        self.assertIsNone(listing.next())
+        self.assertEqual(listing.take_next(), ROOT)
+        self.assertIsNone(listing.take_next())
         self.assertFalse(listing.is_over)
-        listing.read(ROOT, [])
-        second = listing.next()
+        listing.add_records(ROOT, [])
+        second = listing.take_next()
         assert second is not None
         self.assertFalse(listing.is_complete)
-        listing.read(second, [])
+        listing.add_records(second, [])
         self.assertTrue(listing.is_complete)

@@ -7,17 +7,17 @@ import random
 from twisted.trial.unittest import SynchronousTestCase
 
 from middleware.directory.prefix import (
-    FEW,
-    LONGEST,
+    MAX_LEASE_S,
+    MAX_UNDIVIDED,
+    MIN_DEVICES_PER_PLACE,
     ROOT,
-    SHALLOW,
-    STILL_WHOLE,
-    WHOLE,
-    depth_for,
-    lease_at,
-    places_of,
-    prefix_of,
-    size_of,
+    ROOT_LISTED_DEPTH,
+    UNDIVIDED_AGAIN,
+    choose_depth,
+    compute_lease,
+    compute_places,
+    compute_prefix,
+    estimate_size,
 )
 from middleware.directory.presence import DEVICES, MAX_DEPTH
 from middleware.entangled.contact import Contact
@@ -35,70 +35,70 @@ class PrefixTests(SynchronousTestCase):
         """At depth 0 every device is under the root key, the only key of a small team."""
         self.assertEqual(ROOT.key, DEVICES)
         for node_id in ids(20):
-            self.assertEqual(places_of(node_id, 0), [DEVICES])
+            self.assertEqual(compute_places(node_id, 0), [DEVICES])
 
     def test_a_key_begins_as_its_devices_do(self) -> None:
         """The key of a prefix starts with the bits of its devices' ids, which places it near their nodes."""
         for node_id in ids(20):
             for depth in range(MAX_DEPTH + 1):
-                place = prefix_of(node_id, depth)
+                place = compute_prefix(node_id, depth)
                 self.assertTrue(place.has(node_id) and place.has(place.key))
                 self.assertTrue(place.has(place.first) and place.first <= node_id)
 
     def test_halves(self) -> None:
         """One half of a prefix has the same key, the other another, and each id is in exactly one half."""
         for node_id in ids(20):
-            place = prefix_of(node_id, 5)
-            self.assertEqual(place.along.key, place.key)
-            self.assertNotEqual(place.aside.key, place.key)
-            self.assertNotEqual(place.along.has(node_id), place.aside.has(node_id))
+            place = compute_prefix(node_id, 5)
+            self.assertEqual(place.same_key_half.key, place.key)
+            self.assertNotEqual(place.other_key_half.key, place.key)
+            self.assertNotEqual(place.same_key_half.has(node_id), place.other_key_half.has(node_id))
 
     def test_two_places_and_one_stays(self) -> None:
         """A device that moves by one depth keeps one of its keys."""
         for node_id in ids(50):
             for depth in range(MAX_DEPTH):
-                before, after = places_of(node_id, depth), places_of(node_id, depth + 1)
+                before, after = compute_places(node_id, depth), compute_places(node_id, depth + 1)
                 self.assertTrue(set(before) & set(after))
-                self.assertLessEqual(len(after), 3 if depth < SHALLOW else 2)
+                self.assertLessEqual(len(after), 3 if depth < ROOT_LISTED_DEPTH else 2)
 
     def test_small_team_is_never_split(self) -> None:
         """The depth is 0 up to ``WHOLE`` members, and returns to 0 only at ``STILL_WHOLE`` members."""
-        self.assertEqual([depth_for(size, 0) for size in (1, 8, 48, WHOLE)], [0] * 4)
-        self.assertEqual([depth_for(size) for size in (1, 8, 48, WHOLE)], [0] * 4)
-        self.assertEqual(depth_for(WHOLE + 1, 0), 1)
-        self.assertEqual(depth_for(STILL_WHOLE + 1, 1), 1)
-        self.assertEqual(depth_for(STILL_WHOLE, 1), 0)
+        self.assertEqual([choose_depth(size, 0) for size in (1, 8, 48, MAX_UNDIVIDED)], [0] * 4)
+        self.assertEqual([choose_depth(size) for size in (1, 8, 48, MAX_UNDIVIDED)], [0] * 4)
+        self.assertEqual(choose_depth(MAX_UNDIVIDED + 1, 0), 1)
+        self.assertEqual(choose_depth(UNDIVIDED_AGAIN + 1, 1), 1)
+        self.assertEqual(choose_depth(UNDIVIDED_AGAIN, 1), 0)
 
     def test_hysteresis(self) -> None:
         """From any depth the next depths converge to the right one, and small changes of the size move no device."""
         for exponent in range(1, MAX_DEPTH):
-            size = FEW * 2.0**exponent * 1.4
-            if size <= WHOLE:
+            size = MIN_DEVICES_PER_PLACE * 2.0**exponent * 1.4
+            if size <= MAX_UNDIVIDED:
                 continue
             for depth in (0, 3, MAX_DEPTH):
                 for _ in range(2 * MAX_DEPTH):
-                    depth = depth_for(size, depth)
+                    depth = choose_depth(size, depth)
                 self.assertLessEqual(abs(depth - exponent), 1)
-                self.assertEqual(depth_for(size * 1.1, depth), depth)
-                self.assertEqual(depth_for(size / 1.1, depth), depth)
-        border = FEW * 2.0**6
-        self.assertEqual([depth_for(border * 1.05, 5), depth_for(border / 1.05, 6)], [5, 6])
+                self.assertEqual(choose_depth(size * 1.1, depth), depth)
+                self.assertEqual(choose_depth(size / 1.1, depth), depth)
+        border = MIN_DEVICES_PER_PLACE * 2.0**6
+        self.assertEqual([choose_depth(border * 1.05, 5), choose_depth(border / 1.05, 6)], [5, 6])
         # A device moves by at most one depth at a time, and never beyond the maximum.
-        self.assertEqual([depth_for(1e9, 0), depth_for(3, 9), depth_for(1, 0)], [1, 8, 0])
-        self.assertEqual([depth_for(1e30, MAX_DEPTH), depth_for(1e30)], [MAX_DEPTH, MAX_DEPTH])
+        self.assertEqual([choose_depth(1e9, 0), choose_depth(3, 9), choose_depth(1, 0)], [1, 8, 0])
+        self.assertEqual([choose_depth(1e30, MAX_DEPTH), choose_depth(1e30)], [MAX_DEPTH, MAX_DEPTH])
 
     def test_lease_grows_with_the_depth(self) -> None:
         """A team with one prefix keeps its lease; each depth doubles it up to a minute, and never shortens it."""
-        self.assertEqual([lease_at(depth, 1.0) for depth in (0, 1, 2, 5)], [1.0, 2.0, 4.0, 32.0])
-        self.assertEqual(lease_at(MAX_DEPTH, 1.0), LONGEST)
-        self.assertEqual([lease_at(0, 90.0), lease_at(4, 90.0)], [90.0, 90.0])
+        self.assertEqual([compute_lease(depth, 1.0) for depth in (0, 1, 2, 5)], [1.0, 2.0, 4.0, 32.0])
+        self.assertEqual(compute_lease(MAX_DEPTH, 1.0), MAX_LEASE_S)
+        self.assertEqual([compute_lease(0, 90.0), compute_lease(4, 90.0)], [90.0, 90.0])
 
     def test_size(self) -> None:
         """A few contacts are counted; in a large team the nearest ones estimate the size within a factor of two."""
         contacts = [Contact(random.Random(n).randbytes(32), Address("10.0.0.1", 7000)) for n in range(3000)]
-        self.assertEqual(size_of(contacts[0].node_id, contacts[1:7]), 7)
+        self.assertEqual(estimate_size(contacts[0].node_id, contacts[1:7]), 7)
         right = 0
         for contact in contacts[:100]:
             near = sorted(contacts, key=lambda c: int.from_bytes(c.node_id) ^ int.from_bytes(contact.node_id))[1:9]
-            right += 1500 < size_of(contact.node_id, near) < 6000
+            right += 1500 < estimate_size(contact.node_id, near) < 6000
         self.assertGreaterEqual(right, 90)

@@ -14,16 +14,16 @@ from twisted.trial.unittest import SynchronousTestCase
 from middleware.directory.presence import (
     DEVICES,
     IDLE,
-    MESSAGES_KEPT,
+    MAX_MESSAGES,
     SEARCHING,
     Device,
     Presence,
-    device_of,
-    devices_of,
+    parse_device,
+    parse_devices,
 )
 from middleware.entangled.identity import Identity
 from middleware.entangled.record import Record
-from middleware.entangled.value import MAX_VALUE
+from middleware.entangled.value import MAX_VALUE_BYTES
 
 DOG = Identity(b"\1" * 32)
 CAT = Identity(b"\2" * 32)
@@ -52,18 +52,18 @@ def record(value: object, owner: Identity = DOG, name: str = "dog") -> Record:
 
 def content(**changes: object) -> dict[str, object]:
     """Return the content of the record of ``DEVICE`` with ``changes``."""
-    return {**msgpack.unpackb(DEVICE.packed()), **changes}
+    return {**msgpack.unpackb(DEVICE.pack()), **changes}
 
 
 class DeviceTests(SynchronousTestCase):
     def test_there_and_back(self) -> None:
         """A device survives packing and unpacking; unused fields take no space."""
-        self.assertEqual(device_of(record(DEVICE.packed())), DEVICE)
+        self.assertEqual(parse_device(record(DEVICE.pack())), DEVICE)
         placed = replace(DEVICE, pages=("http://10.0.0.1:8080",), position={"x": 1.0, "y": 2.5, "heading": -0.5})
-        self.assertEqual(device_of(record(placed.packed())), placed)
+        self.assertEqual(parse_device(record(placed.pack())), placed)
         bare = {"uuid": DEVICE.uuid, "name": "dog", "of a later version": 1}
-        self.assertEqual(device_of(record(bare)), Device(DEVICE.uuid, "dog"))
-        self.assertEqual({"pages", "position"} & set(msgpack.unpackb(DEVICE.packed())), set())
+        self.assertEqual(parse_device(record(bare)), Device(DEVICE.uuid, "dog"))
+        self.assertEqual({"pages", "position"} & set(msgpack.unpackb(DEVICE.pack())), set())
 
     def test_crafted(self) -> None:
         """A record of another node, or with a wrong type, an invalid number or no name, gives no device."""
@@ -96,10 +96,10 @@ class DeviceTests(SynchronousTestCase):
                     one = record(content(**{name: value}))
                 except ValueError:
                     continue
-                self.assertIsNone(device_of(one), (name, value))
-        self.assertIsNone(device_of(record(DEVICE.packed(), CAT)))
+                self.assertIsNone(parse_device(one), (name, value))
+        self.assertIsNone(parse_device(record(DEVICE.pack(), CAT)))
         for value in (None, b"", b"\xc1", [1], 5, {}, {"name": "dog"}, b"\x91" * 600):
-            self.assertIsNone(device_of(record(value)), value)
+            self.assertIsNone(parse_device(record(value)), value)
 
     @settings(max_examples=200)
     @given(
@@ -114,24 +114,24 @@ class DeviceTests(SynchronousTestCase):
     def test_total(self, value: object) -> None:
         """Any record gives a device or None, and never raises."""
         one = record(value)
-        self.assertIsInstance(device_of(one), Device | None)
+        self.assertIsInstance(parse_device(one), Device | None)
         if isinstance(value, dict):
-            device_of(record({**content(), **value}))
+            parse_device(record({**content(), **value}))
 
     def test_order_of_joining(self) -> None:
         """Devices are listed in the order of joining, ties by uuid; records that are not devices are skipped."""
         cat = Device(CAT.node_id.hex(), "cat", joined=1)
-        records = [record(DEVICE.packed()), record(cat.packed(), CAT, "cat"), record(b"?")]
-        self.assertEqual([d.name for d, _ in devices_of(records)], ["cat", "dog"])
-        self.assertEqual(devices_of(records)[0][1], records[1])
-        self.assertEqual(devices_of([record(cat.packed(), CAT, "dog")]), [])
+        records = [record(DEVICE.pack()), record(cat.pack(), CAT, "cat"), record(b"?")]
+        self.assertEqual([d.name for d, _ in parse_devices(records)], ["cat", "dog"])
+        self.assertEqual(parse_devices(records)[0][1], records[1])
+        self.assertEqual(parse_devices([record(cat.pack(), CAT, "dog")]), [])
 
     def test_one_name_twice(self) -> None:
         """Devices of the same name get a part of their ids as a suffix; two records of one device do not."""
         cat = Device(CAT.node_id.hex(), "dog", joined=1)
-        records = [record(DEVICE.packed()), record(cat.packed(), CAT)]
-        self.assertEqual([d.name for d, _ in devices_of(records)], [f"dog-{d.uuid[:6]}" for d in (cat, DEVICE)])
-        self.assertEqual([d.name for d, _ in devices_of([records[0], records[0]])], ["dog", "dog"])
+        records = [record(DEVICE.pack()), record(cat.pack(), CAT)]
+        self.assertEqual([d.name for d, _ in parse_devices(records)], [f"dog-{d.uuid[:6]}" for d in (cat, DEVICE)])
+        self.assertEqual([d.name for d, _ in parse_devices([records[0], records[0]])], ["dog", "dog"])
 
     def test_message_lines(self) -> None:
         """Only the newest messages are kept, each truncated to the maximum length."""
@@ -140,23 +140,23 @@ class DeviceTests(SynchronousTestCase):
             device = device.with_message(float(n), f"{n}" * 100)
         self.assertEqual([t for t, _ in device.messages], [4.0, 5.0, 6.0, 7.0, 8.0])
         self.assertEqual({len(text) for _, text in device.messages}, {70})
-        self.assertEqual(len(device.messages), MESSAGES_KEPT)
+        self.assertEqual(len(device.messages), MAX_MESSAGES)
 
     def test_too_large_gives_way(self) -> None:
         """A record that is too large drops old messages first, then the description; the rest must fit."""
         device = Device(DEVICE.uuid, "dog", description="d" * 600)
         for n in range(5):
             device = device.with_message(float(n), f"{n}" * 70)
-        said = device_of(record(device.packed()))
+        said = parse_device(record(device.pack()))
         assert said is not None
-        self.assertLessEqual(len(device.packed()), MAX_VALUE)
+        self.assertLessEqual(len(device.pack()), MAX_VALUE_BYTES)
         self.assertEqual(said.description, device.description)
         self.assertEqual(said.messages, device.messages[-len(said.messages) :])
         huge = Device(DEVICE.uuid, "dog", description="d" * 1200, messages=((1.0, "m"),))
-        said = device_of(record(huge.packed()))
+        said = parse_device(record(huge.pack()))
         self.assertEqual(said and (said.description, said.messages), ("", ()))
         crowded = Device(DEVICE.uuid, "dog", deployed={f"{n}" * 32: "1 1a2b3c4d, 2 refused" for n in range(8)})
-        said = device_of(record(replace(crowded, capabilities={"c" * 300: {"p" * 200: 1.0}}).packed()))
+        said = parse_device(record(replace(crowded, capabilities={"c" * 300: {"p" * 200: 1.0}}).pack()))
         self.assertEqual(said and said.deployed, {})
 
 
@@ -164,7 +164,7 @@ class PresenceTests(SynchronousTestCase):
     def setUp(self) -> None:
         self.told: list[Device | None] = []
         self.calls: list[tuple[float, Callable[[], None]]] = []
-        self.presence = Presence(DEVICE, lambda value: self.told.append(device_of(record(value))), self.later)
+        self.presence = Presence(DEVICE, lambda value: self.told.append(parse_device(record(value))), self.later)
 
     def later(self, delay: float, work: Callable[[], None]) -> Any:
         self.calls.append((delay, work))
@@ -182,11 +182,11 @@ class PresenceTests(SynchronousTestCase):
         self.presence.change(status=IDLE)
         self.presence.change(task="t2")
         self.presence.change(task="t2")
-        self.assertEqual([delay for delay, _ in self.calls], [Presence.PAUSE])
+        self.assertEqual([delay for delay, _ in self.calls], [Presence.PAUSE_S])
         self.calls.pop()[1]()
         self.assertEqual([(d.task, d.status) for d in self.told[1:] if d], [("t2", IDLE)])
         self.presence.change(task="t2")
         self.assertEqual(self.calls, [])
-        self.presence.say(5.0, "here")
+        self.presence.add_message(5.0, "here")
         self.calls.pop()[1]()
         self.assertEqual(self.told[-1] and self.told[-1].messages[-1], (5.0, "here"))

@@ -9,8 +9,8 @@ from twisted.trial.unittest import SynchronousTestCase
 
 from middleware.directory.presence import EXECUTING, SEARCHING, Device
 from middleware.errors import BadFault
-from middleware.faults.kinds import KINDS, Fault, begins_in, parse_fault
-from middleware.faults.takeover import WATCHED_S, Takeover, acting
+from middleware.faults.kinds import KINDS, Fault, parse_delay, parse_fault
+from middleware.faults.takeover import OBSERVATION_S, Takeover, find_executing
 
 
 class FaultTests(SynchronousTestCase):
@@ -23,9 +23,9 @@ class FaultTests(SynchronousTestCase):
 
     def test_begins(self) -> None:
         """A device answers with the start of its fault; an invalid answer counts as at once."""
-        self.assertEqual(begins_in(0.5), 0.5)
+        self.assertEqual(parse_delay(0.5), 0.5)
         for answer in (None, "soon", True, -1.0, 3600.0, math.nan, math.inf, [0.5]):
-            self.assertEqual(begins_in(answer), 0.0)
+            self.assertEqual(parse_delay(answer), 0.0)
 
     def test_unlawful(self) -> None:
         """An invalid fault is refused with the name of the field, for any input from the network."""
@@ -51,10 +51,10 @@ class TakeoverTests(SynchronousTestCase):
     def test_time_the_first_other(self) -> None:
         """The timer stops at the first other device that acts on the same task, and does not change afterwards."""
         clock = Takeover("a", "t1", 10.0, 14.0)
-        clock.look({"a": "t1", "b": "t2"}, 10.5)
+        clock.observe({"a": "t1", "b": "t2"}, 10.5)
         self.assertIsNone(clock.seconds)
-        clock.look({"a": "t1", "b": "t1"}, 11.5)
-        clock.look({"c": "t1"}, 13.0)
+        clock.observe({"a": "t1", "b": "t1"}, 11.5)
+        clock.observe({"c": "t1"}, 13.0)
         self.assertEqual((clock.seconds, clock.to), (1.5, "b"))
 
     def test_end(self) -> None:
@@ -62,10 +62,10 @@ class TakeoverTests(SynchronousTestCase):
         self.assertFalse(Takeover("a", "", 10.0, 14.0).is_open(10.1))
         clock = Takeover("a", "t1", 10.0, 14.0)
         self.assertTrue(clock.is_open(14.0))
-        clock.look({"b": "t1"}, 14.0 + WATCHED_S)
+        clock.observe({"b": "t1"}, 14.0 + OBSERVATION_S)
         self.assertIsNone(clock.seconds)
 
     def test_acting(self) -> None:
         """A device acts if it executes a task, not if it searches."""
         devices = [Device("a", "dog1", task="t", status=EXECUTING), Device("b", "dog2", task="t", status=SEARCHING)]
-        self.assertEqual(acting(devices), {"a": "t"})
+        self.assertEqual(find_executing(devices), {"a": "t"})

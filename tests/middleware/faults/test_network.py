@@ -7,7 +7,7 @@ import random
 from twisted.trial.unittest import SynchronousTestCase
 
 from middleware.entangled.clock import HeapClock
-from middleware.entangled.network.switchboard import CALM, Switchboard, Weather
+from middleware.entangled.network.switchboard import PERFECT, LinkConditions, Switchboard
 from middleware.faults.network import FaultyNetwork
 
 
@@ -15,8 +15,8 @@ class FaultyNetworkTests(SynchronousTestCase):
     def setUp(self) -> None:
         self.clock = HeapClock()
         board = Switchboard(self.clock, random.Random(1))
-        self.network = FaultyNetwork(board.network(), self.clock, random.Random(2))
-        self.other = board.network()
+        self.network = FaultyNetwork(board.make_network(), self.clock, random.Random(2))
+        self.other = board.make_network()
         self.came: list[bytes] = []
         self.answers: list[bytes] = []
         self.network.listen(lambda datagram, source: self.came.append(datagram))
@@ -39,39 +39,39 @@ class FaultyNetworkTests(SynchronousTestCase):
     def test_deaf_and_mute(self) -> None:
         """A deaf node only sends, a mute node only receives, and a node that is both is disconnected."""
         for deaf, mute, passes in ((True, False, (0, 1)), (False, True, (1, 0)), (True, True, (0, 0))):
-            self.network.is_deaf, self.network.is_mute = deaf, mute
+            self.network.is_receive_blocked, self.network.is_send_blocked = deaf, mute
             self.assertEqual(self.exchange(), passes)
-        self.network.is_deaf = self.network.is_mute = False
+        self.network.is_receive_blocked = self.network.is_send_blocked = False
         self.assertEqual(self.exchange(), (1, 1))
 
     def test_loss(self) -> None:
         """A lossy node loses the configured share of datagrams in each direction; the rest arrives at once."""
-        self.network.weather = Weather(loss=0.2)
+        self.network.weather = LinkConditions(loss=0.2)
         came, went = self.exchange(times=1000)
         self.assertTrue(750 < came < 850 and 750 < went < 850, (came, went))
 
     def test_duplicates_and_jitter(self) -> None:
         """Duplicated datagrams arrive twice, jitter stays within its bounds, and reordered datagrams arrive last."""
-        self.network.weather = Weather(delay_s=0.1, jitter_s=0.05, duplicate=1.0, reorder=1.0)
+        self.network.weather = LinkConditions(delay_s=0.1, jitter_s=0.05, duplicate=1.0, reorder=1.0)
         self.assertEqual(self.exchange(0.14), (0, 0))
         self.assertEqual(self.exchange(0.12)[0], 2)
 
     def test_delay(self) -> None:
         """A delayed datagram arrives late by the delay; a datagram in flight when the port closes is lost."""
-        self.network.weather = Weather(delay_s=0.3)
+        self.network.weather = LinkConditions(delay_s=0.3)
         self.assertEqual(self.exchange(0.29), (0, 0))
         self.clock.advance(0.02)
         self.assertEqual((len(self.came), len(self.answers)), (1, 1))
         self.exchange(0.1)
-        self.network.weather = CALM
+        self.network.weather = PERFECT
         self.network.close()
         self.clock.advance(1.0)
         self.assertEqual((len(self.came), len(self.answers)), (1, 1))
 
     def test_cut_catches_what_is_on_its_way(self) -> None:
         """A node that is disconnected while datagrams are in flight neither receives nor sends them."""
-        self.network.weather = Weather(delay_s=0.3)
+        self.network.weather = LinkConditions(delay_s=0.3)
         self.exchange(0.1)
-        self.network.is_deaf = self.network.is_mute = True
+        self.network.is_receive_blocked = self.network.is_send_blocked = True
         self.clock.advance(1.0)
         self.assertEqual((self.came, self.answers), ([], []))

@@ -6,14 +6,14 @@ from dataclasses import dataclass
 from typing import Any
 
 from middleware.consensus.lease import lease_codec
-from middleware.consensus.lease.lease_codec import AHEAD
+from middleware.consensus.lease.lease_codec import EARLY_PROMISE_SHARE
 from middleware.entangled.data.memory import MemoryStore
-from middleware.entangled.quorum.acceptor import Acceptor, Terms
-from middleware.entangled.quorum.ballot import FIRST, Ballot
-from middleware.entangled.quorum.log import Codec, Log
+from middleware.entangled.quorum.acceptor import Acceptor, AcceptorSettings
+from middleware.entangled.quorum.ballot import FIRST_CONFIGURATION, Ballot
+from middleware.entangled.quorum.log import Codec, RegisterLog
 from middleware.entangled.quorum.register import Reply
-from middleware.entangled.space import seat, take_codec
-from middleware.entangled.space.posting import Place
+from middleware.entangled.space import take_acceptor, take_codec
+from middleware.entangled.space.tuple_record import TupleId
 from tests.middleware.consensus.lease.test_lease_codec import MEMBERS
 
 TTL = 10.0
@@ -25,7 +25,7 @@ class Use:
 
     key: Any
     codec: Codec[Any]
-    terms: Terms
+    terms: AcceptorSettings
     names: tuple[Any, ...]
     values: tuple[Any, ...]
 
@@ -35,9 +35,19 @@ class Use:
 
 
 TAKE = Use(
-    Place(b"k" * 20, b"o" * 32, "t", b"m" * 8), take_codec.CODEC, seat.TERMS, (b"a", b"b", b"c"), (b"x", b"y", b"z")
+    TupleId(b"k" * 20, b"o" * 32, "t", b"m" * 8),
+    take_codec.CODEC,
+    take_acceptor.TERMS,
+    (b"a", b"b", b"c"),
+    (b"x", b"y", b"z"),
 )
-LEASE = Use("t", lease_codec.CODEC, Terms(AHEAD), ("a", "b", "c"), (MEMBERS[:3], MEMBERS[1:4], MEMBERS[2:5]))
+LEASE = Use(
+    "t",
+    lease_codec.CODEC,
+    AcceptorSettings(EARLY_PROMISE_SHARE),
+    ("a", "b", "c"),
+    (MEMBERS[:3], MEMBERS[1:4], MEMBERS[2:5]),
+)
 
 
 class Member:
@@ -49,15 +59,17 @@ class Member:
         self.restart(0.0)
 
     def restart(self, now: float) -> None:
-        self.acceptor = Acceptor(Log(self.store, self.use.codec, lambda *_: False, now), self.use.terms)
+        self.acceptor = Acceptor(RegisterLog(self.store, self.use.codec, lambda *_: False, now), self.use.terms)
 
-    def prepare(self, ballot: Ballot, now: float, reserve: float = 0.0, configuration: int = FIRST) -> Reply:
+    def prepare(
+        self, ballot: Ballot, now: float, reserve: float = 0.0, configuration: int = FIRST_CONFIGURATION
+    ) -> Reply:
         return self.acceptor.prepare(self.use.key, configuration, ballot, TTL, now, reserve)
 
-    def lease(self, ballot: Ballot, token: int, now: float, configuration: int = FIRST) -> Reply:
+    def lease(self, ballot: Ballot, token: int, now: float, configuration: int = FIRST_CONFIGURATION) -> Reply:
         return self.acceptor.lease(self.use.key, configuration, ballot, token, TTL, now)
 
-    def accept(self, ballot: Ballot, value: Any, now: float, configuration: int = FIRST) -> Reply:
+    def accept(self, ballot: Ballot, value: Any, now: float, configuration: int = FIRST_CONFIGURATION) -> Reply:
         return self.acceptor.accept(self.use.key, configuration, ballot, value, now)
 
     def release(self, ballot: Ballot, now: float, rest: float = 0.0) -> Reply:

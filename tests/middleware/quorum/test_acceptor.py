@@ -8,9 +8,9 @@ from typing import Any
 
 from twisted.trial.unittest import SynchronousTestCase
 
-from middleware.entangled.quorum.acceptor import TABLE, Event, Stand, State, state_of
-from middleware.entangled.quorum.ballot import FIRST, NONE, ROOM
-from middleware.entangled.quorum.register import Kind, Register, Reply
+from middleware.entangled.quorum.acceptor import TABLE, BallotRelation, Event, State, find_state
+from middleware.entangled.quorum.ballot import FIRST_CONFIGURATION, INITIAL_CEILING, NO_BALLOT
+from middleware.entangled.quorum.register import Register, Reply, ReplyKind
 from tests.middleware.quorum.members import LEASE, TAKE, TTL, Member, Use
 
 ENDING_AT = 0.9 * TTL
@@ -18,17 +18,17 @@ LOW, MID, HIGH, OTHER = LEASE.ballot(1, 0), LEASE.ballot(2, 0), LEASE.ballot(3, 
 HELD_BY_LOW = {"promised": LOW, "holder": LOW, "token": 1, "ttl": TTL, "until": TTL}
 HELD_BY_OTHER = {**HELD_BY_LOW, "promised": LEASE.ballot(1, 1), "holder": LEASE.ballot(1, 1)}
 RESERVED = {"promised": LEASE.ballot(1, 1), "reserve": TTL, "reserved_until": TTL}
-RECIPES: dict[Stand, tuple[dict[str, Any], Any, float, int]] = {
-    Stand.BEHIND: ({}, MID, 1.0, FIRST + 1),
-    Stand.MOVED: ({"configuration": FIRST + 1}, MID, 1.0, FIRST),
-    Stand.HELD: ({**HELD_BY_OTHER, "promised": MID}, MID, 1.0, FIRST),
-    Stand.LOWER: ({"promised": OTHER}, LOW, 1.0, FIRST),
-    Stand.OVERTAKEN: ({**HELD_BY_LOW, "promised": OTHER}, LOW, ENDING_AT, FIRST),
-    Stand.OWN: (HELD_BY_LOW, LOW, 1.0, FIRST),
-    Stand.ENDING: (HELD_BY_OTHER, MID, ENDING_AT, FIRST),
-    Stand.RESERVED: (RESERVED, MID, 1.0, FIRST),
-    Stand.FOREIGN: ({"promised": OTHER}, MID, 1.0, FIRST),
-    Stand.FREE: ({"promised": LOW}, MID, 1.0, FIRST),
+RECIPES: dict[BallotRelation, tuple[dict[str, Any], Any, float, int]] = {
+    BallotRelation.BEHIND: ({}, MID, 1.0, FIRST_CONFIGURATION + 1),
+    BallotRelation.MOVED: ({"configuration": FIRST_CONFIGURATION + 1}, MID, 1.0, FIRST_CONFIGURATION),
+    BallotRelation.HELD: ({**HELD_BY_OTHER, "promised": MID}, MID, 1.0, FIRST_CONFIGURATION),
+    BallotRelation.LOWER: ({"promised": OTHER}, LOW, 1.0, FIRST_CONFIGURATION),
+    BallotRelation.OVERTAKEN: ({**HELD_BY_LOW, "promised": OTHER}, LOW, ENDING_AT, FIRST_CONFIGURATION),
+    BallotRelation.OWN: (HELD_BY_LOW, LOW, 1.0, FIRST_CONFIGURATION),
+    BallotRelation.ENDING: (HELD_BY_OTHER, MID, ENDING_AT, FIRST_CONFIGURATION),
+    BallotRelation.RESERVED: (RESERVED, MID, 1.0, FIRST_CONFIGURATION),
+    BallotRelation.FOREIGN: ({"promised": OTHER}, MID, 1.0, FIRST_CONFIGURATION),
+    BallotRelation.FREE: ({"promised": LOW}, MID, 1.0, FIRST_CONFIGURATION),
 }
 """What a register holds, and the ballot, moment and configuration that then stand so to it."""
 GIVEN_BACK = {"promised": MID, "spent": HIGH}
@@ -43,14 +43,14 @@ class TableTests(SynchronousTestCase):
                 continue
             member = Member(LEASE)
             fields, ballot, now, configuration = RECIPES[stand]
-            if (event, stand) == (Event.RELEASE, Stand.LOWER):
+            if (event, stand) == (Event.RELEASE, BallotRelation.LOWER):
                 fields, ballot = GIVEN_BACK, MID
-            register = replace(member.acceptor.log.blank(0.0), **fields)
+            register = replace(member.acceptor.log.make_register(0.0), **fields)
             if state is State.SEALED:
                 register.accepted, register.value = LEASE.ballot(1, 2), LEASE.values[2]
-            register.is_over = state is State.OVER
-            member.acceptor.log.enter(LEASE.key, register, 0.0)
-            token = 1 if stand in (Stand.OWN, Stand.OVERTAKEN) else 2
+            register.is_closed = state is State.OVER
+            member.acceptor.log.add(LEASE.key, register, 0.0)
+            token = 1 if stand in (BallotRelation.OWN, BallotRelation.OVERTAKEN) else 2
             if event is Event.LEASE:
                 reply = member.lease(ballot, token, now, configuration)
             elif event is Event.ACCEPT:
@@ -58,27 +58,27 @@ class TableTests(SynchronousTestCase):
             else:
                 is_release = event is Event.RELEASE
                 reply = member.release(ballot, now) if is_release else member.prepare(ballot, now, 0.0, configuration)
-            self.assertEqual((reply.kind, state_of(register)), (kind, after), (state, event, stand))
+            self.assertEqual((reply.kind, find_state(register)), (kind, after), (state, event, stand))
 
     def test_unknown(self) -> None:
         """An unprepared register rejects an accept that needs a promise, and a release, and takes no space."""
         for use in (TAKE, LEASE):
             member = Member(use)
             ballot = use.ballot(1, 0)
-            accepts = Kind.UNPREPARED if use.terms.must_prepare else Kind.GRANTED
-            self.assertEqual(member.release(ballot, 0.0).kind, Kind.UNPREPARED)
+            accepts = ReplyKind.UNPREPARED if use.terms.must_prepare else ReplyKind.GRANTED
+            self.assertEqual(member.release(ballot, 0.0).kind, ReplyKind.UNPREPARED)
             self.assertEqual(len(member.acceptor.log), 0)
             self.assertEqual(member.accept(ballot, use.values[0], 0.0).kind, accepts)
-            self.assertEqual(len(member.acceptor.log), accepts is Kind.GRANTED)
-            self.assertEqual(Member(use).prepare(ballot, 0.0).kind, Kind.GRANTED)
+            self.assertEqual(len(member.acceptor.log), accepts is ReplyKind.GRANTED)
+            self.assertEqual(Member(use).prepare(ballot, 0.0).kind, ReplyKind.GRANTED)
 
     def test_no_row_is_missing(self) -> None:
         """The table has a row for each state, event and possible relation of a ballot."""
         found = {stand for _, event, stand in TABLE if event is not Event.RELEASE}
-        released = {Stand.FOREIGN, Stand.LOWER, Stand.HELD, Stand.FREE}
+        released = {BallotRelation.FOREIGN, BallotRelation.LOWER, BallotRelation.HELD, BallotRelation.FREE}
         wanted = {(s, e, st) for s in State for e in Event for st in (released if e is Event.RELEASE else found)}
         self.assertEqual(set(TABLE), wanted)
-        self.assertEqual(found | released, set(Stand))
+        self.assertEqual(found | released, set(BallotRelation))
 
 
 class ReachableTests(SynchronousTestCase):
@@ -108,15 +108,15 @@ class ReachableTests(SynchronousTestCase):
 
     def explore(self, use: Use, questions: tuple[tuple[str, Any, int], ...]) -> int:
         """Send all requests in all states reachable in five time steps; return the number of states."""
-        start = (Member(use).acceptor.log.blank(0.0), 0)
+        start = (Member(use).acceptor.log.make_register(0.0), 0)
         states, seen = [start], {self.digest(*start)}
         for register, step in states:
             later = [(register, step + 1)] if step < 4 else []
             for event, ballot, token in questions:
                 member, now = Member(use), step * 0.4 * TTL
                 after = replace(register, listeners={})
-                if register.promised != NONE:
-                    member.acceptor.log.enter(use.key, after, 0.0)
+                if register.promised != NO_BALLOT:
+                    member.acceptor.log.add(use.key, after, 0.0)
                 reply = self.ask(member, event, ballot, token, now)
                 after = member.acceptor.log.get(use.key) or after
                 self.verify(use, register, after, event, ballot, token, now, reply)
@@ -130,8 +130,15 @@ class ReachableTests(SynchronousTestCase):
     def digest(self, register: Register, step: int) -> tuple[Any, ...]:
         """Return the distinguishing features of a state; periods that have ended are equal."""
         now = step * 0.4 * TTL
-        told = register.promised, register.holder, register.spent, register.accepted, register.token, register.grantee
-        return (*told, max(0.0, register.until - now), max(0.0, register.reserved_until - now), step)
+        told = (
+            register.promised,
+            register.holder,
+            register.released,
+            register.accepted,
+            register.token,
+            register.grantee,
+        )
+        return (*told, max(0.0, register.lease_until - now), max(0.0, register.reserved_until - now), step)
 
     def ask(self, member: Member, event: str, ballot: Any, token: int, now: float) -> Reply:
         """Send one request; the accepted value depends on the ballot."""
@@ -160,53 +167,53 @@ class ReachableTests(SynchronousTestCase):
         """Check the invariants of one step, with the names of ``docs/explanation/quorum.md``."""
         case = event, ballot, token, now, before
         lives = use.codec.lives
-        is_held = before.until > now and not ballot.is_kin(before.holder, lives)
-        if reply.kind not in (Kind.GRANTED, Kind.SEALED):
+        is_held = before.lease_until > now and not ballot.is_same_life(before.holder, lives)
+        if reply.kind not in (ReplyKind.GRANTED, ReplyKind.SEALED):
             self.assertEqual(self.digest(before, 0), self.digest(after, 0), case)  # a rejection changes nothing
         self.assertGreaterEqual(after.promised, before.promised, case)  # P1
         self.assertGreaterEqual(after.accepted, before.accepted, case)  # A1
         self.assertGreaterEqual(after.token, before.token, case)  # T1
-        self.assertGreaterEqual(after.spent, NONE)
-        if event == "lease" and reply.kind is Kind.GRANTED:
+        self.assertGreaterEqual(after.released, NO_BALLOT)
+        if event == "lease" and reply.kind is ReplyKind.GRANTED:
             self.assertFalse(is_held, case)  # L1
-            self.assertEqual(before.accepted, NONE, case)  # C1
-            self.assertGreater(ballot, before.spent, case)  # B3
-            extends = before.until > now and token == before.token and before.holder > before.spent
+            self.assertEqual(before.accepted, NO_BALLOT, case)  # C1
+            self.assertGreater(ballot, before.released, case)  # B3
+            extends = before.lease_until > now and token == before.token and before.holder > before.released
             self.assertTrue(ballot >= before.promised or extends, case)  # P1, L4
-            self.assertTrue(token > before.token or ballot.is_kin(before.holder, lives), case)  # T2
-        if event == "accept" and reply.kind is Kind.GRANTED:
-            self.assertFalse(before.until > now, case)  # C2
-            self.assertTrue(ballot >= before.promised and ballot > before.spent, case)  # P1, B3
-            self.assertTrue(not use.terms.must_prepare or before.promised != NONE, case)  # R4
-        if event in ("prepare", "reserve") and reply.kind in (Kind.GRANTED, Kind.SEALED):
+            self.assertTrue(token > before.token or ballot.is_same_life(before.holder, lives), case)  # T2
+        if event == "accept" and reply.kind is ReplyKind.GRANTED:
+            self.assertFalse(before.lease_until > now, case)  # C2
+            self.assertTrue(ballot >= before.promised and ballot > before.released, case)  # P1, B3
+            self.assertTrue(not use.terms.must_prepare or before.promised != NO_BALLOT, case)  # R4
+        if event in ("prepare", "reserve") and reply.kind in (ReplyKind.GRANTED, ReplyKind.SEALED):
             self.assertEqual(reply.accepted, before.accepted, case)  # A2
-            self.assertEqual(reply.kind is Kind.SEALED, before.accepted != NONE, case)
-            is_reserved = before.reserved_until > now and not ballot.is_kin(before.promised, lives)
+            self.assertEqual(reply.kind is ReplyKind.SEALED, before.accepted != NO_BALLOT, case)
+            is_reserved = before.reserved_until > now and not ballot.is_same_life(before.promised, lives)
             self.assertFalse(is_reserved, case)  # L3
-            self.assertTrue(not is_held or before.is_given_back or before.until - now <= 0.2 * TTL, case)  # L3
+            self.assertTrue(not is_held or before.is_released or before.lease_until - now <= 0.2 * TTL, case)  # L3
         if event != "release":
-            self.assertGreaterEqual(after.until, before.until, case)  # L3: only the holder shortens a lease
+            self.assertGreaterEqual(after.lease_until, before.lease_until, case)  # L3: only the holder shortens a lease
         elif is_held:
-            self.assertEqual(after.until, before.until, case)
+            self.assertEqual(after.lease_until, before.lease_until, case)
 
 
 class NumberTests(SynchronousTestCase):
     def test_numbers_are_bounded(self) -> None:
         """The highest ballots and tokens get no promise, which leaves room for other proposers (N1)."""
         for use in (TAKE, LEASE):
-            member, huge = Member(use), use.ballot(ROOM + 1, 0)
-            self.assertEqual(member.prepare(huge, 0.0).kind, Kind.OUTBID)
-            self.assertEqual(member.prepare(use.ballot(1, 0), 0.0).kind, Kind.GRANTED)
-            self.assertEqual(member.accept(huge, use.values[0], 0.0).kind, Kind.OUTBID)
-            self.assertEqual(member.lease(use.ballot(1, 0), ROOM + 1, 0.0).kind, Kind.OUTBID)
-            self.assertEqual(member.prepare(huge, 1.0).kind, Kind.GRANTED)
+            member, huge = Member(use), use.ballot(INITIAL_CEILING + 1, 0)
+            self.assertEqual(member.prepare(huge, 0.0).kind, ReplyKind.OUTBID)
+            self.assertEqual(member.prepare(use.ballot(1, 0), 0.0).kind, ReplyKind.GRANTED)
+            self.assertEqual(member.accept(huge, use.values[0], 0.0).kind, ReplyKind.OUTBID)
+            self.assertEqual(member.lease(use.ballot(1, 0), INITIAL_CEILING + 1, 0.0).kind, ReplyKind.OUTBID)
+            self.assertEqual(member.prepare(huge, 1.0).kind, ReplyKind.GRANTED)
 
     def test_another_life(self) -> None:
         """A restarted proposer waits for the end of its earlier lease, because its device may still act (L2)."""
         member = Member(LEASE)
         member.lease(LOW, 1, 0.0)
-        self.assertEqual(member.prepare(MID, 1.0).kind, Kind.GRANTED)
-        self.assertEqual(member.prepare(MID._replace(counter=MID.counter + 1), 1.0).kind, Kind.HELD)
+        self.assertEqual(member.prepare(MID, 1.0).kind, ReplyKind.GRANTED)
+        self.assertEqual(member.prepare(MID._replace(counter=MID.counter + 1), 1.0).kind, ReplyKind.HELD)
 
     def test_restart(self) -> None:
         """A restarted acceptor keeps its promises, leases and accepted values (D1, R2)."""
@@ -214,16 +221,16 @@ class NumberTests(SynchronousTestCase):
             member, first, second = Member(use), use.ballot(1, 0), use.ballot(2, 1)
             member.prepare(second, 0.0)
             member.restart(50.0)
-            self.assertEqual(member.prepare(first, 50.0).kind, Kind.OUTBID)
+            self.assertEqual(member.prepare(first, 50.0).kind, ReplyKind.OUTBID)
             member.accept(second, use.values[0], 50.0)
             member.restart(99.0)
             told = member.prepare(use.ballot(3, 1), 99.0)
-            self.assertEqual((told.kind, told.accepted, told.value), (Kind.SEALED, second, use.values[0]))
+            self.assertEqual((told.kind, told.accepted, told.value), (ReplyKind.SEALED, second, use.values[0]))
         leased = Member(LEASE)
         leased.lease(LOW, 1, 0.0)
         leased.restart(50.0)
-        self.assertEqual(leased.prepare(OTHER, 51.0).kind, Kind.HELD)
+        self.assertEqual(leased.prepare(OTHER, 51.0).kind, ReplyKind.HELD)
         reserved = Member(TAKE)
         reserved.prepare(TAKE.ballot(1, 0), 0.0, TTL)
         reserved.restart(50.0)
-        self.assertEqual(reserved.prepare(TAKE.ballot(2, 1), 51.0).kind, Kind.HELD)
+        self.assertEqual(reserved.prepare(TAKE.ballot(2, 1), 51.0).kind, ReplyKind.HELD)

@@ -9,25 +9,25 @@ from typing import Any
 from twisted.internet.defer import Deferred
 from twisted.trial.unittest import SynchronousTestCase
 
-from middleware.entangled.quorum.ballot import NONE, Ballot
+from middleware.entangled.quorum.ballot import NO_BALLOT, Ballot
 from middleware.entangled.quorum.proposer import Outcome, Result, conclude, decide
-from middleware.entangled.quorum.register import Kind, Reply
+from middleware.entangled.quorum.register import Reply, ReplyKind
 from middleware.entangled.quorum.round import Tally
 from tests.middleware.quorum.members import LEASE, TAKE, Member, Use
 
 LOW, MID = Ballot(1, b"a"), Ballot(2, b"b")
 
 
-def reply(kind: Kind, counter: int = 9, accepted: Ballot = NONE, value: bytes | None = None) -> Reply:
+def reply(kind: ReplyKind, counter: int = 9, accepted: Ballot = NO_BALLOT, value: bytes | None = None) -> Reply:
     return Reply(kind, Ballot(counter, b""), accepted=accepted, value=value)
 
 
 class ConcludeTests(SynchronousTestCase):
     def test_conclude(self) -> None:
         """The replies make a round won, decided, held, outbid or silent; the highest accepted value is completed."""
-        yes, held = reply(Kind.GRANTED), Reply(Kind.HELD, Ballot(4, b""), remaining=2.5)
-        old, new = reply(Kind.GRANTED, 9, LOW, b"old"), reply(Kind.GRANTED, 9, MID, b"new")
-        outbid = reply(Kind.OUTBID, 9, LOW, b"x")
+        yes, held = reply(ReplyKind.GRANTED), Reply(ReplyKind.HELD, Ballot(4, b""), remaining=2.5)
+        old, new = reply(ReplyKind.GRANTED, 9, LOW, b"old"), reply(ReplyKind.GRANTED, 9, MID, b"new")
+        outbid = reply(ReplyKind.OUTBID, 9, LOW, b"x")
         rows: list[tuple[list[Reply | None], Outcome | None]] = [
             ([yes], None),
             ([yes, yes], Outcome(Result.WON, None, 9)),
@@ -36,12 +36,12 @@ class ConcludeTests(SynchronousTestCase):
             ([outbid, outbid], Outcome(Result.DECIDED, b"x", 9)),
             ([old, old], Outcome(Result.DECIDED, b"old", 9)),
             # Two acceptors accepted the same value under two ballots, which is no decision.
-            ([outbid, reply(Kind.OUTBID, 9, MID, b"x")], Outcome(Result.OUTBID, None, 9)),
+            ([outbid, reply(ReplyKind.OUTBID, 9, MID, b"x")], Outcome(Result.OUTBID, None, 9)),
             ([held], None),
             ([held, None], Outcome(Result.HELD, None, 4, 2.5)),
-            ([held, reply(Kind.OUTBID, 7)], Outcome(Result.OUTBID, None, 7, 2.5)),
+            ([held, reply(ReplyKind.OUTBID, 7)], Outcome(Result.OUTBID, None, 7, 2.5)),
             ([None, None], Outcome(Result.SILENT)),
-            ([None, Reply(Kind.UNPREPARED), None], Outcome(Result.SILENT)),
+            ([None, Reply(ReplyKind.UNPREPARED), None], Outcome(Result.SILENT)),
         ]
         for replies, outcome in rows:
             tally = Tally(3)
@@ -63,7 +63,7 @@ class DecideTests(SynchronousTestCase):
             await waiting[-1]
 
         async def ask(question: Callable[[Member], Reply]) -> Outcome:
-            tally = Tally(3, (Kind.GRANTED, Kind.SEALED))
+            tally = Tally(3, (ReplyKind.GRANTED, ReplyKind.SEALED))
             for place, member in enumerate(members):
                 await turn()
                 tally.add(place, question(member) if rng.random() < 0.7 else None)
@@ -119,6 +119,6 @@ class DecideTests(SynchronousTestCase):
             self.assertEqual(self.successResultOf(told), (third, use.values[1]))
 
     def _concluded(self, reply: Reply) -> Outcome:
-        tally = Tally(1, (Kind.GRANTED, Kind.SEALED))
+        tally = Tally(1, (ReplyKind.GRANTED, ReplyKind.SEALED))
         tally.add(0, reply)
         return conclude(tally)

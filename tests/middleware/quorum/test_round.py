@@ -8,18 +8,18 @@ from typing import Any
 from twisted.internet.defer import Deferred, fail, succeed
 from twisted.trial.unittest import SynchronousTestCase
 
-from middleware.consensus.lease.lease_codec import pack_reply, unpack_reply
+from middleware.consensus.lease.lease_codec import pack_reply, parse_reply
 from middleware.entangled.clock import HeapClock
 from middleware.entangled.errors import NoAnswer
-from middleware.entangled.quorum.register import Kind, Reply
-from middleware.entangled.quorum.round import NEWS, PAUSE, TRIES, Round, Tally
+from middleware.entangled.quorum.register import Reply, ReplyKind
+from middleware.entangled.quorum.round import MIN_TRIES, NEWS_INTERVAL_S, RETRY_INTERVAL_S, Round, Tally
 
-YES, NO = Reply(Kind.GRANTED), Reply(Kind.HELD, remaining=1.0)
+YES, NO = Reply(ReplyKind.GRANTED), Reply(ReplyKind.HELD, remaining=1.0)
 
 
 def decoded(place: int, answer: object) -> list[Reply] | None:
     """Decode a reply like the proposer of a lease."""
-    reply = unpack_reply(answer)
+    reply = parse_reply(answer)
     return None if reply is None else [reply]
 
 
@@ -32,7 +32,7 @@ class RoundTests(SynchronousTestCase):
         self.asked.append((self.clock.seconds(), place, Deferred()))
         return self.asked[-1][2]
 
-    def round(self, size: int = 3, short: float = PAUSE) -> Round:
+    def round(self, size: int = 3, short: float = RETRY_INTERVAL_S) -> Round:
         return Round([Tally(size)], self.ask, decoded, self.clock, 0.5, short)
 
     def answer(self, number: int, reply: Reply) -> None:
@@ -52,7 +52,7 @@ class RoundTests(SynchronousTestCase):
     def test_members_about_to_be_free_are_asked_again(self) -> None:
         """A member with a lease that ends within 100 ms is queried again at its end; others count as rejections."""
         asked = self.round()
-        self.answer(0, Reply(Kind.HELD, remaining=0.03))
+        self.answer(0, Reply(ReplyKind.HELD, remaining=0.03))
         self.answer(1, NO)
         self.assertNoResult(asked.outcome)
         self.clock.advance(0.03)
@@ -67,26 +67,26 @@ class RoundTests(SynchronousTestCase):
         self.answer(0, NO)
         self.answer(1, NO)
         self.assertNoResult(asked.outcome)
-        self.clock.advance(NEWS)
+        self.clock.advance(NEWS_INTERVAL_S)
         self.assertEqual([member for _, member, _ in self.asked[3:]], [0, 1])
         self.answer(3, YES)
         self.answer(4, YES)
         self.assertTrue(self.successResultOf(asked.outcome).tally.is_won)
         self.asked.clear()
         looked = self.round(short=0.0)
-        self.answer(0, Reply(Kind.HELD, remaining=0.03))
-        self.answer(1, Reply(Kind.HELD, remaining=0.03))
+        self.answer(0, Reply(ReplyKind.HELD, remaining=0.03))
+        self.answer(1, Reply(ReplyKind.HELD, remaining=0.03))
         self.assertFalse(self.successResultOf(looked.outcome).tally.is_won)
 
     def test_who_is_silent(self) -> None:
         """A member with any reply counts as present; a member without one counts as silent after three requests."""
         asked = self.round()
         self.answer(1, NO)
-        self.assertEqual((asked.answered, asked.silent), ([1], []))
-        self.clock.advance(PAUSE * (TRIES - 1))
-        self.assertEqual(asked.silent, [0, 2])
-        self.answer(0, Reply(Kind.HELD, remaining=0.05))
-        self.assertEqual((asked.answered, asked.silent), ([1, 0], [2]))
+        self.assertEqual((asked.answered_places, asked.silent_places), ([1], []))
+        self.clock.advance(RETRY_INTERVAL_S * (MIN_TRIES - 1))
+        self.assertEqual(asked.silent_places, [0, 2])
+        self.answer(0, Reply(ReplyKind.HELD, remaining=0.05))
+        self.assertEqual((asked.answered_places, asked.silent_places), ([1, 0], [2]))
 
     def test_silent_members_are_asked_again(self) -> None:
         """A silent member is queried every 100 ms until the decision, and at least three times; others once."""
@@ -95,7 +95,7 @@ class RoundTests(SynchronousTestCase):
         self.answer(2, YES)
         self.clock.advance(1.0)
         moments = [round(moment, 6) for moment, member, _ in self.asked if member == 0]
-        self.assertEqual(moments, [number * PAUSE for number in range(TRIES)])
+        self.assertEqual(moments, [number * RETRY_INTERVAL_S for number in range(MIN_TRIES)])
         self.assertEqual([member for _, member, _ in self.asked].count(1), 1)
         del self.asked[:]
         self.round()
@@ -116,7 +116,7 @@ class RoundTests(SynchronousTestCase):
         asked = self.round()
         self.answer(0, YES)
         self.answer(1, NO)
-        self.clock.advance(PAUSE + 0.01)
+        self.clock.advance(RETRY_INTERVAL_S + 0.01)
         self.assertFalse(self.successResultOf(asked.outcome).tally.is_won)
 
     def test_sent_at_counts_the_latest_majority(self) -> None:
@@ -131,14 +131,14 @@ class RoundTests(SynchronousTestCase):
         self.clock.advance(0.25)
         self.answer(len(self.asked) - 1, YES)
         self.answer(len(self.asked) - 2, YES)
-        self.assertAlmostEqual(self.successResultOf(later.outcome).sent_at, 0.25 + 2 * PAUSE)
+        self.assertAlmostEqual(self.successResultOf(later.outcome).sent_at, 0.25 + 2 * RETRY_INTERVAL_S)
         self.assertFalse(self.asked[first][2].called)
 
     def test_strange_and_late_answers(self) -> None:
         """Errors and invalid replies do not count; after ``close`` no request is sent and replies are ignored."""
         asked = self.round()
         self.answer(0, YES)
-        self.clock.advance(PAUSE)
+        self.clock.advance(RETRY_INTERVAL_S)
         self.asked[1][2].errback(NoAnswer("late"))
         self.asked[2][2].callback(["?"])
         self.assertNoResult(asked.outcome)
@@ -158,10 +158,10 @@ class RoundTests(SynchronousTestCase):
         """``free_in`` is the time until the second shortest lease ends, by the members' clocks."""
         asked = self.round()
         self.clock.advance(0.04)
-        self.answer(0, Reply(Kind.HELD, remaining=0.2))
-        self.answer(1, Reply(Kind.HELD, remaining=0.9))
+        self.answer(0, Reply(ReplyKind.HELD, remaining=0.2))
+        self.answer(1, Reply(ReplyKind.HELD, remaining=0.9))
         # The third member did not reply, so the second is needed; its lease counts from the middle of 0.00 and 0.04.
-        self.assertAlmostEqual(asked.free_in(), 0.88)
+        self.assertAlmostEqual(asked.estimate_wait(), 0.88)
         unheard = self.round()
         self.clock.advance(0.6)
-        self.assertEqual(unheard.free_in(), 0.0)
+        self.assertEqual(unheard.estimate_wait(), 0.0)

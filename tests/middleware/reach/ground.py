@@ -12,13 +12,13 @@ from middleware.entangled.clock import HeapClock
 from middleware.entangled.contact import Contact
 from middleware.entangled.data.memory import MemoryStore
 from middleware.entangled.identity import Identity
-from middleware.entangled.network.nat import Nat, NatKind
+from middleware.entangled.network.nat_router import NatKind, NatRouter
 from middleware.entangled.network.network import Address
-from middleware.entangled.network.switchboard import Switchboard, SwitchboardNetwork, Weather
+from middleware.entangled.network.switchboard import LinkConditions, Switchboard, SwitchboardNetwork
 from middleware.entangled.node import EntangledNode
 
 TEAM = b"t" * 32
-LINK = Weather(delay_s=0.015)
+LINK = LinkConditions(delay_s=0.015)
 """One crossing of a site's uplink: two sites are 60 ms apart, there and back."""
 
 
@@ -32,7 +32,7 @@ class Ground:
     def __init__(
         self,
         seed: int = 1,
-        weather: Weather = LINK,
+        weather: LinkConditions = LINK,
         lifetime: float = 30.0,
         nets: tuple[str, str] = ("203.0.113", "192.168"),
     ) -> None:
@@ -43,7 +43,7 @@ class Ground:
         self.board = Switchboard(self.clock, random.Random(f"{seed}/board"))
         self.nodes: dict[str, EntangledNode] = {}
         self.networks: dict[str, SwitchboardNetwork] = {}
-        self.routers: dict[str, Nat] = {}
+        self.routers: dict[str, NatRouter] = {}
         self.outside, self.inside = nets
         self.public = Address(f"{self.outside}.1", 7000)
         self.node("pub", self.public)
@@ -53,12 +53,12 @@ class Ground:
         if kind != "none":
             host, rng = f"{self.outside}.{10 + len(self.routers)}", random.Random(f"{self.seed}/{name}")
             nat: NatKind = kind  # type: ignore[assignment]
-            self.routers[name] = self.board.router(Nat(nat, host, rng, self.lifetime), self.weather)
+            self.routers[name] = self.board.add_router(NatRouter(nat, host, rng, self.lifetime), self.weather)
 
     def node(self, name: str, address: Address, site: str = "") -> EntangledNode:
         """Create and start a node at a site or on the public net; it joins through the public node."""
         identity = Identity(random.Random(f"{self.seed}/{name}").randbytes(32))
-        network = self.board.network(*address, home=self.routers.get(site))
+        network = self.board.make_network(*address, home=self.routers.get(site))
         rng = random.Random(f"{self.seed}/{name}/dice")
         node = EntangledNode(identity, TEAM, network, MemoryStore(), self.clock, rng)
         node.rpc("echo")(lambda peer, value: value)
@@ -76,18 +76,18 @@ class Ground:
             return self.node(name, Address(f"{self.inside}.{ord(site) % 200}.{host}", 7000), site)
         address = Address(f"{self.outside}.{100 + len(self.nodes)}", 7000)
         for other in self.networks.values():
-            self.board.set_weather(address, other.address, self.weather)
+            self.board.set_conditions(address, other.address, self.weather)
         return self.node(name, address)
 
     def met_at(self, of: EntangledNode) -> Contact:
         """Return the contact of a node as the public node sees it."""
-        peer = self.nodes["pub"].endpoint.peers.known(of.identity.public)
+        peer = self.nodes["pub"].endpoint.peers.get(of.identity.public)
         assert peer is not None and peer.session is not None
         return peer.session.contact
 
     def way(self, a: EntangledNode, b: EntangledNode) -> str:
         """Return the kind of the current path from ``a`` to ``b``."""
-        kind = a.reach.ways.passage(b.contact).kind
+        kind = a.nat.paths.find_path(b.contact).kind
         return kind if kind in ("none", "carried") else "direct"
 
     def call(self, a: EntangledNode, contact: Contact, timeout: float | None = None) -> tuple[Any, float]:
@@ -112,7 +112,7 @@ class Ground:
     def stop(self) -> None:
         """Stop every node."""
         for node in self.nodes.values():
-            node.vanish()
+            node.stop_silently()
 
 
 class GroundCase(SynchronousTestCase):
@@ -121,7 +121,7 @@ class GroundCase(SynchronousTestCase):
     def ground(
         self,
         seed: int = 1,
-        weather: Weather = LINK,
+        weather: LinkConditions = LINK,
         lifetime: float = 30.0,
         nets: tuple[str, str] = ("203.0.113", "192.168"),
     ) -> Ground:

@@ -10,10 +10,10 @@ from middleware.entangled.clock import HeapClock
 from middleware.entangled.contact import Contact
 from middleware.entangled.errors import Refused
 from middleware.entangled.identity import Identity
-from middleware.entangled.network.network import Address, relayed
-from middleware.entangled.network.switchboard import Weather
-from middleware.entangled.reach.candidate import MAX_CANDIDATES, is_loopback, is_near, packed, unpacked
-from middleware.entangled.reach.introducer import INTRODUCTIONS, MEETS, MEETS_AT_ONCE, Allowance
+from middleware.entangled.nat.candidate import MAX_CANDIDATES, is_loopback, is_near, pack_candidates, parse_candidates
+from middleware.entangled.nat.introducer import ATTEMPT_BURST, ATTEMPTS_PER_S, INTRODUCTIONS_PER_S, IntroductionLimits
+from middleware.entangled.network.network import Address, relayed_address
+from middleware.entangled.network.switchboard import LinkConditions
 from tests.middleware.reach.ground import GroundCase
 
 INTRODUCE, MEET = "reach.introduce", "reach.meet"
@@ -24,9 +24,9 @@ class QuietTests(GroundCase):
 
     def test_neighbours_ask_nobody(self) -> None:
         """Nodes on one LAN use no introduction, address probe, relay or timer, even if a node fails."""
-        ground = self.ground(weather=Weather(delay_s=0.001))
+        ground = self.ground(weather=LinkConditions(delay_s=0.001))
         asked: list[bytes] = []
-        ground.nodes["pub"].vanish()
+        ground.nodes["pub"].stop_silently()
         nodes = [ground.node(f"n{n}", Address(f"192.168.7.{9 + n}", 7000)) for n in range(4)]
         first = nodes[0]
         for node in nodes:
@@ -34,12 +34,12 @@ class QuietTests(GroundCase):
             node.endpoint.expose(INTRODUCE, lambda peer, *rest: asked.append(b""), changes=True)
         ground.run(5.0)
         self.assertEqual(len(first.overlay.contacts()), 3)
-        nodes[3].vanish()
+        nodes[3].stop_silently()
         ground.run(30.0)
         self.assertEqual(asked, [])
         for node in nodes[:3]:
-            self.assertFalse(node.reach._upgrades or node.reach._ports or node.reach._is_ticking)
-            self.assertEqual(len(node.reach.relay), 0)
+            self.assertFalse(node.nat._upgrades or node.nat._additional_ports or node.nat._is_maintenance_scheduled)
+            self.assertEqual(len(node.nat.relay), 0)
 
     def test_answered_at_once(self) -> None:
         """A node that replies at once is never introduced, at any distance."""
@@ -80,7 +80,7 @@ class HostileTests(GroundCase):
             answer = self.asked(MEET, public, [["203.0.113.77", 7], 3, ["0.0.0.0", 1]], 3)
             self.assertTrue(isinstance(answer, Refused | list), repr(answer))
         for host, port in (("x", 1), ("203.0.113.5", -1), ("~" + "0" * 40, 1), ("203.0.113.5", 70000)):
-            self.a.endpoint.tell(self.g.met_at(self.b), "reach.seen", host, port)
+            self.a.endpoint.notify(self.g.met_at(self.b), "reach.seen", host, port)
         self.g.run(1.0)
         self.assertEqual(self.flushLoggedErrors(), [])
         self.assertEqual(self.asked("echo", 3), 3)
@@ -93,28 +93,28 @@ class HostileTests(GroundCase):
         d = self.g.at("d", "port")
         self.g.run(6.0)
         self.assertNotEqual((self.g.way(c, d), self.g.way(d, c)), ("none", "none"))
-        contact = c.overlay.roster.get(d.identity.node_id)
+        contact = c.overlay.members.get(d.identity.node_id)
         assert contact is not None
         self.assertEqual(self.g.call(c, contact)[0], 7)
 
     def test_nobody_to_ask(self) -> None:
         """A call to an unknown relayed node fails like any call without a reply and leaves no state."""
         stranger = Identity(b"s" * 32)
-        answer, seconds = self.g.call(self.a, Contact(stranger.public, relayed(stranger.node_id)))
+        answer, seconds = self.g.call(self.a, Contact(stranger.public, relayed_address(stranger.node_id)))
         self.assertIn("no answer", str(answer))
         self.assertLess(seconds, 2.0)
         odd = Contact(stranger.public, Address("~" + "z" * 40, 1))
         self.assertIn("no answer", str(self.g.call(self.a, odd)[0]))
         self.g.run(6.0)
-        self.assertEqual(len(self.a.endpoint.peers._openings), 0)
+        self.assertEqual(len(self.a.endpoint.peers._handshakes), 0)
 
     def test_outside(self) -> None:
         """Behind a symmetric router two peers see two ports, behind other types the same port."""
         for site, kind, ports in (("c", "port", 1), ("d", "sym", 2)):
             c = self.g.at(site, kind)
             self.g.run(2.0)
-            self.assertGreaterEqual(len({address.port for address in c.reach.outside.addresses}), ports)
-            self.assertEqual({address.host for address in c.reach.outside.addresses}, {self.g.routers[site].host})
+            self.assertGreaterEqual(len({address.port for address in c.nat.external.addresses}), ports)
+            self.assertEqual({address.host for address in c.nat.external.addresses}, {self.g.routers[site].host})
 
 
 ASKER, OTHER, STRANGER = b"a" * 32, b"o" * 32, b"s" * 32
@@ -126,27 +126,27 @@ class AllowanceTests(SynchronousTestCase):
     def setUp(self) -> None:
         """Create an unused allowance."""
         self.clock = HeapClock()
-        self.allowance = Allowance(self.clock)
+        self.allowance = IntroductionLimits(self.clock)
 
     def test_each_peer_has_its_own(self) -> None:
         """A peer that used its introductions waits for the next one; other peers are not affected."""
-        granted = [self.allowance.may_introduce(ASKER) for _ in range(int(2 * INTRODUCTIONS) + 1)]
-        self.assertEqual((sum(granted), granted[-1]), (2 * INTRODUCTIONS, False))
+        granted = [self.allowance.may_introduce(ASKER) for _ in range(int(2 * INTRODUCTIONS_PER_S) + 1)]
+        self.assertEqual((sum(granted), granted[-1]), (2 * INTRODUCTIONS_PER_S, False))
         self.assertTrue(self.allowance.may_introduce(OTHER))
         self.assertTrue(self.allowance.may_meet(ASKER))
-        self.clock.advance(1.01 / INTRODUCTIONS)
+        self.clock.advance(1.01 / INTRODUCTIONS_PER_S)
         self.assertEqual([self.allowance.may_introduce(ASKER) for _ in range(2)], [True, False])
 
     def test_who_is_met_does_not_count(self) -> None:
         """Each peer that answers restores one use of its introducer; other uses return at a fixed rate."""
         while self.allowance.may_meet(ASKER):
-            self.allowance.introduced(STRANGER, ASKER)
+            self.allowance.record_introducer(STRANGER, ASKER)
         for public, again in ((OTHER, False), (STRANGER, True), (STRANGER, False)):
-            self.allowance.met(public)
+            self.allowance.refund(public)
             self.assertEqual(self.allowance.may_meet(ASKER), again)
-        self.clock.advance(2 * MEETS_AT_ONCE / MEETS)
-        granted = [self.allowance.may_meet(ASKER) for _ in range(int(2 * MEETS_AT_ONCE))]
-        self.assertEqual(sum(granted), MEETS_AT_ONCE)
+        self.clock.advance(2 * ATTEMPT_BURST / ATTEMPTS_PER_S)
+        granted = [self.allowance.may_meet(ASKER) for _ in range(int(2 * ATTEMPT_BURST))]
+        self.assertEqual(sum(granted), ATTEMPT_BURST)
 
 
 class CandidateTests(SynchronousTestCase):
@@ -155,19 +155,19 @@ class CandidateTests(SynchronousTestCase):
     def test_there_and_back(self) -> None:
         """IPv4 and IPv6 addresses survive packing without duplicates, up to ``MAX_CANDIDATES``."""
         addresses = [Address("203.0.113.1", 7000), Address("2001:db8::1", 1), Address("192.168.1.2", 65535)]
-        self.assertEqual(unpacked(packed([*addresses, *addresses])), addresses)
+        self.assertEqual(parse_candidates(pack_candidates([*addresses, *addresses])), addresses)
         many = [Address("203.0.113.1", port) for port in range(1, 50)]
-        self.assertEqual(unpacked([list(address) for address in many]), many[:MAX_CANDIDATES])
+        self.assertEqual(parse_candidates([list(address) for address in many]), many[:MAX_CANDIDATES])
 
     def test_what_no_peer_can_have(self) -> None:
         """Multicast, wildcard, broadcast, host name and relay addresses, invalid ports and other input are dropped."""
         hosts = ["224.0.0.1", "ff02::1", "0.0.0.0", "::", "255.255.255.255", "localhost", "~" + "0" * 40, "", "1" * 99]
         for host in hosts:
-            self.assertEqual(unpacked([[host, 7000]]), [], host)
+            self.assertEqual(parse_candidates([[host, 7000]]), [], host)
         odd: list[object] = [None, 7, "x", [7], [[]], [["203.0.113.1"]], [["203.0.113.1", 0]], [["203.0.113.1", "7"]]]
         for fields in odd:
-            self.assertEqual(unpacked(fields), [], repr(fields))
-        self.assertEqual(unpacked([["203.0.113.1", 65536], [b"203.0.113.1", 1], ["203.0.113.1", True]]), [])
+            self.assertEqual(parse_candidates(fields), [], repr(fields))
+        self.assertEqual(parse_candidates([["203.0.113.1", 65536], [b"203.0.113.1", 1], ["203.0.113.1", True]]), [])
 
     def test_near(self) -> None:
         """Hosts on one machine or one private network are near; public hosts and other networks are not."""

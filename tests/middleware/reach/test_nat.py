@@ -7,18 +7,18 @@ import random
 from twisted.trial.unittest import SynchronousTestCase
 
 from middleware.entangled.clock import HeapClock
-from middleware.entangled.network.nat import Nat, NatKind
+from middleware.entangled.network.nat_router import NatKind, NatRouter
 from middleware.entangled.network.network import Address
-from middleware.entangled.network.switchboard import Switchboard, Weather
+from middleware.entangled.network.switchboard import LinkConditions, Switchboard
 
 INSIDE = Address("192.168.1.2", 7000)
 HOST = "203.0.113.9"
 A, A2, B = Address("203.0.113.1", 1), Address("203.0.113.1", 2), Address("203.0.113.2", 1)
 
 
-def nat(kind: NatKind) -> Nat:
+def nat(kind: NatKind) -> NatRouter:
     """Return a router of this NAT type."""
-    return Nat(kind, HOST, random.Random(3))
+    return NatRouter(kind, HOST, random.Random(3))
 
 
 class NatTests(SynchronousTestCase):
@@ -36,48 +36,50 @@ class NatTests(SynchronousTestCase):
         ]
         for kind, expected in kinds:
             router = nat(kind)
-            outside = router.out(INSIDE, A, 0.0)
+            outside = router.translate_outgoing(INSIDE, A, 0.0)
             port = outside.port if outside is not None else INSIDE.port
-            self.assertEqual([router.into(source, port, 0.0) == INSIDE for source in (A, A2, B)], expected, kind)
+            self.assertEqual(
+                [router.translate_incoming(source, port, 0.0) == INSIDE for source in (A, A2, B)], expected, kind
+            )
 
     def test_symmetric_ports_differ(self) -> None:
         """A symmetric router maps each destination to another, stable port; other types use one port for all."""
         kinds: list[tuple[NatKind, int]] = [("sym", 2), ("port", 1)]
         for kind, count in kinds:
             router = nat(kind)
-            a, b, again = (router.out(INSIDE, to, 0.0) for to in (A, B, A))
+            a, b, again = (router.translate_outgoing(INSIDE, to, 0.0) for to in (A, B, A))
             self.assertEqual((a, len({a, b})), (again, count))
 
     def test_mappings_end(self) -> None:
         """Traffic in either direction keeps a mapping alive; after a restart the router creates a new mapping."""
-        router = Nat("port", HOST, random.Random(3), 10.0)
-        outside = router.out(INSIDE, A, 0.0)
+        router = NatRouter("port", HOST, random.Random(3), 10.0)
+        outside = router.translate_outgoing(INSIDE, A, 0.0)
         assert outside is not None
-        passed = [router.into(A, outside.port, moment) for moment in (9.0, 18.0, 29.0)]
+        passed = [router.translate_incoming(A, outside.port, moment) for moment in (9.0, 18.0, 29.0)]
         self.assertEqual(passed, [INSIDE, INSIDE, None])
-        before = router.out(INSIDE, A, 30.0)
+        before = router.translate_outgoing(INSIDE, A, 30.0)
         router.rebind()
         assert before is not None
-        self.assertIsNone(router.into(A, before.port, 31.0))
-        self.assertNotEqual(router.out(INSIDE, A, 31.0), before)
+        self.assertIsNone(router.translate_incoming(A, before.port, 31.0))
+        self.assertNotEqual(router.translate_outgoing(INSIDE, A, 31.0), before)
 
     def test_leaky_ports_are_burnt(self) -> None:
         """A leaky router changes the port for a destination that sent a datagram too early, and for no other."""
         router = nat("leaky")
-        before = router.out(INSIDE, A, 0.0)
+        before = router.translate_outgoing(INSIDE, A, 0.0)
         assert before is not None
-        self.assertIsNone(router.into(B, before.port, 1.0))
-        self.assertNotEqual(router.out(INSIDE, B, 1.0), before)
-        self.assertEqual(router.out(INSIDE, A, 1.0), before)
+        self.assertIsNone(router.translate_incoming(B, before.port, 1.0))
+        self.assertNotEqual(router.translate_outgoing(INSIDE, B, 1.0), before)
+        self.assertEqual(router.translate_outgoing(INSIDE, A, 1.0), before)
 
     def test_on_the_board(self) -> None:
         """Nodes behind one router reach each other by their private addresses, but not by the public one."""
         clock = HeapClock()
         board = Switchboard(clock, random.Random(1))
-        router = board.router(nat("full"), Weather(delay_s=0.5))
+        router = board.add_router(nat("full"), LinkConditions(delay_s=0.5))
         got: list[tuple[float, bytes, Address]] = []
-        one, other = (board.network(f"192.168.1.{n}", 7000, home=router) for n in (2, 3))
-        far = board.network(*B)
+        one, other = (board.make_network(f"192.168.1.{n}", 7000, home=router) for n in (2, 3))
+        far = board.make_network(*B)
         for network in (one, other, far):
             network.listen(lambda datagram, source: got.append((clock.seconds(), datagram, source)))
         one.send(b"near", other.address)
@@ -96,20 +98,20 @@ class NatTests(SynchronousTestCase):
         """An additional port has a separate mapping; replies to a source that used this port leave from it."""
         clock = HeapClock()
         board = Switchboard(clock, random.Random(1))
-        router = board.router(nat("full"))
-        one, far = board.network(*INSIDE, home=router), board.network(*B)
+        router = board.add_router(nat("full"))
+        one, far = board.make_network(*INSIDE, home=router), board.make_network(*B)
         sources: list[Address] = []
         one.listen(lambda datagram, source: one.send(datagram, source))
         far.listen(lambda datagram, source: sources.append(source))
         port = one.open_port()
-        self.assertEqual(one.lead(B, port), 0)
+        self.assertEqual(one.assign_port(B, port), 0)
         one.send(b"x", B)
         clock.advance(0.0)
         self.assertEqual(sources, [Address(HOST, port)])
-        third = board.network(*A)
+        third = board.make_network(*A)
         third.listen(lambda datagram, source: sources.append(source))
         third.send(b"y", Address(HOST, port))
         clock.advance(0.0)
-        one.shut_port(port)
+        one.close_port(port)
         self.assertEqual(sources[1:], [Address(HOST, port)])
-        self.assertEqual((one.lead(B, 0), one.local(B)), (0, INSIDE))
+        self.assertEqual((one.assign_port(B, 0), one.source_address(B)), (0, INSIDE))

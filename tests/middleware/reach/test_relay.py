@@ -10,18 +10,18 @@ from twisted.trial.unittest import SynchronousTestCase
 from middleware.entangled.clock import HeapClock
 from middleware.entangled.contact import Contact
 from middleware.entangled.identity import Identity
-from middleware.entangled.network.network import MAX_CARRIED, MAX_DATAGRAM, Address, relayed
-from middleware.entangled.network.switchboard import Switchboard
-from middleware.entangled.reach.relay import (
-    CARRIED,
-    CARRY,
+from middleware.entangled.nat.relay import (
     MAX_PAIRS,
     ONE_SIDED_S,
     PAIR_BURST,
     PAIR_RATE,
+    RELAY_REQUEST,
+    RELAYED_DATAGRAM,
     Relay,
 )
-from middleware.entangled.reach.upgrade import GIVEN_UP_S, PAUSES, TURN, Upgrades
+from middleware.entangled.nat.upgrade import RETRY_INTERVALS_S, SILENCE_LIMIT_S, TURN_DELAY_S, PathUpgrades
+from middleware.entangled.network.network import MAX_DATAGRAM_BYTES, MAX_RELAYED_BYTES, Address, relayed_address
+from middleware.entangled.network.switchboard import Switchboard
 from middleware.entangled.wire.noise import TransportKeys
 from middleware.entangled.wire.peer import Peers
 from middleware.entangled.wire.session import Session
@@ -47,36 +47,36 @@ class RelayTests(SynchronousTestCase):
 
     def send(self, session: Session, plain: bytes) -> None:
         """Record a sent message, which must fit into a datagram."""
-        self.assertLessEqual(len(session.seal(plain)), MAX_CARRIED)
+        self.assertLessEqual(len(session.seal(plain)), MAX_RELAYED_BYTES)
         self.sent.append((session.contact.node_id, plain))
 
     def carry(self, sender: bytes, to: bytes, inner: bytes = b"inner") -> int:
         """Return the number of datagrams that the relay forwards for one from ``sender``."""
         before = len(self.sent)
-        self.relay.on_carry(self.sessions[sender], bytes([CARRY]) + to + inner, Address("203.0.113.1", 1))
+        self.relay.on_request(self.sessions[sender], bytes([RELAY_REQUEST]) + to + inner, Address("203.0.113.1", 1))
         return len(self.sent) - before
 
     def test_carries(self) -> None:
         """A forwarded datagram, up to the full size, carries the id of its sender."""
-        self.assertEqual(self.carry(self.a, self.b, bytes(MAX_DATAGRAM)), 1)
-        self.assertEqual(self.sent, [(self.b, bytes([CARRIED]) + self.a + bytes(MAX_DATAGRAM))])
+        self.assertEqual(self.carry(self.a, self.b, bytes(MAX_DATAGRAM_BYTES)), 1)
+        self.assertEqual(self.sent, [(self.b, bytes([RELAYED_DATAGRAM]) + self.a + bytes(MAX_DATAGRAM_BYTES))])
 
     def test_what_is_not_carried(self) -> None:
         """Datagrams to unknown nodes, to the sender, of invalid length or from a relayed session are not forwarded."""
         self.assertEqual(self.carry(self.a, bytes(20)), 0)
         self.assertEqual(self.carry(self.a, self.a), 0)
         self.assertEqual(self.carry(self.a, self.b, b""), 0)
-        self.assertEqual(self.carry(self.a, self.b, bytes(MAX_DATAGRAM + 1)), 0)
+        self.assertEqual(self.carry(self.a, self.b, bytes(MAX_DATAGRAM_BYTES + 1)), 0)
         self.assertEqual(self.carry(self.a, self.b[:10], b""), 0)
         session = self.sessions[self.a]
-        session.contact = Contact(session.contact.public, relayed(self.a))
+        session.contact = Contact(session.contact.public, relayed_address(self.a))
         self.assertEqual(self.carry(self.a, self.b), 0)
         self.assertEqual(self.counters["uncarried"] + self.counters["malformed"], 6)
 
     def test_a_pair_has_its_share(self) -> None:
         """A pair gets its burst at once and its rate in the long run, without an effect on other pairs."""
-        full = bytes(MAX_DATAGRAM)
-        self.assertEqual(sum(self.carry(self.a, self.b, full) for _ in range(200)), PAIR_BURST // MAX_DATAGRAM)
+        full = bytes(MAX_DATAGRAM_BYTES)
+        self.assertEqual(sum(self.carry(self.a, self.b, full) for _ in range(200)), PAIR_BURST // MAX_DATAGRAM_BYTES)
         self.assertEqual(self.carry(self.b, self.a, full), 0)
         self.assertEqual(self.carry(self.a, self.c, full), 1)
         carried = 0
@@ -112,19 +112,19 @@ class UpgradeTests(SynchronousTestCase):
     def setUp(self) -> None:
         """Create a relayed session."""
         clock, rng = HeapClock(), random.Random(1)
-        peers = Peers([], clock, rng, Switchboard(clock, rng).network("10.0.0.1", 7), Counter())
+        peers = Peers([], clock, rng, Switchboard(clock, rng).make_network("10.0.0.1", 7), Counter())
         identity = Identity(b"p" * 32)
         self.public = identity.public
-        contact = Contact(identity.public, relayed(identity.node_id))
+        contact = Contact(identity.public, relayed_address(identity.node_id))
         self.session = Session(contact, 1, 2, TransportKeys(bytes(32), bytes(32), bytes(32)), 0.0, is_confirmed=True)
-        peers.established(self.session)
-        self.upgrades = Upgrades(peers)
+        peers.add_session(self.session)
+        self.upgrades = PathUpgrades(peers)
 
     def tried(self, until: float) -> list[float]:
         """Return the times of the attempts while the peer is heard continuously, in steps of half a second."""
         moments = []
         for step in range(int(2 * until) + 1):
-            self.session.heard_at = now = step / 2
+            self.session.last_received_at = now = step / 2
             moments += [now for _ in self.upgrades.due(now)]
         return moments
 
@@ -134,17 +134,17 @@ class UpgradeTests(SynchronousTestCase):
         self.upgrades.add(self.public, False, 0.9)  # already known
         moments = self.tried(150.0)
         pauses = [after - before for before, after in zip([0.0, *moments], moments, strict=False)]
-        self.assertEqual(pauses, [*PAUSES, PAUSES[-1]])
-        self.upgrades.hurry(151.0)
+        self.assertEqual(pauses, [*RETRY_INTERVALS_S, RETRY_INTERVALS_S[-1]])
+        self.upgrades.retry_now(151.0)
         self.assertEqual([step for _, step in self.upgrades.due(151.0)], [0])
 
     def test_only_one_of_the_two(self) -> None:
         """Of two peers the one that ``is_behind`` tries later, and waits longer while the other one tries."""
         self.upgrades.add(self.public, True, 0.0)
-        self.assertEqual(self.tried(PAUSES[0] + TURN), [PAUSES[0] + TURN])
-        now = PAUSES[0] + 2 * TURN
-        self.upgrades.put_off(self.public, now)
-        self.assertEqual(self.tried(10.0)[0], now + PAUSES[1] + TURN)
+        self.assertEqual(self.tried(RETRY_INTERVALS_S[0] + TURN_DELAY_S), [RETRY_INTERVALS_S[0] + TURN_DELAY_S])
+        now = RETRY_INTERVALS_S[0] + 2 * TURN_DELAY_S
+        self.upgrades.delay(self.public, now)
+        self.assertEqual(self.tried(10.0)[0], now + RETRY_INTERVALS_S[1] + TURN_DELAY_S)
 
     def test_no_longer_than_needed(self) -> None:
         """A peer that is reached directly or silent for long is removed."""
@@ -152,5 +152,5 @@ class UpgradeTests(SynchronousTestCase):
         self.upgrades.drop(self.public)
         self.assertEqual(len(self.upgrades), 0)
         self.upgrades.add(self.public, False, 0.0)
-        self.assertEqual(list(self.upgrades.due(self.session.heard_at + GIVEN_UP_S + 0.1)), [])
+        self.assertEqual(list(self.upgrades.due(self.session.last_received_at + SILENCE_LIMIT_S + 0.1)), [])
         self.assertEqual(len(self.upgrades), 0)

@@ -8,11 +8,11 @@ from typing import Any
 from twisted.trial.unittest import SynchronousTestCase
 
 from middleware.entangled.contact import Contact
-from middleware.entangled.network.network import Address, relayed
-from middleware.entangled.network.switchboard import Weather
+from middleware.entangled.nat.path_kind import PeerPath, classify_path
+from middleware.entangled.nat.path_tracker import EXTENSION_S, MAX_PORTS, UNUSED_PORT_S
+from middleware.entangled.network.network import Address, relayed_address
+from middleware.entangled.network.switchboard import LinkConditions
 from middleware.entangled.node import EntangledNode
-from middleware.entangled.reach.passage import Passage, kind_of
-from middleware.entangled.reach.way import HELD_S, MAX_FRESH, SHUT_S
 from middleware.entangled.wire.noise import TransportKeys
 from middleware.entangled.wire.peer import Peer
 from middleware.entangled.wire.session import Session
@@ -33,7 +33,7 @@ def ways(ground: Ground, one: str, other: str) -> tuple[str, float]:
     known, since = 0.0, ground.clock.seconds()
     while ground.clock.seconds() < since + 8.0:
         ground.run(0.01)
-        to_b, to_a = a.endpoint.peers.known(b.identity.public), b.endpoint.peers.known(a.identity.public)
+        to_b, to_a = a.endpoint.peers.get(b.identity.public), b.endpoint.peers.get(a.identity.public)
         if not known and (to_b or to_a):
             known = ground.clock.seconds()
         if to_b and to_a and to_b.session and to_a.session:
@@ -74,7 +74,7 @@ class WeatherTests(GroundCase):
         pairs = [("port", "port"), ("full", "addr"), ("port", "sym"), ("none", "port")]
         for seed in range(10):
             for one, other in pairs:
-                ground = self.ground(seed, Weather(delay_s=0.015, loss=0.3))
+                ground = self.ground(seed, LinkConditions(delay_s=0.015, loss=0.3))
                 way, seconds = ways(ground, one, other)
                 if seconds > 5.0:
                     late.append((seed, one, other, way, seconds))
@@ -86,7 +86,7 @@ class WeatherTests(GroundCase):
             for delay_s in (0.015, 0.25):
                 ground = self.ground()
                 ground.site("b", other)
-                ground.board.router_weather[ground.routers["b"]] = Weather(delay_s)
+                ground.board.router_conditions[ground.routers["b"]] = LinkConditions(delay_s)
                 _, seconds = ways(ground, one, other)
                 self.assertLess(seconds, 5.0, f"{one} and {other}")
                 ground.run(5.0)
@@ -103,7 +103,9 @@ class WeatherTests(GroundCase):
                 ground.site("b", other)
                 host = ground.routers[late].host
                 for port in range(6990, 7010):
-                    ground.board.set_weather(ground.public, Address(host, port), Weather(delay_s=0.5), one_way=True)
+                    ground.board.set_conditions(
+                        ground.public, Address(host, port), LinkConditions(delay_s=0.5), one_way=True
+                    )
                 ways_seen = set()
                 ways(ground, one, other)
                 ground.run(20.0)
@@ -135,7 +137,7 @@ class WeatherTests(GroundCase):
             ground = self.ground(lifetime=15.0)
             a, b = ground.at("a", one), ground.at("b", other)
             ground.run(60.0)
-            to_b = a.overlay.roster.get(b.identity.node_id)
+            to_b = a.overlay.members.get(b.identity.node_id)
             assert to_b is not None
             answer, seconds = ground.call(a, to_b)
             self.assertEqual(answer, 7)
@@ -166,12 +168,12 @@ class WeatherTests(GroundCase):
         peer = _peer(a, b)
         assert peer is not None and peer.session is not None
         at_b = peer.session.contact.address
-        port = ground.networks["a2"].local(at_b).port
-        self.assertIn(port, a.reach._ports)
-        a.reach.outside.saw(peer.session.contact, Address(ground.routers["a"].host, 3), is_told=True)
-        self.assertEqual(len(a.endpoint.peers._openings), 0)
-        a.reach._assign_port(peer, [at_b], 0)
-        self.assertEqual(ground.networks["a2"].local(at_b).port, port)
+        port = ground.networks["a2"].source_address(at_b).port
+        self.assertIn(port, a.nat._additional_ports)
+        a.nat.external.record(peer.session.contact, Address(ground.routers["a"].host, 3), is_told=True)
+        self.assertEqual(len(a.endpoint.peers._handshakes), 0)
+        a.nat._assign_port(peer, [at_b], 0)
+        self.assertEqual(ground.networks["a2"].source_address(at_b).port, port)
 
     def test_direct_before_carried(self) -> None:
         """A relayed session does not replace a working direct one, but replaces a dead one."""
@@ -180,14 +182,14 @@ class WeatherTests(GroundCase):
         ground.run(3.0)
         a.call(b.contact, "echo", 1)
         ground.run(0.1)
-        carried = Contact(b.identity.public, relayed(b.identity.node_id))
+        carried = Contact(b.identity.public, relayed_address(b.identity.node_id))
         for later, way in ((0.0, "direct"), (10.0, "carried")):
             if later:
-                b.vanish()
+                b.stop_silently()
                 ground.run(later)
             keys = TransportKeys(bytes(32), bytes(32), bytes(32))
             session = Session(carried, 77 + int(later), 78, keys, ground.clock.seconds(), is_confirmed=True)
-            a.endpoint.peers.established(session)
+            a.endpoint.peers.add_session(session)
             self.assertEqual(ground.way(a, b), way)
 
     def test_another_address(self) -> None:
@@ -196,7 +198,7 @@ class WeatherTests(GroundCase):
         a, b = ground.at("a", "port"), ground.at("b", "port")
         ground.run(5.0)
         ground.site("c", "port")
-        ground.networks["a2"].home = ground.routers["c"]
+        ground.networks["a2"].router = ground.routers["c"]
         ground.board._ports[ground.routers["c"], a.contact.address] = ground.networks["a2"]
         self.assertLess(_reached_again(ground, b, a), 5.0)
         self.assertEqual(ground.met_at(a).address.host, ground.routers["c"].host)
@@ -218,7 +220,7 @@ class CarriedTests(GroundCase):
         """A relayed pair can exchange large messages, and gets a direct path when its routers permit it."""
         ground = self.ground()
         a, b = self.carried(ground)
-        session = a.endpoint.peers.session(b.identity.public)
+        session = a.endpoint.peers.find_session(b.identity.public)
         assert session is not None
         large, got = random.Random(1).randbytes(20_000), list[Any]()
         a.call(session.contact, "echo", large).addBoth(got.append)
@@ -239,10 +241,10 @@ class CarriedTests(GroundCase):
             ground = self.ground()
             ground.node("other", Address("203.0.113.200", 7000))
             a, b = self.carried(ground)
-            to_b = a.overlay.roster.get(b.identity.node_id)
+            to_b = a.overlay.members.get(b.identity.node_id)
             assert to_b is not None
             ground.run(moment / 4)
-            ground.nodes["pub"].vanish()
+            ground.nodes["pub"].stop_silently()
             began = ground.clock.seconds()
             while ground.call(a, to_b)[0] != 7:
                 self.assertLess(ground.clock.seconds() - began, 5.0)
@@ -270,24 +272,24 @@ class CarriedTests(GroundCase):
         b = ground.node("b", Address("203.0.113.220", 7000))
         ground.run(2.0)
         peers = c.endpoint.peers
-        known = peers.known(b.identity.public)
+        known = peers.get(b.identity.public)
         assert known is not None
         peers.evict(known)
-        c.reach.acquaintances.named(Contact(b.identity.public, relayed(b.identity.node_id)), others[3].contact)
+        c.nat.selector.record_namer(Contact(b.identity.public, relayed_address(b.identity.node_id)), others[3].contact)
         asked.clear()
-        answer, _ = ground.call(c, Contact(b.identity.public, relayed(b.identity.node_id)))
+        answer, _ = ground.call(c, Contact(b.identity.public, relayed_address(b.identity.node_id)))
         self.assertEqual(answer, 7)
         self.assertIn(others[3].identity.node_id, asked[:3])
         self.assertEqual(ground.way(a, b), "direct")
 
 
 def _peer(of: EntangledNode, other: EntangledNode) -> Peer | None:
-    return of.endpoint.peers.known(other.identity.public)
+    return of.endpoint.peers.get(other.identity.public)
 
 
 def _listening(node: EntangledNode, asked: list[bytes]) -> Any:
     """Return the node's method, wrapped to record its calls."""
-    answer = node.reach.introducer.answer_introduce
+    answer = node.nat.introducer.answer_introduce
 
     def introduce(peer: Contact, wanted: bytes, candidates: list[object], order: int) -> Any:
         asked.append(node.identity.node_id)
@@ -300,7 +302,7 @@ def _reached_again(ground: Ground, asked: EntangledNode, asker: EntangledNode) -
     """Return the seconds until a call from ``asker`` to the known address of ``asked`` is answered."""
     began = ground.clock.seconds()
     while ground.clock.seconds() < began + 20.0:
-        contact = asker.overlay.roster.get(asked.identity.node_id) or ground.met_at(asked)
+        contact = asker.overlay.members.get(asked.identity.node_id) or ground.met_at(asked)
         if ground.call(asker, contact)[0] == 7:
             return ground.clock.seconds() - began
         ground.run(0.2)
@@ -313,25 +315,25 @@ class FreshPortTests(GroundCase):
     def test_so_many_and_no_more(self) -> None:
         """At the limit a new port is opened only in place of the oldest one, after its hold time."""
         ground = self.ground()
-        ports = ground.at("a", "none").reach._ports
-        opened = [ports.open() for _ in range(MAX_FRESH)]
-        self.assertEqual((len(set(opened)), ports.open()), (MAX_FRESH, 0))
-        ground.run(HELD_S + 0.1)
+        ports = ground.at("a", "none").nat._additional_ports
+        opened = [ports.open() for _ in range(MAX_PORTS)]
+        self.assertEqual((len(set(opened)), ports.open()), (MAX_PORTS, 0))
+        ground.run(EXTENSION_S + 0.1)
         another = ports.open()
         self.assertNotEqual(another, 0)
-        self.assertEqual(len(ports), MAX_FRESH)
+        self.assertEqual(len(ports), MAX_PORTS)
         self.assertIn(another, ports)
-        self.assertEqual([port in ports for port in opened], [False] + [True] * (MAX_FRESH - 1))
+        self.assertEqual([port in ports for port in opened], [False] + [True] * (MAX_PORTS - 1))
 
     def test_unused_ones_are_shut(self) -> None:
         """A fresh port without a session is closed after ``SHUT_S`` seconds."""
         ground = self.ground()
-        reach = ground.at("a", "none").reach
+        reach = ground.at("a", "none").nat
         reach._open_port()
-        ground.run(SHUT_S - 1.0)
-        self.assertEqual(len(reach._ports), 1)
+        ground.run(UNUSED_PORT_S - 1.0)
+        self.assertEqual(len(reach._additional_ports), 1)
         ground.run(3.0)
-        self.assertEqual(len(reach._ports), 0)
+        self.assertEqual(len(reach._additional_ports), 0)
 
 
 OWN = Address("192.168.1.7", 8484)
@@ -343,24 +345,24 @@ class KindTests(SynchronousTestCase):
     def test_each_kind_of_address(self) -> None:
         """The address shows relayed, tunnelled and loopback paths; an introduced distant address counts as punched."""
         kinds = {
-            "carried": relayed(bytes(20)),
+            "carried": relayed_address(bytes(20)),
             "tunnel": Address("~wss-0123456789ab", 1),
             "machine": Address("127.0.0.1", 7000),
             "lan": Address("192.168.1.9", 8484),
             "direct": Address("203.0.113.9", 8484),
         }
-        self.assertEqual([kind_of(address, OWN, False, False) for address in kinds.values()], list(kinds))
-        self.assertEqual(kind_of(OWN, OWN, False, False), "machine")
-        introduced = [kind_of(kinds[kind], OWN, False, True) for kind in ("lan", "direct")]
+        self.assertEqual([classify_path(address, OWN, False, False) for address in kinds.values()], list(kinds))
+        self.assertEqual(classify_path(OWN, OWN, False, False), "machine")
+        introduced = [classify_path(kinds[kind], OWN, False, True) for kind in ("lan", "direct")]
         self.assertEqual(introduced, ["lan", "punched"])
 
 
 class PassageTests(GroundCase):
     """Tests of ``Ways.passage`` with simulated routers."""
 
-    def passage(self, a: EntangledNode, b: EntangledNode) -> Passage:
+    def passage(self, a: EntangledNode, b: EntangledNode) -> PeerPath:
         """Return the path from ``a`` to ``b``."""
-        return a.reach.ways.passage(b.contact)
+        return a.nat.paths.find_path(b.contact)
 
     def test_kinds(self) -> None:
         """Nodes behind cone routers are punched, behind symmetric routers relayed, and at one site use their LAN."""
@@ -374,7 +376,7 @@ class PassageTests(GroundCase):
             a = ground.at("a", one)
             ground.run(2.0)
             b = ground.at(site, other, 3)
-            self.assertEqual(self.passage(a, b), Passage("none"))
+            self.assertEqual(self.passage(a, b), PeerPath("none"))
             ground.run(6.0)
             for near, far in ((a, b), (b, a)):
                 passage = self.passage(near, far)
@@ -393,6 +395,6 @@ class PassageTests(GroundCase):
         a.endpoint.reopen(pub.contact)
         ground.run(10.0)
         self.assertEqual(self.passage(a, pub).since, since)
-        pub.vanish()
+        pub.stop_silently()
         ground.run(60.0)
-        self.assertNotIn(pub.identity.public, a.reach.ways._passages)
+        self.assertNotIn(pub.identity.public, a.nat.paths._path_kinds)

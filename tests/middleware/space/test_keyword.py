@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 from twisted.trial.unittest import SynchronousTestCase
 
 from middleware.entangled.errors import TooLarge
-from middleware.entangled.network.switchboard import Weather
+from middleware.entangled.network.switchboard import LinkConditions
 from middleware.entangled.space.keyword import BadName, Keywords, Match, words
 from tests.fleet import FleetCase
 
@@ -51,7 +51,7 @@ class KeywordsTests(FleetCase):
 
     def test_publishers_at_the_same_moment(self) -> None:
         """Eight nodes publish one name concurrently under datagram loss, and all eight matches are in the index."""
-        fleet = self.fleet(8, weather=Weather(delay_s=0.005, jitter_s=0.004, loss=0.1))
+        fleet = self.fleet(8, weather=LinkConditions(delay_s=0.005, jitter_s=0.004, loss=0.1))
         keywords = [Keywords(node) for node in fleet.nodes]
         work = [one.publish("same name", bytes([number])) for number, one in enumerate(keywords)]
         fleet.run(6.0)

@@ -22,23 +22,23 @@ from middleware.entangled.network.network import Address
 from middleware.entangled.quorum import log as module
 from middleware.entangled.quorum.acceptor import Event
 from middleware.entangled.quorum.ballot import Ballot
-from middleware.entangled.quorum.register import Kind
+from middleware.entangled.quorum.register import ReplyKind
 from middleware.entangled.record import Record
-from middleware.entangled.space.council import Council
-from middleware.entangled.space.posting import (
-    Member,
-    Place,
-    Posted,
-    Reader,
-    Taken,
-    packed_taken,
-    packed_tuple,
-    place_unpacked,
-    posting,
-    standing,
-)
-from middleware.entangled.space.seat import MAX_PLACES, Seat
+from middleware.entangled.space.take_acceptor import MAX_TUPLES, TakeAcceptor
 from middleware.entangled.space.take_codec import CODEC, unpack_reply
+from middleware.entangled.space.take_proposer import TakeProposer
+from middleware.entangled.space.tuple_record import (
+    Member,
+    RecordParser,
+    StoredTuple,
+    TakenNote,
+    TupleId,
+    pack_taken,
+    pack_tuple,
+    parse_record,
+    parse_records,
+    parse_tuple_id,
+)
 
 ME = Identity(b"m" * 32)
 PEER = Contact(ME.public, Address("10.0.0.1", 1))
@@ -50,16 +50,16 @@ FOREIGN: Any = st.recursive(
 )
 
 
-def place(number: int, name: str = "t") -> Place:
-    return Place(KEY, ME.public, f"{name}{number}", number.to_bytes(8, "big"))
+def place(number: int, name: str = "t") -> TupleId:
+    return TupleId(KEY, ME.public, f"{name}{number}", number.to_bytes(8, "big"))
 
 
 def record(name: str, value: bytes | None, sequence: int = 1) -> Record:
     return Record(KEY, name, ME.public, sequence, "team", 60.0, value, bytes([sequence]) * 64)
 
 
-def tuple_record(where: Place, sequence: int = 1) -> Record:
-    return record(where.name, packed_tuple(where.mark, ("x",), [Member(PEER, b"i" * 8)]), sequence)
+def tuple_record(where: TupleId, sequence: int = 1) -> Record:
+    return record(where.name, pack_tuple(where.mark, ("x",), [Member(PEER, b"i" * 8)]), sequence)
 
 
 class Exposed:
@@ -76,20 +76,20 @@ class SeatTests(SynchronousTestCase):
         self.store = MemoryStore()
         self.seat = self.made()
 
-    def made(self, seed: int = 1) -> Seat:
+    def made(self, seed: int = 1) -> TakeAcceptor:
         """Create the member again on the same store, as after a restart."""
-        return Seat(Exposed(), self.store, self.clock, random.Random(seed))
+        return TakeAcceptor(Exposed(), self.store, self.clock, random.Random(seed))
 
-    def claim(self, where: Place, counter: int = 1, taker: bytes = b"a", lease: float = 2.0) -> Kind:
-        answer: Any = self.seat.answer_claim(PEER, KEY, [where.packed()], self.seat.incarnation, counter, taker, lease)
+    def claim(self, where: TupleId, counter: int = 1, taker: bytes = b"a", lease: float = 2.0) -> ReplyKind:
+        answer: Any = self.seat.answer_claim(PEER, KEY, [where.pack()], self.seat.incarnation, counter, taker, lease)
         return self._kind(answer, Event.PREPARE)
 
-    def confirm(self, where: Place, counter: int = 1, taker: bytes = b"a") -> Kind:
+    def confirm(self, where: TupleId, counter: int = 1, taker: bytes = b"a") -> ReplyKind:
         life = self.seat.incarnation
-        answer: Any = self.seat.answer_confirm(PEER, KEY, [where.packed()], life, counter, taker, taker)
+        answer: Any = self.seat.answer_confirm(PEER, KEY, [where.pack()], life, counter, taker, taker)
         return self._kind(answer, Event.ACCEPT)
 
-    def _kind(self, answer: Any, event: Event) -> Kind:
+    def _kind(self, answer: Any, event: Event) -> ReplyKind:
         reply = unpack_reply(answer[0], event)
         assert reply is not None
         return reply.kind
@@ -100,25 +100,25 @@ class SeatTests(SynchronousTestCase):
         self.claim(place(1))
         note = CODEC.bucket_of(place(1))
         rotten = MemoryStore()
-        rotten.note("decree/incarnation", life)
-        rotten.note(note, b"rotten")
+        rotten.set_note("decree/incarnation", life)
+        rotten.set_note(note, b"rotten")
         for seed, store in enumerate((MemoryStore(), rotten), start=5):
             self.store = store
             self.seat = self.made(seed)
             self.assertNotEqual(self.seat.incarnation, life)
-            self.assertRaises(Refused, self.seat.answer_claim, PEER, KEY, [place(1).packed()], life, 9, b"b", 1.0)
-            self.assertIsNone(self.seat.vote(place(1)))
-            self.assertEqual(self.claim(place(1)), Kind.GRANTED)
+            self.assertRaises(Refused, self.seat.answer_claim, PEER, KEY, [place(1).pack()], life, 9, b"b", 1.0)
+            self.assertIsNone(self.seat.find_vote(place(1)))
+            self.assertEqual(self.claim(place(1)), ReplyKind.GRANTED)
 
     def test_wrong_questions(self) -> None:
         """An invalid request is rejected and has no effect."""
-        life, where = self.seat.incarnation, place(1).packed()
+        life, where = self.seat.incarnation, place(1).pack()
         wrong: list[tuple[Any, ...]] = [
             (KEY[1:], [where], life, 1, b"a", 1.0), (KEY, [], life, 1, b"a", 1.0),
             (KEY, [where, where], life, 1, b"a", 1.0),
             (KEY, [[1]], life, 1, b"a", 1.0), (KEY, [where], b"", 1, b"a", 1.0), (KEY, [where], life, 0, b"a", 1.0),
             (KEY, [where], life, 1, b"", 1.0), (KEY, [where], life, 1, b"a", 0.0), (KEY, [where], life, 1, b"a", 601.0),
-            (KEY, [place(n).packed() for n in range(MAX_PLACES + 1)], life, 1, b"a", 1.0),
+            (KEY, [place(n).pack() for n in range(MAX_TUPLES + 1)], life, 1, b"a", 1.0),
         ]  # fmt: skip
         for question in wrong:
             self.assertRaises(Refused, self.seat.answer_claim, PEER, *question)
@@ -128,13 +128,13 @@ class SeatTests(SynchronousTestCase):
     def test_nothing_is_promised_about_what_is_over(self) -> None:
         """A tuple that its publisher removed, or replaced by another one in its slot, cannot be claimed."""
         self.store.put(tuple_record(place(1)), 99.0)
-        self.assertEqual(self.claim(place(1)), Kind.GRANTED)
+        self.assertEqual(self.claim(place(1)), ReplyKind.GRANTED)
         self.store.put(tuple_record(place(2)), 99.0)
         self.store.put(record(place(2).name, None, 2), 99.0)
-        self.assertEqual(self.claim(place(2)), Kind.OUTBID)
+        self.assertEqual(self.claim(place(2)), ReplyKind.OUTBID)
         old = place(3)
-        self.store.put(tuple_record(Place(KEY, ME.public, old.name, b"another!")), 99.0)
-        self.assertEqual(self.claim(old), Kind.OUTBID)
+        self.store.put(tuple_record(TupleId(KEY, ME.public, old.name, b"another!")), 99.0)
+        self.assertEqual(self.claim(old), ReplyKind.OUTBID)
 
     def test_bounded(self) -> None:
         """A full member removes only registers of removed tuples, and keeps a floor for their ballots."""
@@ -144,13 +144,13 @@ class SeatTests(SynchronousTestCase):
             self.confirm(place(number), counter=number + 1)
         self.assertRaises(Refused, self.claim, place(9))
         self.store.put(record(place(1).name, None), 99.0)
-        self.assertEqual(self.claim(place(9), counter=1), Kind.GRANTED)
-        self.assertIsNone(self.seat.vote(place(1)))
-        self.assertEqual(self.claim(place(1), counter=9), Kind.OUTBID)
+        self.assertEqual(self.claim(place(9), counter=1), ReplyKind.GRANTED)
+        self.assertIsNone(self.seat.find_vote(place(1)))
+        self.assertEqual(self.claim(place(1), counter=9), ReplyKind.OUTBID)
         self.store.put(record(place(0).name, None), 99.0)
         self.claim(place(10), counter=9)
         self.seat = self.made(2)
-        self.assertEqual(self.claim(place(11), counter=1), Kind.OUTBID)
+        self.assertEqual(self.claim(place(11), counter=1), ReplyKind.OUTBID)
         self.assertEqual(len(self.seat), 4)
 
     def test_unsettled(self) -> None:
@@ -159,37 +159,37 @@ class SeatTests(SynchronousTestCase):
             self.store.put(tuple_record(place(number)), 999.0)
             self.claim(place(number))
             self.confirm(place(number))
-        self.assertEqual(self.seat.unsettled(), [])
+        self.assertEqual(self.seat.list_unfinished(), [])
         self.store.put(record(place(2).name, None, 2), 999.0)
         self.clock.advance(4.0)
-        self.assertEqual([posted.place for posted in self.seat.unsettled()], [place(1), place(3)])
-        self.assertEqual(self.seat.unsettled(), [])
-        self.seat.settle(place(3))
+        self.assertEqual([posted.tuple_id for posted in self.seat.list_unfinished()], [place(1), place(3)])
+        self.assertEqual(self.seat.list_unfinished(), [])
+        self.seat.finish(place(3))
         self.clock.advance(4.0)
-        self.assertEqual([posted.place for posted in self.seat.unsettled()], [place(1)])
+        self.assertEqual([posted.tuple_id for posted in self.seat.list_unfinished()], [place(1)])
         self.seat = self.made(2)
-        self.seat.sit()
+        self.seat.load()
         self.clock.advance(4.0)
-        self.assertIn(place(1), [posted.place for posted in self.seat.unsettled()])
+        self.assertIn(place(1), [posted.tuple_id for posted in self.seat.list_unfinished()])
 
     def test_answers_wait_for_the_disk(self) -> None:
         """A vote is sent only after the store has written it."""
         disk: Deferred[None] = Deferred()
-        self.seat.written = lambda: disk
+        self.seat.wait_for_write = lambda: disk
         life = self.seat.incarnation
-        answer: Any = self.seat.answer_claim(PEER, KEY, [place(1).packed()], life, 1, b"a", 1.0)
+        answer: Any = self.seat.answer_claim(PEER, KEY, [place(1).pack()], life, 1, b"a", 1.0)
         self.assertNoResult(answer)
         disk.callback(None)
-        self.assertEqual(self._kind(self.successResultOf(answer), Event.PREPARE), Kind.GRANTED)
+        self.assertEqual(self._kind(self.successResultOf(answer), Event.PREPARE), ReplyKind.GRANTED)
 
     def test_what_was_accepted_is_told(self) -> None:
         """A later claim returns the accepted value, one second after the first taker could have completed it."""
         self.claim(place(1), 1, b"a", lease=100.0)
-        self.assertEqual([self.confirm(place(1)) for _ in range(2)], [Kind.GRANTED] * 2)
-        self.assertEqual(self.claim(place(1), 2, b"b"), Kind.HELD)
+        self.assertEqual([self.confirm(place(1)) for _ in range(2)], [ReplyKind.GRANTED] * 2)
+        self.assertEqual(self.claim(place(1), 2, b"b"), ReplyKind.HELD)
         self.clock.advance(1.0)
-        self.assertEqual(self.claim(place(1), 2, b"b"), Kind.GRANTED)
-        told = self.seat.answer_claim(PEER, KEY, [place(1).packed()], self.seat.incarnation, 3, b"b", 1.0)
+        self.assertEqual(self.claim(place(1), 2, b"b"), ReplyKind.GRANTED)
+        told = self.seat.answer_claim(PEER, KEY, [place(1).pack()], self.seat.incarnation, 3, b"b", 1.0)
         reply = unpack_reply(told[0], Event.PREPARE)  # type: ignore[index]
         assert reply is not None
         self.assertEqual((reply.accepted, reply.value), (Ballot(1, b"a"), b"a"))
@@ -198,7 +198,7 @@ class SeatTests(SynchronousTestCase):
     @given(foreign=FOREIGN, noise=st.binary(max_size=60))
     def test_notes_are_decoded_totally(self, foreign: Any, noise: bytes) -> None:
         """A corrupted stored vote decodes to None, without an exception."""
-        good = [KEY, place(1).packed(), 1, b"a", 1.0, None]
+        good = [KEY, place(1).pack(), 1, b"a", 1.0, None]
         self.assertEqual(CODEC.unpack(CODEC.pack({})), ({}, True))
         rows = [[foreign], [[*good[:5], foreign]], [[*good[:5], [1, b"a", foreign]]], foreign]
         rows += [[[*good[:n], foreign, *good[n + 1 :]]] for n in range(5)]
@@ -216,46 +216,46 @@ class PostingTests(SynchronousTestCase):
     def test_round_trip(self) -> None:
         """A tuple and the note of its taking survive encoding and decoding."""
         council = (Member(PEER, b"i" * 8),)
-        value = packed_tuple(place(1).mark, ("x", 1, None), council)
-        self.assertEqual(posting(record(place(1).name, value)), Posted(place(1), ("x", 1, None), council))
-        self.assertEqual(posting(record("n", packed_taken(place(1), b"taker"))), Taken(place(1), b"taker"))
+        value = pack_tuple(place(1).mark, ("x", 1, None), council)
+        self.assertEqual(parse_record(record(place(1).name, value)), StoredTuple(place(1), ("x", 1, None), council))
+        self.assertEqual(parse_record(record("n", pack_taken(place(1), b"taker"))), TakenNote(place(1), b"taker"))
 
     def test_standing(self) -> None:
         """A taken tuple is no longer available; another tuple in the same slot is."""
-        note = record("n", packed_taken(place(1), b"taker"))
-        posted, taken = standing([tuple_record(place(1)), tuple_record(place(2)), note])
-        self.assertEqual([one.place for one in posted], [place(2)])
+        note = record("n", pack_taken(place(1), b"taker"))
+        posted, taken = parse_records([tuple_record(place(1)), tuple_record(place(2)), note])
+        self.assertEqual([one.tuple_id for one in posted], [place(2)])
         self.assertEqual(list(taken), [place(1)])
-        newer = Place(KEY, ME.public, place(1).name, b"another!")
-        reader = Reader()
+        newer = TupleId(KEY, ME.public, place(1).name, b"another!")
+        reader = RecordParser()
         for _ in range(2):
-            posted, _ = reader.standing([tuple_record(newer, 2), note])
-            self.assertEqual([one.place for one in posted], [newer])
+            posted, _ = reader.parse([tuple_record(newer, 2), note])
+            self.assertEqual([one.tuple_id for one in posted], [newer])
 
     def test_unlawful(self) -> None:
         """A record that is not a posting decodes to None."""
-        member = [*PEER.packed(), b"i" * 8]
+        member = [*PEER.pack(), b"i" * 8]
         for fields in (
             [1, b"short", ["x"], [member]], [1, b"m" * 8, [], [member]], [1, b"m" * 8, ["x"], []],
             [1, b"m" * 8, ["x"], [member] * 2], [1, b"m" * 8, ["x"], [member[:3]]],
             [1, b"m" * 8, ["x"], [[1, 2, 3, 4]]],
-            [2, [ME.public, "n", b"m"], b"t"], [2, place(1).packed(), b""], [3], 5,
+            [2, [ME.public, "n", b"m"], b"t"], [2, place(1).pack(), b""], [3], 5,
         ):  # fmt: skip
-            self.assertIsNone(posting(record("t", msgpack.packb(fields))), fields)
-        self.assertIsNone(posting(record("t", None)))
-        self.assertIsNone(place_unpacked(KEY, [ME.public, "", b"m" * 8]))
+            self.assertIsNone(parse_record(record("t", msgpack.packb(fields))), fields)
+        self.assertIsNone(parse_record(record("t", None)))
+        self.assertIsNone(parse_tuple_id(KEY, [ME.public, "", b"m" * 8]))
 
     @settings(max_examples=300)
     @given(foreign=FOREIGN, noise=st.binary(max_size=60))
     def test_total(self, foreign: Any, noise: bytes) -> None:
         """Any record decodes to a posting or None, without an exception."""
-        self.assertIsInstance(posting(record("t", noise)), Posted | Taken | None)
+        self.assertIsInstance(parse_record(record("t", noise)), StoredTuple | TakenNote | None)
         for fields in (foreign, [1, b"m" * 8, foreign, [foreign]], [1, b"m" * 8, ["x"], foreign], [2, foreign, b"t"]):
             try:
                 packed = msgpack.packb(fields)
             except (ValueError, OverflowError):
                 continue
-            self.assertIsInstance(posting(record("t", packed)), Posted | Taken | None)
+            self.assertIsInstance(parse_record(record("t", packed)), StoredTuple | TakenNote | None)
 
 
 OWN = b"own"
@@ -265,11 +265,11 @@ class ResolveTests(SynchronousTestCase):
     def setUp(self) -> None:
         self.clock, self.rng = HeapClock(), random.Random(1)
         self.contacts = [Contact(Identity(bytes([n]) * 32).public, Address("10.0.0.1", 7000 + n)) for n in range(3)]
-        self.seats = [Seat(Exposed(), MemoryStore(), self.clock, self.rng) for _ in range(3)]
+        self.seats = [TakeAcceptor(Exposed(), MemoryStore(), self.clock, self.rng) for _ in range(3)]
         pairs = zip(self.contacts, self.seats, strict=True)
-        self.posted = Posted(place(1), ("x",), tuple(Member(contact, seat.incarnation) for contact, seat in pairs))
+        self.posted = StoredTuple(place(1), ("x",), tuple(Member(contact, seat.incarnation) for contact, seat in pairs))
         self.silent: set[int] = set()
-        self.council = Council(self.ask, self.clock, self.rng, Background(self.clock))
+        self.council = TakeProposer(self.ask, self.clock, self.rng, Background(self.clock))
 
     def ask(self, contact: Contact, method: str, arguments: tuple[object, ...]) -> Deferred[Any]:
         number = self.contacts.index(contact)
@@ -280,7 +280,7 @@ class ResolveTests(SynchronousTestCase):
     def begin(self, number: int, counter: int, taker: bytes) -> None:
         """Let one member accept a take, as if the taker failed afterwards."""
         seat = self.seats[number]
-        places: list[object] = [place(1).packed()]
+        places: list[object] = [place(1).pack()]
         seat.answer_claim(PEER, KEY, places, seat.incarnation, counter, taker, 1.0)
         seat.answer_confirm(PEER, KEY, places, seat.incarnation, counter, taker, taker)
 

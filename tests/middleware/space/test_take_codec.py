@@ -10,14 +10,14 @@ from hypothesis import strategies as st
 from twisted.trial.unittest import SynchronousTestCase
 
 from middleware.entangled.quorum.acceptor import Event
-from middleware.entangled.quorum.ballot import NONE, Ballot
+from middleware.entangled.quorum.ballot import NO_BALLOT, Ballot
 from middleware.entangled.quorum.log import Floor
-from middleware.entangled.quorum.register import Kind, Reply
-from middleware.entangled.space.posting import Place
+from middleware.entangled.quorum.register import Reply, ReplyKind
 from middleware.entangled.space.take_codec import CODEC, pack_reply, unpack_reply
+from middleware.entangled.space.tuple_record import TupleId
 
 REPLIES = st.tuples(
-    st.sampled_from([Kind.GRANTED, Kind.HELD, Kind.OUTBID, Kind.UNPREPARED]),
+    st.sampled_from([ReplyKind.GRANTED, ReplyKind.HELD, ReplyKind.OUTBID, ReplyKind.UNPREPARED]),
     st.integers(0, 2**48 - 1).map(lambda counter: Ballot(counter, b"")),
     st.just(0),
     st.floats(0.0, 600.0),
@@ -41,10 +41,12 @@ class WireTests(SynchronousTestCase):
 
     def test_codes(self) -> None:
         """A reply to one type of request is invalid for another type."""
-        codes = [pack_reply(Reply(Kind.GRANTED), event)[0] for event in (Event.PREPARE, Event.ACCEPT, Event.RELEASE)]
+        codes = [
+            pack_reply(Reply(ReplyKind.GRANTED), event)[0] for event in (Event.PREPARE, Event.ACCEPT, Event.RELEASE)
+        ]
         self.assertEqual(codes, [0, 1, 5])
-        self.assertEqual(pack_reply(Reply(Kind.SEALED), Event.PREPARE)[0], 0)
-        self.assertIsNone(unpack_reply(pack_reply(Reply(Kind.GRANTED), Event.PREPARE), Event.ACCEPT))
+        self.assertEqual(pack_reply(Reply(ReplyKind.SEALED), Event.PREPARE)[0], 0)
+        self.assertIsNone(unpack_reply(pack_reply(Reply(ReplyKind.GRANTED), Event.PREPARE), Event.ACCEPT))
 
     @settings(max_examples=300)
     @given(foreign=FOREIGN, accepted=FOREIGN)
@@ -52,7 +54,7 @@ class WireTests(SynchronousTestCase):
         """Any other input decodes to None without an exception."""
         for fields in (foreign, [0, 1, 0.5, accepted], [0, 1, 0.5, [1, b"a", foreign]], [foreign, 1, 0.5, None]):
             reply = unpack_reply(fields, Event.PREPARE)
-            self.assertTrue(reply is None or isinstance(reply.kind, Kind))
+            self.assertTrue(reply is None or isinstance(reply.kind, ReplyKind))
 
     def test_out_of_range(self) -> None:
         """Numbers and names out of range are rejected."""
@@ -74,11 +76,11 @@ class NoteTests(SynchronousTestCase):
             [key, [owner, "two", b"n" * 8], 9, b"b", 1.0, [7, b"c", b"value"]],
         ]
         votes, is_whole = codec.unpack(msgpack.packb(rows))
-        one, two = (votes[Place(key, *fields)] for _, fields, *_ in rows)  # type: ignore[misc]
+        one, two = (votes[TupleId(key, *fields)] for _, fields, *_ in rows)  # type: ignore[misc]
         self.assertTrue(is_whole)
-        self.assertEqual((one.promised, one.reserve, one.accepted), (Ballot(3, b"a"), 2.5, NONE))
+        self.assertEqual((one.promised, one.reserve, one.accepted), (Ballot(3, b"a"), 2.5, NO_BALLOT))
         self.assertEqual((two.promised, two.accepted, two.value), (Ballot(9, b"b"), Ballot(7, b"c"), b"value"))
         self.assertEqual(codec.pack(votes), msgpack.packb(rows))
         self.assertEqual(codec.unpack_floor((41).to_bytes(8, "big")), Floor(41))
         self.assertEqual(codec.pack_floor(Floor(41)), (41).to_bytes(8, "big"))
-        self.assertEqual(codec.bucket_of(Place(key, owner, "one", b"m" * 8)), "decree/53")
+        self.assertEqual(codec.bucket_of(TupleId(key, owner, "one", b"m" * 8)), "decree/53")

@@ -15,9 +15,9 @@ from middleware.entangled.space.template import (
     ANY,
     OPERATORS,
     BadTuple,
-    template_of,
-    tuple_of,
-    tuple_unpacked,
+    make_template,
+    make_tuple,
+    parse_tuple,
     where,
 )
 
@@ -39,16 +39,16 @@ FOREIGN = st.recursive(
 class TemplateTests(SynchronousTestCase):
     def test_values_match_their_like_only(self) -> None:
         """1, 1.0, True and None are four distinct values and match only themselves."""
-        self.assertTrue(template_of(["a", 1, None, b"x"]).matches(("a", 1, None, b"x")))
+        self.assertTrue(make_template(["a", 1, None, b"x"]).matches(("a", 1, None, b"x")))
         for other in (1.0, True, "1", None):
-            self.assertFalse(template_of([1]).matches((other,)))
+            self.assertFalse(make_template([1]).matches((other,)))
 
     def test_types_and_wildcards(self) -> None:
         """A type matches only its values, ANY matches each value, and a template only matches tuples of its length."""
-        self.assertTrue(template_of([int, str, ANY]).matches((1, "a", None)))
-        self.assertFalse(template_of([int]).matches((True,)))
-        self.assertFalse(template_of([float]).matches((1,)))
-        self.assertFalse(template_of([ANY]).matches(("a", "b")))
+        self.assertTrue(make_template([int, str, ANY]).matches((1, "a", None)))
+        self.assertFalse(make_template([int]).matches((True,)))
+        self.assertFalse(make_template([float]).matches((1,)))
+        self.assertFalse(make_template([ANY]).matches(("a", "b")))
 
     def test_predicates(self) -> None:
         """Each operator gives its specified result, compares int with float, and is false for incomparable values."""
@@ -62,7 +62,7 @@ class TemplateTests(SynchronousTestCase):
             ("prefix", b"j", "job", False), ("prefix", "j", 1, False),
         ]  # fmt: skip
         for operator, operand, value, holds in rows:
-            self.assertEqual(template_of([where(operator, operand)]).matches((value,)), holds, (operator, value))
+            self.assertEqual(make_template([where(operator, operand)]).matches((value,)), holds, (operator, value))
 
     def test_wrong_predicates(self) -> None:
         """An invalid operator or operand raises ``BadTuple``."""
@@ -76,30 +76,30 @@ class TemplateTests(SynchronousTestCase):
     def test_wrong_fields(self) -> None:
         """Invalid tuples and templates raise ``BadTuple``, and the message names the field."""
         for wrong in ([], [1] * 33, "text", b"bytes", [object()], [[1]], [2**64], ["\ud800"], [float("nan")], 5):
-            self.assertRaises(BadTuple, tuple_of, wrong)
-            self.assertRaises(BadTuple, template_of, wrong)
-        self.assertRaises(BadTuple, tuple_of, [ANY])
-        self.assertRaises(BadTuple, template_of, [list])
-        self.assertIn("field 1", str(self.assertRaises(BadTuple, tuple_of, [1, object()])))
+            self.assertRaises(BadTuple, make_tuple, wrong)
+            self.assertRaises(BadTuple, make_template, wrong)
+        self.assertRaises(BadTuple, make_tuple, [ANY])
+        self.assertRaises(BadTuple, make_template, [list])
+        self.assertIn("field 1", str(self.assertRaises(BadTuple, make_tuple, [1, object()])))
 
     def test_too_large(self) -> None:
         """A tuple that does not fit into a record raises ``TooLarge``."""
-        self.assertRaises(TooLarge, tuple_of, ["x" * 700])
-        self.assertRaises(TooLarge, template_of, [b"x" * 700])
+        self.assertRaises(TooLarge, make_tuple, ["x" * 700])
+        self.assertRaises(TooLarge, make_template, [b"x" * 700])
 
     @settings(max_examples=150)
     @given(fields=st.lists(VALUES, min_size=1, max_size=8))
     def test_tuple_round_trip(self, fields: list[Any]) -> None:
         """Every tuple survives encoding and decoding, and matches itself as a template."""
-        back = tuple_unpacked(msgpack.unpackb(msgpack.packb(list(tuple_of(fields)))))
+        back = parse_tuple(msgpack.unpackb(msgpack.packb(list(make_tuple(fields)))))
         self.assertEqual(repr(back), repr(tuple(fields)))
-        self.assertTrue(template_of(fields).matches(back))
+        self.assertTrue(make_template(fields).matches(back))
 
     @settings(max_examples=300)
     @given(operator=st.sampled_from([*OPERATORS, "=", "like"]), foreign=FOREIGN | st.lists(FOREIGN, max_size=4))
     def test_total(self, operator: str, foreign: Any) -> None:
         """Any input decodes to a tuple or raises ``Malformed``; any operand is valid or raises ``BadTuple``."""
         with contextlib.suppress(Malformed):
-            self.assertIsInstance(tuple_unpacked(foreign), tuple)
+            self.assertIsInstance(parse_tuple(foreign), tuple)
         with contextlib.suppress(BadTuple):
             self.assertIn(where(operator, foreign).holds(1), (True, False))

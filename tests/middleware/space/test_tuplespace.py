@@ -9,15 +9,15 @@ from typing import Any
 from twisted.internet.defer import CancelledError, Deferred
 
 from middleware.entangled.errors import NoAnswer, NotRunning, Refused, TooLarge
-from middleware.entangled.network.switchboard import Weather
+from middleware.entangled.network.switchboard import LinkConditions
 from middleware.entangled.node import EntangledNode
-from middleware.entangled.space.posting import Posted, posting
 from middleware.entangled.space.taker import Claim, ClaimLost
 from middleware.entangled.space.template import ANY, BadTuple, where
+from middleware.entangled.space.tuple_record import StoredTuple, parse_record
 from middleware.entangled.space.tuplespace import NoTuple, TupleSpace
-from tests.fleet import Fleet, FleetCase
+from tests.fleet import EntangledTeam, FleetCase
 
-DELAY = Weather(delay_s=0.005, jitter_s=0.002)
+DELAY = LinkConditions(delay_s=0.005, jitter_s=0.002)
 
 
 class SpaceCase(FleetCase):
@@ -25,10 +25,10 @@ class SpaceCase(FleetCase):
 
     made: list[TupleSpace]
 
-    def spaces(self, n: int, weather: Weather = DELAY, seed: int = 1) -> tuple[Fleet, list[TupleSpace]]:
+    def spaces(self, n: int, weather: LinkConditions = DELAY, seed: int = 1) -> tuple[EntangledTeam, list[TupleSpace]]:
         """Return a simulated team and a space on each node; the spaces are stopped before the team."""
         fleet = self.fleet(n, seed, weather)
-        spaces = [TupleSpace(node, fleet.clock, fleet.rng(place)) for place, node in enumerate(fleet.nodes)]
+        spaces = [TupleSpace(node, fleet.clock, fleet.make_life_rng(place)) for place, node in enumerate(fleet.nodes)]
         self.made = spaces
         return fleet, spaces
 
@@ -41,17 +41,17 @@ class SpaceCase(FleetCase):
             space.stop()
         super().tearDown()
 
-    def posted(self, fleet: Fleet) -> list[Posted]:
+    def posted(self, fleet: EntangledTeam) -> list[StoredTuple]:
         """Return every tuple that some node stores, without duplicates."""
-        said = [posting(record) for node in fleet.nodes for record in node.store.records()]
-        return list({one.place: one for one in said if isinstance(one, Posted)}.values())
+        said = [parse_record(record) for node in fleet.nodes for record in node.store.records()]
+        return list({one.tuple_id: one for one in said if isinstance(one, StoredTuple)}.values())
 
     def called_up(self, node: EntangledNode, answer: Callable[..., object]) -> None:
         """Let ``node`` give this reply to an invitation to a council."""
-        node.seat.sit()  # otherwise the seat would register its method later
+        node.take_acceptor.load()  # otherwise the seat would register its method later
         node.endpoint.expose("decree.enrol", answer)
 
-    def moment(self, fleet: Fleet, work: Deferred[Any]) -> list[float]:
+    def moment(self, fleet: EntangledTeam, work: Deferred[Any]) -> list[float]:
         """Return a list that will contain the time at which ``work`` fires."""
         moments: list[float] = []
 
@@ -85,7 +85,7 @@ class TupleSpaceTests(SpaceCase):
         fleet, (a, b, _) = self.spaces(3)
         for space in (a, a, b):
             self.done(fleet, space.put(("same",)), 1.0)
-        other = TupleSpace(fleet.nodes[1], fleet.clock, fleet.rng(9), name="other")
+        other = TupleSpace(fleet.nodes[1], fleet.clock, fleet.make_life_rng(9), name="other")
         self.made.append(other)
         self.assertIsNone(self.done(fleet, other.read_if_exists(("same",))))
         self.assertIsNone(self.done(fleet, b.read_if_exists(("same", ANY))))
@@ -99,7 +99,7 @@ class TupleSpaceTests(SpaceCase):
         decide = b._taker.decide
 
         async def cut_off(claims: Sequence[Claim]) -> list[bool]:
-            fleet.board.weather = Weather(loss=1.0)
+            fleet.switchboard.conditions = LinkConditions(loss=1.0)
             return await decide(claims)
 
         self.patch(b._taker, "decide", cut_off)
@@ -134,8 +134,8 @@ class TupleSpaceTests(SpaceCase):
         waiting = self.moment(fleet, spaces[0].read(("go",)))
         fleet.run(1.0)
         for place in (2, 3, 4):
-            fleet.board.kill(fleet.address(place))
-            fleet.nodes[place].vanish()
+            fleet.switchboard.kill(fleet.address(place))
+            fleet.nodes[place].stop_silently()
         fleet.run(12.0)
         began = fleet.clock.seconds()
         # Half of the members are missing, so the put cannot be confirmed, but the blocked read returns.
@@ -153,7 +153,7 @@ class TupleSpaceTests(SpaceCase):
         self.assertNoResult(put)
         self.assertEqual(self.posted(fleet), [])
         for node in fleet.nodes[1:]:
-            self.called_up(node, node.seat.answer_enrol)
+            self.called_up(node, node.take_acceptor.answer_enrol)
         self.done(fleet, put)
         self.assertEqual([len(one.council) for one in self.posted(fleet)], [3])
         for node in fleet.nodes[1:]:
@@ -264,7 +264,7 @@ class TupleSpaceTests(SpaceCase):
 
 
 class ClaimTests(SpaceCase):
-    def _claimed(self, fleet: Fleet, space: TupleSpace, lease: float = 2.0) -> Claim:
+    def _claimed(self, fleet: EntangledTeam, space: TupleSpace, lease: float = 2.0) -> Claim:
         claim = self.done(fleet, space.claim(("job", ANY), lease), 1.0)
         self.assertIsInstance(claim, Claim)
         return claim
@@ -288,7 +288,7 @@ class ClaimTests(SpaceCase):
         self._claimed(fleet, spaces[2], lease=3.0)
         for place in (1, 2):
             spaces[place].stop()
-            fleet.nodes[place].vanish()
+            fleet.nodes[place].stop_silently()
         got = self.moment(fleet, spaces[3].get(("job", int)))
         fleet.run(5.5)
         self.assertEqual(len(got), 1)
@@ -348,15 +348,15 @@ class RestartTests(SpaceCase):
         fleet, spaces = self.spaces(3)
         self.done(fleet, spaces[0].put(("job", 1)), 1.0)
         self.done(fleet, spaces[1].get(("job", ANY)), 1.0)
-        lives = [node.seat.incarnation for node in fleet.nodes]
+        lives = [node.take_acceptor.incarnation for node in fleet.nodes]
         for space, node in zip(spaces, fleet.nodes, strict=True):
             space.stop()
-            node.vanish()
+            node.stop_silently()
         for place in range(3):
             fleet.restart(place, [other for other in range(3) if other != place])
         fleet.run(5.0)
-        self.made = [TupleSpace(node, fleet.clock, fleet.rng(7)) for node in fleet.nodes]
-        self.assertEqual([node.seat.incarnation for node in fleet.nodes], lives)
+        self.made = [TupleSpace(node, fleet.clock, fleet.make_life_rng(7)) for node in fleet.nodes]
+        self.assertEqual([node.take_acceptor.incarnation for node in fleet.nodes], lives)
         for space in self.made:
             self.assertIsNone(self.done(fleet, space.get_if_exists(("job", ANY)), 2.0))
         self.done(fleet, self.made[0].put(("job", 2)), 1.0)

@@ -6,8 +6,8 @@ from collections import Counter
 
 from twisted.trial.unittest import SynchronousTestCase
 
-from middleware.stop.halt import Halt
 from middleware.stop.stop_set import Statement, StopSet
+from middleware.stop.stop_state import StopState
 from tests.invariants.stops import Violation, run
 
 SEQUENCES = 100
@@ -47,7 +47,7 @@ class SequenceTests(SynchronousTestCase):
         for owner, name, bug in (
             (StopSet, "merge", ends_all),
             (StopSet, "merge", by_anybody),
-            (Halt, "_save", lambda self: None),
+            (StopState, "_save", lambda self: None),
         ):
             patch = self.patch(owner, name, bug)
             self.assertTrue(self.found(), bug)

@@ -1,10 +1,10 @@
-"""Tests of ``middleware.tasks.councils``."""
+"""Tests of ``middleware.tasks.council_manager``."""
 
 from __future__ import annotations
 
 from twisted.trial.unittest import SynchronousTestCase
 
-from middleware.tasks.councils import filled
+from middleware.tasks.council_manager import choose_successors
 from tests.middleware.consensus.lease.test_lease_codec import MEMBERS
 
 
@@ -12,7 +12,7 @@ class VacancyTests(SynchronousTestCase):
     def filled(self, council: str, silent: str, candidates: str, size: int = 3) -> str | None:
         """Return the next council, with its members by number."""
         seats, gone, others = ([MEMBERS[int(number)] for number in group] for group in (council, silent, candidates))
-        following = filled(seats, gone, others, size)
+        following = choose_successors(seats, gone, others, size)
         return None if following is None else "".join(str(MEMBERS.index(member)) for member in following)
 
     def test_silent_members_are_replaced(self) -> None:

@@ -13,8 +13,8 @@ from middleware.directory.presence import Capabilities
 from middleware.entangled.contact import Contact
 from middleware.entangled.identity import Identity
 from middleware.entangled.network.network import Address
-from middleware.entangled.record import Record, hashed_key
-from middleware.tasks.order import PAUSE, RESUME, Order, order_of
+from middleware.entangled.record import Record, hash_key
+from middleware.tasks.order import PAUSE, RESUME, Order, find_newest_order
 from middleware.tasks.task import (
     CANCELLED,
     COMPLETED,
@@ -25,12 +25,12 @@ from middleware.tasks.task import (
     Member,
     Result,
     Task,
+    find_outcome,
+    find_unmet_requirements,
     group_key,
-    member_of,
-    outcome_of,
-    refusals,
-    result_of,
-    task_of,
+    parse_member,
+    parse_result,
+    parse_task,
 )
 
 DOG = Identity(b"\1" * 32)
@@ -46,7 +46,7 @@ DONE = Result(COMPLETED, "dog", 12.5, 3, (("dog", 1.5),))
 def record(name: str, value: object, owner: Identity = DOG) -> Record:
     """Return a record with this value; any value but bytes is packed."""
     packed = value if isinstance(value, bytes) or value is None else bytes(msgpack.packb(value))
-    return Record(hashed_key("any"), name, owner.public, 1, "team", 1.0, packed, bytes(64))
+    return Record(hash_key("any"), name, owner.public, 1, "team", 1.0, packed, bytes(64))
 
 
 def changed(packed: bytes, **changes: object) -> dict[str, object]:
@@ -63,30 +63,30 @@ anything = st.recursive(
     | st.binary(max_size=4),
     lambda inner: st.lists(inner, max_size=3) | st.dictionaries(st.text(max_size=3), inner, max_size=3),
 )
-NAMES = sorted({*msgpack.unpackb(TASK.packed()), *msgpack.unpackb(REPORT.packed()), *msgpack.unpackb(DONE.packed())})
+NAMES = sorted({*msgpack.unpackb(TASK.pack()), *msgpack.unpackb(REPORT.pack()), *msgpack.unpackb(DONE.pack())})
 DEPTH = b"\x91" * 900
 
 
 class DecoderTests(SynchronousTestCase):
     def test_there_and_back(self) -> None:
         """Tasks, reports and results survive packing and unpacking."""
-        self.assertEqual(task_of(record("t1", TASK.packed())), TASK)
-        self.assertEqual(member_of(record(MEMBER, REPORT.packed())), REPORT)
-        self.assertEqual(result_of(record(RESULT, DONE.packed())), DONE)
+        self.assertEqual(parse_task(record("t1", TASK.pack())), TASK)
+        self.assertEqual(parse_member(record(MEMBER, REPORT.pack())), REPORT)
+        self.assertEqual(parse_result(record(RESULT, DONE.pack())), DONE)
         minded = replace(REPORT, battery=0.5, value=(1.0, -2.5), choice="red", weight=2.0, electorate=5.0)
-        self.assertEqual(member_of(record(MEMBER, minded.packed())), minded)
+        self.assertEqual(parse_member(record(MEMBER, minded.pack())), minded)
         bare = replace(REPORT, cost=None)
-        self.assertEqual(member_of(record(MEMBER, bare.packed())), bare)
+        self.assertEqual(parse_member(record(MEMBER, bare.pack())), bare)
 
     def test_in_another_slot(self) -> None:
         """A task, report or result in a slot with another name is ignored."""
-        self.assertIsNone(task_of(record("t2", TASK.packed())))
-        self.assertIsNone(member_of(record(RESULT, REPORT.packed())))
-        self.assertIsNone(result_of(record(MEMBER, DONE.packed())))
+        self.assertIsNone(parse_task(record("t2", TASK.pack())))
+        self.assertIsNone(parse_member(record(RESULT, REPORT.pack())))
+        self.assertIsNone(parse_result(record(MEMBER, DONE.pack())))
 
     def test_nobody_reports_for_another(self) -> None:
         """A report in the name of another node is ignored."""
-        self.assertIsNone(member_of(record(MEMBER, REPORT.packed(), CAT)))
+        self.assertIsNone(parse_member(record(MEMBER, REPORT.pack(), CAT)))
 
     def test_crafted_tasks(self) -> None:
         """A task with a wrong type, an invalid number or an invalid council member is ignored."""
@@ -111,13 +111,13 @@ class DecoderTests(SynchronousTestCase):
             "group": [5, None],
             "preemptible": [1, None],
             "exclusive": [0, "no"],
-            "council": [5, None, [5], [[b"x", "10.0.0.1", 7000]], [COUNCIL[0].packed(), 5], {"a": 1}],
+            "council": [5, None, [5], [[b"x", "10.0.0.1", 7000]], [COUNCIL[0].pack(), 5], {"a": 1}],
         }
         for name, values in bad.items():
             for value in values:
-                self.assertIsNone(task_of(record("t1", changed(TASK.packed(), **{name: value}))), (name, value))
+                self.assertIsNone(parse_task(record("t1", changed(TASK.pack(), **{name: value}))), (name, value))
         for value in (None, b"", b"\xc1", [1], {}, {"task_id": "t1"}, DEPTH):
-            self.assertIsNone(task_of(record("t1", value)), value)
+            self.assertIsNone(parse_task(record("t1", value)), value)
 
     def test_crafted_reports(self) -> None:
         """A report with a wrong type is ignored; a report with an invalid cost has no cost."""
@@ -147,28 +147,28 @@ class DecoderTests(SynchronousTestCase):
         }
         for name, values in bad.items():
             for value in values:
-                self.assertIsNone(member_of(record(MEMBER, changed(REPORT.packed(), **{name: value}))), (name, value))
+                self.assertIsNone(parse_member(record(MEMBER, changed(REPORT.pack(), **{name: value}))), (name, value))
         for cost in ("near", -1.0, float("nan"), float("inf"), True, [1]):
-            report = member_of(record(MEMBER, changed(REPORT.packed(), cost=cost)))
+            report = parse_member(record(MEMBER, changed(REPORT.pack(), cost=cost)))
             self.assertEqual(report, replace(REPORT, cost=None), cost)
         for nothing in (None, b"", {}, {"uuid": UUID}, DEPTH):
-            self.assertIsNone(member_of(record(MEMBER, nothing)), nothing)
+            self.assertIsNone(parse_member(record(MEMBER, nothing)), nothing)
 
     def test_report_that_is_stale_when_it_comes(self) -> None:
         """A report that is older than its validity has no cost; a report without a validity counts."""
         for age, valid_for, cost in ((2.0, 1.0, None), (1.0, 2.0, 1.5), (9.0, 0.0, 1.5)):
-            report = member_of(record(MEMBER, changed(REPORT.packed(), age=age, valid_for=valid_for)))
+            report = parse_member(record(MEMBER, changed(REPORT.pack(), age=age, valid_for=valid_for)))
             self.assertEqual(report and report.cost, cost, (age, valid_for))
 
     def test_usual_fields_take_no_room(self) -> None:
         """Default values are omitted from a record, and restored when it is read."""
         plain = Task("t1", "search", "Find it")
         self.assertEqual(
-            sorted(msgpack.unpackb(plain.packed())), ["kind", "parameters", "requirements", "task_id", "title"]
+            sorted(msgpack.unpackb(plain.pack())), ["kind", "parameters", "requirements", "task_id", "title"]
         )
-        self.assertEqual(task_of(record("t1", plain.packed())), plain)
+        self.assertEqual(parse_task(record("t1", plain.pack())), plain)
         full = replace(TASK, priority=5, deadline=9.0, preemptible=True, exclusive=False, group="g", configuration=2)
-        self.assertEqual(task_of(record("t1", full.packed())), full)
+        self.assertEqual(parse_task(record("t1", full.pack())), full)
 
     def test_crafted_results(self) -> None:
         """A result with a wrong type, number or outcome is ignored."""
@@ -182,9 +182,9 @@ class DecoderTests(SynchronousTestCase):
         }
         for name, values in bad.items():
             for value in values:
-                self.assertIsNone(result_of(record(RESULT, changed(DONE.packed(), **{name: value}))), (name, value))
+                self.assertIsNone(parse_result(record(RESULT, changed(DONE.pack(), **{name: value}))), (name, value))
         for value in (None, b"", {}, {"outcome": COMPLETED}, DEPTH):
-            self.assertIsNone(result_of(record(RESULT, value)), value)
+            self.assertIsNone(parse_result(record(RESULT, value)), value)
 
     @settings(max_examples=250)
     @given(st.binary(max_size=60) | st.dictionaries(st.sampled_from(NAMES), anything, max_size=4) | anything)
@@ -192,25 +192,25 @@ class DecoderTests(SynchronousTestCase):
         """Any record gives a valid object or None, and never raises."""
         values = [value]
         if isinstance(value, dict) and all(isinstance(name, str) for name in value):
-            values += [changed(one, **value) for one in (TASK.packed(), REPORT.packed(), DONE.packed())]
+            values += [changed(one, **value) for one in (TASK.pack(), REPORT.pack(), DONE.pack())]
         for one in values:
-            task = task_of(record("t1", one))
+            task = parse_task(record("t1", one))
             if task is not None:
-                lacking = refusals({"camera": {"width": 1}}, task.requirements)
+                lacking = find_unmet_requirements({"camera": {"width": 1}}, task.requirements)
                 self.assertTrue(all(isinstance(line, str) for line in lacking), lacking)
-            self.assertIsInstance(member_of(record(MEMBER, one)), Member | None)
-            self.assertIsInstance(outcome_of(TASK, [record(RESULT, one)]), Result | None)
+            self.assertIsInstance(parse_member(record(MEMBER, one)), Member | None)
+            self.assertIsInstance(find_outcome(TASK, [record(RESULT, one)]), Result | None)
 
 
 class OutcomeTests(SynchronousTestCase):
     def test_highest_token_holds(self) -> None:
         """Of several results the one with the highest token wins, in any order; without any the task is open."""
         late = Result(FAILED, "cat", 1.0, 7)
-        records = [record(RESULT, DONE.packed()), record(RESULT, late.packed(), CAT), record(MEMBER, REPORT.packed())]
-        self.assertEqual(outcome_of(TASK, records), late)
-        self.assertEqual(outcome_of(TASK, records[::-1]), late)
-        self.assertIsNone(outcome_of(TASK, records[2:]))
-        self.assertEqual(outcome_of(TASK, [record(RESULT, Result(CANCELLED, "x").packed())]), Result(CANCELLED, "x"))
+        records = [record(RESULT, DONE.pack()), record(RESULT, late.pack(), CAT), record(MEMBER, REPORT.pack())]
+        self.assertEqual(find_outcome(TASK, records), late)
+        self.assertEqual(find_outcome(TASK, records[::-1]), late)
+        self.assertIsNone(find_outcome(TASK, records[2:]))
+        self.assertEqual(find_outcome(TASK, [record(RESULT, Result(CANCELLED, "x").pack())]), Result(CANCELLED, "x"))
 
     def test_groups_are_apart(self) -> None:
         """Two tasks never share a key."""
@@ -234,28 +234,28 @@ class RefusalTests(SynchronousTestCase):
             ({"arm": {}, "camera": {"width": 209}}, ["has no arm", "camera width is 208, less than 209"]),
         ]
         for requirements, reasons in rows:
-            self.assertEqual(refusals(has, requirements), reasons)
+            self.assertEqual(find_unmet_requirements(has, requirements), reasons)
 
     def test_a_number_that_is_none_is_not_enough(self) -> None:
         """A capability of NaN meets no requirement."""
-        self.assertEqual(len(refusals({"camera": {"width": float("nan")}}, {"camera": {"width": 1}})), 1)
+        self.assertEqual(len(find_unmet_requirements({"camera": {"width": float("nan")}}, {"camera": {"width": 1}})), 1)
 
 
 class OrderTests(SynchronousTestCase):
     def test_newest_holds(self) -> None:
         """Of several orders the newest wins, in any order of the records; ties are broken deterministically."""
         resumed = replace(PAUSED, word=RESUME, at=6.0)
-        records = [record(ORDER, PAUSED.packed()), record(ORDER, resumed.packed())]
-        self.assertEqual(order_of(records), resumed)
-        self.assertEqual(order_of(records[::-1]), resumed)
-        tie = [record(ORDER, PAUSED.packed()), record(ORDER, replace(PAUSED, word=RESUME).packed())]
-        self.assertEqual(order_of(tie), order_of(tie[::-1]))
+        records = [record(ORDER, PAUSED.pack()), record(ORDER, resumed.pack())]
+        self.assertEqual(find_newest_order(records), resumed)
+        self.assertEqual(find_newest_order(records[::-1]), resumed)
+        tie = [record(ORDER, PAUSED.pack()), record(ORDER, replace(PAUSED, word=RESUME).pack())]
+        self.assertEqual(find_newest_order(tie), find_newest_order(tie[::-1]))
 
     def test_nothing(self) -> None:
         """Without a valid order the task continues."""
-        lawful = msgpack.unpackb(PAUSED.packed())
+        lawful = msgpack.unpackb(PAUSED.pack())
         crafted = [{}, {**lawful, "word": "FLY"}, {**lawful, "by": 5}, {**lawful, "at": float("nan")}, [1], b"\xc1"]
         for value in crafted:
-            self.assertIsNone(order_of([record(ORDER, value)]), value)
-        self.assertIsNone(order_of([record(MEMBER, PAUSED.packed())]))
-        self.assertIsNone(order_of([]))
+            self.assertIsNone(find_newest_order([record(ORDER, value)]), value)
+        self.assertIsNone(find_newest_order([record(MEMBER, PAUSED.pack())]))
+        self.assertIsNone(find_newest_order([]))

@@ -21,10 +21,10 @@ from middleware.entangled.clock import HeapClock
 from sim.robots.crowd.command import MakeTeam, main
 from sim.robots.crowd.controller import Controller, stand
 from sim.robots.crowd.crowd import Crowd
-from sim.robots.crowd.ground import Ground, roomy
-from sim.robots.crowd.picture import INK, OTHER, drawn
-from sim.robots.crowd.search import Word, search, table
-from sim.robots.crowd.yard import CrowdYard
+from sim.robots.crowd.picture import INK, OTHER, draw_svg
+from sim.robots.crowd.scene import CrowdScene, make_square_scene
+from sim.robots.crowd.search import AgentStatus, format_table, run_search
+from sim.robots.crowd.simulator import CrowdSimulator
 
 
 class PlayedTeam:
@@ -34,34 +34,34 @@ class PlayedTeam:
         self,
         seed: int,
         agents: int,
-        ground: Ground,
+        ground: CrowdScene,
         controller: Controller = stand,
         stopwatch: Callable[[], float] = lambda: 0.0,
         choose: Any = min,
     ) -> None:
         self.clock = HeapClock()
-        self.board: Any = SimpleNamespace(counters=Counter(sent=0), digest=lambda: "0" * 64)
-        self.yard = CrowdYard(self.clock, Random(seed), ground, agents, controller, stopwatch)
-        self.yard.start()
+        self.switchboard: Any = SimpleNamespace(counters=Counter(sent=0), digest=lambda: "0" * 64)
+        self.simulator = CrowdSimulator(self.clock, Random(seed), ground, agents, controller, stopwatch)
+        self.simulator.start()
         self._choose = choose
 
     def assign(self) -> None:
         """Count ten datagrams."""
-        self.board.counters["sent"] += 10
+        self.switchboard.counters["sent"] += 10
 
-    def words(self) -> Mapping[str, Word]:
+    def get_statuses(self) -> Mapping[str, AgentStatus]:
         """Return no costs before the target is placed; afterwards the distances and the chosen agent."""
-        crowd, target = self.yard.crowd, self.yard.crowd.target
+        crowd, target = self.simulator.crowd, self.simulator.crowd.target
         if target is None:
-            return {name: Word(None, "") for name in self.yard.names}
+            return {name: AgentStatus(None, "") for name in self.simulator.names}
         gaps = np.hypot(crowd.x - target.x, crowd.y - target.y)
-        costs = {name: float(gaps[body]) for body, name in enumerate(self.yard.names)}
+        costs = {name: float(gaps[body]) for body, name in enumerate(self.simulator.names)}
         chosen = self._choose(costs, key=costs.__getitem__) if self.clock.seconds() > 6.0 else ""
-        return {name: Word(cost, chosen) for name, cost in costs.items()}
+        return {name: AgentStatus(cost, chosen) for name, cost in costs.items()}
 
-    def done_by(self) -> str | None:
+    def find_finisher(self) -> str | None:
         """Return the agent at the target."""
-        return next(iter(self.words().values())).assigned if self.clock.seconds() > 7.0 else None
+        return next(iter(self.get_statuses().values())).assigned if self.clock.seconds() > 7.0 else None
 
     def stop(self) -> None:
         """Do nothing: the stub has no nodes."""
@@ -78,22 +78,22 @@ class ImpatientTeam(PlayedTeam):
 class SearchTests(SynchronousTestCase):
     def test_moments_are_noted(self) -> None:
         """``search`` records the times of engagement, first sight, agreement and arrival, and checks the agent."""
-        outcome = search(PlayedTeam(1, 4, roomy(9)), 1, 60.0, lambda: 0.0)
+        outcome = run_search(PlayedTeam(1, 4, make_square_scene(9)), 1, 60.0, lambda: 0.0)
         self.assertEqual((outcome.engaged, outcome.first, outcome.found), (0.5, 5.0, 4))
         self.assertEqual((outcome.agree, outcome.reach, outcome.right), (6.5, 7.5, True))
         self.assertEqual((outcome.datagrams, len(outcome.trail)), (10, 3))
-        self.assertIn(f"7.5 s by {outcome.by}", table(outcome))
-        wrong = search(PlayedTeam(1, 4, roomy(9), choose=max), 1, 60.0, lambda: 0.0)
-        self.assertEqual((wrong.right, "NO" in table(wrong)), (False, True))
+        self.assertIn(f"7.5 s by {outcome.by}", format_table(outcome))
+        wrong = run_search(PlayedTeam(1, 4, make_square_scene(9), choose=max), 1, 60.0, lambda: 0.0)
+        self.assertEqual((wrong.right, "NO" in format_table(wrong)), (False, True))
 
     def test_limit_and_end_leave_a_report(self) -> None:
         """A search that ends early, by its limit or by ``is_over``, reports the results so far."""
-        team = PlayedTeam(1, 4, roomy(9))
-        short = search(team, 1, 2.0, lambda: 0.0)
-        ended = search(team, 1, 60.0, lambda: 0.0, is_over=lambda: team.clock.seconds() > 3.22)
+        team = PlayedTeam(1, 4, make_square_scene(9))
+        short = run_search(team, 1, 2.0, lambda: 0.0)
+        ended = run_search(team, 1, 60.0, lambda: 0.0, is_over=lambda: team.clock.seconds() > 3.22)
         for outcome, seconds in ((short, 2.0), (ended, 1.25)):
             self.assertEqual((outcome.seconds, outcome.reach, outcome.right), (seconds, None, None))
-            self.assertIn("- by nobody", table(outcome))
+            self.assertIn("- by nobody", format_table(outcome))
 
 
 class CommandTests(SynchronousTestCase):
@@ -166,10 +166,10 @@ class CommandTests(SynchronousTestCase):
 class PictureTests(SynchronousTestCase):
     def test_draws_everybody(self) -> None:
         """Each robot is drawn once, in the colour of its state, with target, caption and a legend of the states."""
-        crowd = Crowd(1, roomy(30))
+        crowd = Crowd(1, make_square_scene(30))
         crowd.place_target_at_random()
         going = "the one that goes"
-        svg = drawn(crowd, "a < b", {3: going}, [(1.0, 1.0), (2.0, 2.0)])
+        svg = draw_svg(crowd, "a < b", {3: going}, [(1.0, 1.0), (2.0, 2.0)])
         ET.fromstring(svg)
         self.assertEqual(svg.count("h0"), 30)
         for words in ("a &lt; b", INK[going], INK[OTHER], going, OTHER):

@@ -1,4 +1,4 @@
-"""Tests of ``sim.robots.crowd.yard``, ``feeling`` and ``eye``: drivers use a crowd robot like any simulated robot."""
+"""Tests of ``sim.robots.crowd.simulator``, ``feeling`` and ``eye``: drivers use a crowd robot like any simulated robot."""
 
 from __future__ import annotations
 
@@ -11,19 +11,19 @@ import numpy as np
 from twisted.internet.task import Clock
 from twisted.trial.unittest import SynchronousTestCase
 
-from agents.vision import Size, find_target
+from agents.vision import TargetSize, find_target
 from drivers.driver import Permit
 from drivers.errors import DriverError, UsageError
 from drivers.reading import Observation
 from drivers.sim.driver import SimDriver
 from middleware.entangled.clock import HeapClock
 from sim.robots.crowd.controller import stand
-from sim.robots.crowd.ground import Ground
-from sim.robots.crowd.yard import SPARE, CrowdBody, CrowdYard
-from sim.robots.scene import FOOTPRINT, SceneError, loaded
-from sim.robots.sensor import NOSE
-from sim.robots.world import TICK
-from sim.robots.yard import Yard
+from sim.robots.crowd.scene import CrowdScene
+from sim.robots.crowd.simulator import SPARE_CONNECTIONS, CrowdRobot, CrowdSimulator
+from sim.robots.scene import FOOTPRINT_RADIUS_M, SceneError, load_scene
+from sim.robots.sensor import NOSE_M
+from sim.robots.simulator import RobotSimulator
+from sim.robots.world import TICK_S
 
 
 class DrivenTests(SynchronousTestCase):
@@ -32,7 +32,7 @@ class DrivenTests(SynchronousTestCase):
     def setUp(self) -> None:
         """Place the first robot at the left, facing right, and the others behind it."""
         self.clock = HeapClock()
-        self.yard = CrowdYard(self.clock, Random(1), Ground(5, 6.0, 4.0), 2, stand)
+        self.yard = CrowdSimulator(self.clock, Random(1), CrowdScene(5, 6.0, 4.0), 2, stand)
         self.crowd = self.yard.crowd
         for body, (x, y) in enumerate(((1.0, 2.0), (0.3, 0.3), (0.3, 3.7), (0.3, 3.0), (0.3, 1.0))):
             self.crowd.move(body, x, y, 0.0)
@@ -60,7 +60,7 @@ class DrivenTests(SynchronousTestCase):
 
     def test_tells_what_a_dog_tells(self) -> None:
         """A crowd robot sends the same keys, value types and samples as a robot of ``Yard``, in a frame each 32 ms."""
-        dogs = Yard(self.clock, Random(1), loaded("three-dogs"))
+        dogs = RobotSimulator(self.clock, Random(1), load_scene("three-dogs"))
         dogs.start()
         dog = SimDriver({"robot": "dog1"}, dogs.connector(), self.clock)
         dog.connect()
@@ -70,7 +70,7 @@ class DrivenTests(SynchronousTestCase):
         self.assertEqual(*kinds)
         self.assertEqual(sorted(here.samples), sorted(there.samples))
         before = driver.diagnostics()["frames"]
-        self.clock.advance(100 * TICK)
+        self.clock.advance(100 * TICK_S)
         self.assertEqual(driver.diagnostics()["frames"] - before, 100)
         for yard in (dogs, self.yard):
             yard.stop()
@@ -96,19 +96,19 @@ class DrivenTests(SynchronousTestCase):
         driver.connect().addCallback(lambda _: driver.enable())
         self.clock.advance(0.5)
         self.act(driver, 0.5, ttl=0.4, vx=0.16)
-        connector.silence()
+        connector.block_data()
         self.clock.advance(0.25)
         self.assertGreater(float(self.crowd.vx[0]), 0.15)
         self.clock.advance(0.5)
         self.assertEqual(float(self.crowd.vx[0]), 0.0)
         self.clock.advance(4.0)
-        self.assertEqual(self.yard.holders, [])
+        self.assertEqual(self.yard.driven_robots, [])
 
     def test_ranges(self) -> None:
         """The near and far sensors measure from the nose to the obstacle, and return NaN beyond their range."""
         driver = self.driver()
         for gap, near in ((0.3, True), (1.0, False)):
-            self.crowd.place_target(1.0 + NOSE + gap + 0.08, 2.0)
+            self.crowd.place_target(1.0 + NOSE_M + gap + 0.08, 2.0)
             rows: list[Observation] = []
             end = driver.subscribe(rows.append)
             self.clock.advance(1.0)
@@ -142,29 +142,29 @@ class DrivenTests(SynchronousTestCase):
         frame = self.newest(driver).frame
         assert frame is not None
         self.assertGreaterEqual(driver.diagnostics()["pictures"], 9)
-        seen = find_target(frame.data, Size(0.08, 0.22))
+        seen = find_target(frame.data, TargetSize(0.08, 0.22))
         assert seen is not None
-        self.assertLess(abs(seen.bearing - math.atan2(0.3, 2.0 - NOSE)), 0.02)
-        self.assertLess(abs(seen.distance - math.hypot(0.3, 2.0 - NOSE)), 0.1)
+        self.assertLess(abs(seen.bearing - math.atan2(0.3, 2.0 - NOSE_M)), 0.02)
+        self.assertLess(abs(seen.distance - math.hypot(0.3, 2.0 - NOSE_M)), 0.1)
         for body, (x, y) in enumerate(((1.5, 2.08), (1.75, 2.11)), 3):
             self.crowd.move(body, x, y, 0.0)
         self.clock.advance(0.5)
         hidden = self.newest(driver).frame
         assert hidden is not None
-        rest = find_target(hidden.data, Size(0.08, 0.22))
+        rest = find_target(hidden.data, TargetSize(0.08, 0.22))
         self.assertTrue(rest is None or not rest.is_whole)
 
     def test_pictures_without_a_target_have_no_red(self) -> None:
         """The agents' vision finds no target in pictures of walls, floor and other robots."""
-        yard = CrowdYard(self.clock, Random(2), Ground(60, 5.0, 5.0), 60, stand)
+        yard = CrowdSimulator(self.clock, Random(2), CrowdScene(60, 5.0, 5.0), 60, stand)
         for name in yard.names:
-            picture = yard.lend(name).picture()
+            picture = yard.reserve_for_emulator(name).picture()
             assert picture is not None
-            self.assertIsNone(find_target(picture, Size(0.08, 0.22)))
+            self.assertIsNone(find_target(picture, TargetSize(0.08, 0.22)))
 
     def test_body_for_an_emulator(self) -> None:
         """A robot that is lent to an emulator moves, stops, senses and detects bumps, and rejects drivers."""
-        body = self.yard.lend("robot2")
+        body = self.yard.reserve_for_emulator("robot2")
         body.drive(0.16, 0.0, 0.0)
         self.clock.advance(1.0)
         self.assertGreater(float(self.crowd.x[1]), 0.4)
@@ -172,19 +172,19 @@ class DrivenTests(SynchronousTestCase):
         self.clock.advance(0.5)
         self.assertEqual(float(self.crowd.vx[1]), 0.0)
         self.assertEqual(self.bumps(body), (False, False))
-        self.crowd.move(2, float(self.crowd.x[1]) + 2 * FOOTPRINT, 0.3, 0.0)
+        self.crowd.move(2, float(self.crowd.x[1]) + 2 * FOOTPRINT_RADIUS_M, 0.3, 0.0)
         self.assertEqual(self.bumps(body), (True, True))
-        self.crowd.move(1, 3.0, FOOTPRINT, math.radians(-60.0))
+        self.crowd.move(1, 3.0, FOOTPRINT_RADIUS_M, math.radians(-60.0))
         self.assertEqual(self.bumps(body), (False, True))
         self.crowd.move(1, 3.0, 2.0, 0.0)
-        self.crowd.place_target(3.0 + FOOTPRINT + 0.08, 2.0)
+        self.crowd.place_target(3.0 + FOOTPRINT_RADIUS_M + 0.08, 2.0)
         self.assertEqual(self.bumps(body), (True, True))
         self.assertIn("odom.x", body.sense())
         body.halt()
         self.assertEqual(self.driver("robot2").state, "closed")
-        self.assertRaises(UsageError, self.yard.lend, "robot3")
+        self.assertRaises(UsageError, self.yard.reserve_for_emulator, "robot3")
 
-    def bumps(self, body: CrowdBody) -> tuple[Any, Any]:
+    def bumps(self, body: CrowdRobot) -> tuple[Any, Any]:
         """Return the values of the left and right bump sensors."""
         values = body.sense()
         return values["bump.left"], values["bump.right"]
@@ -192,10 +192,10 @@ class DrivenTests(SynchronousTestCase):
     def test_wrong_numbers_are_refused(self) -> None:
         """Invalid numbers of drivers, a driver for an undriven robot, and one connection too many are rejected."""
         for driven in (-1, 6, 1.5, True):
-            self.assertRaises(SceneError, CrowdYard, self.clock, Random(1), Ground(5, 6.0, 4.0), driven)
+            self.assertRaises(SceneError, CrowdSimulator, self.clock, Random(1), CrowdScene(5, 6.0, 4.0), driven)
         self.assertEqual(self.driver("robot3").state, "closed")
         connector = self.yard.connector()
-        callers = [SimDriver({"robot": "robot1"}, connector, self.clock) for _ in range(2 + SPARE + 1)]
+        callers = [SimDriver({"robot": "robot1"}, connector, self.clock) for _ in range(2 + SPARE_CONNECTIONS + 1)]
         for caller in callers:
             caller.connect().addErrback(lambda why: None)
         self.clock.advance(0.05)
@@ -204,22 +204,22 @@ class DrivenTests(SynchronousTestCase):
     def test_costs_are_counted_apart(self) -> None:
         """The stopwatch counts the time for motion and the time for observations separately."""
         moments = iter(np.arange(0.0, 1000.0, 1.0).tolist())
-        yard = CrowdYard(self.clock, Random(1), Ground(5, 6.0, 4.0), 1, stand, lambda: next(moments))
+        yard = CrowdSimulator(self.clock, Random(1), CrowdScene(5, 6.0, 4.0), 1, stand, lambda: next(moments))
         yard.start()
-        self.clock.advance(TICK * 10.5)
-        self.assertEqual((yard.moving, yard.telling), (10.0, 10.0))
+        self.clock.advance(TICK_S * 10.5)
+        self.assertEqual((yard.moving_s, yard.reporting_s), (10.0, 10.0))
 
     def test_time_lost_is_not_made_up_for(self) -> None:
         """After a pause of the machine the simulation does not catch up, and drops commands from before it."""
         clock = Clock()
-        yard = CrowdYard(clock, Random(1), Ground(5, 6.0, 4.0), 1, stand)
+        yard = CrowdSimulator(clock, Random(1), CrowdScene(5, 6.0, 4.0), 1, stand)
         yard.start()
         yard.drive("robot1", 0.16, 0.0, 0.0)
-        clock.advance(TICK)
-        self.assertGreater(float(yard.crowd.wish[0, 0]), 0.0)
+        clock.advance(TICK_S)
+        self.assertGreater(float(yard.crowd.commands[0, 0]), 0.0)
         clock.advance(5.0)
-        self.assertEqual((yard.crowd.ticks, float(yard.crowd.wish[0, 0])), (2, 0.0))
-        clock.advance(TICK)
+        self.assertEqual((yard.crowd.ticks, float(yard.crowd.commands[0, 0])), (2, 0.0))
+        clock.advance(TICK_S)
         self.assertEqual(yard.crowd.ticks, 3)
         yard.stop()
         clock.advance(1.0)

@@ -14,14 +14,14 @@ from typing import Any
 from twisted.trial.unittest import SynchronousTestCase
 
 from drivers.registry import describe
-from sim.demo import port, stage
-from sim.demo.cast import CASTS, MOST_PORTS, chosen
+from sim.demo import free_ports, preparation
 from sim.demo.configuration import DOGS, Plan
 from sim.demo.demonstration import main
-from sim.demo.experiment import LIMIT_S, Experiment, report, table, to_target
-from sim.demo.stage import MARK, Trouble, arranged, fresh
-from sim.demo.story import present, told
-from sim.demo.visitor import MAX_EVENT, EventStream
+from sim.demo.experiment import LIMIT_S, Experiment, format_table, make_report, measure_distances
+from sim.demo.page_client import MAX_EVENT_BYTES, EventParser
+from sim.demo.preparation import MARKER_FILE, DemoError, lock_run_dir, make_plan
+from sim.demo.robots import MAX_PORTS, ROBOT_SETS, make_robots
+from sim.demo.state_changes import describe_changes, find_present
 
 TASK = "t1"
 
@@ -66,11 +66,11 @@ class ExperimentTests(SynchronousTestCase):
         ):
             run = Experiment("one", TASK, kills, 0.0)
             for now, (seen, xs) in enumerate(looks):
-                run.look(float(now), seen, snapshot(*xs))
-            said, (row,) = table([run]), report([run])
+                run.update(float(now), seen, snapshot(*xs))
+            said, (row,) = format_table([run]), make_report([run])
             self.assertTrue(run.is_over)
-            self.assertEqual((run.held, row["held"], words in said), (held, held, True), said)
-            self.assertEqual(list(row["checks"].values()), [check.held for check in run.checks()])
+            self.assertEqual((run.has_passed, row["held"], words in said), (held, held, True), said)
+            self.assertEqual(list(row["checks"].values()), [check.is_met for check in run.list_checks()])
 
     def test_who_is_killed(self) -> None:
         """``look`` names the moving dog once, 0.1 m nearer or half way; never in experiment 1 or if it is gone."""
@@ -82,36 +82,36 @@ class ExperimentTests(SynchronousTestCase):
             (False, RUNS, (1.0, 0.4), ["", ""]),
         ):
             run = Experiment("two", TASK, kills, 0.0)
-            self.assertEqual([run.look(float(now), seen, snapshot(x, 1.5)) for now, x in enumerate(ways)], named)
+            self.assertEqual([run.update(float(now), seen, snapshot(x, 1.5)) for now, x in enumerate(ways)], named)
 
     def test_takeover_is_timed_until_another_dog_moves(self) -> None:
         """The takeover lasts from the kill until another dog executes and moves; the killed dog is ignored."""
         run = Experiment("two", TASK, True, 0.0)
-        run.look(0.0, RUNS, snapshot(1.0, 1.5))
-        self.assertEqual(run.look(1.0, RUNS, snapshot(0.8, 1.5)), "dog1")
-        run.look(1.5, RUNS, snapshot(0.8, 1.5, moving="dog1"))
+        run.update(0.0, RUNS, snapshot(1.0, 1.5))
+        self.assertEqual(run.update(1.0, RUNS, snapshot(0.8, 1.5)), "dog1")
+        run.update(1.5, RUNS, snapshot(0.8, 1.5, moving="dog1"))
         taken = state("EXECUTING", dog1="EXECUTING", dog2="EXECUTING")
-        run.look(2.0, taken, snapshot(0.8, 1.5))
+        run.update(2.0, taken, snapshot(0.8, 1.5))
         self.assertIsNone(run.takeover_s)
-        run.look(2.25, taken, snapshot(0.8, 1.5, moving="dog2"))
+        run.update(2.25, taken, snapshot(0.8, 1.5, moving="dog2"))
         self.assertAlmostEqual(run.takeover_s or 0.0, 1.25)
-        run.look(9.0, state("COMPLETED", "dog2", dog2="DONE"), snapshot(0.8, 0.3))
-        self.assertTrue(run.held, table([run]))
+        run.update(9.0, state("COMPLETED", "dog2", dog2="DONE"), snapshot(0.8, 0.3))
+        self.assertTrue(run.has_passed, format_table([run]))
 
     def test_experiment_ends_when_time_is_up(self) -> None:
         """An experiment is over after the time limit, and its table shows the last status of the task."""
         run = Experiment("one", TASK, False, 0.0)
-        run.look(LIMIT_S - 1, state("OPEN"), None)
+        run.update(LIMIT_S - 1, state("OPEN"), None)
         self.assertFalse(run.is_over)
-        run.look(LIMIT_S + 1, state("OPEN"), None)
+        run.update(LIMIT_S + 1, state("OPEN"), None)
         self.assertTrue(run.is_over)
-        self.assertIn("out of time, task OPEN", table([run]))
+        self.assertIn("out of time, task OPEN", format_table([run]))
 
     def test_distances_need_a_target(self) -> None:
         """Without a target, or without a snapshot, there are no distances."""
-        self.assertEqual(to_target(snapshot(1.0, target=False)), {})
-        self.assertEqual(to_target(None), {})
-        self.assertEqual(to_target(snapshot(-2.0)), {"dog1": 2.0})
+        self.assertEqual(measure_distances(snapshot(1.0, target=False)), {})
+        self.assertEqual(measure_distances(None), {})
+        self.assertEqual(measure_distances(snapshot(-2.0)), {"dog1": 2.0})
 
 
 class StoryTests(SynchronousTestCase):
@@ -136,8 +136,8 @@ class StoryTests(SynchronousTestCase):
             (state("OPEN"), agreed, ["2 of 2 agree on dog1 (dog1 0.50 m)"]),
             (agreed, agreed, []),
         ):
-            self.assertEqual(told(before, after), lines)
-        self.assertEqual(list(present(state("OPEN", dog1="IDLE", dog2="GONE"))), ["dog1"])
+            self.assertEqual(describe_changes(before, after), lines)
+        self.assertEqual(list(find_present(state("OPEN", dog1="IDLE", dog2="GONE"))), ["dog1"])
 
 
 class ConfigurationTests(SynchronousTestCase):
@@ -147,12 +147,12 @@ class ConfigurationTests(SynchronousTestCase):
         ports = {"vaio": 7000, "pi": 7004, "dog1": 7001, "dog2": 7002, "dog3": 7003}
         folder = Path('/tmp/a "strange"\\folder\x7f')
         self.plan = Plan(folder, "127.0.0.1", 8080, 7400, ports, "quiet-otter", 8081)
-        self.plan = replace(self.plan, robots=chosen("sim", DOGS, folder, iter(()), 7400))
+        self.plan = replace(self.plan, robots=make_robots("sim", DOGS, folder, iter(()), 7400))
         self.tables = self.read(self.plan)
 
     def read(self, plan: Plan) -> dict[str, Any]:
         """Parse the configuration of each node."""
-        return {name: tomllib.loads(text) for name, text in plan.texts().items()}
+        return {name: tomllib.loads(text) for name, text in plan.make_configs().items()}
 
     def test_every_node_has_a_file_in_lawful_toml(self) -> None:
         """Two web nodes and three dogs have their own ports, stores and robots, and know the first node."""
@@ -170,27 +170,29 @@ class ConfigurationTests(SynchronousTestCase):
 
     def test_every_node_is_a_member(self) -> None:
         """The founding arguments list each node that has a file, and no configuration contains a team key."""
-        words = self.plan.founding()
+        words = self.plan.make_init_arguments()
         members = [word.partition("=")[0] for flag, word in zip(words, words[1:], strict=False) if flag == "--member"]
         self.assertEqual([words[words.index("--first") + 1], *members], list(self.tables))
         self.assertNotIn("team_key", str(self.tables))
 
     def test_every_cast_is_known_to_its_drivers(self) -> None:
         """Emulators match the drivers of each cast, ports are unique, and one Aibo speaks the older dialect."""
-        self.assertEqual(self.plan.played, "")
-        for wish in CASTS:
-            ports = iter(range(9000, 9000 + MOST_PORTS * len(DOGS)))
-            plan = replace(self.plan, robots=chosen(wish, DOGS, self.plan.run_dir, ports, 7400))
-            tables, played = self.read(plan), tomllib.loads(plan.played)
+        self.assertEqual(self.plan.emulated_robots, "")
+        for wish in ROBOT_SETS:
+            ports = iter(range(9000, 9000 + MAX_PORTS * len(DOGS)))
+            plan = replace(self.plan, robots=make_robots(wish, DOGS, self.plan.run_dir, ports, 7400))
+            tables, played = self.read(plan), tomllib.loads(plan.emulated_robots)
             for name, robot in plan.robots.items():
                 self.assertEqual(tables[name]["node"]["kind"], robot.model)
-                self.assertEqual({**tables[name]["driver"], **robot.more}, played.get(name, robot.driver))
+                self.assertEqual(
+                    {**tables[name]["driver"], **robot.emulator_options}, played.get(name, robot.driver_table)
+                )
                 parts = [(part["kind"], part["options"]) for part in robot.parts]
                 capabilities = describe(robot.kind, robot.options, name, parts).capabilities
                 self.assertLessEqual({"base2d", "odometry", "camera"}, set(capabilities), wish)
             taken = re.findall(r"\b90\d\d\b", str([tables[name]["driver"] for name in DOGS]))
             self.assertEqual(len(taken), len(set(taken)))
-            dialects = [robot.played.get("dialect") for robot in plan.robots.values()]
+            dialects = [robot.simulator_table.get("dialect") for robot in plan.robots.values()]
             self.assertEqual(dialects, [None, None, "T2" if wish == "aibo" else None])
 
     def test_two_nodes_serve_the_page(self) -> None:
@@ -212,15 +214,15 @@ class EventStreamTests(SynchronousTestCase):
     def test_events_survive_any_cut(self) -> None:
         """The parser finds the same events in the whole input and byte by byte, and ignores comments."""
         wanted = [("state", b'{"a":\n1}'), ("other", b"x"), ("message", b"y")]
-        self.assertEqual(EventStream().feed(self.WIRE), wanted)
-        stream = EventStream()
+        self.assertEqual(EventParser().feed(self.WIRE), wanted)
+        stream = EventParser()
         pieces = [event for byte in self.WIRE for event in stream.feed(bytes([byte]))]
         self.assertEqual(pieces, wanted)
 
     def test_endless_line_is_dropped(self) -> None:
         """The parser drops a line without end and parses the events after it."""
-        stream = EventStream()
-        stream.feed(b"data: " + b"x" * (MAX_EVENT + 1))
+        stream = EventParser()
+        stream.feed(b"data: " + b"x" * (MAX_EVENT_BYTES + 1))
         self.assertEqual(stream.feed(b"\n\ndata: y\n\n"), [("message", b"y")])
 
 
@@ -232,56 +234,56 @@ class StageTests(SynchronousTestCase):
 
     def test_ports_of_one_plan_differ(self) -> None:
         """A requested port for the page is not used for the page over TLS as well."""
-        (wanted,) = port.free("tcp", "127.0.0.1", 1)
-        self.patch(stage, "TLS_PORT", wanted)
-        plan = arranged(self.folder, "127.0.0.1", wanted, True, lambda line: None, True)
-        ports = [plan.web_port, plan.reserve_port, *plan.tls_ports, plan.yard_port]
+        (wanted,) = free_ports.find_free_ports("tcp", "127.0.0.1", 1)
+        self.patch(preparation, "TLS_PORT", wanted)
+        plan = make_plan(self.folder, "127.0.0.1", wanted, True, lambda line: None, True)
+        ports = [plan.web_port, plan.reserve_port, *plan.tls_ports, plan.simulator_port]
         self.assertEqual((plan.web_port, len(set(ports))), (wanted, 5))
 
     def test_free_ports_stay_free(self) -> None:
         """Free ports lie below the range for outgoing connections, so no other process takes them at random."""
         lowest_given = 32_768
-        for kind in ("tcp", "udp", port.BOTH):
-            ports = port.free(kind, "127.0.0.1", 20)
+        for kind in ("tcp", "udp", free_ports.TCP_AND_UDP):
+            ports = free_ports.find_free_ports(kind, "127.0.0.1", 20)
             self.assertEqual(len(set(ports)), 20)
             self.assertLess(max(ports), lowest_given)
 
     def test_ports_are_free_for_both_kinds(self) -> None:
         """A port for both TCP and UDP is skipped if one of them is in use."""
-        first, last = port.free(port.BOTH, "127.0.0.1", 2)
-        self.patch(port, "QUIET", [first, last])
+        first, last = free_ports.find_free_ports(free_ports.TCP_AND_UDP, "127.0.0.1", 2)
+        self.patch(free_ports, "PORT_RANGE", [first, last])
         for kind in (socket.SOCK_STREAM, socket.SOCK_DGRAM):
             with socket.socket(socket.AF_INET, kind) as held:
                 held.bind(("127.0.0.1", first))
                 if kind == socket.SOCK_STREAM:
                     held.listen(1)
-                self.assertEqual(port.free(port.BOTH, "127.0.0.1", 1), [last])
-                self.assertRaises(OSError, port.free, port.BOTH, "127.0.0.1", 2)
+                self.assertEqual(free_ports.find_free_ports(free_ports.TCP_AND_UDP, "127.0.0.1", 1), [last])
+                self.assertRaises(OSError, free_ports.find_free_ports, free_ports.TCP_AND_UDP, "127.0.0.1", 2)
 
     def test_only_a_free_folder_of_ours_is_emptied(self) -> None:
         """The folder of an earlier demonstration is emptied; a folder with other files, or in use, stays unchanged."""
-        fresh(self.folder).close()
+        lock_run_dir(self.folder).close()
         (self.folder / "dog1.sqlite").write_text("old")
         (self.folder / "inner").mkdir()
-        with fresh(self.folder):
-            self.assertEqual([entry.name for entry in self.folder.iterdir()], [MARK])
-            self.assertNotIn("\n", str(self.assertRaises(Trouble, fresh, self.folder)))
-        (self.folder / MARK).rename(self.folder / "thesis.txt")
-        self.assertRaises(Trouble, fresh, self.folder)
+        with lock_run_dir(self.folder):
+            self.assertEqual([entry.name for entry in self.folder.iterdir()], [MARKER_FILE])
+            self.assertNotIn("\n", str(self.assertRaises(DemoError, lock_run_dir, self.folder)))
+        (self.folder / MARKER_FILE).rename(self.folder / "thesis.txt")
+        self.assertRaises(DemoError, lock_run_dir, self.folder)
         self.assertTrue((self.folder / "thesis.txt").exists())
 
     def test_what_is_no_folder_is_refused(self) -> None:
         """A file at the path of the folder or of its parent is rejected with a remedy."""
         self.folder.write_text("mine")
         for folder in (self.folder, self.folder / "inner"):
-            said = str(self.assertRaises(Trouble, fresh, folder))
+            said = str(self.assertRaises(DemoError, lock_run_dir, folder))
             self.assertTrue(said.startswith(f"cannot use {folder} ("), said)
             self.assertIn("choose another --run-dir", said)
 
     def test_foreign_address_is_refused(self) -> None:
         """An address of another machine is rejected with a hint to ``--web-host``, not as a busy port."""
         for wanted in (None, 8080):
-            error = self.assertRaises(Trouble, arranged, self.folder, "192.0.2.1", wanted, True, lambda line: None)
+            error = self.assertRaises(DemoError, make_plan, self.folder, "192.0.2.1", wanted, True, lambda line: None)
             self.assertRegex(str(error), r"cannot serve the page on 192\.0\.2\.1 \(.*\); set --web-host")
 
 

@@ -13,7 +13,7 @@ from twisted.python.failure import Failure
 from twisted.trial.unittest import SynchronousTestCase
 from zope.interface import implementer
 
-from sim.demo.processes import RESTART_S, Team, on_leash
+from sim.demo.processes import RESTART_S, ProcessGroup, make_child_command
 
 
 class MemoryProcess:
@@ -67,9 +67,9 @@ class TeamTests(SynchronousTestCase):
         self.folder.mkdir()
         self.said: list[tuple[str, str]] = []
 
-    def team(self, stubborn: bool = False) -> tuple[Team, MemoryProcesses]:
+    def team(self, stubborn: bool = False) -> tuple[ProcessGroup, MemoryProcesses]:
         reactor = MemoryProcesses(stubborn)
-        team = Team(reactor, self.folder, lambda name, line: self.said.append((name, line)))
+        team = ProcessGroup(reactor, self.folder, lambda name, line: self.said.append((name, line)))
         team.add("dog1", ["-m", "x"])
         team.add("dog2", ["-m", "y"])
         team.start()
@@ -80,13 +80,13 @@ class TeamTests(SynchronousTestCase):
     def test_processes_start_on_a_leash_and_are_heard(self) -> None:
         """Each process starts on a leash; its lines reach the listener, its log file and its tail."""
         team, reactor = self.team()
-        self.assertEqual(reactor.started[0].arguments, on_leash(["-m", "x"]))
-        self.assertEqual((team.pid("dog1"), team.pid("dog2"), team.missing()), (100, 101, []))
+        self.assertEqual(reactor.started[0].arguments, make_child_command(["-m", "x"]))
+        self.assertEqual((team.get_pid("dog1"), team.get_pid("dog2"), team.list_ended()), (100, 101, []))
         reactor.started[0].write_line(b"one\ntw")
         reactor.started[0].write_line(b"o\n")
         self.assertEqual(self.said, [("dog1", "one"), ("dog1", "two")])
         self.assertEqual((self.folder / "dog1.log").read_text(), "one\ntwo\n")
-        self.assertEqual(team.tail("dog1"), ["one", "two"])
+        self.assertEqual(team.get_tail("dog1"), ["one", "two"])
 
     def test_killed_process_stays_away_for_the_delay(self) -> None:
         """A killed process restarts after ``RESTART_S`` and not before; the other process keeps running."""
@@ -96,11 +96,11 @@ class TeamTests(SynchronousTestCase):
         for name in ("dog1", "cat1"):
             self.assertRaises(KeyError, team.kill, name)
         reactor.advance(0.0)
-        self.assertEqual((reactor.started[0].signals, team.missing()), (["KILL"], ["dog1"]))
+        self.assertEqual((reactor.started[0].signals, team.list_ended()), (["KILL"], ["dog1"]))
         reactor.advance(RESTART_S - 0.1)
-        self.assertIsNone(team.pid("dog1"))
+        self.assertIsNone(team.get_pid("dog1"))
         reactor.advance(0.2)
-        self.assertEqual((team.pid("dog1"), team.pid("dog2")), (102, 101))
+        self.assertEqual((team.get_pid("dog1"), team.get_pid("dog2")), (102, 101))
 
     def test_stop_ends_all_and_starts_none(self) -> None:
         """After ``stop`` no process runs or restarts, and no timer is left; later calls complete as well."""
@@ -112,7 +112,7 @@ class TeamTests(SynchronousTestCase):
         self.successResultOf(first)
         self.successResultOf(second)
         self.successResultOf(team.stop())
-        self.assertEqual((team.missing(), reactor.getDelayedCalls()), (["dog1", "dog2"], []))
+        self.assertEqual((team.list_ended(), reactor.getDelayedCalls()), (["dog1", "dog2"], []))
 
     def test_stop_waits_for_the_stubborn_and_kills_them(self) -> None:
         """``stop`` kills a process that ignores TERM for four seconds, and waits for its end."""

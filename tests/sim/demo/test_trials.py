@@ -11,7 +11,7 @@ from typing import Any
 from twisted.trial.unittest import SynchronousTestCase
 
 from middleware.entangled.clock import HeapClock
-from sim.demo.trials import Outcome, main, percentile, table, trial
+from sim.demo.trials import Outcome, format_table, main, percentile, run_trial
 
 
 class PlayedTeam:
@@ -19,8 +19,8 @@ class PlayedTeam:
 
     def __init__(self, seed: int) -> None:
         self.clock = HeapClock()
-        self.board = self
-        self.yard = None
+        self.switchboard = self
+        self.simulator = None
         self.lost: set[str] = set()
         self._seed = seed
         self._began: float | None = None
@@ -50,7 +50,7 @@ class PlayedTeam:
     def _by(self) -> str:
         return "dog2" if "dog1" in self.lost else "dog1"
 
-    def truth(self) -> dict[str, Any]:
+    def get_true_state(self) -> dict[str, Any]:
         """Return a snapshot in which the acting dog walks to the target."""
         near = max(0.22, 1.0 - 0.1 * self._age())
         at = {"dog1": 0.9 if "dog1" in self.lost else near, "dog2": near if "dog1" in self.lost else 2.0}
@@ -75,7 +75,7 @@ class PlayedTeam:
 class TrialTests(SynchronousTestCase):
     def test_trial_notes_what_came_of_it(self) -> None:
         """A trial records the finishing dog, the checks of finding and agreement, and the digest of the trace."""
-        outcome = trial(PlayedTeam, 1, 2)
+        outcome = run_trial(PlayedTeam, 1, 2)
         self.assertEqual(outcome.broken, [])
         self.assertTrue(outcome.held and outcome.found and outcome.agreed and outcome.right)
         self.assertEqual((outcome.by, outcome.killed, outcome.digest), ("dog1", "", "digest 2"))
@@ -84,7 +84,7 @@ class TrialTests(SynchronousTestCase):
         """In experiment 2 the acting dog is killed once, the takeover is timed, and each phase is drawn as a PNG."""
         folder = Path(self.mktemp())
         folder.mkdir()
-        outcome = trial(PlayedTeam, 2, 2, folder)
+        outcome = run_trial(PlayedTeam, 2, 2, folder)
         self.assertEqual((outcome.killed, outcome.by, outcome.broken), ("dog1", "dog2", []))
         assert outcome.takeover is not None
         self.assertLess(outcome.takeover, 0.1)
@@ -103,7 +103,7 @@ class TrialTests(SynchronousTestCase):
         good: dict[str, Any] = {"held": True, "found": True, "agreed": True, "right": True}
         outcomes = [Outcome(n, 1, **good, find=1.0 + n, agree=2.0, reach=10.0) for n in range(3)]
         outcomes.append(Outcome(1, 2, takeover=1.25))
-        lines = [line.split() for line in table(outcomes).splitlines()]
+        lines = [line.split() for line in format_table(outcomes).splitlines()]
         self.assertEqual(lines[1][:7], ["experiment", "1", "3", "3", "3", "3", "3"])
         self.assertEqual(lines[1][7:], ["2.00", "(3.00)", "2.00", "(2.00)", "10.00", "(10.00)", "-"])
         self.assertEqual(lines[2], ["experiment", "2", "1", "0", "0", "0", "0", "-", "-", "-", "1.25", "(1.25)"])

@@ -4,61 +4,61 @@ from __future__ import annotations
 
 from twisted.trial.unittest import SynchronousTestCase
 
-from sim.team.checker import PARTS, check
+from sim.team.checker import PARTS, find_violations
 from sim.team.event import (
+    ActiveTasks,
     Answered,
+    AnswerRepeated,
     Asked,
-    Awaited,
+    Assumptions,
     Born,
-    Calm,
-    Commanded,
-    Concluded,
-    Counted,
+    CommandExpected,
+    CommandReceived,
+    CommandSent,
+    ContactKnown,
     Decided,
     Died,
-    Engaged,
     Event,
-    Expired,
-    Halted,
-    Held,
-    Issued,
-    Met,
-    Open,
-    Posted,
-    Ran,
-    Reached,
-    Repeated,
+    FaultFree,
+    InvalidDatagram,
+    LeaseHeld,
+    LeaseWon,
+    LivingMembers,
+    MajorityReachable,
+    MembersListed,
+    OpenTask,
+    OutcomeExpired,
+    OutcomeStored,
     Report,
-    Seated,
+    RequestExecuted,
+    RobotStopped,
     Settled,
-    Shot,
-    Size,
     Stored,
-    Strange,
-    Terms,
+    TableSize,
+    TupleStored,
     Unanswered,
-    Voted,
-    Won,
+    UnvalidatedTraffic,
+    VoteAccepted,
 )
 from sim.team.history import History
 from sim.team.invariant.durability import Slot
 
-TERMS = Terms(0.0, 1.5, 0.01, 0.3, 0.1)
+TERMS = Assumptions(0.0, 1.5, 0.01, 0.3, 0.1)
 SLOT = Slot(b"key", b"owner", "a")
 OTHER = Slot(b"key", b"owner", "b")
 ONE = Born(0.0, 1, 1, b"p1", b"\1", "h:1")
 TWO = Born(0.0, 2, 1, b"p2", b"\2", "h:2")
 COUNCIL = (b"m1", b"m2", b"m3")
-POSTED = Posted(0.0, "mark", ("job", 1), COUNCIL, (b"i", b"i", b"i"))
-SEATED = Seated(9.0, ((b"m1", b"i"), (b"m2", b"i"), (b"m3", b"other")))
-TAKEN = [POSTED, Voted(1.0, "mark", 1, b"taker", b"m1"), Voted(1.0, "mark", 1, b"taker", b"m2")]
+POSTED = TupleStored(0.0, "mark", ("job", 1), COUNCIL, (b"i", b"i", b"i"))
+SEATED = LivingMembers(9.0, ((b"m1", b"i"), (b"m2", b"i"), (b"m3", b"other")))
+TAKEN = [POSTED, VoteAccepted(1.0, "mark", 1, b"taker", b"m1"), VoteAccepted(1.0, "mark", 1, b"taker", b"m2")]
 PUT: list[Event] = [Asked(0.0, 1, 1, "put", ("job", 1)), Answered(0.5, 1)]
 SURVEY = Asked(5.0, 9, 2, "survey", "job")
 
 
-def command(at: float, token: int, is_accepted: bool = True, place: int = 1) -> Commanded:
+def command(at: float, token: int, is_accepted: bool = True, place: int = 1) -> CommandReceived:
     """Return a command for t0 that is in force for one second."""
-    return Commanded(at, "t0", place, token, is_accepted, at + 1.0, at + 1.0)
+    return CommandReceived(at, "t0", place, token, is_accepted, at + 1.0, at + 1.0)
 
 
 def write(at: float, number: int, is_known: bool = True, what: str = "write") -> list[Event]:
@@ -80,36 +80,38 @@ def decided(place: int, assigned: str, cost: float = 1.0, serial: int = 5, holde
     return Decided(1.0 + place / 10, place, "t0", reports, ("basis", cost, serial), assigned, holder, 0.1)
 
 
-def shot(after: str = "same", raised: str = "", logged: str = "", answers: tuple[tuple[bool, int], ...] = ()) -> Shot:
+def shot(
+    after: str = "same", raised: str = "", logged: str = "", answers: tuple[tuple[bool, int], ...] = ()
+) -> InvalidDatagram:
     """Return the delivery of a forged datagram of ten bytes."""
-    return Shot(1.0, 1, "forged", bytes(10), "same", after, raised, logged, answers)
+    return InvalidDatagram(1.0, 1, "forged", bytes(10), "same", after, raised, logged, answers)
 
 
 BROKEN: dict[str, list[list[Event]]] = {
     "E1": [
-        [TERMS, Won(1.0, "t0", 1, 5), Won(2.0, "t0", 2, 5)],
+        [TERMS, LeaseWon(1.0, "t0", 1, 5), LeaseWon(2.0, "t0", 2, 5)],
         [TERMS, command(1.0, 5), command(2.0, 4)],
-        [TERMS, Commanded(3.0, "t0", 1, 1, True, 4.0, 2.0)],
+        [TERMS, CommandReceived(3.0, "t0", 1, 1, True, 4.0, 2.0)],
     ],
     "E2": [
-        [TERMS, Held(1.0, "t0", 1, (2,))],
-        [TERMS, command(1.0, 1), Held(2.2, "t0", 2)],
+        [TERMS, LeaseHeld(1.0, "t0", 1, (2,))],
+        [TERMS, command(1.0, 1), LeaseHeld(2.2, "t0", 2)],
     ],
     "E3": [
-        [Awaited(1.0, "t0", "1 is gone", 3, 1.0, 2.0), command(2.0, 3)],
-        [Awaited(1.0, "t0", "1 is gone", 3, 1.0, 2.0), command(3.1, 4)],
+        [CommandExpected(1.0, "t0", "1 is gone", 3, 1.0, 2.0), command(2.0, 3)],
+        [CommandExpected(1.0, "t0", "1 is gone", 3, 1.0, 2.0), command(3.1, 4)],
     ],
     "E4": [
-        [Asked(1.0, 1, 0, "submit", "t0"), Open(9.0, "t0", 1, "waiting", False)],
-        [Asked(1.0, 1, 0, "submit", "t0"), Expired(5.0, "t0"), Open(9.0, "t0", 1, "", True)],
-        [Expired(5.0, "t0"), Engaged(5.1, 1, ("t0",))],
+        [Asked(1.0, 1, 0, "submit", "t0"), OpenTask(9.0, "t0", 1, "waiting", False)],
+        [Asked(1.0, 1, 0, "submit", "t0"), OutcomeExpired(5.0, "t0"), OpenTask(9.0, "t0", 1, "", True)],
+        [OutcomeExpired(5.0, "t0"), ActiveTasks(5.1, 1, ("t0",))],
     ],
     "E5": [
         [Asked(1.0, 1, 1, "close", "t0"), Answered(1.1, 1), command(1.2, 7)],
-        [Terms(0.0, 1.5, 0.05, 0.3, 0.1), Asked(1.0, 1, 1, "close", "t0"), Answered(1.1, 1), command(1.3, 7)],
+        [Assumptions(0.0, 1.5, 0.05, 0.3, 0.1), Asked(1.0, 1, 1, "close", "t0"), Answered(1.1, 1), command(1.3, 7)],
         [Asked(1.0, 1, 1, "close", "t0"), Unanswered(1.1, 1, "no majority")],
         [Asked(1.0, 1, 1, "close", "t0")],
-        [Calm(0.0, 4.0), Concluded(1.0, "t0", "COMPLETED"), Engaged(5.1, 1, ("t0",))],
+        [FaultFree(0.0, 4.0), OutcomeStored(1.0, "t0", "COMPLETED"), ActiveTasks(5.1, 1, ("t0",))],
     ],
     "E6": [[decided(1, "a", 1.9, holder="b")]],
     "E7": [
@@ -117,13 +119,13 @@ BROKEN: dict[str, list[list[Event]]] = {
         [decided(1, "a"), decided(1, "a", serial=4)],
     ],
     "E8": [
-        [TERMS, Issued(2.0, "t0", 1, 1.9, 1.9)],
-        [Engaged(1.0, 1, ("t0", "t1"))],
-        [Engaged(1.0, 1, ("t0",), ("t0", "t1"))],
+        [TERMS, CommandSent(2.0, "t0", 1, 1.9, 1.9)],
+        [ActiveTasks(1.0, 1, ("t0", "t1"))],
+        [ActiveTasks(1.0, 1, ("t0",), ("t0", "t1"))],
     ],
     "E9": [
-        [TERMS, Reached(1.0, "t0", 1, False), Won(1.8, "t0", 1, 3)],
-        [TERMS, Reached(1.0, "t0", 1, False), command(2.8, 3)],
+        [TERMS, MajorityReachable(1.0, "t0", 1, False), LeaseWon(1.8, "t0", 1, 3)],
+        [TERMS, MajorityReachable(1.0, "t0", 1, False), command(2.8, 3)],
     ],
     "D1": [
         [*write(1.0, 1), *read(2.0, {})],
@@ -142,9 +144,9 @@ BROKEN: dict[str, list[list[Event]]] = {
         ],
     ],
     "D5": [
-        [ONE, Met(1.0, 1, b"ghost", "h:9")],
-        [ONE, Met(1.0, 1, b"p1", "h:1")],
-        [ONE, TWO, Met(1.0, 1, b"p2", "h:9")],
+        [ONE, ContactKnown(1.0, 1, b"ghost", "h:9")],
+        [ONE, ContactKnown(1.0, 1, b"p1", "h:1")],
+        [ONE, TWO, ContactKnown(1.0, 1, b"p2", "h:9")],
     ],
     "D6": [
         [ONE, TWO, Asked(1.0, 1, 1, "look up", b"\3", 8), Answered(1.1, 1, ())],
@@ -152,11 +154,11 @@ BROKEN: dict[str, list[list[Event]]] = {
         [ONE, TWO, Asked(1.0, 1, 1, "look up", b"\3", 8)],
     ],
     "D7": [
-        [ONE, TWO, Counted(1.0, 1, ())],
+        [ONE, TWO, MembersListed(1.0, 1, ())],
         [Settled(1.0), Asked(2.0, 1, 1, "read", b"key", "majority"), Unanswered(2.1, 1, "few", True)],
     ],
     "T1": [
-        [*TAKEN, Voted(2.0, "mark", 2, b"other", b"m2"), Voted(2.0, "mark", 2, b"other", b"m3")],
+        [*TAKEN, VoteAccepted(2.0, "mark", 2, b"other", b"m2"), VoteAccepted(2.0, "mark", 2, b"other", b"m3")],
         [
             *(Asked(1.0, 1, 1, "take", "job"), Answered(1.1, 1, (("job", 1),))),
             *(Asked(2.0, 2, 2, "take", "job"), Answered(2.1, 2, (("job", 1),))),
@@ -173,7 +175,7 @@ BROKEN: dict[str, list[list[Event]]] = {
             *(SURVEY, Answered(5.1, 9, (("job", 1),))),
         ]
     ],
-    "T4": [[Repeated(1.0, ("job", 1), b"taker", b"other")], [Repeated(1.0, ("job", 1), b"taker", None)]],
+    "T4": [[AnswerRepeated(1.0, ("job", 1), b"taker", b"other")], [AnswerRepeated(1.0, ("job", 1), b"taker", None)]],
     "T5": [[*PUT, POSTED, Settled(2.0), SEATED]],
     "T6": [
         [Asked(1.0, 1, 1, "wait", "he"), Asked(2.0, 2, 2, "ring", "bell"), Answered(2.1, 2)],
@@ -181,12 +183,12 @@ BROKEN: dict[str, list[list[Event]]] = {
     ],
     "R1": [[shot("other")], [shot(raised="KeyError()")], [shot(logged="oh")]],
     "R2": [
-        [Ran(1.0, 1, 1, 7), Ran(1.1, 1, 1, 7)],
+        [RequestExecuted(1.0, 1, 1, 7), RequestExecuted(1.1, 1, 1, 7)],
         [Asked(1.0, 1, 2, "run", 7), Answered(1.2, 1, (7, 1, 1, 1))],
-        [Asked(1.0, 1, 2, "run", 7), Ran(1.1, 1, 1, 7), Answered(1.2, 1, (8, 1, 1, 1))],
+        [Asked(1.0, 1, 2, "run", 7), RequestExecuted(1.1, 1, 1, 7), Answered(1.2, 1, (8, 1, 1, 1))],
     ],
-    "R3": [[shot(answers=((True, 11),))], [shot(answers=((False, 1),))], [Strange(1.0, 11, 10)]],
-    "R4": [[Size(1.0, 1, "peers", 11, 10)]],
+    "R3": [[shot(answers=((True, 11),))], [shot(answers=((False, 1),))], [UnvalidatedTraffic(1.0, 11, 10)]],
+    "R4": [[TableSize(1.0, 1, "peers", 11, 10)]],
 }
 """Of each invariant, histories that break it and nothing else."""
 
@@ -199,23 +201,23 @@ LAWFUL: dict[str, list[Event]] = {
     ],
     "members that forget may grant a lower token": [
         TERMS,
-        Won(1.0, "t0", 1, 5),
+        LeaseWon(1.0, "t0", 1, 5),
         Died(1.5, 3, True),
-        Won(2.0, "t0", 2, 1),
+        LeaseWon(2.0, "t0", 2, 1),
     ],
     "a robot that was told to stop has come to rest": [
         TERMS,
         command(1.0, 1),
-        Halted(1.5, "t0", 1, 1.8),
-        Held(1.9, "t0", 2),
+        RobotStopped(1.5, "t0", 1, 1.8),
+        LeaseHeld(1.9, "t0", 2),
     ],
-    "clocks that are further off may overlap": [Terms(0.0, 1.5, 0.05, 0.0, 0.1), Held(1.0, "t0", 1, (2,))],
-    "another acts in time": [Awaited(1.0, "t0", "1 is gone", 3, 1.0, 2.0), command(2.9, 4)],
+    "clocks that are further off may overlap": [Assumptions(0.0, 1.5, 0.05, 0.0, 0.1), LeaseHeld(1.0, "t0", 1, (2,))],
+    "another acts in time": [CommandExpected(1.0, "t0", "1 is gone", 3, 1.0, 2.0), command(2.9, 4)],
     "who is reached again may win": [
         TERMS,
-        Reached(1.0, "t0", 1, False),
-        Reached(2.0, "t0", 1, True),
-        Won(4.0, "t0", 1, 3),
+        MajorityReachable(1.0, "t0", 1, False),
+        MajorityReachable(2.0, "t0", 1, True),
+        LeaseWon(4.0, "t0", 1, 3),
     ],
     "a write that nobody acknowledged may be absent": [*write(1.0, 1, False), *read(2.0, {})],
     "and it may be there": [*write(1.0, 1, False), *read(2.0, {SLOT: 1})],
@@ -233,25 +235,25 @@ LAWFUL: dict[str, list[Event]] = {
         Asked(2.0, 1, 1, "read", b"key", "majority"),
         Unanswered(2.1, 1, "few", True),
     ],
-    "the dead are not counted": [ONE, TWO, Died(1.0, 2), Counted(2.0, 1, ())],
+    "the dead are not counted": [ONE, TWO, Died(1.0, 2), MembersListed(2.0, 1, ())],
     "a take that is not confirmed may have happened": [
         *TAKEN,
         *(Asked(1.0, 5, 1, "take", "job"), Unanswered(2.0, 5, "silence"), *PUT, SURVEY, Answered(5.1, 9, ())),
     ],
     "votes of two ballots do not add up": [
-        *(POSTED, Voted(1.0, "mark", 1, b"taker", b"m1"), Voted(2.0, "mark", 2, b"taker", b"m2")),
-        *(Voted(3.0, "mark", 3, b"other", b"m2"), Voted(3.0, "mark", 3, b"other", b"m3")),
+        *(POSTED, VoteAccepted(1.0, "mark", 1, b"taker", b"m1"), VoteAccepted(2.0, "mark", 2, b"taker", b"m2")),
+        *(VoteAccepted(3.0, "mark", 3, b"other", b"m2"), VoteAccepted(3.0, "mark", 3, b"other", b"m3")),
     ],
-    "a council that has forgotten cannot decide": [*PUT, POSTED, Settled(2.0), Seated(9.0, ((b"m1", b"i"),))],
+    "a council that has forgotten cannot decide": [*PUT, POSTED, Settled(2.0), LivingMembers(9.0, ((b"m1", b"i"),))],
     "who died waits no more": [
         *(Asked(1.0, 1, 1, "wait", "he"), Unanswered(1.5, 1, "it died")),
         *(Asked(2.0, 2, 2, "ring", "bell"), Answered(2.1, 2)),
     ],
-    "another life may run a question again": [Ran(1.0, 1, 1, 7), Ran(2.0, 1, 2, 7)],
+    "another life may run a question again": [RequestExecuted(1.0, 1, 1, 7), RequestExecuted(2.0, 1, 2, 7)],
     "an answer as long as the question": [
         shot(answers=((True, 10),)),
-        Strange(1.0, 10, 10),
-        Size(1.0, 1, "peers", 10, 10),
+        UnvalidatedTraffic(1.0, 10, 10),
+        TableSize(1.0, 1, "peers", 10, 10),
     ],
     "of other reports another may be named": [decided(1, "a"), decided(2, "b", 2.5)],
 }
@@ -263,7 +265,7 @@ class CheckerTests(SynchronousTestCase):
         """Each history in ``BROKEN`` violates its invariant and no other."""
         for name, histories in BROKEN.items():
             for history in histories:
-                found = {line.partition(":")[0] for line in check(history)}
+                found = {line.partition(":")[0] for line in find_violations(history)}
                 self.assertEqual(found, {name}, history)
 
     def test_none_is_forgotten(self) -> None:
@@ -272,11 +274,11 @@ class CheckerTests(SynchronousTestCase):
 
     def test_lawful(self) -> None:
         """Valid histories that resemble violations pass."""
-        self.assertEqual({why: found for why, history in LAWFUL.items() if (found := check(history))}, {})
+        self.assertEqual({why: found for why, history in LAWFUL.items() if (found := find_violations(history))}, {})
 
     def test_no_line_twice(self) -> None:
         """A violation that repeats in the same way is reported once."""
-        self.assertEqual(len(check([TERMS, *[Held(1.0, "t0", 1, (2,))] * 3])), 1)
+        self.assertEqual(len(find_violations([TERMS, *[LeaseHeld(1.0, "t0", 1, (2,))] * 3])), 1)
 
 
 class HistoryTests(SynchronousTestCase):
@@ -284,9 +286,9 @@ class HistoryTests(SynchronousTestCase):
         """Return a history with one operation."""
         moments = iter([1.0, 2.0, 2.5])
         history = History(lambda: next(moments))
-        number = history.asked("client", "put", ("job", 1))
-        history.note(Died, 3)
-        history.answered(number, result)
+        number = history.record_request("client", "put", ("job", 1))
+        history.record(Died, 3)
+        history.record_answer(number, result)
         return history
 
     def test_order(self) -> None:

@@ -58,8 +58,8 @@ class ClientTests(SynchronousTestCase):
             self.clients.write(2, self.node, KEY, name, act=act)
         self.assertEqual(self.peer.puts, [b"1", b"1", b"3"])
         self.assertEqual(self.history.events[2:4], [Asked(1.0, 2, 2, REMOVE, self.slot, 2), Answered(1.0, 2)])
-        self.assertEqual([slot.name for slot in self.clients.slots(self.slot.owner)], ["a", "b"])
-        self.assertEqual(self.clients.slots(b"somebody else"), [])
+        self.assertEqual([slot.name for slot in self.clients.list_slots(self.slot.owner)], ["a", "b"])
+        self.assertEqual(self.clients.list_slots(b"somebody else"), [])
 
     def test_reads(self) -> None:
         """A read returns the records, and the history contains the number in each slot, 0 for an empty slot."""
@@ -80,4 +80,4 @@ class ClientTests(SynchronousTestCase):
         self.assertEqual(self.successResultOf(self.clients.read(2, 1, self.node, KEY)), [])
         gaps = [event.is_unavailable for event in self.history if isinstance(event, Unanswered)]
         self.assertEqual(gaps, [False, True])
-        self.assertEqual((self.clients.asked, dict(self.clients.answered)), ({WRITE: 1, READ: 1}, {}))
+        self.assertEqual((self.clients.request_counts, dict(self.clients.answer_counts)), ({WRITE: 1, READ: 1}, {}))

@@ -10,7 +10,7 @@ from xml.etree import ElementTree
 from twisted.trial.unittest import SynchronousTestCase
 
 from middleware.errors import BadSetting
-from sim.team.command import ENDED, KINDS, MISSED, Environment, run
+from sim.team.command import EXIT_INTERRUPTED, EXIT_MISSED, KINDS, Environment, run
 from sim.team.report import Trace
 
 SCENARIO = """
@@ -84,7 +84,7 @@ class CommandTests(SynchronousTestCase):
     def test_missed_target_fails(self) -> None:
         """A missed target is reported and sets the exit code."""
         text = SCENARIO + '[targets]\n"nodes" = ">= 5"\n'
-        self.assertEqual(self.run_it(text=text), MISSED)
+        self.assertEqual(self.run_it(text=text), EXIT_MISSED)
         self.assertIn("MISSED    nodes: >= 5", self.out.getvalue())
 
     def test_target_without_figure_is_refused(self) -> None:
@@ -102,7 +102,7 @@ class CommandTests(SynchronousTestCase):
         """An interrupted run leaves a report as text, JSON, trace and picture, each marked as partial."""
         files = [str(self.folder / name) for name in ("r.json", "t.jsonl", "p.svg")]
         code = self.run_it("--json", files[0], "--trace", files[1], "--picture", files[2], stop_after=3)
-        self.assertEqual(code, ENDED)
+        self.assertEqual(code, EXIT_INTERRUPTED)
         self.assertIn("PARTIAL   ended while joining, after 0.9 s", self.out.getvalue())
         report = json.loads(Path(files[0]).read_text())
         self.assertEqual((report["partial"], report["phase"]), (True, "joining"))
@@ -139,9 +139,9 @@ class TraceTests(SynchronousTestCase):
         out = io.StringIO()
         trace = Trace(out, 2)
         trace.begin(seed=3)
-        trace.told(1.25, "born", 0, "")
-        trace.told(2.0, "fault", -1, "1: crash")
-        trace.told(3.0, "killed", 0, "")
+        trace.write_event(1.25, "born", 0, "")
+        trace.write_event(2.0, "fault", -1, "1: crash")
+        trace.write_event(3.0, "killed", 0, "")
         trace.end(partial=False)
         self.assertEqual(
             [json.loads(line) for line in out.getvalue().splitlines()],

@@ -9,7 +9,7 @@ from statistics import fmean
 from twisted.trial.unittest import SynchronousTestCase
 
 from middleware.entangled.network.network import Address
-from sim.team.faults.barrier import clog, cut, deaf, mute, pairs
+from sim.team.faults.barrier import block_host, block_incoming, block_outgoing, block_pairs, isolate
 from sim.team.link import LinkSettings, TeamLink
 
 NODES = [Address(f"10.0.0.{number}", 7000) for number in range(200)]
@@ -18,7 +18,7 @@ A, B, C = NODES[:3]
 
 def _sent(link: TeamLink, count: int, gap: float = 0.001, source: Address = A, to: Address = B) -> list[list[float]]:
     rng = random.Random(1)
-    return [list(link.delays(source, to, 100, turn * gap, rng)) for turn in range(count)]
+    return [list(link.draw_delays(source, to, 100, turn * gap, rng)) for turn in range(count)]
 
 
 class TeamLinkTests(SynchronousTestCase):
@@ -74,15 +74,17 @@ class TeamLinkTests(SynchronousTestCase):
         sent = _sent(link, 10, gap=0.0)
         self.assertEqual([round(delays[0], 3) for delays in sent[:6]], [0.1, 0.2, 0.3, 0.4, 0.5, 0.6])
         self.assertEqual(sent[6:], [[]] * 4)
-        self.assertEqual(len(link.delays(B, A, 100, 0.0, random.Random(1))), 1, "another sender has a line of its own")
-        self.assertApproximates(link.delays(A, B, 100, 10.0, random.Random(1))[0], 0.1, 1e-9)
+        self.assertEqual(
+            len(link.draw_delays(B, A, 100, 0.0, random.Random(1))), 1, "another sender has a line of its own"
+        )
+        self.assertApproximates(link.draw_delays(A, B, 100, 10.0, random.Random(1))[0], 0.1, 1e-9)
 
     def test_bad_weather_is_lost_besides(self) -> None:
         """``worse`` adds loss while it is set."""
         link = TeamLink(LinkSettings("lan"), "1")
-        link.worse = 0.5
+        link.extra_loss = 0.5
         self.assertApproximates(sum(not delays for delays in _sent(link, 4000)) / 4000, 0.5, 0.03)
-        link.worse = 0.0
+        link.extra_loss = 0.0
         self.assertTrue(all(_sent(link, 100)))
 
 
@@ -92,10 +94,10 @@ class BarrierTests(SynchronousTestCase):
     def test_each_kind_stops_what_it_should(self) -> None:
         """``cut`` blocks both directions at the edge of a group, ``deaf`` and ``mute`` one, ``clog`` one host."""
         table = {
-            cut([A.host, B.host]): {(A, C), (C, A), (B, C), (C, B)},
-            deaf([A.host, B.host]): {(C, A), (C, B)},
-            mute([A.host, B.host]): {(A, C), (B, C)},
-            clog(A.host): {(A, B), (B, A), (A, C), (C, A)},
+            isolate([A.host, B.host]): {(A, C), (C, A), (B, C), (C, B)},
+            block_incoming([A.host, B.host]): {(C, A), (C, B)},
+            block_outgoing([A.host, B.host]): {(A, C), (B, C)},
+            block_host(A.host): {(A, B), (B, A), (A, C), (C, A)},
         }
         for barrier, stopped in table.items():
             found = {(x, y) for x in (A, B, C) for y in (A, B, C) if x != y and barrier(x, y)}
@@ -104,7 +106,7 @@ class BarrierTests(SynchronousTestCase):
     def test_pairs_are_a_share_and_the_same_both_ways(self) -> None:
         """``pairs`` cuts the given share of all pairs in both directions, and other pairs with another salt."""
         nodes = NODES[:150]
-        barrier, other = pairs(0.05, "1"), pairs(0.05, "2")
+        barrier, other = block_pairs(0.05, "1"), block_pairs(0.05, "2")
         cut_off = [(a, b) for a, b in combinations(nodes, 2) if barrier(a, b)]
         self.assertApproximates(len(cut_off) / (150 * 149 / 2), 0.05, 0.01)
         self.assertTrue(all(barrier(b, a) for a, b in cut_off))

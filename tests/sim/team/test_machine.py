@@ -11,7 +11,7 @@ from zope.interface.verify import verifyObject
 
 from middleware.entangled.clock import HeapClock
 from middleware.entangled.network.switchboard import Switchboard
-from sim.team.machine import MOST_WAITING, Machine, MachineNetwork
+from sim.team.machine import MAX_QUEUED_DATAGRAMS, Machine, MachineNetwork
 
 
 class MachineTests(SynchronousTestCase):
@@ -56,9 +56,9 @@ class MachineTests(SynchronousTestCase):
         """A frozen machine runs nothing; after the thaw overdue timers run in order, then datagrams arrive."""
         board = Switchboard(self.world, random.Random(1))
         machine = Machine(self.world)
-        network = MachineNetwork(machine, board.network("10.0.0.1", 7000))
+        network = MachineNetwork(machine, board.make_network("10.0.0.1", 7000))
         network.listen(lambda datagram, source: self.seen.append(datagram))
-        other = board.network("10.0.0.2", 7000)
+        other = board.make_network("10.0.0.2", 7000)
         other.listen(lambda datagram, source: None)
         machine.freeze()
         machine.callLater(2.0, self.seen.append, "second")
@@ -94,17 +94,17 @@ class MachineTests(SynchronousTestCase):
             self.world.advance(3.0)
             self.assertEqual(machine.seconds(), shown)
             machine.thaw()
-            self.assertEqual((machine.seconds(), machine.at(shown + 2.0)), (shown, 5.0))
-            self.assertEqual(machine.unstopped_at(shown), shown / 2.0)
+            self.assertEqual((machine.seconds(), machine.to_simulator_time(shown + 2.0)), (shown, 5.0))
+            self.assertEqual(machine.to_unsuspended_time(shown), shown / 2.0)
 
     def test_buffer_holds_so_many_datagrams(self) -> None:
         """A frozen machine buffers the first ``MOST_WAITING`` datagrams and drops the rest."""
         machine = Machine(self.world)
         machine.freeze()
-        for number in range(MOST_WAITING + 50):
-            machine.take(lambda datagram, source: self.seen.append(datagram), b"%d" % number, None)
+        for number in range(MAX_QUEUED_DATAGRAMS + 50):
+            machine.deliver_datagram(lambda datagram, source: self.seen.append(datagram), b"%d" % number, None)
         machine.thaw()
-        self.assertEqual((len(self.seen), self.seen[0]), (MOST_WAITING, b"0"))
+        self.assertEqual((len(self.seen), self.seen[0]), (MAX_QUEUED_DATAGRAMS, b"0"))
 
     def test_dead_machine_does_nothing(self) -> None:
         """Timers of a dead machine never run, even if the machine was frozen."""

@@ -8,7 +8,15 @@ from twisted.trial.unittest import SynchronousTestCase
 
 from middleware.errors import BadSetting
 from sim.team.faults.settings import Fault
-from sim.team.memory import BASE, KIB, NO_LIMIT, check, foreseen, free, resident
+from sim.team.memory import (
+    BASE_BYTES,
+    KIB_PER_NODE,
+    NO_LIMIT_BYTES,
+    check_memory,
+    estimate_bytes,
+    measure_free_bytes,
+    measure_resident_bytes,
+)
 from sim.team.scenario import Scenario
 
 MEMINFO = "MemTotal: 8000000 kB\nMemAvailable:    4000000 kB\n"
@@ -29,7 +37,7 @@ class MemoryTests(SynchronousTestCase):
     def test_machine_and_groups_set_the_limit(self) -> None:
         """The limit is the minimum of the free memory and of each cgroup, v1 or v2; ``max`` is no limit."""
         files = {"/proc/meminfo": MEMINFO}
-        self.assertEqual(free(_machine(files)), 4_000_000 * 1024)
+        self.assertEqual(measure_free_bytes(_machine(files)), 4_000_000 * 1024)
         files |= {
             "/proc/self/cgroup": "0::/team/run\n",
             "/sys/fs/cgroup/team/run/memory.max": "max",
@@ -37,26 +45,28 @@ class MemoryTests(SynchronousTestCase):
             "/sys/fs/cgroup/team/memory.max": "1000",
             "/sys/fs/cgroup/team/memory.current": "300",
         }
-        self.assertEqual(free(_machine(files)), 700)
+        self.assertEqual(measure_free_bytes(_machine(files)), 700)
         files["/proc/self/cgroup"] = "3:cpu,cpuacct:/\n5:memory:/box\n"
         files["/sys/fs/cgroup/memory/box/memory.limit_in_bytes"] = "500"
         files["/sys/fs/cgroup/memory/box/memory.usage_in_bytes"] = "600"
-        self.assertEqual(free(_machine(files)), 0)
-        self.assertEqual(free(_machine({})), NO_LIMIT)
+        self.assertEqual(measure_free_bytes(_machine(files)), 0)
+        self.assertEqual(measure_free_bytes(_machine({})), NO_LIMIT_BYTES)
 
     def test_team_that_does_not_fit_is_refused(self) -> None:
         """The error names a number of nodes that fits; nodes that join during the run count as well."""
         files = {"/proc/meminfo": MEMINFO}
-        check(Scenario(nodes=10_000), _machine(files))
-        error = self.assertRaises(BadSetting, check, Scenario(nodes=20_000), _machine(files))
+        check_memory(Scenario(nodes=10_000), _machine(files))
+        error = self.assertRaises(BadSetting, check_memory, Scenario(nodes=20_000), _machine(files))
         self.assertEqual(error.key, "--nodes")
         fit = int(error.remedy.split()[3].rstrip(",").replace(",", ""))
-        check(Scenario(nodes=fit), _machine(files))
-        self.assertRaises(BadSetting, check, Scenario(nodes=fit + 50), _machine(files))
+        check_memory(Scenario(nodes=fit), _machine(files))
+        self.assertRaises(BadSetting, check_memory, Scenario(nodes=fit + 50), _machine(files))
         crowd = Scenario(nodes=10, faults=(Fault("crowd", 1.0, count=90),))
-        self.assertEqual(foreseen(crowd), BASE + 100 * KIB["entangled"] * 1024)
+        self.assertEqual(estimate_bytes(crowd), BASE_BYTES + 100 * KIB_PER_NODE["entangled"] * 1024)
 
     def test_own_size_is_read(self) -> None:
         """The memory of the process is reported in bytes, or as 0 if the system does not report it."""
-        self.assertEqual(resident(_machine({"/proc/self/status": "Name: x\nVmRSS:\t  100 kB\n"})), 102_400)
-        self.assertEqual(resident(_machine({})), 0)
+        self.assertEqual(
+            measure_resident_bytes(_machine({"/proc/self/status": "Name: x\nVmRSS:\t  100 kB\n"})), 102_400
+        )
+        self.assertEqual(measure_resident_bytes(_machine({})), 0)

@@ -8,14 +8,14 @@ from twisted.logger import Logger
 from twisted.python.failure import Failure
 from twisted.trial.unittest import SynchronousTestCase
 
-from sim.team.disk import Disk
+from sim.team.disk import SimulatedDisk
 from sim.team.faults.settings import Fault
-from sim.team.figure import Bound, Figure
 from sim.team.link import LinkSettings
+from sim.team.metric import Bound, Metric
 from sim.team.run import DONE, JOINING, RUNNING, Run
 from sim.team.scenario import Clocks, Join, Scenario, Sessions
 from sim.team.team import Team
-from sim.team.workload import Kind, Workload
+from sim.team.workload import Workload, WorkloadKind
 
 
 @dataclass(frozen=True)
@@ -36,21 +36,21 @@ class _Steps(Workload):
     def step(self) -> None:
         self.steps.append(self.team.clock.seconds())
 
-    def settled(self) -> None:
+    def make_final_requests(self) -> None:
         self.settled_at = self.team.clock.seconds()
 
-    def verdict(self) -> list[str]:
+    def find_violations(self) -> list[str]:
         return list(self.found)
 
-    def figures(self) -> list[Figure]:
-        return [Figure("steps", len(self.steps))]
+    def collect_metrics(self) -> list[Metric]:
+        return [Metric("steps", len(self.steps))]
 
 
 class _Finds(_Steps):
     found = ("E1: something is wrong",)
 
 
-KINDS = {"steps": Kind(_Nothing, _Steps), "finds": Kind(_Nothing, _Finds)}
+KINDS = {"steps": WorkloadKind(_Nothing, _Steps), "finds": WorkloadKind(_Nothing, _Finds)}
 JOIN = Join(pause=0.2, settle=1.0)
 BASE = Scenario(nodes=6, seconds=10.0, join=JOIN, loads=(("steps", _Nothing()),))
 
@@ -62,15 +62,15 @@ class RunTests(SynchronousTestCase):
         """Run a scenario to its end; return the run and the events since the team was complete."""
         run = Run(scenario, seed, KINDS)
         told: list[tuple[float, str, int]] = []
-        run.team.told.append(lambda now, event, place, more: told.append((now, event, place)))
-        run.go()
+        run.team.event_listeners.append(lambda now, event, place, more: told.append((now, event, place)))
+        run.run()
         began = run.began_at or 0.0
         return run, [(round(now - began, 6), event, place) for now, event, place in told if now >= began]
 
     def test_workloads_act_while_it_lasts(self) -> None:
         """Workloads step at the scenario's pace, learn the end of the repair, and are compared to the targets."""
         run = Run(replace(BASE, repair=5.0, targets=(("steps", Bound(19)),)), 1, KINDS)
-        outcome = run.go()
+        outcome = run.run()
         workload = run.workloads[0][1]
         assert isinstance(workload, _Steps) and run.began_at is not None
         self.assertEqual([round(at - run.began_at, 3) for at in workload.steps], [n / 2 for n in range(20)])
@@ -82,7 +82,7 @@ class RunTests(SynchronousTestCase):
     def test_workloads_wait_for_their_lead(self) -> None:
         """With a lead the workloads start after it."""
         run = Run(replace(BASE, lead=7.5), 1, KINDS)
-        run.go()
+        run.run()
         workload = run.workloads[0][1]
         assert isinstance(workload, _Steps) and run.began_at is not None
         self.assertEqual(round(workload.steps[0] - run.began_at, 3), 7.5)
@@ -91,14 +91,14 @@ class RunTests(SynchronousTestCase):
     def test_violations_and_unknown_targets_are_told(self) -> None:
         """The outcome lists the violations of workloads; a target without a measurement is a violation as well."""
         scenario = replace(BASE, loads=(("finds", _Nothing()),), targets=(("stops", Bound(1)),))
-        found = Run(scenario, 1, KINDS).go().violations
+        found = Run(scenario, 1, KINDS).run().violations
         self.assertEqual(found, ["targets: nothing measured 'stops'; there are steps", "E1: something is wrong"])
 
     def test_it_can_be_ended_at_any_moment(self) -> None:
         """A run that ends early, while nodes join or while it runs, has a partial outcome."""
         for end, phase in ((0.5, JOINING), (6.0, RUNNING)):
             run = Run(BASE, 1, KINDS, lambda run, end=end: run.team.clock.seconds() >= end)  # type: ignore[misc]
-            outcome = run.go()
+            outcome = run.run()
             self.assertEqual((outcome.phase, outcome.is_partial), (phase, True))
             self.assertLess(outcome.seconds, end + 0.5)
             self.assertEqual(len(outcome.digest), 32)
@@ -118,25 +118,25 @@ class RunTests(SynchronousTestCase):
                 real[0] += 0.6 if is_slow and real[0] < 6.0 else 0.0
                 return real[0]
 
-            digests.append(Run(replace(BASE, seconds=1.0), 1, KINDS, watched=look, seconds=seconds).go().digest)
+            digests.append(Run(replace(BASE, seconds=1.0), 1, KINDS, watched=look, seconds=seconds).run().digest)
         self.assertEqual(digests[0], digests[1])
         gaps = [min(b - a for a, b in zip(seen, seen[1:], strict=False) if b > a) for seen in watched.values()]
         self.assertEqual(gaps[1] < 0.01 < gaps[0], True, gaps)
-        end = Run(BASE, 1, KINDS, watched=lambda run: run.team.clock.seconds() > 0.1, seconds=lambda: 0.0).go()
+        end = Run(BASE, 1, KINDS, watched=lambda run: run.team.clock.seconds() > 0.1, seconds=lambda: 0.0).run()
         self.assertTrue(end.is_partial)
 
     def test_who_is_not_in_is_a_violation(self) -> None:
         """A node that does not join within the time limit is a violation."""
         link = LinkSettings("none", loss=0.9)
         scenario = replace(BASE, link=link, join=replace(JOIN, within=1.0), seconds=0.0)
-        self.assertIn("nodes have not joined", Run(scenario, 1, KINDS).go().violations[0])
+        self.assertIn("nodes have not joined", Run(scenario, 1, KINDS).run().violations[0])
 
     def test_exception_is_a_violation(self) -> None:
         """An exception in a call and a logged failure are violations, and do not end the run."""
         run = Run(BASE, 1, KINDS)
-        run.team.at(3.0, lambda: 1 // 0)
-        run.team.at(4.0, lambda: Logger().failure("a node's own", Failure(KeyError("x"))))
-        outcome = run.go()
+        run.team.schedule(3.0, lambda: 1 // 0)
+        run.team.schedule(4.0, lambda: Logger().failure("a node's own", Failure(KeyError("x"))))
+        outcome = run.run()
         self.assertFalse(outcome.is_partial)
         self.assertEqual(
             [line.rpartition(":")[0] for line in outcome.violations],
@@ -164,17 +164,17 @@ class RunTests(SynchronousTestCase):
         run, told = self.told(replace(BASE, nodes=8, faults=faults, repair=60.0))
         team = run.team
         self.assertEqual(len([1 for _, event, _ in told if event == "fault"]), len(faults))
-        self.assertEqual((team.alive(), sorted(team.inside())), (list(range(10)), list(range(10))))
-        self.assertEqual(team.board.barriers, [])
-        self.assertAlmostEqual(team.link.worse, 0.0)
+        self.assertEqual((team.alive(), sorted(team.get_joined())), (list(range(10)), list(range(10))))
+        self.assertEqual(team.switchboard.barriers, [])
+        self.assertAlmostEqual(team.link.extra_loss, 0.0)
         for place in team.places:
-            here = team.place(place)
+            here = team.get_state(place)
             assert here.machine is not None
-            self.assertFalse(here.machine.is_still)
+            self.assertFalse(here.machine.is_frozen)
             self.assertAlmostEqual(here.rate, 1.0)
-            self.assertAlmostEqual(here.step, 0.0)
-            self.assertEqual(here.store.trouble, "")
-        known = [len(team.entangled(place).overlay.contacts()) for place in team.alive()]
+            self.assertAlmostEqual(here.wall_error, 0.0)
+            self.assertEqual(here.store.write_error, "")
+        known = [len(team.get_entangled(place).overlay.contacts()) for place in team.alive()]
         self.assertEqual(known, [9] * 10)
 
     def test_what_lasts_ends_at_its_time(self) -> None:
@@ -186,13 +186,20 @@ class RunTests(SynchronousTestCase):
         seen: dict[float, tuple[object, ...]] = {}
 
         def looked(run: Run) -> bool:
-            here, at = run.team.place(1), run.team.clock.seconds() - (run.began_at or 99.0)
-            if here.machine is not None and isinstance(here.store, Disk):
-                still, full = here.machine.is_still, here.store.is_full
-                seen[at] = len(run.team.board.barriers), run.team.link.worse, still, here.rate, full, here.step
+            here, at = run.team.get_state(1), run.team.clock.seconds() - (run.began_at or 99.0)
+            if here.machine is not None and isinstance(here.store, SimulatedDisk):
+                still, full = here.machine.is_frozen, here.store.is_full
+                seen[at] = (
+                    len(run.team.switchboard.barriers),
+                    run.team.link.extra_loss,
+                    still,
+                    here.rate,
+                    full,
+                    here.wall_error,
+                )
             return False
 
-        Run(replace(BASE, faults=faults), 1, KINDS, looked).go()
+        Run(replace(BASE, faults=faults), 1, KINDS, looked).run()
         calm, bad = (0, 0.0, False, 1.0, False, 0.0), (1, 0.25, True, 1.5, True, -60.0)
         self.assertEqual({seen[at] for at in seen if 0 <= at < 1.9 or at > 5.1}, {calm})
         self.assertEqual({seen[at] for at in seen if 2.1 < at < 4.9}, {bad})
@@ -209,9 +216,9 @@ class RunTests(SynchronousTestCase):
         sessions = Sessions("exponential", 10.0, 2.0)
         run, told = self.told(replace(BASE, nodes=12, seconds=60.0, sessions=sessions))
         ended = [event for _, event, _ in told if event == "killed"]
-        stays = sessions.stays
+        stays = sessions.session_durations
         assert stays is not None
-        expected = 12 * 60.0 / (stays.mean + sessions.breaks.mean)
+        expected = 12 * 60.0 / (stays.mean + sessions.absence_durations.mean)
         self.assertApproximates(len(ended) / expected, 1.0, 0.35)
         self.assertGreaterEqual(len(run.team.living), 2)
         self.assertGreater(len([1 for _, event, _ in told if event == "born"]), 0.7 * len(ended))
@@ -220,7 +227,7 @@ class RunTests(SynchronousTestCase):
         """With ``same`` false another node takes the place of a node that left."""
         run = Run(replace(BASE, seconds=40.0, sessions=Sessions("fixed", 15.0, 2.0, 0.5, same=False)), 1, KINDS)
         before = [run.team.identity(place) for place in range(6)]
-        run.go()
+        run.run()
         self.assertTrue(all(run.team.identity(place) != before[place] for place in range(6)))
 
     def test_same_seed_gives_the_same_hash(self) -> None:
@@ -233,6 +240,6 @@ class RunTests(SynchronousTestCase):
             faults=(Fault("freeze", 1.0, lasts=3.0, count=2), Fault("cut", 5.0, lasts=3.0, share=0.4)),
             repair=5.0,
         )
-        hashes = [Run(scenario, seed, KINDS).go().digest for seed in (5, 5, 6)]
+        hashes = [Run(scenario, seed, KINDS).run().digest for seed in (5, 5, 6)]
         self.assertEqual(hashes[0], hashes[1])
         self.assertNotEqual(hashes[0], hashes[2])

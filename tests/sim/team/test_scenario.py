@@ -12,9 +12,9 @@ from msgspec import Meta
 from twisted.trial.unittest import SynchronousTestCase
 
 from middleware.errors import BadSetting
-from sim.team import session
+from sim.team import durations
 from sim.team.command import KINDS
-from sim.team.scenario import FOLDER, Scenario, loaded, names, scenario_of
+from sim.team.scenario import FOLDER, Scenario, list_names, load_scenario, parse_scenario
 
 
 @dataclass(frozen=True)
@@ -107,7 +107,7 @@ WRONG = {
 
 
 def _read(text: str, **changes: object) -> Scenario:
-    return scenario_of(text, "bad.toml", "bad", SETTINGS, changes)
+    return parse_scenario(text, "bad.toml", "bad", SETTINGS, changes)
 
 
 class ScenarioTests(SynchronousTestCase):
@@ -121,7 +121,7 @@ class ScenarioTests(SynchronousTestCase):
         self.assertEqual(scenario.faults[1].places, (0, 3))
         self.assertEqual(scenario.loads, (("lookups", _Load(2.0)),))
         self.assertEqual([(name, str(bound)) for name, bound in scenario.targets], [("hops", "<= 5")])
-        self.assertEqual(scenario.sessions.stays, None)
+        self.assertEqual(scenario.sessions.session_durations, None)
 
     def test_wrong_values_are_named_with_their_line(self) -> None:
         """Each invalid value is rejected with file, line, key and a remedy."""
@@ -166,9 +166,9 @@ class ScenarioTests(SynchronousTestCase):
 
     def test_scenarios_that_ship_are_lawful(self) -> None:
         """Each scenario in the package is valid and has a description."""
-        self.assertIn("steady", names())
-        for name in names():
-            self.assertTrue(loaded(name, {name: kind.settings for name, kind in KINDS.items()}).about, name)
+        self.assertIn("steady", list_names())
+        for name in list_names():
+            self.assertTrue(load_scenario(name, {name: kind.settings for name, kind in KINDS.items()}).about, name)
 
     def test_example_of_the_document_is_lawful(self) -> None:
         """The scenario in docs/how-to/simulate-teams.md is valid."""
@@ -176,12 +176,12 @@ class ScenarioTests(SynchronousTestCase):
         found = re.findall(r"```toml\n(.*?)```", document, re.DOTALL)
         self.assertEqual(len(found), 1)
         sorts = {name: kind.settings for name, kind in KINDS.items()}
-        self.assertEqual(len(scenario_of(found[0], "docs/how-to/simulate-teams.md", "example", sorts).faults), 1)
+        self.assertEqual(len(parse_scenario(found[0], "docs/how-to/simulate-teams.md", "example", sorts).faults), 1)
 
     def test_unknown_names_are_refused_with_the_nearest(self) -> None:
         """An unknown name is rejected with the nearest name, and an unreadable file is rejected."""
-        self.assertIn("steady", self.assertRaises(BadSetting, loaded, "stedy", {}).remedy)
-        self.assertIn("cannot be read", self.assertRaises(BadSetting, loaded, "/nowhere/x.toml", {}).problem)
+        self.assertIn("steady", self.assertRaises(BadSetting, load_scenario, "stedy", {}).remedy)
+        self.assertIn("cannot be read", self.assertRaises(BadSetting, load_scenario, "/nowhere/x.toml", {}).problem)
 
 
 class SessionTests(SynchronousTestCase):
@@ -189,22 +189,22 @@ class SessionTests(SynchronousTestCase):
 
     def test_half_of_them_are_shorter_than_the_median(self) -> None:
         """Random durations have the expected median and mean."""
-        for kind in session.KINDS:
-            stays, rng = session.Session(kind, 60.0), random.Random(1)
-            drawn = [stays.drawn(rng) for _ in range(40_000)]
+        for kind in durations.KINDS:
+            stays, rng = durations.DurationDistribution(kind, 60.0), random.Random(1)
+            drawn = [stays.draw(rng) for _ in range(40_000)]
             self.assertApproximates(median(drawn), 60.0, 2.0, kind)
             self.assertApproximates(fmean(drawn) / stays.mean, 1.0, 0.06, kind)
 
     def test_rate_of_leaving_is_the_same_from_the_start(self) -> None:
         """Sessions that are already under way end at a constant rate from the start: n / mean per second."""
-        for kind in session.KINDS:
-            stays, rng = session.Session(kind, 60.0), random.Random(2)
+        for kind in durations.KINDS:
+            stays, rng = durations.DurationDistribution(kind, 60.0), random.Random(2)
             ends = []
             for _ in range(20_000):
-                moment = stays.left(rng)
+                moment = stays.draw_remaining(rng)
                 while moment < 60.0:
                     ends.append(moment)
-                    moment += stays.drawn(rng)
+                    moment += stays.draw(rng)
             expected = 20_000 / stays.mean * 20.0
             for start in (0.0, 20.0, 40.0):
                 count = sum(start <= moment < start + 20 for moment in ends)

@@ -8,7 +8,7 @@ from collections.abc import Iterator
 
 from twisted.trial.unittest import SynchronousTestCase
 
-from sim.team.shrink import WHOLE, Trim, fewest, shrunk
+from sim.team.reduction import NO_REDUCTION, Reduction, minimize, reduce_run
 
 
 class FewestTests(SynchronousTestCase):
@@ -23,7 +23,7 @@ class FewestTests(SynchronousTestCase):
                 next(tries)
                 return needed <= set(kept)
 
-            self.assertEqual(set(fewest(range(16), fails)), needed)
+            self.assertEqual(set(minimize(range(16), fails)), needed)
             self.assertLess(next(tries), 60)
 
     def test_none_can_be_dropped(self) -> None:
@@ -32,7 +32,7 @@ class FewestTests(SynchronousTestCase):
         def fails(kept: tuple[int, ...]) -> bool:
             return {1, 2} <= set(kept) or {5, 6, 7} <= set(kept)
 
-        found = fewest(range(8), fails)
+        found = minimize(range(8), fails)
         self.assertTrue(fails(found))
         self.assertFalse(any(fails(tuple(set(found) - {number})) for number in found))
 
@@ -41,21 +41,23 @@ class ShrunkTests(SynchronousTestCase):
     def test_all_that_can_go_goes(self) -> None:
         """Faults, link impairments, workloads and seconds that the failure does not need are removed."""
 
-        def fails(trim: Trim) -> bool:
-            is_long = trim.within(20.0) >= 5.0
+        def fails(trim: Reduction) -> bool:
+            is_long = trim.limit_duration(20.0) >= 5.0
             return trim.keeps(3) and is_long and (not trim.only or "records" in trim.only)
 
-        found = shrunk(WHOLE, 5, ["records", "wire"], 20.0, fails)
-        self.assertEqual(found, Trim((3,), True, ("records",), 5.0))
+        found = reduce_run(NO_REDUCTION, 5, ["records", "wire"], 20.0, fails)
+        self.assertEqual(found, Reduction((3,), True, ("records",), 5.0))
 
     def test_what_is_needed_stays(self) -> None:
         """A failure that needs everything is not shrunk."""
-        whole = Trim((0, 1), False, ("records", "wire"))
-        self.assertEqual(shrunk(WHOLE, 2, ["records", "wire"], 20.0, lambda trim: trim == WHOLE).keep, (0, 1))
-        self.assertEqual(shrunk(whole, 2, ["records", "wire"], 20.0, lambda trim: trim == whole), whole)
+        whole = Reduction((0, 1), False, ("records", "wire"))
+        self.assertEqual(
+            reduce_run(NO_REDUCTION, 2, ["records", "wire"], 20.0, lambda trim: trim == NO_REDUCTION).keep, (0, 1)
+        )
+        self.assertEqual(reduce_run(whole, 2, ["records", "wire"], 20.0, lambda trim: trim == whole), whole)
 
     def test_no_more_time(self) -> None:
         """When the time for tries is over, the last failing trim is the result."""
         tries = iter([False, True])
-        found = shrunk(WHOLE, 4, ["records"], 20.0, lambda trim: next(tries, False))
-        self.assertEqual(found, Trim((2, 3)))
+        found = reduce_run(NO_REDUCTION, 4, ["records"], 20.0, lambda trim: next(tries, False))
+        self.assertEqual(found, Reduction((2, 3)))

@@ -29,16 +29,16 @@ class TeamTests(SynchronousTestCase):
         """Start a team that stops with the test."""
         team = Team(scenario, seed)
         self.teams.append(team)
-        team.stand()
+        team.form()
         return team
 
     def test_all_come_in_whatever_the_way(self) -> None:
         """Nodes join one by one, in batches and all at once; in a small team each then knows all others."""
         for join in (QUICK, Join("batches", 0.5, 3, settle=3.0), Join("at once", 0.5, settle=5.0)):
             team = self.team(Scenario(nodes=8, join=join))
-            self.assertEqual((team.alive(), sorted(team.inside())), (list(range(8)),) * 2, join.how)
-            self.assertTrue(team.is_standing())
-            known = [len(team.entangled(place).overlay.contacts()) for place in team.alive()]
+            self.assertEqual((team.alive(), sorted(team.get_joined())), (list(range(8)),) * 2, join.how)
+            self.assertTrue(team.is_joined())
+            known = [len(team.get_entangled(place).overlay.contacts()) for place in team.alive()]
             self.assertEqual(known, [7] * 8, join.how)
 
     def test_batches_come_in_their_size(self) -> None:
@@ -46,8 +46,10 @@ class TeamTests(SynchronousTestCase):
         team = Team(Scenario(nodes=6, join=Join("batches", 1.0, 2)), 1)
         self.teams.append(team)
         born: list[tuple[float, int]] = []
-        team.told.append(lambda now, event, place, more: born.append((now, place)) if event == "born" else None)
-        self.assertEqual(team.come(), 3.0)
+        team.event_listeners.append(
+            lambda now, event, place, more: born.append((now, place)) if event == "born" else None
+        )
+        self.assertEqual(team.start_all(), 3.0)
         team.run(3.0)
         self.assertEqual(born, [(0.0, 0), (1.0, 1), (1.0, 2), (2.0, 3), (2.0, 4), (3.0, 5)])
 
@@ -55,27 +57,27 @@ class TeamTests(SynchronousTestCase):
         """A restarted node keeps its identity and its store, and listeners learn of its end and its start."""
         team = self.team(Scenario(nodes=4, join=QUICK))
         lives: list[tuple[str, int]] = []
-        team.attend(
+        team.watch_lives(
             lambda place, node: lives.append(("born", place)), lambda place, node: lives.append(("died", place))
         )
         self.assertEqual(lives, [("born", place) for place in range(4)])
         key = b"k" * 20
-        put = team.entangled(2).put(key, "x", b"\x01")
+        put = team.get_entangled(2).put(key, "x", b"\x01")
         team.run(5.0)
         self.successResultOf(put)
-        former = team.entangled(2)
+        former = team.get_entangled(2)
         team.kill(2)
         self.assertNotIn(2, team.living)
-        self.assertNotIn(2, team.inside())
+        self.assertNotIn(2, team.get_joined())
         team.run(1.0)
         team.start(2)
-        self.assertEqual([record.name for record in team.entangled(2).store.get(key)], ["x"])
-        entered = team.entered(2)
+        self.assertEqual([record.name for record in team.get_entangled(2).store.get(key)], ["x"])
+        entered = team.when_joined(2)
         self.assertNoResult(entered)
         team.run(2.0)
         self.assertTrue(self.successResultOf(entered))
         self.assertEqual(lives[4:], [("died", 2), ("born", 2)])
-        self.assertEqual(team.entangled(2).identity, former.identity)
+        self.assertEqual(team.get_entangled(2).identity, former.identity)
 
     def test_another_node_may_take_the_place(self) -> None:
         """A replaced node has another identity and an empty store."""
@@ -84,12 +86,12 @@ class TeamTests(SynchronousTestCase):
         team.leave(3)
         team.replace(3)
         self.assertNotEqual(team.identity(3), former)
-        store = team.place(3).store
+        store = team.get_state(3).store
         self.assertIsInstance(store, MemoryStore)
         self.assertEqual(len(store), 0)
         team.start(3)
         team.run(2.0)
-        self.assertIn(3, team.inside())
+        self.assertIn(3, team.get_joined())
         self.assertRaises(ValueError, team.start, 3)
         self.assertRaises(ValueError, team.replace, 3)
 
@@ -97,11 +99,11 @@ class TeamTests(SynchronousTestCase):
         """``entered`` gives False for a node that ends before it has joined, and for a node that is not running."""
         team = self.team(Scenario(nodes=3, join=QUICK))
         place = team.add()
-        waiting = team.entered(place)
+        waiting = team.when_joined(place)
         team.kill(place)
         self.assertFalse(self.successResultOf(waiting))
-        self.assertFalse(self.successResultOf(team.entered(place)))
-        self.assertTrue(self.successResultOf(team.entered(0)))
+        self.assertFalse(self.successResultOf(team.when_joined(place)))
+        self.assertTrue(self.successResultOf(team.when_joined(0)))
         self.assertEqual(list(team.places), [0, 1, 2, 3])
 
     def test_still_node_is_lost_and_comes_back(self) -> None:
@@ -111,10 +113,10 @@ class TeamTests(SynchronousTestCase):
         key = team.identity(1).node_id
         team.freeze(1)
         team.run(20.0)
-        self.assertFalse(any(contact.node_id == key for contact in team.entangled(0).overlay.contacts()))
+        self.assertFalse(any(contact.node_id == key for contact in team.get_entangled(0).overlay.contacts()))
         team.thaw(1)
         team.run(10.0)
-        self.assertTrue(any(contact.node_id == key for contact in team.entangled(0).overlay.contacts()))
+        self.assertTrue(any(contact.node_id == key for contact in team.get_entangled(0).overlay.contacts()))
         self.assertIs(team.node(1), node)
 
     def test_freezing_needs_machines(self) -> None:
@@ -128,9 +130,9 @@ class TeamTests(SynchronousTestCase):
         team.kill(4)
         team.start(4)
         team.run(5.0)
-        self.assertEqual(sum(team.traffic(place).sent for place in team.places), team.board.counters["sent"])
+        self.assertEqual(sum(team.traffic(place).sent for place in team.places), team.switchboard.counters["sent"])
         received = sum(team.traffic(place).received for place in team.places)
-        self.assertEqual(received, team.board.counters["delivered"])
+        self.assertEqual(received, team.switchboard.counters["delivered"])
         self.assertGreater(team.traffic(4).received_bytes, 0)
 
     def test_swarm_nodes_are_there_as_devices(self) -> None:
@@ -146,9 +148,9 @@ class TeamTests(SynchronousTestCase):
     def test_nodes_behind_routers_come_in(self) -> None:
         """Some nodes, never the first two, are behind a NAT, and join the network nevertheless."""
         team = self.team(Scenario(nodes=6, join=QUICK, nat=Nats(0.5, ("port",))))
-        behind = [place for place in team.places if team.place(place).home is not None]
+        behind = [place for place in team.places if team.get_state(place).nat is not None]
         self.assertTrue(behind and not {0, 1} & set(behind))
-        self.assertEqual(sorted(team.inside()), list(range(6)))
+        self.assertEqual(sorted(team.get_joined()), list(range(6)))
 
     def test_everything_follows_from_the_seed(self) -> None:
         """The same scenario and seed give the same digest; another seed gives another one."""

@@ -14,7 +14,7 @@ from typing import Any
 from twisted.trial.unittest import SynchronousTestCase
 
 from middleware.config.settings import Settings
-from middleware.entangled.control.place import ENDING, FOLDER
+from middleware.entangled.control.socket_path import FOLDER_NAME, SUFFIX
 from swarmnode.doctor.command import main
 from swarmnode.doctor.facts import Facts, Health
 from tests.swarmnode.doctor.test_diagnosis import WELL
@@ -41,7 +41,7 @@ class CommandTests(SynchronousTestCase):
 
     def setUp(self) -> None:
         self.folder = Path(self.mktemp()).absolute()
-        (self.folder / FOLDER).mkdir(mode=0o700, parents=True)
+        (self.folder / FOLDER_NAME).mkdir(mode=0o700, parents=True)
         self.patch(os, "environ", {**os.environ, "XDG_RUNTIME_DIR": str(self.folder)})
         self.settings = self.folder / "dog1.toml"
         self.settings.write_text('[node]\nname = "dog1"\nteam_key = "k"\n', encoding="utf-8")
@@ -51,7 +51,7 @@ class CommandTests(SynchronousTestCase):
 
     def runs(self, name: str) -> None:
         """Create the control socket's file for a running node of that name."""
-        (self.folder / FOLDER / f"{name}{ENDING}").touch()
+        (self.folder / FOLDER_NAME / f"{name}{SUFFIX}").touch()
 
     def ask(self, path: Path, request: dict[str, Any]) -> Iterator[dict[str, Any]]:
         """Answer in place of the node."""

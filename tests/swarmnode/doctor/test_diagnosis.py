@@ -9,9 +9,9 @@ from twisted.trial.unittest import SynchronousTestCase
 
 from middleware.entangled.network.interface import Interface
 from middleware.entangled.network.network import Address
-from middleware.entangled.wire.hail import VERSION
-from swarmnode.doctor.diagnosis import diagnosed
-from swarmnode.doctor.facts import Answer, Certificate, Facts, Health, Lan, Probe, Storage
+from middleware.entangled.wire.probe import VERSION
+from swarmnode.doctor.diagnosis import diagnose
+from swarmnode.doctor.facts import Answer, Certificate, Facts, Health, LanDiscovery, Probe, Storage
 
 LO = Interface(1, "lo", ("127.0.0.1",), is_loopback=True)
 WLAN = Interface(2, "wlan0", ("192.168.1.7", "fd00::7"))
@@ -21,7 +21,7 @@ WALL = 1_800_000_000.0
 MEMBER = Probe(NEAR, Answer(NEAR, offset=0.1), is_member=True, is_near=True)
 OUTSIDE = Probe(FAR, Answer(FAR, offset=-0.1, seen=Address("192.168.1.7", 5)), is_member=True)
 SILENT, SILENT_NEAR = Probe(FAR), Probe(NEAR, is_near=True)
-HEALTHY = Lan((Answer(NEAR, offset=0.0),), is_sent=True, is_own_heard=True)
+HEALTHY = LanDiscovery((Answer(NEAR, offset=0.0),), is_sent=True, has_received_own=True)
 WELL = Facts(
     "dog1",
     "192.168.1.7",
@@ -30,10 +30,10 @@ WELL = Facts(
     interfaces=(LO, WLAN, CABLE),
     known=(MEMBER, OUTSIDE),
     lan=HEALTHY,
-    way_out="192.168.1.7",
+    source_address="192.168.1.7",
     is_gateway_resolved=True,
 )
-CALLED = Lan((), is_sent=True, is_own_heard=True)
+CALLED = LanDiscovery((), is_sent=True, has_received_own=True)
 """A call to the LAN that nobody answered."""
 DAY = 86400.0
 OFF = Probe(Address("192.168.1.33", 8484), is_near=True, is_resolved=False)
@@ -59,7 +59,7 @@ class DiagnosisTests(SynchronousTestCase):
     def check(self, *cases: Case) -> None:
         """Check that each case has exactly one finding."""
         for changes, cause, words in cases:
-            found = diagnosed(replace(WELL, **changes))
+            found = diagnose(replace(WELL, **changes))
             self.assertEqual([f"{finding.weight} {finding.cause}" for finding in found], [cause], changes)
             self.assertTrue(all([found[0].what, found[0].why, found[0].remedy]))
             self.assertIn(words, f"{found[0].what} {found[0].why} {found[0].remedy}")
@@ -67,7 +67,7 @@ class DiagnosisTests(SynchronousTestCase):
     def check_well(self, *cases: dict[str, Any]) -> None:
         """Check that no case has a finding."""
         for changes in cases:
-            self.assertEqual(diagnosed(replace(WELL, **changes)), [], changes)
+            self.assertEqual(diagnose(replace(WELL, **changes)), [], changes)
 
     def test_way(self) -> None:
         """Problems on the path to known nodes are found: firewalls, client isolation, wrong addresses."""
@@ -105,12 +105,12 @@ class DiagnosisTests(SynchronousTestCase):
 
     def test_multicast(self) -> None:
         """Multicast blocked by the network differs from multicast blocked by this machine; own replies do not count."""
-        own = Lan((Answer(Address("192.168.1.7", 8485), offset=0.0),), True, True)
+        own = LanDiscovery((Answer(Address("192.168.1.7", 8485), offset=0.0),), True, True)
         self.check(
             ({"lan": CALLED}, "warning multicast-blocked", "This network does not forward multicast"),
             ({"lan": own}, "warning multicast-blocked", "This network does not forward multicast"),
-            ({"lan": Lan((), True, False)}, "warning multicast-blocked", "This machine does not receive"),
-            ({"lan": Lan((), False, False)}, "warning multicast-blocked", "This machine cannot send"),
+            ({"lan": LanDiscovery((), True, False)}, "warning multicast-blocked", "This machine does not receive"),
+            ({"lan": LanDiscovery((), False, False)}, "warning multicast-blocked", "This machine cannot send"),
         )
 
     def test_kind_of_router(self) -> None:
@@ -158,10 +158,12 @@ class DiagnosisTests(SynchronousTestCase):
         """
 
         def offset(*seconds: float) -> dict[str, Any]:
-            lan = Lan(tuple(Answer(Address("192.168.1.9", n), offset=s) for n, s in enumerate(seconds)), True, True)
+            lan = LanDiscovery(
+                tuple(Answer(Address("192.168.1.9", n), offset=s) for n, s in enumerate(seconds)), True, True
+            )
             return {"known": (), "lan": lan}
 
-        own = Lan((Answer(Address("192.168.1.7", 8485), offset=0.0), Answer(NEAR, offset=-7200.0)), True, True)
+        own = LanDiscovery((Answer(Address("192.168.1.7", 8485), offset=0.0), Answer(NEAR, offset=-7200.0)), True, True)
         passed = Certificate(WALL - 410 * DAY, WALL - 45 * DAY)
         self.check(
             (offset(60.0, 61.0), "warning clock-off", "60 seconds behind"),
@@ -187,6 +189,6 @@ class DiagnosisTests(SynchronousTestCase):
 
     def test_the_gravest_comes_first(self) -> None:
         """Errors come before warnings, and warnings before notes."""
-        changes = {**seen_at(5), "lan": Lan((), True, False), "open_files": (("a", 0o644),)}
-        found = diagnosed(replace(WELL, **changes))
+        changes = {**seen_at(5), "lan": LanDiscovery((), True, False), "open_files": (("a", 0o644),)}
+        found = diagnose(replace(WELL, **changes))
         self.assertEqual([finding.weight for finding in found], ["error", "warning", "note"])

@@ -8,7 +8,7 @@ from pathlib import Path
 from twisted.trial.unittest import SynchronousTestCase
 
 from middleware.config.settings import Settings
-from swarmnode.doctor.measure import measured
+from swarmnode.doctor.measure import measure_facts
 
 
 class MeasureTests(SynchronousTestCase):
@@ -26,14 +26,14 @@ class MeasureTests(SynchronousTestCase):
 
     def test_well(self) -> None:
         """A node with a private folder and private files has no problem."""
-        facts = measured(self.settings(store="a.sqlite"))
+        facts = measure_facts(self.settings(store="a.sqlite"))
         assert facts.storage is not None
         self.assertEqual((facts.storage.problem, facts.open_files, facts.lan, facts.known), ("", (), None, ()))
-        self.assertIn("127.0.0.1", facts.own)
+        self.assertIn("127.0.0.1", facts.own_addresses)
 
     def test_nobody_at_a_port_of_this_machine(self) -> None:
         """A closed port is distinguished from a silent one."""
-        facts = measured(self.settings(port=0, known_nodes=["127.0.0.1:9"]))
+        facts = measure_facts(self.settings(port=0, known_nodes=["127.0.0.1:9"]))
         self.assertEqual([probe.error for probe in facts.known], ["refused"])
 
     def test_open_files(self) -> None:
@@ -43,15 +43,15 @@ class MeasureTests(SynchronousTestCase):
         os.chmod(self.folder / "a.sqlite", 0o640)
         os.chmod(self.file, 0o644)
         self.assertEqual(
-            set(measured(settings).open_files), {(str(self.folder / "a.sqlite"), 0o640), (str(self.file), 0o644)}
+            set(measure_facts(settings).open_files), {(str(self.folder / "a.sqlite"), 0o640), (str(self.file), 0o644)}
         )
 
     def test_store(self) -> None:
         """A missing folder, and a folder at the path of the store, are reported; a store in memory has no file."""
-        missing = measured(self.settings(store="nowhere/a.sqlite")).storage
+        missing = measure_facts(self.settings(store="nowhere/a.sqlite")).storage
         (self.folder / "b.sqlite").mkdir()
-        folder = measured(self.settings(store="b.sqlite")).storage
+        folder = measure_facts(self.settings(store="b.sqlite")).storage
         assert missing is not None and folder is not None
         self.assertIn("does not exist", missing.problem)
         self.assertIn("It is a folder", folder.problem)
-        self.assertIsNone(measured(self.settings()).storage)
+        self.assertIsNone(measure_facts(self.settings()).storage)

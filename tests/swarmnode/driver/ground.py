@@ -31,10 +31,10 @@ class ScriptedTerminal:
         for seconds, key in self._keys:
             self._clock.callLater(seconds, pressed, key)
 
-    def line(self, text: str) -> None:
+    def show_status(self, text: str) -> None:
         self.lines.append((self._clock.seconds(), text))
 
-    def say(self, text: str) -> None:
+    def write_line(self, text: str) -> None:
         self.said.append(text)
 
     def close(self) -> None:
@@ -53,10 +53,10 @@ class MemoryGround:
         self._connector = connector
         self._pass_time = pass_time
 
-    def connector(self, is_moving: bool) -> tuple[Any, Callable[[], list[str]]]:
+    def make_connector(self, is_moving: bool) -> tuple[Any, Callable[[], list[str]]]:
         return self._connector, lambda: self.problems
 
-    def terminal(self) -> ScriptedTerminal:
+    def open_terminal(self) -> ScriptedTerminal:
         self.terminals.append(ScriptedTerminal(self.clock, self.keys))
         return self.terminals[-1]
 

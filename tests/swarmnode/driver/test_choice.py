@@ -15,10 +15,17 @@ from twisted.trial.unittest import SynchronousTestCase
 
 from drivers.errors import UsageError
 from drivers.link import TcpConnector
-from swarmnode.driver.catalogue import Candidate, Entry, candidate_lines, candidates, catalogue, catalogue_lines
-from swarmnode.driver.choice import options_of
-from swarmnode.driver.ground import Ear, WitnessedConnector
-from swarmnode.driver.sheet import shown
+from swarmnode.driver.catalogue import (
+    KindEntry,
+    SerialDevice,
+    format_kind_entries,
+    format_serial_devices,
+    list_kind_entries,
+    list_serial_devices,
+)
+from swarmnode.driver.environment import RecordingConnector, WarningCollector
+from swarmnode.driver.formatting import format_reading
+from swarmnode.driver.selection import parse_options
 
 
 class OptionTests(SynchronousTestCase):
@@ -26,7 +33,7 @@ class OptionTests(SynchronousTestCase):
         """A value is parsed as TOML if possible, otherwise it is text; dots create tables."""
         words = ["host=192.168.0.51", "port=7400", "camera=false", "speed=[0.1, 0.2]", "ports.walk=1", "ports.head=2"]
         self.assertEqual(
-            options_of([*words, "name=a=b", "when=2020-01-01", "empty="]),
+            parse_options([*words, "name=a=b", "when=2020-01-01", "empty="]),
             {
                 **{"host": "192.168.0.51", "port": 7400, "camera": False, "speed": [0.1, 0.2]},
                 **{"ports": {"walk": 1, "head": 2}, "name": "a=b", "when": "2020-01-01", "empty": ""},
@@ -36,21 +43,23 @@ class OptionTests(SynchronousTestCase):
     def test_other_words_are_refused(self) -> None:
         """A word that is not KEY=VALUE, and a key that is both a value and a table, are rejected."""
         for words in (["host"], ["=1"], ["a..b=1"], ["ports=1", "ports.walk=2"]):
-            self.assertIn("--option", str(self.assertRaises(UsageError, options_of, words)))
+            self.assertIn("--option", str(self.assertRaises(UsageError, parse_options, words)))
 
 
 class CandidateTests(SynchronousTestCase):
     def test_serial_devices_are_shown(self) -> None:
         """Each serial device is listed with its description, the next command, and the remedy if access is denied."""
-        found = candidates(lambda: [("/dev/ttyUSB1", "FTDI"), ("/dev/ttyUSB0", "")], lambda device: "1" in device)
-        self.assertEqual(found, [Candidate("/dev/ttyUSB0", "", False), Candidate("/dev/ttyUSB1", "FTDI", True)])
-        told = "\n".join(candidate_lines(found))
+        found = list_serial_devices(
+            lambda: [("/dev/ttyUSB1", "FTDI"), ("/dev/ttyUSB0", "")], lambda device: "1" in device
+        )
+        self.assertEqual(found, [SerialDevice("/dev/ttyUSB0", "", False), SerialDevice("/dev/ttyUSB1", "FTDI", True)])
+        told = "\n".join(format_serial_devices(found))
         self.assertIn("/dev/ttyUSB1  FTDI\n  swarm driver probe --kind bittle --option port=/dev/ttyUSB1", told)
         self.assertEqual(told.count("no permission"), 1)
 
     def test_nothing_is_said_as_well(self) -> None:
         """Without serial devices the output says that a robot in the network must be named."""
-        self.assertIn("has to be named", "\n".join(candidate_lines([])))
+        self.assertIn("has to be named", "\n".join(format_serial_devices([])))
 
 
 class UnitTests(SynchronousTestCase):
@@ -71,16 +80,16 @@ class UnitTests(SynchronousTestCase):
             ("mode", "safe", "safe"),
             ("safety.event", "", "-"),
         ):
-            self.assertEqual(shown(key, value), told)
+            self.assertEqual(format_reading(key, value), told)
 
 
 class CatalogueTests(SynchronousTestCase):
     def test_says_what_is_missing(self) -> None:
         """A kind with a missing library names the package to install; other kinds are ready."""
-        bare = {entry.kind: entry for entry in catalogue(lambda library: False)}
+        bare = {entry.kind: entry for entry in list_kind_entries(lambda library: False)}
         self.assertIn("pip install 'swarm-node[serial]'", bare["create2"].needs)
         self.assertEqual((bare["create2"].is_ready, bare["aibo"].is_ready), (False, True))
-        self.assertTrue(all(entry.is_ready for entry in catalogue(lambda library: True)))
+        self.assertTrue(all(entry.is_ready for entry in list_kind_entries(lambda library: True)))
 
     def test_names_the_broken_kinds_of_others(self) -> None:
         """A driver of another distribution is listed with its docstring; one that cannot be imported is broken."""
@@ -92,10 +101,10 @@ class CatalogueTests(SynchronousTestCase):
         (folder / "odd_of_tests.py").write_text('class Odd:\n    """An odd robot.\n\n    And more.\n    """\n')
         self.patch(sys, "path", [str(folder), *sys.path])
         self.addCleanup(sys.modules.pop, "odd_of_tests", None)
-        found = {entry.kind: entry for entry in catalogue()}
-        self.assertEqual(found["odd"], Entry("odd", "An odd robot (odd_of_tests:Odd)"))
+        found = {entry.kind: entry for entry in list_kind_entries()}
+        self.assertEqual(found["odd"], KindEntry("odd", "An odd robot (odd_of_tests:Odd)"))
         self.assertIn("no_such_module_of_tests", found["torn"].problem)
-        told = catalogue_lines([found["odd"], found["torn"]])
+        told = format_kind_entries([found["odd"], found["torn"]])
         self.assertEqual(told[0], "odd   An odd robot (odd_of_tests:Odd)")
         self.assertTrue(told[1].startswith("torn  broken: driver 'torn' cannot be loaded"))
 
@@ -107,41 +116,41 @@ class WitnessTests(SynchronousTestCase):
         tcp = SimpleNamespace(call=lambda host, port, caller: line)
         cable = SimpleNamespace()
         serial = SimpleNamespace(call=lambda host, port, caller: cable)
-        connector = WitnessedConnector(tcp, serial)
-        self.assertIs(connector.call("dog1", 10020, None), line)
-        self.assertIs(connector.call("/dev/ttyUSB0", 115200, None), cable)
-        self.assertEqual(connector.problems(), ["dog1:10020: it is off"])
+        connector = RecordingConnector(tcp, serial)
+        self.assertIs(connector.connect("dog1", 10020, None), line)
+        self.assertIs(connector.connect("/dev/ttyUSB0", 115200, None), cable)
+        self.assertEqual(connector.list_problems(), ["dog1:10020: it is off"])
         line.problem = ""
-        self.assertEqual(connector.problems(), [])
+        self.assertEqual(connector.list_problems(), [])
 
     def test_knows_a_serial_device_by_its_name(self) -> None:
         """Every path is a serial device, links included; a host name that begins like one is not."""
         tcp = SimpleNamespace(call=lambda host, port, caller: "tcp")
         serial = SimpleNamespace(call=lambda host, port, caller: "serial")
-        connector = WitnessedConnector(tcp, serial)
+        connector = RecordingConnector(tcp, serial)
         for name in ("/dev/ttyUSB0", "/tmp/create2", "./create2", "COM3", r"\\.\COM12"):
-            self.assertEqual(connector.call(name, 115200, None), "serial", name)
+            self.assertEqual(connector.connect(name, 115200, None), "serial", name)
         for name in ("dog1", "192.168.0.51", "fe80::1", "COMpass.lan", "COM-board"):
-            self.assertEqual(connector.call(name, 10020, None), "tcp", name)
+            self.assertEqual(connector.connect(name, 10020, None), "tcp", name)
 
     def test_keeps_one_line_to_each_place(self) -> None:
         """A robot that is queried with one connection per request does not fill the memory."""
         tcp = SimpleNamespace(call=lambda host, port, caller: SimpleNamespace(problem=caller))
-        connector = WitnessedConnector(tcp, None)
+        connector = RecordingConnector(tcp, None)
         for number in range(1000):
-            connector.call("dog1", 80, f"problem {number}")
+            connector.connect("dog1", 80, f"problem {number}")
         self.assertEqual(len(vars(connector)["_lines"]), 1)
-        self.assertEqual(connector.problems(), ["dog1:80: problem 999"])
+        self.assertEqual(connector.list_problems(), ["dog1:80: problem 999"])
 
     def test_hears_the_warnings_of_drivers(self) -> None:
         """Each warning of a driver is recorded once; messages of other modules and of lower levels are not."""
-        ear = Ear()
+        ear = WarningCollector()
         for namespace in ("drivers.aibo.driver", "drivers.aibo.driver", "middleware.node"):
             Logger(namespace).warn("{robot}: it\nis off", robot=namespace[:7])
         Logger("drivers.link").info("nothing")
         ear.close()
         Logger("drivers.link").warn("too late")
-        self.assertEqual(ear.heard, ["drivers: it is off"])
+        self.assertEqual(ear.warnings, ["drivers: it is off"])
 
     def test_tcp_line_says_why_there_is_no_link(self) -> None:
         """A refused connection, a timeout and similar errors are reported with a remedy until the link is up."""
@@ -152,7 +161,7 @@ class WitnessTests(SynchronousTestCase):
                 connected.append(arguments)
                 return SimpleNamespace(state="disconnected", connect=lambda: None)
 
-        line = TcpConnector(Reactor()).call("dog1", 1, SimpleNamespace())
+        line = TcpConnector(Reactor()).connect("dog1", 1, SimpleNamespace())
         told = vars(line)
         for problem, remedy in (
             (error.ConnectionRefusedError(), "nothing listens at this port"),

@@ -13,11 +13,11 @@ from twisted.internet.task import Clock
 from twisted.trial.unittest import SynchronousTestCase
 
 from drivers.driver import Permit
-from drivers.registry import driver_for, kinds
+from drivers.registry import create_driver, list_kinds
 from sim.robots.emulator.aibo_dog import AiboEmulator
-from sim.robots.emulator.body import MemoryBody
+from sim.robots.emulator.simulated_robot import MemoryRobot
 from swarmnode.driver.command import main
-from swarmnode.driver.pilot import Pilot
+from swarmnode.driver.keyboard import KeyboardController
 from tests.swarmnode.driver.ground import MemoryGround
 from tests.webnode.picture import jpeg
 
@@ -30,7 +30,7 @@ class DriverCommandTests(SynchronousTestCase):
     def setUp(self) -> None:
         """Start an emulated Aibo in virtual time."""
         self.clock = Clock()
-        self.body = MemoryBody(jpeg=JPEG, values={"power.level": 0.8, "range.near": 0.25})
+        self.body = MemoryRobot(jpeg=JPEG, values={"power.level": 0.8, "range.near": 0.25})
         self.dog = AiboEmulator(self.clock, self.body, random.Random(1))
         self.dog.start()
         self.connector = self.dog.connector()
@@ -47,7 +47,7 @@ class DriverCommandTests(SynchronousTestCase):
         self.assertEqual(self.clock.getDelayedCalls(), [])
 
     def pass_time(self, seconds: float) -> None:
-        self.body.pass_time(seconds)
+        self.body.advance(seconds)
         self.speeds.append((round(self.clock.seconds(), 3), *self.body.motion[::2]))
 
     def moving(self, began: float, ended: float) -> list[float]:
@@ -59,9 +59,9 @@ class DriverCommandTests(SynchronousTestCase):
         code, output, _ = self.ground.swarm_driver("list")
         self.assertEqual(code, 0)
         told = {line.split()[0] for line in output.splitlines() if not line.startswith(" ")}
-        self.assertLessEqual(set(kinds()), told)
+        self.assertLessEqual(set(list_kinds()), told)
         entries = json.loads(self.ground.swarm_driver("list --json")[1])
-        self.assertEqual([entry["kind"] for entry in entries], kinds())
+        self.assertEqual([entry["kind"] for entry in entries], list_kinds())
 
     def test_info_describes_before_connecting(self) -> None:
         """Limits with units, skills and rates are printed without a robot, by kind or from a node's settings."""
@@ -151,7 +151,7 @@ class DriverCommandTests(SynchronousTestCase):
     def test_drive_says_why_it_does_not_move(self) -> None:
         """The status line shows that the motors were switched off at the robot, and m enables them again."""
         self.ground.keys = [(1.5, "w"), (2.0, "m"), (3.0, "w"), (4.0, "x")]
-        self.clock.callLater(1.0, self.dog.press)
+        self.clock.callLater(1.0, self.dog.press_back_button)
         self.ground.swarm_driver(f"drive {BLIND}")
         lines = self.ground.terminals[0].lines
         self.assertTrue(any("motors are off; call enable() first" in line for at, line in lines if 1.5 < at < 1.7))
@@ -208,17 +208,17 @@ class DriverCommandTests(SynchronousTestCase):
 
     def test_pilot_speaks_with_the_robots_own_token(self) -> None:
         """A robot that has obeyed token 7 is driven with token 7, because a higher one would lock out the team."""
-        driver = driver_for("aibo", {"host": "dog1", "camera": False}, "dog1", self.clock, self.connector)
+        driver = create_driver("aibo", {"host": "dog1", "camera": False}, "dog1", self.clock, self.connector)
         driver.connect()
         self.turn(1.0)
         driver.enable()
         self.turn(0.3)
         driver.act({}, Permit(7, self.clock.seconds() + 0.5))
-        pilot = Pilot(driver)
+        pilot = KeyboardController(driver)
         self.assertTrue(pilot.press("w", self.clock.seconds()))
-        self.assertEqual((pilot.said, driver.token, pilot.is_moving), ("", 7, True))
+        self.assertEqual((pilot.message, driver.token, pilot.is_moving), ("", 7, True))
         self.assertFalse(pilot.press("x", self.clock.seconds()))
-        self.assertEqual(pilot.done["base.vx"], 0.0)
+        self.assertEqual(pilot.last_motion["base.vx"], 0.0)
         driver.disconnect()
 
     def turn(self, seconds: float) -> None:

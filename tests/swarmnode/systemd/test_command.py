@@ -16,7 +16,7 @@ from twisted.trial.unittest import SkipTest, SynchronousTestCase
 
 from middleware.config.settings import Settings
 from swarmnode.systemd.command import main
-from swarmnode.systemd.unit import Unit, unit_for
+from swarmnode.systemd.unit import Unit, make_unit
 
 PROGRAM = "/opt/swarm-node/bin/twistd"
 
@@ -24,7 +24,7 @@ PROGRAM = "/opt/swarm-node/bin/twistd"
 def unit(node: dict[str, object] | None = None, **tables: dict[str, object]) -> Unit:
     """Return the unit of a system service."""
     mapping = {"node": {"name": "dog1", **(node or {})}, **tables}
-    return unit_for(Settings.from_mapping(mapping, "/etc/team/dog1.toml"), PROGRAM, is_user=False)
+    return make_unit(Settings.from_mapping(mapping, "/etc/team/dog1.toml"), PROGRAM, is_user=False)
 
 
 class UnitTests(SynchronousTestCase):
@@ -67,7 +67,7 @@ class UnitTests(SynchronousTestCase):
 
     def test_names_cannot_add_lines(self) -> None:
         """Spaces, quotes and percent signs of a path are escaped."""
-        made = unit_for(Settings.from_mapping({"node": {"name": "a"}}, '/a b/50%"/a.toml'), PROGRAM, is_user=True)
+        made = make_unit(Settings.from_mapping({"node": {"name": "a"}}, '/a b/50%"/a.toml'), PROGRAM, is_user=True)
         self.assertIn('--config "/a b/50%%\\"/a.toml"\n', made.text)
 
     def test_systemd_takes_it(self) -> None:
@@ -77,7 +77,9 @@ class UnitTests(SynchronousTestCase):
         folder = Path(self.mktemp())
         folder.mkdir()
         file = folder / "swarm-node-dog1.service"
-        made = unit_for(Settings.from_mapping({"node": {"name": "dog1"}}, "/a.toml"), shutil.which("true") or "", False)
+        made = make_unit(
+            Settings.from_mapping({"node": {"name": "dog1"}}, "/a.toml"), shutil.which("true") or "", False
+        )
         file.write_text(made.text, encoding="utf-8")
         verified = subprocess.run(["systemd-analyze", "verify", file], capture_output=True, text=True, check=False)
         self.assertEqual((verified.returncode, verified.stderr), (0, ""))

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import random
 
-from middleware.consensus.bidding.announcement import Announcement, Entry
+from middleware.consensus.bidding.announcement import AnnouncedReport, Announcement
 from middleware.consensus.bidding.auction import Auction
 from middleware.consensus.bidding.bid import Bid
-from middleware.consensus.bidding.party import OnSummary, Party
-from middleware.consensus.bidding.rule import Rule
+from middleware.consensus.bidding.merge_rule import MergeRule
+from middleware.consensus.bidding.participant import OnSummary, Participant
 from middleware.consensus.strategies.nearest import Nearest
 from middleware.consensus.strategy import Report
 from middleware.entangled.contact import Contact
@@ -26,22 +26,24 @@ def bid(place: int, cost: float | None, revision: int = 0, auction: Auction = AU
     """Return the signed bid of the agent at ``place``."""
     agent = AGENTS[place]
     report = None if cost is None else Report(agent.node_id.hex(), cost)
-    return Bid(agent.public, report, revision).signed(agent, auction)
+    return Bid(agent.public, report, revision).sign(agent, auction)
 
 
 def announced(number: int, rank: int, *bids: Bid, auction: Auction = AUCTION) -> Announcement:
     """Return an announcement, signed by the council member at ``rank``."""
-    entries = tuple(Entry(b.report, b.revision) for b in bids if b.report is not None)
-    return Announcement(number, rank, entries).signed(AGENTS[rank].sign, auction)
+    entries = tuple(AnnouncedReport(b.report, b.revision) for b in bids if b.report is not None)
+    return Announcement(number, rank, entries).sign(AGENTS[rank].sign, auction)
 
 
-def rule() -> Rule:
+def rule() -> MergeRule:
     """Return the rule of the strategy ``Nearest``."""
-    return Rule(Nearest())
+    return MergeRule(Nearest())
 
 
-def party(place: int, auction: Auction = AUCTION, seed: int = 1, on_summary: OnSummary = lambda reports: None) -> Party:
+def party(
+    place: int, auction: Auction = AUCTION, seed: int = 1, on_summary: OnSummary = lambda reports: None
+) -> Participant:
     """Return the party of the node at ``place``, which knows all other nodes."""
     others = [contact for contact in CONTACTS if contact is not CONTACTS[place]]
     dice = random.Random(f"{seed}/{place}")
-    return Party(auction, CONTACTS[place], rule(), lambda: others, dice, AGENTS[place].sign, on_summary)
+    return Participant(auction, CONTACTS[place], rule(), lambda: others, dice, AGENTS[place].sign, on_summary)

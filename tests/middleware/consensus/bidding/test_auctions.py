@@ -6,24 +6,24 @@ import math
 from dataclasses import replace
 from typing import Any
 
-from middleware.consensus.bidding import party
-from middleware.consensus.bidding.announcement import Announcement, Entry
+from middleware.consensus.bidding import participant
+from middleware.consensus.bidding.announcement import AnnouncedReport, Announcement
 from middleware.consensus.bidding.auction import Auction
-from middleware.consensus.bidding.auctions import MAX_PARTIES, Bidding
+from middleware.consensus.bidding.auction_service import MAX_PARTICIPANTS, Bidding
 from middleware.consensus.bidding.bid import Bid
-from middleware.consensus.bidding.errand import MAX_BIDS
-from middleware.consensus.bidding.scale import TREE
+from middleware.consensus.bidding.outgoing_message import MAX_BIDS_PER_MESSAGE
+from middleware.consensus.bidding.path_choice import TREE
 from middleware.consensus.strategy import Report
 from middleware.entangled.errors import Refused
-from middleware.entangled.kademlia.distance import closest
-from middleware.entangled.network.switchboard import Weather
-from middleware.entangled.wire import asker
-from middleware.entangled.wire.door import ROLE
+from middleware.entangled.kademlia.distance import select_closest
+from middleware.entangled.network.switchboard import LinkConditions
+from middleware.entangled.wire import requester
+from middleware.entangled.wire.admission_check import ROLE
 from middleware.entangled.wire.message import Failure
-from middleware.entangled.wire.method import error_of
+from middleware.entangled.wire.method import make_error
 from middleware.node import SwarmNode
 from middleware.tasks.task import MEMBER, Task, group_key
-from tests.fleet import FleetCase, SwarmFleet
+from tests.fleet import FleetCase, SwarmTeam
 
 WAITING = 0.5
 
@@ -31,11 +31,13 @@ WAITING = 0.5
 class AuctionCase(FleetCase):
     """A team and one auction."""
 
-    def prepared(self, n: int, seed: int = 1, weather: Weather | None = None, strategy: str = "nearest") -> SwarmFleet:
+    def prepared(
+        self, n: int, seed: int = 1, weather: LinkConditions | None = None, strategy: str = "nearest"
+    ) -> SwarmTeam:
         """Return a team in which the three nodes nearest to the task are its council."""
         fleet = self.swarm(n, seed) if weather is None else self.swarm(n, seed, weather)
         key = group_key("job")
-        council = closest([node.entangled.contact for node in fleet.nodes], key, 3)
+        council = select_closest([node.entangled.contact for node in fleet.nodes], key, 3)
         self.task = Task("job", "find", "Find it", waiting_period=WAITING, council=tuple(council), strategy=strategy)
         self.views: dict[int, list[tuple[Report, ...]]] = {place: [] for place in range(n)}
         return fleet
@@ -44,22 +46,22 @@ class AuctionCase(FleetCase):
         """Return the auction of the task."""
         return Auction("job", 1, self.task.council, self.task.strategy, WAITING, **others)
 
-    def enter(self, fleet: SwarmFleet, *costs: float) -> list[Bidding]:
+    def enter(self, fleet: SwarmTeam, *costs: float) -> list[Bidding]:
         """Let the nodes bid."""
         biddings = []
         for place, cost in enumerate(costs):
             node = fleet.nodes[place]
-            bidding = node.bidding(self.task, 1, self.views[place].append)
+            bidding = node.start_bidding(self.task, 1, self.views[place].append)
             bidding.report(Report(node.uuid, cost))
             biddings.append(bidding)
         return biddings
 
-    def outsider(self, fleet: SwarmFleet) -> SwarmNode:
+    def outsider(self, fleet: SwarmTeam) -> SwarmNode:
         """Return a node that is not a member of the council."""
         council = {member.node_id for member in self.task.council}
         return next(node for node in fleet.nodes if node.entangled.identity.node_id not in council)
 
-    def ask(self, fleet: SwarmFleet, sender: SwarmNode, to: SwarmNode, method: str, *arguments: object) -> object:
+    def ask(self, fleet: SwarmTeam, sender: SwarmNode, to: SwarmNode, method: str, *arguments: object) -> object:
         """Return the result of a request, its value or its exception."""
         asked = sender.entangled.endpoint.ask(to.entangled.contact, method, *arguments, changes=True)
         asked.addErrback(lambda failure: failure.value)
@@ -80,15 +82,15 @@ class DisseminationTests(AuctionCase):
             self.assertEqual([r.cost for r in self.views[place][-1]], [1.0, 2.0, 3.0])
             self.assertEqual(self.views[place][-1][0].agent, fleet.nodes[1].uuid)
 
-    def tree(self) -> SwarmFleet:
+    def tree(self) -> SwarmTeam:
         """Return a team of twelve that sends its bids along the tree."""
         fleet = self.prepared(12)
         for node in fleet.nodes:
-            node.dissemination._scale.way = TREE
-            node.dissemination._scale.counted = lambda bidders: TREE  # type: ignore[method-assign]
+            node.auction_service._path_choice.path = TREE
+            node.auction_service._path_choice.choose = lambda bidders: TREE  # type: ignore[method-assign]
         return fleet
 
-    def assert_agreed(self, fleet: SwarmFleet) -> None:
+    def assert_agreed(self, fleet: SwarmTeam) -> None:
         """Let all twelve nodes bid, and check that they agree on the last one, which is the nearest."""
         self.enter(fleet, *(float(12 - place) for place in range(12)))
         fleet.run(3.0)
@@ -104,18 +106,18 @@ class DisseminationTests(AuctionCase):
         fleet = self.tree()
         council = {member.node_id for member in self.task.council}
         outside = [node for node in fleet.nodes if node.entangled.identity.node_id not in council]
-        [known] = closest([node.entangled.contact for node in outside], group_key("job"), 1)
+        [known] = select_closest([node.entangled.contact for node in outside], group_key("job"), 1)
         refused: list[str] = []
 
         def noted(failure: Failure) -> Exception:
             refused.append(failure.text)
-            return error_of(failure)
+            return make_error(failure)
 
-        self.patch(party, "MAX_CHILDREN", 2)
-        self.patch(asker, "error_of", noted)
+        self.patch(participant, "MAX_CHILDREN", 2)
+        self.patch(requester, "error_of", noted)
         for node in outside:
-            around = replace(node.dissemination._environment, contacts=lambda: [known])
-            node.dissemination._environment = around
+            around = replace(node.auction_service._environment, contacts=lambda: [known])
+            node.auction_service._environment = around
         self.assert_agreed(fleet)
         self.assertEqual(sum("send their bids here" in text for text in refused), len(outside) - 1 - 2)
 
@@ -143,12 +145,12 @@ class DisseminationTests(AuctionCase):
         for cost in (2.5, 2.4, 2.3):
             biddings[place].report(Report(fleet.nodes[place].uuid, cost))
         fleet.run(2.0)
-        fleet.nodes[place].vanish()
-        fleet.nodes[place] = fleet.made(place)
+        fleet.nodes[place].stop_silently()
+        fleet.nodes[place] = fleet.make_node(place)
         fleet.nodes[place].startService()
         fleet.run(2.0)
         node = fleet.nodes[place]
-        node.bidding(self.task, 1, self.views[place].append).report(Report(node.uuid, 9.0))
+        node.start_bidding(self.task, 1, self.views[place].append).report(Report(node.uuid, 9.0))
         fleet.run(4.0)
         for other in range(4):
             costs = {r.agent: r.cost for r in self.views[other][-1]}
@@ -168,7 +170,7 @@ class DisseminationTests(AuctionCase):
         """A callback that raises does not affect other bidders."""
         fleet = self.prepared(4)
         self.enter(fleet, 3.0, 1.0, 2.0)
-        fleet.nodes[0].bidding(self.task, 1, lambda reports: 1 // 0)  # type: ignore[arg-type]
+        fleet.nodes[0].start_bidding(self.task, 1, lambda reports: 1 // 0)  # type: ignore[arg-type]
         fleet.run(2.0)
         self.assertEqual(len(self.flushLoggedErrors(ZeroDivisionError)), 1)
         self.assertNotEqual(self.views[0], [])
@@ -184,10 +186,10 @@ class HostileTests(AuctionCase):
         liar = self.outsider(fleet)
         victim = next(node for node in fleet.nodes if node is not liar)
         auction = self.auction()
-        lie = (Entry(Report(liar.uuid, 0.0)),)
+        lie = (AnnouncedReport(Report(liar.uuid, 0.0)),)
         for rank in range(3):
-            forged = Announcement(99, rank, lie).signed(liar.entangled.identity.sign, auction)
-            answer = self.ask(fleet, liar, victim, "bid.announce", auction.packed(), forged.packed())
+            forged = Announcement(99, rank, lie).sign(liar.entangled.identity.sign, auction)
+            answer = self.ask(fleet, liar, victim, "bid.announce", auction.pack(), forged.pack())
             self.assertIsInstance(answer, Refused)
             self.assertIn("no quorum member of the task made it", str(answer))
         fleet.run(2.0)
@@ -200,10 +202,12 @@ class HostileTests(AuctionCase):
         self.enter(fleet, 3.0, 1.0)
         node, liar = fleet.nodes[0], self.outsider(fleet)
         auction = self.auction()
-        forged = Announcement(99, 0, (Entry(Report(liar.uuid, 0.0)),)).signed(liar.entangled.identity.sign, auction)
-        party = next(iter(node.dissemination._parties))
+        forged = Announcement(99, 0, (AnnouncedReport(Report(liar.uuid, 0.0)),)).sign(
+            liar.entangled.identity.sign, auction
+        )
+        party = next(iter(node.auction_service._participants))
         with self.assertRaises(Refused):
-            node.dissemination._process_announcement(party, forged.packed())
+            node.auction_service._process_announcement(party, forged.pack())
 
     def test_bids_for_others(self) -> None:
         """An offer with a bid that its agent did not sign for this auction is refused completely."""
@@ -213,10 +217,10 @@ class HostileTests(AuctionCase):
         own = liar.entangled.identity
         bids = [
             Bid(fleet.nodes[1].entangled.identity.public, Report(fleet.nodes[1].uuid, 0.0), 0, b"x" * 64),
-            Bid(own.public, Report(liar.uuid, 0.0)).signed(own, other),
+            Bid(own.public, Report(liar.uuid, 0.0)).sign(own, other),
         ]
         for bid in bids:
-            answer = self.ask(fleet, liar, victim, "bid.offer", auction.packed(), [bid.packed()], 0, False)
+            answer = self.ask(fleet, liar, victim, "bid.offer", auction.pack(), [bid.pack()], 0, False)
             self.assertIsInstance(answer, Refused)
 
     def test_bids_of_those_who_may_not(self) -> None:
@@ -226,57 +230,55 @@ class HostileTests(AuctionCase):
         public, auction = viewer.entangled.identity.public, self.auction()
         victim.entangled.replica.may_store = lambda slot: slot.owner != public or slot.name != MEMBER
         bids = [
-            Bid(node.entangled.identity.public, Report(node.uuid, 1.0))
-            .signed(node.entangled.identity, auction)
-            .packed()
+            Bid(node.entangled.identity.public, Report(node.uuid, 1.0)).sign(node.entangled.identity, auction).pack()
             for node in (viewer, good)
         ]
-        answer = self.ask(fleet, viewer, victim, "bid.offer", auction.packed(), bids[:1], 0, False)
+        answer = self.ask(fleet, viewer, victim, "bid.offer", auction.pack(), bids[:1], 0, False)
         self.assertEqual(getattr(answer, "code", ""), ROLE)
-        self.assertEqual(len(list(victim.dissemination._parties)), 0)
-        answer = self.ask(fleet, viewer, victim, "bid.offer", auction.packed(), bids, 0, False)
+        self.assertEqual(len(list(victim.auction_service._participants)), 0)
+        answer = self.ask(fleet, viewer, victim, "bid.offer", auction.pack(), bids, 0, False)
         self.assertNotIsInstance(answer, Refused)
-        party = next(iter(victim.dissemination._parties))
-        self.assertIsNone(party.summary.of(viewer.uuid))
-        self.assertIsNotNone(party.summary.of(good.uuid))
+        party = next(iter(victim.auction_service._participants))
+        self.assertIsNone(party.summary.get(viewer.uuid))
+        self.assertIsNotNone(party.summary.get(good.uuid))
 
     def test_nonsense(self) -> None:
         """Invalid arguments are refused in one line with the reason, and change nothing."""
         fleet = self.prepared(3)
         liar, victim = fleet.nodes[0], fleet.nodes[1]
         own, auction = liar.entangled.identity, self.auction()
-        good = Bid(own.public, Report(liar.uuid, 1.0)).signed(own, auction).packed()
+        good = Bid(own.public, Report(liar.uuid, 1.0)).sign(own, auction).pack()
         questions: list[tuple[object, ...]] = [
             ("bid.offer", [], [good], 0, False),
-            ("bid.offer", auction.packed(), [good] * (MAX_BIDS + 1), 0, False),
-            ("bid.offer", auction.packed(), [[1, 2, 3]], 0, False),
-            ("bid.offer", auction.packed(), [good], -1, False),
-            ("bid.offer", auction.packed(), [good], 10**12, False),
-            ("bid.offer", auction.packed(), "bids", 0, False),
-            ("bid.announce", auction.packed(), 7),
+            ("bid.offer", auction.pack(), [good] * (MAX_BIDS_PER_MESSAGE + 1), 0, False),
+            ("bid.offer", auction.pack(), [[1, 2, 3]], 0, False),
+            ("bid.offer", auction.pack(), [good], -1, False),
+            ("bid.offer", auction.pack(), [good], 10**12, False),
+            ("bid.offer", auction.pack(), "bids", 0, False),
+            ("bid.announce", auction.pack(), 7),
             ("bid.announce", 7, []),
         ]
         for method, *arguments in questions:
             answer = self.ask(fleet, liar, victim, str(method), *arguments)
             self.assertIsInstance(answer, Refused, (method, answer))
-        liar.entangled.endpoint.tell(victim.entangled.contact, "bid.cry", auction.packed(), [good])
+        liar.entangled.endpoint.notify(victim.entangled.contact, "bid.cry", auction.pack(), [good])
         fleet.run(1.0)
-        self.assertEqual(len(list(victim.dissemination._parties)), 0)
+        self.assertEqual(len(list(victim.auction_service._participants)), 0)
 
     def test_invented_auctions(self) -> None:
         """A peer that invents auctions fills a limited table, and leaves no timer behind."""
         fleet = self.prepared(3)
         liar, victim = fleet.nodes[0], fleet.nodes[1]
         [bidding] = self.enter(fleet, 3.0)
-        bidding_of_victim = victim.bidding(self.task, 1, self.views[1].append)
+        bidding_of_victim = victim.start_bidding(self.task, 1, self.views[1].append)
         own = liar.entangled.identity
-        for epoch in range(MAX_PARTIES + 20):
+        for epoch in range(MAX_PARTICIPANTS + 20):
             auction = Auction("job", 1_000 + epoch, self.task.council, "nearest", WAITING)
-            bid = Bid(own.public, Report(liar.uuid, 1.0)).signed(own, auction)
+            bid = Bid(own.public, Report(liar.uuid, 1.0)).sign(own, auction)
             peer = liar.entangled.contact
-            victim.dissemination.answer_offer(peer, auction.packed(), [bid.packed()], 0, True)
-        self.assertEqual(len(victim.dissemination._parties), MAX_PARTIES)
-        self.assertLessEqual(len(victim.dissemination._timers), MAX_PARTIES)
+            victim.auction_service.answer_offer(peer, auction.pack(), [bid.pack()], 0, True)
+        self.assertEqual(len(victim.auction_service._participants), MAX_PARTICIPANTS)
+        self.assertLessEqual(len(victim.auction_service._timers), MAX_PARTICIPANTS)
         bidding_of_victim.report(Report(victim.uuid, 1.0))
         fleet.run(2.0)
         self.assertEqual(self.views[1][-1][0].agent, victim.uuid)
@@ -294,11 +296,11 @@ class HostileTests(AuctionCase):
         members = {member.node_id for member in self.task.council}
         for node in fleet.nodes:
             if node.entangled.identity.node_id in members:
-                node.vanish()
+                node.stop_silently()
         left = [place for place, node in enumerate(fleet.nodes) if node.running]
         auction = self.auction(exclusive=False)
         for place in left:
             node = fleet.nodes[place]
-            node.dissemination.enter(auction, self.views[place].append).report(Report(node.uuid, 1.0 + place))
+            node.auction_service.take_part(auction, self.views[place].append).report(Report(node.uuid, 1.0 + place))
         fleet.run(8.0)
         self.assertEqual({self.views[place][-1][0].agent for place in left}, {fleet.nodes[left[0]].uuid})

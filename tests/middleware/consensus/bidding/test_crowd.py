@@ -7,64 +7,64 @@ import io
 
 from twisted.trial.unittest import SynchronousTestCase
 
-from benchmarks.dissemination import BUSIEST, Crowd, Outcome, Weather, main
+from benchmarks.bidding import BUSIEST, AuctionSimulation, LinkFaults, Outcome, main
 from benchmarks.measure import percentile
-from middleware.consensus.bidding.scale import DIRECT
+from middleware.consensus.bidding.path_choice import DIRECT
 
 AFTER = 4.0
 
 
-def outcome(crowd: Crowd, until: float = AFTER) -> Outcome:
+def outcome(crowd: AuctionSimulation, until: float = AFTER) -> Outcome:
     """Run a crowd and return its outcome."""
     crowd.run(until)
-    return crowd.outcome()
+    return crowd.make_outcome()
 
 
 class SmallTests(SynchronousTestCase):
     def test_three_agents(self) -> None:
         """Three agents agree with at most ten messages each at 10 % datagram loss."""
-        runs = [outcome(Crowd(3, seed, Weather(0.1))) for seed in range(40)]
+        runs = [outcome(AuctionSimulation(3, seed, LinkFaults(0.1))) for seed in range(40)]
         self.assertEqual(min(run.right for run in runs), 1.0)
         self.assertLessEqual(sum(run.messages for run in runs) / len(runs), 10.0)
 
     def test_every_second_datagram_comes_twice(self) -> None:
         """Duplicated datagrams change nothing: there is one announcement, and every agent receives it."""
-        crowd = Crowd(30, 2, Weather(twice=0.5))
+        crowd = AuctionSimulation(30, 2, LinkFaults(duplicate=0.5))
         self.assertEqual(outcome(crowd).right, 1.0)
         self.assertEqual({p.announcement and p.announcement.number for p in crowd.parties}, {1})
 
     def test_first_member_is_dead(self) -> None:
         """If the first member of the council is dead, the next member announces."""
         for seed in range(3):
-            crowd = Crowd(12, seed, Weather(0.1), way=DIRECT)
+            crowd = AuctionSimulation(12, seed, LinkFaults(0.1), way=DIRECT)
             crowd.dead.add(crowd._places[crowd.auction.council[0].node_id])
-            crowd.best = crowd.right_one()
+            crowd.best = crowd.find_right_winner()
             self.assertEqual(outcome(crowd, 8.0).right, 1.0)
 
 
 class LargeTests(SynchronousTestCase):
     def test_hundred_agents(self) -> None:
         """A hundred agents agree along the tree within 0.6 s, with at most six messages each, at 10 % loss."""
-        runs = [outcome(Crowd(100, seed, Weather(0.1))) for seed in range(5)]
-        took = [t for run in runs for t in run.took]
+        runs = [outcome(AuctionSimulation(100, seed, LinkFaults(0.1))) for seed in range(5)]
+        took = [t for run in runs for t in run.agreement_times]
         self.assertEqual(min(run.right for run in runs), 1.0)
         self.assertLessEqual(sum(run.messages for run in runs) / len(runs), 6.0)
         self.assertLessEqual(percentile(took, 0.95), 0.6)
 
     def test_thousand_agents(self) -> None:
         """A thousand agents agree within 0.8 s, with at most six messages each; no node exceeds its limit."""
-        run = outcome(Crowd(1_000, 3, Weather(0.1)))
+        run = outcome(AuctionSimulation(1_000, 3, LinkFaults(0.1)))
         self.assertEqual(run.right, 1.0)
         self.assertLessEqual(run.messages, 6.0)
         self.assertLessEqual(run.busiest, BUSIEST)
-        self.assertLessEqual(percentile(run.took, 0.95), 0.8)
+        self.assertLessEqual(percentile(run.agreement_times, 0.95), 0.8)
 
     def test_branch_dies_with_what_it_holds(self) -> None:
         """A relay that dies with unsent bids loses none of them for good: each bidder repeats its own bid."""
         for seed in range(3):
-            crowd = Crowd(100, seed, Weather(), spread=0.02)
+            crowd = AuctionSimulation(100, seed, LinkFaults(), spread=0.02)
             winner = crowd.costs.index(min(crowd.costs))
-            carry = crowd._carry
+            carry = crowd._send_message
 
             def killing(place: int, errand, crowd=crowd, winner=winner, carry=carry) -> None:  # type: ignore[no-untyped-def]
                 carry(place, errand)
@@ -72,25 +72,25 @@ class LargeTests(SynchronousTestCase):
                     # The first relay of the winning bid confirms it and then dies.
                     to = crowd._places[errand.to.node_id]
                     if crowd.auction.rank(errand.to.node_id) is None:
-                        crowd.at(crowd.now + 0.1, crowd.dead.add, to)
+                        crowd.schedule(crowd.now + 0.1, crowd.dead.add, to)
 
-            crowd._carry = killing  # type: ignore[method-assign]
+            crowd._send_message = killing  # type: ignore[method-assign]
             crowd.run(8.0)
-            crowd.best = crowd.right_one()
-            self.assertEqual(crowd.outcome().right, 1.0)
+            crowd.best = crowd.find_right_winner()
+            self.assertEqual(crowd.make_outcome().right, 1.0)
 
     def test_announcement_is_lost_for_a_branch(self) -> None:
         """Bidders that receive no announcement query the council."""
-        crowd = Crowd(100, 4, Weather())
+        crowd = AuctionSimulation(100, 4, LinkFaults())
         crowd.run(0.45)
-        relays = [i for i, p in enumerate(crowd.parties) if len(p.audience) and p._rank is None]
+        relays = [i for i, p in enumerate(crowd.parties) if len(p.recipients) and p._rank is None]
         crowd.dead.update(relays)
-        crowd.best = crowd.right_one()
+        crowd.best = crowd.find_right_winner()
         self.assertEqual(outcome(crowd, 8.0).right, 1.0)
 
     def test_replayed(self) -> None:
         """The same seed gives the same run, another seed another run."""
-        first, same, other = (outcome(Crowd(60, seed, Weather(0.1, 0.02))).digest for seed in (5, 5, 6))
+        first, same, other = (outcome(AuctionSimulation(60, seed, LinkFaults(0.1, 0.02))).digest for seed in (5, 5, 6))
         self.assertEqual(first, same)
         self.assertNotEqual(first, other)
 
@@ -98,7 +98,7 @@ class LargeTests(SynchronousTestCase):
 class CutOffTests(SynchronousTestCase):
     def test_exclusive_without_a_council(self) -> None:
         """An exclusive task is not decided without its council."""
-        crowd = Crowd(20, 1, Weather(), council_is_dead=True)
+        crowd = AuctionSimulation(20, 1, LinkFaults(), council_is_dead=True)
         self.assertEqual(outcome(crowd, 6.0).right, 0.0)
 
 

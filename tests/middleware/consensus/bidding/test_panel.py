@@ -1,4 +1,4 @@
-"""Tests of ``middleware.consensus.bidding.panel``: the reporters of a large group, and the times of their records."""
+"""Tests of ``middleware.consensus.bidding.reporters``: the reporters of a large group, and the times of their records."""
 
 from __future__ import annotations
 
@@ -7,107 +7,113 @@ from dataclasses import replace
 
 from twisted.trial.unittest import SynchronousTestCase
 
-from middleware.consensus.bidding.panel import (
-    BELIEVED,
-    LISTENING,
-    MOST_OPEN,
-    PAUSE,
-    SEATS,
-    SETTLING,
-    SPACING,
-    Panel,
-    panel_of,
+from middleware.consensus.bidding.reporters import (
+    ASSUMED_PRESENT_S,
+    ENOUGH_RECORDS,
+    LISTENING_S,
+    MAX_SMALL_TEAM,
+    RECORD_PAUSE_S,
+    SETTLING_S,
+    TURN_SPACING_S,
+    Reporters,
+    make_reporters,
 )
 from middleware.directory.presence import EXECUTING, SEARCHING, WAITING
 from middleware.tasks.task import Member
 
 MANY = 100
 ME = Member("me", "dog", SEARCHING)
-OTHERS = {f"other{n}" for n in range(SEATS)}
+OTHERS = {f"other{n}" for n in range(ENOUGH_RECORDS)}
 
 
 class PanelTests(SynchronousTestCase):
     def setUp(self) -> None:
-        self.panel = Panel("me", 0.5)
-        self.panel.heard((), MANY, 0.0)
-        self.turn = LISTENING + 0.5 * MANY * SPACING
+        self.panel = Reporters("me", 0.5)
+        self.panel.on_records((), MANY, 0.0)
+        self.turn = LISTENING_S + 0.5 * MANY * TURN_SPACING_S
 
     def full(self) -> None:
         """Let enough records exist."""
-        self.panel.heard(OTHERS, MANY, 0.1)
+        self.panel.on_records(OTHERS, MANY, 0.1)
 
     def test_all_write_in_a_small_team(self) -> None:
         """Up to ``MOST_OPEN`` participants, each report is written at once, and each participant counts."""
-        self.panel.heard(OTHERS, MOST_OPEN, 0.0)
-        self.assertEqual((self.panel.is_partial(0.0), self.panel.counts(0.0)), (False, True))
-        self.assertEqual(self.panel.due(ME, 0.0), 0.0)
-        self.panel.wrote(ME, 0.0)
-        self.assertEqual(self.panel.due(replace(ME, why="waits"), 0.1), 0.1)
+        self.panel.on_records(OTHERS, MAX_SMALL_TEAM, 0.0)
+        self.assertEqual((self.panel.is_partial(0.0), self.panel.is_known(0.0)), (False, True))
+        self.assertEqual(self.panel.compute_due(ME, 0.0), 0.0)
+        self.panel.on_written(ME, 0.0)
+        self.assertEqual(self.panel.compute_due(replace(ME, why="waits"), 0.1), 0.1)
 
     def test_turn_comes_while_there_are_few(self) -> None:
         """Above that limit, an agent without a decision writes at its turn, unless enough others have written."""
-        self.panel.heard(OTHERS, MOST_OPEN + 1, 0.0)
-        self.assertEqual((self.panel.is_partial(0.0), self.panel.due(ME, 0.0)), (True, math.inf))
-        panel = Panel("me", 0.5)
-        panel.heard((), MANY, 0.0)
-        self.assertAlmostEqual(panel.due(ME, 0.0), self.turn)
-        panel.heard(OTHERS, MANY, 0.2)
-        self.assertEqual(panel.due(ME, 50.0), math.inf)
-        self.assertFalse(panel.counts(50.0))
+        self.panel.on_records(OTHERS, MAX_SMALL_TEAM + 1, 0.0)
+        self.assertEqual((self.panel.is_partial(0.0), self.panel.compute_due(ME, 0.0)), (True, math.inf))
+        panel = Reporters("me", 0.5)
+        panel.on_records((), MANY, 0.0)
+        self.assertAlmostEqual(panel.compute_due(ME, 0.0), self.turn)
+        panel.on_records(OTHERS, MANY, 0.2)
+        self.assertEqual(panel.compute_due(ME, 50.0), math.inf)
+        self.assertFalse(panel.is_known(50.0))
 
     def test_gone_ones_are_replaced(self) -> None:
         """When records disappear, the turns start again."""
         self.full()
-        self.panel.heard(sorted(OTHERS)[1:], MANY, 10.0)
-        self.assertAlmostEqual(self.panel.due(ME, 10.0), 10.0 + self.turn)
+        self.panel.on_records(sorted(OTHERS)[1:], MANY, 10.0)
+        self.assertAlmostEqual(self.panel.compute_due(ME, 10.0), 10.0 + self.turn)
 
     def test_small_group_of_a_large_team(self) -> None:
         """If few records exist after all turns, the group is small and each agent writes at once."""
-        over = LISTENING + MANY * SPACING + SETTLING
+        over = LISTENING_S + MANY * TURN_SPACING_S + SETTLING_S
         self.assertEqual([self.panel.is_partial(over - 0.01), self.panel.is_partial(over)], [True, False])
-        self.assertEqual(self.panel.due(ME, over), over)
+        self.assertEqual(self.panel.compute_due(ME, over), over)
 
     def test_who_is_announced_writes(self) -> None:
         """An agent that the council announces writes at once, even if enough records exist."""
         self.full()
-        self.panel.announced(["a", "me"], 5.0)
-        self.assertEqual((self.panel.due(ME, 5.0), self.panel.counts(5.0), self.panel.has_word), (5.0, True, True))
+        self.panel.on_announcement(["a", "me"], 5.0)
+        self.assertEqual(
+            (self.panel.compute_due(ME, 5.0), self.panel.is_known(5.0), self.panel.has_announcement), (5.0, True, True)
+        )
 
     def test_who_acts_writes(self) -> None:
         """An agent that acts, holds a token or is assigned writes at once."""
         self.full()
         for told in (replace(ME, status=EXECUTING), replace(ME, token=3), replace(ME, assigned="me")):
-            self.assertEqual(self.panel.due(told, 5.0), 5.0)
+            self.assertEqual(self.panel.compute_due(told, 5.0), 5.0)
 
     def test_record_of_a_former_life_is_replaced(self) -> None:
         """A record of this agent from before a restart is replaced with the current state."""
-        self.panel.heard({*OTHERS, "me"}, MANY, 1.0)
-        self.assertEqual((self.panel.due(ME, 1.0), self.panel.is_written), (1.0, True))
+        self.panel.on_records({*OTHERS, "me"}, MANY, 1.0)
+        self.assertEqual((self.panel.compute_due(ME, 1.0), self.panel.is_written), (1.0, True))
 
     def test_few_changes_are_written(self) -> None:
         """A change of action is written at once, of the assigned agent after a pause, others only if needed."""
         self.full()
-        self.panel.wrote(ME, 1.0)
-        self.assertEqual(self.panel.due(ME, 9.0), math.inf)
-        self.assertEqual(self.panel.due(replace(ME, status=WAITING), 1.1), 1.1)
-        self.assertEqual(self.panel.due(replace(ME, cost=2.0), 1.1), 1.1)
-        self.assertEqual(self.panel.due(replace(ME, available=False), 1.1), 1.1)
-        self.assertEqual(self.panel.due(replace(ME, assigned="a"), 1.1), 1.0 + PAUSE)
-        self.assertEqual(self.panel.due(replace(ME, why="waits"), 1.1), math.inf)
-        self.panel.announced(["me"], 1.1)
-        self.assertEqual(self.panel.due(replace(ME, why="waits"), 1.2), 1.0 + PAUSE)
+        self.panel.on_written(ME, 1.0)
+        self.assertEqual(self.panel.compute_due(ME, 9.0), math.inf)
+        self.assertEqual(self.panel.compute_due(replace(ME, status=WAITING), 1.1), 1.1)
+        self.assertEqual(self.panel.compute_due(replace(ME, cost=2.0), 1.1), 1.1)
+        self.assertEqual(self.panel.compute_due(replace(ME, available=False), 1.1), 1.1)
+        self.assertEqual(self.panel.compute_due(replace(ME, assigned="a"), 1.1), 1.0 + RECORD_PAUSE_S)
+        self.assertEqual(self.panel.compute_due(replace(ME, why="waits"), 1.1), math.inf)
+        self.panel.on_announcement(["me"], 1.1)
+        self.assertEqual(self.panel.compute_due(replace(ME, why="waits"), 1.2), 1.0 + RECORD_PAUSE_S)
 
     def test_announced_ones_are_believed_for_a_while(self) -> None:
         """An announced agent counts as present until its record is due, even if it is announced repeatedly."""
-        self.panel.announced(["a"], 1.0)
-        self.panel.announced(["a", "b"], 1.9)
-        late = 1.0 + BELIEVED
-        self.assertEqual([self.panel.believes("a", late - 0.01), self.panel.believes("a", late)], [True, False])
-        self.assertEqual([self.panel.believes("b", late), self.panel.believes("c", late)], [True, False])
+        self.panel.on_announcement(["a"], 1.0)
+        self.panel.on_announcement(["a", "b"], 1.9)
+        late = 1.0 + ASSUMED_PRESENT_S
+        self.assertEqual(
+            [self.panel.is_assumed_present("a", late - 0.01), self.panel.is_assumed_present("a", late)], [True, False]
+        )
+        self.assertEqual(
+            [self.panel.is_assumed_present("b", late), self.panel.is_assumed_present("c", late)], [True, False]
+        )
 
     def test_places_are_spread(self) -> None:
         """The agent farthest from the key has the first turn, the nearest the last."""
         key = bytes(20)
-        self.assertEqual(panel_of("00" * 20, key).place, 1.0)
-        self.assertAlmostEqual(panel_of("ff" * 20, key).place, 0.0)
-        self.assertAlmostEqual(panel_of("80" + "00" * 19, key).place, 0.5)
+        self.assertEqual(make_reporters("00" * 20, key).place, 1.0)
+        self.assertAlmostEqual(make_reporters("ff" * 20, key).place, 0.0)
+        self.assertAlmostEqual(make_reporters("80" + "00" * 19, key).place, 0.5)

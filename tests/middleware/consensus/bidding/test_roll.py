@@ -7,11 +7,11 @@ from dataclasses import replace
 from twisted.internet.defer import Deferred
 from twisted.trial.unittest import SynchronousTestCase
 
-from middleware.consensus.bidding.group import Group, Heard, Roll
+from middleware.consensus.bidding.group import Group, OnMembers, TaskMembers
+from middleware.consensus.report_view import ReportView
 from middleware.consensus.strategy import Report
-from middleware.consensus.view import View
 from middleware.tasks.task import Member, Result, Task
-from tests.fleet import FleetCase, SwarmFleet
+from tests.fleet import FleetCase, SwarmTeam
 
 
 def member(uuid: str, cost: float | None) -> Member:
@@ -26,57 +26,57 @@ def costs(members: list[Member]) -> dict[str, float | None]:
 
 class RollTests(SynchronousTestCase):
     def setUp(self) -> None:
-        self.roll = Roll()
-        self.roll.present([member("a", 3.0), member("b", None)])
+        self.roll = TaskMembers()
+        self.roll.update_present([member("a", 3.0), member("b", None)])
 
     def test_announced_bids_count(self) -> None:
         """A bid announced after the record counts; an agent that is not present has no bid."""
-        self.roll.announced([Report("b", 1.0), Report("c", 0.5)])
-        self.assertEqual(costs(self.roll.members()), {"a": 3.0, "b": 1.0})
+        self.roll.update_announced([Report("b", 1.0), Report("c", 0.5)])
+        self.assertEqual(costs(self.roll.list_members()), {"a": 3.0, "b": 1.0})
 
     def test_later_record_counts(self) -> None:
         """A record that changed after the announcement wins, including a withdrawn bid."""
-        self.roll.announced([Report("a", 2.0), Report("b", 1.0)])
-        self.roll.present([member("a", None), member("b", None)])
-        self.assertEqual(costs(self.roll.members()), {"a": None, "b": 1.0})
+        self.roll.update_announced([Report("a", 2.0), Report("b", 1.0)])
+        self.roll.update_present([member("a", None), member("b", None)])
+        self.assertEqual(costs(self.roll.list_members()), {"a": None, "b": 1.0})
 
     def test_announced_bids_tell_all_that_is_read(self) -> None:
         """All fields of an announced bid that the strategy reads count; a changed record overrides them."""
-        roll = Roll(View(("choice", "weight")))
-        roll.present([member("a", 3.0), member("b", 2.0)])
-        roll.announced([Report("a", 3.0, choice="red", weight=2.0, battery=0.1), Report("b", 2.0, weight=-1.0)])
-        told = {m.uuid: (m.choice, m.weight, m.battery) for m in roll.members()}
+        roll = TaskMembers(ReportView(("choice", "weight")))
+        roll.update_present([member("a", 3.0), member("b", 2.0)])
+        roll.update_announced([Report("a", 3.0, choice="red", weight=2.0, battery=0.1), Report("b", 2.0, weight=-1.0)])
+        told = {m.uuid: (m.choice, m.weight, m.battery) for m in roll.list_members()}
         self.assertEqual(told, {"a": ("red", 2.0, 1.0), "b": ("", 1.0, 1.0)})
-        roll.present([replace(member("a", 3.0), choice="blue"), member("b", 2.0)])
-        self.assertEqual(roll.members()[0].choice, "blue")
+        roll.update_present([replace(member("a", 3.0), choice="blue"), member("b", 2.0)])
+        self.assertEqual(roll.list_members()[0].choice, "blue")
 
     def test_who_left_bids_nothing(self) -> None:
         """The announced bid of an agent is dropped when the agent leaves, and does not return with it."""
-        self.roll.announced([Report("b", 1.0)])
-        self.roll.present([member("a", 3.0)])
-        self.roll.present([member("a", 3.0), member("b", None)])
-        self.assertEqual(costs(self.roll.members()), {"a": 3.0, "b": None})
-        self.roll.present([member("a", 3.0)])
-        self.roll.announced([Report("b", 1.0)])
-        self.assertEqual(self.roll.awaited(), [])
+        self.roll.update_announced([Report("b", 1.0)])
+        self.roll.update_present([member("a", 3.0)])
+        self.roll.update_present([member("a", 3.0), member("b", None)])
+        self.assertEqual(costs(self.roll.list_members()), {"a": 3.0, "b": None})
+        self.roll.update_present([member("a", 3.0)])
+        self.roll.update_announced([Report("b", 1.0)])
+        self.assertEqual(self.roll.list_awaited(), [])
 
     def test_announced_before_the_record(self) -> None:
         """A bid announced before the agent's record counts when the record arrives, until the record changes."""
-        self.roll.announced([Report("c", 0.5)])
-        self.assertEqual(self.roll.awaited(), [Report("c", 0.5)])
+        self.roll.update_announced([Report("c", 0.5)])
+        self.assertEqual(self.roll.list_awaited(), [Report("c", 0.5)])
         here = [member("a", 3.0), member("b", None)]
-        self.roll.present([*here, member("c", None)])
-        self.assertEqual((costs(self.roll.members())["c"], self.roll.awaited()), (0.5, []))
-        self.roll.present([*here, member("c", 0.7)])
-        self.assertEqual(costs(self.roll.members())["c"], 0.7)
+        self.roll.update_present([*here, member("c", None)])
+        self.assertEqual((costs(self.roll.list_members())["c"], self.roll.list_awaited()), (0.5, []))
+        self.roll.update_present([*here, member("c", 0.7)])
+        self.assertEqual(costs(self.roll.list_members())["c"], 0.7)
 
     def test_newest_announcement_alone_awaits(self) -> None:
         """An agent that is missing in the newest announcement is not awaited, and its later record wins."""
-        self.roll.announced([Report("c", 0.5), Report("d", 0.6)])
-        self.roll.present([member("a", 3.0), member("d", None)])
-        self.roll.announced([Report("a", 2.0)])
-        self.assertEqual(self.roll.awaited(), [])
-        self.assertEqual(costs(self.roll.members()), {"a": 2.0, "d": None})
+        self.roll.update_announced([Report("c", 0.5), Report("d", 0.6)])
+        self.roll.update_present([member("a", 3.0), member("d", None)])
+        self.roll.update_announced([Report("a", 2.0)])
+        self.assertEqual(self.roll.list_awaited(), [])
+        self.assertEqual(costs(self.roll.list_members()), {"a": 2.0, "d": None})
 
 
 class GroupTests(FleetCase):
@@ -86,18 +86,18 @@ class GroupTests(FleetCase):
         super().setUp()
         self.heard: dict[int, list[dict[str, float | None]]] = {place: [] for place in range(3)}
 
-    def groups(self, fleet: SwarmFleet) -> list[Group]:
+    def groups(self, fleet: SwarmTeam) -> list[Group]:
         """Return the groups of the first three nodes for a new task."""
         task = Task("job", "find", "Find it", waiting_period=0.5)
         task = self.done(fleet, Deferred.fromCoroutine(fleet.nodes[0].submit(task)))
         self.assertEqual(len(task.council), 3)
-        groups = [fleet.nodes[place].group(task, self.hearing(place)) for place in range(3)]
+        groups = [fleet.nodes[place].join_group(task, self.hearing(place)) for place in range(3)]
         for place, group in enumerate(groups):
             group.report(member(fleet.nodes[place].uuid, None))
         fleet.run(1.0)
         return groups
 
-    def hearing(self, place: int) -> Heard:
+    def hearing(self, place: int) -> OnMembers:
         """Return a callback that records the members that the node at ``place`` receives."""
 
         def heard(members: list[Member], outcome: Result | None) -> None:

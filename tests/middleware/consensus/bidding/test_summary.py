@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from twisted.trial.unittest import SynchronousTestCase
 
 from middleware.consensus.bidding.bid import Bid
-from middleware.consensus.bidding.rule import LEADING, MAX_REPORTS, Rule, leading
+from middleware.consensus.bidding.merge_rule import MAX_LEADING_REPORTS, MAX_REPORTS, MergeRule, select_leading
 from middleware.consensus.bidding.summary import MAX_SUPERSEDING, Summary
 from middleware.consensus.strategies.nearest import Nearest
 from middleware.consensus.strategy import Consensus, Report
@@ -40,11 +40,11 @@ class SummaryTests(SynchronousTestCase):
 
     def test_best_stand(self) -> None:
         """If the strategy has no ``merge``, the cheapest bids are kept, in any order of arrival."""
-        self.summary = Summary(Rule(Finding()))
+        self.summary = Summary(MergeRule(Finding()))
         for place, cost in ((3, 4.0), (4, 1.0), (5, 9.0), (6, 2.0), (7, 3.0), (8, 8.0)):
             self.summary.join([bid(place, cost)])
         self.assertEqual([report.cost for report in self.summary.standing], [1.0, 2.0, 3.0, 4.0])
-        self.assertEqual(len(self.summary.bids()), LEADING)
+        self.assertEqual(len(self.summary.list_bids()), MAX_LEADING_REPORTS)
 
     def test_change_is_told(self) -> None:
         """A join returns whether it changed anything; a duplicate changes nothing."""
@@ -95,7 +95,7 @@ class SummaryTests(SynchronousTestCase):
         """The number of withdrawals that a summary keeps is limited."""
         for number in range(MAX_SUPERSEDING + 50):
             self.summary.join([Bid(number.to_bytes(32), None, 1)])
-        self.assertEqual(len(self.summary.bids()), MAX_SUPERSEDING)
+        self.assertEqual(len(self.summary.list_bids()), MAX_SUPERSEDING)
 
 
 class Raising(Nearest):
@@ -128,31 +128,31 @@ class RuleTests(SynchronousTestCase):
     def test_strategy_that_raises(self) -> None:
         """If the strategy raises, the failing method is reported and the nearest reports are kept."""
         blamed: list[str] = []
-        raising = Rule(Raising(), lambda method, error: blamed.append(method))
+        raising = MergeRule(Raising(), lambda method, error: blamed.append(method))
         both = (Report("a", 2.0), Report("b", 1.0))
-        self.assertEqual(raising.merged(both, ()), (both[1], both[0]))
-        self.assertEqual(raising.decided(both)[0], "b")
+        self.assertEqual(raising.merge(both, ()), (both[1], both[0]))
+        self.assertEqual(raising.decide(both)[0], "b")
         self.assertEqual(blamed, ["merge", "find"])
 
     def test_strategy_that_lies(self) -> None:
         """Reports and winners that a strategy invents are dropped."""
-        lying = Rule(Lying())
+        lying = MergeRule(Lying())
         both = (Report("a", 2.0), Report("b", 1.0))
-        self.assertEqual(lying.merged(both, ()), (both[1], both[0]))
-        self.assertEqual(lying.decided(both)[0], "b")
-        self.assertIsNone(lying.decided(())[0])
+        self.assertEqual(lying.merge(both, ()), (both[1], both[0]))
+        self.assertEqual(lying.decide(both)[0], "b")
+        self.assertIsNone(lying.decide(())[0])
 
     def test_strategy_that_hoards(self) -> None:
         """A summary is limited to ``MAX_REPORTS`` reports, and one report for each agent."""
         reports = [Report(f"{n:040}", float(n)) for n in range(MAX_REPORTS + 100)]
-        self.assertEqual(len(Rule(Hoarding()).merged(reports, reports)), MAX_REPORTS)
-        twice = Rule(Hoarding()).merged([Report("a", 1.0)], [Report("a", 2.0)])
+        self.assertEqual(len(MergeRule(Hoarding()).merge(reports, reports)), MAX_REPORTS)
+        twice = MergeRule(Hoarding()).merge([Report("a", 1.0)], [Report("a", 2.0)])
         self.assertEqual(twice, (Report("a", 1.0),))
 
     @given(*(st.lists(st.builds(Report, st.sampled_from("abcdefgh"), st.floats(0, 9))) for _ in range(3)))
     @settings(max_examples=60, deadline=None)
     def test_leading_is_a_join(self, a: list[Report], b: list[Report], c: list[Report]) -> None:
         """The built-in summary is commutative, associative and idempotent."""
-        self.assertEqual(leading(a, b), leading(b, a))
-        self.assertEqual(leading(leading(a, b), c), leading(a, leading(b, c)))
-        self.assertEqual(leading(leading(a, b), b), leading(a, b))
+        self.assertEqual(select_leading(a, b), select_leading(b, a))
+        self.assertEqual(select_leading(select_leading(a, b), c), select_leading(a, select_leading(b, c)))
+        self.assertEqual(select_leading(select_leading(a, b), b), select_leading(a, b))

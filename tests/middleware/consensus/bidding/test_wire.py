@@ -11,9 +11,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from twisted.trial.unittest import SynchronousTestCase
 
-from middleware.consensus.bidding.announcement import announcement_of
-from middleware.consensus.bidding.auction import Auction, auction_of
-from middleware.consensus.bidding.bid import bid_of, report_of
+from middleware.consensus.bidding.announcement import parse_announcement
+from middleware.consensus.bidding.auction import Auction, parse_auction
+from middleware.consensus.bidding.bid import parse_bid, parse_report
 from tests.middleware.consensus.bidding.ground import AGENTS, AUCTION, CONTACTS, COUNCIL, announced, bid
 
 leaves = st.none() | st.booleans() | st.integers(-(2**63), 2**64 - 1) | st.floats() | st.text() | st.binary()
@@ -28,13 +28,13 @@ def sent(content: Any) -> Any:
 class WireTests(SynchronousTestCase):
     def test_comes_as_it_went(self) -> None:
         """An auction, a bid, its withdrawal and an announcement survive encoding, and their signatures are valid."""
-        auction = auction_of(sent(AUCTION.packed()))
+        auction = parse_auction(sent(AUCTION.pack()))
         self.assertEqual((auction, auction and auction.digest), (AUCTION, AUCTION.digest))
         for one in (bid(3, 2.5), bid(3, 0), bid(3, None, 4)):
-            there = bid_of(sent(one.packed()))
+            there = parse_bid(sent(one.pack()))
             self.assertEqual((there, there and there.is_genuine(AUCTION)), (one, True))
         said = announced(3, 1, bid(4, 1.5), bid(5, 2.5, 2))
-        heard = announcement_of(sent(said.packed()))
+        heard = parse_announcement(sent(said.pack()))
         self.assertEqual((heard, heard and heard.is_genuine(AUCTION)), (said, True))
 
 
@@ -45,29 +45,29 @@ class AuctionTests(SynchronousTestCase):
             replace(AUCTION, council=COUNCIL[:2]),
             replace(AUCTION, epoch=2),
             replace(AUCTION, strategy="cbba"),
-            replace(AUCTION, waiting=9.0),
+            replace(AUCTION, waiting_period=9.0),
             replace(AUCTION, exclusive=False),
         ]
         self.assertEqual(len({each.digest for each in [AUCTION, *others]}), 6)
 
     def test_unlawful_ones(self) -> None:
         """An auction with an invalid council, epoch, strategy or waiting period is not decoded."""
-        lawful = AUCTION.packed()
-        for place, wrong in ((0, ""), (0, 7), (1, -1), (2, []), (2, [CONTACTS[0].packed()] * 2), (3, "x" * 65)):
-            self.assertIsNone(auction_of([*lawful[:place], wrong, *lawful[place + 1 :]]), wrong)
+        lawful = AUCTION.pack()
+        for place, wrong in ((0, ""), (0, 7), (1, -1), (2, []), (2, [CONTACTS[0].pack()] * 2), (3, "x" * 65)):
+            self.assertIsNone(parse_auction([*lawful[:place], wrong, *lawful[place + 1 :]]), wrong)
         for waiting in (math.nan, math.inf, -1.0, 1e9):
-            self.assertIsNone(auction_of([*lawful[:4], waiting, True]), waiting)
+            self.assertIsNone(parse_auction([*lawful[:4], waiting, True]), waiting)
 
     @given(anything)
     @settings(max_examples=60, deadline=None)
     def test_decoders_are_total(self, content: Any) -> None:
         """For any input a decoder returns a valid object or None, and never raises."""
-        auction, one, announcement = auction_of(content), bid_of(content), announcement_of(content)
-        for shaped in ([AUCTION.packed()[:2] + [content] * 4], [AGENTS[0].public, content, 0, b"s" * 64]):
-            auction_of(shaped)
-            bid_of(shaped)
-        announcement_of([1, 0, content, b"s" * 64])
-        announcement_of([1, 0, [["a" * 40, content, 0]], b"s" * 64])
+        auction, one, announcement = parse_auction(content), parse_bid(content), parse_announcement(content)
+        for shaped in ([AUCTION.pack()[:2] + [content] * 4], [AGENTS[0].public, content, 0, b"s" * 64]):
+            parse_auction(shaped)
+            parse_bid(shaped)
+        parse_announcement([1, 0, content, b"s" * 64])
+        parse_announcement([1, 0, [["a" * 40, content, 0]], b"s" * 64])
         self.assertTrue(auction is None or isinstance(auction, Auction))
         self.assertEqual((one, announcement), (None, None))
 
@@ -90,9 +90,9 @@ class BidTests(SynchronousTestCase):
     def test_costs_that_are_none(self) -> None:
         """NaN, infinite, negative and huge costs, and unknown fields, give no report."""
         for cost in (math.nan, math.inf, -math.inf, -1.0, 1e300, True, "1", None):
-            self.assertIsNone(report_of({"cost": cost}, "a"), cost)
-        self.assertIsNone(report_of({"cost": 1.0, "friend": "b"}, "a"))
-        self.assertIsNone(report_of({"cost": 1.0, "agent": "b"}, "a"))
+            self.assertIsNone(parse_report({"cost": cost}, "a"), cost)
+        self.assertIsNone(parse_report({"cost": 1.0, "friend": "b"}, "a"))
+        self.assertIsNone(parse_report({"cost": 1.0, "agent": "b"}, "a"))
 
 
 class AnnouncementTests(SynchronousTestCase):
@@ -101,7 +101,7 @@ class AnnouncementTests(SynchronousTestCase):
         stranger = AGENTS[7]
         one = announced(1, 0, bid(4, 1.5))
         for rank in (0, 1, 2, 3, 99):
-            forged = replace(one, rank=rank).signed(stranger.sign, AUCTION)
+            forged = replace(one, rank=rank).sign(stranger.sign, AUCTION)
             self.assertFalse(forged.is_genuine(AUCTION), rank)
 
     def test_forged_ones(self) -> None:
@@ -115,7 +115,7 @@ class AnnouncementTests(SynchronousTestCase):
     def test_doubled_agents(self) -> None:
         """An announcement with two reports of one agent is not decoded."""
         one = announced(1, 0, bid(4, 1.5), bid(4, 2.5))
-        self.assertIsNone(announcement_of(sent(one.packed())))
+        self.assertIsNone(parse_announcement(sent(one.pack())))
 
     def test_precedence(self) -> None:
         """The higher number has precedence; at equal numbers the member of lower rank."""

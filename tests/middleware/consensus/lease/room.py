@@ -9,7 +9,7 @@ from twisted.internet.defer import Deferred
 from twisted.trial.unittest import SynchronousTestCase
 
 from middleware.consensus.lease.charter import Charter, sign_change
-from middleware.consensus.lease.lessee import Lessee
+from middleware.consensus.lease.lease_client import LeaseClient
 from middleware.entangled.quorum.ballot import Ballot
 from sim.team.leases.team import LeaseTeam
 
@@ -32,27 +32,27 @@ class RoomCase(SynchronousTestCase):
 
     def chartered(self, *councils: Sequence[int], signers: int = 2) -> Charter:
         """Return the charter that proves these successive councils of the task."""
-        charter, sitting = self.room.councils[T], [3, 4, 5]
+        charter, sitting = self.room.charters[T], [3, 4, 5]
         for number, council in enumerate(councils, start=1):
             members = tuple(self.room.contacts[place] for place in council)
             ballot = Ballot(number, "agent")
             signed = [(n, self.room.identities[place]) for n, place in enumerate(sitting[:signers])]
             votes = [(n, 7, sign_change(each, T, number, ballot, members, 7)) for n, each in signed]
-            charter, sitting = charter.extended(members, ballot, tuple(votes)), list(council)
+            charter, sitting = charter.with_change(members, ballot, tuple(votes)), list(council)
         return charter
 
-    def lessee(self, place: int) -> Lessee:
+    def lessee(self, place: int) -> LeaseClient:
         """Return the lease client of an agent."""
-        return self.room.bidders[place].lessee(T)
+        return self.room.nodes[place].get_lease_client(T)
 
     def run_for(self, seconds: float) -> None:
         """Advance the clock."""
         self.room.clock.advance(seconds)
 
-    def wanting(self, place: int, seconds: float = 0.1) -> Lessee:
+    def wanting(self, place: int, seconds: float = 0.1) -> LeaseClient:
         """Return the lease client of an agent that has requested the lease ``seconds`` ago."""
         lessee = self.lessee(place)
-        lessee.want()
+        lessee.claim()
         self.run_for(seconds)
         return lessee
 

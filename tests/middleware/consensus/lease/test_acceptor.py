@@ -6,12 +6,12 @@ import math
 
 from twisted.trial.unittest import SynchronousTestCase
 
-from middleware.consensus.lease.acceptor import IDLE_AGE, MAX_LISTENERS, LeaseAcceptor
-from middleware.consensus.lease.lease_codec import CODEC, LIFE
+from middleware.consensus.lease.acceptor import IDLE_AGE_S, MAX_LISTENERS, LeaseAcceptor
+from middleware.consensus.lease.lease_codec import BALLOT_MODULUS, CODEC
 from middleware.entangled.data.memory import MemoryStore
 from middleware.entangled.quorum import log
 from middleware.entangled.quorum.ballot import Ballot
-from middleware.entangled.quorum.register import Kind, Reply
+from middleware.entangled.quorum.register import Reply, ReplyKind
 from tests.middleware.consensus.lease.test_lease_codec import MEMBERS
 
 TTL = 2.0
@@ -19,7 +19,7 @@ TTL = 2.0
 
 def ballot(number: int, agent: str) -> Ballot:
     """Return a ballot of an agent that was never restarted."""
-    return Ballot(number * LIFE, agent)
+    return Ballot(number * BALLOT_MODULUS, agent)
 
 
 class AcceptorTests(SynchronousTestCase):
@@ -38,31 +38,33 @@ class AcceptorTests(SynchronousTestCase):
         """Near the end of a lease a proposer gets a promise for the time after it, but no earlier grant."""
         self.prepare(1, "a", 0.0)
         self.propose(1, "a", 1, 0.0)
-        self.assertEqual(self.prepare(2, "b", 1.5).kind, Kind.HELD)
-        self.assertEqual(self.prepare(0, "b", 1.75).kind, Kind.HELD)
+        self.assertEqual(self.prepare(2, "b", 1.5).kind, ReplyKind.HELD)
+        self.assertEqual(self.prepare(0, "b", 1.75).kind, ReplyKind.HELD)
         promised = self.prepare(2, "b", 1.75)
-        self.assertEqual((promised.kind, promised.remaining, promised.token), (Kind.GRANTED, 0.25, 1))
-        self.assertEqual(self.propose(2, "b", 2, 1.99).kind, Kind.HELD)
-        self.assertEqual(self.propose(2, "b", 2, 2.0).kind, Kind.GRANTED)
+        self.assertEqual((promised.kind, promised.remaining, promised.token), (ReplyKind.GRANTED, 0.25, 1))
+        self.assertEqual(self.propose(2, "b", 2, 1.99).kind, ReplyKind.HELD)
+        self.assertEqual(self.propose(2, "b", 2, 2.0).kind, ReplyKind.GRANTED)
 
     def test_promise_ends_no_lease(self) -> None:
         """The holder renews its lease despite another's promise, also after its release, but cannot claim a new one."""
         self.prepare(1, "a", 0.0)
         self.propose(1, "a", 1, 0.0)
         self.prepare(2, "b", 1.75)
-        self.assertEqual(self.propose(1, "a", 2, 1.8).kind, Kind.OUTBID)
-        self.assertEqual(self.propose(1, "a", 1, 1.8).kind, Kind.GRANTED)
-        self.assertEqual(self.propose(2, "b", 2, 2.0).kind, Kind.HELD)
-        self.acceptor.free("t", ballot(2, "b"), 2.1)
-        self.assertEqual(self.propose(1, "a", 1, 2.2).kind, Kind.GRANTED)
-        self.assertEqual(self.propose(2, "b", 2, 4.3).kind, Kind.OUTBID)
-        self.assertEqual(self.prepare(3, "b", 4.3).kind, Kind.GRANTED)
+        self.assertEqual(self.propose(1, "a", 2, 1.8).kind, ReplyKind.OUTBID)
+        self.assertEqual(self.propose(1, "a", 1, 1.8).kind, ReplyKind.GRANTED)
+        self.assertEqual(self.propose(2, "b", 2, 2.0).kind, ReplyKind.HELD)
+        self.acceptor.release_by_ballot("t", ballot(2, "b"), 2.1)
+        self.assertEqual(self.propose(1, "a", 1, 2.2).kind, ReplyKind.GRANTED)
+        self.assertEqual(self.propose(2, "b", 2, 4.3).kind, ReplyKind.OUTBID)
+        self.assertEqual(self.prepare(3, "b", 4.3).kind, ReplyKind.GRANTED)
 
     def test_former_life_is_another(self) -> None:
         """A restarted agent must wait for the end of its earlier lease, because its robot may still move."""
         self.prepare(1, "a", 0.0)
         self.propose(1, "a", 1, 0.0)
-        self.assertEqual(self.acceptor.prepare("t", 1, Ballot(9 * LIFE + 5, "a"), TTL, 1.0).kind, Kind.HELD)
+        self.assertEqual(
+            self.acceptor.prepare("t", 1, Ballot(9 * BALLOT_MODULUS + 5, "a"), TTL, 1.0).kind, ReplyKind.HELD
+        )
 
     def test_release(self) -> None:
         """A released lease is free at once, waiting proposers are notified, and a late proposal does not restore it."""
@@ -70,45 +72,47 @@ class AcceptorTests(SynchronousTestCase):
         self.propose(1, "a", 1, 0.0)
         self.prepare(2, "b", 0.5)
         self.prepare(2, "c", 0.5)
-        self.assertEqual(self.acceptor.free("t", ballot(1, "a"), 1.0), ["b", "c"])
-        self.assertEqual(self.acceptor.free("t", ballot(1, "a"), 1.0), [])
-        self.assertEqual(self.propose(1, "a", 1, 1.0).kind, Kind.OUTBID)
-        self.assertEqual(self.prepare(2, "b", 1.0).kind, Kind.GRANTED)
+        self.assertEqual(self.acceptor.release_by_ballot("t", ballot(1, "a"), 1.0), ["b", "c"])
+        self.assertEqual(self.acceptor.release_by_ballot("t", ballot(1, "a"), 1.0), [])
+        self.assertEqual(self.propose(1, "a", 1, 1.0).kind, ReplyKind.OUTBID)
+        self.assertEqual(self.prepare(2, "b", 1.0).kind, ReplyKind.GRANTED)
 
     def test_release_before_the_robot_rests(self) -> None:
         """A release while the robot still moves gives a promise at once, and a grant when the robot stands still."""
         self.prepare(1, "a", 0.0)
         self.propose(1, "a", 1, 0.0)
         self.prepare(2, "b", 0.5)
-        self.assertEqual(self.acceptor.free("t", ballot(1, "a"), 1.0, 0.2), ["b"])
+        self.assertEqual(self.acceptor.release_by_ballot("t", ballot(1, "a"), 1.0, 0.2), ["b"])
         promised = self.prepare(2, "b", 1.05)
-        self.assertEqual((promised.kind, round(promised.remaining, 3)), (Kind.GRANTED, 0.15))
+        self.assertEqual((promised.kind, round(promised.remaining, 3)), (ReplyKind.GRANTED, 0.15))
         early = self.propose(2, "b", 2, 1.15)
-        self.assertEqual((early.kind, round(early.remaining, 3)), (Kind.HELD, 0.05))
-        self.assertEqual(self.propose(1, "a", 1, 1.16).kind, Kind.OUTBID)
-        self.assertEqual(self.propose(2, "b", 2, 1.2).kind, Kind.GRANTED)
+        self.assertEqual((early.kind, round(early.remaining, 3)), (ReplyKind.HELD, 0.05))
+        self.assertEqual(self.propose(1, "a", 1, 1.16).kind, ReplyKind.OUTBID)
+        self.assertEqual(self.propose(2, "b", 2, 1.2).kind, ReplyKind.GRANTED)
 
     def test_change_by_the_holder(self) -> None:
         """A holder that releases by a change keeps others away for a TTL, also at members of the next council."""
         self.prepare(1, "a", 0.0)
         self.propose(1, "a", 1, 0.0)
         self.prepare(2, "a", 0.1)
-        self.assertEqual(self.acceptor.accept("t", 1, ballot(2, "a"), MEMBERS[:3], 0.1, 1, True).kind, Kind.GRANTED)
-        self.assertEqual(self.prepare(3, "b", 0.2).kind, Kind.HELD)
-        self.assertEqual(self.propose(2, "a", 1, 0.2).kind, Kind.SEALED)
+        self.assertEqual(
+            self.acceptor.accept("t", 1, ballot(2, "a"), MEMBERS[:3], 0.1, 1, True).kind, ReplyKind.GRANTED
+        )
+        self.assertEqual(self.prepare(3, "b", 0.2).kind, ReplyKind.HELD)
+        self.assertEqual(self.propose(2, "a", 1, 0.2).kind, ReplyKind.SEALED)
         self.acceptor.install("t", 2, MEMBERS[:3], 1, 0.3, ballot(2, "a"), TTL)
-        self.assertEqual(self.acceptor.prepare("t", 2, ballot(3, "b"), TTL, 1.0).kind, Kind.HELD)
-        self.assertEqual(self.acceptor.prepare("t", 2, ballot(3, "b"), TTL, 0.2 + TTL).kind, Kind.GRANTED)
-        self.assertEqual(self.acceptor.lease("t", 2, ballot(3, "b"), 2, TTL, 0.2 + TTL).kind, Kind.HELD)
-        self.assertEqual(self.acceptor.prepare("t", 2, ballot(4, "a"), TTL, 0.4).kind, Kind.GRANTED)
-        self.assertEqual(self.acceptor.prepare("t", 2, ballot(5, "b"), TTL, 0.3 + TTL).kind, Kind.GRANTED)
+        self.assertEqual(self.acceptor.prepare("t", 2, ballot(3, "b"), TTL, 1.0).kind, ReplyKind.HELD)
+        self.assertEqual(self.acceptor.prepare("t", 2, ballot(3, "b"), TTL, 0.2 + TTL).kind, ReplyKind.GRANTED)
+        self.assertEqual(self.acceptor.lease("t", 2, ballot(3, "b"), 2, TTL, 0.2 + TTL).kind, ReplyKind.HELD)
+        self.assertEqual(self.acceptor.prepare("t", 2, ballot(4, "a"), TTL, 0.4).kind, ReplyKind.GRANTED)
+        self.assertEqual(self.acceptor.prepare("t", 2, ballot(5, "b"), TTL, 0.3 + TTL).kind, ReplyKind.GRANTED)
 
     def test_release_that_overtakes_its_proposal(self) -> None:
         """A proposal that arrives after its own release is not granted."""
         self.prepare(1, "a", 0.0)
-        self.acceptor.free("t", ballot(1, "a"), 0.1)
-        self.assertEqual(self.propose(1, "a", 1, 0.2).kind, Kind.OUTBID)
-        self.assertEqual(self.prepare(2, "a", 0.3).kind, Kind.GRANTED)
+        self.acceptor.release_by_ballot("t", ballot(1, "a"), 0.1)
+        self.assertEqual(self.propose(1, "a", 1, 0.2).kind, ReplyKind.OUTBID)
+        self.assertEqual(self.prepare(2, "a", 0.3).kind, ReplyKind.GRANTED)
 
     def test_release_of_an_older_ballot_too(self) -> None:
         """The release of the latest ballot also releases all older ballots of the agent, in any order of arrival."""
@@ -119,22 +123,22 @@ class AcceptorTests(SynchronousTestCase):
             self.prepare(2, "a", 0.1)
             if proposes_first:
                 self.propose(2, "a", 1, 0.2)
-            self.acceptor.free("t", ballot(2, "a"), 0.3)
-            self.assertEqual(self.propose(2, "a", 1, 0.4).kind, Kind.OUTBID)
-            self.acceptor.free("t", ballot(1, "a"), 0.5)
-            self.assertEqual(self.prepare(3, "b", 0.6)[:4:3], (Kind.GRANTED, 0.0))
+            self.acceptor.release_by_ballot("t", ballot(2, "a"), 0.3)
+            self.assertEqual(self.propose(2, "a", 1, 0.4).kind, ReplyKind.OUTBID)
+            self.acceptor.release_by_ballot("t", ballot(1, "a"), 0.5)
+            self.assertEqual(self.prepare(3, "b", 0.6)[:4:3], (ReplyKind.GRANTED, 0.0))
 
     def test_freed(self) -> None:
         """A released lease is accepted from other members only with the holder and its token."""
         self.prepare(1, "a", 0.0)
         self.propose(1, "a", 1, 0.0)
         for agent, token in (("b", 1), ("a", 0), ("a", 2)):
-            self.assertEqual(self.acceptor.freed("t", agent, token, 0.5), [])
-            self.assertEqual(self.prepare(2, "b", 0.5).kind, Kind.HELD)
-        self.assertEqual(self.acceptor.freed("t", "a", 1, 0.5, 0.1), ["b"])
-        self.assertEqual(self.propose(1, "a", 1, 0.55).kind, Kind.OUTBID)
-        self.assertEqual(self.prepare(2, "b", 0.6).kind, Kind.GRANTED)
-        self.assertEqual(self.acceptor.freed("u", "a", 1, 0.5), [])
+            self.assertEqual(self.acceptor.release_by_token("t", agent, token, 0.5), [])
+            self.assertEqual(self.prepare(2, "b", 0.5).kind, ReplyKind.HELD)
+        self.assertEqual(self.acceptor.release_by_token("t", "a", 1, 0.5, 0.1), ["b"])
+        self.assertEqual(self.propose(1, "a", 1, 0.55).kind, ReplyKind.OUTBID)
+        self.assertEqual(self.prepare(2, "b", 0.6).kind, ReplyKind.GRANTED)
+        self.assertEqual(self.acceptor.release_by_token("u", "a", 1, 0.5), [])
 
     def test_listeners_are_bounded(self) -> None:
         """The number of waiting proposers is limited, and the most recent ones are notified."""
@@ -142,7 +146,7 @@ class AcceptorTests(SynchronousTestCase):
         self.propose(1, "a", 1, 0.0)
         for number in range(3 * MAX_LISTENERS):
             self.prepare(2, f"b{number:03d}", 0.5)
-        told = self.acceptor.free("t", ballot(1, "a"), 1.0)
+        told = self.acceptor.release_by_ballot("t", ballot(1, "a"), 1.0)
         self.assertEqual((len(told), told[-1]), (MAX_LISTENERS, f"b{3 * MAX_LISTENERS - 1:03d}"))
 
     def test_no_room(self) -> None:
@@ -155,7 +159,7 @@ class AcceptorTests(SynchronousTestCase):
             self.acceptor.close("u", "a", 1, 0, 0.0),
             self.acceptor.install("u", 2, MEMBERS[:3], 0, 0.0),
         ):
-            self.assertEqual(reply.kind, Kind.QUIET)
+            self.assertEqual(reply.kind, ReplyKind.QUIET)
             self.assertGreater(reply.remaining, 0.0)
 
     def test_close_after_release(self) -> None:
@@ -163,62 +167,64 @@ class AcceptorTests(SynchronousTestCase):
         store = MemoryStore()
         self.acceptor = LeaseAcceptor(store, -math.inf)
         self.propose(1, "a", 3, 0.0)
-        self.acceptor.free("t", ballot(1, "a"), 0.5)
+        self.acceptor.release_by_ballot("t", ballot(1, "a"), 0.5)
         self.propose(2, "b", 4, 0.5)
-        self.acceptor.free("t", ballot(2, "b"), 1.0)
+        self.acceptor.release_by_ballot("t", ballot(2, "b"), 1.0)
         self.acceptor = LeaseAcceptor(store, -math.inf)
         kinds = [self.acceptor.close("t", "a", 1, token, 1.0).kind for token in (3, 4)]
-        self.assertEqual(kinds, [Kind.OUTBID, Kind.BEHIND])
-        self.assertEqual(self.acceptor.close("t", "b", 1, 4, 1.0).kind, Kind.OVER)
+        self.assertEqual(kinds, [ReplyKind.OUTBID, ReplyKind.BEHIND])
+        self.assertEqual(self.acceptor.close("t", "b", 1, 4, 1.0).kind, ReplyKind.OVER)
 
     def test_close_under_a_token_of_others(self) -> None:
         """An acceptor that did not grant a token does not sign an end under it."""
         self.propose(1, "a", 3, 0.0)
         self.acceptor.accept("t", 1, ballot(2, "b"), MEMBERS, 3.0, 5)
-        self.assertEqual([self.acceptor.close("t", agent, 1, 5, 3.0).kind for agent in ("a", "b")], [Kind.BEHIND] * 2)
+        self.assertEqual(
+            [self.acceptor.close("t", agent, 1, 5, 3.0).kind for agent in ("a", "b")], [ReplyKind.BEHIND] * 2
+        )
 
     def test_close(self) -> None:
         """After a close nothing is granted or renewed; the reply contains the remaining time of the lease."""
         self.prepare(1, "a", 0.0)
         self.propose(1, "a", 3, 0.0)
-        self.assertEqual(self.acceptor.close("t", "b", 1, 2, 0.5).kind, Kind.OUTBID)
+        self.assertEqual(self.acceptor.close("t", "b", 1, 2, 0.5).kind, ReplyKind.OUTBID)
         closed = self.acceptor.close("t", "b", 1, 0, 0.5)
-        self.assertEqual((closed.kind, closed.remaining), (Kind.OVER, 1.5))
+        self.assertEqual((closed.kind, closed.remaining), (ReplyKind.OVER, 1.5))
         self.assertEqual(self.acceptor.close("t", "a", 1, 3, 0.5).remaining, 0.0)
-        self.assertEqual(self.propose(1, "a", 3, 0.6).kind, Kind.OVER)
-        self.assertEqual(self.prepare(9, "b", 99.0).kind, Kind.OVER)
+        self.assertEqual(self.propose(1, "a", 3, 0.6).kind, ReplyKind.OVER)
+        self.assertEqual(self.prepare(9, "b", 99.0).kind, ReplyKind.OVER)
 
     def test_change(self) -> None:
         """An accepted change seals the council; a reply contains the change, and after its decision the new council."""
         self.prepare(1, "a", 0.0)
         changed = self.acceptor.accept("t", 1, ballot(1, "a"), MEMBERS[:3], 0.0, 4)
-        self.assertEqual(changed.kind, Kind.GRANTED)
-        self.assertEqual(self.propose(1, "a", 5, 0.1).kind, Kind.SEALED)
+        self.assertEqual(changed.kind, ReplyKind.GRANTED)
+        self.assertEqual(self.propose(1, "a", 5, 0.1).kind, ReplyKind.SEALED)
         asked = self.prepare(2, "b", 0.1)
         self.assertEqual(
-            (asked.kind, asked.accepted, asked.value, asked.token), (Kind.SEALED, ballot(1, "a"), MEMBERS[:3], 4)
+            (asked.kind, asked.accepted, asked.value, asked.token), (ReplyKind.SEALED, ballot(1, "a"), MEMBERS[:3], 4)
         )
-        self.assertEqual(self.acceptor.accept("t", 1, ballot(1, "a"), MEMBERS[:2], 0.2, 4).kind, Kind.OUTBID)
+        self.assertEqual(self.acceptor.accept("t", 1, ballot(1, "a"), MEMBERS[:2], 0.2, 4).kind, ReplyKind.OUTBID)
         installed = self.acceptor.install("t", 2, MEMBERS[:3], 4, 0.3, proof=b"proof")
-        self.assertEqual(installed.kind, Kind.GRANTED)
+        self.assertEqual(installed.kind, ReplyKind.GRANTED)
         told = self.prepare(3, "b", 0.4)
-        self.assertEqual((told.kind, told.configuration, told.proof), (Kind.MOVED, 2, b"proof"))
-        self.assertEqual(self.prepare(3, "b", 0.4, configuration=2).kind, Kind.GRANTED)
-        self.assertEqual(self.propose(3, "b", 4, 0.4, configuration=2).kind, Kind.OUTBID)
-        self.assertEqual(self.propose(3, "b", 5, 0.4, configuration=2).kind, Kind.GRANTED)
+        self.assertEqual((told.kind, told.configuration, told.proof), (ReplyKind.MOVED, 2, b"proof"))
+        self.assertEqual(self.prepare(3, "b", 0.4, configuration=2).kind, ReplyKind.GRANTED)
+        self.assertEqual(self.propose(3, "b", 4, 0.4, configuration=2).kind, ReplyKind.OUTBID)
+        self.assertEqual(self.propose(3, "b", 5, 0.4, configuration=2).kind, ReplyKind.GRANTED)
 
     def test_promise_survives_a_restart(self) -> None:
         """A promise survives a restart; an acceptor with a corrupt store entry grants nothing."""
         store = MemoryStore()
         LeaseAcceptor(store, -math.inf).prepare("t", 1, ballot(2, "a"), TTL, 0.0)
         self.acceptor = LeaseAcceptor(store, 50.0)
-        self.assertEqual(self.prepare(1, "b", 51.0).kind, Kind.OUTBID)
+        self.assertEqual(self.prepare(1, "b", 51.0).kind, ReplyKind.OUTBID)
         self.acceptor.accept("t", 1, ballot(2, "a"), MEMBERS[:3], 51.0)
         self.acceptor = LeaseAcceptor(store, 60.0)
-        self.assertEqual(self.prepare(3, "b", 61.0).kind, Kind.SEALED)
-        store.note(CODEC.bucket_of("t"), b"rotten")
+        self.assertEqual(self.prepare(3, "b", 61.0).kind, ReplyKind.SEALED)
+        store.set_note(CODEC.bucket_of("t"), b"rotten")
         self.acceptor = LeaseAcceptor(store, 50.0)
-        self.assertEqual(self.prepare(1, "b", 51.0).kind, Kind.QUIET)
+        self.assertEqual(self.prepare(1, "b", 51.0).kind, ReplyKind.QUIET)
 
     def test_forgotten(self) -> None:
         """An evicted task leaves a lower bound for ballots and tokens, also after a restart."""
@@ -227,9 +233,9 @@ class AcceptorTests(SynchronousTestCase):
         self.acceptor = LeaseAcceptor(store, -math.inf)
         self.prepare(2, "b", 0.0)
         self.propose(2, "b", 5, 0.0)
-        self.assertEqual(self.acceptor.prepare("u", 1, ballot(9, "a"), TTL, 0.9 * IDLE_AGE).kind, Kind.QUIET)
-        self.assertEqual(self.acceptor.prepare("u", 1, ballot(9, "a"), TTL, 1.1 * IDLE_AGE).kind, Kind.GRANTED)
+        self.assertEqual(self.acceptor.prepare("u", 1, ballot(9, "a"), TTL, 0.9 * IDLE_AGE_S).kind, ReplyKind.QUIET)
+        self.assertEqual(self.acceptor.prepare("u", 1, ballot(9, "a"), TTL, 1.1 * IDLE_AGE_S).kind, ReplyKind.GRANTED)
         self.patch(log, "MAX_REGISTERS", 2)
-        for acceptor in (self.acceptor, LeaseAcceptor(store, 1.2 * IDLE_AGE)):
-            asked = acceptor.prepare("t", 1, ballot(2, "a"), TTL, 1.3 * IDLE_AGE)
-            self.assertEqual((asked.kind, asked.token), (Kind.OUTBID, 5))
+        for acceptor in (self.acceptor, LeaseAcceptor(store, 1.2 * IDLE_AGE_S)):
+            asked = acceptor.prepare("t", 1, ballot(2, "a"), TTL, 1.3 * IDLE_AGE_S)
+            self.assertEqual((asked.kind, asked.token), (ReplyKind.OUTBID, 5))

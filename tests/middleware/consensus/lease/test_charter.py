@@ -9,19 +9,19 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from middleware.consensus.lease.charter import (
-    MAX_LINKS,
+    MAX_CHANGES,
     MAX_TOKEN,
     Charter,
-    Ending,
-    Judge,
-    charter_of,
-    ending_of,
-    pin,
+    CharterVerifier,
+    EndProof,
+    create_charter,
+    parse_charter,
+    parse_end_proof,
     sign_change,
     sign_end,
 )
 from middleware.entangled.errors import Refused
-from middleware.entangled.quorum.ballot import Ballot, believed
+from middleware.entangled.quorum.ballot import Ballot, highest_credible
 from tests.middleware.consensus.lease.room import RoomCase, T
 
 
@@ -29,16 +29,16 @@ class CharterTests(RoomCase):
     def test_chain(self) -> None:
         """A charter contains the newest council, and survives encoding."""
         charter = self.chartered([3, 4, 6], [0, 4, 6])
-        again = charter_of(charter.packed)
+        again = parse_charter(charter.packed)
         self.assertEqual(again, charter)
         self.assertTrue(charter.is_genuine(T))
-        self.assertEqual([self.room.place_of(member) for member in charter.members], [0, 4, 6])
+        self.assertEqual([self.room.get_place(member) for member in charter.members], [0, 4, 6])
         self.assertEqual((charter.configuration, charter.token, charter.ballot), (3, 7, Ballot(2, "agent")))
 
     def test_anything_changed(self) -> None:
         """A charter with a changed task, member, order, ballot, token or signer, or too few signers, is not genuine."""
         charter = self.chartered([3, 4, 6], [0, 4, 6])
-        first, second = charter.links
+        first, second = charter.changes
         forged = self.room.identities[6]
         for links in (
             (second,),
@@ -52,7 +52,7 @@ class CharterTests(RoomCase):
             (first, second._replace(votes=(second.votes[0], (2, 7, second.votes[1][2])))),
             (first, second._replace(votes=(second.votes[0], (9, 7, second.votes[1][2])))),
         ):
-            self.assertFalse(replace(charter, links=links).is_genuine(T), links)
+            self.assertFalse(replace(charter, changes=links).is_genuine(T), links)
         self.assertFalse(charter.is_genuine("t1"))
         self.assertFalse(replace(charter, owner=forged.public).is_genuine(T))
         self.assertFalse(replace(charter, first=tuple(self.room.contacts[:3])).is_genuine(T))
@@ -64,31 +64,31 @@ class CharterTests(RoomCase):
 
     def test_judge(self) -> None:
         """A council pinned by a node without the right to publish tasks is rejected."""
-        pinned = pin(self.room.identities[0], T, tuple(self.room.contacts[:3]))
-        judge = self.room.judge
-        self.assertIsNone(judge.read(T, pinned.packed))
-        self.assertEqual(Judge(lambda public, task_id: True).read(T, pinned.packed), pinned)
-        self.assertIsNone(judge.read(T, self.chartered([3, 4, 6], signers=1).packed))
+        pinned = create_charter(self.room.identities[0], T, tuple(self.room.contacts[:3]))
+        judge = self.room.charter_verifier
+        self.assertIsNone(judge.parse(T, pinned.packed))
+        self.assertEqual(CharterVerifier(lambda public, task_id: True).parse(T, pinned.packed), pinned)
+        self.assertIsNone(judge.parse(T, self.chartered([3, 4, 6], signers=1).packed))
 
     def test_bounded(self) -> None:
         """The number of links of a charter and its token are limited."""
         charter = self.chartered([3, 4, 6])
-        full = replace(charter, links=charter.links * MAX_LINKS)
-        self.assertRaises(Refused, full.extended, charter.members, charter.ballot, ())
-        self.assertEqual(charter_of(full.packed), full)
-        self.assertIsNone(charter_of(replace(charter, links=charter.links * (MAX_LINKS + 1)).packed))
-        link = charter.links[0]._replace(votes=((0, 2**61, bytes(64)), (1, 3, bytes(64))))
-        self.assertEqual(replace(charter, links=(link,)).token, MAX_TOKEN)
+        full = replace(charter, changes=charter.changes * MAX_CHANGES)
+        self.assertRaises(Refused, full.with_change, charter.members, charter.ballot, ())
+        self.assertEqual(parse_charter(full.packed), full)
+        self.assertIsNone(parse_charter(replace(charter, changes=charter.changes * (MAX_CHANGES + 1)).packed))
+        link = charter.changes[0]._replace(votes=((0, 2**61, bytes(64)), (1, 3, bytes(64))))
+        self.assertEqual(replace(charter, changes=(link,)).token, MAX_TOKEN)
 
     def test_ending(self) -> None:
         """A majority of the current council proves the agent that ended the task, and its token."""
-        pinned = self.room.councils[T]
+        pinned = self.room.charters[T]
         for charter, seats in ((pinned, [3, 4, 5]), (self.chartered([0, 4, 6]), [0, 4, 6])):
             votes = [
                 (place, sign_end(self.room.identities[seat], T, charter.configuration, "a", 7))
                 for place, seat in enumerate(seats)
             ]
-            ending = ending_of(Ending(charter, tuple(votes[:2])).packed, pinned)
+            ending = parse_end_proof(EndProof(charter, tuple(votes[:2])).packed, pinned)
             assert ending is not None
             self.assertTrue(ending.is_genuine(T, "a", 7))
             self.assertFalse(ending.is_genuine(T, "a", 8))
@@ -96,8 +96,8 @@ class CharterTests(RoomCase):
             self.assertFalse(ending.is_genuine("t1", "a", 7))
             self.assertFalse(replace(ending, signatures=(votes[0],)).is_genuine(T, "a", 7))
             self.assertFalse(replace(ending, signatures=(votes[0], votes[0])).is_genuine(T, "a", 7))
-        other = pin(self.room.operator, T, tuple(self.room.contacts[:3]))
-        self.assertIsNone(ending_of(Ending(self.chartered([0, 4, 6]), tuple(votes)).packed, other))
+        other = create_charter(self.room.operator, T, tuple(self.room.contacts[:3]))
+        self.assertIsNone(parse_end_proof(EndProof(self.chartered([0, 4, 6]), tuple(votes)).packed, other))
 
     @settings(max_examples=100)
     @given(st.recursive(st.none() | st.integers() | st.binary(max_size=70) | st.text(), st.lists, max_leaves=20))
@@ -107,9 +107,9 @@ class CharterTests(RoomCase):
             packed = bytes(msgpack.packb(content))
         except OverflowError:
             return
-        self.assertIsInstance(charter_of(packed), Charter | None)
-        self.assertIsInstance(ending_of(packed, self.chartered()), Ending | None)
-        self.assertIsNone(self.room.judge.read(T, content))
+        self.assertIsInstance(parse_charter(packed), Charter | None)
+        self.assertIsInstance(parse_end_proof(packed, self.chartered()), EndProof | None)
+        self.assertIsNone(self.room.charter_verifier.parse(T, content))
 
     def test_signatures_are_apart(self) -> None:
         """A signature of a change is not valid for an end, and the reverse."""
@@ -121,8 +121,8 @@ class CharterTests(RoomCase):
 class NumberTests(RoomCase):
     def test_believed(self) -> None:
         """A high number that a single member of three reports does not count."""
-        self.assertEqual(believed([5, 7, 3], 3), 7)
-        self.assertEqual(believed([2**61, 7, 3], 3), 7)
-        self.assertEqual(believed([2**61, 2**60], 3), 2**60)
-        self.assertEqual(believed([2**61], 1), 2**61)
-        self.assertEqual(believed([], 3), 0)
+        self.assertEqual(highest_credible([5, 7, 3], 3), 7)
+        self.assertEqual(highest_credible([2**61, 7, 3], 3), 7)
+        self.assertEqual(highest_credible([2**61, 2**60], 3), 2**60)
+        self.assertEqual(highest_credible([2**61], 1), 2**61)
+        self.assertEqual(highest_credible([], 3), 0)

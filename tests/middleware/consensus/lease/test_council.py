@@ -1,10 +1,10 @@
-"""Tests of ``middleware.consensus.lease.council``."""
+"""Tests of ``middleware.consensus.lease.lease_proposer``."""
 
 from __future__ import annotations
 
 from dataclasses import replace
 
-from middleware.consensus.lease.council import NoMajority, Superseded
+from middleware.consensus.lease.lease_proposer import NoMajority, Superseded
 from middleware.entangled.errors import Refused
 from middleware.entangled.quorum.ballot import Ballot
 from tests.middleware.consensus.lease.room import TTL, RoomCase, T
@@ -13,12 +13,12 @@ from tests.middleware.consensus.lease.room import TTL, RoomCase, T
 class CouncilTests(RoomCase):
     def change(self, place: int, *members: int) -> object:
         """Return the result of a change requested by an agent: None, or the error."""
-        council = self.lessee(place).council
-        return self.outcome(council.change([self.room.contacts[n] for n in members]))
+        council = self.lessee(place).proposer
+        return self.outcome(council.change_members([self.room.contacts[n] for n in members]))
 
     def places(self, place: int) -> list[int]:
         """Return the council as an agent knows it."""
-        return [self.room.place_of(member) for member in self.lessee(place).council.members]
+        return [self.room.get_place(member) for member in self.lessee(place).proposer.members]
 
     def test_change(self) -> None:
         """A change installs the new council with configuration + 1, which grants the next lease with a higher token."""
@@ -26,7 +26,7 @@ class CouncilTests(RoomCase):
         self.lessee(0).release()
         self.run_for(0.1)
         self.assertIsNone(self.change(1, 3, 4, 6))
-        self.assertEqual((self.places(1), self.lessee(1).council.configuration), ([3, 4, 6], 2))
+        self.assertEqual((self.places(1), self.lessee(1).proposer.configuration), ([3, 4, 6], 2))
         for gone in (3, 5):
             self.room.kill(gone)
         self.wanting(1, 1.0)
@@ -36,7 +36,7 @@ class CouncilTests(RoomCase):
         """A client with an old council record is redirected by any member, including departed ones."""
         self.assertIsNone(self.change(1, 0, 1, 2))
         self.assertEqual(self.places(2), [0, 1, 2])
-        self.room.councils[T] = replace(self.room.councils[T], links=())
+        self.room.charters[T] = replace(self.room.charters[T], changes=())
         self.lessee(0)
         self.assertEqual(self.places(0), [3, 4, 5])
         self.wanting(0, 0.3)
@@ -59,23 +59,23 @@ class CouncilTests(RoomCase):
             self.wanting(0)
             self.lessee(1).stand_by(1)
             self.run_for(TTL)
-            self.room.referee.stop(0, T)
-            moved = self.lessee(0).move([self.room.contacts[n] for n in (3, 4, 6)])
+            self.room.recorder.stop_robot(0, T)
+            moved = self.lessee(0).change_council([self.room.contacts[n] for n in (3, 4, 6)])
             self.assertIsNone(self.lessee(0).lease)
             self.assertIsNone(self.outcome(moved, stop_time + 0.2))
             self.assertEqual((self.holders(), self.token(0)), ([0], 2))
-            self.assertEqual((self.places(0), self.room.referee.wins), ([3, 4, 6], 2))
+            self.assertEqual((self.places(0), self.room.recorder.wins), ([3, 4, 6], 2))
             self.room.kill(5)
             self.run_for(TTL)
             self.room.kill(0)
             self.run_for(2 * TTL)
-            self.assertEqual((self.holders(), self.places(1), self.room.referee.found), ([1], [3, 4, 6], []))
+            self.assertEqual((self.holders(), self.places(1), self.room.recorder.violations), ([1], [3, 4, 6], []))
 
     def test_move_that_fails(self) -> None:
         """If the change of the council fails, the holder claims the lease again at the old council."""
         self.wanting(0)
         self.run_for(TTL)
-        moved = self.lessee(0).move([self.room.contacts[n] for n in (1, 2, 6)])
+        moved = self.lessee(0).change_council([self.room.contacts[n] for n in (1, 2, 6)])
         self.cut(0, 1, 2, 6)
         self.assertIsInstance(self.outcome(moved), NoMajority)
         self.run_for(TTL)
@@ -88,26 +88,28 @@ class CouncilTests(RoomCase):
         self.wanting(0)
         self.cut(4, *range(4), 5, 6)
         self.run_for(4.0)
-        council = self.lessee(0).council
-        self.assertEqual((council.silent(3.0), council.silent(4.5)), ((self.room.contacts[4],), ()))
+        council = self.lessee(0).proposer
+        self.assertEqual(
+            (council.find_silent_members(3.0), council.find_silent_members(4.5)), ((self.room.contacts[4],), ())
+        )
         self.room.radio.cut.clear()
         self.run_for(TTL)
-        self.assertEqual(council.silent(0.0), ())
+        self.assertEqual(council.find_silent_members(0.0), ())
         self.lessee(0).release()
         self.cut(5, *range(5), 6)
         self.run_for(5.0)
-        self.assertEqual(council.silent(3.0), ())
+        self.assertEqual(council.find_silent_members(3.0), ())
         for _ in range(3):
-            council.visit()
+            council.ping_members()
             self.run_for(2.0)
-        self.assertEqual(council.silent(3.0), (self.room.contacts[5],))
+        self.assertEqual(council.find_silent_members(3.0), (self.room.contacts[5],))
 
     def test_learnt_from_the_record(self) -> None:
         """A newer configuration in the task's record is adopted, an older one is ignored."""
-        council = self.lessee(0).council
-        council.learn(self.chartered([4, 5, 6], [0, 1, 2]).packed)
+        council = self.lessee(0).proposer
+        council.learn_charter(self.chartered([4, 5, 6], [0, 1, 2]).packed)
         for packed in (self.chartered([4, 5, 6]).packed, b"", b"?"):
-            council.learn(packed)
+            council.learn_charter(packed)
             self.assertEqual((council.configuration, self.places(0)), (3, [0, 1, 2]))
 
     def test_two_changes_at_once(self) -> None:
@@ -115,8 +117,8 @@ class CouncilTests(RoomCase):
         for seed in range(12):
             self.room = self.made(seed=f"two {seed}")
             for place, members in ((0, (3, 4, 6)), (1, (5, 6, 2))):
-                council = self.lessee(place).council
-                council.change([self.room.contacts[n] for n in members]).addErrback(lambda f: f.trap(Refused))
+                council = self.lessee(place).proposer
+                council.change_members([self.room.contacts[n] for n in members]).addErrback(lambda f: f.trap(Refused))
             self.run_for(3.0)
             for place in (0, 1):
                 self.wanting(place, 1.0)
@@ -127,8 +129,8 @@ class CouncilTests(RoomCase):
     def test_change_that_was_half_done_is_completed(self) -> None:
         """A client that finds an accepted but unfinished change completes it before it claims the lease."""
         self.cut(1, 6, 0, 2)
-        council = self.lessee(1).council
-        error = self.outcome(council.change([self.room.contacts[n] for n in (0, 2, 6)]))
+        council = self.lessee(1).proposer
+        error = self.outcome(council.change_members([self.room.contacts[n] for n in (0, 2, 6)]))
         self.assertIsInstance(error, NoMajority)
         self.wanting(0, 0.5)
         self.assertEqual((self.places(0), self.holders()), ([0, 2, 6], [0]))
@@ -137,7 +139,7 @@ class CouncilTests(RoomCase):
         """Of two changes with one acceptance each, the one with the higher ballot may be decided, and is completed."""
         for place, council in ((4, (0, 2, 6)), (3, (1, 2, 6))):
             members = tuple(self.room.contacts[n] for n in council)
-            acceptor, now = self.room.bidders[place].acceptor, self.room.bidders[place].machine.seconds()
+            acceptor, now = self.room.nodes[place].acceptor, self.room.nodes[place].machine.seconds()
             acceptor.accept(T, 1, Ballot(5 - place, "x"), members, now)
         self.cut(0, 5)
         self.assertIsInstance(self.change(0, 1, 3, 6), Superseded)
@@ -153,13 +155,13 @@ class CouncilTests(RoomCase):
     def test_strange_councils(self) -> None:
         """A council without members, or with too many, raises ``ValueError``."""
         for members in ([], [self.room.contacts[0]] * 8):
-            self.assertRaises(ValueError, self.lessee(0).council.change, members)
+            self.assertRaises(ValueError, self.lessee(0).proposer.change_members, members)
 
     def test_close_waits_for_whoever_may_still_act(self) -> None:
         """A close is acknowledged when a majority has stored it and the lease in force has expired."""
         self.wanting(0)
         self.cut(0, 3, 4, 5)
-        closing = self.lessee(1).council.close()
+        closing = self.lessee(1).proposer.close()
         self.run_for(TTL - 0.3)
         self.assertNoResult(closing)
         self.run_for(0.4)
@@ -172,7 +174,7 @@ class CouncilTests(RoomCase):
     def test_holder_closes_at_once(self) -> None:
         """A holder that stands still closes the task without waiting for its own lease."""
         lessee = self.wanting(0)
-        self.assertIsNone(self.outcome(lessee.council.close(self.token(0)), 0.05))
+        self.assertIsNone(self.outcome(lessee.proposer.close(self.token(0)), 0.05))
         self.wanting(1, 1.0)
         self.assertEqual((self.holders(), self.lessee(1).is_over), ([], True))
 
@@ -183,7 +185,7 @@ class CouncilTests(RoomCase):
         self.wanting(1)
         self.assertEqual(self.holders(), [1])
         self.cut(0, 3)
-        closing = stale.council.close()
+        closing = stale.proposer.close()
         self.run_for(TTL - 0.3)
         self.assertNoResult(closing)
         self.run_for(0.5)
@@ -193,11 +195,11 @@ class CouncilTests(RoomCase):
     def test_close_without_a_majority(self) -> None:
         """A close that only a minority has stored is not acknowledged."""
         self.cut(0, 3, 4)
-        self.assertIsInstance(self.outcome(self.lessee(0).council.close()), NoMajority)
+        self.assertIsInstance(self.outcome(self.lessee(0).proposer.close()), NoMajority)
 
     def test_change_after_the_end(self) -> None:
         """The council of a closed task cannot change."""
-        self.outcome(self.lessee(0).council.close())
+        self.outcome(self.lessee(0).proposer.close())
         error = self.change(1, 3, 4, 6)
         self.assertIsInstance(error, Refused)
         self.assertIn("the task has ended", str(error))

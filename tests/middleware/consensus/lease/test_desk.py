@@ -1,4 +1,4 @@
-"""Tests of ``middleware.consensus.lease.desk`` between the nodes of a team."""
+"""Tests of ``middleware.consensus.lease.lease_service`` between the nodes of a team."""
 
 from __future__ import annotations
 
@@ -7,13 +7,13 @@ from collections.abc import Sequence
 from twisted.internet.defer import Deferred
 from twisted.trial.unittest import SynchronousTestCase
 
-from middleware.consensus.lease.desk import MOST_WAIT_S, in_time
-from middleware.consensus.lease.lessee import Lessee
+from middleware.consensus.lease.lease_client import LeaseClient
+from middleware.consensus.lease.lease_service import MAX_WAIT_S, propose_when_free
 from middleware.entangled.clock import HeapClock
 from middleware.entangled.data.memory import MemoryStore
-from middleware.entangled.quorum.register import Kind, Reply
+from middleware.entangled.quorum.register import Reply, ReplyKind
 from middleware.tasks.task import Task
-from tests.fleet import FleetCase, SwarmFleet
+from tests.fleet import FleetCase, SwarmTeam
 
 TASK = Task("t1", "search", "Find it")
 
@@ -26,10 +26,10 @@ class SlowStore(MemoryStore):
         self.owed: list[Deferred[None]] = []
         self.is_slow = False
 
-    def written(self) -> Deferred[None]:
+    def wait_for_write(self) -> Deferred[None]:
         """Return a Deferred that fires at once, or with the next ``write``."""
         if not self.is_slow:
-            return super().written()
+            return super().wait_for_write()
         self.owed.append(Deferred())
         return self.owed[-1]
 
@@ -41,18 +41,18 @@ class SlowStore(MemoryStore):
 
 
 class DeskTests(FleetCase):
-    def team(self, n: int = 4) -> tuple[SwarmFleet, Task, list[Lessee]]:
+    def team(self, n: int = 4) -> tuple[SwarmTeam, Task, list[LeaseClient]]:
         """Return nodes that may grant, a task, and the lease client of each node."""
         fleet = self.swarm(n)
         fleet.run(TASK.lease_ttl)
         task = self.done(fleet, Deferred.fromCoroutine(fleet.nodes[0].submit(TASK)), 1.0)
-        return fleet, task, [node.lessee(task, lambda: None, 0) for node in fleet.nodes]
+        return fleet, task, [node.make_lease_client(task, lambda: None, 0) for node in fleet.nodes]
 
-    def holders(self, lessees: Sequence[Lessee]) -> list[int]:
+    def holders(self, lessees: Sequence[LeaseClient]) -> list[int]:
         """Return the nodes that hold the lease."""
         return [place for place, lessee in enumerate(lessees) if lessee.lease is not None]
 
-    def end(self, fleet: SwarmFleet, lessees: Sequence[Lessee]) -> None:
+    def end(self, fleet: SwarmTeam, lessees: Sequence[LeaseClient]) -> None:
         """Release all claims, which removes the timers."""
         for lessee in lessees:
             lessee.release()
@@ -61,7 +61,7 @@ class DeskTests(FleetCase):
     def test_polite_leave_is_heard_by_those_that_stand_by(self) -> None:
         """The council notifies a standby of a release, and the standby acts long before its next poll."""
         fleet, _, lessees = self.team()
-        lessees[1].want()
+        lessees[1].claim()
         fleet.run(0.3)
         lessees[2].stand_by()
         fleet.run(2.02)
@@ -74,7 +74,7 @@ class DeskTests(FleetCase):
     def test_heirs_are_told_by_the_holder(self) -> None:
         """The holder notifies the named standbys of its release, even if they never polled the council."""
         fleet, _, lessees = self.team()
-        lessees[1].want()
+        lessees[1].claim()
         fleet.run(0.3)
         lessees[3].stand_by(3)
         lessees[1].release([fleet.nodes[3].entangled.contact])
@@ -87,13 +87,13 @@ class DeskTests(FleetCase):
         fleet = self.swarm(4)
         stores = [SlowStore() for _ in range(4)]
         for node, store in zip(fleet.nodes, stores, strict=True):
-            node.councils.desk._store = store
+            node.council_manager.lease_service._store = store
         fleet.run(TASK.lease_ttl)
         task = self.done(fleet, Deferred.fromCoroutine(fleet.nodes[0].submit(TASK)), 1.0)
         for store in stores:
             store.is_slow = True
-        lessee = fleet.nodes[1].lessee(task, lambda: None, 0)
-        lessee.want()
+        lessee = fleet.nodes[1].make_lease_client(task, lambda: None, 0)
+        lessee.claim()
         fleet.run(0.2)
         self.assertIsNone(lessee.lease)
         for _ in range(30):
@@ -111,12 +111,12 @@ class DeskTests(FleetCase):
         fleet, task, lessees = self.team(5)
         outsiders = [n.entangled.contact for n in fleet.nodes if n.entangled.contact not in task.council]
         following = [task.council[0], *outsiders[:2]]
-        self.assertIsNone(self.done(fleet, lessees[0].council.change(following), 1.0))
-        lessees[1].want()
+        self.assertIsNone(self.done(fleet, lessees[0].proposer.change_members(following), 1.0))
+        lessees[1].claim()
         fleet.run(0.5)
         self.assertEqual(self.holders(lessees), [1])
-        self.assertEqual((list(lessees[1].council.members), lessees[1].council.configuration), (following, 2))
-        self.assertIsNone(self.done(fleet, lessees[2].council.close(), 3.0))
+        self.assertEqual((list(lessees[1].proposer.members), lessees[1].proposer.configuration), (following, 2))
+        self.assertIsNone(self.done(fleet, lessees[2].proposer.close(), 3.0))
         self.assertEqual((self.holders(lessees), lessees[1].is_over), ([], True))
         self.end(fleet, lessees)
 
@@ -140,34 +140,38 @@ class InTimeTests(SynchronousTestCase):
     def proposed(self) -> Reply:
         """Return the reply of a member that grants from ``until`` on."""
         left = self.until - self.clock.seconds()
-        return Reply(Kind.HELD, remaining=left) if left > 0.0 else Reply(Kind.GRANTED)
+        return Reply(ReplyKind.HELD, remaining=left) if left > 0.0 else Reply(ReplyKind.GRANTED)
 
     def test_answers_when_the_lease_ends(self) -> None:
         """A proposal shortly before the end of a lease is granted at that time instead of refused."""
-        self.clock.advance(1.0 - MOST_WAIT_S + 0.01)
-        answer = in_time(self.proposed, self.clock)
-        self.clock.advance(MOST_WAIT_S - 0.02)
+        self.clock.advance(1.0 - MAX_WAIT_S + 0.01)
+        answer = propose_when_free(self.proposed, self.clock)
+        self.clock.advance(MAX_WAIT_S - 0.02)
         self.assertNoResult(answer)
         self.clock.advance(0.01)
-        self.assertEqual(self.successResultOf(answer).kind, Kind.GRANTED)
+        self.assertEqual(self.successResultOf(answer).kind, ReplyKind.GRANTED)
 
     def test_a_lease_that_is_renewed(self) -> None:
         """If the lease is renewed meanwhile, the waiting proposal is refused at the time of its expected end."""
         self.clock.advance(0.95)
-        answer = in_time(self.proposed, self.clock)
+        answer = propose_when_free(self.proposed, self.clock)
         self.until = 2.0
         self.clock.advance(0.05)
-        self.assertEqual(self.successResultOf(answer).kind, Kind.HELD)
+        self.assertEqual(self.successResultOf(answer).kind, ReplyKind.HELD)
 
     def test_answers_at_once(self) -> None:
         """A reply that needs no short wait is returned at once."""
-        for reply in (Reply(Kind.GRANTED), Reply(Kind.OUTBID), Reply(Kind.HELD, remaining=MOST_WAIT_S + 0.01)):
-            self.assertEqual(self.successResultOf(in_time(lambda reply=reply: reply, self.clock)), reply)  # type: ignore[misc]
+        for reply in (
+            Reply(ReplyKind.GRANTED),
+            Reply(ReplyKind.OUTBID),
+            Reply(ReplyKind.HELD, remaining=MAX_WAIT_S + 0.01),
+        ):
+            self.assertEqual(self.successResultOf(propose_when_free(lambda reply=reply: reply, self.clock)), reply)  # type: ignore[misc]
 
     def test_nobody_waits_any_more(self) -> None:
         """A cancelled answer leaves no timer and grants nothing."""
         self.clock.advance(0.95)
-        answer = in_time(self.proposed, self.clock)
+        answer = propose_when_free(self.proposed, self.clock)
         answer.addErrback(lambda _: None)
         answer.cancel()
         self.assertEqual(self.clock.getDelayedCalls(), [])

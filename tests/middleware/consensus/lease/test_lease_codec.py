@@ -9,12 +9,19 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from twisted.trial.unittest import SynchronousTestCase
 
-from middleware.consensus.lease.lease_codec import CODEC, LIFE, MAX_COUNCIL, members_of, pack_reply, unpack_reply
+from middleware.consensus.lease.lease_codec import (
+    BALLOT_MODULUS,
+    CODEC,
+    MAX_COUNCIL,
+    pack_reply,
+    parse_members,
+    parse_reply,
+)
 from middleware.entangled.contact import Contact
 from middleware.entangled.network.network import Address
 from middleware.entangled.quorum.ballot import Ballot
 from middleware.entangled.quorum.log import Floor
-from middleware.entangled.quorum.register import Kind, Reply
+from middleware.entangled.quorum.register import Reply, ReplyKind
 
 MEMBERS = tuple(Contact(bytes([n]) * 32, Address("10.0.0.1", 7000 + n)) for n in range(MAX_COUNCIL + 1))
 ANYTHING = st.recursive(
@@ -27,31 +34,31 @@ ANYTHING = st.recursive(
 class BallotTests(SynchronousTestCase):
     def test_lives(self) -> None:
         """Ballots of one run of an agent are kin; ballots of another agent or after a restart are not."""
-        one = Ballot(3 * LIFE + 7, "a")
-        self.assertTrue(one.is_kin(Ballot(9 * LIFE + 7, "a"), LIFE))
-        self.assertFalse(one.is_kin(Ballot(3 * LIFE + 7, "b"), LIFE))
-        self.assertFalse(one.is_kin(Ballot(3 * LIFE + 8, "a"), LIFE))
+        one = Ballot(3 * BALLOT_MODULUS + 7, "a")
+        self.assertTrue(one.is_same_life(Ballot(9 * BALLOT_MODULUS + 7, "a"), BALLOT_MODULUS))
+        self.assertFalse(one.is_same_life(Ballot(3 * BALLOT_MODULUS + 7, "b"), BALLOT_MODULUS))
+        self.assertFalse(one.is_same_life(Ballot(3 * BALLOT_MODULUS + 8, "a"), BALLOT_MODULUS))
 
 
 class ReplyTests(SynchronousTestCase):
     def test_there_and_back(self) -> None:
         """Replies of every kind survive packing and unpacking."""
-        for kind in Kind:
+        for kind in ReplyKind:
             reply = Reply(kind, Ballot(5, "a"), 3, 1.25, 2)
-            if kind is Kind.SEALED:
+            if kind is ReplyKind.SEALED:
                 reply = reply._replace(accepted=reply.promised, value=MEMBERS[:3])
-            self.assertEqual(unpack_reply(pack_reply(reply)), reply)
+            self.assertEqual(parse_reply(pack_reply(reply)), reply)
 
     def test_strange_durations(self) -> None:
         """An invalid duration is read as 0."""
         for strange in (-1.0, float("nan")):
-            read = unpack_reply(["granted", 1, "a", 1, strange, 1, []])
+            read = parse_reply(["granted", 1, "a", 1, strange, 1, []])
             assert read is not None
             self.assertEqual(read.remaining, 0.0)
 
     def test_unlawful(self) -> None:
         """Any other content is not a reply."""
-        good = pack_reply(Reply(Kind.GRANTED, Ballot(5, "a"), 3, 1.25, 2))
+        good = pack_reply(Reply(ReplyKind.GRANTED, Ballot(5, "a"), 3, 1.25, 2))
         for place, bad in (
             (0, "yes"),
             (0, 1),
@@ -64,25 +71,25 @@ class ReplyTests(SynchronousTestCase):
             (5, "1"),
             (6, 0),
         ):
-            self.assertIsNone(unpack_reply([*good[:place], bad, *good[place + 1 :]]), (place, bad))
+            self.assertIsNone(parse_reply([*good[:place], bad, *good[place + 1 :]]), (place, bad))
         others: tuple[object, ...] = (None, 5, [], good[:-1], [*good, 0], {})
         for other in others:
-            self.assertIsNone(unpack_reply(other))
+            self.assertIsNone(parse_reply(other))
 
     def test_councils(self) -> None:
         """A council consists of a limited number of distinct contacts."""
-        packed = [member.packed() for member in MEMBERS]
-        self.assertEqual(members_of(packed[:MAX_COUNCIL]), MEMBERS[:MAX_COUNCIL])
+        packed = [member.pack() for member in MEMBERS]
+        self.assertEqual(parse_members(packed[:MAX_COUNCIL]), MEMBERS[:MAX_COUNCIL])
         for bad in (packed, [packed[0], packed[0]], [[b"k", "h", 1]], [1], None, b"x"):
-            self.assertIsNone(members_of(bad))
+            self.assertIsNone(parse_members(bad))
 
     @settings(max_examples=300)
     @given(ANYTHING)
     def test_total(self, answer: object) -> None:
         """Any answer of a peer is a reply or None, and never raises."""
-        read = unpack_reply(answer)
+        read = parse_reply(answer)
         self.assertTrue(read is None or read.remaining >= 0.0)
-        members_of(answer)
+        parse_members(answer)
 
 
 class NoteTests(SynchronousTestCase):
@@ -90,16 +97,16 @@ class NoteTests(SynchronousTestCase):
 
     def test_old_notes(self) -> None:
         """Promises, leases, accepted values and closes are read from rows with and without proof and grantee."""
-        codec, members = CODEC, [member.packed() for member in MEMBERS[:3]]
+        codec, members = CODEC, [member.pack() for member in MEMBERS[:3]]
         row = [2, [9, "b", 7, "a", 5, "c", 9, "b"], 4, 1.5, members, True, b"proof", "d"]
         for length, proof, grantee in ((6, b"", "a"), (7, b"proof", "a"), (8, b"proof", "d")):
             registers, is_whole = codec.unpack(msgpack.packb({"t": row[:length]}))
             self.assertTrue(is_whole)
             found = registers["t"]
-            ballots = found.promised, found.holder, found.spent, found.accepted
+            ballots = found.promised, found.holder, found.released, found.accepted
             self.assertEqual(ballots, (Ballot(9, "b"), Ballot(7, "a"), Ballot(5, "c"), Ballot(9, "b")))
             self.assertEqual((found.configuration, found.token, found.ttl, found.value), (2, 4, 1.5, MEMBERS[:3]))
-            self.assertEqual((found.is_over, found.proof, found.grantee), (True, proof, grantee))
+            self.assertEqual((found.is_closed, found.proof, found.grantee), (True, proof, grantee))
         self.assertEqual(codec.pack(registers), msgpack.packb({"t": row}))
         self.assertEqual(codec.bucket_of("t"), f"lease/{zlib.crc32(b't') % 64}")
 

@@ -1,11 +1,11 @@
-"""Tests of ``middleware.consensus.lease.lessee``."""
+"""Tests of ``middleware.consensus.lease.lease_client``."""
 
 from __future__ import annotations
 
 from middleware.consensus.lease.client_states import State
 from middleware.entangled.data.memory import MemoryStore
-from sim.team.leases.radio import Air
-from sim.team.leases.takeover import takeover, upkeep
+from sim.team.leases.radio_link import LinkQuality
+from sim.team.leases.takeover import measure_takeover, measure_upkeep
 from tests.middleware.consensus.lease.room import TTL, RoomCase, T
 
 
@@ -15,9 +15,9 @@ class LesseeTests(RoomCase):
         for lose in ("outrank", "cut"):
             self.room = self.made(seed=f"listener {lose}")
             lessee = self.wanting(0)
-            lessee._changed = lambda lessee=lessee: lessee.release() if not lessee.token else None  # type: ignore[misc]
+            lessee._on_change = lambda lessee=lessee: lessee.release() if not lessee.token else None  # type: ignore[misc]
             if lose == "outrank":
-                lessee.outrank(9)
+                lessee.on_higher_token(9)
             else:
                 self.cut(0, 3, 4, 5)
                 self.run_for(2 * TTL)
@@ -33,8 +33,8 @@ class LesseeTests(RoomCase):
             self.lessee(1).stand_by(1)
             self.run_for(TTL)
             self.room.kill(0)
-            members = [self.room.bidders[place] for place in (3, 4, 5)]
-            _, ends, _ = sorted(one.machine.at(one.acceptor.log.get(T).until) for one in members)  # type: ignore[union-attr]
+            members = [self.room.nodes[place] for place in (3, 4, 5)]
+            _, ends, _ = sorted(one.machine.to_simulator_time(one.acceptor.log.get(T).lease_until) for one in members)  # type: ignore[union-attr]
             self.run_for(ends - self.room.clock.seconds() - 0.001)
             self.assertIsNone(self.lessee(1).lease, seed)
             self.run_for(0.02)
@@ -46,8 +46,8 @@ class LesseeTests(RoomCase):
         self.lessee(1).stand_by(1)
         self.run_for(TTL)
         self.cut(0, 3, 4, 5)
-        until = [self.room.bidders[place].acceptor.log.get(T).until for place in (3, 4, 5)]  # type: ignore[union-attr]
-        self.run_for(min(until) - self.room.bidders[3].machine.seconds() - 0.2)
+        until = [self.room.nodes[place].acceptor.log.get(T).lease_until for place in (3, 4, 5)]  # type: ignore[union-attr]
+        self.run_for(min(until) - self.room.nodes[3].machine.seconds() - 0.2)
         self.room.radio.cut.clear()
         self.run_for(2 * TTL)
         self.assertEqual((self.holders(), self.token(0)), ([0], 1))
@@ -72,7 +72,7 @@ class LesseeTests(RoomCase):
         self.cut(1, 4, 5)
         self.lessee(1).stand_by(3)
         self.run_for(1.5 * TTL)
-        self.lessee(1).freed(0)
+        self.lessee(1).on_released(0)
         self.run_for(0.35)
         self.lessee(1).stand_by(2)
         self.room.radio.cut.clear()
@@ -83,9 +83,9 @@ class LesseeTests(RoomCase):
         """A standby that learns of a new council polls it at once, and is notified of a release there."""
         self.wanting(0)
         self.lessee(1).stand_by(1)
-        moved = self.lessee(0).move([self.room.contacts[place] for place in (3, 4, 6)])
+        moved = self.lessee(0).change_council([self.room.contacts[place] for place in (3, 4, 6)])
         self.outcome(moved, 0.1)
-        self.lessee(1).suspect()
+        self.lessee(1).suspect_holder()
         self.run_for(0.1)
         self.lessee(0).release()
         self.run_for(0.1)
@@ -97,7 +97,7 @@ class LesseeTests(RoomCase):
             self.room = self.made(seed=f"free {seed}")
             for place, rank in ((2, 2), (1, 1)):
                 self.lessee(place).stand_by(rank)
-                self.lessee(place).suspect()
+                self.lessee(place).suspect_holder()
             self.run_for(0.1)
             self.assertEqual(self.holders(), [1], seed)
 
@@ -109,7 +109,7 @@ class LesseeTests(RoomCase):
                 self.lessee(0).release()
                 self.wanting(0)
             self.lessee(1).stand_by(1)
-            self.room.bidders[0].leave(T, [1])
+            self.room.nodes[0].leave(T, [1])
             self.run_for(0.04)
             self.assertEqual(self.holders(), [1], seed)
 
@@ -117,17 +117,17 @@ class LesseeTests(RoomCase):
         """A holder keeps its ballot while a restarted member cannot grant yet, because another would not help."""
         self.room.kill(3)
         self.room.stores[3] = MemoryStore()
-        self.room.bidders[3] = self.room.born(3)
+        self.room.nodes[3] = self.room.start_life(3)
         self.wanting(0)
-        first = self.room.bidders[4].acceptor.log.get(T).holder  # type: ignore[union-attr]
+        first = self.room.nodes[4].acceptor.log.get(T).holder  # type: ignore[union-attr]
         self.run_for(2 * TTL)
         for place in (3, 4):
-            self.assertEqual(self.room.bidders[place].acceptor.log.get(T).holder, first)  # type: ignore[union-attr]
+            self.assertEqual(self.room.nodes[place].acceptor.log.get(T).holder, first)  # type: ignore[union-attr]
 
     def test_stand_by_that_is_named(self) -> None:
         """A standby that then wants the lease gets it; a holder that is given a rank keeps its lease."""
         self.lessee(0).stand_by(3)
-        self.lessee(0).want()
+        self.lessee(0).claim()
         self.run_for(2 * TTL)
         self.assertEqual(self.holders(), [0])
         self.lessee(0).stand_by(1)
@@ -137,9 +137,9 @@ class LesseeTests(RoomCase):
     def test_outranked_while_it_holds(self) -> None:
         """If the device has obeyed a higher token, the holder's lease is void and it claims a higher token."""
         lessee = self.wanting(0)
-        lessee.outrank(1)
+        lessee.on_higher_token(1)
         self.assertEqual(self.token(0), 1)
-        lessee.outrank(7)
+        lessee.on_higher_token(7)
         self.assertIsNone(lessee.lease)
         self.run_for(0.1)
         self.assertEqual(self.token(0), 8)
@@ -148,10 +148,10 @@ class LesseeTests(RoomCase):
         """Replies to a request from before a release are ignored; the next claim has a new token."""
         lessee = self.lessee(0)
         for _ in range(5):
-            lessee.want()
+            lessee.claim()
             self.run_for(0.003)
             lessee.release()
-        lessee.want()
+        lessee.claim()
         self.run_for(TTL)
         self.assertEqual(self.holders(), [0])
 
@@ -205,48 +205,48 @@ class LesseeTests(RoomCase):
         self.lessee(0).release()
         self.run_for(0.1)
         for place in (3, 4, 5):
-            bidder = self.room.bidders[place]
-            until = bidder.machine.at(bidder.acceptor.log.get(T).until)  # type: ignore[union-attr]
+            bidder = self.room.nodes[place]
+            until = bidder.machine.to_simulator_time(bidder.acceptor.log.get(T).lease_until)  # type: ignore[union-attr]
             self.assertGreaterEqual(until, stopped + 0.3)
 
     def test_rest_after_the_deadline_counts_on_the_clock_of_the_device(self) -> None:
         """A holder with a fast clock that resumes after its deadline releases only when its robot stands still."""
         self.room = self.made(stop_time=0.3, rates=(1.01, 1.0, 1.0, 1.0, 1.0, 1.0, 1.0))
         self.wanting(0, 1.0)
-        machine, lease = self.room.bidders[0].machine, self.lessee(0).lease
+        machine, lease = self.room.nodes[0].machine, self.lessee(0).lease
         assert lease is not None
         obeyed_until = self.room.clock.seconds() + lease.deadline - machine.seconds()
         machine.freeze(False)
-        self.room.clock.advance(machine.at(lease.deadline) + 0.1 - self.room.clock.seconds())
+        self.room.clock.advance(machine.to_simulator_time(lease.deadline) + 0.1 - self.room.clock.seconds())
         machine.thaw()
         self.lessee(0).release()
         self.run_for(0.1)
         for place in (3, 4, 5):
-            bidder = self.room.bidders[place]
-            until = bidder.machine.at(bidder.acceptor.log.get(T).until)  # type: ignore[union-attr]
+            bidder = self.room.nodes[place]
+            until = bidder.machine.to_simulator_time(bidder.acceptor.log.get(T).lease_until)  # type: ignore[union-attr]
             self.assertGreaterEqual(until, obeyed_until + 0.3)
 
     def test_rough_weather(self) -> None:
         """At 50 % loss, with duplicates and delays, there is never more than one holder, and often one."""
-        self.room.radio.air = Air(0.02, 0.05, 0.5, 0.3, 5.0)
+        self.room.radio.quality = LinkQuality(0.02, 0.05, 0.5, 0.3, 5.0)
         for place in range(3):
-            self.lessee(place).want()
+            self.lessee(place).claim()
         held = 0
         for _ in range(400):
             self.run_for(0.1)
             self.assertLessEqual(len(self.holders()), 1)
             held += len(self.holders())
         self.assertGreater(held, 100)
-        self.assertEqual(self.room.referee.found, [])
+        self.assertEqual(self.room.recorder.violations, [])
 
 
 class FigureTests(RoomCase):
     def test_takeover(self) -> None:
         """Of two hundred takeovers at 10 % loss, half take less than 1.5 s, and 99 of 100 less than 2 s."""
-        seconds = sorted(takeover(seed) for seed in range(200))
+        seconds = sorted(measure_takeover(seed) for seed in range(200))
         self.assertLess(seconds[100], 1.5)
         self.assertLess(seconds[198], 2.0)
 
     def test_upkeep(self) -> None:
         """Keeping a lease takes at most twelve datagrams per second."""
-        self.assertLessEqual(upkeep(), 12.0)
+        self.assertLessEqual(measure_upkeep(), 12.0)

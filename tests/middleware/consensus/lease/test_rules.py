@@ -7,12 +7,12 @@ from twisted.internet.defer import Deferred
 from drivers.driver import Permit
 from drivers.errors import StaleCommand
 from drivers.gate import Gate
-from middleware.consensus.lease.council import NoMajority, OpenClaim, Superseded
-from middleware.consensus.lease.lessee import CLOCK_MARGIN, RENEWALS
+from middleware.consensus.lease.lease_client import CLOCK_MARGIN, RENEWALS_PER_TTL
+from middleware.consensus.lease.lease_proposer import LeaseHeld, NoMajority, Superseded
 from middleware.entangled.data.memory import MemoryStore
-from middleware.entangled.kademlia.distance import closest
+from middleware.entangled.kademlia.distance import select_closest
 from middleware.entangled.record import Record
-from middleware.tasks.task import COMPLETED, RESULT, Result, Task, group_key, outcome_of
+from middleware.tasks.task import COMPLETED, RESULT, Result, Task, find_outcome, group_key
 from sim.team.machine import Machine
 from tests.fleet import FleetCase
 from tests.middleware.consensus.lease.room import TTL, RoomCase, T
@@ -25,36 +25,36 @@ class PinnedTests(FleetCase):
         task = self.done(fleet, Deferred.fromCoroutine(fleet.nodes[0].submit(Task("t1", "search", "Find it"))), 1.0)
         key = group_key("t1")
         contacts = [node.entangled.contact for node in fleet.nodes]
-        self.assertEqual(list(task.council), closest(contacts, key, 3))
-        lessee = fleet.nodes[1].lessee(task, lambda: None, 0)
+        self.assertEqual(list(task.council), select_closest(contacts, key, 3))
+        lessee = fleet.nodes[1].make_lease_client(task, lambda: None, 0)
         for place in range(4, 9):
-            fleet.nodes.append(fleet.made(place))
+            fleet.nodes.append(fleet.make_node(place))
             fleet.nodes[place].startService()
             fleet.run(0.5)
-        now_closest = closest([node.entangled.contact for node in fleet.nodes], key, 3)
+        now_closest = select_closest([node.entangled.contact for node in fleet.nodes], key, 3)
         self.assertNotEqual(list(task.council), now_closest)
-        self.assertEqual(lessee.council.members, task.council)
+        self.assertEqual(lessee.proposer.members, task.council)
 
 
 class RuleTests(RoomCase):
     def test_rule_2_council_changes_by_a_majority_of_the_old_one(self) -> None:
         """The old council decides a change by a majority, with configuration + 1, and never during an open claim."""
-        council = self.lessee(1).council
+        council = self.lessee(1).proposer
         following = [self.room.contacts[n] for n in (0, 1, 2)]
         self.wanting(0)
-        self.assertIsInstance(self.outcome(council.change(following)), OpenClaim)
+        self.assertIsInstance(self.outcome(council.change_members(following)), LeaseHeld)
         self.lessee(0).release()
         self.run_for(0.1)
         self.cut(1, 3, 4)
-        self.assertIsInstance(self.outcome(council.change(following)), NoMajority)
+        self.assertIsInstance(self.outcome(council.change_members(following)), NoMajority)
         self.room.radio.cut.clear()
-        self.assertIsNone(self.outcome(council.change(following)))
+        self.assertIsNone(self.outcome(council.change_members(following)))
         self.assertEqual((council.configuration, list(council.members)), (2, following))
 
     def test_rule_3_durations_travel_never_times(self) -> None:
         """Nodes with different clocks work together, and no message contains a time of a clock."""
         sent: list[float] = []
-        for bidder in self.room.bidders:
+        for bidder in self.room.nodes:
             answer = bidder.answer
 
             def heard(source: int, method: str, arguments: tuple[object, ...], answer=answer) -> object:  # type: ignore[no-untyped-def]
@@ -63,7 +63,7 @@ class RuleTests(RoomCase):
                 return reply
 
             bidder.answer = heard  # type: ignore[method-assign]
-        clocks = [bidder.machine.seconds() for bidder in self.room.bidders]
+        clocks = [bidder.machine.seconds() for bidder in self.room.nodes]
         self.assertGreater(max(clocks) - min(clocks), 100.0)
         self.lessee(1).stand_by()
         self.wanting(0, 3 * TTL)
@@ -80,7 +80,7 @@ class RuleTests(RoomCase):
             self.run_for(0.1)
             for member in range(self.room.n):
                 self.room.kill(member)
-                self.room.bidders[member] = self.room.born(member)
+                self.room.nodes[member] = self.room.start_life(member)
             self.run_for(0.1)
         self.assertEqual(tokens, sorted(set(tokens)))
 
@@ -94,7 +94,7 @@ class RuleTests(RoomCase):
                 self.room.kill(member)
                 if is_lost:
                     self.room.stores[member] = MemoryStore()
-                self.room.bidders[member] = self.room.born(member)
+                self.room.nodes[member] = self.room.start_life(member)
             self.lessee(0).release()
             self.wanting(1, 0.2)
             self.assertEqual(self.holders(), [] if is_lost else [1])
@@ -109,10 +109,10 @@ class RuleTests(RoomCase):
         lease = lessee.lease
         assert lease is not None
         asked_at: list[float] = []
-        member = self.room.bidders[3].machine
-        take = member.take
-        member.take = lambda *a: (asked_at.append(self.room.bidders[0].machine.seconds()), take(*a))[1]  # type: ignore[func-returns-value,method-assign]
-        self.run_for(TTL / RENEWALS)
+        member = self.room.nodes[3].machine
+        take = member.deliver_datagram
+        member.deliver_datagram = lambda *a: (asked_at.append(self.room.nodes[0].machine.seconds()), take(*a))[1]  # type: ignore[func-returns-value,method-assign]
+        self.run_for(TTL / RENEWALS_PER_TTL)
         renewed = lessee.lease
         assert renewed is not None
         sent = renewed.deadline - TTL * (1.0 - CLOCK_MARGIN) + 0.3
@@ -132,19 +132,19 @@ class RuleTests(RoomCase):
             ends = 0.0
             while not self.lessee(1).lease:
                 now = lessee.lease
-                ends = self.room.bidders[0].machine.at(now.deadline) if now else ends
+                ends = self.room.nodes[0].machine.to_simulator_time(now.deadline) if now else ends
                 self.run_for(0.005)
             self.assertGreaterEqual(self.room.clock.seconds() + 0.001, ends + stop_time)
-            self.assertEqual(self.room.referee.found, [])
+            self.assertEqual(self.room.recorder.violations, [])
 
     def test_rule_6_stand_by_asks_when_pushes_are_lost(self) -> None:
         """A standby takes over without a notification of the release, because it polls three times per TTL."""
         self.wanting(0)
         self.lessee(1).stand_by()
         self.run_for(TTL)
-        self.room.tell = lambda *_: None  # type: ignore[method-assign]
+        self.room.notify = lambda *_: None  # type: ignore[method-assign]
         self.lessee(0).release()
-        self.run_for(TTL / RENEWALS + 0.1)
+        self.run_for(TTL / RENEWALS_PER_TTL + 0.1)
         self.assertEqual(self.holders(), [1])
 
     def test_rule_6_renewed_three_times_a_ttl(self) -> None:
@@ -164,21 +164,21 @@ class RuleTests(RoomCase):
         lessee = self.wanting(0, 1.0)
         self.lessee(1).stand_by()
         self.run_for(0.2)
-        self.room.bidders[0].machine.freeze(is_suspended=True)
+        self.room.nodes[0].machine.freeze(is_suspended=True)
         self.run_for(4 * TTL)
-        accepted = len(self.room.referee.accepted[T])
-        self.room.bidders[0].machine.thaw()
+        accepted = len(self.room.recorder.accepted[T])
+        self.room.nodes[0].machine.thaw()
         self.assertIsNone(lessee.lease)
         self.run_for(1.0)
-        self.assertEqual((self.holders(), lessee.pauses), ([1], 1))
-        self.assertEqual({place for _, _, place in self.room.referee.accepted[T][accepted:]}, {1})
-        self.assertEqual(self.room.referee.found, [])
+        self.assertEqual((self.holders(), lessee.late_timer_count), ([1], 1))
+        self.assertEqual({place for _, _, place in self.room.recorder.accepted[T][accepted:]}, {1})
+        self.assertEqual(self.room.recorder.violations, [])
 
     def test_rule_7_clock_that_stands_still_is_not_enough(self) -> None:
         """With a clock that stops during a suspension the holder would wrongly trust its old lease."""
         self.patch(Machine, "COUNTS_SUSPENSION", False)
         lessee = self.wanting(0, 1.0)
-        self.room.bidders[0].machine.freeze(is_suspended=True)
+        self.room.nodes[0].machine.freeze(is_suspended=True)
         self.run_for(4 * TTL)
         self.assertIsNotNone(lessee.lease)
 
@@ -188,25 +188,25 @@ class RuleTests(RoomCase):
         gate.admit(Permit(2, 5.0), 4.0)
         self.assertRaises(StaleCommand, gate.admit, Permit(1, 9.0), 4.1)
         self.assertRaises(StaleCommand, gate.admit, Permit(3, 4.0), 4.1)
-        self.assertEqual((gate.is_over(4.9), gate.is_over(5.0)), (False, True))
+        self.assertEqual((gate.is_motion_over(4.9), gate.is_motion_over(5.0)), (False, True))
 
     def test_rule_9_the_end_carries_the_token(self) -> None:
         """A former holder cannot close the task under its old token; of two results the higher token wins."""
         self.wanting(0)
         self.lessee(0).release()
         self.wanting(1)
-        stale = self.lessee(0).council.close(1)
+        stale = self.lessee(0).proposer.close(1)
         self.assertIsInstance(self.outcome(stale), Superseded)
         self.assertEqual(self.holders(), [1])
-        self.assertIsNone(self.outcome(self.lessee(1).council.close(2)))
+        self.assertIsNone(self.outcome(self.lessee(1).proposer.close(2)))
         self.assertEqual(self.holders(), [])
         results = [Result(COMPLETED, "dog1", 1.0, 2), Result(COMPLETED, "dog0", 1.0, 1)]
         records = [
-            Record(group_key(T), RESULT, bytes([n]) * 32, 1, "team", 0.0, result.packed(), bytes(64))
+            Record(group_key(T), RESULT, bytes([n]) * 32, 1, "team", 0.0, result.pack(), bytes(64))
             for n, result in enumerate(results)
         ]
         for told in (records, records[::-1]):
-            self.assertEqual(outcome_of(Task(T, "search", "Find it"), told), results[0])
+            self.assertEqual(find_outcome(Task(T, "search", "Find it"), told), results[0])
 
     def test_rule_10_graceful_leave(self) -> None:
         """After a release the first standby acts within 0.2 s, not counting the stopping time."""
@@ -216,23 +216,23 @@ class RuleTests(RoomCase):
             self.lessee(2).stand_by(2)
             self.lessee(1).stand_by(1)
             self.run_for(TTL)
-            self.room.bidders[0].leave(T)
+            self.room.nodes[0].leave(T)
             self.run_for(max(0.0, stop_time - 0.01))
             self.assertEqual(self.holders(), [])
             self.run_for(0.05)
             self.assertEqual(self.holders(), [1])
-            self.assertEqual(self.room.referee.found, [])
+            self.assertEqual(self.room.recorder.violations, [])
 
     def test_rule_11_suspicion_shortens_no_lease(self) -> None:
         """Suspicion by a standby does not shorten the lease; when it ends, the standby is ready."""
         self.wanting(0)
         self.lessee(1).stand_by()
         for _ in range(40):
-            self.lessee(1).suspect()
+            self.lessee(1).suspect_holder()
             self.run_for(0.1)
         self.assertEqual((self.holders(), self.token(0)), ([0], 1))
         self.room.kill(0)
-        self.lessee(1).suspect()
+        self.lessee(1).suspect_holder()
         self.run_for(TTL - 0.6)
         self.assertIsNone(self.lessee(1).lease)
         self.run_for(0.7)

@@ -16,8 +16,8 @@ class ScheduleTests(SynchronousTestCase):
         for seed in range(1, 21):
             schedule = Leases(seed)
             self.assertEqual(schedule.run(), [], seed)
-            wins += schedule.referee.wins
-            changes += sum(len(charter.links) for charter in schedule.councils.values())
+            wins += schedule.recorder.wins
+            changes += sum(len(charter.changes) for charter in schedule.charters.values())
         self.assertGreater(wins, 100)
         self.assertGreater(changes, 0)
 

@@ -1,0 +1,67 @@
+"""Measure the operations that only some libraries have: long values and watches."""
+
+from __future__ import annotations
+
+import asyncio
+import time
+
+from benchmarks.dht.library import MIB
+from benchmarks.dht.workload import Result, Workload, summarize
+
+LONG_VALUES = 5
+LONG_LIMIT_S = 10.0
+LOSS_SHARE = 0.05
+WATCHES = 30
+NOTIFICATION_LIMIT_S = 2.0
+
+
+async def measure_long_values(course: Workload) -> None:
+    """Put and get 1 MiB, also with datagram loss at every node, if the library supports it."""
+    entry, nodes = course.team.library, course.nodes
+    if entry.largest < MIB:
+        return
+    async with course.phase("1 MiB"):
+        course.result["long"] = await _measure_long(course, "long")
+        if "lose" in entry.features:
+            for node in nodes:
+                await node.run_order("lose", share=LOSS_SHARE)
+            course.result["long_lossy"] = await _measure_long(course, "long and lossy")
+    if "lose" in entry.features:
+        for node in nodes:
+            await node.run_order("lose", share=0.0)
+
+
+async def _measure_long(course: Workload, name: str) -> Result:
+    puts, gets, failed = [], [], 0
+    for number in range(LONG_VALUES):
+        writer, reader = course.rng.sample(course.nodes, 2)
+        put = await course.run_operation(writer, "put", f"{name} {number}", MIB, LONG_LIMIT_S)
+        get = await course.run_operation(reader, "get", f"{name} {number}", MIB, LONG_LIMIT_S) if put["good"] else put
+        if not (put["good"] and get["good"]):
+            failed += 1
+            break
+        puts.append(put["ms"])
+        gets.append(get["ms"])
+    return {"put": summarize(puts), "get": summarize(gets), "failed": failed}
+
+
+async def measure_watches(course: Workload) -> None:
+    """Measure the time from the start of a put until a watcher at another node has the value."""
+    if "watch" not in course.team.library.features:
+        return
+    took: list[float] = []
+    async with course.phase("watch", 120.0):
+        await asyncio.sleep(course.plan.scale_pause(1.0))
+        count = course.plan.scale_count(WATCHES)
+        for number in range(count):
+            writer, watcher = course.rng.sample(course.nodes, 2)
+            key, value = f"watched {number}", course.make_value()
+            await watcher.run_order("watch", key=key, value=value)
+            begun = (await course.run_operation(writer, "put", key, value))["moment"]
+            ends_at = time.monotonic() + NOTIFICATION_LIMIT_S
+            moments: list[float] = []
+            while not moments and time.monotonic() < ends_at:
+                await asyncio.sleep(0.02)
+                moments = (await watcher.run_order("heard", key=key))["moments"]
+            took += [(moment - begun) * 1000 for moment in moments[:1]]
+        course.result["watch"] = {**summarize(took), "lost": count - len(took), "of": count}

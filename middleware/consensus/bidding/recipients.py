@@ -1,0 +1,111 @@
+"""The nodes that offered bids to this node and receive its announcements; pure."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+from middleware.consensus.bidding.announcement import Announcement
+from middleware.consensus.bidding.outgoing_message import Notice
+from middleware.entangled.contact import Contact
+
+MAX_RECIPIENTS = 1024
+"""Maximum number of listeners; the oldest is removed, and asks for the announcement itself."""
+RETRY_PAUSES_S = (0.0, 1.0, 2.0, 4.0)
+"""Seconds after each failed message until the next; after the last one a listener must ask itself."""
+NO_PRECEDENCE = (0, 0)
+
+
+@dataclass
+class _Recipient:
+    """``knows`` is the precedence of the last announcement that the listener has confirmed."""
+
+    contact: Contact
+    is_shared: bool
+    known_precedence: tuple[int, int] = NO_PRECEDENCE
+    is_pending: bool = False
+    failures: int = 0
+    send_at: float = 0.0
+
+
+class Recipients:
+    """The listeners of one node in one auction.
+
+    A listener that is shared with the other quorum members receives an announcement from the member that made it; the
+    others receive all announcements from this node.
+    """
+
+    def __init__(self) -> None:
+        self._recipients: dict[bytes, _Recipient] = {}
+
+    def __len__(self) -> int:
+        return len(self._recipients)
+
+    def has(self, contact: Contact) -> bool:
+        """Return whether ``contact`` is a listener."""
+        return contact.node_id in self._recipients
+
+    @property
+    def is_shared(self) -> bool:
+        """Whether most listeners are shared, as in a small team, in which every bidder sends to all quorum members."""
+        shared = sum(1 for listener in self._recipients.values() if listener.is_shared)
+        return 2 * shared > len(self._recipients)
+
+    def add(self, contact: Contact, is_shared: bool = False) -> None:
+        """Add ``contact`` as a listener, or update it; it is reachable at present."""
+        known = self._recipients.get(contact.node_id)
+        if known is not None:
+            known.contact, known.failures, known.send_at = contact, 0, 0.0
+            known.is_shared = known.is_shared and is_shared
+            return
+        if len(self._recipients) >= MAX_RECIPIENTS:
+            del self._recipients[next(iter(self._recipients))]
+        self._recipients[contact.node_id] = _Recipient(contact, is_shared)
+
+    def record_known(self, contact: Contact, announcement: Announcement) -> None:
+        """Record that a listener has this announcement."""
+        listener = self._recipients.get(contact.node_id)
+        if listener is not None:
+            listener.known_precedence = max(listener.known_precedence, announcement.precedence)
+
+    def compute_due(self, announcement: Announcement | None, is_mine: bool) -> float:
+        """Return the time of the next message to a listener."""
+        owed = self._find_uninformed(announcement, is_mine)
+        return min((listener.send_at for listener in owed), default=math.inf)
+
+    def take_due_notices(self, announcement: Announcement | None, is_mine: bool, now: float) -> list[Notice]:
+        """Return the messages that are due now, at most one per listener."""
+        out = []
+        for listener in self._find_uninformed(announcement, is_mine):
+            if announcement is not None and listener.send_at <= now:
+                listener.is_pending = True
+                out.append(Notice(listener.contact, announcement))
+        return out
+
+    def on_answer(self, notice: Notice) -> None:
+        """Record that a listener confirmed the announcement."""
+        listener = self._recipients.get(notice.to.node_id)
+        if listener is not None:
+            listener.is_pending, listener.failures, listener.send_at = False, 0, 0.0
+        self.record_known(notice.to, notice.announcement)
+
+    def on_failure(self, notice: Notice, now: float) -> None:
+        """Record that a listener did not answer."""
+        listener = self._recipients.get(notice.to.node_id)
+        if listener is not None:
+            listener.is_pending = False
+            is_last = listener.failures >= len(RETRY_PAUSES_S)
+            listener.send_at = math.inf if is_last else now + RETRY_PAUSES_S[listener.failures]
+            listener.failures += 1
+
+    def _find_uninformed(self, announcement: Announcement | None, is_mine: bool) -> list[_Recipient]:
+        """Return the listeners that do not know ``announcement`` and have no message under way."""
+        if announcement is None:
+            return []
+        return [
+            listener
+            for listener in self._recipients.values()
+            if listener.known_precedence < announcement.precedence
+            and not listener.is_pending
+            and (is_mine or not listener.is_shared)
+        ]

@@ -1,0 +1,87 @@
+"""Send datagrams through relays to nodes that this one cannot reach directly.
+
+CARRY asks a relay to forward a datagram (``relay`` is the other side), and CARRIED delivers a forwarded datagram.
+"""
+
+from __future__ import annotations
+
+from twisted.internet.interfaces import IReactorTime
+
+from middleware.entangled.bounded import put_bounded
+from middleware.entangled.contact import Contact
+from middleware.entangled.identity import ID_BYTES
+from middleware.entangled.nat.known_peers import MAX_KNOWN
+from middleware.entangled.nat.relay import HEADER_BYTES, RELAY_REQUEST
+from middleware.entangled.nat.relayed_network import RelayedNetwork
+from middleware.entangled.network.network import Address, is_relayed, relayed_address
+from middleware.entangled.wire.endpoint import Endpoint
+from middleware.entangled.wire.session import Session
+
+MAX_RELAYS = 3
+"""The number of relays remembered for the same node."""
+
+
+class RelayClient:
+    """The relays to each node, by its id, and the datagrams through them."""
+
+    def __init__(self, own_id: bytes, endpoint: Endpoint, paths: RelayedNetwork, clock: IReactorTime) -> None:
+        self._own_id = own_id
+        self._endpoint = endpoint
+        self._network = paths
+        self._clock = clock
+        self._relays: dict[bytes, dict[bytes, float]] = {}
+
+    def __len__(self) -> int:
+        return len(self._relays)
+
+    def add_relay(self, to: bytes, carrier: bytes) -> None:
+        """Record that a peer relays to the node with that id."""
+        carriers = self._relays.pop(to, None) or {}
+        carriers[carrier] = self._clock.seconds()
+        if len(carriers) > MAX_RELAYS:
+            del carriers[min(carriers, key=lambda public: carriers[public])]
+        put_bounded(self._relays, to, carriers, MAX_KNOWN)
+
+    def relay_keys(self, to: bytes) -> list[bytes]:
+        """Return the public keys of the relays to the node with that id."""
+        return list(self._relays.get(to, ()))
+
+    def find_contacts(self, to: bytes) -> list[Contact]:
+        """Return the relays to that node that this node reaches directly."""
+        sessions = [self._endpoint.peers.find_direct_session(public) for public in self.relay_keys(to)]
+        return [session.contact for session in sessions if session is not None]
+
+    def find_session(self, to: bytes) -> Session | None:
+        """Return the direct session with the latest known relay to the node with that id."""
+        carriers = self._relays.get(to, {})
+        for public in sorted(carriers, key=lambda public: -carriers[public]):
+            session = self._endpoint.peers.find_direct_session(public)
+            if session is not None:
+                return session
+        return None
+
+    def send(self, datagram: bytes, to: Address) -> None:
+        """Send a datagram through a relay to the node with that virtual address; it is lost if there is no relay."""
+        target = _parse_node_id(to)
+        carrier = self.find_session(target) if target else None
+        if carrier is None:
+            self._endpoint.counters["uncarried"] += 1
+        else:
+            self._endpoint.send_sealed(carrier, bytes([RELAY_REQUEST]) + target + datagram)
+
+    def on_relayed(self, session: Session, plain: bytes, source: Address) -> None:
+        """Process a datagram that the peer of ``session`` relayed to this node."""
+        inner, sender = plain[HEADER_BYTES:], plain[1:HEADER_BYTES]
+        if not inner or is_relayed(session.contact.address) or sender == self._own_id:
+            self._endpoint.counters["malformed"] += 1
+            return
+        self.add_relay(sender, session.contact.public)
+        self._network.receive_relayed(inner, relayed_address(sender))
+
+
+def _parse_node_id(address: Address) -> bytes:
+    try:
+        found = bytes.fromhex(address.host[1:])
+    except ValueError:
+        return b""
+    return found if len(found) == ID_BYTES else b""

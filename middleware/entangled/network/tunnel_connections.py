@@ -1,0 +1,153 @@
+"""Manage the connections of one tunnel: one, or up to three redundant ones on a lossy path.
+
+A TCP stream stalls while lost segments are retransmitted, often for seconds at 30 % loss in each direction, and
+everything behind them is delayed.  Parallel streams seldom stall at the same time.  Therefore a tunnel has three
+connections after a recent stall, and sends each datagram over the two that make progress; the receiving endpoint drops
+duplicates.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+from middleware.entangled.network.network import Address
+from middleware.entangled.network.stream_transport import StreamState
+from middleware.entangled.network.tunnel_connection import TunnelConnection
+
+MAX_CONNECTIONS = 3
+"""The maximum number of connections of one tunnel."""
+COPIES = 2
+"""The number of connections that carry each datagram, if there are several."""
+STALLED_S = 0.3
+"""The time in seconds after which a stream that retransmits without progress counts as stalled."""
+REPLACE_STALLED_S = 1.5
+"""The time in seconds after which a stalled stream is dialled again, if another one makes progress."""
+LOSSY_RETRANSMISSIONS = 2
+"""The number of retransmissions before a stream is open that indicates a lossy path."""
+REDUNDANCY_S = 30.0
+"""The time in seconds for which a tunnel has several connections after a stall."""
+DIAL_NEXT_S = 1.2
+"""The time in seconds after which another connection is dialled if none opens."""
+REDIAL_DELAY_S = 1.0
+"""The minimum time in seconds between the loss of a connection and the next one, if there are others."""
+MAX_STALLED_BYTES = 4096
+"""The bytes that a stalled stream may hold; further datagrams would be late and delay the ones after them."""
+
+ReadState = Callable[[Any], StreamState | None]
+
+
+@dataclass(slots=True)
+class _Progress:
+    """The progress of a stream: when it last delivered something, and its counts at that time."""
+
+    moved_at: float
+    acked: int = -1
+    retransmissions: int = 0
+    unacked: int = 0
+    is_retransmitting: bool = False
+
+
+class TunnelConnections:
+    """The connections of the tunnel to ``address``; ``measure`` returns the state of a transport's stream."""
+
+    def __init__(self, address: Address, measure: ReadState, now: float) -> None:
+        self.address = address
+        self.token = b""
+        """Identifies the tunnel to the other end, which groups its connections by it."""
+        self.connections: list[TunnelConnection] = []
+        self.is_answered = False
+        self.started_at = self.active_at = now
+        self.hold_until = float("-inf")
+        self._read_state = measure
+        self._redundant_until = float("-inf")
+        self._progress: dict[TunnelConnection, _Progress] = {}
+
+    @property
+    def is_open(self) -> bool:
+        """Whether datagrams can be sent."""
+        return any(link.is_open for link in self.connections)
+
+    def add(self, link: TunnelConnection) -> None:
+        """Add a connection."""
+        self.connections.append(link)
+
+    def remove(self, link: TunnelConnection, now: float) -> None:
+        """Remove a connection."""
+        if link in self.connections:
+            self.connections.remove(link)
+            self.hold_until = now + REDIAL_DELAY_S
+        self._progress.pop(link, None)
+
+    def send(self, datagram: bytes, now: float) -> bool:
+        """Send a datagram over the connections that make progress; return False if it was dropped."""
+        self.is_answered, self.active_at = True, now
+        links = self.order_by_progress(now) or self.connections[:1]
+        sent = 0
+        for link in links:
+            pace = self._progress.get(link)
+            if pace is not None and self._is_stalled(pace, now) and pace.unacked > MAX_STALLED_BYTES:
+                continue
+            dropped = link.dropped
+            link.send(datagram)
+            sent += link.dropped == dropped
+            if sent == COPIES:
+                break
+        return sent > 0
+
+    def order_by_progress(self, now: float) -> list[TunnelConnection]:
+        """Return the open connections, first the ones that make progress and hold the fewest bytes."""
+        links = [link for link in self.connections if link.is_open]
+        for link in links:
+            self._measure_progress(link, now)
+        if len(links) > 1:
+            links.sort(key=lambda link: self._rank(self._progress[link], now))
+        return links
+
+    def find_most_stalled(self, now: float) -> TunnelConnection:
+        """Return the most stalled connection except the newest, or the oldest if none is stalled."""
+        self.order_by_progress(now)
+        return max(self.connections[:-1], key=lambda link: self._rank(self._progress.get(link) or _Progress(now), now))
+
+    def target_count(self, now: float) -> int:
+        """Return the number of connections that the tunnel should have."""
+        if not self.is_open:
+            return min(MAX_CONNECTIONS, 1 + int((now - self.started_at) / DIAL_NEXT_S))
+        return MAX_CONNECTIONS if now < self._redundant_until else 1
+
+    def find_surplus(self, now: float) -> list[TunnelConnection]:
+        """Return the connections to close: stalled ones, and surplus ones."""
+        links = self.order_by_progress(now)
+        if not links:
+            return []
+        if self.target_count(now) == 1:
+            return [link for link in self.connections if link is not links[0]]
+        if self._is_stalled(self._progress[links[0]], now):
+            return []
+        return [link for link in links if self._stalled_s(self._progress[link], now) > REPLACE_STALLED_S]
+
+    # -- private ----------------------------------------------------------------------------------------------------
+
+    def _measure_progress(self, link: TunnelConnection, now: float) -> None:
+        pace = self._progress.setdefault(link, _Progress(now))
+        strain = self._read_state(link.transport)
+        if strain is None:
+            return
+        if pace.acked < 0 and strain.retransmissions >= LOSSY_RETRANSMISSIONS:
+            self._redundant_until = now + REDUNDANCY_S
+        if strain.acked != pace.acked or not strain.unacked:
+            pace.moved_at, pace.acked, pace.retransmissions = now, strain.acked, strain.retransmissions
+        pace.unacked = strain.unacked
+        pace.is_retransmitting = strain.retransmissions > pace.retransmissions
+        if self._is_stalled(pace, now):
+            self._redundant_until = now + REDUNDANCY_S
+
+    def _stalled_s(self, pace: _Progress, now: float) -> float:
+        return now - pace.moved_at if pace.unacked else 0.0
+
+    def _is_stalled(self, pace: _Progress, now: float) -> bool:
+        return pace.is_retransmitting and self._stalled_s(pace, now) > STALLED_S
+
+    def _rank(self, pace: _Progress, now: float) -> tuple[bool, float, int]:
+        return self._is_stalled(pace, now), self._stalled_s(pace, now), pace.unacked

@@ -1,0 +1,119 @@
+"""Batching of a node's own records on the way to their replicas.
+
+After Nagle (RFC 896): while a replica has not answered the last request, further records wait and then share one
+request.  A single write is not delayed, and many writes share datagrams.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+
+from twisted.internet.defer import Deferred
+
+from middleware.entangled.background import Background
+from middleware.entangled.contact import Contact
+from middleware.entangled.errors import Crowded, EntangledError, NoAnswer, Refused
+from middleware.entangled.kademlia.overlay import Overlay
+from middleware.entangled.record import Record
+
+MAX_LOAD_BYTES = 1300
+"""Bytes of records in one datagram."""
+MAX_WAITING = 2048
+"""Maximum records that wait for one replica."""
+
+
+Waiting = deque[tuple[Record, Deferred[object]]]
+"""The records that wait for one replica, each with the Deferred of its result."""
+
+
+class RecordBatcher:
+    """Sends the own records of a node to their replicas."""
+
+    def __init__(self, overlay: Overlay, chores: Background) -> None:
+        self._overlay = overlay
+        self._background = chores
+        self._waiting: dict[bytes, Waiting] = {}
+
+    async def store(self, contact: Contact, record: Record, left: float | None = None) -> object:
+        """Send STORE for ``record`` and return the reply; raise the errors of the request.
+
+        A record of another owner, with ``left`` seconds of remaining lifetime, is sent at once by itself.
+        """
+        if left is not None:
+            return (await self._send(contact, [record], [left]))[0]
+        if record.message_bytes > MAX_LOAD_BYTES:
+            return (await self._send(contact, [record]))[0]  # sent in fragments, so it takes longer
+        waiting = self._waiting.get(contact.node_id)
+        if waiting is not None:
+            if len(waiting) >= MAX_WAITING:
+                raise Crowded(f"more than {MAX_WAITING} records wait for {contact.address}; write more slowly")
+            result: Deferred[object] = Deferred()
+            waiting.append((record, result))
+            return await result
+        waiting = self._waiting[contact.node_id] = deque()
+        try:
+            results = await self._send(contact, [record])
+        except NoAnswer:
+            self._send_all(waiting, contact)
+            raise
+        finally:
+            self._finish_request(waiting, contact)
+        return results[0]
+
+    # -- inside -----------------------------------------------------------------------------------------------------
+
+    def _finish_request(self, waiting: Waiting, contact: Contact) -> None:
+        """Send the next request after the last one ended, if records wait."""
+        if waiting:
+            self._background.fork(self._send_next(waiting, contact))
+        else:
+            del self._waiting[contact.node_id]
+
+    def _send_all(self, waiting: Waiting, contact: Contact) -> None:
+        """Send all waiting records at once after a request was not answered."""
+        while waiting:
+            self._background.fork(self._deliver(contact, _take_batch(waiting)))
+
+    async def _send_next(self, waiting: Waiting, contact: Contact) -> None:
+        try:
+            await self._deliver(contact, _take_batch(waiting))
+        except NoAnswer:
+            self._send_all(waiting, contact)
+        finally:
+            self._finish_request(waiting, contact)
+
+    async def _deliver(self, contact: Contact, load: list[tuple[Record, Deferred[object]]]) -> None:
+        """Send ``load`` in one request and fire its Deferreds; also raise ``NoAnswer``."""
+        try:
+            answers = await self._send(contact, [record for record, _ in load])
+        except Refused as error:
+            if len(load) == 1:
+                load[0][1].errback(error)
+            else:  # send each by itself, so that only the refused one fails
+                for one in load:
+                    self._background.fork(self._deliver(contact, [one]))
+        except EntangledError as error:
+            for _, result in load:
+                result.errback(error)
+            if isinstance(error, NoAnswer):
+                raise
+        else:
+            for (_, result), answer in zip(load, answers, strict=True):
+                result.callback(answer)
+
+    async def _send(self, contact: Contact, records: list[Record], *lives: list[float]) -> list[object]:
+        packed = [record.pack() for record in records]
+        answer = await self._overlay.ask(contact, "store", packed, *lives, changes=True)
+        if not isinstance(answer, list) or len(answer) != len(records):
+            raise Refused(f"{contact.address} refuses the record")
+        return answer
+
+
+def _take_batch(waiting: Waiting) -> list[tuple[Record, Deferred[object]]]:
+    """Remove and return the next waiting records, as many as fit into one datagram."""
+    room = MAX_LOAD_BYTES
+    load: list[tuple[Record, Deferred[object]]] = []
+    while waiting and (waiting[0][0].message_bytes <= room or not load):
+        load.append(waiting.popleft())
+        room -= load[-1][0].message_bytes
+    return load

@@ -1,0 +1,167 @@
+"""The records that this node and a peer should both hold: digests of parts, lists of slots, and pages of records.
+
+Answers DIGESTS, PLACES, FETCH and LACKING; ``handover`` sends these requests.
+"""
+
+from __future__ import annotations
+
+from bisect import bisect_right
+from collections.abc import Callable
+
+from twisted.internet.interfaces import IReactorTime
+
+from middleware.entangled.contact import Contact
+from middleware.entangled.errors import Refused
+from middleware.entangled.kademlia.overlay import Overlay
+from middleware.entangled.record import Record, Slot, parse_slot
+from middleware.entangled.replication.replica import PAGE_BYTES, Replica
+from middleware.entangled.replication.sync_state import CURRENT, NEVER_SYNCED
+from middleware.entangled.replication.watch import digest_of
+from middleware.entangled.wire.endpoint import Endpoint
+
+GROUPS = 16
+"""Parts of the id space with a digest each, so that a difference in one does not require comparing all."""
+PAGE_RECORDS = 12
+"""Maximum slots or records in one message."""
+SNAPSHOT_S = 2.0
+"""Seconds that a snapshot of the slots is kept for a peer after its request for digests."""
+MAX_SNAPSHOTS = 8
+MAX_PEERS = 1024
+"""Peers whose last request is remembered; the oldest is dropped first."""
+SIGNATURE_BITS = 512
+"""Bits of a signature; the requester picks one at random to select the records in a sum of lifetimes."""
+
+Mark = tuple[int, bytes]
+"""Version of a slot: the record's sequence and the first bytes of its signature; (-1, b"") if empty."""
+
+
+class Comparison:
+    """The team records of one node as its peers see them.
+
+    ``asked_at`` maps peers to the time of their last request for digests; ``standing`` returns this node's sync state.
+    """
+
+    def __init__(self, replica: Replica, overlay: Overlay, endpoint: Endpoint, clock: IReactorTime) -> None:
+        self.requested_at: dict[bytes, float] = {}
+        self.get_sync_state: Callable[[], int] = lambda: CURRENT
+        self._replica = replica
+        self._overlay = overlay
+        self._clock = clock
+        self._own_id = overlay.own_id
+        self._snapshots: dict[bytes, tuple[float, list[list[Record]]]] = {}
+        self._responsible: dict[bytes, list[bytes]] = {}
+        self._members_version = -1
+        endpoint.expose("digests", self._answer_digests)
+        endpoint.expose("places", self._answer_places)
+        endpoint.expose("fetch", self._answer_fetch)
+        endpoint.expose("lacking", self._answer_lacking)
+
+    def find_shared(self, peer: Contact) -> tuple[list[list[Record]], list[Record]]:
+        """Return the records that both nodes should hold, by parts, and the records only the peer should hold."""
+        groups: list[list[Record]] = [[] for _ in range(GROUPS)]
+        extra = []
+        if self._members_version != self._overlay.members.version or not self._overlay.is_complete:
+            self._responsible.clear()
+            self._members_version = self._overlay.members.version
+        for record in self._replica.team_records():
+            ids = self._responsible.get(record.key)
+            if ids is None:
+                ids = self._responsible[record.key] = [c.node_id for c in self._overlay.find_responsible(record.key)]
+            is_mine, is_theirs = self._own_id in ids, peer.node_id in ids
+            if is_theirs and is_mine:
+                groups[record.key[0] * GROUPS >> 8].append(record)
+            elif is_theirs:
+                extra.append(record)
+        return groups, extra
+
+    def sum_lifetimes(self, group: list[Record], bit: int) -> int:
+        """Return the whole seconds left, summed over the records of ``group`` with ``bit`` set in their signature.
+
+        The owner does not sign the remaining lifetime, so the digest cannot cover it.  A node that reported a short
+        lifetime to one replica could balance a sum over all records by its own records, but not a sum over a random
+        subset.
+        """
+        byte, mask = bit >> 3, 1 << (bit & 7)
+        return sum(
+            int(self._replica.remaining_lifetime(r))
+            for r in group
+            if len(r.signature) > byte and r.signature[byte] & mask
+        )
+
+    # -- requests of peers ---------------------------------------------------------------------------------------------
+
+    def _answer_digests(self, peer: Contact, bit: int, standing: int) -> list[object]:
+        """DIGESTS: the digest of each part, the number of records that only the peer should hold, and the lifetimes.
+
+        Both nodes exchange their sync states as well.
+        """
+        if not 0 <= bit < SIGNATURE_BITS:
+            raise Refused(f"a signature has the bits 0 to {SIGNATURE_BITS - 1}")
+        *groups, extra = self._make_snapshot(peer)
+        self.requested_at.pop(peer.node_id, None)
+        self.requested_at[peer.node_id] = self._clock.seconds()
+        if len(self.requested_at) > MAX_PEERS:
+            del self.requested_at[next(iter(self.requested_at))]
+        self._overlay.members.set_voter(peer.node_id, standing > NEVER_SYNCED)
+        lives = [self.sum_lifetimes(group, bit) for group in groups]
+        return [[digest_of(group) for group in groups], len(extra), lives, self.get_sync_state()]
+
+    def _answer_places(self, peer: Contact, group: int, after: list[object]) -> list[object]:
+        """PLACES: a page of slots with marks in one part (-1: records for the peer only), in order."""
+        if not -1 <= group < GROUPS:
+            raise Refused(f"a group is a number from -1 to {GROUPS - 1}")
+        cursor = parse_slot(after)
+        if after and cursor is None:
+            raise Refused("a page begins after a key, an owner and a name")
+        listed_at, lists = self._snapshots.get(peer.node_id, (-SNAPSHOT_S, []))
+        if self._clock.seconds() - listed_at >= SNAPSHOT_S:
+            lists = self._make_snapshot(peer)
+        records = lists[group]
+        begin = bisect_right(records, cursor, key=lambda record: record.slot) if cursor else 0
+        return [
+            [*record.slot, record.sequence, record.signature[:8], int(self._replica.remaining_lifetime(record))]
+            for record in records[begin : begin + PAGE_RECORDS]
+        ]
+
+    def _answer_fetch(self, peer: Contact, slots: list[object]) -> list[object]:
+        """FETCH: the record in each slot and its seconds left, or None; cut to one page."""
+        page: list[object] = []
+        size = 0
+        for place in slots[:PAGE_RECORDS]:
+            slot = parse_slot(place)
+            if slot is None:
+                raise Refused("a slot is a key, an owner and a name")
+            record = self._replica.get_visible(slot)
+            size += 0 if record is None else record.message_bytes
+            if page and size > PAGE_BYTES:
+                break
+            page.append(None if record is None else [record.pack(), self._replica.remaining_lifetime(record)])
+        return page
+
+    def _answer_lacking(self, peer: Contact, places: list[object]) -> list[bool]:
+        """LACKING: whether the record of each given slot and mark is newer than the local one."""
+        answer = []
+        for place in places[:PAGE_RECORDS]:
+            if not (isinstance(place, list) and [type(part) for part in place] == [bytes, bytes, str, int, bytes]):
+                raise Refused("a place is a key, an owner, a name, a number and a signature's first bytes")
+            answer.append((place[3], place[4]) > mark_of(self._replica.get_visible(Slot(*place[:3]))))
+        return answer
+
+    # -- inside -----------------------------------------------------------------------------------------------------
+
+    def _make_snapshot(self, peer: Contact) -> list[list[Record]]:
+        """Return ``both`` as sorted lists, records for the peer only last; keep them as its snapshot."""
+        groups, extra = self.find_shared(peer)
+        lists = [sorted(records, key=lambda record: record.slot) for records in (*groups, extra)]
+        now = self._clock.seconds()
+        self._snapshots.pop(peer.node_id, None)
+        for other, (at, _) in list(self._snapshots.items()):
+            if now - at >= SNAPSHOT_S or len(self._snapshots) >= MAX_SNAPSHOTS:
+                del self._snapshots[other]  # snapshots keep replaced records in memory
+        self._snapshots[peer.node_id] = (now, lists)
+        return lists
+
+
+def mark_of(record: Record | None) -> Mark:
+    """Return the version mark of ``record``; a newer record has a higher one."""
+    return (-1, b"") if record is None else (record.sequence, record.signature[:8])

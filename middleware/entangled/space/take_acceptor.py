@@ -1,0 +1,222 @@
+"""The acceptor of a node for takes of tuples: answers claims, confirmations and releases.
+
+It stores its votes as notes in the node's store, so they survive a restart.  A node without notes starts with a new
+incarnation.  Tuples name the incarnation of each member, so a member that lost its votes does not vote about tuples
+that it may have voted on before.
+"""
+
+from __future__ import annotations
+
+import random
+from collections.abc import Callable
+from typing import Final, Protocol
+
+from twisted.internet.defer import Deferred
+from twisted.internet.interfaces import IReactorTime
+
+from middleware.entangled.contact import Contact
+from middleware.entangled.data.store import Store
+from middleware.entangled.errors import Refused
+from middleware.entangled.quorum.acceptor import Acceptor, AcceptorSettings, Event
+from middleware.entangled.quorum.ballot import FIRST_CONFIGURATION, NO_BALLOT, Ballot
+from middleware.entangled.quorum.log import MAX_REGISTERS, RegisterLog
+from middleware.entangled.quorum.register import Register, Reply, ReplyKind
+from middleware.entangled.record import KEY_BYTES
+from middleware.entangled.space.take_codec import CODEC, MAX_LEASE_S, is_counter, pack_reply
+from middleware.entangled.space.tuple_record import (
+    INCARNATION_BYTES,
+    StoredTuple,
+    TupleId,
+    is_taker_name,
+    parse_record,
+    parse_tuple_id,
+)
+
+MAX_TUPLES = 12
+"""Tuples in one request: more would not fit into a datagram."""
+UNFINISHED_S = 3.0
+"""Seconds after which a member completes a confirmation that it has not seen the end of."""
+TERMS = AcceptorSettings(completion_s=1.0, must_prepare=True)
+_INCARNATION: Final = "decree/incarnation"
+
+Answers = list[object] | Deferred[list[object]]
+
+
+class MethodRegistry(Protocol):
+    """Makes methods callable by peers; ``Endpoint`` implements it."""
+
+    def expose(self, name: str, answer: Callable[..., object], changes: bool = False) -> None:
+        """Let peers call ``answer(peer, *arguments)`` under ``name``."""
+
+
+class TakeAcceptor:
+    """The acceptor of one node for all councils that it is a member of.
+
+    ``written`` may be set to a function that returns a Deferred which fires when all notes are on disk; answers then
+    wait for it, so that even a power failure loses no vote that was sent.
+    """
+
+    def __init__(self, endpoint: MethodRegistry, store: Store, clock: IReactorTime, rng: random.Random) -> None:
+        self.wait_for_write: Callable[[], Deferred[None]] | None = None
+        self._store = store
+        self._clock = clock
+        self._rng = rng
+        self._acceptor: Acceptor[TupleId] | None = None
+        self._unfinished: dict[TupleId, float] = {}
+        self._incarnation = b""
+        endpoint.expose("decree.enrol", self.answer_enrol)
+        endpoint.expose("decree.claim", self.answer_claim, changes=True)
+        endpoint.expose("decree.confirm", self.answer_confirm, changes=True)
+        endpoint.expose("decree.release", self.answer_release, changes=True)
+
+    def __len__(self) -> int:
+        """Return the number of stored votes."""
+        return len(self._loaded_acceptor.log)
+
+    @property
+    def incarnation(self) -> bytes:
+        """The random id of this node's set of votes; it changes if the node loses them."""
+        self.load()
+        return self._incarnation
+
+    def load(self) -> None:
+        """Load the votes of an earlier run, or start a new incarnation."""
+        if self._acceptor is None:
+            self._acceptor = self._load()
+
+    def find_vote(self, place: TupleId) -> Register | None:
+        """Return this node's vote about the tuple of ``place``, or None."""
+        return self._loaded_acceptor.log.get(place)
+
+    def list_unfinished(self) -> list[StoredTuple]:
+        """Return the tuples with a take accepted here that has had no known end for ``UNSETTLED_S`` seconds.
+
+        Each is returned again after ``UNSETTLED_S`` seconds, until ``settle`` is called.
+        """
+        now = self._clock.seconds()
+        late = [place for place, since in self._unfinished.items() if since + UNFINISHED_S <= now]
+        found = []
+        for place in late:
+            record = self._store.get_slot(place.slot)
+            parsed = parse_record(record) if record is not None else None
+            if isinstance(parsed, StoredTuple) and parsed.tuple_id == place:
+                self._unfinished[place] = now
+                found.append(parsed)
+            else:
+                self.finish(place)  # removed, or stored at other nodes, which complete it
+        return found
+
+    def finish(self, place: TupleId) -> None:
+        """Note that the decision about ``place`` is complete."""
+        self._unfinished.pop(place, None)
+
+    # -- requests of claimants --------------------------------------------------------------------------------------
+
+    def answer_enrol(self, peer: Contact) -> bytes:
+        """ENROL: agree to be a member of councils; return the incarnation."""
+        return self.incarnation
+
+    def answer_claim(
+        self,
+        peer: Contact,
+        key: bytes,
+        places: list[object],
+        incarnation: bytes,
+        counter: int,
+        taker: bytes,
+        lease: float,
+    ) -> Answers:
+        """CLAIM: promise and lease the ballot for each of ``places`` under ``key``, or reply with the reason."""
+        wanted, ballot = self._parse_request(key, places, incarnation, counter, taker)
+        if not 0.0 < lease <= MAX_LEASE_S:
+            raise Refused(f"a lease lasts more than 0 and at most {MAX_LEASE_S:.0f} seconds")
+        now = self._clock.seconds()
+        return self._pack_answer(Event.PREPARE, [self._prepare(place, ballot, float(lease), now) for place in wanted])
+
+    def answer_confirm(
+        self,
+        peer: Contact,
+        key: bytes,
+        places: list[object],
+        incarnation: bytes,
+        counter: int,
+        taker: bytes,
+        value: bytes,
+    ) -> Answers:
+        """CONFIRM: accept ``value`` as the taker of each of ``places`` under the ballot, or reply with the reason."""
+        wanted, ballot = self._parse_request(key, places, incarnation, counter, taker)
+        if not is_taker_name(value):
+            raise Refused("decree.confirm needs the name of a taker")
+        now, acceptor = self._clock.seconds(), self._loaded_acceptor
+        replies = [acceptor.accept(place, FIRST_CONFIGURATION, ballot, value, now) for place in wanted]
+        for place, reply in zip(wanted, replies, strict=True):
+            if reply.accepted != NO_BALLOT:
+                self._unfinished.setdefault(place, now)
+        return self._pack_answer(Event.ACCEPT, replies)
+
+    def answer_release(
+        self, peer: Contact, key: bytes, places: list[object], incarnation: bytes, counter: int, taker: bytes
+    ) -> Answers:
+        """RELEASE: end the ballot's lease on each of ``places``."""
+        wanted, ballot = self._parse_request(key, places, incarnation, counter, taker)
+        now = self._clock.seconds()
+        replies = [self._loaded_acceptor.release(place, ballot, now) for place in wanted]
+        return [pack_reply(reply, Event.RELEASE) for reply in replies]
+
+    # -- inside -----------------------------------------------------------------------------------------------------
+
+    def _parse_request(
+        self, key: bytes, places: list[object], incarnation: bytes, counter: int, taker: bytes
+    ) -> tuple[list[TupleId], Ballot]:
+        """Check the common arguments of a request; return the tuples and the ballot; raise ``Refused``."""
+        if incarnation != self.incarnation:
+            raise Refused("this member has lost its votes since it joined that council")
+        if len(key) != KEY_BYTES or not 0 < len(places) <= MAX_TUPLES:
+            raise Refused(f"a request names a key and 1 to {MAX_TUPLES} places")
+        wanted = [place for place in (parse_tuple_id(key, fields) for fields in places) if place is not None]
+        if len(wanted) < len(places) or len(set(wanted)) < len(wanted):
+            raise Refused("a place is an owner, a name and a mark, and a request names each place once")
+        if not (is_counter(counter) and is_taker_name(taker)):
+            raise Refused("a ballot is a positive number and the name of a taker")
+        return wanted, Ballot(counter, taker)
+
+    @property
+    def _loaded_acceptor(self) -> Acceptor[TupleId]:
+        self.load()
+        assert self._acceptor is not None
+        return self._acceptor
+
+    def _prepare(self, place: TupleId, ballot: Ballot, lease: float, now: float) -> Reply:
+        if self.find_vote(place) is None and self._is_over(place):
+            return Reply(ReplyKind.OUTBID, ballot)
+        reply = self._loaded_acceptor.prepare(place, FIRST_CONFIGURATION, ballot, 0.0, now, lease)
+        if reply.kind is ReplyKind.QUIET:
+            raise Refused(f"this member has room for {MAX_REGISTERS} votes and all are in use; try another tuple")
+        return reply
+
+    def _is_over(self, place: TupleId) -> bool:
+        """Return whether the publisher has removed this tuple or reused its slot."""
+        record = self._store.get_slot(place.slot)
+        if record is None:
+            return False
+        parsed = parse_record(record)
+        return not isinstance(parsed, StoredTuple) or parsed.tuple_id != place
+
+    def _may_forget(self, place: TupleId, vote: Register, now: float) -> bool:
+        """Return whether a vote is no longer needed: its lease has expired, or its tuple does not exist."""
+        return (vote.accepted == NO_BALLOT and vote.reserved_until <= now) or self._is_over(place)
+
+    def _pack_answer(self, event: Event, replies: list[Reply]) -> Answers:
+        packed: list[object] = [pack_reply(reply, event) for reply in replies]
+        return packed if self.wait_for_write is None else self.wait_for_write().addCallback(lambda _: packed)
+
+    def _load(self) -> Acceptor[TupleId]:
+        now = self._clock.seconds()
+        log = RegisterLog(self._store, CODEC, self._may_forget, now)
+        self._incarnation = self._store.get_note(_INCARNATION) or b""
+        if len(self._incarnation) != INCARNATION_BYTES or not log.is_complete:
+            log.clear()
+            self._incarnation = self._rng.randbytes(INCARNATION_BYTES)
+            self._store.set_note(_INCARNATION, self._incarnation)
+        self._unfinished = {place: now for place, vote in log.registers.items() if vote.accepted != NO_BALLOT}
+        return Acceptor(log, TERMS)

@@ -1,0 +1,109 @@
+"""The proposer's requests to the council of a tuple, the members named in its record.
+
+It claims tuples, confirms takes, and completes unfinished decisions; it depends only on a function that asks a member.
+"""
+
+from __future__ import annotations
+
+import random
+from collections.abc import Callable, Sequence
+from typing import Any
+
+from twisted.internet.defer import Deferred
+from twisted.internet.interfaces import IReactorTime
+
+from middleware.entangled.background import Background
+from middleware.entangled.contact import Contact
+from middleware.entangled.errors import EntangledError, NotRunning
+from middleware.entangled.quorum.acceptor import Event
+from middleware.entangled.quorum.ballot import Ballot
+from middleware.entangled.quorum.proposer import Outcome, Result, conclude, decide
+from middleware.entangled.quorum.register import Reply
+from middleware.entangled.quorum.round import Round, Tally
+from middleware.entangled.space.take_codec import unpack_reply
+from middleware.entangled.space.tuple_record import Member, StoredTuple
+
+RESOLVE_LEASE_S = 2.0
+
+Ask = Callable[[Contact, str, tuple[object, ...]], "Deferred[Any]"]
+"""Calls a method of a member: (contact, method, arguments)."""
+
+
+class TakeProposer:
+    """The requests of one claimant to councils; ``chores`` ends with the claimant."""
+
+    def __init__(self, ask: Ask, clock: IReactorTime, rng: random.Random, chores: Background) -> None:
+        self._ask = ask
+        self._clock = clock
+        self._rng = rng
+        self._background = chores
+
+    async def claim(self, posted: Sequence[StoredTuple], ballot: Ballot, lease: float) -> list[Outcome]:
+        """Run one round of claims for tuples of one key and council; release the others afterwards."""
+        outcomes = await self.renew(posted, ballot, lease)
+        lost = [p for p, o in zip(posted, outcomes, strict=True) if o.result not in (Result.WON, Result.DECIDED)]
+        if lost:
+            # The promises of a minority must not delay another claimant.
+            self.release(lost, ballot)
+        return outcomes
+
+    async def renew(self, posted: Sequence[StoredTuple], ballot: Ballot, lease: float) -> list[Outcome]:
+        """Run one round of claims under a ballot that has won before; if it fails, the present lease stays valid."""
+        return await self._run_round(posted, "decree.claim", Event.PREPARE, ballot, lease)
+
+    async def confirm(self, posted: Sequence[StoredTuple], ballot: Ballot, value: bytes) -> list[Outcome]:
+        """Run one round that confirms takes of tuples of one key and council."""
+        return await self._run_round(posted, "decree.confirm", Event.ACCEPT, ballot, value)
+
+    def release(self, posted: Sequence[StoredTuple], ballot: Ballot) -> None:
+        """Release the leases at all reachable members; at the others they expire."""
+        for member in posted[0].council:
+            request = self._ask(member.contact, "decree.release", _make_arguments(posted, member, ballot))
+            request.addErrback(lambda failure: failure.trap(EntangledError))
+
+    async def resolve(self, posted: StoredTuple, bidder: bytes, value: bytes | None, counter: int = 0) -> bytes | None:
+        """Retry until the council has decided about a tuple, and return the decided value.
+
+        Proposes ``value`` if no other value was accepted.  With None it proposes none, and returns None if no value was
+        accepted.  Raises ``NotRunning`` when the claimant is stopped.
+        """
+
+        async def prepare(ballot: Ballot) -> Outcome:
+            return (await self.claim([posted], ballot, RESOLVE_LEASE_S))[0]
+
+        async def accept(ballot: Ballot, chosen: bytes) -> Outcome:
+            return (await self.confirm([posted], ballot, chosen))[0]
+
+        async def sleep(seconds: float) -> None:
+            if self._background.is_stopped:
+                raise NotRunning("the tuple space stopped during the confirmation of a take")
+            await self._background.sleep(seconds)
+
+        ballot = Ballot(counter + 1, bidder)
+        ballot, decided = await decide(ballot, value, prepare, accept, sleep, self._rng)
+        if decided is None:
+            self.release([posted], ballot)
+        return decided  # type: ignore[no-any-return]
+
+    async def _run_round(
+        self, posted: Sequence[StoredTuple], method: str, event: Event, ballot: Ballot, argument: object
+    ) -> list[Outcome]:
+        council = posted[0].council
+
+        def ask(place: int) -> Deferred[Any]:
+            return self._ask(
+                council[place].contact, method, (*_make_arguments(posted, council[place], ballot), argument)
+            )
+
+        def decode(place: int, answer: object) -> list[Reply | None] | None:
+            replies = answer if isinstance(answer, list) and len(answer) == len(posted) else None
+            return replies and [unpack_reply(fields, event) for fields in replies]
+
+        tallies = [Tally(len(council)) for _ in posted]
+        await Round(tallies, ask, decode, self._clock, short=0.0, single=True).outcome
+        return [conclude(tally) for tally in tallies]
+
+
+def _make_arguments(posted: Sequence[StoredTuple], member: Member, ballot: Ballot) -> tuple[object, ...]:
+    places = [each.tuple_id.pack() for each in posted]
+    return (posted[0].tuple_id.key, places, member.incarnation, ballot.counter, ballot.proposer)

@@ -1,0 +1,180 @@
+"""Probe an address for a node of any team, with HAIL and ECHO; neither is encrypted or contains a secret.
+
+A node that finds no team, or not its own, learns from it whether an address is reachable, which team is there, the
+protocol version, the clock difference, and its own external address.  HAIL and ECHO have the same length, and ECHOs are
+rate-limited.
+"""
+
+from __future__ import annotations
+
+import random
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Generic, NamedTuple, TypeVar
+
+from twisted.internet.defer import Deferred
+from twisted.internet.interfaces import IDelayedCall, IReactorTime
+
+from middleware.entangled.background import cancel
+from middleware.entangled.errors import Malformed, NoAnswer
+from middleware.entangled.network.network import ADDRESS_BYTES, Address, pack_address, parse_address
+from middleware.entangled.token_bucket import TokenBucket
+from middleware.entangled.wire.congestion import BACKOFF_FACTOR, INITIAL_TIMEOUT_S, MAX_TIMEOUT_S
+
+T = TypeVar("T")
+PROBE, PROBE_REPLY = 0x19, 0x1A
+VERSION = 1
+TOKEN_BYTES = 16
+FINGERPRINT_BYTES = 8
+REPLIES_PER_S = 20.0
+"""ECHOs per second: enough for the diagnostics of a whole team, and 8 kbit/s at most."""
+_HEADER_BYTES = 1 + TOKEN_BYTES
+PROBE_BYTES = _HEADER_BYTES + 1 + FINGERPRINT_BYTES + 8 + ADDRESS_BYTES
+
+
+class ProbeReply(NamedTuple):
+    """The content of an ECHO.
+
+    ``fingerprint`` identifies the team (zero: an open team), ``wall`` is the clock of its node in Unix seconds (0:
+    unknown), ``seen`` is the source address of the HAIL.
+    """
+
+    token: bytes
+    version: int
+    fingerprint: bytes
+    unix_time_s: float
+    observed_address: Address | None
+
+
+def pack_probe(token: bytes) -> bytes:
+    """Return a HAIL; ``token`` (16 bytes) is returned in the ECHO."""
+    return (bytes([PROBE]) + token).ljust(PROBE_BYTES, b"\0")
+
+
+def pack_reply(asked: bytes, fingerprint: bytes, wall: float, source: Address) -> bytes:
+    """Return the ECHO for the HAIL ``asked`` from ``source``; raise ``Malformed`` if it is no HAIL."""
+    if len(asked) != PROBE_BYTES or asked[0] != PROBE:
+        raise Malformed("the HAIL has the wrong length")
+    moment = max(0, int(1000 * wall)).to_bytes(8, "little")
+    return (
+        bytes([PROBE_REPLY]) + asked[1:_HEADER_BYTES] + bytes([VERSION]) + fingerprint + moment + pack_address(source)
+    )
+
+
+def parse_reply(datagram: bytes) -> ProbeReply:
+    """Decode an ECHO; raise ``Malformed``."""
+    if len(datagram) != PROBE_BYTES or datagram[0] != PROBE_REPLY:
+        raise Malformed("the ECHO has the wrong length")
+    rest = datagram[_HEADER_BYTES:]
+    fingerprint, moment = rest[1 : 1 + FINGERPRINT_BYTES], rest[1 + FINGERPRINT_BYTES : -ADDRESS_BYTES]
+    wall = int.from_bytes(moment, "little") / 1000
+    return ProbeReply(datagram[1:_HEADER_BYTES], rest[0], fingerprint, wall, parse_address(rest[-ADDRESS_BYTES:]))
+
+
+class ProbeResponder:
+    """Answers up to ``RATE`` HAILs per second; ``send`` sends a datagram, ``wall`` returns Unix seconds."""
+
+    def __init__(
+        self, send: Callable[[bytes, Address], None], clock: IReactorTime, fingerprint: Callable[[], bytes]
+    ) -> None:
+        self.unix_time: Callable[[], float] = lambda: 0.0
+        self._send = send
+        self._clock = clock
+        self._fingerprint = fingerprint
+        self._bucket = TokenBucket(REPLIES_PER_S)
+
+    def on_probe(self, datagram: bytes, source: Address) -> str:
+        """Answer a HAIL; return the reason in one word if it was dropped."""
+        try:
+            answer = pack_reply(datagram, self._fingerprint(), self.unix_time(), source)
+        except Malformed:
+            return "malformed"
+        if not self._bucket.take(self._clock.seconds()):
+            return "crowded"
+        self._send(answer, source)
+        return ""
+
+
+@dataclass(slots=True, eq=False)
+class PendingProbe(Generic[T]):
+    """A request to an address without a session; ``datagrams`` are sent in turn."""
+
+    address: Address
+    datagrams: Sequence[bytes]
+    started_at: float
+    deadline: float
+    deferred: Deferred[T]
+    tries: int = 0
+    timer: IDelayedCall | None = None
+
+
+class ProbeSender(Generic[T]):
+    """Resends each probe until it is answered or its timeout expires; ``send`` sends a datagram."""
+
+    failure_text = "no answer"
+
+    def __init__(self, send: Callable[[bytes, Address], None], clock: IReactorTime) -> None:
+        self._send = send
+        self._clock = clock
+        self._pending: dict[bytes, PendingProbe[T]] = {}
+
+    def stop(self, error: Exception) -> None:
+        """Fail the pending probes with ``error``."""
+        for token in list(self._pending):
+            probe = self._forget(token)
+            if probe is not None:
+                probe.deferred.errback(error)
+
+    def _start(self, token: bytes, address: Address, datagrams: Sequence[bytes], timeout: float) -> Deferred[T]:
+        now, deferred = self._clock.seconds(), Deferred[T](lambda _: self._drop(token))
+        self._pending[token] = PendingProbe(address, datagrams, now, now + timeout, deferred)
+        self._try(token, INITIAL_TIMEOUT_S)
+        return deferred
+
+    def _try(self, token: bytes, wait: float) -> None:
+        probe = self._pending[token]
+        left = probe.deadline - self._clock.seconds()
+        if left <= 0:
+            self._forget(token)
+            probe.deferred.errback(NoAnswer(f"{self.failure_text} at {probe.address}"))
+            return
+        self._send(probe.datagrams[probe.tries % len(probe.datagrams)], probe.address)
+        probe.tries += 1
+        wait = min(wait, MAX_TIMEOUT_S)
+        probe.timer = self._clock.callLater(min(wait, left), self._try, token, wait * BACKOFF_FACTOR)
+
+    def _drop(self, token: bytes) -> None:
+        self._forget(token)
+
+    def _forget(self, token: bytes) -> PendingProbe[T] | None:
+        probe = self._pending.pop(token, None)
+        if probe is not None:
+            cancel(probe.timer)
+        return probe
+
+
+class Prober(ProbeSender[ProbeReply]):
+    """Sends HAILs to addresses; ``send`` sends a datagram."""
+
+    def __init__(self, send: Callable[[bytes, Address], None], clock: IReactorTime, rng: random.Random) -> None:
+        super().__init__(send, clock)
+        self._rng = rng
+
+    def probe(self, address: Address, timeout: float = 1.5) -> Deferred[ProbeReply]:
+        """Probe ``address``; fails with ``NoAnswer`` after ``timeout`` seconds."""
+        token = self._rng.randbytes(TOKEN_BYTES)
+        return self._start(token, address, [pack_probe(token)], timeout)
+
+    def on_reply(self, datagram: bytes, source: Address) -> str:
+        """Process an ECHO; return the reason in one word if it was dropped."""
+        try:
+            answer = parse_reply(datagram)
+        except Malformed:
+            return "malformed"
+        probe = self._pending.get(answer.token)
+        if probe is None:
+            return "unasked"
+        if probe.address == source:
+            self._forget(answer.token)
+            probe.deferred.callback(answer)
+        return ""

@@ -1,0 +1,392 @@
+"""Keep the requests of this node until they are answered, and send notifications.
+
+It decides when to retransmit a request and when to give it up.  The endpoint calls it with each received answer.
+"""
+
+from __future__ import annotations
+
+import random
+from collections import Counter
+from collections.abc import Callable
+from dataclasses import dataclass
+
+from twisted.internet import defer
+from twisted.internet.defer import Deferred
+from twisted.internet.interfaces import IDelayedCall, IReactorTime
+
+from middleware.entangled.background import cancel
+from middleware.entangled.contact import Contact
+from middleware.entangled.errors import Crowded, NoAnswer, TooLarge
+from middleware.entangled.network.network import Address
+from middleware.entangled.wire.congestion import MAX_TIMEOUT_S
+from middleware.entangled.wire.fragmenter import Fragmenter
+from middleware.entangled.wire.message import (
+    MAX_MESSAGE_BYTES,
+    Answer,
+    Cancel,
+    Failure,
+    MessageKey,
+    Notification,
+    Request,
+    encode,
+    set_remaining_time,
+)
+from middleware.entangled.wire.method import make_error
+from middleware.entangled.wire.peer import HANDSHAKE_S, OutgoingHandshake, Peer, Peers
+from middleware.entangled.wire.session import MAX_PLAIN_BYTES, Session
+
+TIMEOUT_S = 1.5
+MAX_NOTIFICATIONS = 32
+SILENCE_S = 5.0
+MAX_IN_FLIGHT = 32
+"""Requests that may be under way to one peer; further ones wait in a queue. They take a quarter of the usual receive
+buffer of 208 KiB, because other nodes send requests to the same peer."""
+MAX_QUEUED = 8192
+MAX_QUEUED_S = 10.0
+_QUEUE_TIMEOUT_TEXT = "timed out in the queue; send fewer requests at the same time"
+_HANDSHAKES_TEXT = "too many handshakes are under way; try again later"
+_FULL_TEXT = "too many requests or bytes are under way; try again later"
+
+
+@dataclass(slots=True, eq=False)
+class PendingRequest:
+    """A request that waits for its answer.
+
+    ``is_patient``: the caller gave a longer timeout than the default; ``is_bulky``: the request is sent in fragments;
+    ``is_light``: the request does not justify a handshake. ``grace`` is the time in seconds that the answer has after
+    the request left the queue and after each acknowledged fragment; 0 if the caller gave a timeout.
+    """
+
+    number: int
+    method: str
+    peer: Peer
+    address: Address
+    message: bytes
+    changes: bool
+    created_at: float
+    deadline: float
+    has_long_timeout: bool
+    is_fragmented: bool
+    avoids_handshake: bool
+    extension_s: float
+    deferred: Deferred[object]
+    tries: int = 0
+    sent_at: float = 0.0
+    progress_at: float = -1.0
+    timer: IDelayedCall | None = None
+
+    @property
+    def is_counted(self) -> bool:
+        """Whether the request counts towards ``MAX_IN_FLIGHT``; fragments have their own congestion window."""
+        return not (self.has_long_timeout or self.is_fragmented)
+
+
+class Requester:
+    """The outgoing requests of an endpoint; ``send`` is called with a session and the bytes of a message."""
+
+    def __init__(
+        self,
+        clock: IReactorTime,
+        rng: random.Random,
+        peers: Peers,
+        courier: Fragmenter,
+        send: Callable[[Session, bytes], None],
+        counters: Counter[str],
+    ) -> None:
+        self._clock = clock
+        self._peers = peers
+        self._send = send
+        self._counters = counters
+        self._fragmenter = courier
+        self._requests: dict[int, PendingRequest] = {}
+        self._queued = 0
+        # A random start within 62 bits keeps the request ids of a restarted node apart from its earlier ones.
+        self._next_number = rng.getrandbits(62)
+        peers.on_handshake_failed.add(self._fail_unanswered)
+
+    def ask(
+        self,
+        contact: Contact,
+        method: str,
+        arguments: tuple[object, ...],
+        timeout: float | None,
+        changes: bool,
+        is_light: bool = False,
+    ) -> Deferred[object]:
+        """Send a request; see ``Endpoint.ask``."""
+        number = self._next_number
+        try:
+            peer = self._peers.get_or_create(contact)
+        except ValueError:
+            return defer.fail(NoAnswer(f"{contact.address}: the public key of this contact is invalid"))
+        try:
+            message = encode(Request(number, method, arguments, behind=number - peer.oldest_request(number)))
+        except (TypeError, ValueError, OverflowError) as error:
+            return defer.fail(error)
+        if len(message) > MAX_MESSAGE_BYTES:
+            return defer.fail(TooLarge(_format_too_large(method, message, MAX_MESSAGE_BYTES)))
+        if self._queued >= MAX_QUEUED:
+            self._counters["crowded"] += 1
+            return defer.fail(Crowded(f"{method} asked of {contact.address}: {_FULL_TEXT}"))
+        is_bulky = len(message) > MAX_PLAIN_BYTES
+        if is_bulky and not self._fragmenter.reserve(contact.public, len(message)):
+            return defer.fail(Crowded(f"{method} asked of {contact.address}: {_FULL_TEXT}"))
+        self._next_number += 1
+        now = self._clock.seconds()
+        patience = TIMEOUT_S if timeout is None else timeout
+        deferred: Deferred[object] = Deferred(lambda _: self._cancel(inquiry))
+        inquiry = PendingRequest(
+            number=number,
+            method=method,
+            peer=peer,
+            address=contact.address,
+            message=message,
+            changes=changes,
+            created_at=now,
+            deadline=now + patience,
+            has_long_timeout=patience > TIMEOUT_S,
+            is_fragmented=is_bulky,
+            avoids_handshake=is_light,
+            extension_s=TIMEOUT_S if timeout is None else 0.0,
+            deferred=deferred,
+        )
+        is_open = (
+            self._peers.find_usable_session(peer) is not None
+        )  # before the request itself marks the session as in use
+        self._requests[number] = inquiry
+        peer.add_request(number)
+        if is_open and (peer.in_flight < MAX_IN_FLIGHT or not inquiry.is_counted):
+            self._send_request(inquiry)
+            return deferred
+        peer.enqueue(number)
+        self._queued += 1
+        self._set_timer(inquiry, patience)
+        if not is_open and not self._open_session(inquiry):
+            self._fail(inquiry, _HANDSHAKES_TEXT)
+        return deferred
+
+    def notify(self, contact: Contact, method: str, arguments: tuple[object, ...]) -> None:
+        """Send a notification; see ``Endpoint.tell``."""
+        message = encode(Notification(method, arguments))
+        if len(message) > MAX_PLAIN_BYTES:
+            raise TooLarge(_format_too_large(method, message, MAX_PLAIN_BYTES))
+        try:
+            peer = self._peers.get_or_create(contact)
+        except ValueError:
+            self._counters["untold"] += 1
+            return
+        session = self._peers.find_usable_session(peer)
+        if session is not None:
+            self._send(session, message)
+            if self._clock.seconds() - session.last_received_at > SILENCE_S:
+                # A notification has no answer: without this handshake a restart of the peer would go unnoticed.
+                self._peers.open(peer, contact.address)
+        elif len(peer.notifications) < MAX_NOTIFICATIONS and (
+            peer.handshake is not None or self._peers.open(peer, contact.address)
+        ):
+            peer.notifications += (message,)
+        else:
+            self._counters["untold"] += 1
+
+    def stop(self, error: Exception) -> None:
+        """Cancel every timer and fail every request with ``error``."""
+        self._fail_all(list(self._requests.values()), lambda: error)
+
+    def fail_requests(self, peer: Peer, error: Callable[[], Exception]) -> None:
+        """Fail every request to a peer, because one of the two nodes rejects the other."""
+        self._counters["untold"] += len(peer.notifications)
+        peer.notifications = ()
+        self._fail_all(self._requests_to(peer), error)
+
+    def is_pending(self, number: int, public: bytes) -> bool:
+        """Return whether the request ``number`` waits for an answer from the peer with that key."""
+        inquiry = self._requests.get(number)
+        return inquiry is not None and inquiry.peer.public == public
+
+    def record_progress(self, number: int, public: bytes) -> None:
+        """Record that the peer acknowledged a fragment of a request, or that a fragment of its answer arrived."""
+        if self.is_pending(number, public):
+            inquiry = self._requests[number]
+            inquiry.progress_at = self._clock.seconds()
+            inquiry.deadline = max(inquiry.deadline, inquiry.progress_at + inquiry.extension_s)
+
+    def resolve(self, message: Answer | Failure, public: bytes) -> None:
+        """Pass an answer to its caller, or count an answer that no request waits for."""
+        inquiry = self._requests.get(message.id)
+        if inquiry is None or inquiry.peer.public != public:
+            self._counters["unasked"] += 1
+            return
+        is_timed = inquiry.tries > 0 and inquiry.progress_at < 0 and not inquiry.is_fragmented
+        if is_timed:  # otherwise the time includes the handshake or the transfer
+            self._peers.record_answer(inquiry.peer, inquiry.tries, self._clock.seconds() - inquiry.sent_at)
+        self._forget(inquiry)
+        if isinstance(message, Answer):
+            inquiry.deferred.callback(message.value)
+        else:
+            inquiry.deferred.errback(make_error(message))
+
+    def send_waiting(self, peer: Peer, session: Session, is_owed: bool) -> None:
+        """Send the messages that waited for a session; ``is_owed``: the peer waits for a datagram in it."""
+        sent = 0
+        for message in peer.notifications:
+            self._send(session, message)
+            sent += 1
+        peer.notifications = ()
+        if is_owed:  # the peer may have lost the session in which these requests were sent
+            for inquiry in self._requests_to(peer):
+                if inquiry.tries:
+                    self._send_request(inquiry)
+                    sent += 1
+        sent += self._send_queued(peer)
+        if is_owed and not sent:
+            self._send(session, b"")
+
+    def _send_request(self, inquiry: PendingRequest) -> None:
+        """Send a request in the peer's newest session and set its timer."""
+        session = inquiry.peer.sessions[-1]
+        now = self._clock.seconds()
+        inquiry.tries += 1
+        if inquiry.tries == 1:
+            inquiry.sent_at = now
+            inquiry.peer.in_flight += inquiry.is_counted
+        message = set_remaining_time(inquiry.message, inquiry.deadline - now)
+        if inquiry.is_fragmented:
+            self._fragmenter.send(inquiry.peer.public, MessageKey(False, inquiry.number), message)
+        else:
+            self._send(session, message)
+        within = inquiry.deadline - inquiry.created_at
+        wait = self._peers.retry_interval(inquiry.peer.round_trip, inquiry.tries, within)
+        if inquiry.has_long_timeout and inquiry.tries > 1:
+            # A slow method: the later retransmissions are for an answer that was lost.
+            wait = max(wait, (inquiry.deadline - now) / max(1, self._peers.tries + 1 - inquiry.tries))
+        self._set_timer(inquiry, wait)
+
+    def _on_timer(self, inquiry: PendingRequest) -> None:
+        """Retransmit a request, open a session for it, or fail it, when its timer fires."""
+        now, peer = self._clock.seconds(), inquiry.peer
+        left = inquiry.deadline - now
+        if left <= 0 and inquiry.number in peer.queue and peer.session is not None:
+            # The request is queued behind others that the peer is answering; its delay does not mean that the peer
+            # failed.
+            left = min(peer.session.last_received_at, inquiry.created_at + MAX_QUEUED_S) + inquiry.extension_s - now
+            if left <= 0:
+                self._fail(inquiry, _QUEUE_TIMEOUT_TEXT)
+            else:
+                inquiry.deadline = now + left
+                self._set_timer(inquiry, left)
+            return
+        if left <= 0:
+            self._fail(inquiry, f"no answer in {now - inquiry.created_at:.2f} s")
+            return
+        session = self._peers.find_usable_session(peer)
+        is_silent = session is not None and session.last_received_at <= inquiry.sent_at
+        if session is None:
+            if not self._open_session(inquiry):
+                self._fail(inquiry, _HANDSHAKES_TEXT)
+            else:
+                self._set_timer(inquiry, left)
+        elif inquiry.is_fragmented or inquiry.progress_at >= 0:
+            # The courier retransmits fragments; a handshake is needed only if the peer lost the session.
+            if is_silent or now - session.last_received_at > MAX_TIMEOUT_S:
+                self._open_session(inquiry)
+            self._set_timer(inquiry, MAX_TIMEOUT_S)
+        elif inquiry.tries >= self._peers.tries:
+            is_opening = peer.handshake is not None and not peer.handshake.is_waiting
+            if inquiry.has_long_timeout or not is_silent or is_opening or not peer.round_trip.is_measured:
+                self._set_timer(inquiry, left)
+            else:
+                self._fail(inquiry, f"no answer to {inquiry.tries} tries")
+        else:
+            if is_silent and not inquiry.avoids_handshake and inquiry.tries >= self._peers.tries_before_check(peer):
+                self._open_session(inquiry)  # the peer may have restarted without the session
+            self._send_request(inquiry)
+
+    def _send_queued(self, peer: Peer) -> int:
+        """Send queued requests to a peer up to ``MAX_IN_FLIGHT``; return their number."""
+        sent = 0
+        while peer.queue and peer.in_flight < MAX_IN_FLIGHT and self._peers.find_usable_session(peer) is not None:
+            inquiry = self._requests[next(iter(peer.queue))]
+            self._leave_queue(inquiry)
+            # Without a timeout from the caller, the time for the answer starts now.
+            inquiry.deadline = max(inquiry.deadline, self._clock.seconds() + inquiry.extension_s)
+            self._send_request(inquiry)
+            sent += 1
+        return sent
+
+    def _leave_queue(self, inquiry: PendingRequest) -> None:
+        if inquiry.number in inquiry.peer.queue:
+            inquiry.peer.dequeue(inquiry.number)
+            self._queued -= 1
+
+    def _requests_to(self, peer: Peer) -> list[PendingRequest]:
+        return [self._requests[number] for number in peer.requests]
+
+    def _open_session(self, inquiry: PendingRequest) -> bool:
+        """Open a session for a request, which the INIT carries if allowed; return False for too many handshakes."""
+        left = inquiry.deadline - self._clock.seconds()
+        rider = b"" if inquiry.changes else set_remaining_time(inquiry.message, left)
+        return self._peers.open(inquiry.peer, inquiry.address, rider, within=min(left, HANDSHAKE_S))
+
+    def _fail_unanswered(self, opening: OutgoingHandshake) -> None:
+        """Fail the requests that waited for a handshake that got no answer."""
+        peer = opening.peer
+        self._counters["untold"] += len(peer.notifications)
+        peer.notifications = ()
+        if peer.sessions:
+            for inquiry in self._requests_to(peer):
+                if inquiry.tries >= self._peers.tries:  # it waited for this handshake only
+                    self._on_timer(inquiry)
+            return  # the others have their own timers
+        for inquiry in self._requests_to(peer):
+            was_tried = inquiry.created_at <= opening.started_at and inquiry.address == opening.address
+            if inquiry.has_long_timeout or not was_tried:
+                if not self._open_session(inquiry):
+                    self._fail(inquiry, _HANDSHAKES_TEXT)
+            else:
+                self._fail(inquiry, f"no answer to {opening.tries} handshakes")
+
+    def _set_timer(self, inquiry: PendingRequest, wait: float) -> None:
+        cancel(inquiry.timer)
+        wait = max(0.0, min(wait, inquiry.deadline - self._clock.seconds()))
+        inquiry.timer = self._clock.callLater(wait, self._on_timer, inquiry)
+
+    def _fail_all(self, inquiries: list[PendingRequest], error: Callable[[], Exception]) -> None:
+        for inquiry in inquiries:
+            self._remove(inquiry)
+        for inquiry in inquiries:
+            inquiry.deferred.errback(error())
+
+    def _fail(self, inquiry: PendingRequest, why: str) -> None:
+        self._forget(inquiry)
+        kind = Crowded if why in (_HANDSHAKES_TEXT, _QUEUE_TIMEOUT_TEXT) else NoAnswer
+        inquiry.deferred.errback(kind(f"{inquiry.method} asked of {inquiry.address}: {why}"))
+
+    def _cancel(self, inquiry: PendingRequest) -> None:
+        """Forget a request that its caller cancelled, and notify the peer."""
+        self._forget(inquiry)
+        session = self._peers.find_usable_session(inquiry.peer)
+        if session is not None and inquiry.tries:
+            self._send(session, encode(Cancel(inquiry.number)))
+
+    def _forget(self, inquiry: PendingRequest) -> None:
+        """Remove a request and send the next queued one."""
+        self._remove(inquiry)
+        self._send_queued(inquiry.peer)
+
+    def _remove(self, inquiry: PendingRequest) -> None:
+        cancel(inquiry.timer)
+        if self._requests.pop(inquiry.number, None) is None:
+            return
+        inquiry.peer.remove_request(inquiry.number)
+        self._leave_queue(inquiry)
+        if inquiry.tries:
+            inquiry.peer.in_flight -= inquiry.is_counted
+        if inquiry.is_fragmented:
+            self._fragmenter.drop(inquiry.peer.public, MessageKey(False, inquiry.number))
+            self._fragmenter.release(inquiry.peer.public, len(inquiry.message))
+        if inquiry.progress_at >= 0:
+            self._fragmenter.forget_incoming(inquiry.peer.public, MessageKey(True, inquiry.number))
+
+
+def _format_too_large(method: str, message: bytes, most: int) -> str:
+    return f"{method}: the message has {len(message)} bytes, the limit is {most}; split or shorten it"

@@ -1,0 +1,165 @@
+"""Run a scenario of faults on a stage, and measure the time of each takeover.
+
+The stage is a running team (``swarm chaos``) or a simulated one in virtual time; both run the same steps.
+"""
+
+from __future__ import annotations
+
+import random
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass
+from typing import Protocol
+
+from middleware.directory.presence import Device
+from middleware.faults.kinds import KINDS, Fault
+from middleware.faults.scenario import ANY_DEVICE, EXECUTING_DEVICE, Scenario
+from middleware.faults.takeover import TARGET_S, Takeover, find_executing
+
+POLL_INTERVAL_S = 0.05
+DEVICE_TIMEOUT_S = 60.0
+"""Seconds to wait for an executing device, or for the device with a given name."""
+SETTLE_S = 6.0
+"""Seconds after a fault without a takeover within which the remaining devices can end the task."""
+ROLES_WITHOUT_ROBOT = {"bootstrap", "web"}
+
+
+class DeviceNotPresent(Exception):
+    """The device for a fault is not present; ``str()`` is one line for display."""
+
+
+class TeamUnderTest(Protocol):
+    """A team for fault scenarios; ``seconds`` is its clock."""
+
+    def seconds(self) -> float:
+        """Return the time in seconds."""
+
+    def wait(self, seconds: float) -> None:
+        """Wait for ``seconds``."""
+
+    def devices(self) -> list[Device]:
+        """Return the present devices, in the order of joining."""
+
+    def assign(self, task: str) -> str:
+        """Publish a predefined task; returns its id."""
+
+    def inject(self, device: Device, fault: Fault) -> float:
+        """Inject the fault into the device; returns the seconds until it begins, when the device has confirmed."""
+
+    def is_over(self, task_id: str) -> bool:
+        """Return whether the task has ended."""
+
+
+@dataclass
+class FaultOutcome:
+    """One fault of a device and its takeover; ``is_ended``: the task ended before a takeover."""
+
+    device: str
+    fault: Fault
+    takeover: Takeover
+    to: str = ""
+    is_ended: bool = False
+
+    @property
+    def is_lost(self) -> bool:
+        """Whether a device with this fault cannot continue its task."""
+        return KINDS[self.fault.kind].is_lost
+
+    @property
+    def is_within_target(self) -> bool:
+        """Whether another device took over in time, if that was necessary."""
+        if self.takeover.seconds is not None:
+            return self.takeover.seconds <= TARGET_S
+        must = self.is_lost and self.fault.seconds > TARGET_S
+        return not (self.takeover.task and must) or self.is_ended
+
+    def __str__(self) -> str:
+        what = f"{self.device}: {self.fault.kind}"
+        if not self.takeover.task:
+            return f"{what}, executed no task"
+        if self.takeover.seconds is not None:
+            late = "" if self.is_within_target else f", later than {TARGET_S:g} s"
+            return f"{what}, {self.to} took over {self.takeover.task} after {self.takeover.seconds:.2f} s{late}"
+        if self.is_ended:
+            return f"{what}, {self.takeover.task} ended before another took over"
+        return (
+            f"{what}, no device took over {self.takeover.task}"
+            if not self.is_within_target
+            else f"{what}, no takeover needed"
+        )
+
+
+def run_scenario(scenario: Scenario, seed: int, stage: TeamUnderTest, say: Callable[[str], None]) -> list[FaultOutcome]:
+    """Run the scenario, and report each loss when it is settled; raises ``NobodyThere``."""
+    rng = random.Random(seed)
+    losses: list[FaultOutcome] = []
+    if scenario.task:
+        say(f"assigned {scenario.task} as {stage.assign(scenario.task)}")
+    began = stage.seconds()
+    for step in scenario.steps:
+        while stage.seconds() < began + step.at:
+            _update(stage, losses, say)
+        device = _wait_for_device(stage, step.device, rng, losses, say)
+        task = find_executing(stage.devices()).get(device.uuid, "")
+        now = stage.inject(device, step.fault) + stage.seconds()
+        lasts = "" if step.fault.kind == "kill" else f" for {step.fault.seconds:g} s"
+        say(f"{device.name}: {step.fault.kind}{lasts}")
+        losses.append(FaultOutcome(device.name, step.fault, Takeover(device.uuid, task, now, now + step.fault.seconds)))
+    while any(_is_open(loss, stage.seconds()) for loss in losses):
+        _update(stage, losses, say)
+    for loss in losses:
+        if loss.takeover.seconds is None:
+            loss.is_ended = bool(loss.takeover.task) and stage.is_over(loss.takeover.task)
+            say(str(loss))
+    return losses
+
+
+def _is_open(loss: FaultOutcome, now: float) -> bool:
+    return loss.takeover.is_open(now) and (loss.is_lost or now < loss.takeover.until) and not _is_given_up(loss, now)
+
+
+def _is_given_up(loss: FaultOutcome, now: float) -> bool:
+    # A killed process has no end of its fault, and the end of a long fault is not awaited.
+    return now > loss.takeover.began + max(SETTLE_S, min(loss.fault.seconds, 3 * SETTLE_S))
+
+
+def _update(stage: TeamUnderTest, losses: Iterable[FaultOutcome], say: Callable[[str], None]) -> None:
+    stage.wait(POLL_INTERVAL_S)
+    devices = stage.devices()
+    acts, names = find_executing(devices), {device.uuid: device.name for device in devices}
+    for loss in losses:
+        if loss.takeover.observe(acts, stage.seconds()):
+            loss.to = names[loss.takeover.to]
+            say(str(loss))
+
+
+def _wait_for_device(
+    stage: TeamUnderTest, wanted: str, rng: random.Random, losses: Iterable[FaultOutcome], say: Callable[[str], None]
+) -> Device:
+    end = stage.seconds() + DEVICE_TIMEOUT_S
+    while stage.seconds() <= end:
+        if found := _matching_devices(stage, wanted, losses):
+            return rng.choice(found) if wanted == ANY_DEVICE else found[0]
+        _update(stage, losses, say)
+    names = ", ".join(device.name for device in stage.devices()) or "none"
+    what = (
+        "executes a task"
+        if wanted == EXECUTING_DEVICE
+        else "can be chosen"
+        if wanted == ANY_DEVICE
+        else f"has the name {wanted}"
+    )
+    raise DeviceNotPresent(f"no device {what} within {DEVICE_TIMEOUT_S:g} s; present devices: {names}")
+
+
+def _matching_devices(stage: TeamUnderTest, wanted: str, losses: Iterable[FaultOutcome]) -> list[Device]:
+    here = stage.devices()
+    if wanted == ANY_DEVICE:
+        return sorted(
+            (each for each in here if not ROLES_WITHOUT_ROBOT & set(each.roles)), key=lambda device: device.name
+        )
+    if wanted != EXECUTING_DEVICE:
+        return [device for device in here if device.name == wanted]
+    # An isolated device still reports that it executes the task; skip it.
+    lost = {loss.takeover.lost for loss in losses if loss.is_lost and stage.seconds() < loss.takeover.until}
+    acts = find_executing(here)
+    return [device for device in here if device.uuid in acts and device.uuid not in lost]

@@ -1,0 +1,144 @@
+"""The quorum members of tasks: chooses and replaces them, and creates their clients and this node's acceptor."""
+
+from __future__ import annotations
+
+import random
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+from typing import Any
+
+from twisted.internet.defer import Deferred
+from twisted.internet.interfaces import IReactorTime
+
+from middleware.consensus.lease.charter import CharterVerifier, create_charter, parse_charter
+from middleware.consensus.lease.lease_client import LeaseClient
+from middleware.consensus.lease.lease_proposer import LeaseProposer
+from middleware.consensus.lease.lease_service import LeaseService
+from middleware.entangled.contact import Contact
+from middleware.entangled.data.store import Store
+from middleware.entangled.kademlia.distance import select_closest
+from middleware.entangled.node import EntangledNode
+from middleware.entangled.quorum.ballot import majority
+from middleware.entangled.record import Slot
+from middleware.tasks.task import TASKS, Task, group_key
+
+LARGE_TEAM_CONTACTS = 50
+"""Number of contacts from which a task has five quorum members instead of three."""
+SILENT_S = 10.0
+"""Seconds without an answer after which a quorum member is replaced."""
+
+
+class CouncilManager:
+    """The quorum members of tasks, reached through ``entangled``.
+
+    ``born_at`` is the time at which the node started.  ``moved`` is called with a task whose quorum members have
+    changed.  ``may_sit`` returns whether the owner of a key may be a quorum member.
+    """
+
+    def __init__(
+        self,
+        entangled: EntangledNode,
+        store: Store,
+        clock: IReactorTime,
+        rng: random.Random,
+        born_at: float,
+        moved: Callable[[Task], object],
+        may_sit: Callable[[bytes], bool],
+    ) -> None:
+        self._entangled = entangled
+        self._clock = clock
+        self._rng = rng
+        self._on_change = moved
+        self._may_be_member = may_sit
+        self.charter_verifier = CharterVerifier(self._may_publish)
+        self.lease_service = LeaseService(
+            entangled.endpoint, entangled.identity, store, clock, born_at, self.charter_verifier, self._may_be_member
+        )
+
+    async def choose_council(self, task: Task) -> Task:
+        """Return a new ``task`` with its quorum members, which this node signs.
+
+        They are the nodes closest to its key now (consensus rule 1).
+        """
+        key = group_key(task.task_id)
+        found = await self._entangled.find_node(key)
+        candidates = [node for node in [*found, self._entangled.contact] if self._may_be_member(node.public)]
+        members = take_odd_number(select_closest(candidates, key, self._choose_size(task)))
+        charter = create_charter(self._entangled.identity, task.task_id, members)
+        return replace(task, council=members, charter=charter.packed)
+
+    def make_proposer(self, task: Task, floor: int = 0) -> LeaseProposer:
+        """Return a client for the quorum members of ``task``; its tokens are above ``floor``."""
+        ttl = float(task.lease_ttl)
+
+        def ask(member: Contact, method: str, arguments: tuple[Any, ...]) -> Deferred[Any]:
+            return self.lease_service.call_member(self._entangled.contact, member, method, arguments, ttl / 3)
+
+        def moved() -> None:
+            self._on_change(task.with_council(council.charter) if council.charter is not None else task)
+
+        pinned = task.task_id, self._entangled.contact.node_id.hex(), ttl, task.council
+        read = self.charter_verifier.parse
+        council = LeaseProposer(
+            *pinned, ask, self._clock, self._rng, parse_charter(task.charter), read, task.configuration, floor, moved
+        )
+        return council
+
+    def make_lease_client(self, task: Task, changed: Callable[[], None], floor: int) -> LeaseClient:
+        """Create this node's lease client for ``task``, with tokens above ``floor``."""
+        lessee = LeaseClient(self.make_proposer(task, floor), self._clock, self._rng, changed, task.stop_time)
+        self.lease_service.register(lessee)
+        return lessee
+
+    def has_vacancy(self, task: Task, council: LeaseProposer) -> bool:
+        """Return whether a quorum member is silent, or there were too few nodes when they were chosen."""
+        return 0 < len(council.members) < self._choose_size(task) or bool(council.find_silent_members(SILENT_S))
+
+    async def find_successors(self, task: Task, council: LeaseProposer) -> tuple[Contact, ...] | None:
+        """Return the next quorum members of ``task``: the present ones that answer, and the closest other nodes.
+
+        None if that would be no improvement.  Fails with ``EntangledError`` if no node answers.
+        """
+        key, silent = group_key(task.task_id), council.find_silent_members(SILENT_S)
+        silent_ids = {member.node_id for member in silent}
+        nodes = await self._entangled.find_node(key)
+        found = [node for node in nodes if node.node_id not in silent_ids and self._may_be_member(node.public)]
+        candidates = select_closest([*found, self._entangled.contact], key, len(found) + 1)
+        return choose_successors(council.members, silent, candidates, self._choose_size(task))
+
+    def _may_publish(self, public: bytes, task_id: str) -> bool:
+        return self._entangled.replica.may_store(Slot(TASKS, public, task_id))
+
+    def _choose_size(self, task: Task) -> int:
+        tolerates = max(task.tolerates, 2 if len(self._entangled.overlay.contacts()) >= LARGE_TEAM_CONTACTS else 1)
+        return 2 * tolerates + 1
+
+
+def choose_successors(
+    members: Sequence[Contact], silent: Sequence[Contact], candidates: Sequence[Contact], size: int
+) -> tuple[Contact, ...] | None:
+    """Return the quorum members that should follow ``members``, of which some are ``silent``; None for no change.
+
+    Members that answer remain; ``candidates`` fill the other places in order, up to ``size``.  A change must increase
+    the number of answering members that may be lost: three instead of two, but never four instead of three.
+    """
+    silent_ids, member_ids = {member.node_id for member in silent}, {member.node_id for member in members}
+    responding = [member for member in members if member.node_id not in silent_ids]
+    others = [one for one in candidates if one.node_id not in member_ids]
+    following = (*responding, *others)[: max(size, len(responding))]
+    following = take_odd_number(following)
+    if _count_tolerated_losses(len(following), len(following)) <= _count_tolerated_losses(
+        len(responding), len(members)
+    ):
+        return None
+    return following
+
+
+def take_odd_number(members: Sequence[Contact]) -> tuple[Contact, ...]:
+    """Return the first ``members``, an odd number of them: four tolerate no more failures than three."""
+    return tuple(members[: len(members) - 1 + len(members) % 2])
+
+
+def _count_tolerated_losses(responding: int, size: int) -> int:
+    """Return the number of members ``responding`` that may be lost while the rest is a majority of ``size``."""
+    return responding - majority(size)

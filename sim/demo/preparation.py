@@ -1,0 +1,121 @@
+"""Prepare the folder and the ports of a demonstration before anything starts."""
+
+from __future__ import annotations
+
+import fcntl
+import secrets
+import shutil
+import sys
+from collections.abc import Callable
+from importlib.machinery import PathFinder
+from pathlib import Path
+from typing import TextIO
+
+from sim.demo import free_ports
+from sim.demo.configuration import BOOTSTRAP, DOGS, RESERVE, Plan
+from sim.demo.robots import LOOPBACK, MAX_PORTS, make_robots
+
+WEB_PORT, TLS_PORT, NODE_PORT, SIMULATOR_PORT = 8080, 8443, 7000, 7400
+SERVER_PORTS = 5
+"""Number of ports for the two pages, both over TLS, and the simulator."""
+ANY_ADDRESS = "0.0.0.0"
+MARKER_FILE = ".swarm-demo"
+CODE_LETTERS = "abcdefghjkmnpqrstuvwxyz"
+"""Letters of a sign-in code; none resembles another or a digit."""
+
+
+class DemoError(Exception):
+    """The demonstration cannot continue; the message is for the person who started it."""
+
+
+def lock_run_dir(run_dir: Path) -> TextIO:
+    """Create or empty ``run_dir`` and lock it; returns the lock, which is held until it is closed.
+
+    Refuses a folder with anything but an earlier demonstration.
+    """
+    mark = run_dir / MARKER_FILE
+    try:
+        run_dir.mkdir(parents=True, exist_ok=True)
+        if not mark.exists() and any(run_dir.iterdir()):
+            raise DemoError(f"{run_dir} is not empty and not from an earlier demonstration; choose another --run-dir")
+        lock = mark.open("a", encoding="utf-8")
+    except OSError as error:
+        raise DemoError(f"cannot use {run_dir} ({error.strerror}); choose another --run-dir") from error
+    try:
+        fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except OSError:
+        lock.close()
+        raise DemoError(f"another demonstration runs in {run_dir}; end it, or choose another --run-dir") from None
+    for entry in run_dir.iterdir():
+        if entry.name == MARKER_FILE:
+            continue
+        if entry.is_dir() and not entry.is_symlink():
+            shutil.rmtree(entry)
+        else:
+            entry.unlink()
+    return lock
+
+
+def print_line(line: str) -> None:
+    """Print a line and flush."""
+    sys.stdout.write(line + "\n")
+    sys.stdout.flush()
+
+
+def has_tls() -> bool:
+    """Return whether nodes of this installation can serve TLS, even if this process blocks the import of OpenSSL."""
+    return all(PathFinder.find_spec(name) is not None for name in ("OpenSSL", "cryptography"))
+
+
+def make_plan(
+    run_dir: Path,
+    web_host: str,
+    web_port: int | None,
+    usual: bool,
+    say: Callable[[str], None],
+    with_tls: bool = False,
+    robot: str = "sim",
+) -> Plan:
+    """Return a plan with free ports; reports each usual port that is busy.
+
+    ``usual``: try the usual ports first, for interactive use; otherwise all ports are arbitrary, so that several
+    demonstrations can start at the same time.  ``with_tls``: also serve the pages over TLS.  ``robot``: a key of
+    ``sim.demo.robots.CASTS``.
+    """
+    try:
+        free_ports.check_host("tcp", web_host)
+    except OSError as error:
+        remedy = "set --web-host to an address of this machine, or 0.0.0.0 for all of them"
+        raise DemoError(f"cannot serve the page on {web_host} ({error.strerror}); {remedy}") from error
+    # Free on every address, as page and robots may use different ones; without the requested port.
+    found = free_ports.find_free_ports("tcp", ANY_ADDRESS, 1 + SERVER_PORTS + MAX_PORTS * len(DOGS))
+    spare = iter([one for one in found if one != web_port])
+    if web_port:
+        web = free_ports.require_port("tcp", web_host, web_port, "the page")
+    else:
+        web = free_ports.choose_port("tcp", web_host, WEB_PORT if usual else 0, spare)
+    reserve = free_ports.choose_port("tcp", web_host, web + 1 if usual and web < 65535 else 0, spare)
+    tls = (0, 0)
+    if with_tls:
+        # The ports of the page are not bound yet, so they would look free.
+        preferred_port = TLS_PORT if usual and not {TLS_PORT, TLS_PORT + 1} & {web, reserve} else 0
+        first = free_ports.choose_port("tcp", web_host, preferred_port, spare)
+        tls = (first, free_ports.choose_port("tcp", web_host, first + 1 if first == preferred_port else 0, spare))
+    yard = free_ports.choose_port("tcp", LOOPBACK, SIMULATOR_PORT if usual else 0, spare)
+    quiet = iter(free_ports.find_free_ports("udp", LOOPBACK, 2 + len(DOGS)))
+    node = free_ports.choose_port("udp", LOOPBACK, NODE_PORT if usual else 0, quiet)
+    others = [next(quiet) for _ in (RESERVE, *DOGS)]
+    if usual:
+        wanted = [
+            ("the page", web_port or WEB_PORT, web),
+            ("the yard", SIMULATOR_PORT, yard),
+            ("vaio", NODE_PORT, node),
+        ]
+        wanted += [("the page over TLS", TLS_PORT, tls[0])] if with_tls else []
+        for what, preferred_port, got in wanted:
+            if preferred_port != got:
+                say(f"port {preferred_port} is busy; {what} uses {got}")
+    nodes = {BOOTSTRAP: node, **dict(zip((RESERVE, *DOGS), others, strict=True))}
+    code = "".join(secrets.choice(CODE_LETTERS) for _ in range(8))
+    robots = make_robots(robot, DOGS, run_dir, spare, yard)
+    return Plan(run_dir, web_host, web, yard, nodes, f"{code[:4]}-{code[4:]}", reserve, tls, robots)
