@@ -44,7 +44,7 @@ LAYERS: dict[str, Layer] = {
         "Noise sessions, requests and answers, fragments, retransmission", (*BASE, *_entangled("network"))
     ),
     "middleware.entangled.kademlia": Layer(
-        "contacts, buckets, lookups, the roster of members", (*BASE, *_entangled("network", "wire"))
+        "contacts, buckets, lookups, the table of members", (*BASE, *_entangled("network", "wire"))
     ),
     "middleware.entangled.nat": Layer(
         "paths to nodes behind routers: introduction, hole punching, relays", (*BASE, *_entangled("network", "wire"))
@@ -64,20 +64,20 @@ LAYERS: dict[str, Layer] = {
     ),
     "middleware.entangled": Layer(
         "the peer-to-peer library: `node.py` wires the packages below; knows no device",
-        _entangled("data", "kademlia", "network", "reach", "replication", "space", "wire"),
+        _entangled("data", "kademlia", "nat", "network", "replication", "space", "wire"),
     ),
     "middleware.directory": Layer("presence of devices, and the list of all, split by prefix", LIBRARY),
-    "middleware.consensus.lease": Layer("task leases with fencing tokens, granted by a council's majority", LIBRARY),
+    "middleware.consensus.lease": Layer("task leases with fencing tokens, granted by the majority of a council", LIBRARY),
     "middleware.stop": Layer("stops of the whole team and their releases", LIBRARY),
     "middleware.tasks": Layer(
         "tasks, orders about them, and their councils", (*LIBRARY, *_middleware("directory", "consensus.lease"))
     ),
     "middleware.consensus": Layer(
-        "who should act: strategies, their conformance kit, the guard around them, verdicts",
+        "the choice of the acting agent: strategies, their conformance kit, the checks around them, decision records",
         (*LIBRARY, *_middleware("directory", "tasks")),
     ),
     "middleware.consensus.bidding": Layer(
-        "bids on their way to the council and its announcement back: direct, tree, flood",
+        "the delivery of bids to the council and of its announcement back: direct, tree, flood",
         (*LIBRARY, *_middleware("consensus", "directory", "tasks")),
     ),
     "middleware.admission": Layer(
@@ -105,7 +105,7 @@ LAYERS: dict[str, Layer] = {
     ),
     "drivers": Layer("one contract for every robot, one package a kind; no kind knows another", ("formats",)),
     "agents": Layer(
-        "observe, report, confer, execute, give back",
+        "observe, report, decide, execute, give back",
         (
             *LIBRARY,
             *("formats", "drivers.driver", "drivers.errors", "drivers.reading"),
@@ -120,7 +120,7 @@ LAYERS: dict[str, Layer] = {
         "the page over the node's store",
         (
             *("formats", *LIBRARY),
-            *_middleware("admission.roles", "config", "diagnostics.survey", "directory.presence", "faults"),
+            *_middleware("admission.roles", "config", "diagnostics.node_diagnostics", "directory.presence", "faults"),
             *_middleware("frontend", "node", "stop", "tasks"),
         ),
     ),

@@ -212,7 +212,7 @@ class FactoryTests(SynchronousTestCase):
         """Return the sessions of a gateway with these settings."""
         settings = Settings.from_mapping({"node": {"name": "vaio", "team_key": "x" * 20}, "web": web}, "vaio.toml")
         entangled = SimpleNamespace(watch=lambda *what, **how: None, identity=Identity(bytes(32)))
-        node, team = SimpleNamespace(entangled=entangled), SimpleNamespace(may_vouch=lambda public: True)
+        node, team = SimpleNamespace(entangled=entangled), SimpleNamespace(can_authenticate=lambda public: True)
         return make_sessions(settings, cast(Any, node), None, random.Random(1), cast(Any, team))
 
     def test_have_the_code_of_the_settings(self) -> None:

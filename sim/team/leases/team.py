@@ -76,7 +76,7 @@ class LeaseNode:
         """Return this agent's lease client for a task."""
         if task_id not in self.lease_clients:
             charter = self.world.get_charter(self.place, task_id)
-            council = LeaseProposer(
+            council: LeaseProposer = LeaseProposer(
                 task_id,
                 self.world.contacts[self.place].node_id.hex(),
                 self.world.ttl,
@@ -88,8 +88,8 @@ class LeaseNode:
                 self.world.charter_verifier.parse,
                 charter.configuration,
                 self.world.recorder.get_highest_token(self.place, task_id),
+                lambda: self.world.on_council_changed(task_id, council),
             )
-            council.on_change = lambda: self.world.on_council_changed(task_id, council)
             changed = lambda: self.world.recorder.on_lease_change(self, task_id)  # noqa: E731
             self.lease_clients[task_id] = LeaseClient(council, self.machine, self._rng, changed, self.world.stop_time)
             self._service.register(self.lease_clients[task_id])
