@@ -54,7 +54,7 @@ class _Client:
     def __init__(self, rover, link):
         self._rover, self._link, self._rest = rover, link, b""
 
-    def received(self, data):
+    def data_received(self, data):
         *lines, self._rest = (self._rest + data).split(b"\n")
         for line in lines:
             self._rover.obey(line)

@@ -36,12 +36,12 @@ class Rover(BaseDriver):
     def _halt(self):
         self._link.send(b"V 0 0\n")
 
-    def link_up(self, link):  # noqa: D102 (interface of the connector, like received)
+    def link_up(self, link):  # noqa: D102 (interface of the connector, like data_received)
         self._link, self._tail = link, b""
         self._halt()
         self._up()
 
-    def received(self, data):  # noqa: D102
+    def data_received(self, data):  # noqa: D102
         *lines, self._tail = (self._tail[-99:] + data).split(b"\n")
         for words in map(bytes.split, lines):
             is_whole = len(words) == 6 and all(map(NUMBER.fullmatch, words))

@@ -163,8 +163,8 @@ class _Dead:
     def __init__(self) -> None:
         self.hung_up: Deferred[None] = Deferred()
 
-    def open_connection(self, host: str, port: int, caller: Port) -> _Dead:
-        caller.link_up(self)
+    def connect(self, host: str, port: int, client: Port) -> _Dead:
+        client.link_up(self)
         return self
 
     def send(self, data: bytes) -> None:

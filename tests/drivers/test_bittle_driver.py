@@ -317,7 +317,7 @@ class WifiTests(BittleCase):
         for _ in range(200):
             self.robot.accept_http(KeptLink()).data_received(f"GET {path} HTTP/1.1\r\n\r\n".encode())
             self.pass_time(0.1)
-        self.assertLessEqual(len(self.robot.tasks) + len(self.robot.said), 50)
+        self.assertLessEqual(len(self.robot.tasks) + len(self.robot.task_output), 50)
 
     def test_names_the_wrong_board(self) -> None:
         """If the option ``board`` is wrong, the problem contains the HTTP status."""

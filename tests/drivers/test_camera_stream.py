@@ -220,9 +220,9 @@ class StreamTests(Conformance, RobotCase):
         """The driver of a network camera loads neither OpenCV, NumPy nor pyserial, and starts no thread."""
         script = (
             "import sys, threading; from twisted.internet.task import Clock\n"
-            "from drivers.registry import driver_for; from drivers.link import MemoryConnector\n"
+            "from drivers.registry import create_driver; from drivers.link import MemoryConnector\n"
             "clock = Clock()\n"
-            f"driver = driver_for('camera', {{'url': {URL!r}}}, 'cam', clock, MemoryConnector(clock, None))\n"
+            f"driver = create_driver('camera', {{'url': {URL!r}}}, 'cam', clock, MemoryConnector(clock, None))\n"
             "driver.connect()\n"
             "assert not {'cv2', 'numpy', 'serial', 'twisted.internet.reactor'} & set(sys.modules)\n"
             "assert threading.active_count() == 1"

@@ -116,8 +116,8 @@ class RegistryTests(SynchronousTestCase):
         script = (
             "import sys; from twisted.internet.task import Clock\n"
             "import drivers.registry as r; assert 'drivers.sim.driver' not in sys.modules\n"
-            "r.describe('sim', {}); r.driver_for('sim', {}, 'dog1', None)\n"
-            "for kind in ('create2', 'bittle'): r.driver_for(kind, {'port': '/dev/x'}, 'robot', Clock())\n"
+            "r.describe('sim', {}); r.create_driver('sim', {}, 'dog1', None)\n"
+            "for kind in ('create2', 'bittle'): r.create_driver(kind, {'port': '/dev/x'}, 'robot', Clock())\n"
             "import drivers.sim.client; unwanted = {'cv2', 'numpy', 'pymunk', 'serial', 'twisted.internet.reactor'}\n"
             "heavy = unwanted & set(sys.modules)\n"
             "assert not heavy, heavy"

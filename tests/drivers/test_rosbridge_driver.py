@@ -37,7 +37,7 @@ class RosbridgeDriverTests(Conformance, RobotCase):
         return dict(self.newest(driver).values)
 
     def heard(self, op: str) -> list[dict[str, Any]]:
-        return [said for said in self.robot.heard if said["op"] == op]
+        return [said for said in self.robot.received_messages if said["op"] == op]
 
     def test_drives_with_the_type_that_the_robot_listens_to(self) -> None:
         """The driver asks the robot for its velocity type: Twist and TwistStamped work without options."""
@@ -83,7 +83,7 @@ class RosbridgeDriverTests(Conformance, RobotCase):
         self.assertIn("Twist", {one["type"].rpartition("/")[2] for one in self.heard("advertise")})
         self.robot.has_rosapi = False
         self.cut_link()
-        self.robot.heard.clear()
+        self.robot.received_messages.clear()
         self.pass_time(2.0)
         self.assertTrue(self.heard("advertise")[0]["type"].endswith("/TwistStamped"))
 
@@ -112,7 +112,7 @@ class RosbridgeDriverTests(Conformance, RobotCase):
     def test_says_the_velocity_again_and_zero_at_the_end(self) -> None:
         """The velocity is published ten times a second; at the deadline zero is published once, then nothing."""
         driver = self.ready()
-        self.robot.heard.clear()
+        self.robot.received_messages.clear()
         driver.act({"base.vx": 0.1}, self.permit(seconds=1.0))
         self.pass_time(1.5)
         said = [one["msg"]["linear"]["x"] for one in self.heard("publish")]
@@ -132,7 +132,7 @@ class RosbridgeDriverTests(Conformance, RobotCase):
         self.assertGreater(self.true_speed(), 0.1)
         self.pass_time(0.3)
         self.assertEqual(self.true_speed(), 0.0)
-        self.robot.heard.clear()
+        self.robot.received_messages.clear()
         self.connector.is_open = True
         self.pass_time(2.0)
         self.assertEqual([one["msg"]["linear"]["x"] for one in self.heard("publish")], [0.0])

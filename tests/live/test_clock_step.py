@@ -33,11 +33,11 @@ from twisted.internet import reactor
 from middleware.entangled.identity import Identity
 from middleware.entangled.network.udp import UdpNetwork
 from middleware.entangled.node import EntangledNode
-from middleware.entangled.record import hashed_key
+from middleware.entangled.record import hash_key
 from middleware.entangled.data.sqlite import SqliteStore
 
 folder, step = sys.argv[1], float(sys.argv[2])
-key, short = hashed_key("device"), hashed_key("short")
+key, short = hash_key("device"), hash_key("short")
 nodes, networks = [], []
 for number in range(2):
     network = UdpNetwork(reactor, "127.0.0.1", 0)
@@ -68,7 +68,7 @@ def begin():
 
 def silence():
     seen.append([time.monotonic(), "silent"])
-    nodes[0].vanish()
+    nodes[0].stop_silently()
     reactor.callLater(2.5, end)
 
 def end():

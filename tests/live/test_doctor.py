@@ -21,21 +21,21 @@ DOCTOR = """
 import sys, time
 from functools import partial
 from swarmnode.doctor.command import main
-from swarmnode.doctor.measure import measured
+from swarmnode.doctor.measure import measure_facts
 late = float(sys.argv[1])
-sys.exit(main(sys.argv[2:], measure=partial(measured, wall=lambda: time.time() - late)))
+sys.exit(main(sys.argv[2:], measure=partial(measure_facts, wall=lambda: time.time() - late)))
 """
 OTHER_VERSION = """
 import socket, sys
 from middleware.entangled.network.network import Address
-from middleware.entangled.wire.probe import echo
+from middleware.entangled.wire.probe import pack_reply
 own = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
 own.bind((sys.argv[1], int(sys.argv[2])))
 print("ready", flush=True)
 while True:
     data, source = own.recvfrom(2048)
     if data[0] == 0x19:
-        answer = bytearray(echo(data, bytes(8), 0.0, Address(*source)))
+        answer = bytearray(pack_reply(data, bytes(8), 0.0, Address(*source)))
         answer[17] = 9
         own.sendto(bytes(answer), source)
 """
@@ -144,7 +144,7 @@ class LanTests(DoctorCase):
 
     def test_one_of_no_team_finds_whom_to_ask(self) -> None:
         """A machine without a team finds the nodes on its LAN by discovery."""
-        program = "from swarmnode.doctor.measure import on_lan; print(*[each.address for each in on_lan()])"
+        program = "from swarmnode.doctor.measure import discover_on_lan; print(*[each.address for each in discover_on_lan()])"
         done = self.net.run("a1", [sys.executable, "-c", program], timeout=LIMIT_S)
         self.assertEqual((done.stdout.strip(), done.stderr), (self.other, ""))
 

@@ -121,10 +121,10 @@ class InternetTests(NamespaceCase):
         """After an exception or a kill of the creating process, no process of an internet is left."""
         program = (
             "import os, signal, sys\n"
-            "from sim.namespaces.internet import Internet, Site\nfrom sim.namespaces.nat import Kind\n"
-            "with Internet([Site('a', Kind.PORT)]) as net:\n"
+            "from sim.namespaces.internet import Internet, Site\nfrom sim.namespaces.nat import NatKind\n"
+            "with Internet([Site('a', NatKind.PORT)]) as net:\n"
             "    started = net.start('a1', ['sleep', '600'])\n"
-            "    print(started.pid, *[net.room(name).pid for name in ('', 'a1', 'a-gw')], flush=True)\n"
+            "    print(started.pid, *[net.get_namespace(name).pid for name in ('', 'a1', 'a-gw')], flush=True)\n"
             "    if sys.argv[1] == 'raise': raise SystemExit(3)\n"
             "    signal.pause()\n"
         )

@@ -21,8 +21,8 @@ import sys
 signal.signal(signal.SIGINT, signal.default_int_handler)
 from pathlib import Path
 from twisted.internet import reactor
-from sim.demo.processes import Team
-team = Team(reactor, Path(sys.argv[1]), lambda name, line: print(line, flush=True))
+from sim.demo.processes import ProcessGroup
+team = ProcessGroup(reactor, Path(sys.argv[1]), lambda name, line: print(line, flush=True))
 for name in ("a", "b"):
     team.add(name, [sys.argv[2], name])
 team.start()

@@ -14,12 +14,12 @@ ROOT = Path(__file__).resolve().parents[2]
 FAILING_DISK = """
 import resource, signal, sys
 from contextlib import suppress
-from benchmarks.store import TTL, written_as
+from benchmarks.store import TTL_S, make_record
 from middleware.entangled.errors import BadStore, Unwritable
 from middleware.entangled.data.sqlite import SqliteStore
 
 store = SqliteStore.open(sys.argv[1], 0.0)
-store.put(written_as(1), TTL)
+store.put(make_record(1), TTL_S)
 store.flush()
 signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
 resource.setrlimit(resource.RLIMIT_FSIZE, (100_000, resource.RLIM_INFINITY))
@@ -27,16 +27,16 @@ number = 1
 try:
     while True:
         number += 1
-        store.put(written_as(number), TTL)
+        store.put(make_record(number), TTL_S)
         if number % 20 == 0:
             with suppress(BadStore):
                 store.flush(0.01)
 except Unwritable as error:
     assert "cannot be written" in str(error), error
-assert store.slot(written_as(1).slot) == written_as(1)
+assert store.get_slot(make_record(1).slot) == make_record(1)
 resource.setrlimit(resource.RLIMIT_FSIZE, (resource.RLIM_INFINITY, resource.RLIM_INFINITY))
 store.flush(5.0)
-assert store.put(written_as(number), TTL) and not store.trouble
+assert store.put(make_record(number), TTL_S) and not store.write_error
 store.close()
 again = SqliteStore.open(sys.argv[1], 0.0)
 assert [r.sequence for r in again.records()] == list(range(1, number + 1)), again.usage

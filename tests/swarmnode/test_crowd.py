@@ -10,10 +10,10 @@ from swarmnode.crowd import TASK_NODE, CrowdTeam
 from tests.replay import replayed
 
 RUN = """
-from sim.robots.crowd.scene import Ground
-from sim.robots.crowd.search import search
+from sim.robots.crowd.scene import CrowdScene
+from sim.robots.crowd.search import run_search
 from swarmnode.crowd import CrowdTeam
-print(search(CrowdTeam(4, 3, Ground(30, 5.0, 5.0)), 4, 6.0, lambda: 0.0).digest)
+print(run_search(CrowdTeam(4, 3, CrowdScene(30, 5.0, 5.0)), 4, 6.0, lambda: 0.0).digest)
 """
 
 

@@ -25,7 +25,7 @@ class InvitationTests(SynchronousTestCase):
 
     def test_leave_a_note(self) -> None:
         """A web node writes its address and code to a private file; the next start replaces it."""
-        self.patch(sys.modules["middleware.entangled.control.socket_path"], "MAX_PATH", 4096)
+        self.patch(sys.modules["middleware.entangled.control.socket_path"], "MAX_PATH_BYTES", 4096)
         for code in ("quiet-otter", "loud-otter"):
             announce_page("vaio", "0.0.0.0", lambda: 8080, code)
         self.assertEqual(list_pages(), [PageAccess("vaio", "http://127.0.0.1:8080/", "loud-otter", os.getpid())])
@@ -36,7 +36,7 @@ class InvitationTests(SynchronousTestCase):
 
     def test_show_the_code_at_a_terminal(self) -> None:
         """A node that is started at a terminal prints the code; other or closed streams get none."""
-        self.patch(sys.modules["middleware.entangled.control.socket_path"], "MAX_PATH", 4096)
+        self.patch(sys.modules["middleware.entangled.control.socket_path"], "MAX_PATH_BYTES", 4096)
         screen = io.StringIO()
         announce_page("vaio", "0.0.0.0", lambda: 8080, "quiet-otter", terminal=screen)
         self.assertIn("http://127.0.0.1:8080/#code=quiet-otter", screen.getvalue())

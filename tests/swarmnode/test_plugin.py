@@ -139,11 +139,11 @@ class CheckedServiceTests(SynchronousTestCase):
                 Settings.from_mapping({"node": {"name": "a", "team_key": KEY, **more}}, "test"),
                 world.seams("a", NODE_PORT),
             )
-            self.patch(plugin, "real_network", lambda node, *_: lambda: world.board.make_network(node.host, node.port))
+            self.patch(plugin, "make_network_factory", lambda node, *_: lambda: world.board.make_network(node.host, node.port))
             return made
 
         self.patch(
-            plugin, "given_way", lambda settings: replace_busy_ports(settings, lambda _, host, port: port != NODE_PORT)
+            plugin, "replace_busy_ports", lambda settings: replace_busy_ports(settings, lambda _, host, port: port != NODE_PORT)
         )
         moved = service()
         moved.startService()

@@ -8,11 +8,11 @@ from swarmnode.simulated_team import SimulatedTeam
 from tests.replay import replayed
 
 RUN = """
-from swarmnode.simulated_team import VirtualTeam
-team = VirtualTeam(7)
+from swarmnode.simulated_team import SimulatedTeam
+team = SimulatedTeam(7)
 team.run_demo()
 team.clock.advance(12.0)
-print(team.board.digest())
+print(team.switchboard.digest())
 """
 
 

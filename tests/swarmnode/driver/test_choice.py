@@ -113,9 +113,9 @@ class WitnessTests(SynchronousTestCase):
     def test_remembers_what_is_wrong_with_each_line(self) -> None:
         """Serial devices and addresses use different connectors, and a link's problem is reported while it lasts."""
         line = SimpleNamespace(problem="it is off")
-        tcp = SimpleNamespace(call=lambda host, port, caller: line)
+        tcp = SimpleNamespace(connect=lambda host, port, client: line)
         cable = SimpleNamespace()
-        serial = SimpleNamespace(call=lambda host, port, caller: cable)
+        serial = SimpleNamespace(connect=lambda host, port, client: cable)
         connector = RecordingConnector(tcp, serial)
         self.assertIs(connector.connect("dog1", 10020, None), line)
         self.assertIs(connector.connect("/dev/ttyUSB0", 115200, None), cable)
@@ -125,8 +125,8 @@ class WitnessTests(SynchronousTestCase):
 
     def test_knows_a_serial_device_by_its_name(self) -> None:
         """Every path is a serial device, links included; a host name that begins like one is not."""
-        tcp = SimpleNamespace(call=lambda host, port, caller: "tcp")
-        serial = SimpleNamespace(call=lambda host, port, caller: "serial")
+        tcp = SimpleNamespace(connect=lambda host, port, client: "tcp")
+        serial = SimpleNamespace(connect=lambda host, port, client: "serial")
         connector = RecordingConnector(tcp, serial)
         for name in ("/dev/ttyUSB0", "/tmp/create2", "./create2", "COM3", r"\\.\COM12"):
             self.assertEqual(connector.connect(name, 115200, None), "serial", name)
@@ -135,11 +135,11 @@ class WitnessTests(SynchronousTestCase):
 
     def test_keeps_one_line_to_each_place(self) -> None:
         """A robot that is queried with one connection per request does not fill the memory."""
-        tcp = SimpleNamespace(call=lambda host, port, caller: SimpleNamespace(problem=caller))
+        tcp = SimpleNamespace(connect=lambda host, port, client: SimpleNamespace(problem=client))
         connector = RecordingConnector(tcp, None)
         for number in range(1000):
             connector.connect("dog1", 80, f"problem {number}")
-        self.assertEqual(len(vars(connector)["_lines"]), 1)
+        self.assertEqual(len(vars(connector)["_reconnectors"]), 1)
         self.assertEqual(connector.list_problems(), ["dog1:80: problem 999"])
 
     def test_hears_the_warnings_of_drivers(self) -> None:
