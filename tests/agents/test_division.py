@@ -149,7 +149,7 @@ class DueTests(SynchronousTestCase):
     def part(self, cost: float | None = 1.0, assigned: str = "", is_acting: bool = False, is_free: bool = True) -> Any:
         """Return a task as its agent sees it."""
         me = Member("a", "dog", WAITING, cost, assigned)
-        return SimpleNamespace(engagement=SimpleNamespace(me=me, is_acting=is_acting, may_be_put_aside=is_free))
+        return SimpleNamespace(engagement=SimpleNamespace(me=me, is_acting=is_acting, can_yield_robot=is_free))
 
     def test_given_task_has_it(self) -> None:
         """The robot works on its agent's assigned task, unless it acts on another one or records its outcome."""

@@ -85,7 +85,7 @@ class Council:
         held = self.token and self._clock.seconds() < self.deadline
         return Lease("t1", self.token, self.deadline) if held else None
 
-    def want(self) -> None:
+    def claim(self) -> None:
         """Record that the agent wants the lease."""
         self.is_wanted = True
 
@@ -106,11 +106,11 @@ class Council:
         self.places.append(0)
         return succeed(None)
 
-    def suspect(self) -> None:
+    def suspect_holder(self) -> None:
         """Record that the holder may have failed."""
         self._events.append("suspected")
 
-    def move(self, members: Sequence[Contact]) -> Deferred[None]:
+    def change_council(self, members: Sequence[Contact]) -> Deferred[None]:
         """Record the change of the council, which ends the lease."""
         self._events.append(f"moved to {len(members)}")
         self.token = 0

@@ -22,7 +22,18 @@ def with_camera(**properties: float) -> MotionCapabilities:
 class DescriptionTests(SynchronousTestCase):
     def test_unknown_body_is_an_ers7(self) -> None:
         """Without a description the capabilities are exactly the simulated dog's."""
-        for name in ("walk", "turn", "look_turn", "strafes", "ranges", "lens", "ahead", "stop_at", "fresh", "aim"):
+        for name in (
+            "walk",
+            "turn",
+            "look_turn",
+            "strafes",
+            "ranges",
+            "lens",
+            "ahead",
+            "stop_distance",
+            "fresh",
+            "facing_tolerance",
+        ):
             self.assertEqual(
                 getattr(MotionCapabilities(), name), getattr(MotionCapabilities(described("sim")), name), name
             )

@@ -249,7 +249,7 @@ def _only_slot(self: SlotMaintenance, key: bytes) -> str:
 
 _BUGS: dict[tuple[str, ...], dict[str, list[tuple[Any, str, Any]]]] = {
     ("records",): {
-        "tombstone dropped too early": [(owner, "TOMBSTONE_TTL", 3.0)],
+        "tombstone dropped too early": [(owner, "TOMBSTONE_TTL_S", 3.0)],
         "acknowledged by a minority": [(Overlay, "find_voters", lambda self, key, targets: _voters(targets[:1]))],
         "lower sequence accepted": [(Record, "supersedes", lambda self, other: True)],
         "contact entered unchecked": [(Overlay, "lookup", _lookup_that_believes)],

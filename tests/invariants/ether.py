@@ -305,12 +305,16 @@ class Node:
         self.wall = ether.clock.seconds
         self.joined: Deferred[None] = succeed(None)
         self.presence = SimpleNamespace(
-            device=SimpleNamespace(name=f"dog{place}"), say=lambda *_: None, change=lambda **_: None
+            device=SimpleNamespace(name=f"dog{place}"), add_message=lambda *_: None, change=lambda **_: None
         )
         self.entangled = SimpleNamespace(get=self._get)
         self.find_contacts = lambda uuids: ()
-        self.council_manager = SimpleNamespace(of=lambda task: Council(), has_vacancy=lambda task, council: False)
-        self.stop_state = SimpleNamespace(watch=lambda obey: None, learn=lambda: None, is_on=False, is_known=True)
+        self.council_manager = SimpleNamespace(
+            make_proposer=lambda task: Council(), has_vacancy=lambda task, council: False
+        )
+        self.stop_state = SimpleNamespace(
+            subscribe=lambda listener: None, request_stops=lambda: None, is_motion_forbidden=False, is_known=True
+        )
         self.deployed: DeployedModules = {}
         self.strategies = StrategyRegistry()
         self.groups: dict[str, list[tuple[Any, Any]]] = {}

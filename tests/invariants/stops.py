@@ -108,7 +108,7 @@ class Life:
     def __post_init__(self) -> None:
         self.identity = self.net.identities[self.name]
         self.store = self.net.disks[self.name]
-        self.endpoint = self.replica = self.door = self
+        self.endpoint = self.replica = self.admission = self
         self.records: list[Record] = []
         self.halt = expose_stops(self, self.net.dice, self.later, lambda stops, words: None)  # type: ignore[arg-type]
         if self.name in ROBOTS:
@@ -128,7 +128,7 @@ class Life:
         """Schedule a call that is dropped at the end of this run."""
         self.net.clock.callLater(seconds, lambda: None if self.is_over else call())
 
-    def may(self, public: bytes, method: str) -> bool:
+    def may_call(self, public: bytes, method: str) -> bool:
         """Return whether a present member may call the method."""
         return self.net.may(public)
 

@@ -256,13 +256,13 @@ def _buckets(node: EntangledNode) -> list[Any]:
 
 def _ways(node: EntangledNode) -> list[tuple[str, int, int]]:
     reach: Any = node.nat
-    tables = ("acquaintances", "_carriers", "_upgrades", "_allowance")
+    tables = ("selector", "_relays", "_upgrades", "_limits")
     return [
         ("peers by their ids", len(reach._known), MAX_PEERS),
         ("pairs that are carried for", len(reach.relay), MAX_PAIRS),
-        ("fresh ports", len(reach._ports), MAX_PORTS),
+        ("fresh ports", len(reach._additional_ports), MAX_PORTS),
         *((f"ways ({name})", len(getattr(reach, name)), MAX_KNOWN) for name in tables),
         ("holes in its router", len(reach.paths._mapped_peers), MAX_KNOWN),
-        ("where it is seen", len(reach.outside._seen), MAX_KNOWN),
-        ("who was told where it is seen", len(reach.outside._notified_at), MAX_KNOWN),
+        ("where it is seen", len(reach.external._reports), MAX_KNOWN),
+        ("who was told where it is seen", len(reach.external._notified_at), MAX_KNOWN),
     ]

@@ -27,7 +27,7 @@ FOREVER_S = 1e9
 
 
 class SharedStoreNode:
-    """One node of a trial, with the interface that a tuple space requires (``space.peer.Peer``)."""
+    """One node of a trial, with the interface that a tuple space requires (``space.node_interface.NodeInterface``)."""
 
     def __init__(self, trial: SharedStoreTrial, place: int, identity: Identity, rng: random.Random) -> None:
         self.identity = identity
@@ -38,7 +38,7 @@ class SharedStoreNode:
         self._network = trial.network(place)
         self.contact = Contact(identity.public, self._network.address)
         self.endpoint = Endpoint(identity, TEAM_KEY, self._network, trial.clock, rng)
-        self.seat = TakeAcceptor(self.endpoint, self.store, trial.clock, rng)
+        self.take_acceptor = TakeAcceptor(self.endpoint, self.store, trial.clock, rng)
 
     def start(self) -> None:
         """Open the port."""
@@ -47,7 +47,7 @@ class SharedStoreNode:
     def join(self, known: object) -> None:
         """Do nothing: all nodes know each other."""
 
-    def vanish(self) -> None:
+    def stop_silently(self) -> None:
         """Leave without notice."""
         self.endpoint.stop()
         self.watches.clear()
@@ -57,7 +57,7 @@ class SharedStoreNode:
         others = [node.contact for node in self._trial.living_nodes() if node is not self]
         return defer.succeed(select_closest(others, target, 8))
 
-    def newest(self, contact: Contact) -> Contact:
+    def find_newest(self, contact: Contact) -> Contact:
         """Return ``contact``: addresses do not change here."""
         return contact
 

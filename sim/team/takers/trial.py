@@ -205,7 +205,7 @@ class TakingTrial(Simulation):
 
     def is_stored(self, posted: StoredTuple) -> bool:
         """Return whether a living node holds this tuple; an unacknowledged one may vanish with its nodes."""
-        held = [node.store.slot(posted.tuple_id.slot) for node in self.living.values()]
+        held = [node.store.get_slot(posted.tuple_id.slot) for node in self.living.values()]
         return any(record is not None and parse_record(record) == posted for record in held)
 
     def find_violations(self) -> list[str]:

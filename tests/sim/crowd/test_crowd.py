@@ -16,12 +16,12 @@ from sim.robots.world import SUBSTEP_S, TICK_S, NotPossible, World
 from tests.replay import replayed
 
 RUN = """
-from sim.robots.crowd.controller import CONTROLLERS, Senses
+from sim.robots.crowd.controller import CONTROLLERS, Readings
 from sim.robots.crowd.crowd import Crowd
-from sim.robots.crowd.scene import roomy
-crowd = Crowd(7, roomy(400, 0.2))
+from sim.robots.crowd.scene import make_square_scene
+crowd = Crowd(7, make_square_scene(400, 0.2))
 for turn in range(150):
-    crowd.wish[:] = CONTROLLERS["wander"](Senses(crowd))
+    crowd.commands[:] = CONTROLLERS["wander"](Readings(crowd))
     crowd.step()
 print(crowd.digest())
 """
