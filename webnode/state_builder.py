@@ -16,14 +16,14 @@ from middleware.tasks.task import Task
 from webnode.state import GONE, DepartedDevices, State, format_state
 
 MAX_TASKS = 20
-MAX_STOPS = 64
+MAX_LISTED_STOPS = 64
 """Maximum number of stops listed; when these are released, the next ones are listed."""
 MAX_AGE_S = 0.1
 """Maximum age of a cached state in seconds; it bounds the work when many clients ask at once."""
 
 
 class StateCache:
-    """A cache of the newest state for callers on any thread, refreshed at most every ``FRESH_S``."""
+    """A cache of the newest state for callers on any thread, refreshed at most every ``MAX_AGE_S``."""
 
     def __init__(self, read: Callable[[], State], clock: Callable[[], float]) -> None:
         self._read = read
@@ -112,7 +112,7 @@ def _make_stop_view(stops: Mapping[str, str], devices: Iterable[State]) -> State
         "halted": bool(known) and not others,
         "halt": {
             "ordered": bool(stops),
-            "stops": [{"id": stop, "by": known[stop]} for stop in sorted(known)[:MAX_STOPS]],
+            "stops": [{"id": stop, "by": known[stop]} for stop in sorted(known)[:MAX_LISTED_STOPS]],
             "standing": [row["name"] for row in standing],
             "others": others if known else [],
         },
