@@ -38,7 +38,7 @@ def main(arguments: list[str] | None = None) -> int:
         loss = least + (most - least) * number / max(1, wanted.trials - 1)
         began = time.monotonic()
         tuples = wanted.tuples * (number + 1) // wanted.trials - wanted.tuples * number // wanted.trials
-        trial = kind(wanted.seed + number, tuples, loss, not wanted.quiet_conditions, wanted.takers, wanted.nodes)
+        trial = kind(wanted.seed + number, tuples, loss, not wanted.calm, wanted.takers, wanted.nodes)
         sent = trial.switchboard.counters["sent"]
         trial.run_trial()
         found = trial.find_violations()
@@ -46,7 +46,7 @@ def main(arguments: list[str] | None = None) -> int:
         broken = Counter(line[:2] for line in found)
         confirmed = len(trial.recorder.tuples) - len(trial.recorder.list_undecided())
         print(
-            f"{trial.seed:4d}  {loss:4.2f}  {'no' if wanted.quiet_conditions else 'yes':>5}  {tuples:6d}  {confirmed:9d}"
+            f"{trial.seed:4d}  {loss:4.2f}  {'no' if wanted.calm else 'yes':>5}  {tuples:6d}  {confirmed:9d}"
             f"  {broken['T1']:5d}  {broken['T2'] + broken['T5']:4d}  {broken['T3']:10d}"
             f"  {trial.clock.seconds():11.0f}  {(trial.switchboard.counters['sent'] - sent) / max(1, tuples):15.0f}"
             f"  {time.monotonic() - began:6.0f}",

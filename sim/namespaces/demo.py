@@ -125,7 +125,7 @@ def main(arguments: Sequence[str] = tuple(sys.argv[1:])) -> int:
         places = connect_robots(net)
         for site in net.sites:
             net.impair(site, loss=given.loss)
-        net.record_frames(given.record_frames)
+        net.record_frames(given.record)
         print_line(
             f"dog1 behind a router ({KINDS[0].description}), dog2 behind another ({KINDS[1].description}), dog3 at home"
         )
