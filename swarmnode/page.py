@@ -49,10 +49,10 @@ class PageService(MultiService):
     """
 
     def __init__(
-        self, web: WebService, operator: SimulatorClient | None, tell: Callable[[], None], phones: Phones
+        self, web: WebService, simulator: SimulatorClient | None, tell: Callable[[], None], phones: Phones
     ) -> None:
         super().__init__()
-        self._operator = operator
+        self._operator = simulator
         self._phones = phones
         self._announce = tell
         web.setServiceParent(self)
@@ -73,30 +73,38 @@ class PageService(MultiService):
 
 
 def make_page_service(
-    settings: Settings, seams: Dependencies, reactor: Any, node: SwarmNode, door: Callable[..., TlsPort] | None
+    settings: Settings,
+    dependencies: Dependencies,
+    reactor: Any,
+    node: SwarmNode,
+    make_tls_port: Callable[..., TlsPort] | None,
 ) -> PageService:
-    """Return the page over the data store of ``node``; ``door`` creates its TLS port, if it has one."""
-    address, wall, store = settings.web, seams.wall, settings.node.store
-    operator = None
+    """Return the page over the data store of ``node``; ``make_tls_port`` creates its TLS port, if it has one."""
+    address, wall, store = settings.web, dependencies.wall, settings.node.store
+    simulator = None
     if address.yard is not None:
-        operator = SimulatorClient(TcpConnector(), reactor, address.yard.host, address.yard.port)
+        simulator = SimulatorClient(TcpConnector(), reactor, address.yard.host, address.yard.port)
     client = TeamClient(node)
-    desk = TeamControl(client, TASKS, DEMO_TASK, operator)
-    tls = None if door is None else door(settings, node.store, reactor, wall, seams.rng, _list_machine_names)
+    desk = TeamControl(client, TASKS, DEMO_TASK, simulator)
+    tls = (
+        None
+        if make_tls_port is None
+        else make_tls_port(settings, node.store, reactor, wall, dependencies.rng, _list_machine_names)
+    )
     team = TeamFallbacks(node, reactor.seconds)
-    phones = make_gateway(settings, node, seams, reactor, client.view)
+    phones = make_gateway(settings, node, dependencies, reactor, client.view)
 
     def urls() -> list[str]:
         return web.urls(_list_machine_names())
 
     authority, fingerprint = (b"", "") if tls is None else (tls.signer.pem, tls.signer.fingerprint)
-    board = Services(
+    services = Services(
         desk,
-        make_sessions(settings, node, reactor, seams.rng, team),
+        make_sessions(settings, node, reactor, dependencies.rng, team),
         AuditLog(None if store == IN_MEMORY else Path(f"{store}.audit"), wall),
         fallbacks=team,
-        survey=Diagnostics(node, client),
-        halts=StopControl(client),
+        diagnostics=Diagnostics(node, client),
+        stop_control=StopControl(client),
         faults=FaultControl(node, reactor.seconds) if settings.faults.allow else None,
         phones=phones,
         invites=Invites(urls, authority, fingerprint, reactor, reactor.getThreadPool()),
@@ -110,7 +118,7 @@ def make_page_service(
         address.host,
         address.port,
         StateCache(lambda: stored(wall()), reactor.seconds),
-        board,
+        services,
         wall,
         list_host_names(settings, socket.gethostname()),
         [] if tls is None else [tls.open],
@@ -120,10 +128,10 @@ def make_page_service(
 
     def tell() -> None:
         where = address.host, lambda: web.port
-        announce_page(settings.node.name, *where, board.sessions.code, web.secure_port, find_terminal())
+        announce_page(settings.node.name, *where, services.sessions.code, web.secure_port, find_terminal())
         team.publish(urls())
 
-    return PageService(web, operator, tell, phones)
+    return PageService(web, simulator, tell, phones)
 
 
 def list_host_names(settings: Settings, machine: str) -> frozenset[str]:

@@ -43,7 +43,7 @@ def _call_directly(call: Callable[..., Any], *arguments: Any, limit_s: float | N
 
 def create_app(
     read: Callable[[], State],
-    board: Services,
+    services: Services,
     on_reactor: OnReactor = _call_directly,
     hosts: Collection[str] = (),
     wall: Callable[[], float] = lambda: 0.0,
@@ -51,17 +51,20 @@ def create_app(
     """Return the Flask application.
 
     ``read`` returns the newest state and may be called from any thread.  ``on_reactor(f, *arguments)`` calls ``f`` on
-    the reactor's thread and returns its result (``server.caller`` makes one; the default calls directly, for tests).
-    ``hosts`` are names of this machine in addition to its addresses and local names.  ``wall`` returns unix time.
+    the reactor's thread and returns its result (``server.make_caller`` makes one; the default calls directly, for
+    tests).  ``hosts`` are names of this machine in addition to its addresses and local names.  ``wall`` returns unix
+    time.
     """
     app = Flask("webnode", static_folder=None)
     app.config["MAX_CONTENT_LENGTH"] = MAX_BODY
     app.json.sort_keys = False  # type: ignore[attr-defined]
 
     # navigator.sendBeacon, which a phone uses when its page is closed, cannot set headers.
-    unmarked = {(str(route.method), _to_flask_rule(route.path)) for route in TABLE if route.role == "phone"}
-    lets_in = partial(on_reactor, board.fallbacks.is_allowed_origin)
-    _add_checks(app, lets_in, hosts, lambda: (request.method, str(request.url_rule)) not in unmarked)
+    without_csrf_header = {(str(route.method), _to_flask_rule(route.path)) for route in TABLE if route.role == "phone"}
+    is_allowed_origin = partial(on_reactor, services.fallbacks.is_allowed_origin)
+    _add_checks(
+        app, is_allowed_origin, hosts, lambda: (request.method, str(request.url_rule)) not in without_csrf_header
+    )
     _add_error_handlers(app)
     _serve_page(app, read)
     dispatch = Dispatch()
@@ -69,13 +72,13 @@ def create_app(
     def serve(route: Route) -> None:
         def answer(**path: str) -> Response:
             now = wall()
-            who = on_reactor(board.sessions.authenticate, _read_token(), now)
-            check_role(route.role, who)
-            given = check_request(route, path, request.args, {} if route.method == "GET" else _read_body())
-            ask = RouteRequest(
-                given, who, board, read(), _read_idempotency_key(), request.remote_addr or "", now, TABLE
+            user = on_reactor(services.sessions.authenticate, _read_token(), now)
+            check_role(route.role, user)
+            values = check_request(route, path, request.args, {} if route.method == "GET" else _read_body())
+            route_request = RouteRequest(
+                values, user, services, read(), _read_idempotency_key(), request.remote_addr or "", now, TABLE
             )
-            result = on_reactor(dispatch.carry_out, route, ask, limit_s=route.limit_s)
+            result = on_reactor(dispatch.carry_out, route, route_request, limit_s=route.limit_s)
             is_content = isinstance(result, Content)
             response = app.response_class(result.body, content_type=result.kind) if is_content else jsonify(result)
             response.status_code = route.status
@@ -89,23 +92,25 @@ def create_app(
     return app
 
 
-def _add_checks(app: Flask, lets_in: IsAllowedOrigin, hosts: Collection[str], needs_mark: Callable[[], bool]) -> None:
+def _add_checks(
+    app: Flask, is_allowed_origin: IsAllowedOrigin, hosts: Collection[str], needs_csrf_header: Callable[[], bool]
+) -> None:
     """Check ``Host`` and ``Origin`` of each request, and set the security headers of each response."""
 
     @app.before_request
-    def admit() -> Response | None:
-        marked = not needs_mark() or request.headers.get("X-Swarm") == "1" or request.is_json
+    def check_headers() -> Response | None:
+        has_csrf_header = not needs_csrf_header() or request.headers.get("X-Swarm") == "1" or request.is_json
         host, origin = request.headers.get("Host", ""), request.headers.get("Origin")
-        is_let_in = not is_own_origin(origin, host) and lets_in(origin or "")
-        g.headers = make_headers(host, origin, lambda _: is_let_in)
-        problem = find_refusal(request.method, host, origin, marked, hosts, lambda _: is_let_in)
+        is_allowed = not is_own_origin(origin, host) and is_allowed_origin(origin or "")
+        g.headers = make_headers(host, origin, lambda _: is_allowed)
+        problem = find_refusal(request.method, host, origin, has_csrf_header, hosts, lambda _: is_allowed)
         if problem is not None:
             raise problem
         # OPTIONS is the preflight request (CORS) for a page of another web node.
         return app.response_class(status=204) if request.method == "OPTIONS" else None
 
     @app.after_request
-    def strict(response: Response) -> Response:
+    def add_headers(response: Response) -> Response:
         response.headers.update(g.get("headers", HEADERS))
         response.headers.setdefault("Cache-Control", "no-store")
         return response
@@ -115,11 +120,11 @@ def _add_error_handlers(app: Flask) -> None:
     """Answer every error as JSON with field, problem and remedy."""
 
     @app.errorhandler(Refusal)
-    def refused(error: Refusal) -> tuple[Response, int]:
+    def answer_refusal(error: Refusal) -> tuple[Response, int]:
         return jsonify(error.fields), error.status
 
     @app.errorhandler(HTTPException)
-    def http_error(error: HTTPException) -> tuple[Response, int]:
+    def answer_http_error(error: HTTPException) -> tuple[Response, int]:
         code = error.code or 500
         remedy = "send a smaller body" if code == 413 else "see docs/reference/http-api.md for the routes and methods"
         response = jsonify(Refusal(request.path, error.name.lower(), remedy).fields)
@@ -129,7 +134,7 @@ def _add_error_handlers(app: Flask) -> None:
         return response, code
 
     @app.errorhandler(Exception)
-    def broken(error: Exception) -> tuple[Response, int]:
+    def answer_exception(error: Exception) -> tuple[Response, int]:
         app.logger.error("%s %s failed", request.method, request.path, exc_info=error)
         return jsonify(Refusal(request.path, "internal error", "try again; the node's log has the cause").fields), 500
 

@@ -31,25 +31,25 @@ class AuditLog:
     _log = Logger()
 
     def __init__(
-        self, path: Path | None = None, wall: Callable[[], float] = lambda: 0.0, most: int = MAX_FILE_BYTES
+        self, path: Path | None = None, wall: Callable[[], float] = lambda: 0.0, max_bytes: int = MAX_FILE_BYTES
     ) -> None:
         self._path = path
         self._wall = wall
-        self._max_bytes = most
+        self._max_bytes = max_bytes
         self._newest: deque[dict[str, Json]] = deque([] if path is None else _read_tail(path), maxlen=MAX_LINES)
         self._counts: Counter[tuple[str, str]] = Counter()
-        self._strangers: OrderedDict[tuple[str, str, str], list[float]] = OrderedDict()
+        self._repeated: OrderedDict[tuple[str, str, str], list[float]] = OrderedDict()
         self._is_failing = False
 
-    def write(self, who: User, source: str, route: str, target: str, outcome: str) -> None:
+    def write(self, user: User, source: str, route: str, target: str, outcome: str) -> None:
         """Write one line: ``route`` is method and path, ``target`` the path parameters, ``outcome`` the status."""
-        self._counts[who.role, outcome[:3]] += 1
+        self._counts[user.role, outcome[:3]] += 1
         now = self._wall()
-        repeated = self._count_repetitions((source, route, outcome), now) if who.role == "anyone" else 0
+        repeated = self._count_repetitions((source, route, outcome), now) if user.role == "anyone" else 0
         if repeated is None:
             return
-        line: dict[str, Json] = {"at": round(now, 3), "who": who.name, "role": who.role, "from": source}
-        line |= {"session": who.token_id, "route": route, "target": target, "outcome": outcome}
+        line: dict[str, Json] = {"at": round(now, 3), "who": user.name, "role": user.role, "from": source}
+        line |= {"session": user.token_id, "route": route, "target": target, "outcome": outcome}
         if repeated:
             line["repeated"] = repeated
         self._newest.appendleft(line)
@@ -65,35 +65,35 @@ class AuditLog:
             self._is_failing = False
 
     def list_newest(self, count: int) -> list[dict[str, Json]]:
-        """Return the newest lines, newest first; at most ``AUDITED``."""
+        """Return the newest lines, newest first; at most ``MAX_LINES``."""
         return list(self._newest)[:count]
 
     def get_counts(self) -> Mapping[tuple[str, str], int]:
         """Return the number of changes since the start by role and status, suppressed repetitions included."""
         return self._counts
 
-    def _count_repetitions(self, what: tuple[str, str, str], now: float) -> int | None:
+    def _count_repetitions(self, key: tuple[str, str, str], now: float) -> int | None:
         """Return the number of repetitions suppressed since the last line; None if this one is suppressed as well."""
-        known = self._strangers.get(what)
+        known = self._repeated.get(key)
         if known is not None and 0.0 <= now - known[0] < QUIET_S:
             known[1] += 1
             return None
-        self._strangers[what] = [now, 0]
-        self._strangers.move_to_end(what)
-        if len(self._strangers) > KNOWN:
-            self._strangers.popitem(last=False)
+        self._repeated[key] = [now, 0]
+        self._repeated.move_to_end(key)
+        if len(self._repeated) > KNOWN:
+            self._repeated.popitem(last=False)
         return 0 if known is None else int(known[1])
 
 
-def _append_line(path: Path, line: str, most: int) -> None:
+def _append_line(path: Path, line: str, max_bytes: int) -> None:
     descriptor = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_APPEND, 0o600)
     with open(descriptor, "a", encoding="utf-8") as file:
-        is_full = file.tell() + len(line) > most
+        is_full = file.tell() + len(line) > max_bytes
         if not is_full:
             file.write(line)
     if is_full:
         os.replace(path, path.with_name(f"{path.name}.1"))
-        _append_line(path, line[:most], most)
+        _append_line(path, line[:max_bytes], max_bytes)
 
 
 def _read_tail(path: Path) -> list[dict[str, Json]]:

@@ -1,4 +1,4 @@
-"""Define the visitors of the page: sessions, their tokens and their roles."""
+"""Define the users of the page: sessions, their tokens and their roles."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ class Token:
 
 
 class Sessions(Protocol):
-    """The signed-in visitors; ``now`` is unix seconds."""
+    """The signed-in users; ``now`` is unix seconds."""
 
     code: str
     """The sign-in code of operators; empty if none is needed."""
@@ -54,18 +54,18 @@ class Sessions(Protocol):
         """Sign in with a code or password, from the address ``source``; fails with ``Refusal`` 401 or 429."""
 
     def authenticate(self, token: str, now: float) -> User:
-        """Return the visitor of a token or ticket, without one a visitor ``anyone``; never raises."""
+        """Return the user of a token or ticket, without one a user with the role ``anyone``; never raises."""
 
-    def issue_guest_token(self, who: User, name: str, role: Role, now: float, seconds: float) -> Token:
-        """Return a token for a guest of ``who``, valid no longer than ``who`` can stay."""
+    def issue_guest_token(self, user: User, name: str, role: Role, now: float, seconds: float) -> Token:
+        """Return a token for a guest of ``user``, valid no longer than ``user`` can stay."""
 
-    def issue_derived_token(self, who: User, name: str, role: Role, now: float, seconds: float) -> Token:
-        """Return a token for ``who`` under another name, which ends with the session."""
+    def issue_derived_token(self, user: User, name: str, role: Role, now: float, seconds: float) -> Token:
+        """Return a token for ``user`` under another name, which ends with the session."""
 
-    def renew_token(self, who: User, now: float) -> Token:
+    def renew_token(self, user: User, now: float) -> Token:
         """Return a later token for the same session; raises ``Refusal`` 401 for anyone and for a ticket."""
 
-    def issue_peer_tokens(self, who: User, nodes: Iterable[str], now: float) -> dict[str, Token]:
+    def issue_peer_tokens(self, user: User, nodes: Iterable[str], now: float) -> dict[str, Token]:
         """Return tokens for the same session at the web nodes ``nodes`` (uuids), each valid there for some minutes.
 
         Raises ``Refusal`` 401 for anyone and for a ticket.
@@ -76,34 +76,34 @@ class Sessions(Protocol):
 
 
 class OpenSessions:
-    """Treat every visitor as an operator while ``may_serve``: for a page of this machine only, and for tests."""
+    """Treat every user as an operator while ``can_serve``: for a page of this machine only, and for tests."""
 
     code = ""
 
-    def __init__(self, may_serve: Callable[[], bool] = lambda: True) -> None:
-        self._can_serve = may_serve
+    def __init__(self, can_serve: Callable[[], bool] = lambda: True) -> None:
+        self._can_serve = can_serve
 
     def sign_in(self, proof: str, source: str, now: float) -> Deferred[Token]:
-        """Sign in every visitor, for a day."""
+        """Sign in every user, for a day."""
         return succeed(self.issue_guest_token(User(), "visitor", "operator", now, 86400.0))
 
     def authenticate(self, token: str, now: float) -> User:
         """Return an operator."""
         return User("visitor", "operator") if self._can_serve() else User()
 
-    def issue_guest_token(self, who: User, name: str, role: Role, now: float, seconds: float) -> Token:
+    def issue_guest_token(self, user: User, name: str, role: Role, now: float, seconds: float) -> Token:
         """Return a constant token."""
         return Token("open", "open", role, now + seconds)
 
     issue_derived_token = issue_guest_token
 
-    def renew_token(self, who: User, now: float) -> Token:
+    def renew_token(self, user: User, now: float) -> Token:
         """Return a constant token."""
-        return self.issue_guest_token(who, who.name, who.role, now, 86400.0)
+        return self.issue_guest_token(user, user.name, user.role, now, 86400.0)
 
-    def issue_peer_tokens(self, who: User, nodes: Iterable[str], now: float) -> dict[str, Token]:
+    def issue_peer_tokens(self, user: User, nodes: Iterable[str], now: float) -> dict[str, Token]:
         """Return a constant token for each node."""
-        return {node: self.renew_token(who, now) for node in nodes}
+        return {node: self.renew_token(user, now) for node in nodes}
 
     def revoke(self, token_id: str, until: float = math.inf) -> None:
         """Do nothing."""

@@ -23,13 +23,15 @@ WaitingRequest = tuple[Request, bytes, IDelayedCall]
 class CameraStream:
     """The newest picture of one device, and the requests that wait for the next one.
 
-    ``watch`` opens the upstream and may raise ``Refusal``.  An upstream that is silent for ``POLL_S`` is reopened, as
-    the device may have a new address.  A camera ends two seconds after its last request.
+    ``open_upstream`` may raise ``Refusal``.  An upstream that is silent for ``POLL_S`` is reopened, as the device may
+    have a new address.  A camera ends two seconds after its last request.
     """
 
-    def __init__(self, clock: IReactorTime, watch: Callable[[OnFrame], Callable[[], None]], on_end: Callable[[], None]):
+    def __init__(
+        self, clock: IReactorTime, open_upstream: Callable[[OnFrame], Callable[[], None]], on_end: Callable[[], None]
+    ):
         self._clock = clock
-        self._watch = watch
+        self._open_upstream = open_upstream
         self._on_end = on_end
         self._opened_at = clock.seconds()
         self._newest: tuple[int, bytes, float] | None = None
@@ -37,7 +39,7 @@ class CameraStream:
         self._linger: IDelayedCall | None = None
         self._is_ended = False
         self.waiting: list[WaitingRequest] = []
-        self._stop_upstream = watch(self.on_frame)
+        self._stop_upstream = open_upstream(self.on_frame)
 
     def wait(self, request: Request) -> None:
         """Answer ``request`` with the first picture that its viewer has not seen."""
@@ -93,7 +95,7 @@ class CameraStream:
         self._stop_upstream()
         self._stop_upstream = lambda: None
         try:
-            self._stop_upstream = self._watch(self.on_frame)
+            self._stop_upstream = self._open_upstream(self.on_frame)
             self._opened_at = self._clock.seconds()
         except Refusal:
             self.close()

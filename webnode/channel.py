@@ -53,10 +53,10 @@ def make_raw_response(refusal: Refusal) -> bytes:
 class LimitedRequest(SiteRequest):
     """A request whose body is limited to ``guard.MAX_BODY``; a larger one is answered with 413 and disconnected.
 
-    ``who`` is the authenticated client of a request to a native resource.
+    ``authenticated_user`` is the client of a request to a native resource.
     """
 
-    who = User()
+    authenticated_user = User()
     _body_bytes = 0
     _is_refused = False
 
@@ -92,7 +92,7 @@ class LimitedRequest(SiteRequest):
 
 
 class Channel(HTTPChannel):
-    """A connection with deadlines; ``factory`` is a site that was passed to ``limited``."""
+    """A connection with deadlines; ``factory`` is a site that was passed to ``limit_connections``."""
 
     factory: Any
     transport: Any
@@ -230,9 +230,9 @@ class Channel(HTTPChannel):
                 self.limits.count(kind, self._address, 1)
             self._counted_kind = kind
 
-    def _set_deadline(self, seconds: float, late: Any) -> None:
+    def _set_deadline(self, seconds: float, on_timeout: Any) -> None:
         self._cancel(self._deadline)
-        self._deadline = self.callLater(seconds, late)
+        self._deadline = self.callLater(seconds, on_timeout)
 
     def _cancel(self, call: IDelayedCall | None) -> None:
         if call is not None and call.active():
@@ -253,9 +253,9 @@ class Channel(HTTPChannel):
 
 def limit_connections(site: Site, limits: AddressLimits) -> None:
     """Apply ``limits`` and the deadlines of this module to the connections of ``site``."""
-    held: Any = site
-    held.protocol = Channel
-    held.limits = limits
-    held.timeOut = None
+    configured: Any = site
+    configured.protocol = Channel
+    configured.limits = limits
+    configured.timeOut = None
     # Channel implements HTTP/1.1 only, also if the package h2 is installed.
-    held.acceptableProtocols = lambda: [b"http/1.1"]
+    configured.acceptableProtocols = lambda: [b"http/1.1"]

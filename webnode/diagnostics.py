@@ -73,37 +73,37 @@ class Diagnostics:
     # -- inside -----------------------------------------------------------------------------------------------------
 
     def _query(self, method: str) -> Deferred[Json]:
-        """Fire with the replies of all devices, queried at most once in ``FRESH_S``."""
-        asked = self._queries[method]
-        if asked.waiting is None:
-            if self._node.clock.seconds() - asked.ended_at < MAX_AGE_S:
-                return succeed(asked.reply)
-            self._query_all(method, asked)
-        if asked.waiting is None:  # all devices have replied synchronously
-            return succeed(asked.reply)
-        waiter: Deferred[Json] = Deferred(asked.waiting.remove)
-        asked.waiting.append(waiter)
+        """Fire with the replies of all devices, queried at most once in ``MAX_AGE_S``."""
+        query = self._queries[method]
+        if query.waiting is None:
+            if self._node.clock.seconds() - query.ended_at < MAX_AGE_S:
+                return succeed(query.reply)
+            self._query_all(method, query)
+        if query.waiting is None:  # all devices have replied synchronously
+            return succeed(query.reply)
+        waiter: Deferred[Json] = Deferred(query.waiting.remove)
+        query.waiting.append(waiter)
         return waiter
 
-    def _query_all(self, method: str, asked: _Query) -> None:
+    def _query_all(self, method: str, query: _Query) -> None:
         devices = self._client.view.devices
         names = {device.uuid: device.name for device in devices}
         devices = devices[:MAX_QUERIED]
-        asked.waiting = []
+        query.waiting = []
 
-        def ended(outcomes: list[tuple[bool, Any]]) -> None:
+        def finish(outcomes: list[tuple[bool, Any]]) -> None:
             # In the order of joining, whatever the order of the replies.
             replies = [(device.uuid, outcome) for device, (_, outcome) in zip(devices, outcomes, strict=True)]
-            views = {uuid: asked.view(outcome, names) for uuid, outcome in replies if isinstance(outcome, dict)}
+            views = {uuid: query.view(outcome, names) for uuid, outcome in replies if isinstance(outcome, dict)}
             silent: list[Json] = [uuid for uuid, _ in replies if uuid not in views]
-            asked.reply = {"here": self._node.uuid, "devices": views, "silent": silent}
-            asked.ended_at = self._node.clock.seconds()
-            waiting, asked.waiting = asked.waiting or [], None
+            query.reply = {"here": self._node.uuid, "devices": views, "silent": silent}
+            query.ended_at = self._node.clock.seconds()
+            waiting, query.waiting = query.waiting or [], None
             for waiter in waiting:
-                waiter.callback(asked.reply)
+                waiter.callback(query.reply)
 
         answers = [maybeDeferred(self._query_device, device.uuid, method) for device in devices]
-        DeferredList(answers, consumeErrors=True).addCallback(ended)
+        DeferredList(answers, consumeErrors=True).addCallback(finish)
 
     def _query_device(self, uuid: str, method: str) -> Deferred[Any]:
         if uuid == self._node.uuid:
@@ -163,27 +163,27 @@ def _make_network_view(reply: dict[Any, Any], names: dict[str, str]) -> Json:
 
 
 def _make_links_view(reply: dict[Any, Any], names: dict[str, str]) -> Json:
-    ways = [each for each in _read_list(reply.get("links")) if isinstance(each, dict) and clean_text(each.get("id"))]
+    links = [each for each in _read_list(reply.get("links")) if isinstance(each, dict) and clean_text(each.get("id"))]
     refusals = [each for each in _read_list(reply.get("refusals")) if isinstance(each, dict)]
     return {
-        "links": [_make_link_view(each, names) for each in ways],
+        "links": [_make_link_view(each, names) for each in links],
         "refusals": [_make_refusal_view(each) for each in refusals],
     }
 
 
 def _make_link_view(reply: dict[Any, Any], names: dict[str, str]) -> Json:
     """Return one path and its score, which is None if nothing is measured."""
-    way, by = reply.get("way"), clean_text(reply.get("by"), limit=64)
+    path_kind, by = reply.get("way"), clean_text(reply.get("by"), limit=64)
     loss, round_trip, jitter = (clean_distance(reply.get(name)) for name in ("loss", "round_trip", "jitter"))
     loss = None if loss is None else min(loss, 1.0)
     return {
         "uuid": clean_text(reply["id"], limit=64),
         "name": names.get(reply["id"], clean_text(reply["id"], limit=8)),
-        "way": way if way in PATH_KINDS else "none",
+        "way": path_kind if path_kind in PATH_KINDS else "none",
         "by": names.get(by, by[:8]),
         "address": clean_text(reply.get("address"), limit=64),
         "for_s": clean_distance(reply.get("for")),
-        "score": None if loss is None else LinkQuality(loss, round_trip, jitter, way == "carried").score,
+        "score": None if loss is None else LinkQuality(loss, round_trip, jitter, path_kind == "carried").score,
         "loss": loss,
         "rtt_ms": None if round_trip is None else round(1000 * round_trip, 2),
         "jitter_ms": None if jitter is None else round(1000 * jitter, 2),

@@ -1,4 +1,4 @@
-"""Call a route's answer once per idempotency key, and write each change to the audit log."""
+"""Call a route's handler once per idempotency key, and write each change to the audit log."""
 
 from __future__ import annotations
 
@@ -16,48 +16,48 @@ MAX_ANSWERS = 256
 
 
 class Dispatch:
-    """Calls the answers of routes; on the reactor's thread."""
+    """Calls the handlers of routes; on the reactor's thread."""
 
     def __init__(self) -> None:
         self._answers: OrderedDict[tuple[str, str, str], _Answer] = OrderedDict()
 
-    def carry_out(self, route: Route, ask: RouteRequest) -> Deferred[Any]:
+    def carry_out(self, route: Route, request: RouteRequest) -> Deferred[Any]:
         """Return the answer; a repeated id of the same session gets the first answer again."""
         # A route that a viewer may call changes nothing, whatever its method.
         if route.method == "GET" or route.role == "viewer":
-            return self._call(route, ask)
+            return self._call(route, request)
         # Unauthenticated clients share one identity: a stored answer must not reach another client.
-        if not ask.id or route.role == "anyone":
-            return self._call_audited(route, ask)
-        key = ask.user.token_id, route.name, ask.id
+        if not request.id or route.role == "anyone":
+            return self._call_audited(route, request)
+        key = request.user.token_id, route.name, request.id
         known = self._answers.get(key)
         if known is None:
             known = self._answers[key] = _Answer()
             while len(self._answers) > MAX_ANSWERS:
                 self._answers.popitem(last=False)
-            self._call_audited(route, ask).addBoth(known.set_outcome)
+            self._call_audited(route, request).addBoth(known.set_outcome)
         return known.wait()
 
-    def _call(self, route: Route, ask: RouteRequest) -> Deferred[Any]:
+    def _call(self, route: Route, request: RouteRequest) -> Deferred[Any]:
         assert route.handler is not None
-        return maybeDeferred(route.handler, ask)
+        return maybeDeferred(route.handler, request)
 
-    def _call_audited(self, route: Route, ask: RouteRequest) -> Deferred[Any]:
-        def note(outcome: Any) -> Any:
+    def _call_audited(self, route: Route, request: RouteRequest) -> Deferred[Any]:
+        def write_audit(outcome: Any) -> Any:
             result = str(route.status)
             if isinstance(outcome, Failure):
                 refusal = outcome.value
                 result = f"{refusal.status} {refusal.problem}" if isinstance(refusal, Refusal) else "500"
-            named = {name for name in ask.values if f"{{{name}}}" in route.path}
-            target = " ".join(str(ask.values[name]) for name in sorted(named))
-            ask.services.audit.write(ask.user, ask.source, route.name, target, result)
+            named = {name for name in request.values if f"{{{name}}}" in route.path}
+            target = " ".join(str(request.values[name]) for name in sorted(named))
+            request.services.audit.write(request.user, request.source, route.name, target, result)
             return outcome
 
-        return self._call(route, ask).addBoth(note)
+        return self._call(route, request).addBoth(write_audit)
 
 
 class _Answer:
-    """The outcome of a route's answer, and the requests that wait for it."""
+    """The outcome of a route's handler, and the requests that wait for it."""
 
     def __init__(self) -> None:
         self._outcome: list[Any] = []

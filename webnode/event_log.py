@@ -1,7 +1,7 @@
 """Derive events from successive states of the team.  Pure.
 
 Events: a device arrives or leaves, a task changes its status, a group agrees on an agent, and a takeover with its
-duration.  The chronicle starts with its node and knows nothing earlier.
+duration.  The event log starts with its node and knows nothing earlier.
 """
 
 from __future__ import annotations
@@ -51,8 +51,8 @@ class EventLog:
     there was one.
     """
 
-    def __init__(self, kept: int = MAX_ENTRIES) -> None:
-        self._entries: deque[Entry] = deque(maxlen=kept)
+    def __init__(self, max_entries: int = MAX_ENTRIES) -> None:
+        self._entries: deque[Entry] = deque(maxlen=max_entries)
         self._n = 0
         self._last_state: State = {}
         self._acting: dict[str, set[str]] = {}
@@ -68,8 +68,8 @@ class EventLog:
         self._compare_tasks(_index_rows(before, "tasks", "id"), _rows(state, "tasks"), now)
         ended = {task["id"] for task in _rows(state, "tasks") if task["status"] in ENDED_STATUSES}
         # Reports on a task that has ended expire one after another; agreement among the rest means nothing.
-        confer = [group for group in _rows(state, "groups") if group["task"] not in ended]
-        self._compare_groups(_index_rows(before, "groups", "task"), confer, now)
+        open_groups = [group for group in _rows(state, "groups") if group["task"] not in ended]
+        self._compare_groups(_index_rows(before, "groups", "task"), open_groups, now)
         self._find_takeovers(state, titles, ended, now)
         self._compare_stops(before, state, now)
 
@@ -169,7 +169,7 @@ class EventLog:
             if task in ended or (not self._losses[task].is_gone and now - self._losses[task].at > FAULT_ATTRIBUTION_S):
                 del self._losses[task]
         # Between two acting devices there may be none for some time: keep the last one until the next acts.
-        self._acting = {**{task: who for task, who in self._acting.items() if task not in ended}, **acting}
+        self._acting = {**{task: uuids for task, uuids in self._acting.items() if task not in ended}, **acting}
 
     def _record_takeover(self, task: str, title: str, uuids: set[str], names: Mapping[str, str], now: float) -> None:
         before, loss = self._acting.get(task, set()), self._losses.get(task)

@@ -135,14 +135,16 @@ class TeamFallbacks(Fallbacks):
 
     def list_pages(self) -> list[Page]:
         """Return the pages that gateways serve now, this node's pages first."""
-        here = [each for each in self._served if each.end == inf]
-        may = {
-            public for public in {each.public for each in here} if self.can_authenticate(public) or public == self._own
+        current = [each for each in self._served if each.end == inf]
+        gateways = {
+            public
+            for public in {each.public for each in current}
+            if self.can_authenticate(public) or public == self._own
         }
-        return [each.page for each in here if each.public in may]
+        return [each.page for each in current if each.public in gateways]
 
     def can_authenticate(self, public: bytes) -> bool:
-        """Return whether the node with the key ``public`` may currently authenticate visitors."""
+        """Return whether the node with the key ``public`` may currently authenticate users."""
         if self._node.team is not None:
             return GATEWAY in self._node.team.admission.roles_of(public)
         now = self._clock()
@@ -153,17 +155,17 @@ class TeamFallbacks(Fallbacks):
 
         A loopback origin is accepted if its scheme and port match, as its page comes from this machine.
         """
-        asked, now = get_origin(origin), self._clock()
-        if not asked:
+        wanted, now = get_origin(origin), self._clock()
+        if not wanted:
             return False
-        here = urlsplit(asked)
+        current = urlsplit(wanted)
 
-        def is_there(url: str) -> bool:
+        def is_match(url: str) -> bool:
             known = urlsplit(get_origin(url))
-            is_port = (known.scheme, known.port) == (here.scheme, here.port)
-            return is_port and (known.hostname == here.hostname or is_loopback(here.hostname or ""))
+            is_port = (known.scheme, known.port) == (current.scheme, current.port)
+            return is_port and (known.hostname == current.hostname or is_loopback(current.hostname or ""))
 
-        found = {each.public for each in self._served if each.end > now and is_there(each.page.url)}
+        found = {each.public for each in self._served if each.end > now and is_match(each.page.url)}
         return any(public == self._own or self.can_authenticate(public) for public in found)
 
     def _on_records(self, records: list[Record]) -> None:
@@ -171,15 +173,15 @@ class TeamFallbacks(Fallbacks):
             (device, record.owner) for device, record in parse_devices(records) if device.uuid != self._node.uuid
         ]
         own = self._node.presence.device
-        here = [
+        current = [
             _Served(public, page)
             for device, public in [(Device(self._node.uuid, own.name, pages=own.pages), self._own), *devices]
             for page in find_pages([device], self._node.uuid)
         ]
-        now, known = self._clock(), {(each.public, each.page.url) for each in here}
-        gone = [
+        now, known = self._clock(), {(each.public, each.page.url) for each in current}
+        departed = [
             replace(each, end=min(each.end, now + ORIGIN_KEPT_S))
             for each in self._served
             if each.end > now and (each.public, each.page.url) not in known
         ]
-        self._served = here + sorted(gone, key=lambda each: -each.end)[:MAX_GONE]
+        self._served = current + sorted(departed, key=lambda each: -each.end)[:MAX_GONE]

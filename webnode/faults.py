@@ -71,9 +71,9 @@ class FaultControl:
             return fail(Refusal("device", "it has left the network", "wait until it is back", 409))
         name = self._names.get(uuid, "it")
         if kind not in self.get_kinds(uuid):
-            can = ", ".join(self.get_kinds(uuid))
-            remedy = f"choose one of {can}" if can else 'set "allow = true" below [faults] in its settings'
-            return fail(Refusal("kind" if can else "device", f"{name} does not allow {kind}", remedy, 409))
+            allowed = ", ".join(self.get_kinds(uuid))
+            remedy = f"choose one of {allowed}" if allowed else 'set "allow = true" below [faults] in its settings'
+            return fail(Refusal("kind" if allowed else "device", f"{name} does not allow {kind}", remedy, 409))
         task = find_executing(device for device, _ in parse_devices(self._watch.records)).get(uuid, "")
 
         def add_fault(answer: object) -> None:
@@ -91,10 +91,10 @@ class FaultControl:
             problem = clean_text(failure.getErrorMessage(), "it refused")
             raise Refusal("device", f"{name}: {problem}", "check its settings", 409)
 
-        asked = self._node.entangled.call(
+        call = self._node.entangled.call(
             contact, CAUSE_METHOD, fault.kind, fault.seconds, amount, timeout=ANSWER_LIMIT_S, changes=True
         )
-        return asked.addCallbacks(add_fault, refused)
+        return call.addCallbacks(add_fault, refused)
 
     def list_active(self) -> list[dict[str, Json]]:
         """Return the faults that are active or ended recently, newest first.
@@ -109,28 +109,28 @@ class FaultControl:
 
     # -- inside -----------------------------------------------------------------------------------------------------
 
-    def _make_row(self, caused: _InjectedFault, now: float) -> dict[str, Json]:
-        clock, fault = caused.takeover, caused.fault
+    def _make_row(self, injected: _InjectedFault, now: float) -> dict[str, Json]:
+        takeover, fault = injected.takeover, injected.fault
         return {
-            "n": caused.n,
-            "uuid": clock.lost,
-            "name": caused.name,
+            "n": injected.n,
+            "uuid": takeover.lost,
+            "name": injected.name,
             "kind": fault.kind,
             "amount": fault.amount if KINDS[fault.kind].unit else None,
-            "left_s": round(min(fault.seconds, max(0.0, clock.until - now)), 1),
-            "since_s": round(max(0.0, now - clock.began), 1),
-            "task": clock.task,
-            "takeover_s": None if clock.seconds is None else round(clock.seconds, 2),
-            "to": self._names.get(clock.to, clock.to[:8]),
-            "watched": clock.is_open(now),
+            "left_s": round(min(fault.seconds, max(0.0, takeover.until - now)), 1),
+            "since_s": round(max(0.0, now - takeover.began), 1),
+            "task": takeover.task,
+            "takeover_s": None if takeover.seconds is None else round(takeover.seconds, 2),
+            "to": self._names.get(takeover.to, takeover.to[:8]),
+            "watched": takeover.is_open(now),
         }
 
     def _on_records(self, records: list[Record]) -> None:
         devices = parse_devices(records)
-        acts, now = find_executing(device for device, _ in devices), self._clock()
+        executing, now = find_executing(device for device, _ in devices), self._clock()
         self._names.update({device.uuid: device.name for device, _ in devices})
         for each in self._injected:
-            each.takeover.observe(acts, now)
+            each.takeover.observe(executing, now)
         for device, record in devices:
             if device.uuid not in self._queried:
                 self._queried.add(device.uuid)
@@ -158,5 +158,5 @@ class FaultControl:
             else:
                 self._kinds.pop(uuid, None)
 
-        asked = self._node.entangled.call(contact, LIST_METHOD).addCallbacks(store_kinds, handle_failure)
-        asked.addErrback(lambda failure: self._log.failure("cannot read which faults a device allows", failure))
+        call = self._node.entangled.call(contact, LIST_METHOD).addCallbacks(store_kinds, handle_failure)
+        call.addErrback(lambda failure: self._log.failure("cannot read which faults a device allows", failure))

@@ -1,6 +1,6 @@
 """Check which requests a page on a LAN may answer, and set strict security headers.  Pure.
 
-The page uses no cookies, so another site can only send requests through a visitor's browser.  Three checks stop them:
+The page uses no cookies, so another site can only send requests through a user's browser.  Three checks stop them:
 ``Host`` must be an address or a name of this machine (against DNS rebinding), ``Origin`` must be the page's own or
 belong to another web node of the team, and a request that changes something must be of a kind that an HTML form cannot
 send.
@@ -75,12 +75,17 @@ def is_own_origin(origin: str | None, host: str) -> bool:
 
 
 def find_refusal(
-    method: str, host: str, origin: str | None, is_marked: bool, names: Collection[str], lets_in: IsAllowedOrigin
+    method: str,
+    host: str,
+    origin: str | None,
+    has_csrf_header: bool,
+    names: Collection[str],
+    is_allowed_origin: IsAllowedOrigin,
 ) -> Refusal | None:
     """Return why a request is rejected, or None.
 
-    ``is_marked``: the request carries a header or content type that an HTML form cannot send.  ``lets_in`` accepts the
-    origins of the team's other web nodes.
+    ``has_csrf_header``: the request carries a header or content type that an HTML form cannot send.
+    ``is_allowed_origin`` accepts the origins of the team's other web nodes.
     """
     if not is_own_host(host, names):
         return Refusal(
@@ -88,16 +93,16 @@ def find_refusal(
         )
     if method in ("GET", "HEAD"):
         return None
-    if not is_own_origin(origin, host) and not lets_in(origin or ""):
+    if not is_own_origin(origin, host) and not is_allowed_origin(origin or ""):
         return Refusal("Origin", "request from another site", "use the node's own page", 403)
-    if method != "OPTIONS" and not is_marked:
+    if method != "OPTIONS" and not has_csrf_header:
         return Refusal("X-Swarm", "the header is missing", "send 'X-Swarm: 1' or JSON with its content type", 403)
     return None
 
 
-def make_headers(host: str, origin: str | None, lets_in: IsAllowedOrigin) -> dict[str, str]:
+def make_headers(host: str, origin: str | None, is_allowed_origin: IsAllowedOrigin) -> dict[str, str]:
     """Return the security headers of a response to ``origin``."""
-    if origin is None or is_own_origin(origin, host) or not lets_in(origin):
+    if origin is None or is_own_origin(origin, host) or not is_allowed_origin(origin):
         return HEADERS
     return {**HEADERS, **SHARED_HEADERS, "Access-Control-Allow-Origin": origin}
 

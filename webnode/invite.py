@@ -25,9 +25,9 @@ def make_qr_code(text: str) -> str:
     if not text:
         return ""
     drawing = io.BytesIO()
-    made = segno.make(text, micro=False, error="m", boost_error=False)
-    looks: dict[str, Any] = {"svgclass": None, "lineclass": None, "omitsize": True, "xmldecl": False, "nl": False}
-    made.save(drawing, kind="svg", border=MARGIN, **looks)
+    qr_code = segno.make(text, micro=False, error="m", boost_error=False)
+    options: dict[str, Any] = {"svgclass": None, "lineclass": None, "omitsize": True, "xmldecl": False, "nl": False}
+    qr_code.save(drawing, kind="svg", border=MARGIN, **options)
     return drawing.getvalue().decode()
 
 

@@ -24,7 +24,7 @@ KEYS: Mapping[str, str] = {"devices": "uuid", "tasks": "id", "groups": "task"}
 class Change:
     """The difference between two states: new and changed rows, ids of removed rows, and changed values.
 
-    ``words`` is ``content`` as JSON, encoded once for all pages.
+    ``encoded`` is ``content`` as JSON, encoded once for all pages.
     """
 
     n: int

@@ -15,7 +15,7 @@ class UnsafeFile(Exception):
 
 
 def read_key_file(path: Path) -> bytes | None:
-    """Read the file, None if it does not exist; raises ``Unsafe`` if other users could have read or written it."""
+    """Read the file, None if it does not exist; raises ``UnsafeFile`` if other users could have read or written it."""
     try:
         descriptor = os.open(path, os.O_RDONLY | os.O_NOFOLLOW | os.O_NONBLOCK)
     except FileNotFoundError:
@@ -23,13 +23,13 @@ def read_key_file(path: Path) -> bytes | None:
     except OSError as error:
         raise UnsafeFile(f"it cannot be read ({error.strerror})") from error
     try:
-        about = os.fstat(descriptor)
-        if not stat.S_ISREG(about.st_mode):
+        status = os.fstat(descriptor)
+        if not stat.S_ISREG(status.st_mode):
             raise UnsafeFile("it is not a regular file")
-        if about.st_uid not in (os.geteuid(), 0):
+        if status.st_uid not in (os.geteuid(), 0):
             raise UnsafeFile("it belongs to another user")
-        if about.st_mode & 0o077:
-            raise UnsafeFile(f"other users can read or write it (mode {stat.S_IMODE(about.st_mode):o})")
+        if status.st_mode & 0o077:
+            raise UnsafeFile(f"other users can read or write it (mode {stat.S_IMODE(status.st_mode):o})")
         return os.read(descriptor, MAX_FILE_BYTES)
     finally:
         os.close(descriptor)

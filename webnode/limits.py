@@ -14,8 +14,8 @@ MAX_OPEN: dict[CountedKind, int] = {"unfinished": 16, "stream": 128, "open": 256
 class AddressLimits:
     """Counts the open connections and requests of each address."""
 
-    def __init__(self, most: dict[CountedKind, int] = MAX_OPEN) -> None:
-        self._max_open = most
+    def __init__(self, max_open: dict[CountedKind, int] = MAX_OPEN) -> None:
+        self._max_open = max_open
         self._counts: Counter[tuple[CountedKind, str]] = Counter()
 
     def can_open(self, kind: CountedKind, address: str) -> bool:

@@ -37,11 +37,11 @@ CHECK_S = 1.0
 RENEWAL_LEAD_S = 3600.0
 """Seconds before the end of a session at which the page is asked to renew it."""
 IDLE_S = 1.0
-"""Interval of reading the state without any stream, for the chronicle and to expire departed devices."""
+"""Interval of reading the state without any stream, for the event log and to expire departed devices."""
 MAX_VIEWERS = 256
 MAX_WAITING = 256
 MAX_NEW_ENTRIES = 100
-"""Number of chronicle entries sent to a new page."""
+"""Number of event log entries sent to a new page."""
 SEND_BUFFER_BYTES, KERNEL_BUFFER_BYTES = 4096, 16384
 """Send buffer limits in bytes for a slow client, here and in the kernel: buffered data would be seconds old."""
 
@@ -53,15 +53,15 @@ StreamCamera = Callable[[str, OnFrame], Callable[[], None]]
 class Viewer:
     """One open event stream; the transport pauses it while its client reads too slowly.
 
-    ``heard`` is the number of the last change sent, ``entry`` the number of the last chronicle entry.
+    ``last_change`` is the number of the last change sent, ``last_entry`` the number of the last entry of the event log.
     """
 
-    def __init__(self, request: Request, is_whole: bool = False, heard: int = 0, ticket: str = "") -> None:
+    def __init__(self, request: Request, is_whole: bool = False, last_change: int = 0, ticket: str = "") -> None:
         self.request = request
         self.ticket = ticket
         self.is_renewing = False
         self.is_whole = is_whole
-        self.last_change = heard
+        self.last_change = last_change
         self.last_entry = 0
         self.paused = False
         self.skipped = 0
@@ -94,9 +94,9 @@ class Viewer:
 class EventStreams(JsonResource):
     """``/events?since=ID&whole=1``: the state, then changes, at most ten per second; a ``beat`` five times a second.
 
-    Events are ``state`` (``state.state_of``; ``resync`` is true if it replaces missed changes), ``change``
+    Events are ``state`` (``state.format_state``; ``resync`` is true if it replaces missed changes), ``change``
     (``journal.Change``), ``yard`` (the map of the simulator, or null), ``pages`` (the URLs of the team's pages),
-    ``event`` (entries of the chronicle), ``ticket`` (the session expires at ``until`` and can be renewed) and ``beat``
+    ``event`` (entries of the event log), ``ticket`` (the session expires at ``until`` and can be renewed) and ``beat``
     (``now`` in unix seconds, ``skipped``: the number of updates skipped for this slow client).  ``since``, or the
     header ``Last-Event-ID``, is the last id received: later changes are sent if they are still kept and smaller than
     the whole state.  With ``whole`` each change is a ``state``.  A stream ends with its session.
@@ -112,17 +112,17 @@ class EventStreams(JsonResource):
         read: Callable[[], State],
         clock: IReactorTime,
         wall: Callable[[], float],
-        board: Services,
+        services: Services,
         version: Callable[[], object] | None = None,
     ) -> None:
         super().__init__()
         self._read = read
         self._clock = clock
         self._wall = wall
-        self._board = board
+        self._services = services
         self._latest_sources: dict[str, Callable[[], Any]] = {
-            "yard": lambda: board.control.get_map(),
-            "pages": lambda: [asdict(page) for page in board.fallbacks.list_pages()],
+            "yard": lambda: services.control.get_map(),
+            "pages": lambda: [asdict(page) for page in services.fallbacks.list_pages()],
         }
         self._version = version
         self._checked_at = 0.0
@@ -143,7 +143,7 @@ class EventStreams(JsonResource):
         return len(self._viewers)
 
     def start(self) -> None:
-        """Start to read the state for the chronicle, also without any stream."""
+        """Start to read the state for the event log, also without any stream."""
         self._is_open = True
         self._schedule(IDLE_S)
 
@@ -190,7 +190,7 @@ class EventStreams(JsonResource):
         self._read_state()
         if not self._viewers:
             return
-        news, is_beat = self._encode_latest(), self._clock.seconds() >= self._beat_at
+        latest, is_beat = self._encode_latest(), self._clock.seconds() >= self._beat_at
         if is_beat:
             self._beat_at = self._clock.seconds() + BEAT_S - CHANGES_INTERVAL_S / 2
         is_checked = self._clock.seconds() >= self._checked_at
@@ -204,7 +204,7 @@ class EventStreams(JsonResource):
                 continue
             text = (
                 self._make_backlog(viewer, True)
-                + self._make_latest_events(viewer, news)
+                + self._make_latest_events(viewer, latest)
                 + (self._make_beat(viewer) if is_beat else "")
             )
             if text:
@@ -213,13 +213,18 @@ class EventStreams(JsonResource):
     def _check_session(self, viewer: Viewer) -> bool:
         """End the stream of an expired session; announce the expiry of one that can be renewed."""
         now = self._wall()
-        who = self._board.sessions.authenticate(viewer.ticket, now)
-        if who.role == "anyone":
+        user = self._services.sessions.authenticate(viewer.ticket, now)
+        if user.role == "anyone":
             self._end(viewer)
             return False
-        if not viewer.is_renewing and not viewer.paused and who.until - now < RENEWAL_LEAD_S and who.until < who.limit:
+        if (
+            not viewer.is_renewing
+            and not viewer.paused
+            and user.until - now < RENEWAL_LEAD_S
+            and user.until < user.limit
+        ):
             viewer.is_renewing = True
-            viewer.request.write(_format_event("ticket", encode_json({"until": who.until})).encode())
+            viewer.request.write(_format_event("ticket", encode_json({"until": user.until})).encode())
         return True
 
     def _end(self, viewer: Viewer) -> None:
@@ -237,11 +242,11 @@ class EventStreams(JsonResource):
         self._known_version, self._read_at = version, now
         with_state = self._call_logged("state", lambda: self._journal.add_state(self._read()))
         if with_state:
-            self._board.event_log.record_state(self._journal.state, self._wall())
+            self._services.event_log.record_state(self._journal.state, self._wall())
         self._read_duration_s = self._clock.seconds() - now
 
     def _make_backlog(self, viewer: Viewer, is_again: bool) -> str:
-        """Return the missed changes or the whole state, whichever is smaller, and the missed chronicle entries."""
+        """Return the missed changes or the whole state, whichever is smaller, and the missed event log entries."""
         journal, text = self._journal, []
         missed = None if viewer.is_whole else journal.list_since(viewer.last_change)
         if (
@@ -254,11 +259,10 @@ class EventStreams(JsonResource):
             text = [f"id: {journal.make_event_id(each.n)}\nevent: change\ndata: {each.encoded}\n\n" for each in missed]
         elif viewer.last_change < journal.n:
             start = "true," if is_again and not viewer.is_whole else "false,"
-            text = [
-                f'id: {journal.make_event_id(journal.n)}\nevent: state\ndata: {{"resync":{start}{self._encoded_state()}\n\n'
-            ]
+            event_id = journal.make_event_id(journal.n)
+            text = [f'id: {event_id}\nevent: state\ndata: {{"resync":{start}{self._encoded_state()}\n\n']
         viewer.last_change = journal.n
-        entries = self._board.event_log.list_since(viewer.last_entry)[-MAX_NEW_ENTRIES:]
+        entries = self._services.event_log.list_since(viewer.last_entry)[-MAX_NEW_ENTRIES:]
         if entries:
             viewer.last_entry = entries[-1].n
             text.append(_format_event("event", encode_json([asdict(entry) for entry in entries])))
@@ -270,9 +274,9 @@ class EventStreams(JsonResource):
             self._encoded = (self._journal.n, encode_json(self._journal.state)[1:])
         return self._encoded[1]
 
-    def _make_latest_events(self, viewer: Viewer, news: Mapping[str, str]) -> str:
+    def _make_latest_events(self, viewer: Viewer, latest: Mapping[str, str]) -> str:
         """Return the events of which only the newest counts, if the viewer has not received them yet."""
-        fresh = {event: text for event, text in news.items() if viewer.sent_latest.get(event) != text}
+        fresh = {event: text for event, text in latest.items() if viewer.sent_latest.get(event) != text}
         viewer.sent_latest |= fresh
         return "".join(_format_event(event, text) for event, text in fresh.items())
 
@@ -325,9 +329,9 @@ class CameraImages(JsonResource):
     new picture.  A second request of the same viewer ends its first with 204, so one picture is in flight per viewer.
     """
 
-    def __init__(self, watch: StreamCamera, clock: IReactorTime) -> None:
+    def __init__(self, stream_camera: StreamCamera, clock: IReactorTime) -> None:
         super().__init__()
-        self._watch = watch
+        self._stream_camera = stream_camera
         self._clock = clock
         self._cameras: dict[str, CameraStream] = {}
 
@@ -345,7 +349,9 @@ class CameraImages(JsonResource):
         camera = self._cameras.get(uuid)
         if camera is None:
             try:
-                camera = CameraStream(self._clock, lambda seen: self._watch(uuid, seen), lambda: self._end(uuid))
+                camera = CameraStream(
+                    self._clock, lambda on_frame: self._stream_camera(uuid, on_frame), lambda: self._end(uuid)
+                )
             except Refusal as refusal:
                 return write_refusal(request, refusal)
             self._cameras[uuid] = camera
@@ -368,9 +374,9 @@ class CameraImages(JsonResource):
 class _CameraImage(JsonResource):
     isLeaf = True
 
-    def __init__(self, shots: CameraImages, uuid: str) -> None:
+    def __init__(self, images: CameraImages, uuid: str) -> None:
         super().__init__()
-        self._images = shots
+        self._images = images
         self._uuid = uuid
 
     def render_GET(self, request: Request) -> int | bytes:

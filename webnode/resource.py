@@ -32,8 +32,8 @@ class JsonResource(Resource):
             request.setHeader("Allow", b", ".join(self.methods).decode())
             allowed = " or ".join(method.decode() for method in self.methods)
             return write_refusal(request, Refusal(get_path(request), "method not allowed", f"use {allowed}", 405))
-        told: int | bytes = super().render(request)
-        return told
+        body: int | bytes = super().render(request)
+        return body
 
 
 class RefusedResource(Resource):

@@ -25,7 +25,7 @@ ID_BYTES = 8
 
 
 class Revocations:
-    """The revoked sessions of one web node, not shared; ``has`` may be called on any thread."""
+    """The revoked sessions of one web node, not shared; ``is_revoked`` may be called on any thread."""
 
     def __init__(self) -> None:
         self._known: dict[str, float] = {}
@@ -80,8 +80,8 @@ def read_revocations(record: Record) -> Mapping[str, float]:
     }
 
 
-def _select_newest(ends: Mapping[str, float], most: int) -> dict[str, float]:
-    return dict(list(ends.items())[-most:])
+def _select_newest(ends: Mapping[str, float], max_count: int) -> dict[str, float]:
+    return dict(list(ends.items())[-max_count:])
 
 
 def _ignore_failure(failure: Any) -> None:

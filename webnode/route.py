@@ -1,7 +1,7 @@
 """Describe a route of the API as data, and check requests against it.  Pure.
 
-A route lists the fields of its path, query and body.  ``checked`` converts a request or refuses it with the name of the
-field.  An answer gets an ``Ask`` and knows neither HTTP nor Flask.
+A route lists the fields of its path, query and body.  ``check_request`` converts a request or refuses it with the name
+of the field.  A handler gets a ``RouteRequest`` and knows neither HTTP nor Flask.
 """
 
 from __future__ import annotations
@@ -35,14 +35,14 @@ Kind = Literal["text", "number", "whole", "flag", "choice", "table", "list"]
 Handler = Callable[["RouteRequest"], Any]
 """Called on the reactor's thread; returns JSON or ``Content``, or a Deferred of it, and raises ``Refusal``."""
 Native = Callable[[Services, Any], Any]
-"""Makes the Twisted resource of a route from the board and the reactor, once, when the service is created."""
+"""Makes the Twisted resource of a route from the services and the reactor, once, when the service is created."""
 
 
 @dataclass(frozen=True)
 class Field:
     """One parameter of a route.
 
-    ``least`` and ``most`` bound a number, the characters of a text (default 1 to 300) or the entries of a list.
+    ``minimum`` and ``maximum`` bound a number, the characters of a text (default 1 to 300) or the entries of a list.
     ``default`` is used if the field is missing; a field without a default is required.
     """
 
@@ -65,7 +65,7 @@ class RouteRequest:
     """A checked request for a route.
 
     ``id`` is the client's ``Idempotency-Key`` or empty: repeated requests with one id are carried out once.  ``source``
-    is the client's address, ``now`` unix seconds, ``table`` all routes.
+    is the client's address, ``now`` unix seconds, ``routes`` all routes.
     """
 
     values: Mapping[str, Any]
@@ -90,8 +90,8 @@ class Content:
 class Route:
     """One route of the API.
 
-    With ``answer`` None the route is served by a Twisted resource, made by ``native`` or by ``server``, instead of
-    Flask.  ``limit_s`` replaces the usual time limit of an answer; ``takes`` is the media type of a native body.
+    With ``handler`` None the route is served by a Twisted resource, made by ``native`` or by ``server``, instead of
+    Flask.  ``limit_s`` replaces the usual time limit of an answer; ``body_type`` is the media type of a native body.
     """
 
     method: Literal["GET", "POST", "PUT", "DELETE"]
@@ -112,14 +112,14 @@ class Route:
         return f"{self.method} {self.path}"
 
 
-def check_role(role: Role, who: User) -> None:
-    """Check that ``who`` has the role ``role``; raises ``Refusal`` otherwise."""
-    if who.role in ALLOWED_ROLES[role]:
+def check_role(role: Role, user: User) -> None:
+    """Check that ``user`` has the role ``role``; raises ``Refusal`` otherwise."""
+    if user.role in ALLOWED_ROLES[role]:
         return
-    if who.role == "anyone":
+    if user.role == "anyone":
         remedy = f"sign in at POST {API}/session, and send 'Authorization: Bearer TOKEN' or ?ticket=TICKET"
         raise Refusal("Authorization", "not signed in", remedy, 401)
-    raise Refusal("Authorization", f"a {who.role} may not do this", f"sign in as {role}", 403)
+    raise Refusal("Authorization", f"a {user.role} may not do this", f"sign in as {role}", 403)
 
 
 def check_request(route: Route, path: Mapping[str, str], query: Mapping[str, str], body: object) -> dict[str, Any]:
@@ -131,22 +131,22 @@ def check_request(route: Route, path: Mapping[str, str], query: Mapping[str, str
     for name in body:
         if name not in known:
             raise Refusal(clean_text(name, "body", 64), "unknown field", _suggest_field(name, known))
-    given: dict[str, Any] = dict(path)
+    values: dict[str, Any] = dict(path)
     for field in route.fields:
         place = places[field.where]
         if field.name in place:
             value = place[field.name]
-            given[field.name] = _convert_field(field, value if field.where == "body" else _convert_text(field, value))
+            values[field.name] = _convert_field(field, value if field.where == "body" else _convert_text(field, value))
         elif field.default is REQUIRED:
             raise Refusal(field.name, "it is missing", f"give {field.description}")
         else:
-            given[field.name] = field.default
-    return given
+            values[field.name] = field.default
+    return values
 
 
-def find_device(ask: RouteRequest) -> State:
+def find_device(request: RouteRequest) -> State:
     """Return the device of the path's ``uuid``; raises ``Refusal`` 404 if it is unknown, 409 if it has left."""
-    found = [each for each in ask.state["devices"] if each["uuid"] == ask.values["uuid"]]
+    found = [each for each in request.state["devices"] if each["uuid"] == request.values["uuid"]]
     if not found:
         raise Refusal("device", "unknown device", f"choose one of {API}/devices", 404)
     if found[0]["status"] == GONE:
@@ -159,33 +159,35 @@ def _suggest_field(name: object, known: Collection[str]) -> str:
     return f"leave it out; {near}"
 
 
-def _convert_text(field: Field, word: str) -> object:
+def _convert_text(field: Field, text: str) -> object:
     """Convert the text of a path or query field; an invalid text stays as it is and fails the check."""
     if field.kind in ("number", "whole"):
         try:
-            return float(word)
+            return float(text)
         except ValueError:
-            return word
-    return {"true": True, "false": False}.get(word, word) if field.kind == "flag" else word
+            return text
+    return {"true": True, "false": False}.get(text, text) if field.kind == "flag" else text
 
 
 def make_type_hint(field: Field) -> Any:
     """Return the type of a field with its bounds, for conversion and documentation."""
-    least, most = field.minimum, field.maximum
+    minimum, maximum = field.minimum, field.maximum
     match field.kind:
         case "text":  # may be a password, so errors must not repeat it
             return Annotated[
-                str, Meta(min_length=int(1 if least is None else least), max_length=_get_max_length(field)), Secret()
+                str,
+                Meta(min_length=int(1 if minimum is None else minimum), max_length=_get_max_length(field)),
+                Secret(),
             ]
         case "number" | "whole":
-            low, high = -MAX_NUMBER if least is None else least, MAX_NUMBER if most is None else most
+            low, high = -MAX_NUMBER if minimum is None else minimum, MAX_NUMBER if maximum is None else maximum
             if field.kind == "whole":
                 return Annotated[int, Meta(ge=int(low), le=int(high))]
             return Annotated[float, Meta(ge=low, le=high), *([Unit(field.unit)] if field.unit else [])]
         case "choice":
             return Literal[field.choices]
         case "list":
-            return Annotated[list[Any], Meta(min_length=int(least or 0), max_length=int(most or MAX_ENTRIES))]
+            return Annotated[list[Any], Meta(min_length=int(minimum or 0), max_length=int(maximum or MAX_ENTRIES))]
     return {"flag": bool, "table": dict[str, Any]}[field.kind]
 
 

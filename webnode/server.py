@@ -100,15 +100,17 @@ class _StaticFile(JsonResource):
         self._kind = kind + ("; charset=utf-8" if kind.startswith("text/") else "")
 
     def render_GET(self, request: Request) -> bytes:
-        form = "gzip" if "gzip" in self._encodings and _accepts_gzip(request.getHeader("accept-encoding") or "") else ""
+        encoding = (
+            "gzip" if "gzip" in self._encodings and _accepts_gzip(request.getHeader("accept-encoding") or "") else ""
+        )
         request.setHeader("Content-Type", self._kind)
         request.setHeader("Cache-Control", "no-cache")
         request.setHeader("Vary", "Accept-Encoding")
-        if request.setETag(f'"{self._tag}{form}"'.encode()) is CACHED:
+        if request.setETag(f'"{self._tag}{encoding}"'.encode()) is CACHED:
             return b""
-        if form:
-            request.setHeader("Content-Encoding", form)
-        return self._encodings[form]
+        if encoding:
+            request.setHeader("Content-Encoding", encoding)
+        return self._encodings[encoding]
 
 
 def read_static(path: Path) -> bytes:
@@ -136,7 +138,7 @@ class Root(Resource):
         self,
         flask: IResource,
         native: dict[str, Resource],
-        board: Services,
+        services: Services,
         wall: Callable[[], float],
         hosts: Collection[str] = (),
     ) -> None:
@@ -146,16 +148,16 @@ class Root(Resource):
             (tuple(path.strip("/").encode().split(b"/")), resource, _get_role(path))
             for path, resource in sorted(native.items(), key=lambda item: -item[0].count("/"))
         ]
-        self._board = board
+        self._services = services
         self._wall = wall
         self._hosts = hosts
 
     def getChild(self, path: bytes, request: SiteRequest) -> IResource:
         """Return the resource for ``path``."""
         assert request.prepath is not None and request.postpath is not None
-        asked = (path, *request.postpath)
+        segments = (path, *request.postpath)
         for pattern, resource, role in self._native:
-            if _is_match(asked, pattern):
+            if _is_match(segments, pattern):
                 for _ in pattern[1:]:
                     request.prepath.append(request.postpath.pop(0))
                 return self._check_role(resource, role, request)
@@ -165,24 +167,24 @@ class Root(Resource):
 
     def _check_role(self, resource: Resource, role: Role, request: SiteRequest) -> IResource:
         host, origin = request.getHeader("host") or "", request.getHeader("origin")
-        lets_in = self._board.fallbacks.is_allowed_origin
-        for name, value in make_headers(host, origin, lets_in).items():
+        is_allowed_origin = self._services.fallbacks.is_allowed_origin
+        for name, value in make_headers(host, origin, is_allowed_origin).items():
             request.setHeader(name, value)
         method = (request.method or b"").decode("ascii", "replace")
         # navigator.sendBeacon, which a phone uses when its page is closed, cannot set headers.
-        is_marked = role == "phone" or request.getHeader("x-swarm") == "1" or method == "GET"
-        problem = find_refusal(method, host, origin, is_marked, self._hosts, lets_in)
+        has_csrf_header = role == "phone" or request.getHeader("x-swarm") == "1" or method == "GET"
+        problem = find_refusal(method, host, origin, has_csrf_header, self._hosts, is_allowed_origin)
         if problem is not None:
             return RefusedResource(problem)
         if method == "OPTIONS":
             return _Preflight()
         try:
-            who = self._board.sessions.authenticate(read_token(request), self._wall())
-            check_role(role, who)
-        except Refusal as no:
-            return RefusedResource(no)
+            user = self._services.sessions.authenticate(read_token(request), self._wall())
+            check_role(role, user)
+        except Refusal as refusal:
+            return RefusedResource(refusal)
         if isinstance(request, LimitedRequest):
-            request.who = who
+            request.authenticated_user = user
         return resource
 
 
@@ -196,10 +198,10 @@ class _Preflight(Resource):
         return b""
 
 
-def _is_match(asked: Sequence[bytes], pattern: Sequence[bytes]) -> bool:
-    return len(asked) >= len(pattern) and all(
+def _is_match(segments: Sequence[bytes], pattern: Sequence[bytes]) -> bool:
+    return len(segments) >= len(pattern) and all(
         segment == wanted or (wanted.startswith(b"{") and segment != b"")
-        for segment, wanted in zip(asked, pattern, strict=False)
+        for segment, wanted in zip(segments, pattern, strict=False)
     )
 
 
@@ -239,8 +241,8 @@ class WebService(Service):
 
     ``startService`` raises ``PortTaken`` (one line for the operator) if the port is not available; with port 0 the
     property ``port`` has the chosen one.  ``read`` returns the newest state on any thread, ``live`` on the reactor's
-    thread (default: ``read``); ``version`` can avoid reading it again (see ``Events``).  ``wall`` returns unix time in
-    seconds.  ``doors`` open further ports for the same page.
+    thread (default: ``read``); ``version`` can avoid reading it again (see ``EventStreams``).  ``wall`` returns unix
+    time in seconds.  ``port_openers`` open further ports for the same page.
     """
 
     name = "web"
@@ -251,27 +253,27 @@ class WebService(Service):
         host: str,
         port: int,
         read: Callable[[], State],
-        board: Services,
+        services: Services,
         wall: Callable[[], float],
         hosts: Collection[str] = (),
-        doors: Sequence[OpenPort] = (),
+        port_openers: Sequence[OpenPort] = (),
         live: Callable[[], State] | None = None,
         version: Callable[[], object] | None = None,
     ) -> None:
         self._reactor = reactor
         self._host = host
         self._configured_port = port
-        self._port_openers = doors
+        self._port_openers = port_openers
         self._pool = ThreadPool(1, WORKERS, "web")
-        flask = WSGIResource(reactor, self._pool, create_app(read, board, make_caller(reactor), hosts, wall))
-        self._events = EventStreams(live or read, reactor, wall, board, version)
-        self._camera_images = CameraImages(board.control.stream_camera, reactor)
+        flask = WSGIResource(reactor, self._pool, create_app(read, services, make_caller(reactor), hosts, wall))
+        self._events = EventStreams(live or read, reactor, wall, services, version)
+        self._camera_images = CameraImages(services.control.stream_camera, reactor)
         native: dict[str, Resource] = {"/events": self._events, "/shot": self._camera_images, "/static": StaticFiles()}
-        native.update({route.path: route.native(board, reactor) for route in TABLE if route.native is not None})
-        root = Root(flask, native, board, wall, hosts)
+        native.update({route.path: route.native(services, reactor) for route in TABLE if route.native is not None})
+        root = Root(flask, native, services, wall, hosts)
         self.site = QuietSite(root, requestFactory=LimitedRequest, timeout=30)
         self.site.displayTracebacks = False
-        limit_connections(self.site, board.limits)
+        limit_connections(self.site, services.limits)
         self._listening: IListeningPort | None = None
         self._secure_ports: list[IListeningPort] = []
 
@@ -287,19 +289,19 @@ class WebService(Service):
     @property
     def secure_port(self) -> int:
         """The first of the further ports; 0 if there is none or the service has not started."""
-        return next((int(getattr(door.getHost(), "port", 0)) for door in self._secure_ports), 0)
+        return next((int(getattr(opener.getHost(), "port", 0)) for opener in self._secure_ports), 0)
 
     def urls(self, names: Collection[str]) -> list[str]:
         """Return the URLs of the page; ``names`` are this machine's, for a page at all addresses."""
-        doors = make_urls(self._host, self.secure_port, names, is_secure=True) if self.secure_port else []
-        return [*make_urls(self._host, self.port, names), *doors]
+        port_openers = make_urls(self._host, self.secure_port, names, is_secure=True) if self.secure_port else []
+        return [*make_urls(self._host, self.port, names), *port_openers]
 
     def startService(self) -> None:
         """Open the ports, then start the workers."""
         self._listening = open_port(self._reactor, self._host, self._configured_port, self.site, "port")
         try:
-            for door in self._port_openers:
-                self._secure_ports.append(door(self.site))
+            for opener in self._port_openers:
+                self._secure_ports.append(opener(self.site))
         except PortTaken:
             for port in (self._listening, *self._secure_ports):
                 port.stopListening()

@@ -1,4 +1,4 @@
-"""Collect the services that the answers of routes use.  All of them are called on the reactor's thread."""
+"""Collect the services that the handlers of routes use.  All of them are called on the reactor's thread."""
 
 from __future__ import annotations
 
@@ -55,7 +55,7 @@ class Phones(Protocol):
 
 @dataclass
 class Services:
-    """The services of one web node; a service that the node lacks is None, and ``has`` tells the page so."""
+    """The services of one web node; a service that the node lacks is None, and ``feature_names`` tells the page so."""
 
     control: TeamControl
     sessions: Sessions
@@ -63,8 +63,8 @@ class Services:
     event_log: EventLog = field(default_factory=EventLog)
     fallbacks: Fallbacks = field(default_factory=Fallbacks)
     limits: AddressLimits = field(default_factory=AddressLimits)
-    survey: Diagnostics | None = None
-    halts: StopControl | None = None
+    diagnostics: Diagnostics | None = None
+    stop_control: StopControl | None = None
     faults: FaultControl | None = None
     phones: Phones | None = None
     invites: Invites | None = None
@@ -72,6 +72,12 @@ class Services:
     @property
     def feature_names(self) -> list[str]:
         """Return the names of the optional services that this node has, for the page."""
-        parts = ("survey", "halts", "faults", "phones", "invites")
-        yard = ["yard"] if self.control.get_map() is not None else []
-        return yard + [name for name in parts if getattr(self, name) is not None]
+        features: Mapping[str, object] = {
+            "yard": self.control.get_map(),
+            "survey": self.diagnostics,
+            "halts": self.stop_control,
+            "faults": self.faults,
+            "phones": self.phones,
+            "invites": self.invites,
+        }
+        return [name for name, service in features.items() if service is not None]

@@ -1,4 +1,4 @@
-"""Sign visitors in to the page, by the code printed at start, a password or an invitation."""
+"""Sign users in to the page, by the code printed at start, a password or an invitation."""
 
 from __future__ import annotations
 
@@ -54,31 +54,31 @@ class SignedSessions:
 
     ``code`` signs in operators, and so does the password with the hash ``password`` if that is not empty.  The token of
     a valid session also works as a code, for the same role and until the same time: this is an invitation.  ``key``
-    signs for this web node.  ``may_vouch`` returns whether the node with a public key is a gateway of the team now; a
-    session is valid while all its vouchers are, this node included.  ``revoked`` are the sessions that were ended; a
-    session lasts ``signed_s``, and as long again when it is renewed.
+    signs for this web node.  ``can_authenticate`` returns whether the node with a public key is a gateway of the team
+    now; a session is valid while all its vouchers are, this node included.  ``revocations`` are the sessions that were
+    ended; a session lasts ``session_s``, and as long again when it is renewed.
     """
 
     def __init__(
         self,
         key: TokenKey,
-        may_vouch: Callable[[bytes], bool],
+        can_authenticate: Callable[[bytes], bool],
         code: str,
         password: str,
         rng: random.Random,
         check: Check,
-        revoked: Revocations | None = None,
-        signed_s: float = SESSION_S,
+        revocations: Revocations | None = None,
+        session_s: float = SESSION_S,
     ) -> None:
         self.code = code
         self.key = key
-        self._can_authenticate = may_vouch
+        self._can_authenticate = can_authenticate
         self._password = password
         self._rng = rng
         self._check = check
         self._attempts = SignInAttempts()
-        self._revocations = Revocations() if revoked is None else revoked
-        self.session_s = signed_s
+        self._revocations = Revocations() if revocations is None else revocations
+        self.session_s = session_s
         self._gate = DeferredSemaphore(MAX_CHECKS)
 
     def sign_in(self, proof: str, source: str, now: float) -> Deferred[Token]:
@@ -108,7 +108,7 @@ class SignedSessions:
         return self._gate.run(self._check, self._password, proof).addCallback(finish)
 
     def authenticate(self, token: str, now: float) -> User:
-        """Return the visitor of a token or ticket."""
+        """Return the user of a token or ticket."""
         claim = self.key.read_claim(token)
         if (
             claim is None
@@ -119,33 +119,34 @@ class SignedSessions:
         if not all(self._can_authenticate(public) for public in (self.key.public, *claim.vouchers)):
             return ANONYMOUS
         limit = max(claim.until, claim.limit)
-        who = User(claim.name, claim.role, claim.id, claim.until, limit, claim.is_ticket)
-        return replace(who, parents=claim.parents, vouchers=claim.vouchers)
+        user = User(claim.name, claim.role, claim.id, claim.until, limit, claim.is_ticket)
+        return replace(user, parents=claim.parents, vouchers=claim.vouchers)
 
-    def issue_guest_token(self, who: User, name: str, role: Role, now: float, seconds: float) -> Token:
-        """Return a token for a guest of ``who``, valid no longer than ``who`` can stay."""
-        end = min(now + seconds, who.limit)
-        claim = Claim(self._draw_id(), name, role, int(end), limit=int(end), vouchers=self._list_vouchers(who))
+    def issue_guest_token(self, user: User, name: str, role: Role, now: float, seconds: float) -> Token:
+        """Return a token for a guest of ``user``, valid no longer than ``user`` can stay."""
+        end = min(now + seconds, user.limit)
+        claim = Claim(self._draw_id(), name, role, int(end), limit=int(end), vouchers=self._list_vouchers(user))
         return self._sign(claim)
 
-    def issue_derived_token(self, who: User, name: str, role: Role, now: float, seconds: float) -> Token:
-        """Return a token for ``who`` under another name, which ends with the session."""
+    def issue_derived_token(self, user: User, name: str, role: Role, now: float, seconds: float) -> Token:
+        """Return a token for ``user`` under another name, which ends with the session."""
         token = Claim(
-            self._draw_id(), name, role, int(min(now + seconds, who.limit)), vouchers=self._list_vouchers(who)
+            self._draw_id(), name, role, int(min(now + seconds, user.limit)), vouchers=self._list_vouchers(user)
         )
-        return self._sign(replace(token, limit=token.until, parents=_list_session_ids(who)))
+        return self._sign(replace(token, limit=token.until, parents=_list_session_ids(user)))
 
-    def renew_token(self, who: User, now: float) -> Token:
+    def renew_token(self, user: User, now: float) -> Token:
         """Return another token for the same session; revoking one ends both."""
-        _require_session(who)
-        return self._make_session_token(who, now + self.session_s, who.limit)
+        _require_session(user)
+        return self._make_session_token(user, now + self.session_s, user.limit)
 
-    def issue_peer_tokens(self, who: User, nodes: Iterable[str], now: float) -> dict[str, Token]:
-        """Return tokens for the same session at other web nodes, by uuid, each valid only there and for ``PASS_S``."""
-        _require_session(who)
-        until = min(now + PEER_TOKEN_S, who.limit)
+    def issue_peer_tokens(self, user: User, nodes: Iterable[str], now: float) -> dict[str, Token]:
+        """Return tokens for the same session at other web nodes, by uuid, valid only there for ``PEER_TOKEN_S``."""
+        _require_session(user)
+        until = min(now + PEER_TOKEN_S, user.limit)
         return {
-            node: self._make_session_token(who, until, who.limit, bytes.fromhex(node)) for node in dict.fromkeys(nodes)
+            node: self._make_session_token(user, until, user.limit, bytes.fromhex(node))
+            for node in dict.fromkeys(nodes)
         }
 
     def revoke(self, token_id: str, until: float = math.inf) -> None:
@@ -158,20 +159,20 @@ class SignedSessions:
 
     def _begin(self, name: str, role: Role, now: float, limit: float, invited: User = ANONYMOUS) -> Token:
         """Start a session, which ends with the invitation that it was made from."""
-        who = User(name, role, self._draw_id(), parents=_list_session_ids(invited), vouchers=invited.vouchers)
-        return self._make_session_token(who, now + self.session_s, limit)
+        user = User(name, role, self._draw_id(), parents=_list_session_ids(invited), vouchers=invited.vouchers)
+        return self._make_session_token(user, now + self.session_s, limit)
 
-    def _make_session_token(self, who: User, until: float, limit: float, audience: bytes = b"") -> Token:
-        claim = Claim(who.token_id, who.name, who.role, int(min(until, limit)), limit=int(limit))
-        return self._sign(replace(claim, parents=who.parents, vouchers=self._list_vouchers(who)), audience)
+    def _make_session_token(self, user: User, until: float, limit: float, audience: bytes = b"") -> Token:
+        claim = Claim(user.token_id, user.name, user.role, int(min(until, limit)), limit=int(limit))
+        return self._sign(replace(claim, parents=user.parents, vouchers=self._list_vouchers(user)), audience)
 
     def _sign(self, claim: Claim, audience: bytes = b"") -> Token:
         text, ticket = (self.key.sign_token(each, audience) for each in (claim, claim.ticket))
         return Token(text, ticket, claim.role, float(claim.until))
 
-    def _list_vouchers(self, who: User) -> tuple[bytes, ...]:
-        """Return the other web nodes that vouch for ``who``; raises ``Refusal`` if there are too many."""
-        others = tuple(each for each in who.vouchers if each != self.key.public)
+    def _list_vouchers(self, user: User) -> tuple[bytes, ...]:
+        """Return the other web nodes that vouch for ``user``; raises ``Refusal`` if there are too many."""
+        others = tuple(each for each in user.vouchers if each != self.key.public)
         if len(others) > MAX_VOUCHERS:
             raise Refusal("Authorization", "the session used too many web nodes", "sign in here", 401)
         return others
@@ -183,7 +184,7 @@ class SignedSessions:
 class SignInAttempts:
     """Limits attempts to sign in with a code or password, per address and for all addresses together.
 
-    The common limit does not apply to this machine and to networks from which a visitor has signed in before.
+    The common limit does not apply to this machine and to networks from which a user has signed in before.
     """
 
     def __init__(self) -> None:
@@ -251,12 +252,12 @@ def _normalize_code(code: str) -> bytes:
     return "".join(c for c in code.lower() if not c.isspace() and c != "-").encode()
 
 
-def _list_session_ids(who: User) -> tuple[str, ...]:
-    """Return the ids of the sessions with which everything started by ``who`` ends."""
-    return tuple(each for each in (who.token_id, *who.parents) if each)[:MAX_PARENTS]
+def _list_session_ids(user: User) -> tuple[str, ...]:
+    """Return the ids of the sessions with which everything started by ``user`` ends."""
+    return tuple(each for each in (user.token_id, *user.parents) if each)[:MAX_PARENTS]
 
 
-def _require_session(who: User) -> None:
-    if who.role == "anyone" or who.is_ticket:
-        problem = "a ticket is not enough" if who.is_ticket else "not signed in"
+def _require_session(user: User) -> None:
+    if user.role == "anyone" or user.is_ticket:
+        problem = "a ticket is not enough" if user.is_ticket else "not signed in"
         raise Refusal("Authorization", problem, "send the token, as 'Bearer TOKEN', or sign in", 401)

@@ -36,7 +36,8 @@ def format_state(
 ) -> State:
     """Return the whole view: devices in the order of joining, tasks newest first, groups in the order of the tasks.
 
-    ``departed`` are the devices that left recently (``Departed.of``); ``node`` is the name of the serving node.
+    ``departed`` are the devices that left recently (``DepartedDevices.update``); ``node`` is the name of the
+    serving node.
     """
     present = [view for view in map(make_device_view, devices) if view["uuid"]]
     known = {view["uuid"] for view in present}
@@ -148,8 +149,8 @@ def make_group_view(task: str, title: str, members: Sequence[Fields], known: Map
 class DepartedDevices:
     """Keeps devices that left for some time, so that the page shows them as gone."""
 
-    def __init__(self, remembered_s: float = DEPARTED_SHOWN_S) -> None:
-        self._remembered_s = remembered_s
+    def __init__(self, shown_s: float = DEPARTED_SHOWN_S) -> None:
+        self._shown_s = shown_s
         self._last: dict[str, State] = {}
         self._gone: dict[str, State] = {}
 
@@ -161,7 +162,7 @@ class DepartedDevices:
         present = {view["uuid"]: view for view in map(make_device_view, devices) if view["uuid"]}
         left = {uuid: {**view, "status": GONE, "gone": now} for uuid, view in self._last.items() if uuid not in present}
         gone = {**left, **self._gone}
-        gone = {u: v for u, v in gone.items() if u not in present and now - v["gone"] < self._remembered_s}
+        gone = {u: v for u, v in gone.items() if u not in present and now - v["gone"] < self._shown_s}
         self._last, self._gone = present, gone
         return [dict(view) for view in gone.values()]
 

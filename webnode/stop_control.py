@@ -29,8 +29,8 @@ class StopControl:
 
     def _list_known(self) -> list[bytes]:
         view = self._client.view
-        said = [stop for device in view.devices for stop in device.stops]
-        return [_parse_id(stop) for stop in (*view.stops, *said) if is_stop_id(stop)]
+        obeyed = [stop for device in view.devices for stop in device.stops]
+        return [_parse_id(stop) for stop in (*view.stops, *obeyed) if is_stop_id(stop)]
 
 
 def is_stop_id(stop: str) -> bool:

@@ -29,7 +29,7 @@ ANSWER_LIMIT_S = 1.5
 
 
 class SimulatorControl(Protocol):
-    """The operations of a robot simulator that the desk uses."""
+    """The operations of a robot simulator that ``TeamControl`` uses."""
 
     @property
     def snapshot(self) -> Mapping[str, Any] | None:
@@ -58,13 +58,13 @@ class TeamControl:
     _log = Logger()
 
     def __init__(
-        self, client: TeamClient, predefined: Mapping[str, Task], demo: str, yard: SimulatorControl | None = None
+        self, client: TeamClient, predefined: Mapping[str, Task], demo: str, simulator: SimulatorControl | None = None
     ) -> None:
         self._client = client
         self._view = client.view
         self._predefined = predefined
         self._demo = demo
-        self._simulator = yard
+        self._simulator = simulator
 
     # -- queries ----------------------------------------------------------------------------------------------------
 
@@ -163,16 +163,16 @@ class TeamControl:
         failed: dict[str, str] = {}
 
         def send(device: Device) -> Deferred[Any]:
-            asked = self.call(device.uuid, "device.message", text)
-            return asked.addCallback(lambda _: delivered.append(device.name))
+            call = self.call(device.uuid, "device.message", text)
+            return call.addCallback(lambda _: delivered.append(device.name))
 
         def note_failure(failure: Any, name: str) -> None:
             failure.trap(Refusal)
             failed[name] = failure.value.problem
 
         if uuid:
-            one = self.call(uuid, "device.message", text)
-            return one.addCallback(lambda _: {"delivered": [self._view.find_name(uuid)], "failed": failed})
+            call = self.call(uuid, "device.message", text)
+            return call.addCallback(lambda _: {"delivered": [self._view.find_name(uuid)], "failed": failed})
         all_sent = DeferredList([send(device).addErrback(note_failure, device.name) for device in self._view.devices])
         return all_sent.addCallback(lambda _: {"delivered": sorted(delivered), "failed": failed})
 
@@ -196,8 +196,8 @@ class TeamControl:
         if self._client.find_contact(uuid) is None:
             return fail(Refusal("device", f"{name} has left the network", "choose one of /api/v1/devices", 409))
         until = self._client.clock.seconds() + ANSWER_LIMIT_S
-        asked = self._client.call(uuid, method, *arguments, timeout=ANSWER_LIMIT_S, changes=True)
-        return asked.addErrback(self._explain_failure, uuid, name, until, refused)
+        call = self._client.call(uuid, method, *arguments, timeout=ANSWER_LIMIT_S, changes=True)
+        return call.addErrback(self._explain_failure, uuid, name, until, refused)
 
     def move_target(self, x: float, y: float) -> Deferred[Any]:
         """Put the target at (x, y), metres on the simulator's map."""

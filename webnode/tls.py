@@ -150,20 +150,20 @@ class _TlsFactory(TLSMemoryBIOFactory):
     protocol = _TlsProtocol
     noisy = False
 
-    def __init__(self, certified: CertificateProvider, site: Site, clock: Any) -> None:
-        super().__init__(certified, False, site, clock)
-        self.provider = certified
+    def __init__(self, provider: CertificateProvider, site: Site, clock: Any) -> None:
+        super().__init__(provider, False, site, clock)
+        self.provider = provider
 
 
 class TlsPort:
-    """The TLS port; ``signer`` is the authority that a visitor's browser should trust."""
+    """The TLS port; ``signer`` is the authority that a user's browser should trust."""
 
-    def __init__(self, reactor: Any, host: str, port: int, signer: Authority, certified: CertificateProvider) -> None:
+    def __init__(self, reactor: Any, host: str, port: int, signer: Authority, provider: CertificateProvider) -> None:
         self.signer = signer
         self._reactor = reactor
         self._host = host
         self._port = port
-        self._provider = certified
+        self._provider = provider
 
     def open(self, site: Site) -> IListeningPort:
         """Open the port for ``site``; raises ``PortTaken``."""
@@ -178,9 +178,9 @@ def make_tls_port(
     web, node = settings.web, settings.node
     signer = make_authority(_load_seed(store, rng), node.name)
     path = None if node.store == IN_MEMORY else Path(f"{node.store}{FILE_SUFFIX}")
-    certified = CertificateProvider(signer, node.name, path, names, wall, rng)
+    provider = CertificateProvider(signer, node.name, path, names, wall, rng)
     _log.info("phones that trust the authority {fingerprint} trust this node's page", fingerprint=signer.fingerprint)
-    return TlsPort(reactor, web.host, web.tls_port, signer, certified)
+    return TlsPort(reactor, web.host, web.tls_port, signer, provider)
 
 
 def _load_seed(store: Store, rng: random.Random) -> bytes:

@@ -352,7 +352,7 @@ def board(team: Team) -> Services:
     sessions = TeamSessions(key_of(team.node), gateways.__contains__, "quiet-otter", PASSWORD, random.Random(), checked)
     desk.settings[able[0]["uuid"]] = KNOBS
     survey = MemorySurvey(network(), {f"0{n}" * 16: inventory() for n in (1, 2)}, links(), membership())
-    parts: dict[str, Any] = {"halts": team.halts, "survey": survey, "chronicle": EventLog()}
+    parts: dict[str, Any] = {"stop_control": team.halts, "diagnostics": survey, "event_log": EventLog()}
     parts["faults"], parts["phones"] = MemoryFaults(*KINDS), MemoryPhones(check=check_picture)
     return Services(desk, sessions, AuditLog(wall=time.time), limits=AddressLimits(), **parts)
 

@@ -27,7 +27,7 @@ class ActionTests(SynchronousTestCase):
         self.halts = MemoryHalts("01", "02")
         self.chronicle = EventLog()
         self.desk.settings["01"] = [["description", "a dog", "A line", "", None, 200.0]]
-        self.board = Services(self.desk, Guests(), event_log=self.chronicle, halts=self.halts)
+        self.board = Services(self.desk, Guests(), event_log=self.chronicle, stop_control=self.halts)
         state = format_state([{"uuid": "01", "name": "dog1", "joined": 1}], [], {}, node="vaio")
         app = create_app(lambda: {**state, "halted": self.halts.is_halted()}, self.board, wall=lambda: 1e9)
         app.logger.setLevel(logging.CRITICAL + 1)
@@ -55,7 +55,7 @@ class ActionTests(SynchronousTestCase):
         for method in ("POST", "DELETE"):
             self.assertEqual(self.ask(method, "halt", {}, "viewer")[0], 403)
         self.assertEqual(self.halts.said, [])
-        self.board.halts = None
+        self.board.stop_control = None
         status, answer = self.ask("POST", "halt", {})
         self.assertEqual((status, answer["error"]["field"]), (409, "halt"))
 

@@ -150,7 +150,7 @@ class ChronicleTests(SynchronousTestCase):
 
     def test_keep_so_many(self) -> None:
         """Only the newest entries are kept, with increasing numbers; they can be filtered by device or task."""
-        self.chronicle = EventLog(kept=3)
+        self.chronicle = EventLog(max_entries=3)
         self.saw(1.0, dog(1), dog(2), tasks=[job("OPEN")])
         self.assertEqual([entry.n for entry in self.chronicle.list_since(0)], [2, 3, 4])
         self.assertEqual([entry.n for entry in self.chronicle.list_since(3)], [4])

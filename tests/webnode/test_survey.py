@@ -206,7 +206,7 @@ class SurveyTests(FleetCase):
             answer = client.get(f"/api/v1/{path}?ticket=viewer", headers={"Host": "localhost"})
             return answer.status_code, answer.get_json()
 
-        board = Services(MemoryDesk(), Guests(), survey=survey)
+        board = Services(MemoryDesk(), Guests(), diagnostics=survey)
         self.assertEqual(asked(board, "network"), (200, {"devices": {}, "silent": ["02"]}))
         self.assertEqual((asked(board, "links"), asked(board, "team")), ((200, others[0]), (200, others[1])))
         self.assertEqual(asked(board, "devices/01/inventory"), (200, {"records": 4}))

@@ -1,1 +1,1 @@
-"""The routes of the API, one module per subject; ``table`` collects all of them."""
+"""The routes of the API, one module per subject; ``registry`` collects all of them."""

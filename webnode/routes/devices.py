@@ -13,34 +13,34 @@ AWAY_S = 15.0
 TEXT = Field("text", "text", "the message", maximum=MAX_MESSAGE)
 
 
-def list_devices(ask: RouteRequest) -> Json:
+def list_devices(request: RouteRequest) -> Json:
     """Return all devices."""
-    listed: Json = ask.state["devices"]
+    listed: Json = request.state["devices"]
     return listed
 
 
-def send_to_all(ask: RouteRequest) -> Any:
+def send_to_all(request: RouteRequest) -> Any:
     """Send a message to all devices."""
-    return ask.services.control.send_message("", ask.values["text"])
+    return request.services.control.send_message("", request.values["text"])
 
 
-def send_message(ask: RouteRequest) -> Any:
+def send_message(request: RouteRequest) -> Any:
     """Send a message to one device."""
-    uuid = find_device(ask)["uuid"]
-    return ask.services.control.send_message(uuid, ask.values["text"]).addCallback(
+    uuid = find_device(request)["uuid"]
+    return request.services.control.send_message(uuid, request.values["text"]).addCallback(
         lambda answer: {"id": uuid, **answer}
     )
 
 
-def disconnect(ask: RouteRequest) -> Any:
+def disconnect(request: RouteRequest) -> Any:
     """Let a device leave the network for some time."""
-    uuid, seconds = find_device(ask)["uuid"], ask.values["seconds"]
+    uuid, seconds = find_device(request)["uuid"], request.values["seconds"]
 
     def left(_: object) -> Json:
-        ask.services.event_log.record_fault(uuid, "disconnect", ask.now)
+        request.services.event_log.record_fault(uuid, "disconnect", request.now)
         return {"id": uuid, "seconds": seconds}
 
-    return ask.services.control.disconnect(uuid, seconds).addCallback(left)
+    return request.services.control.disconnect(uuid, seconds).addCallback(left)
 
 
 RESPONSE = "delivered (names), failed (reason by name)"

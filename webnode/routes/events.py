@@ -9,15 +9,15 @@ from webnode.route import API, Field, Route, RouteRequest
 from webnode.sanitize import Json
 
 
-def list_events(ask: RouteRequest) -> Json:
-    """Return the entries of the chronicle, oldest first."""
-    entries = ask.services.event_log.list_since(ask.values["after"], ask.values["about"])
+def list_events(request: RouteRequest) -> Json:
+    """Return the entries of the event log, oldest first."""
+    entries = request.services.event_log.list_since(request.values["after"], request.values["about"])
     return [asdict(entry) for entry in entries]
 
 
-def list_audit(ask: RouteRequest) -> Json:
+def list_audit(request: RouteRequest) -> Json:
     """Return the newest lines of the audit log."""
-    return [*ask.services.audit.list_newest(ask.values["count"])]
+    return [*request.services.audit.list_newest(request.values["count"])]
 
 
 ROUTES = (

@@ -10,10 +10,10 @@ from webnode.route import API, DEVICE, Field, Route, RouteRequest, find_device
 from webnode.sanitize import Json
 
 
-def list_faults(ask: RouteRequest) -> Json:
+def list_faults(request: RouteRequest) -> Json:
     """Return the kinds of faults, the devices that allow them, and active faults; empty without fault injection."""
-    known = ask.services.faults
-    if known is None:
+    control = request.services.faults
+    if control is None:
         return {"kinds": [], "can": {}, "active": []}
     kinds: list[Json] = [
         {
@@ -28,25 +28,25 @@ def list_faults(ask: RouteRequest) -> Json:
         }
         for name, kind in KINDS.items()
     ]
-    can: dict[str, Json] = {each["uuid"]: list(known.get_kinds(each["uuid"])) for each in ask.state["devices"]}
-    active: list[Json] = list(known.list_active())
+    can: dict[str, Json] = {each["uuid"]: list(control.get_kinds(each["uuid"])) for each in request.state["devices"]}
+    active: list[Json] = list(control.list_active())
     return {"kinds": kinds, "can": can, "active": active}
 
 
-def inject_fault(ask: RouteRequest) -> Any:
+def inject_fault(request: RouteRequest) -> Any:
     """Inject a fault into a device."""
-    uuid, board, kind = find_device(ask)["uuid"], ask.services, ask.values["kind"]
-    if board.faults is None:
+    uuid, services, kind = find_device(request)["uuid"], request.services, request.values["kind"]
+    if services.faults is None:
         raise Refusal(
             "device", "this node does not inject faults", 'set "allow = true" below [faults] in its settings', 409
         )
-    seconds, amount = ask.values["seconds"], ask.values["amount"]
+    seconds, amount = request.values["seconds"], request.values["amount"]
 
-    def taken(_: object) -> Json:
-        board.event_log.record_fault(uuid, kind, ask.now)
+    def record_fault(_: object) -> Json:
+        services.event_log.record_fault(uuid, kind, request.now)
         return {"id": uuid, "kind": kind, "seconds": seconds}
 
-    return board.faults.inject(uuid, kind, seconds, amount).addCallback(taken)
+    return services.faults.inject(uuid, kind, seconds, amount).addCallback(record_fault)
 
 
 _USUAL = "; ".join(f"{name}: {kind.amount:g} {kind.unit}" for name, kind in KINDS.items() if kind.unit)
@@ -57,7 +57,8 @@ ROUTES = (
         "Faults that can be injected, and injected faults with their takeover times",
         "viewer",
         list_faults,
-        response="kinds, can (kinds by uuid), active (n, uuid, name, kind, amount, left_s, since_s, task, takeover_s, to)",
+        response="kinds, can (kinds by uuid), "
+        "active (n, uuid, name, kind, amount, left_s, since_s, task, takeover_s, to)",
     ),
     Route(
         "POST",

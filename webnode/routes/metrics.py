@@ -21,13 +21,13 @@ MEDIA_TYPE = "text/plain; version=0.0.4; charset=utf-8"
 TRAFFIC_COUNTERS = ("sent", "received", "dropped")
 
 
-def make_exposition(state: State, board: Services, now: float) -> bytes:
+def make_exposition(state: State, services: Services, now: float) -> bytes:
     """Return the exposition; ``now`` is unix seconds.  Raises ``ModuleNotFoundError`` without the library."""
     from prometheus_client import CollectorRegistry
     from prometheus_client.exposition import generate_latest
 
     registry = CollectorRegistry(auto_describe=False)
-    registry.register(_Collector(list(_make_families(state, board, now))))
+    registry.register(_Collector(list(_make_families(state, services, now))))
     text: bytes = generate_latest(registry)
     return text
 
@@ -43,11 +43,11 @@ class _Collector:
         return ()
 
 
-def _make_families(state: State, board: Services, now: float) -> Iterator[Any]:
+def _make_families(state: State, services: Services, now: float) -> Iterator[Any]:
     from prometheus_client.core import CounterMetricFamily, GaugeMetricFamily
 
-    def by_status(name: str, about: str, rows: Any) -> Any:
-        family = GaugeMetricFamily(name, about, labels=("status",))
+    def by_status(name: str, description: str, rows: Any) -> Any:
+        family = GaugeMetricFamily(name, description, labels=("status",))
         for status, count in sorted(Counter(row["status"] for row in rows).items()):
             family.add_metric([status], count)
         return family
@@ -59,13 +59,13 @@ def _make_families(state: State, board: Services, now: float) -> Iterator[Any]:
     since = GaugeMetricFamily("swarm_device_joined_seconds", "Unix time of joining.", labels=("uuid", "device"))
     flow = CounterMetricFamily("swarm_device_datagrams", "Datagrams of a device.", labels=("uuid", "device", "flow"))
     for device in devices:
-        whose, network = [device["uuid"], device["name"]], device["network"]
-        since.add_metric(whose, device["since"])
+        labels, network = [device["uuid"], device["name"]], device["network"]
+        since.add_metric(labels, device["since"])
         if "contacts" in network:
-            contacts.add_metric(whose, network["contacts"])
+            contacts.add_metric(labels, network["contacts"])
         for name in TRAFFIC_COUNTERS:
             if name in network:
-                flow.add_metric([*whose, name], network[name])
+                flow.add_metric([*labels, name], network[name])
     yield from (contacts, since, flow)
     agree = GaugeMetricFamily("swarm_group_agreeing", "Members of a group that agree.", labels=("task",))
     members = GaugeMetricFamily("swarm_group_members", "Members of a group.", labels=("task",))
@@ -73,25 +73,25 @@ def _make_families(state: State, board: Services, now: float) -> Iterator[Any]:
         agree.add_metric([group["task"]], group["agree"])
         members.add_metric([group["task"]], group["of"])
     yield from (agree, members)
-    kept = GaugeMetricFamily(
+    connections = GaugeMetricFamily(
         "swarm_page_connections",
         "Connections of this node's page: open, with an incomplete request, with a response in progress.",
         labels=("kind",),
     )
     for kind in get_args(CountedKind):
-        kept.add_metric([kind], board.limits.get_total(kind))
-    yield kept
+        connections.add_metric([kind], services.limits.get_total(kind))
+    yield connections
     orders = CounterMetricFamily("swarm_page_orders", "Orders given through this node.", labels=("role", "status"))
-    for (role, status), count in sorted(board.audit.get_counts().items()):
+    for (role, status), count in sorted(services.audit.get_counts().items()):
         orders.add_metric([role, status], count)
     yield orders
     yield GaugeMetricFamily("swarm_page_time_seconds", "Unix time at this node.", value=now)
 
 
-def read_metrics(ask: RouteRequest) -> Content:
+def read_metrics(request: RouteRequest) -> Content:
     """Return all metrics."""
     try:
-        return Content(make_exposition(ask.state, ask.services, ask.now), MEDIA_TYPE)
+        return Content(make_exposition(request.state, request.services, request.now), MEDIA_TYPE)
     except ModuleNotFoundError as error:
         if error.name != "prometheus_client":
             raise

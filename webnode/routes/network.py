@@ -9,30 +9,30 @@ from webnode.errors import Refusal
 from webnode.route import API, DEVICE, Route, RouteRequest, find_device
 
 
-def read_network(ask: RouteRequest) -> Any:
+def read_network(request: RouteRequest) -> Any:
     """Return the contacts of each device and their round-trip times."""
-    return _require_diagnostics(ask).query_network()
+    return _require_diagnostics(request).query_network()
 
 
-def read_links(ask: RouteRequest) -> Any:
+def read_links(request: RouteRequest) -> Any:
     """Return the path and its quality from each device to the others."""
-    return _require_diagnostics(ask).query_links()
+    return _require_diagnostics(request).query_links()
 
 
-def read_team(ask: RouteRequest) -> Any:
+def read_team(request: RouteRequest) -> Any:
     """Return the kind of team and its members."""
-    return _require_diagnostics(ask).describe_team()
+    return _require_diagnostics(request).describe_team()
 
 
-def read_inventory(ask: RouteRequest) -> Any:
+def read_inventory(request: RouteRequest) -> Any:
     """Return the records that a device stores."""
-    return _require_diagnostics(ask).query_inventory(find_device(ask)["uuid"])
+    return _require_diagnostics(request).query_inventory(find_device(request)["uuid"])
 
 
-def _require_diagnostics(ask: RouteRequest) -> Diagnostics:
-    if ask.services.survey is None:
+def _require_diagnostics(request: RouteRequest) -> Diagnostics:
+    if request.services.diagnostics is None:
         raise Refusal("node", "it cannot query devices", "use another web node of the team", 409)
-    return ask.services.survey
+    return request.services.diagnostics
 
 
 ROUTES = (

@@ -15,17 +15,17 @@ VERSION = 1
 WORKER_FILE = Path(__file__).parents[1] / "static" / "sw.js"
 
 
-def read_node(ask: RouteRequest) -> Json:
+def read_node(request: RouteRequest) -> Json:
     """Return the identity of this node, with nothing that requires signing in."""
-    board = ask.services
-    pages = board.fallbacks.list_pages()
+    services = request.services
+    pages = services.fallbacks.list_pages()
     return {
         "node": next((page.node for page in pages if page.is_self), ""),
         "api": VERSION,
-        "name": ask.state["node"],
-        "sign_in": board.sessions.authenticate("", ask.now).role == "anyone",
+        "name": request.state["node"],
+        "sign_in": services.sessions.authenticate("", request.now).role == "anyone",
         "pages": make_page_rows(pages),
-        "has": list(board.feature_names),
+        "has": list(services.feature_names),
     }
 
 
@@ -34,14 +34,14 @@ def make_page_rows(pages: Iterable[Page]) -> list[Json]:
     return [asdict(page) for page in pages]
 
 
-def read_worker(ask: RouteRequest) -> Content:
+def read_worker(request: RouteRequest) -> Content:
     """Return the service worker; its scope would be limited to /static if it were served there."""
     return Content(WORKER_FILE.read_bytes(), "text/javascript; charset=utf-8")
 
 
-def read_state(ask: RouteRequest) -> Json:
+def read_state(request: RouteRequest) -> Json:
     """Return the whole state that the page shows."""
-    return ask.state
+    return request.state
 
 
 ROUTES = (

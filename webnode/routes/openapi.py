@@ -1,4 +1,4 @@
-"""Route of the API's description: the table of routes as an OpenAPI 3.1 document.
+"""Route of the API's description: the routes as an OpenAPI 3.1 document.
 
 Requests are checked against the same table.
 """
@@ -34,10 +34,10 @@ out once per `Idempotency-Key`.  Bodies have at most {MAX_BODY // 1024} KiB; unk
 request is answered with a status of 400 or above and an `Error`."""
 
 
-def make_document(table: Sequence[Route], node: str = "") -> dict[str, Any]:
+def make_document(routes: Sequence[Route], node: str = "") -> dict[str, Any]:
     """Return the document as JSON data; ``node`` is the name of the serving node."""
     paths: dict[str, dict[str, Any]] = {}
-    for route in table:
+    for route in routes:
         paths.setdefault(route.path, {})[route.method.lower()] = _describe_operation(route)
     title = f"Swarm, served by {node}" if node else "Swarm"
     return {
@@ -92,7 +92,7 @@ def _describe_operation(route: Route) -> dict[str, Any]:
 
 
 def _describe_response(route: Route) -> dict[str, Any]:
-    """Describe the response: a media type if ``gives`` is one, else text about JSON."""
+    """Describe the response: a media type if ``response`` is one, else text about JSON."""
     if re.fullmatch(r"\w+/[\w.+-]+", route.response):
         return {"description": route.description, "content": {route.response: {}}}
     if route.handler is None and route.method == "GET":
@@ -127,15 +127,15 @@ def _make_security(route: Route) -> list[dict[str, list[str]]]:
 
 
 def _make_csrf_header(is_needed: bool) -> dict[str, Any]:
-    about = "Shows that the request is not an HTML form of another site; required without a JSON body."
+    description = "Shows that the request is not an HTML form of another site; required without a JSON body."
     schema = {"type": "string", "enum": ["1"]}
-    return {"name": "X-Swarm", "in": "header", "required": is_needed, "description": about, "schema": schema}
+    return {"name": "X-Swarm", "in": "header", "required": is_needed, "description": description, "schema": schema}
 
 
 def _make_idempotency_header() -> dict[str, Any]:
-    about = "The client's id of the request: requests with the same id are carried out once."
+    description = "The client's id of the request: requests with the same id are carried out once."
     schema = {"type": "string", "maxLength": 64, "pattern": "^[!-~]*$"}
-    return {"name": "Idempotency-Key", "in": "header", "required": False, "description": about, "schema": schema}
+    return {"name": "Idempotency-Key", "in": "header", "required": False, "description": description, "schema": schema}
 
 
 def _make_json_content(schema: dict[str, Any]) -> dict[str, Any]:
@@ -153,9 +153,9 @@ def _get_tag(route: Route) -> str:
     return found[0] if found else "page"
 
 
-def read_document(ask: RouteRequest) -> dict[str, Any]:
+def read_document(request: RouteRequest) -> dict[str, Any]:
     """Return the OpenAPI document."""
-    return make_document(ask.routes, str(ask.state["node"]))
+    return make_document(request.routes, str(request.state["node"]))
 
 
 ROUTES = (

@@ -55,25 +55,27 @@ PAIRED_VALUES = (("target.bearing", "target.distance"), ("position.lat", "positi
 """Pairs of values of which both or none have to be present."""
 
 
-def register_phone(ask: RouteRequest) -> Deferred[Json]:
+def register_phone(request: RouteRequest) -> Deferred[Json]:
     """Register a phone as a device."""
-    if ask.services.phones is None:
+    if request.services.phones is None:
         raise Refusal("phone", "this node does not accept phones", "use another web node", 409)
-    if ask.user.name.startswith(PHONE_PREFIX):
+    if request.user.name.startswith(PHONE_PREFIX):
         raise Refusal("ticket", "it is valid for one phone's pictures only", "sign in and use that token", 403)
-    given = ask.values
-    secret, name = given["secret"], given["name"]
+    values = request.values
+    secret, name = values["secret"], values["name"]
     if not re.fullmatch(rf"[0-9a-fA-F]{{{2 * SECRET_BYTES}}}", secret):
         raise Refusal("secret", "invalid secret", f"send {2 * SECRET_BYTES} hexadecimal digits, always the same")
     if not re.fullmatch(r"[A-Za-z0-9_-]+", name):
         raise Refusal("name", "invalid device name", "send 1 to 40 letters, digits, _ or -")
-    can = {key: given[key] for key in ("width", "height", "orientation", "position")}
+    can = {key: values[key] for key in ("width", "height", "orientation", "position")}
 
     def joined(uuid: str) -> Json:
-        token = ask.services.sessions.issue_derived_token(ask.user, f"{PHONE_PREFIX}{uuid}", "phone", ask.now, TICKET_S)
+        token = request.services.sessions.issue_derived_token(
+            request.user, f"{PHONE_PREFIX}{uuid}", "phone", request.now, TICKET_S
+        )
         return {"uuid": uuid, "ticket": token.ticket, "until": token.until, "fps": REQUESTED_FPS}
 
-    return ask.services.phones.join(bytes.fromhex(secret), name, can).addCallback(joined)
+    return request.services.phones.join(bytes.fromhex(secret), name, can).addCallback(joined)
 
 
 def parse_values(text: str) -> dict[str, float]:
@@ -85,12 +87,12 @@ def parse_values(text: str) -> dict[str, float]:
     if not isinstance(found, dict):
         raise Refusal("values", "not a JSON object", 'send for example {"target.bearing": 0.1}')
     for name, value in found.items():
-        measure = VALUE_RANGES.get(name)
-        if measure is None:
+        value_range = VALUE_RANGES.get(name)
+        if value_range is None:
             raise Refusal("values", f"unknown value {name[:40]!r}", f"send some of {', '.join(VALUE_RANGES)}")
         is_number = isinstance(value, int | float) and not isinstance(value, bool)
-        if not is_number or not measure.minimum <= value <= measure.maximum:
-            bounds = f"{measure.minimum:.4g} to {measure.maximum:.4g} {measure.unit}"
+        if not is_number or not value_range.minimum <= value <= value_range.maximum:
+            bounds = f"{value_range.minimum:.4g} to {value_range.maximum:.4g} {value_range.unit}"
             raise Refusal("values", f"{name} is out of range", f"send a number from {bounds}")
     for pair in PAIRED_VALUES:
         if len([name for name in pair if name in found]) == 1:
@@ -104,21 +106,21 @@ class PhoneResource(JsonResource):
     isLeaf = True
     methods = (b"POST",)
 
-    def __init__(self, board: Services, take: Callable[[Services, Phones, str, Request], Json]) -> None:
+    def __init__(self, services: Services, handle: Callable[[Services, Phones, str, Request], Json]) -> None:
         super().__init__()
-        self._board = board
-        self._handle = take
+        self._services = services
+        self._handle = handle
 
     def render_POST(self, request: Request) -> bytes:
         """Process the request, or refuse it."""
         uuid = request.prepath[-2].decode("ascii", "replace")  # type: ignore[attr-defined]
-        who = get_user(request)
+        user = get_user(request)
         try:
-            if self._board.phones is None:
+            if self._services.phones is None:
                 raise Refusal("phone", "this node does not accept phones", "use another web node", 409)
-            if who.role == "phone" and who.name != f"{PHONE_PREFIX}{uuid}":
+            if user.role == "phone" and user.name != f"{PHONE_PREFIX}{uuid}":
                 raise Refusal("ticket", "it belongs to another phone", f"join by POST {API}/phones", 403)
-            reply = self._handle(self._board, self._board.phones, uuid, request)
+            reply = self._handle(self._services, self._services.phones, uuid, request)
         except Refusal as refusal:
             return write_refusal(request, refusal)
         request.setHeader("Content-Type", "application/json")
@@ -127,23 +129,23 @@ class PhoneResource(JsonResource):
 
 
 def get_user(request: Request) -> User:
-    """Return the visitor of a native request."""
-    return getattr(request, "who", User())
+    """Return the authenticated user of a native request."""
+    return getattr(request, "authenticated_user", User())
 
 
-def receive_picture(board: Services, phones: Phones, uuid: str, request: Request) -> Json:
+def receive_picture(services: Services, phones: Phones, uuid: str, request: Request) -> Json:
     """Take one picture and its measured values."""
-    given: bytes = (request.args or {}).get(b"values", [b""])[0]
-    values = parse_values(given.decode("utf-8", "replace"))
-    wanted = phones.receive_picture(uuid, request.content.read() if request.content is not None else b"", values)
-    return {"fps": wanted.fps, "say": wanted.say}
+    encoded: bytes = (request.args or {}).get(b"values", [b""])[0]
+    values = parse_values(encoded.decode("utf-8", "replace"))
+    reply = phones.receive_picture(uuid, request.content.read() if request.content is not None else b"", values)
+    return {"fps": reply.fps, "say": reply.say}
 
 
-def remove_phone(board: Services, phones: Phones, uuid: str, request: Request) -> Json:
+def remove_phone(services: Services, phones: Phones, uuid: str, request: Request) -> Json:
     """Remove the phone; sent by a page that is closed or hidden."""
     phones.leave(uuid)
     source = str(getattr(request.getClientAddress(), "host", ""))
-    board.audit.write(get_user(request), source, f"POST {API}/phones/{{uuid}}/leave", uuid[:64], "200")
+    services.audit.write(get_user(request), source, f"POST {API}/phones/{{uuid}}/leave", uuid[:64], "200")
     return {}
 
 
@@ -183,7 +185,7 @@ ROUTES = (
                 "values",
                 "text",
                 "measured values as a JSON object: "
-                + ", ".join(f"{name} ({measure.unit})" for name, measure in VALUE_RANGES.items()),
+                + ", ".join(f"{name} ({value_range.unit})" for name, value_range in VALUE_RANGES.items()),
                 "query",
                 minimum=0,
                 maximum=MAX_VALUES_CHARS,
@@ -191,7 +193,7 @@ ROUTES = (
             ),
         ),
         response="fps (requested pictures per second), say (text to show on the phone)",
-        native=lambda board, reactor: PhoneResource(board, receive_picture),
+        native=lambda services, reactor: PhoneResource(services, receive_picture),
         body_type="image/jpeg",
     ),
     Route(
@@ -201,6 +203,6 @@ ROUTES = (
         "phone",
         None,
         (UUID,),
-        native=lambda board, reactor: PhoneResource(board, remove_phone),
+        native=lambda services, reactor: PhoneResource(services, remove_phone),
     ),
 )

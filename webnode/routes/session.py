@@ -21,53 +21,55 @@ INVITATION_S = 86400.0
 MAX_INVITATION_S = MAX_SESSION_S
 
 
-def sign_in(ask: RouteRequest) -> Deferred[Json]:
+def sign_in(request: RouteRequest) -> Deferred[Json]:
     """Sign in with a code or a password."""
-    code, password = ask.values["code"], ask.values["password"]
+    code, password = request.values["code"], request.values["password"]
     if bool(code) == bool(password):
         problem = "both code and password are given" if code else "it is missing or empty"
         raise Refusal("code", problem, 'send {"code": "..."} or {"password": "..."}')
-    return ask.services.sessions.sign_in(code or password, ask.source, ask.now).addCallback(_describe_token)
+    return request.services.sessions.sign_in(code or password, request.source, request.now).addCallback(_describe_token)
 
 
-def read_session(ask: RouteRequest) -> Json:
-    """Return the name and role of the visitor."""
-    return {"name": ask.user.name, "role": ask.user.role}
+def read_session(request: RouteRequest) -> Json:
+    """Return the name and role of the user."""
+    return {"name": request.user.name, "role": request.user.role}
 
 
-def sign_out(ask: RouteRequest) -> Json:
+def sign_out(request: RouteRequest) -> Json:
     """End the session."""
-    if ask.user.token_id:
+    if request.user.token_id:
         # Another web node may have renewed the session just now; that token ends as well.
-        until = min(ask.user.limit, max(ask.user.until, ask.now + SESSION_S))
-        ask.services.sessions.revoke(ask.user.token_id, until)
+        until = min(request.user.limit, max(request.user.until, request.now + SESSION_S))
+        request.services.sessions.revoke(request.user.token_id, until)
     return {}
 
 
-def renew_session(ask: RouteRequest) -> Json:
+def renew_session(request: RouteRequest) -> Json:
     """Return another token for the session."""
-    return _describe_token(ask.services.sessions.renew_token(ask.user, ask.now))
+    return _describe_token(request.services.sessions.renew_token(request.user, request.now))
 
 
-def issue_peer_tokens(ask: RouteRequest) -> Json:
+def issue_peer_tokens(request: RouteRequest) -> Json:
     """Return tokens with which the page can continue at the team's other web nodes."""
-    nodes = [page.node for page in ask.services.fallbacks.list_pages() if not page.is_self]
+    nodes = [page.node for page in request.services.fallbacks.list_pages() if not page.is_self]
     return {
         node: _describe_token(token)
-        for node, token in ask.services.sessions.issue_peer_tokens(ask.user, nodes, ask.now).items()
+        for node, token in request.services.sessions.issue_peer_tokens(request.user, nodes, request.now).items()
     }
 
 
-def invite_guest(ask: RouteRequest) -> Any:
+def invite_guest(request: RouteRequest) -> Any:
     """Return a token for a guest, and the link with which the guest opens the page."""
-    given, invites = ask.values, ask.services.invites
+    values, invites = request.values, request.services.invites
     urls = [] if invites is None else invites.urls()
-    if given["page"] and given["page"] not in urls:
+    if values["page"] and values["page"] not in urls:
         raise Refusal("page", "not a URL of this node's page", f"choose one of {', '.join(urls) or 'none'}")
-    token = ask.services.sessions.issue_guest_token(ask.user, given["name"], given["role"], ask.now, given["seconds"])
+    token = request.services.sessions.issue_guest_token(
+        request.user, values["name"], values["role"], request.now, values["seconds"]
+    )
     if invites is None or not urls:
         return _describe_token(token)
-    url = given["page"] or urls[0]
+    url = values["page"] or urls[0]
     link = f"{url}/#code={token.text}" + ("/phone" if token.role == "phone" else "")
     answer: dict[str, Json] = {
         **_describe_token(token),
@@ -76,7 +78,7 @@ def invite_guest(ask: RouteRequest) -> Any:
         **_describe_authority(invites, urls),
     }
     answer["pages"] = [*urls]
-    if not given["draw"]:
+    if not values["draw"]:
         return answer
     qr_codes = gatherResults(
         [invites.draw_qr_code(text) for text in (link, str(answer["certificate"]))], consumeErrors=True
@@ -84,9 +86,9 @@ def invite_guest(ask: RouteRequest) -> Any:
     return qr_codes.addCallback(partial(_add_qr_codes, answer))
 
 
-def read_authority(ask: RouteRequest) -> Content:
+def read_authority(request: RouteRequest) -> Content:
     """Return the certificate authority that a browser has to trust; it is public."""
-    pem = b"" if ask.services.invites is None else ask.services.invites.authority
+    pem = b"" if request.services.invites is None else request.services.invites.authority
     if not pem:
         raise Refusal("certificate", "the page is not served over TLS", 'set tls = "auto" below [web]', 404)
     return Content(pem, "application/x-x509-ca-cert")
@@ -171,8 +173,8 @@ ROUTES = (
             Field("page", "text", "URL of the page, one of this node's", minimum=0, default=""),
             Field("draw", "flag", "also draw QR codes", default=False),
         ),
-        response="token, ticket, role, until (unix seconds), link, reaches (network, or this machine), is_secure, pages, "
-        "certificate (URL), fingerprint, code (SVG), certificate_code",
+        response="token, ticket, role, until (unix seconds), link, reaches (network, or this machine), is_secure, "
+        "pages, certificate (URL), fingerprint, code (SVG), certificate_code",
     ),
     Route(
         "GET",

@@ -24,26 +24,28 @@ SETTING_FIELDS = (
 )
 
 
-def read_settings(desk: TeamControl, uuid: str) -> Deferred[list[Row]]:
+def read_settings(control: TeamControl, uuid: str) -> Deferred[list[Row]]:
     """Read the settings of a device that can change at runtime."""
-    return desk.call(uuid, SETTINGS_METHOD).addCallback(_make_rows)
+    return control.call(uuid, SETTINGS_METHOD).addCallback(_make_rows)
 
 
-def change_settings(desk: TeamControl, uuid: str, changes: Mapping[str, Json]) -> Deferred[list[Row]]:
+def change_settings(control: TeamControl, uuid: str, changes: Mapping[str, Json]) -> Deferred[list[Row]]:
     """Change all of ``changes`` or none; fails with ``Refusal`` 400 for a setting, 409 and 504 for the device."""
-    return desk.call(uuid, TUNE_METHOD, dict(changes), refused=_make_refusal).addCallback(_make_rows)
+    return control.call(uuid, TUNE_METHOD, dict(changes), refused=_make_refusal).addCallback(_make_rows)
 
 
-def _handle_read(ask: RouteRequest) -> Any:
-    return read_settings(ask.services.control, find_device(ask)["uuid"])
+def _handle_read(request: RouteRequest) -> Any:
+    return read_settings(request.services.control, find_device(request)["uuid"])
 
 
-def _handle_change(ask: RouteRequest) -> Any:
-    uuid = find_device(ask)["uuid"]
-    changes = {knob.name: ask.values[knob.name] for knob in SETTING_FIELDS if ask.values[knob.name] is not None}
+def _handle_change(request: RouteRequest) -> Any:
+    uuid = find_device(request)["uuid"]
+    changes = {
+        field.name: request.values[field.name] for field in SETTING_FIELDS if request.values[field.name] is not None
+    }
     if not changes:
-        raise Refusal("body", "no setting given", f"send some of {', '.join(knob.name for knob in SETTING_FIELDS)}")
-    return change_settings(ask.services.control, uuid, changes)
+        raise Refusal("body", "no setting given", f"send some of {', '.join(field.name for field in SETTING_FIELDS)}")
+    return change_settings(request.services.control, uuid, changes)
 
 
 def _make_rows(answer: object) -> list[Row]:
@@ -51,7 +53,7 @@ def _make_rows(answer: object) -> list[Row]:
     return [_make_row(*row) for row in rows if isinstance(row, list) and len(row) == 6 and clean_text(row[0])]
 
 
-def _make_row(key: object, value: object, about: object, unit: object, least: object, most: object) -> Row:
+def _make_row(key: object, value: object, description: object, unit: object, minimum: object, maximum: object) -> Row:
     valid: Any = (
         clean_properties(value)
         if isinstance(value, dict)
@@ -62,18 +64,18 @@ def _make_row(key: object, value: object, about: object, unit: object, least: ob
     return {
         "key": clean_text(key, limit=64),
         "value": valid,
-        "about": clean_text(about),
+        "about": clean_text(description),
         "unit": clean_text(unit, limit=20),
-        "least": None if least is None else clean_number(least),
-        "most": None if most is None else clean_number(most),
+        "least": None if minimum is None else clean_number(minimum),
+        "most": None if maximum is None else clean_number(maximum),
         "choices": [],
     }
 
 
 def _make_refusal(refused: Refused) -> Refusal | None:
     """Return the error of a setting as the device reports it; None for any other refusal."""
-    key, _, words = str(refused).partition(": ")
-    problem, _, remedy = words.rpartition("; ")
+    key, _, text = str(refused).partition(": ")
+    problem, _, remedy = text.rpartition("; ")
     return (
         Refusal(clean_text(key), clean_text(problem), clean_text(remedy))
         if refused.code == INVALID_SETTING and problem

@@ -12,40 +12,45 @@ from webnode.route import API, Field, Route, RouteRequest
 FULL_TURN_RAD = round(math.tau, 4)
 
 
-def move_target(ask: RouteRequest) -> Any:
+def move_target(request: RouteRequest) -> Any:
     """Put the target at a position."""
-    x, y = ask.values["x"], ask.values["y"]
-    _require_inside(_require_map(ask, "target"), "target", x, y)
-    return ask.services.control.move_target(x, y).addCallback(lambda _: {"x": x, "y": y})
+    x, y = request.values["x"], request.values["y"]
+    _require_inside(_require_map(request, "target"), "target", x, y)
+    return request.services.control.move_target(x, y).addCallback(lambda _: {"x": x, "y": y})
 
 
-def move_robot(ask: RouteRequest) -> Any:
+def move_robot(request: RouteRequest) -> Any:
     """Move a robot to a position."""
-    name, x, y, yard = ask.values["name"], ask.values["x"], ask.values["y"], _require_map(ask, "robot")
-    found = next((dog for dog in yard["dogs"] if dog["name"] == name), None)
+    name, x, y, robot_map = (
+        request.values["name"],
+        request.values["x"],
+        request.values["y"],
+        _require_map(request, "robot"),
+    )
+    found = next((dog for dog in robot_map["dogs"] if dog["name"] == name), None)
     if found is None:
-        here = ", ".join(dog["name"] for dog in yard["dogs"])
+        here = ", ".join(dog["name"] for dog in robot_map["dogs"])
         raise Refusal("name", "unknown robot", f"choose one of {here}", 404)
-    _require_inside(yard, "robot", x, y)
-    heading = found["heading"] if ask.values["heading"] is None else ask.values["heading"]
+    _require_inside(robot_map, "robot", x, y)
+    heading = found["heading"] if request.values["heading"] is None else request.values["heading"]
     moved = {"name": name, "x": x, "y": y, "heading": heading}
-    return ask.services.control.move_robot(name, x, y, heading).addCallback(lambda _: moved)
+    return request.services.control.move_robot(name, x, y, heading).addCallback(lambda _: moved)
 
 
-def clear_target(ask: RouteRequest) -> Any:
+def clear_target(request: RouteRequest) -> Any:
     """Remove the target."""
-    return ask.services.control.clear_target().addCallback(lambda _: {})
+    return request.services.control.clear_target().addCallback(lambda _: {})
 
 
-def _require_map(ask: RouteRequest, what: str) -> Mapping[str, Any]:
-    yard = ask.services.control.get_map()
-    if yard is None:
+def _require_map(request: RouteRequest, what: str) -> Mapping[str, Any]:
+    robot_map = request.services.control.get_map()
+    if robot_map is None:
         raise Refusal(what, "this node has no robot simulator", "start one, or name it in the settings", 409)
-    return yard
+    return robot_map
 
 
-def _require_inside(yard: Mapping[str, Any], what: str, x: float, y: float) -> None:
-    width, height = yard["walls"]
+def _require_inside(robot_map: Mapping[str, Any], what: str, x: float, y: float) -> None:
+    width, height = robot_map["walls"]
     if not (0.0 <= x <= width and 0.0 <= y <= height):
         raise Refusal(what, f"({x:g}, {y:g}) is outside the map", f"send x in 0..{width:g} and y in 0..{height:g}")
 

@@ -12,20 +12,24 @@ from webnode.sanitize import Json
 from webnode.stop_control import StopControl
 
 
-def read_halted(ask: RouteRequest) -> Json:
+def read_halted(request: RouteRequest) -> Json:
     """Return whether every robot stands still."""
-    _require_stop_control(ask)
-    return {"halted": bool(ask.state.get("halted"))}
+    _require_stop_control(request)
+    return {"halted": bool(request.state.get("halted"))}
 
 
-def stop_team(ask: RouteRequest) -> Any:
+def stop_team(request: RouteRequest) -> Any:
     """Stop every robot of the team."""
-    return _require_stop_control(ask).stop(_get_name(ask)).addCallback(_summarize, True)
+    return _require_stop_control(request).stop(_get_name(request)).addCallback(_summarize, True)
 
 
-def release_team(ask: RouteRequest) -> Any:
+def release_team(request: RouteRequest) -> Any:
     """End the given stops, or all known ones."""
-    return _require_stop_control(ask).release(_get_name(ask), ask.values.get("stops")).addCallback(_summarize, False)
+    return (
+        _require_stop_control(request)
+        .release(_get_name(request), request.values.get("stops"))
+        .addCallback(_summarize, False)
+    )
 
 
 def _summarize(devices: dict[str, str], otherwise: bool) -> Any:
@@ -34,14 +38,14 @@ def _summarize(devices: dict[str, str], otherwise: bool) -> Any:
     return {"halted": all(each == STANDS_STILL for each in robots) if robots else otherwise, "devices": devices}
 
 
-def _get_name(ask: RouteRequest) -> str:
-    return ask.user.name or ask.user.role
+def _get_name(request: RouteRequest) -> str:
+    return request.user.name or request.user.role
 
 
-def _require_stop_control(ask: RouteRequest) -> StopControl:
-    if ask.services.halts is None:
+def _require_stop_control(request: RouteRequest) -> StopControl:
+    if request.services.stop_control is None:
         raise Refusal("halt", "this node cannot stop the team", "use another web node of the team", 409)
-    return ask.services.halts
+    return request.services.stop_control
 
 
 RESPONSE = "halted (every robot stands still), devices (state by uuid, as text)"

@@ -15,62 +15,66 @@ from webnode.sanitize import Json
 TASK = Field("task_id", "text", "the task", "path", maximum=64)
 
 
-def list_tasks(ask: RouteRequest) -> Json:
+def list_tasks(request: RouteRequest) -> Json:
     """Return all tasks."""
-    listed: Json = ask.state["tasks"]
+    listed: Json = request.state["tasks"]
     return listed
 
 
-def list_predefined(ask: RouteRequest) -> Json:
+def list_predefined(request: RouteRequest) -> Json:
     """Return the predefined tasks."""
-    return [dict(task) for task in ask.services.control.list_predefined()]
+    return [dict(task) for task in request.services.control.list_predefined()]
 
 
-def run_demo(ask: RouteRequest) -> Any:
+def run_demo(request: RouteRequest) -> Any:
     """Run the demonstration."""
-    return maybeDeferred(ask.services.control.run_demo, _derive_task_id(ask, "demo")).addCallback(_wrap_id)
+    return maybeDeferred(request.services.control.run_demo, _derive_task_id(request, "demo")).addCallback(_wrap_id)
 
 
-def assign_task(ask: RouteRequest) -> Any:
+def assign_task(request: RouteRequest) -> Any:
     """Assign a predefined task."""
-    given = ask.values["name"], ask.values["tolerates"], ask.values["group"]
-    return maybeDeferred(ask.services.control.assign, *given, _derive_task_id(ask, "task")).addCallback(_wrap_id)
+    arguments = request.values["name"], request.values["tolerates"], request.values["group"]
+    return maybeDeferred(request.services.control.assign, *arguments, _derive_task_id(request, "task")).addCallback(
+        _wrap_id
+    )
 
 
-def _derive_task_id(ask: RouteRequest, what: str) -> str:
+def _derive_task_id(request: RouteRequest, what: str) -> str:
     """Derive the id of the new task from the idempotency key; empty without a key.
 
     It is the same at every web node: a page whose node failed before answering repeats the request at another one,
     which recognizes it by the id of the task.
     """
-    if not ask.id:
+    if not request.id:
         return ""
-    wish = "\n".join((what, ask.user.token_id, ask.id))
-    return blake2s(wish.encode(), digest_size=6).hexdigest()
+    request_key = "\n".join((what, request.user.token_id, request.id))
+    return blake2s(request_key.encode(), digest_size=6).hexdigest()
 
 
 def _wrap_id(answer: Any) -> Json:
-    told: Json = answer if isinstance(answer, dict) else {"id": answer}
-    return told
+    body: Json = answer if isinstance(answer, dict) else {"id": answer}
+    return body
 
 
-def preview_task(ask: RouteRequest) -> Any:
+def preview_task(request: RouteRequest) -> Any:
     """Return which devices can take a predefined task."""
-    return ask.services.control.preview(ask.values["name"], ask.values["group"])
+    return request.services.control.preview(request.values["name"], request.values["group"])
 
 
-def _make_order_route(word: str, about: str, wish: Callable[[RouteRequest], Callable[[str], Any]]) -> Route:
-    """Return the route of the order ``word`` for an existing task."""
+def _make_order_route(
+    verb: str, description: str, choose_order: Callable[[RouteRequest], Callable[[str], Any]]
+) -> Route:
+    """Return the route of the order ``verb`` for an existing task."""
 
-    def answer(ask: RouteRequest) -> Json:
-        task_id = ask.values["task_id"]
-        if task_id not in [task["id"] for task in ask.state["tasks"]]:
+    def answer(request: RouteRequest) -> Json:
+        task_id = request.values["task_id"]
+        if task_id not in [task["id"] for task in request.state["tasks"]]:
             raise Refusal("task", "unknown task", f"choose one of {API}/tasks", 404)
-        wish(ask)(task_id)
+        choose_order(request)(task_id)
         return {"id": task_id}
 
-    path = f"{API}/tasks/{{task_id}}/{word}"
-    return Route("POST", path, about, "operator", answer, (TASK,), response="id", status=202)
+    path = f"{API}/tasks/{{task_id}}/{verb}"
+    return Route("POST", path, description, "operator", answer, (TASK,), response="id", status=202)
 
 
 NAME = Field("name", "text", "name in the catalogue", maximum=64)
@@ -125,9 +129,13 @@ ROUTES = (
         response="able (uuid, name, busy: its current task), refused (reasons by name), likely (a name, or null), "
         "together (id, title: tasks that the group divides with it)",
     ),
-    _make_order_route("cancel", "End a task; its lease is no longer granted", lambda ask: ask.services.control.cancel),
     _make_order_route(
-        "pause", "Pause a task; its devices stop and are free for other tasks", lambda ask: ask.services.control.pause
+        "cancel", "End a task; its lease is no longer granted", lambda request: request.services.control.cancel
     ),
-    _make_order_route("resume", "Resume a paused task", lambda ask: ask.services.control.resume),
+    _make_order_route(
+        "pause",
+        "Pause a task; its devices stop and are free for other tasks",
+        lambda request: request.services.control.pause,
+    ),
+    _make_order_route("resume", "Resume a paused task", lambda request: request.services.control.resume),
 )
