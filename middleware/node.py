@@ -244,7 +244,7 @@ class SwarmNode(Service):
     def find_devices(
         self, count: int, matches: Matches = lambda device: True, after: bytes | None = None
     ) -> Deferred[Page]:
-        """Fire with at most ``count`` devices; see ``Directory.some``.  Never fails."""
+        """Fire with at most ``count`` devices; see ``Directory.find_devices``.  Never fails."""
         return Deferred.fromCoroutine(self.directory.find_devices(count, matches, after))
 
     def find_contact(self, record: Record) -> Contact | None:

@@ -1,7 +1,7 @@
 """Certificates of members: formats, creation and verification.
 
 A node shows its certificate (its *pass*) in the handshake of a session.  A pass is one msgpack array of at most
-``ROOM`` bytes, in one of four formats:
+``MAX_CERTIFICATE_BYTES`` bytes, in one of four formats:
 
 * ``[0, grant]``: the operator's grant.
 * ``[1, invite, wish, proof, name, not before, not after, signature, grant]``: an admission by invitation.  ``proof`` is
@@ -13,7 +13,7 @@ A node shows its certificate (its *pass*) in the handshake of a session.  A pass
 * ``[3, content, not before, not after, signature, grant]``: a renewal of format 0 or 1.  ``content`` has the fields
   that the operator signed, ``[grant]`` or ``[invite, wish, proof, name, admitter]``; the bootstrap node adds its
   ``signature`` and its ``grant``.  Name and roles follow from ``content``, so a renewal changes only the dates.  Only
-  certificates that the operator issued for ``YEAR`` or longer are renewed, and only by bootstrap nodes that have such
+  certificates that the operator issued for ``DEFAULT_LIFE_S`` or longer are renewed, and only by bootstrap nodes that have such
   a certificate.
 """
 

@@ -57,7 +57,7 @@ def start_incarnation(store: Store, wall: float, rng: random.Random) -> Incarnat
 
 
 class ClosedAdmission:
-    """Verify passes against the membership list ``roll``; implements ``Door``.
+    """Verify passes against the membership list ``roll``; implements ``AdmissionCheck``.
 
     ``membership`` returns this node's own membership.  Verified passes are cached by digest, so each pass costs its
     signature checks once.

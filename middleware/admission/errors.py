@@ -39,7 +39,7 @@ class BadKeyFile(LocalError):
 
 
 class NotWelcome(Refused):
-    """The team rejects this newcomer; ``code`` is a key of ``WHY``."""
+    """The team rejects this newcomer; ``code`` is a key of ``REFUSAL_TEXTS``."""
 
     code = "unknown"
 

@@ -64,7 +64,7 @@ class Gossip:
         self._chores.every(COMPARE_INTERVAL_S, self._compare_with_one)
 
     def add(self, packed: bytes) -> Entry | None:
-        """Add an entry that originates at this node, and push it; raises as ``Roll.add`` does."""
+        """Add an entry that originates at this node, and push it; raises as ``MembershipList.add`` does."""
         entry = self._membership_list.add(packed, self._wall())
         if entry is not None:
             self._on_new_entry(entry)

@@ -154,7 +154,7 @@ def make_reply(invitation: bytes, request: JoinRequest, reply: JoinReply, signer
 
 
 def make_refusal(invitation: bytes, request: JoinRequest, code: str, signer: Signer, rng: random.Random) -> bytes:
-    """Return the WELCOME that rejects a newcomer with a code of ``errors.WHY``."""
+    """Return the WELCOME that rejects a newcomer with a code of ``errors.REFUSAL_TEXTS``."""
     body = _sign_body(invitation, request, msgpack.packb([code]), signer)
     return _encrypt_reply(invitation, request.ephemeral, body, rng)
 

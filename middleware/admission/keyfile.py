@@ -29,7 +29,7 @@ def read(path: Path) -> dict[str, Any]:
 
 
 def read_bytes(path: Path) -> bytes:
-    """Return the content of ``path``, at most ``MAX_FILE`` + 1 bytes; raises ``BadKeyFile`` as ``read`` does."""
+    """Return the content of ``path``, at most ``MAX_FILE_BYTES`` + 1 bytes; raises ``BadKeyFile`` as ``read`` does."""
     try:
         with open(path, "rb") as file:
             state = os.fstat(file.fileno())

@@ -343,7 +343,7 @@ class MembershipList:
         """Return whether no other bootstrap node can renew certificates; the last one renews itself.
 
         A bootstrap node that the operator named after ``since`` does not count, nor does one that ends within two
-        ``STEP``: bootstrap nodes renew each other long before that, so it is offline.
+        ``MIN_RENEWAL_S``: bootstrap nodes renew each other long before that, so it is offline.
         """
         publics = {each.public for each in self._list_kind(Grant)}
         publics |= {each.member.public for each in self._list_kind(Renewal)}

@@ -22,7 +22,7 @@ from middleware.entangled.wire.admission_check import LogLimiter
 SCAN_INTERVAL_S = 600.0
 """Mean seconds between two scans of the list.  Less renews members sooner that are present only briefly."""
 RENEWAL_DIVISOR = 3
-"""A certificate is renewed when less than 1/``LEFT`` of its life is left."""
+"""A certificate is renewed when less than 1/``RENEWAL_DIVISOR`` of its life is left."""
 MAX_RENEWALS_PER_SCAN = 8
 """Renewals signed per scan: the renewals of a team that was founded in one day are spread over hours."""
 

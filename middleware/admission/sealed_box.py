@@ -19,7 +19,7 @@ _NONCE = bytes(12)
 def seal(message: bytes, to: bytes, shared: bytes, about: bytes, rng: random.Random) -> bytes:
     """Encrypt ``message`` to the X25519 key ``to`` and the secret ``shared``; ``about`` is authenticated with it.
 
-    The result is ``OVERHEAD`` bytes longer.  Raises ``Forged`` if ``to`` is not a valid key.
+    The result is ``OVERHEAD_BYTES`` bytes longer.  Raises ``Forged`` if ``to`` is not a valid key.
     """
     secret = rng.randbytes(KEY_BYTES)
     public = bindings.crypto_scalarmult_base(secret)

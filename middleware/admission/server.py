@@ -41,7 +41,7 @@ class AdmissionServer:
     ``identity`` is the node's key pair.  ``take`` uses up one use of an invitation, ``admit`` publishes an admission,
     ``given`` returns the reply content for a pass, and ``send`` sends a datagram.  ``now`` is the monotonic clock for
     rate limits, ``wall`` the wall clock for statements.  ``refused`` is called for each rejected newcomer with its key
-    (empty if the code is unknown), its address and the code of ``WHY``.
+    (empty if the code is unknown), its address and the code of ``REFUSAL_TEXTS``.
     """
 
     _log = Logger()

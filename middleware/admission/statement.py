@@ -272,7 +272,7 @@ def open_statement(operator: bytes, packed: object) -> Statement:
 
 
 def unpack_fields(packed: object) -> list[Any]:
-    """Unpack a msgpack array of at most ``MAX_STATEMENT`` bytes; raises ``Malformed``."""
+    """Unpack a msgpack array of at most ``MAX_STATEMENT_BYTES`` bytes; raises ``Malformed``."""
     if not isinstance(packed, bytes) or len(packed) > MAX_STATEMENT_BYTES:
         raise Malformed(f"a statement has to be at most {MAX_STATEMENT_BYTES} bytes")
     try:

@@ -27,13 +27,13 @@ class UseCounters:
         self._space = TupleSpace(node, clock, rng, SPACE_NAME)
 
     def issue(self, invite: Invite) -> Deferred[list[None]]:
-        """Put the uses of ``invite``; fires when a majority stored them, fails with a ``WeatherError``."""
+        """Put the uses of ``invite``; fires when a majority stored them, fails with a ``TransientError``."""
         name = invitation_id(invite.public)
         puts = [self._space.put((name, number)) for number in range(invite.uses)]
         return gatherResults(puts, consumeErrors=True).addErrback(_unwrap_first_error)
 
     def take(self, invite: Invite) -> Deferred[bool]:
-        """Take one use of ``invite``; fires with whether one was left, fails with a ``WeatherError`` if undecidable."""
+        """Take one use of ``invite``; fires with whether one was left, fails with a ``TransientError`` if undecidable."""
         taken = self._space.get_if_exists((invitation_id(invite.public), int))
         return taken.addCallback(lambda found: found is not None)
 

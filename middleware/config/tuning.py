@@ -66,7 +66,7 @@ class Tuning:
         return [[k.key, k.read(), k.about, k.unit, k.least, k.most] for k in self._settings.values()]
 
     def change(self, changes: Mapping[Any, Any]) -> list[list[object]]:
-        """Apply all changes or none; raises ``Refused`` with the code ``WRONG``."""
+        """Apply all changes or none; raises ``Refused`` with the code ``INVALID_SETTING``."""
         checked = {key: self._check_change(key, value) for key, value in changes.items()}
         before = {key: self._settings[key].read() for key in checked}
         for key, value in checked.items():

@@ -24,9 +24,9 @@ from middleware.tasks.task import Member, is_choice, is_value
 
 SLOT = "verdict"
 MAX_EPOCHS = 4
-"""Number of epochs of a task that an agent keeps; a new one replaces the slot of the epoch ``KEPT`` before it."""
+"""Number of epochs of a task that an agent keeps; a new one replaces the slot of the epoch ``MAX_EPOCHS`` before it."""
 MAX_REPORTS, MAX_BEST_REPORTS = 30, 8
-"""Of more than ``MANY`` reports only the ``BEST`` are recorded, with the total count; ``BEST`` silent names at most."""
+"""Of more than ``MAX_REPORTS`` reports only the ``MAX_BEST_REPORTS`` are recorded, with the total count; ``MAX_BEST_REPORTS`` silent names at most."""
 MAX_STANDBYS = 3
 MAX_RECORD_BYTES = 3300
 """Maximum size of a record's value in bytes: three datagrams, and one for a team of ten."""
@@ -89,7 +89,7 @@ class DecisionRecord:
     def is_publisher(self) -> bool:
         """Whether the agent should write its record.
 
-        In a group of more than ``MANY`` members only the agents with the best reports do.
+        In a group of more than ``MAX_REPORTS`` members only the agents with the best reports do.
         """
         return self.participants <= MAX_REPORTS or self.agent in [
             report.agent for report in self.reports[:MAX_BEST_REPORTS]
@@ -101,7 +101,7 @@ class DecisionRecord:
         return make_slot_name(self.epoch)
 
     def pack(self) -> bytes:
-        """Return the value of the record, at most ``MAX_VERDICT`` bytes; longer texts are cut."""
+        """Return the value of the record, at most ``MAX_RECORD_BYTES`` bytes; longer texts are cut."""
         content = {
             "name": _truncate(self.name, MAX_NAME_BYTES),
             "task": _truncate(self.task, 64),

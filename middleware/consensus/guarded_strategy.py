@@ -28,7 +28,7 @@ from middleware.errors import SwarmError
 
 MAX_REMEMBERED_RESULTS = 64
 MAX_LOSSES = 3
-"""A strategy that is lost this many times within ``SPAN`` calls is not called again.
+"""A strategy that is lost this many times within ``LOSS_SPAN_CALLS`` calls is not called again.
 
 Each loss costs a full deadline.
 """
@@ -156,7 +156,7 @@ class GuardedStrategy:
 
 
 def check_consensus(found: Consensus, contacts: Sequence[Report]) -> Consensus:
-    """Return ``found`` if it is a possible decision for ``contacts``; raise ``NoOpinion`` otherwise."""
+    """Return ``found`` if it is a possible decision for ``contacts``; raise ``StrategyError`` otherwise."""
     if not isinstance(found, Consensus):
         raise StrategyError(f"find returns {type(found).__name__}, not Consensus")
     agents = {report.agent for report in contacts}
@@ -178,7 +178,7 @@ def check_consensus(found: Consensus, contacts: Sequence[Report]) -> Consensus:
 
 
 def check_group(found: Sequence[Consensus], contacts: Sequence[Report], items: Sequence[Item]) -> tuple[Consensus, ...]:
-    """Return ``found`` if it has one possible decision per item within all capacities; else raise ``NoOpinion``."""
+    """Return ``found`` if it has one possible decision per item within all capacities; else raise ``StrategyError``."""
     if not isinstance(found, tuple) or not all(isinstance(point, Consensus) for point in found):
         raise StrategyError("find_group does not return a tuple of Consensus")
     if [point.task for point in found] != [item.task for item in sort_items(items)]:

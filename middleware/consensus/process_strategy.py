@@ -48,7 +48,7 @@ class ProcessStrategy(RemoteStrategy):
         self._start()
 
     def stop(self) -> None:
-        """End the process; later calls raise ``NoOpinion``."""
+        """End the process; later calls raise ``StrategyError``."""
         self._is_stopped = True
         self._end()
 
@@ -81,7 +81,7 @@ class ProcessStrategy(RemoteStrategy):
             process.wait()
 
     def call(self, method: str, arguments: list[Any]) -> Any:
-        """Call ``method`` in the process and return its result; raises ``NoOpinion``."""
+        """Call ``method`` in the process and return its result; raises ``StrategyError``."""
         end = time.monotonic() + self._deadline
         if self._load_error:
             raise StrategyRaised(self._load_error)

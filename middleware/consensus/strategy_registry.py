@@ -12,7 +12,7 @@ class StrategyRegistry:
     """The strategies of one node, by name.
 
     A third-party strategy runs in a process, so one instance is shared by all tasks and auctions until ``stop``.  Its
-    losses (``guard.STRIKES``) therefore count across tasks: each loss blocks the whole node.  A strategy that reached
+    losses (``guarded_strategy.MAX_LOSSES``) therefore count across tasks: each loss blocks the whole node.  A strategy that reached
     the limit is not called again until the node restarts.
     """
 

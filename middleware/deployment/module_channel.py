@@ -90,7 +90,7 @@ class ProcessEnded(Exception):
 
 
 class Channel(Protocol):
-    """The node's end of the two pipes of a process; ``receive`` and ``send`` raise ``Gone``."""
+    """The node's end of the two pipes of a process; ``receive`` and ``send`` raise ``ProcessEnded``."""
 
     def send(self, message: bytes) -> None:
         """Send a message; the next ``receive`` sends the part that does not fit into the pipe now."""

@@ -1,7 +1,7 @@
 """Module side of the channel, in the module's process: load one module and answer the node's requests.
 
 ``confine`` is called with the module's source before the source runs; it drops the privileges of the process and
-returns the limits in effect.  Each kind of module is handled by a ``Kind``.
+returns the limits in effect.  Each kind of module is handled by a ``ModuleKind``.
 """
 
 from __future__ import annotations

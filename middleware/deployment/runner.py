@@ -2,7 +2,7 @@
 
 The node never waits for a behaviour: it sends a request and polls for the reply.  For a strategy it waits at most
 ``DEADLINE_S``.  A process that is late, dies, or sends an unexpected reply is killed; the next request restarts it,
-until it was lost ``STRIKES`` times.
+until it was lost ``MAX_LOSSES`` times.
 """
 
 from __future__ import annotations
@@ -128,7 +128,7 @@ class Runner:
             self._end_process(why)
 
     def call(self, verb: str, arguments: list[Any]) -> Any:
-        """Return the reply to one request, waiting at most ``DEADLINE_S``; raises ``NoOpinion``."""
+        """Return the reply to one request, waiting at most ``DEADLINE_S``; raises ``StrategyError``."""
         self.last_request_at = self._seconds()
         if self.state is State.LOST:
             self.start()
@@ -157,7 +157,7 @@ class Runner:
     def send_request(self, verb: str, arguments: list[Any], take: Callable[[bool, Any], None]) -> None:
         """Send a request without waiting; ``take`` is called with the reply, or with False and an error text.
 
-        Raises ``Gone``.
+        Raises ``ProcessEnded``.
         """
         if self._channel is None:
             raise ProcessEnded(self.why or "its process has ended")
@@ -250,7 +250,7 @@ class PushedStrategy(RemoteStrategy):
         self._runner = runner
 
     def call(self, method: str, arguments: list[Any]) -> Any:
-        """Return the reply of the process; raises ``NoOpinion``."""
+        """Return the reply of the process; raises ``StrategyError``."""
         return self._runner.call(CALL, [STRATEGY_INSTANCE, method, arguments])
 
 
@@ -276,7 +276,7 @@ class BehaviourInstance:
         return self._runner.has_unsent
 
     def send_request(self, method: str, arguments: list[Any], take: Callable[[bool, Any], None]) -> bool:
-        """Send a request without waiting; returns whether that was possible.  ``take`` is as in ``Runner.ask``."""
+        """Send a request without waiting; returns whether that was possible.  ``take`` is as in ``Runner.send_request``."""
         self.poll()
         if self.fault or not self._is_created:
             return False

@@ -99,10 +99,10 @@ def describe_network(node: SwarmNode) -> dict[str, Any]:
 
 
 def describe_links(node: SwarmNode) -> dict[str, Any]:
-    """Return the links from ``node`` to its peers, as ``Gauge.links`` does, and the recent refusals.
+    """Return the links from ``node`` to its peers, as ``LinkMetrics.read`` does, and the recent refusals.
 
     Each refusal has ``who`` (a name of the team, or the beginning of a key, or empty), ``at``, ``side`` as in
-    ``Rebuff``, ``code``, ``reason``, ``ago`` (seconds since the last time) and ``count``.
+    ``Rejection``, ``code``, ``reason``, ``ago`` (seconds since the last time) and ``count``.
     """
     now = node.clock.seconds()
     rebuffs = node.entangled.endpoint.rejections.list_recent(now)[:MAX_REFUSALS]

@@ -45,7 +45,7 @@ class Device:
       in degrees with ``accuracy`` in metres
     - ``laptop``, ``agent``: display names of the computer and of the agent (thesis, Table 5.1)
     - ``depth``: the depth of its place in the directory (``middleware.directory.prefix``)
-    - ``stops``: the ids in hex of the stops that it obeys, at most ``STOPS_SHOWN``
+    - ``stops``: the ids in hex of the stops that it obeys, at most ``MAX_STOPS``
     - ``obeys``: its activity while the team is stopped (``middleware.stop.stop_state``)
     """
 
@@ -72,7 +72,7 @@ class Device:
     obeys: str = ""
 
     def with_message(self, now: float, text: str) -> Device:
-        """Return this device with one more line; at most ``MESSAGES_KEPT`` are kept."""
+        """Return this device with one more line; at most ``MAX_MESSAGES`` are kept."""
         line = (now, text[:MAX_MESSAGE_CHARACTERS])
         return replace(self, messages=(*self.messages, line)[-MAX_MESSAGES:])
 
@@ -166,7 +166,7 @@ Later = Callable[[float, Callable[[], None]], object]
 
 
 class Presence:
-    """This node's own device record, announced after changes at most every ``PAUSE`` seconds."""
+    """This node's own device record, announced after changes at most every ``PAUSE_S`` seconds."""
 
     PAUSE_S = 0.1
 

@@ -231,7 +231,7 @@ class EntangledNode:
         Fails with ``Refused``, code ``role``, if this node's role, as known here or at the replicas, does not allow
         the record.
 
-        Raises ``TooLarge`` at once for a value over ``MAX_VALUE`` or a name over ``MAX_NAME`` bytes, and
+        Raises ``TooLarge`` at once for a value over ``MAX_VALUE_BYTES`` or a name over ``MAX_NAME_BYTES`` bytes, and
         ``ValueError`` for an invalid key.
         """
         if len(value) > MAX_VALUE_BYTES:
@@ -247,7 +247,7 @@ class EntangledNode:
     ) -> Deferred[Stored]:
         """Replace this node's record in a slot by a tombstone; fails as ``put`` does.
 
-        The tombstone stays for ``record.TOMBSTONE_TTL`` seconds, longer than any tolerated absence of a node.
+        The tombstone stays for ``record.TOMBSTONE_TTL_S`` seconds, longer than any tolerated absence of a node.
         """
         return self._put(key, name, None, "team", concern, expect)
 

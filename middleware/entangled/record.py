@@ -30,7 +30,7 @@ TOLERATED_ABSENCE_S = 6 * 86400.0
 """Seconds; a node that was away for longer joins with an empty store, because tombstones of records that it still holds
 may have expired meanwhile."""
 TOMBSTONE_TTL_S = TOLERATED_ABSENCE_S + 86400.0
-"""Seconds that a tombstone stays: a day longer than ``TOLERATED_ABSENCE``, for clock errors and late delivery."""
+"""Seconds that a tombstone stays: a day longer than ``TOLERATED_ABSENCE_S``, for clock errors and late delivery."""
 
 
 class Slot(NamedTuple):
@@ -47,7 +47,7 @@ class Record:
 
     ``owner`` is the public key (32 bytes).  ``ttl`` is in seconds and counts from arrival: a ``leased`` record expires
     that long after the owner's last sign of life, a ``team`` record that long after it was stored.  ``value`` is at
-    most ``MAX_VALUE`` bytes of msgpack, or None for a tombstone.
+    most ``MAX_VALUE_BYTES`` bytes of msgpack, or None for a tombstone.
     """
 
     key: bytes
@@ -100,7 +100,7 @@ class Record:
 
 
 def parse_record(fields: object) -> Record | None:
-    """Parse the fields of ``Record.packed``; None if a type, length or range is wrong."""
+    """Parse the fields of ``Record.pack``; None if a type, length or range is wrong."""
     if not isinstance(fields, list) or len(fields) != 8:
         return None
     key, name, owner, sequence, lifetime, ttl, value, signature = fields
@@ -131,7 +131,7 @@ def parse_slot(fields: object) -> Slot | None:
 
 
 class SignatureCache:
-    """A cache of the last ``MAX_SIGNED`` records with a valid signature; verifying one takes 80 us."""
+    """A cache of the last ``MAX_CACHED`` records with a valid signature; verifying one takes 80 us."""
 
     def __init__(self) -> None:
         self._digests: OrderedDict[bytes, None] = OrderedDict()

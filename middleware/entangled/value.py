@@ -30,7 +30,7 @@ def parse_mapping(record: Record, most: int = MAX_VALUE_BYTES) -> dict[str, Any]
 
 
 def check_size(value: bytes) -> bytes:
-    """Return ``value``; raise ``TooLarge`` if it has more than ``MAX_VALUE`` bytes."""
+    """Return ``value``; raise ``TooLarge`` if it has more than ``MAX_VALUE_BYTES`` bytes."""
     if len(value) > MAX_VALUE_BYTES:
         raise TooLarge(
             f"{len(value)} bytes; a value that all devices store has at most {MAX_VALUE_BYTES}; shorten the texts"
@@ -39,12 +39,12 @@ def check_size(value: bytes) -> bytes:
 
 
 def is_number(value: object) -> bool:
-    """Return whether ``value`` is a number of at most ``LARGEST``, not a boolean, infinity or NaN."""
+    """Return whether ``value`` is a number of at most ``MAX_NUMBER``, not a boolean, infinity or NaN."""
     return type(value) in (int, float) and -MAX_NUMBER <= value <= MAX_NUMBER  # type: ignore[operator]
 
 
 def is_natural(value: object) -> bool:
-    """Return whether ``value`` is an integer from 0 to ``LARGEST``."""
+    """Return whether ``value`` is an integer from 0 to ``MAX_NUMBER``."""
     return type(value) is int and 0 <= value <= MAX_NUMBER
 
 

@@ -89,7 +89,7 @@ class FaultOutcome:
 
 
 def run_scenario(scenario: Scenario, seed: int, stage: TeamUnderTest, say: Callable[[str], None]) -> list[FaultOutcome]:
-    """Run the scenario, and report each loss when it is settled; raises ``NobodyThere``."""
+    """Run the scenario, and report each loss when it is settled; raises ``DeviceNotPresent``."""
     rng = random.Random(seed)
     losses: list[FaultOutcome] = []
     if scenario.task:

@@ -116,7 +116,7 @@ def derive_id(*parts: bytes) -> bytes:
 
 
 def clip_name(by: str) -> str:
-    """Cut the name of an operator to at most ``BY_BYTES`` bytes."""
+    """Cut the name of an operator to at most ``MAX_OPERATOR_BYTES`` bytes."""
     return by.encode(errors="ignore")[:MAX_OPERATOR_BYTES].decode(errors="ignore")
 
 

@@ -16,7 +16,7 @@ ORDERS = (PAUSE, RESUME)
 
 @dataclass(frozen=True)
 class Order:
-    """One order, which is one of ``WORDS``; the newest is valid, by ``at`` (unix seconds on the writer's clock)."""
+    """One order, which is one of ``ORDERS``; the newest is valid, by ``at`` (unix seconds on the writer's clock)."""
 
     word: str
     by: str

@@ -43,7 +43,7 @@ class MethodTests(SiegeCase):
         asked = {name: attacker.ask(contact, name, changes=True) for name in names}
         outcomes = {name: self.outcome(team, each, 0.05) for name, each in asked.items()}
         for name in set(names) - {each for each in names if may_call(which, each)}:
-            attacker.tell(contact, name)  # a notification without a request is refused as well
+            attacker.notify(contact, name)  # a notification without a request is refused as well
         team.run(1.0)
         allowed = [name for name in names if may_call(which, name)]
         self.assertEqual(sorted(ran), sorted(allowed), which)

@@ -62,8 +62,8 @@ class FloodCase(SiegeCase):
             self.sent.append((datagram, to))
             send(datagram, to)
 
-        self.patch(wire, "Acceptance", accepted)
-        self.patch(server, "is_proof", proved)
+        self.patch(wire, "ResponderHandshake", accepted)
+        self.patch(server, "is_join_signature", proved)
         port.send = sends
         self.events = events_of(self)
 

@@ -127,7 +127,7 @@ class InventedKeyTests(RecordCase):
             answers: list[Any] = []
 
             async def read(record: Record = record, answers: list[Any] = answers) -> None:
-                answers.append(await node._reader.pages(contact, record.key))
+                answers.append(await node._reader.read_pages(contact, record.key))
 
             reading.fork(read())
             [watch] = self.watch([record], house)

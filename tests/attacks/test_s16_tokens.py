@@ -110,7 +110,7 @@ class PageCase(SynchronousTestCase):
 
     def tell(self, packed: bytes) -> None:
         """Publish a statement of the operator, and wait for its distribution."""
-        self.successResultOf(Deferred.fromCoroutine(self.vaio.node.team.tell(packed)))
+        self.successResultOf(Deferred.fromCoroutine(self.vaio.node.team.publish(packed)))
         self.run_for(IN_FORCE)
 
     def revoke(self, name: str) -> None:

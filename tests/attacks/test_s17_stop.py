@@ -42,7 +42,7 @@ class HaltingTeam(Village):
         """Start a node, which stands still until it has learned of the stops."""
         super().open(house)
         node: Any = house.node
-        halt = expose_stops(node, self.make_life_rng(house.place), node._chores.later, lambda stops, words: None)
+        halt = expose_stops(node, self.make_life_rng(house.place), node._background.later, lambda stops, words: None)
 
         def obey() -> str:
             if not halt.is_known:
@@ -52,7 +52,7 @@ class HaltingTeam(Village):
         halt.subscribe(obey)
         self.halts[house.name] = halt
         halt.request_stops()
-        node._chores.every(0.5, halt.recheck)
+        node._background.every(0.5, halt.recheck)
 
     def halt(self, house: House) -> StopState:
         return self.halts[house.name]
@@ -306,7 +306,7 @@ class LossTests(StopCase):
     def test_a_stop_that_is_not_saved_says_so(self) -> None:
         """A node that cannot store a stop obeys it, and answers that the stop is not saved."""
         store: Any = self.dogs[0].node.store
-        self.patch(store, "written", lambda: fail(Unwritable("the disk is full")))
+        self.patch(store, "wait_for_write", lambda: fail(Unwritable("the disk is full")))
         self.assertEqual(self.stop(self.ann)["dog1"], STANDS_STILL + NOT_SAVED)
         self.assertTrue(self.team.halt(self.dogs[0]).is_motion_forbidden)
 

@@ -136,7 +136,7 @@ class ReconfigurationTests(LeaseCase):
         liar, accomplices = self.members()[1], self.outsiders()
         forged = tuple(self.team.contact(self.team.houses[place]) for place in accomplices)
         desk: Any = self.team.nodes[liar].council_manager.lease_service
-        desk._after_write = lambda reply: ["moved", 0, "", 0, 0.0, 9, pack_members(forged)]
+        desk._reply_after_write = lambda reply: ["moved", 0, "", 0, 0.0, 9, pack_members(forged)]
         second = self.lessee(accomplices[0])
         second.claim()
         self.team.run(3.0)

@@ -171,7 +171,7 @@ class FloodTests(SynchronousTestCase):
         """Deliver ``data`` to the driver in the chunks of a reactor."""
         for start in range(0, len(data), READ):
             if self.link.receiver is not None:
-                self.link.receiver.received(data[start : start + READ])
+                self.link.receiver.data_received(data[start : start + READ])
 
     def test_flood_of_empty_frames(self) -> None:
         """Of a megabyte of empty frames about a thousand are processed; the driver disconnects and reconnects later."""

@@ -29,7 +29,7 @@ from middleware.entangled.wire.fragmenter import MAX_IN_PER_PEER_BYTES
 
 TEAM = b"k" * 32
 STRANGER = Address("10.0.0.9", 999)
-LEFT_OUT = ("door", "counters", "_counters", "_rng", "_network", "_clock", "_log", "_limit", "_cookie_limit", "_bucket")
+LEFT_OUT = ("admission", "counters", "_counters", "_rng", "_network", "_clock", "_log", "_limit", "_cookie_limit", "_bucket")
 PLAIN = frozenset((bytes, str, int, float, bool, type(None)))
 APART = (FunctionType, MethodType, type, random.Random, HeapClock, Switchboard)
 """Types that are not part of a node's state."""

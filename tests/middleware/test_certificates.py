@@ -36,7 +36,7 @@ class KnownDoor(OpenAdmission):
 
 class Endpoint:
     def __init__(self) -> None:
-        self.door = KnownDoor()
+        self.admission = KnownDoor()
         self.asked: list[list[bytes]] = []
         self.answer: Any = lambda owners: succeed(owners)
         self.exposed: Any = None
@@ -68,14 +68,14 @@ class CertificateTests(SynchronousTestCase):
         self.clock = HeapClock()
         self.endpoint = made()
         self.certificates = Certificates(self.endpoint, self.clock)
-        self.door = self.endpoint.door
+        self.admission = self.endpoint.admission
 
     def learn(self, which: list[bytes], peer: int = 1) -> None:
         self.successResultOf(Deferred.fromCoroutine(self.certificates.fetch_missing(contact(peer), which)))
 
     def test_asked_once_for_each(self) -> None:
         """Each unknown owner is requested once, several in one request."""
-        self.door.known.update(owners(3))
+        self.admission.known.update(owners(3))
         self.learn(owners(20) * 2)
         self.assertEqual(self.endpoint.asked, [owners(20)[3 : 3 + MAX_OWNERS], owners(20)[3 + MAX_OWNERS :]])
         self.learn(owners(20))
@@ -100,13 +100,13 @@ class CertificateTests(SynchronousTestCase):
         self.endpoint.answer = lambda asked: succeed(asked)
         self.clock.advance(RETRY_AFTER_S)
         self.learn(owners(2), 1)
-        self.assertEqual(self.door.known, set(owners(2)))
+        self.assertEqual(self.admission.known, set(owners(2)))
 
     def test_only_those_that_were_asked_for(self) -> None:
         """A certificate counts only for the requested owner; certificates before the first invalid one are kept."""
         self.endpoint.answer = lambda asked: succeed([asked[0], b"", *asked[2:]])
         self.learn(owners(3))
-        self.assertEqual(self.door.known, {owners(3)[0]})
+        self.assertEqual(self.admission.known, {owners(3)[0]})
 
     def test_bounded(self) -> None:
         """The table of peers that replied with invalid certificates is bounded."""
@@ -117,7 +117,7 @@ class CertificateTests(SynchronousTestCase):
 
     def test_answer(self) -> None:
         """A node returns known certificates for up to ``MAX_OWNERS`` owners, and an empty entry for an invalid key."""
-        self.door.known.update(owners(2))
+        self.admission.known.update(owners(2))
         answer = self.endpoint.exposed(contact(1), [*owners(3), b"short", 7])
         self.assertEqual(answer, [*owners(2), b"", b"", b""])
         self.assertEqual(len(self.endpoint.exposed(contact(1), owners(100))), MAX_OWNERS)

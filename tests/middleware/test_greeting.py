@@ -107,7 +107,7 @@ class HailTests(EndpointCase):
         _, to_other = self.endpoint(3, team=b"o" * 32)
 
         found = self.got(self.a.probe(to_other.address))
-        self.assertEqual((found.fingerprint, found.wall), (bytes(8), 0.0))
+        self.assertEqual((found.fingerprint, found.unix_time_s), (bytes(8), 0.0))
 
     def test_nobody_is_there(self) -> None:
         """A probe without a reply fails after its timeout, and a cancelled probe leaves no state."""

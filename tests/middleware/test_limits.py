@@ -45,9 +45,9 @@ PATCHED = (
 )
 
 # These tables have separate limits, larger than ``CROWD``.
-OTHERS: tuple[str, ...] = ("_members", "_listed_at", "_inquiries", "_peers", "sessions", "_responses", "_unconfirmed")
+OTHERS: tuple[str, ...] = ("_members", "_listed_at", "_requests", "_peers", "sessions", "_responses", "_unconfirmed")
 OTHERS += ("_contacts", "_store", "_entries", "_live", "_absent")
-OTHERS += ("_board._names", "_board._untraced")  # Tables of the simulation.
+OTHERS += ("_switchboard._names", "_switchboard._untraced")  # Tables of the simulation.
 
 
 class PageTests(FleetCase):
@@ -86,7 +86,7 @@ class CrowdTests(FleetCase):
     def visit(self, team: Any, node: Any, number: int) -> None:
         """Send each type of request once from an invented identity, then stop it."""
         own = Identity(random.Random(f"crowd {number}").randbytes(32))
-        network = team.switchboard.network(f"10.9.{number}.1", 7)
+        network = team.switchboard.make_network(f"10.9.{number}.1", 7)
         crowd = Endpoint(own, TEAM_KEY, network, team.clock, random.Random(number))
         crowd.start()
         crowd.expose("ping", lambda peer, digest: bytes(8), changes=True)

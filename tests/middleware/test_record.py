@@ -63,7 +63,7 @@ class RecordTest(SynchronousTestCase):
         for change in ({"value": b"there"}, {"sequence": 2}, {"signature": bytes(64)}, {"owner": CAT.public}):
             self.assertFalse(signed.is_genuine(replace(record(), **change)), change)
         self.assertEqual(len(signed), 1)
-        self.patch(records, "verified", lambda *_: self.fail("checked twice"))
+        self.patch(records, "is_signature_valid", lambda *_: self.fail("checked twice"))
         self.assertTrue(signed.is_genuine(replace(record())))
 
     def test_remembered_signatures_are_bounded(self) -> None:
@@ -72,7 +72,7 @@ class RecordTest(SynchronousTestCase):
         signed = SignatureCache()
         for sequence in (1, 2, 3, 1, 4):
             self.assertTrue(signed.is_genuine(record(sequence=sequence)))
-        self.patch(records, "verified", lambda *_: False)
+        self.patch(records, "is_signature_valid", lambda *_: False)
         self.assertEqual([n for n in range(1, 5) if signed.is_genuine(record(sequence=n))], [1, 3, 4])
 
     def test_there_and_back(self) -> None:

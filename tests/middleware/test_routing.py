@@ -189,7 +189,7 @@ class RoutingTableTest(SynchronousTestCase):
         self.assertEqual(target, table.refresh_target(index, random.Random(seed)))
 
     @settings(max_examples=50)
-    @given(st.lists(st.tuples(st.sampled_from(["saw", "failed", "remove"]), st.integers(0, 40)), max_size=200))
+    @given(st.lists(st.tuples(st.sampled_from(["record_contact", "record_miss", "remove"]), st.integers(0, 40)), max_size=200))
     def test_invariants(self, events: list[tuple[str, int]]) -> None:
         """In every state each bucket has at most k contacts, each contact occurs once, and the length is correct."""
         table = RoutingTable(OWN.node_id, k=3)

@@ -150,7 +150,7 @@ class ParticipantTable:
             entry.touched_at = now
 
     def add(self, party: Participant, opener: bytes, now: float) -> list[Participant]:
-        """Add ``party``, which ``opener`` (a node id, or ``OWN``) requested; returns the evicted parties."""
+        """Add ``party``, which ``opener`` (a node id, or ``OWN_OPENER``) requested; returns the evicted parties."""
         idle = [
             d
             for d, entry in self._entries.items()

@@ -1,6 +1,6 @@
 """Merge and evaluate the reports of one auction with its strategy, protected against faulty strategies; pure.
 
-If a third-party strategy raises, returns invalid reports, or has no ``merge``, the ``LEADING`` cheapest reports are
+If a third-party strategy raises, returns invalid reports, or has no ``merge``, the ``MAX_LEADING_REPORTS`` cheapest reports are
 used.  Reports that a strategy invents are dropped.
 """
 

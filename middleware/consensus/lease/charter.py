@@ -88,7 +88,7 @@ class Charter:
         return self.owner, self.signature
 
     def with_change(self, members: tuple[Contact, ...], ballot: Ballot, votes: Votes) -> Charter:
-        """Return this charter with one more council; raise ``Refused`` after ``MAX_LINKS`` changes."""
+        """Return this charter with one more council; raise ``Refused`` after ``MAX_CHANGES`` changes."""
         if len(self.changes) >= MAX_CHANGES:
             raise Refused(f"the council has changed {MAX_CHANGES} times; ask the operator to submit the task again")
         return replace(self, changes=(*self.changes, CouncilChange(members, ballot, votes)))

@@ -41,7 +41,7 @@ SOON_PERIODS = 1.5
 RELEASE_SPREAD_S = 0.3
 """Seconds after a notification of release during which members may not know of it yet."""
 FIRST_STANDBY_SHARE = 0.8
-"""Share of the promise time before the end of a lease (``AHEAD``) at which the first standby asks for promises, so that
+"""Share of the promise time before the end of a lease (``EARLY_PROMISE_SHARE``) at which the first standby asks for promises, so that
 a slightly late estimate is still in time."""
 GRANT_LEAD_S = 0.1
 """Seconds before the end of a lease at which the next grant is requested: time for a retry; members delay the reply to
@@ -198,7 +198,7 @@ class LeaseClient:
         """Change the council to ``members`` (stop the device first).
 
         An own lease is released and reserved for this client, which claims it again at the new council.  Fails as
-        ``Council.change`` does; then the lease is claimed again at the old one.
+        ``LeaseProposer.change_members`` does; then the lease is claimed again at the old one.
         """
         return Deferred.fromCoroutine(self._change_council(members))
 
@@ -206,7 +206,7 @@ class LeaseClient:
         """Close the task, done under ``token``, so that no more leases are granted (stop the device first).
 
         A later token of this client takes precedence.  Fires with the proof, signed by a majority of the council; fails
-        as ``Council.close`` does.
+        as ``LeaseProposer.close`` does.
         """
         return self.proposer.close(max(token, self.token)).addCallback(lambda _: self.proposer.end_proof)
 
@@ -426,7 +426,7 @@ class LeaseClient:
 
     @property
     def _is_recently_released(self) -> bool:
-        """Whether the lease was released within ``FRESH`` seconds, so that some members may not know it yet."""
+        """Whether the lease was released within ``RELEASE_SPREAD_S`` seconds, so that some members may not know it yet."""
         return self._clock.seconds() < self._standby.freed_at + RELEASE_SPREAD_S
 
     @property

@@ -37,7 +37,7 @@ class LeaseHeld(Refused):
 
 
 class Superseded(Refused):
-    """Another change of the council was decided; ``Council`` has the present one."""
+    """Another change of the council was decided; ``LeaseProposer`` has the present one."""
 
 
 class NoMajority(Refused):
@@ -185,8 +185,8 @@ class LeaseProposer:
     def change_members(self, members: Sequence[Contact], keep: bool = False) -> Deferred[None]:
         """Change the council to ``members``; fires when a majority of them has installed it.
 
-        With ``keep`` the own lease is released (``Lessee.move``) and reserved for this agent for one ttl.  Fails with
-        ``OpenClaim`` while another agent holds a lease, ``NoMajority`` if the old council cannot decide, and
+        With ``keep`` the own lease is released (``LeaseClient.change_council``) and reserved for this agent for one ttl.  Fails with
+        ``LeaseHeld`` while another agent holds a lease, ``NoMajority`` if the old council cannot decide, and
         ``Superseded`` if another change was in progress, which is then completed instead.
         """
         wanted = tuple(members)

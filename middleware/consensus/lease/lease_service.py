@@ -223,7 +223,7 @@ MIN_WAIT_S = 0.001
 
 
 def propose_when_free(propose: Callable[[], Reply], clock: IReactorTime) -> Deferred[Reply]:
-    """Call ``propose``, and again when another agent's lease ends within ``MOST_WAIT_S``; fire with its reply.
+    """Call ``propose``, and again when another agent's lease ends within ``MAX_WAIT_S``; fire with its reply.
 
     So no round trip passes between the end of one lease and the grant of the next.
     """

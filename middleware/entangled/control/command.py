@@ -97,7 +97,7 @@ def _add_tuple_commands(verb: Callable[[str, str], argparse.ArgumentParser]) -> 
 
 
 def make_request(options: argparse.Namespace) -> dict[str, Any]:
-    """Return the request of a command line; raise ``word.BadWord``, also for an unreadable file."""
+    """Return the request of a command line; raise ``conversion.InvalidValue``, also for an unreadable file."""
     given = {name: value for name, value in vars(options).items() if name not in ("verb", "node", "json")}
     if "node_asked" in given:
         given["node"] = given.pop("node_asked")

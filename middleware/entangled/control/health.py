@@ -24,12 +24,12 @@ PING_TIMEOUT_S = 1.5
 MAX_LINKS = 32
 """Peers that are measured: 32 x 10 pings in a second are 50 kB in each direction."""
 SLOW_INTERVAL_S = 1.0
-"""Seconds between two pings to a peer, after the first ``ASKED`` ones."""
+"""Seconds between two pings to a peer, after the first ``PINGS`` ones."""
 FEW_PEERS = 10
 """Peers up to which that holds.  With more peers the interval grows, so that a node sends at most 10 pings per second,
 and 100 at first: 1 and 10 kB in each direction."""
 IDLE_S = 12.0
-"""Seconds after the last call of ``Gauge.links`` until the measurement stops."""
+"""Seconds after the last call of ``LinkMetrics.read`` until the measurement stops."""
 
 
 def read_health(node: EntangledNode) -> Mapping[str, Any]:
@@ -49,7 +49,7 @@ def read_health(node: EntangledNode) -> Mapping[str, Any]:
 
 
 async def measure_links(node: EntangledNode, clock: IReactorTime) -> list[Mapping[str, Any]]:
-    """Return the path to each peer with the durations of ``ASKED`` pings, None for a lost one.
+    """Return the path to each peer with the durations of ``PINGS`` pings, None for a lost one.
 
     All times are seconds; ``for`` is the time since the path came into use, None if the peer is unreachable.
     """
@@ -64,7 +64,7 @@ async def measure_links(node: EntangledNode, clock: IReactorTime) -> list[Mappin
 
 
 def describe_path(node: EntangledNode, clock: IReactorTime, contact: Contact) -> dict[str, Any]:
-    """Return the path to a peer: ``way`` is a ``passage.Kind``, ``by`` the id of the relay, or empty."""
+    """Return the path to a peer: ``way`` is a ``path_kind.PathKind``, ``by`` the id of the relay, or empty."""
     passage = node.nat.paths.find_path(contact)
     return {
         "id": contact.node_id.hex(),
@@ -99,7 +99,7 @@ class LinkMetrics:
     """Measures the paths from ``node`` to its peers, only while ``links`` is called.
 
     The first call returns at once, without figures; later calls have more.  Each peer gets several pings in quick
-    succession, then one per second, until ``links`` has not been called for ``IDLE`` seconds.
+    succession, then one per second, until ``links`` has not been called for ``IDLE_S`` seconds.
     """
 
     def __init__(self, node: EntangledNode, clock: IReactorTime, chores: Background) -> None:

@@ -97,10 +97,10 @@ class ControlProtocol(Protocol):
 
 
 class RequestRunner(Shape):
-    """Runs verbs; ``control.verb.Verbs`` implements it."""
+    """Runs verbs; ``control.request_handler.RequestHandler`` implements it."""
 
     def run(self, name: object, arguments: object, tell: Callable[[Any], None]) -> Deferred[Any]:
-        """Run the verb ``name``; see ``Verbs.run``."""
+        """Run the verb ``name``; see ``RequestHandler.run``."""
 
 
 class ControlServer(Service):

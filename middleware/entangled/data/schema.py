@@ -90,7 +90,7 @@ def use_bytes(connection: sqlite3.Connection) -> None:
 def check_version(path: str, connection: sqlite3.Connection) -> int:
     """Return the schema version of the file, 0 if it is empty.
 
-    Raises ``BadStore`` if it is no store or has a newer schema, ``Rotten`` if it is a damaged store.
+    Raises ``BadStore`` if it is no store or has a newer schema, ``CorruptStore`` if it is a damaged store.
     """
     (application,) = connection.execute("PRAGMA application_id").fetchone()
     (version,) = connection.execute("PRAGMA user_version").fetchone()

@@ -183,7 +183,7 @@ class SqliteStore(Store):
 def read_records(path: str | os.PathLike[str], key: bytes) -> list[Record]:
     """Return the records under ``key`` in the file ``path``, in the order of (owner, name); from any thread or process.
 
-    Never blocks the writer; sees committed changes, up to ``writer.COMMIT_AFTER`` late.  Raises ``BadStore``.
+    Never blocks the writer; sees committed changes, up to ``writer.COMMIT_AFTER_S`` late.  Raises ``BadStore``.
     """
     path = os.fspath(path)
     connection = None
@@ -202,7 +202,7 @@ def read_records(path: str | os.PathLike[str], key: bytes) -> list[Record]:
 def _open_file(path: str, durable: Durability) -> tuple[sqlite3.Connection, int, int, Contents]:
     """Lock and open the file; return the connection, the lock, the version that it had, and its contents.
 
-    Raises ``BadStore`` if it is not usable, ``Rotten`` if it is a damaged store.
+    Raises ``BadStore`` if it is not usable, ``CorruptStore`` if it is a damaged store.
     """
     lock = _lock_file(path)
     connection = None

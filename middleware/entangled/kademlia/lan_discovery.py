@@ -3,7 +3,7 @@
 A node multicasts WHO to the LAN, often while it has no contacts and rarely afterwards; some receivers reply from their
 own port after a random delay, and the node then sends a discovery request to each reply's address, which proves its
 membership.  A receiver replies with a probability that decreases with the number of members and senders that it knows,
-so that about ``ANSWERS`` replies are sent in a team of any size, even if all nodes start at the same moment.
+so that about ``TARGET_REPLIES`` replies are sent in a team of any size, even if all nodes start at the same moment.
 """
 
 from __future__ import annotations
@@ -43,7 +43,7 @@ RETRY_INTERVAL_S = 4.0
 MAX_PARALLEL = 3
 """The number of simultaneous discovery requests; the first node to answer names the others of its network."""
 MAX_PENDING = 64
-"""The number of delayed replies, and so of replies within ``MOMENT``."""
+"""The number of delayed replies, and so of replies within ``MAX_REPLY_DELAY_S``."""
 MAX_RECORDED = 256
 
 
@@ -97,7 +97,7 @@ class LanDiscovery:
         self._group.close()
 
     def wait_for_first(self) -> Deferred[None]:
-        """Return a Deferred that fires when a node of the team was found, or after ``LISTEN`` seconds."""
+        """Return a Deferred that fires when a node of the team was found, or after ``LISTEN_S`` seconds."""
         found: Deferred[None] = Deferred()
         if self._overlay.contacts():
             found.callback(None)

@@ -24,7 +24,7 @@ LOOKUP_INTERVALS_S = (3.0, 60.0)
 NEIGHBOUR_SILENCE_S = 12.0
 """The silence in seconds after which a neighbour, or a contact that ``needs_use``, is probed in a large network."""
 PROBES_PER_STEP = 2
-"""The number of distant contacts that are probed per ``PROBE``."""
+"""The number of distant contacts that are probed per ``STEP_S``."""
 MAINTENANCE_S = 15.0
 """The seconds between two runs of infrequent maintenance in a large network."""
 SESSION_S = 120.0
@@ -42,7 +42,7 @@ class ProbeInterval:
 
     In a stable network nearly every probe is unnecessary, in a changing one most contacts fail within a minute.
     Therefore the interval is halved for each lost contact and grows slightly with each answer: in equilibrium a share
-    of ``GONE`` of the probed contacts has failed.  By the measurements of Kademlia and Bamboo this share does not slow
+    of ``TARGET_FAILURES`` of the probed contacts has failed.  By the measurements of Kademlia and Bamboo this share does not slow
     lookups.
     """
 

@@ -2,9 +2,9 @@
 
 Records are stored at the closest *live* members; majorities are counted among the closest of all members, including
 absent ones, because a failed member is indistinguishable from a partitioned one.  Then two majorities share a member
-even if they were formed on different sides.  An absent member stops counting in two cases: after ``STRUCK_S`` if a
+even if they were formed on different sides.  An absent member stops counting in two cases: after ``ABSENT_WITH_MAJORITY_S`` if a
 majority of all members is in touch without it (dynamic voting; Jajodia and Mutchler, 1990), so that members may leave
-one after the other; or after ``COUNTED_S`` in any case, which limits the tolerated duration of a partition.
+one after the other; or after ``MAX_ABSENT_S`` in any case, which limits the tolerated duration of a partition.
 
 A newcomer is *settled* when it has synchronised with a majority of the members before it; until then it does not count
 in majorities, or a minority behind a partition could strike the majority with the help of newcomers.

@@ -28,7 +28,7 @@ from middleware.entangled.network.network import Address
 from middleware.entangled.wire.endpoint import Endpoint
 
 MIN_PING_INTERVAL_S = 3.0
-"""The seconds of silence after which a contact is pinged, in a team of up to ``SMALL`` members."""
+"""The seconds of silence after which a contact is pinged, in a team of up to ``SMALL_TEAM`` members."""
 SMALL_TEAM = 10
 MAX_PING_INTERVAL_S = 9.0
 REFRESH_INTERVAL_S = 3600.0

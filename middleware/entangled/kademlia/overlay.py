@@ -88,7 +88,7 @@ class Overlay:
     in an answer and the contact that named it.
 
     ``is_whole``: all members of the team are known; ``is_large``: there are too many for that; ``is_placed``: this node
-    has looked up its neighbours, so if it knows few nodes there are few.  ``Membership`` and ``Sounding`` set them.  In
+    has looked up its neighbours, so if it knows few nodes there are few.  ``Membership`` and ``LivenessProber`` set them.  In
     a large network the routing table is authoritative, and the roster has only contacts without a place in the table,
     while few are known.
     """

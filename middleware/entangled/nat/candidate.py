@@ -78,7 +78,7 @@ def is_near(host: str, own: str, is_translated: bool = False) -> bool:
 
 
 class _NumericAddress(NamedTuple):
-    """An address as a number, and the index of its range in ``_OF_A_SITE`` (with 0 ``bits``: in none)."""
+    """An address as a number, and the index of its range in ``_SITE_RANGES`` (with 0 ``bits``: in none)."""
 
     version: int
     number: int

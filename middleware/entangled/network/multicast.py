@@ -1,6 +1,6 @@
 """Define the multicast group of the LAN, through which a node finds nodes with unknown addresses.
 
-``lan`` implements it with sockets, ``Segment`` in memory.
+``lan`` implements it with sockets, ``SimulatedLan`` in memory.
 """
 
 from __future__ import annotations
@@ -49,7 +49,7 @@ class SimulatedLan:
 
 
 class SimulatedMulticast:
-    """One node's membership on a ``Segment``; a ``Multicast``.
+    """One node's membership on a ``SimulatedLan``; a ``Multicast``.
 
     As with sockets, it receives at one port and sends from another; ``addresses`` are both.  A test calls ``moved``
     when it moves the node to another LAN.

@@ -86,7 +86,7 @@ class Network(Protocol):
         """Open the port and pass each datagram to ``receiver``; raises ``PortInUse`` if the port is in use."""
 
     def send(self, datagram: bytes, to: Address) -> None:
-        """Send at most ``MAX_CARRIED`` bytes; a datagram that cannot be sent is lost."""
+        """Send at most ``MAX_RELAYED_BYTES`` bytes; a datagram that cannot be sent is lost."""
 
     def close(self) -> None:
         """Close the port; may be called twice."""

@@ -2,7 +2,7 @@
 
 A stream delivers in order, after ``delay_s`` seconds, at most ``rate`` bytes per second; the rest waits in its buffer,
 and a producer is paused while the buffer is full.  Neither end notices a cut: bytes wait, as in TCP.  The same happens
-on a single stalled stream (``Pipe.is_still``), which retransmits in vain.
+on a single stalled stream (``Pipe.is_stalled``), which retransmits in vain.
 """
 
 from __future__ import annotations
@@ -79,7 +79,7 @@ class PipeNetwork:
 
 
 class PipeTransport:
-    """The ``Carrier`` of one host."""
+    """The ``StreamTransport`` of one host."""
 
     def __init__(self, pipes: PipeNetwork, address: Address) -> None:
         self._pipes = pipes

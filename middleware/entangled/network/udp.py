@@ -31,7 +31,7 @@ _PORT_ATTEMPTS = 8
 class UdpNetwork:
     """One UDP port at ``host`` and ``port`` (0: any free one), and additional ones that are opened later.
 
-    ``host`` is an IP address ("0.0.0.0" or "::" for every interface of one family), or ``EVERYWHERE`` for every
+    ``host`` is an IP address ("0.0.0.0" or "::" for every interface of one family), or ``ANY_HOST`` for every
     interface of both families; IPv6 is omitted on machines without it.
 
     ``counters`` counts the datagrams that were sent, received, unsent (no route, invalid address, full buffer) and
@@ -79,7 +79,7 @@ class UdpNetwork:
                     raise
 
     def send(self, datagram: bytes, to: Address) -> None:
-        """Send at most ``MAX_CARRIED`` bytes; a datagram that cannot be sent is counted and lost."""
+        """Send at most ``MAX_RELAYED_BYTES`` bytes; a datagram that cannot be sent is counted and lost."""
         if len(datagram) > MAX_RELAYED_BYTES:
             self.counters["oversized"] += 1
             return
@@ -139,7 +139,7 @@ class UdpNetwork:
         return Address(host, port or self._port_by_target.get(to, 0) or self._number)
 
     def local_hosts(self) -> list[str]:
-        """Return the addresses of this machine at which it listens, cached for ``ROUTE_S``."""
+        """Return the addresses of this machine at which it listens, cached for ``ROUTE_CACHE_S``."""
         if not is_any(self._host):
             return [self._host]
         now = self._reactor.seconds()
@@ -200,7 +200,7 @@ class UdpNetwork:
         return _ask_route("2001:db8::1" if six else "192.0.2.1") or next(iter(own), "::1" if six else "127.0.0.1")
 
     def _find_route(self, host: str, ask: Callable[[], str]) -> str:
-        """Return a cached route to ``host``, calling ``ask`` again after ``ROUTE_S``."""
+        """Return a cached route to ``host``, calling ``ask`` again after ``ROUTE_CACHE_S``."""
         found, asked_at = self._routes.get(host, ("", -math.inf))
         now = self._reactor.seconds()
         if now - asked_at > ROUTE_CACHE_S:

@@ -56,7 +56,7 @@ class Register:
     ``promised`` is the highest promised ballot, reserved for ``reserve`` seconds, until ``reserved_until``.  ``holder``
     is the ballot of the lease, granted for ``ttl`` seconds, until ``until``; ``spent`` is the highest released ballot.
     ``token`` is the fencing token, ``grantee`` the proposer to which it was granted here, empty if only reported by
-    others.  ``value`` was accepted under ``accepted``; if that is ``NONE``, ``value`` is the newest configuration known
+    others.  ``value`` was accepted under ``accepted``; if that is ``NO_BALLOT``, ``value`` is the newest configuration known
     here and ``proof`` its certificate.  Times are on the clock of one process and are not stored.
     """
 

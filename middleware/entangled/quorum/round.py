@@ -87,7 +87,7 @@ class Round:
     ``ask`` sends the request to the member of a place.  If another proposer's lease at a member ends within ``short``
     seconds, the request is repeated then, or sooner if that is long.  ``outcome`` also fires, undecided, when all
     members have answered, after ``patience`` seconds, and shortly after a majority has answered.  A silent member is
-    asked every ``PAUSE`` seconds until the round is decided, and at least ``TRIES`` times.  With ``single`` it is
+    asked every ``RETRY_INTERVAL_S`` seconds until the round is decided, and at least ``MIN_TRIES`` times.  With ``single`` it is
     asked once, the transport retransmits, and a failure counts as its answer.
     """
 
@@ -135,7 +135,7 @@ class Round:
 
     @property
     def silent_places(self) -> list[int]:
-        """The places without an answer after ``TRIES`` requests."""
+        """The places without an answer after ``MIN_TRIES`` requests."""
         return [
             place for place in range(self.tally.size) if place not in self._answer_times and self._attempts >= MIN_TRIES
         ]

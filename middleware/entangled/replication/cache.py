@@ -21,7 +21,7 @@ class PathCache:
         self._bytes = 0
 
     def put(self, key: bytes, records: list[Record], ttl: float, now: float) -> None:
-        """Cache ``records`` for ``ttl`` seconds, at most ``MAX_AGE``."""
+        """Cache ``records`` for ``ttl`` seconds, at most ``MAX_AGE_S``."""
         size = sum(record.message_bytes for record in records)
         self.drop(key)
         if size > MAX_BYTES or not ttl > 0.0:

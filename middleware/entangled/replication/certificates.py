@@ -2,7 +2,7 @@
 
 A node checks a record against its owner's certificate.  It knows most certificates from a session with the owner or
 from the team's membership list; for others, such as guests that only some members met, it asks the node that sent the
-record.  A node that cannot send a certificate is not asked again for ``UNASKED_S`` seconds, so junk costs little.
+record.  A node that cannot send a certificate is not asked again for ``RETRY_AFTER_S`` seconds, so junk costs little.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ MAX_OWNERS = 12
 """Owners in one request."""
 RETRY_AFTER_S = 2.0
 MAX_FAILED_PEERS = 1024
-"""Peers remembered as not to be asked for ``UNASKED_S`` seconds; the oldest is dropped first."""
+"""Peers remembered as not to be asked for ``RETRY_AFTER_S`` seconds; the oldest is dropped first."""
 OWNER_BYTES = 32
 
 

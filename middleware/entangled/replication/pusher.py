@@ -1,6 +1,6 @@
 """Notification of watchers: pushes changes of a key to the peers that watch it.
 
-Soft state: a peer counts as a watcher for the seconds that it names in its request, by default ``WATCH_TTL``.  Pushes
+Soft state: a peer counts as a watcher for the seconds that it names in its request, by default ``WATCH_TTL_S``.  Pushes
 to one watcher of one key are numbered without gaps, so that the watcher notices a missed push and asks again.
 """
 

@@ -344,7 +344,7 @@ class Replica:
             self._schedule_sweep()
 
     def _schedule_sweep(self) -> None:
-        """Schedule the next sweep for the next expiry, rounded up to a multiple of ``SWEEP``."""
+        """Schedule the next sweep for the next expiry, rounded up to a multiple of ``SWEEP_INTERVAL_S``."""
         now, at = self._clock.seconds(), self._swept_at + SWEEP_INTERVAL_S
         due = min(self._store.next_expiry(), now + MAX_SWEEP_INTERVAL_S)
         while at < due or at <= now:

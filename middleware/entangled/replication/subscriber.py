@@ -21,7 +21,7 @@ from middleware.entangled.replication.watch import OnChanged, Watch
 from middleware.entangled.wire.endpoint import Endpoint
 
 RENEW_INTERVAL_S = 2.0
-"""Seconds between two renewals of a watch: four within ``WATCH_TTL``."""
+"""Seconds between two renewals of a watch: four within ``WATCH_TTL_S``."""
 LARGE_RENEW_INTERVAL_S, LARGE_TTL_S = 20.0, 60.0
 """Seconds between two renewals, and of a watch, in a large network, where finding the replicas takes a lookup."""
 MAX_PUSHERS = 3

@@ -36,7 +36,7 @@ class SyncState:
 
     @property
     def value(self) -> int:
-        """``NOVICE``, ``ELDER`` or ``SURE``."""
+        """``NEVER_SYNCED``, ``STALE`` or ``CURRENT``."""
         return CURRENT if self.is_synced else STALE if self._was_synced else NEVER_SYNCED
 
     def set_synced(self) -> bool:

@@ -71,7 +71,7 @@ class SlotMaintenance:
             self._slots_by_key[key] = _Slots()
 
     async def put_tuple(self, key: bytes, fields: Tuple, council: list[Member], ttl: float | None) -> None:
-        """Put a tuple, and remove it after ``ttl`` seconds if it was not taken; fails as ``Peer.put`` does."""
+        """Put a tuple, and remove it after ``ttl`` seconds if it was not taken; fails as ``NodeInterface.put`` does."""
         name = self._take_slot(key)
         place = TupleId(key, self._node.identity.public, name, self._rng.randbytes(MARK_BYTES))
         self._slots_by_key[key].contents[name] = place

@@ -89,9 +89,9 @@ class TakeAcceptor:
         return self._loaded_acceptor.log.get(place)
 
     def list_unfinished(self) -> list[StoredTuple]:
-        """Return the tuples with a take accepted here that has had no known end for ``UNSETTLED_S`` seconds.
+        """Return the tuples with a take accepted here that has had no known end for ``UNFINISHED_S`` seconds.
 
-        Each is returned again after ``UNSETTLED_S`` seconds, until ``settle`` is called.
+        Each is returned again after ``UNFINISHED_S`` seconds, until ``settle`` is called.
         """
         now = self._clock.seconds()
         late = [place for place, since in self._unfinished.items() if since + UNFINISHED_S <= now]

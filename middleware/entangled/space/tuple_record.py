@@ -115,7 +115,7 @@ def is_taker_name(value: object) -> bool:
 
 
 def parse_tuple_id(key: bytes, fields: object) -> TupleId | None:
-    """Parse the fields of ``Place.packed`` for ``key``; None if they are invalid."""
+    """Parse the fields of ``TupleId.pack`` for ``key``; None if they are invalid."""
     match fields:
         case [bytes(owner), str(name), bytes(mark)] if (
             len(owner) == 32 and 0 < len(name) <= MAX_NAME_BYTES and len(mark) == MARK_BYTES

@@ -1,10 +1,10 @@
 """Decide which nodes a team admits and which methods they may call, independently of the transport.
 
 An open team admits every node that holds its key.  In a closed team each side shows a *pass* in the handshake, and the
-admission check (``Door``) of the other side judges it.  The implementation of ``Door`` decides which passes are valid
+admission check (``AdmissionCheck``) of the other side judges it.  The implementation of ``AdmissionCheck`` decides which passes are valid
 and which roles they grant; this module defines only the refusal codes, with a remedy for each.
 
-A copied store makes two nodes with one identity.  Therefore each incarnation (``Life``) of an identity has a number
+A copied store makes two nodes with one identity.  Therefore each incarnation (``Incarnation``) of an identity has a number
 that grows from start to start, and eight random bytes: of two incarnations the later one is admitted, and the other is
 refused.
 
@@ -80,7 +80,7 @@ class Authority(NamedTuple):
 class AdmissionCheck(Protocol):
     """The admission check of a team; the endpoint repeats it at each handshake, so its results may change.
 
-    ``room`` is the maximum length of a pass in this team, at most ``MAX_ROOM`` and equal for all members; 0 in an open
+    ``room`` is the maximum length of a pass in this team, at most ``MAX_PASS_BYTES`` and equal for all members; 0 in an open
     team.  ``shown`` is this node's pass, ``life`` its current incarnation.  ``fingerprint`` is the public identifier of
     the team, 8 bytes (zero: none).  The default methods behave as in an open team.
     """
@@ -235,7 +235,7 @@ class InitTimestamps:
 class LogLimiter:
     """Refusals that were logged, so that each is logged once instead of for each datagram; bounded.
 
-    A sender that invents keys causes at most ``LINES`` log lines at once and one per second.
+    A sender that invents keys causes at most ``LOG_BURST`` log lines at once and one per second.
     """
 
     def __init__(self) -> None:

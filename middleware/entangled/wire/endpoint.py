@@ -116,7 +116,7 @@ class Endpoint:
         self.on_rejecting = Listeners[[Contact, str]]()
         self.on_forgotten = Listeners[[bytes]]()
         self.refusals: dict[bytes, tuple[Contact, str]] = {}
-        """Peers that reject this node, by key, with the refusal code; the latest ``MAX_REFUSALS``."""
+        """Peers that reject this node, by key, with the refusal code; the latest ``MAX_REJECTING_PEERS``."""
         self.rejections = Rejections()
         """Rejections of the last hour, in both directions."""
         self.counters: Counter[str] = Counter()

@@ -303,7 +303,7 @@ class Fragmenter:
                 cancel(self._sweeper)
 
     def _sweep(self) -> None:
-        """Drop messages that received nothing for ``IDLE_S`` or took longer than ``LONGEST_S``."""
+        """Drop messages that received nothing for ``IDLE_TIMEOUT_S`` or took longer than ``MAX_TRANSFER_S``."""
         now = self._clock.seconds()
         for where, assembly in list(self._incoming.items()):
             if now - assembly.last_received_at >= IDLE_TIMEOUT_S or now - assembly.started_at >= MAX_TRANSFER_S:

@@ -6,7 +6,7 @@ times are never transmitted.  A fragment (PART) and a receipt each fill one data
     PART     0x01  flags 1  id 8  total bytes 4  number 2  the bytes of this fragment
     RECEIPT  0x02  flags 1  id 8  next 2  room 2  cause 2  bitmap
 
-All fragments but the last have ``PART_BYTES``, so each fragment has one place and fragments never overlap.  ``next`` is
+All fragments but the last have ``FRAGMENT_BYTES``, so each fragment has one place and fragments never overlap.  ``next`` is
 the first missing fragment, bit n of the bitmap (least significant first) is set if fragment ``next + 1 + n`` has
 arrived, and ``room`` is the number of fragments from ``next`` on that the receiver accepts.  ``cause`` is the fragment
 that triggered the receipt: only its round trip is measured, because earlier receipts for the others may have been lost.

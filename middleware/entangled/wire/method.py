@@ -1,6 +1,6 @@
 """Check arguments and run exposed methods, remember the calls that ran, and convert errors to failures and back.
 
-``Ledger`` prevents a repeated request from running twice.  An error crosses the wire as ``Refused``, with its code and
+``RequestHistory`` prevents a repeated request from running twice.  An error crosses the wire as ``Refused``, with its code and
 its text.
 """
 
@@ -31,7 +31,7 @@ MAX_PER_PEER = 4096
 SEQUENCE_BITS = 32
 """The low bits of a request id, which a requester increments; the bits above are random and new after each restart."""
 MAX_INCARNATIONS = 4
-"""The number of restarts of one peer within ``KEPT_S`` for which ``settled`` is kept."""
+"""The number of restarts of one peer within ``KEEP_ANSWER_S`` for which ``settled`` is kept."""
 MAX_ENTRIES = 16384
 MAX_REQUESTERS = 4096
 _PLAIN_TYPES = (int, float, bool, str, bytes, list, dict, type(None))
@@ -207,7 +207,7 @@ class _PeerRequests:
 
 
 class RequestHistory:
-    """The running requests, and the ones that ended in the last ``KEPT_S`` seconds, by public key and request id.
+    """The running requests, and the ones that ended in the last ``KEEP_ANSWER_S`` seconds, by public key and request id.
 
     A requester includes in each request the oldest one that it still waits for: older ones are forgotten at once, and
     do not run if they arrive late.  A full ledger rejects new requests: forgetting an old one early could run a method
@@ -307,7 +307,7 @@ class RequestHistory:
     def _get_or_create(self, public: bytes, now: float) -> _PeerRequests | None:
         """Return the account of a peer without its expired requests; None if there is no room for another one.
 
-        The account that was unused for longest is deleted if it has no requests and is older than ``KEPT_S``.
+        The account that was unused for longest is deleted if it has no requests and is older than ``KEEP_ANSWER_S``.
         """
         account = self._peers.pop(public, None)
         if account is None:

@@ -72,7 +72,7 @@ def parse_reply(datagram: bytes) -> ProbeReply:
 
 
 class ProbeResponder:
-    """Answers up to ``RATE`` HAILs per second; ``send`` sends a datagram, ``wall`` returns Unix seconds."""
+    """Answers up to ``REPLIES_PER_S`` HAILs per second; ``send`` sends a datagram, ``wall`` returns Unix seconds."""
 
     def __init__(
         self, send: Callable[[bytes, Address], None], clock: IReactorTime, fingerprint: Callable[[], bytes]

@@ -166,7 +166,7 @@ class Requester:
         return deferred
 
     def notify(self, contact: Contact, method: str, arguments: tuple[object, ...]) -> None:
-        """Send a notification; see ``Endpoint.tell``."""
+        """Send a notification; see ``Endpoint.notify``."""
         message = encode(Notification(method, arguments))
         if len(message) > MAX_PLAIN_BYTES:
             raise TooLarge(_format_too_large(method, message, MAX_PLAIN_BYTES))

@@ -111,7 +111,7 @@ class HandshakeFields(NamedTuple):
 
     @property
     def min_init_bytes(self) -> int:
-        """The length of the shortest INIT that may be answered with a pass and a message of ``ANSWER_ROOM`` bytes."""
+        """The length of the shortest INIT that may be answered with a pass and a message of ``MIN_ANSWER_BYTES`` bytes."""
         return MIN_INIT_BYTES + self.max_pass_bytes
 
 
@@ -335,7 +335,7 @@ class Session:
         self._seen = 0  # bit n: the counter n below the highest was received
 
     def seal(self, message: bytes) -> bytes:
-        """Return the next DATA datagram, with ``message`` of at most ``MAX_PLAIN`` bytes."""
+        """Return the next DATA datagram, with ``message`` of at most ``MAX_PLAIN_BYTES`` bytes."""
         counter = self._sent
         self._sent = counter + 1
         header = _pack(DATA, self.remote_index, counter)

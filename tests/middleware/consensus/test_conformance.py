@@ -205,7 +205,7 @@ class ConformanceTests(SynchronousTestCase):
         """Every strategy has the same result, digest included, for any hash seed of the process."""
         replayed(
             self,
-            "import random; from middleware.consensus.conformance import team\n"
-            "from middleware.consensus.strategy import BUILT_IN, strategy_for\n"
-            "for n in sorted(BUILT_IN): print(strategy_for(n).find(team(random.Random(3), 90)))\n",
+            "import random; from middleware.consensus.conformance import make_team\n"
+            "from middleware.consensus.strategy import BUILT_IN, load_strategy\n"
+            "for n in sorted(BUILT_IN): print(load_strategy(n).find(make_team(random.Random(3), 90)))\n",
         )

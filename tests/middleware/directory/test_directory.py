@@ -56,8 +56,8 @@ class Table:
         return counts
 
 
-class Roster:
-    """The part of a roster that the directory reads."""
+class Members:
+    """The part of a member table that the directory reads."""
 
     is_full = False
 
@@ -72,12 +72,12 @@ class Neighbour:
         self.contact = Contact(self.identity.public, Address("10.0.0.1", 1 + number))
         self.lease = 1.0
         self.overlay = self
-        self.roster = Roster()
-        self.is_placed = True
+        self.members = Members()
+        self.has_found_neighbours = True
         self.sequence = 0
         self.own: dict[Slot, float] = {}
-        self.chores = Background(town.clock)
-        self.directory = Directory(cast(EntangledNode, self), self.chores)
+        self.background = Background(town.clock)
+        self.directory = Directory(cast(EntangledNode, self), self.background)
 
     @property
     def is_large(self) -> bool:
@@ -122,12 +122,12 @@ class Neighbour:
         """Join, and review the depth periodically."""
         Deferred.fromCoroutine(self.directory.choose_initial_depth())
         self.say()
-        self.chores.later(self.town.dice.uniform(0.0, REVIEW), self.review)
-        self.chores.every(0.8 * self.lease, self.beat)
+        self.background.later(self.town.dice.uniform(0.0, REVIEW), self.review)
+        self.background.every(0.8 * self.lease, self.beat)
 
     def review(self) -> None:
         """Move if the size of the team has changed."""
-        self.chores.later(REVIEW, self.review)
+        self.background.later(REVIEW, self.review)
         before = self.directory.depth
         if self.directory.update_depth() != before:
             self.say()
@@ -162,7 +162,7 @@ class Town:
     def go(self, gone: Iterable[Neighbour]) -> None:
         """Remove neighbours without a farewell."""
         for neighbour in list(gone):
-            neighbour.chores.stop()
+            neighbour.background.stop()
             self.neighbours.remove(neighbour)
 
     def cut(self, away: Iterable[Neighbour]) -> None:

@@ -15,7 +15,7 @@ from tests.middleware.quorum.members import LEASE, TAKE, TTL, Member, Use
 
 ENDING_AT = 0.9 * TTL
 LOW, MID, HIGH, OTHER = LEASE.ballot(1, 0), LEASE.ballot(2, 0), LEASE.ballot(3, 0), LEASE.ballot(2, 1)
-HELD_BY_LOW = {"promised": LOW, "holder": LOW, "token": 1, "ttl": TTL, "until": TTL}
+HELD_BY_LOW = {"promised": LOW, "holder": LOW, "token": 1, "ttl": TTL, "lease_until": TTL}
 HELD_BY_OTHER = {**HELD_BY_LOW, "promised": LEASE.ballot(1, 1), "holder": LEASE.ballot(1, 1)}
 RESERVED = {"promised": LEASE.ballot(1, 1), "reserve": TTL, "reserved_until": TTL}
 RECIPES: dict[BallotRelation, tuple[dict[str, Any], Any, float, int]] = {
@@ -31,7 +31,7 @@ RECIPES: dict[BallotRelation, tuple[dict[str, Any], Any, float, int]] = {
     BallotRelation.FREE: ({"promised": LOW}, MID, 1.0, FIRST_CONFIGURATION),
 }
 """What a register holds, and the ballot, moment and configuration that then stand so to it."""
-GIVEN_BACK = {"promised": MID, "spent": HIGH}
+GIVEN_BACK = {"promised": MID, "released": HIGH}
 """What a release of a ballot finds that was given back before."""
 
 

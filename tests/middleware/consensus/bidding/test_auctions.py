@@ -114,7 +114,7 @@ class DisseminationTests(AuctionCase):
             return make_error(failure)
 
         self.patch(participant, "MAX_CHILDREN", 2)
-        self.patch(requester, "error_of", noted)
+        self.patch(requester, "make_error", noted)
         for node in outside:
             around = replace(node.auction_service._environment, contacts=lambda: [known])
             node.auction_service._environment = around

@@ -71,7 +71,7 @@ class LargeTests(SynchronousTestCase):
                 if place == winner and not crowd.dead:
                     # The first relay of the winning bid confirms it and then dies.
                     to = crowd._places[errand.to.node_id]
-                    if crowd.auction.rank(errand.to.node_id) is None:
+                    if crowd.auction.find_rank(errand.to.node_id) is None:
                         crowd.schedule(crowd.now + 0.1, crowd.dead.add, to)
 
             crowd._send_message = killing  # type: ignore[method-assign]
