@@ -62,11 +62,11 @@ class Behaviour(Protocol):
 
 
 def create_behaviour(
-    task: Task, rng: random.Random, deployed: DeployedModules | None = None, means: MotionCapabilities | None = None
+    task: Task, rng: random.Random, deployed: DeployedModules | None = None, motion: MotionCapabilities | None = None
 ) -> Behaviour:
     """Create the behaviour for ``task.kind``: a built-in one, or an entry point of ``swarm_node.behaviours``.
 
-    ``deployed:x`` is the module ``x`` in ``deployed``, which an operator deployed to the team.  If ``means`` is given,
+    ``deployed:x`` is the module ``x`` in ``deployed``, which an operator deployed to the team.  If ``motion`` is given,
     it is passed to the behaviour's ``embody``.
 
     A task comes from the network, so its kind selects among installed behaviours and is never an import path.  Raises
@@ -75,8 +75,8 @@ def create_behaviour(
     """
     behaviour = _create_deployed(task, rng, deployed or {}) if is_deployed(task.kind) else _create_installed(task, rng)
     embody = getattr(behaviour, "embody", None)
-    if means is not None and embody is not None:
-        embody(means)
+    if motion is not None and embody is not None:
+        embody(motion)
     return behaviour
 
 

@@ -67,11 +67,11 @@ class _HostedBehaviour:
     def embody(self, fields: dict[str, Any]) -> None:
         """Pass on the motion capabilities; later calls update the same object."""
         is_new = self._motion is None
-        self._motion = means = self._motion or MotionCapabilities()
+        self._motion = motion = self._motion or MotionCapabilities()
         for name, value in fields.items():
-            setattr(means, name, _tuples_from_lists(value))
+            setattr(motion, name, _tuples_from_lists(value))
         if is_new and hasattr(self.behaviour, "embody"):
-            self.behaviour.embody(means)
+            self.behaviour.embody(motion)
 
 
 def read_attributes(thing: object) -> list[Any]:
@@ -82,9 +82,9 @@ def read_attributes(thing: object) -> list[Any]:
     ]
 
 
-def encode_motion(means: MotionCapabilities) -> dict[str, Any]:
+def encode_motion(motion: MotionCapabilities) -> dict[str, Any]:
     """Convert motion capabilities to plain values; ``run`` is left out because the process decodes pictures itself."""
-    fields = {name: value for name, value in vars(means).items() if name != "run"}
+    fields = {name: value for name, value in vars(motion).items() if name != "run"}
     return {name: dict(value) if isinstance(value, Mapping) else value for name, value in fields.items()}
 
 

@@ -78,9 +78,9 @@ class BehaviourProxy:
         self._receive()
         return self._has_failed
 
-    def embody(self, means: MotionCapabilities) -> None:
+    def embody(self, motion: MotionCapabilities) -> None:
         """Pass on the robot's motion capabilities; their changes are sent before each observation."""
-        self._motion = means
+        self._motion = motion
         self._send_motion()
 
     def look(self, seen: Observation, now: float) -> None:

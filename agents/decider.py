@@ -152,21 +152,21 @@ class DecisionRecorder:
         version = str(getattr(self._strategy, "version", "")) if rule == self._strategy.name else ""
         identification = (self._task.task_id, epoch, me, others, rule, version)
         found, view = decision.consensus, make_view(self._strategy)
-        verdict = make_decision_record(*identification, found, decision.assigned, self._task.hysteresis, token, view)
-        return verdict if verdict.is_publisher else None
+        record = make_decision_record(*identification, found, decision.assigned, self._task.hysteresis, token, view)
+        return record if record.is_publisher else None
 
 
 class Decider:
     """One agent's view of ``task``.
 
-    ``uuid`` is the agent's own, ``division`` the task's group or None.  ``panel`` are the reporters of a large team; an
+    ``uuid`` is the agent's own, ``division`` the task's group or None.  ``reporters`` are the reporters of a large team; an
     agent that is not one of them decides from their reports without its own.
     """
 
-    def __init__(self, task: Task, uuid: str, strategy: ConsensusAlgorithm, panel: Reporters) -> None:
+    def __init__(self, task: Task, uuid: str, strategy: ConsensusAlgorithm, reporters: Reporters) -> None:
         self.task_group: TaskGroup | None = None
         self._strategy = strategy
-        self._panel = panel
+        self._panel = reporters
         self._recorder = DecisionRecorder(task, strategy)
         self._uuid = uuid
         self._peers = PeerReports(uuid)

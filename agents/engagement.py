@@ -64,7 +64,7 @@ class EngagementOutputs(Protocol):
     def stop_robot(self) -> float:
         """Stop the robot; return the seconds for which it may still move if it does not respond."""
 
-    def publish_decision_record(self, verdict: DecisionRecord) -> None:
+    def publish_decision_record(self, record: DecisionRecord) -> None:
         """Publish the record of a decision."""
 
     def find_contacts(self, uuids: Sequence[str]) -> Sequence[Contact]:
@@ -85,8 +85,8 @@ class Engagement:
         me: Member,
         behaviour: Behaviour,
         strategy: ConsensusAlgorithm,
-        ports: EngagementOutputs,
-        panel: Reporters,
+        outputs: EngagementOutputs,
+        reporters: Reporters,
         token: int,
         now: float,
         age: float = 0.0,
@@ -97,10 +97,10 @@ class Engagement:
         self.result: Result | None = None
         self.is_paused = False
         self.task_lease = TaskLease(token)
-        self._outputs = ports
+        self._outputs = outputs
         self._report_builder = ReportBuilder(behaviour, find_read_fields(strategy))
         self._execution = Execution(behaviour, task.stall_limit)
-        self._decider = Decider(task, me.uuid, strategy, panel)
+        self._decider = Decider(task, me.uuid, strategy, reporters)
         self._formation = Formation(me.uuid, behaviour)
         self._joined_at = now
         self._age = age
@@ -138,10 +138,10 @@ class Engagement:
 
     # -- inputs -----------------------------------------------------------------------------------------------------
 
-    def join_group(self, division: TaskGroup, now: float) -> None:
+    def join_group(self, task_group: TaskGroup, now: float) -> None:
         """Decide the task together with its group."""
-        self._decider.task_group = division
-        division.join(self.task, lambda now: [self.me, *self._decider.others(now)], now)
+        self._decider.task_group = task_group
+        task_group.join(self.task, lambda now: [self.me, *self._decider.others(now)], now)
 
     def process_reports(self, members: list[Member], outcome: Result | None, now: float) -> None:
         """Process the present members, their reports, and the outcome if there is one; the outcome is final."""
@@ -199,9 +199,9 @@ class Engagement:
 
     # -- the robot --------------------------------------------------------------------------------------------------
 
-    def take_robot(self, lessee: LeaseClient, token: int) -> None:
-        """Assign the robot to this task; it has obeyed ``token``, and ``lessee`` is the client of the task's lease."""
-        self.task_lease.lease_client, self.task_lease.token = lessee, token
+    def take_robot(self, lease_client: LeaseClient, token: int) -> None:
+        """Assign the robot to this task; it has obeyed ``token``, and ``lease_client`` is the client of the task's lease."""
+        self.task_lease.lease_client, self.task_lease.token = lease_client, token
 
     def set_robot_lent(self, is_lent: bool, now: float) -> None:
         """Record whether another task of the group has the robot; if this task had it, it stops acting."""
@@ -293,50 +293,52 @@ class Engagement:
         self, event: Event, now: float, decision: Decision = NO_DECISION, lease: Lease | None = None
     ) -> RobotCommand | None:
         """Apply ``event``, perform its effects in order, and return the resulting action for the robot, if any."""
-        order, deed = decision.ranking, None
+        order, command = decision.ranking, None
         rank = order.index(self.me.uuid) if self.me.uuid in order else 0
         for effect in self.state_machine.apply(event, rank if order else None):
-            deed = self._perform_effect(effect, now, decision, lease)
-        return deed
+            command = self._perform_effect(effect, now, decision, lease)
+        return command
 
     def _perform_effect(
         self, effect: Effect, now: float, decision: Decision, lease: Lease | None
     ) -> RobotCommand | None:
-        claim, ports = self.task_lease, self._outputs
+        task_lease, outputs = self.task_lease, self._outputs
         match effect:  # the effects of every turn come first
             case Effect.WANT:
-                claim.request()
+                task_lease.request()
             case Effect.EXECUTE:
                 assert lease is not None
                 return self._execute(decision, lease, now)
             case Effect.HOLD:
                 return self._hold(decision, now)
             case Effect.STAND_BY:
-                claim.stand_by(self._standby_rank(decision, now))
+                task_lease.stand_by(self._standby_rank(decision, now))
             case Effect.STOP:
-                claim.record_stop(ports.stop_robot(), now)
+                task_lease.record_stop(outputs.stop_robot(), now)
             case Effect.RELEASE:
-                claim.release(now)
+                task_lease.release(now)
             case Effect.GIVE_BACK:
-                ports.log_event("releases the task")
-                claim.release(now)
+                outputs.log_event("releases the task")
+                task_lease.release(now)
             case Effect.HAND_OVER:
-                claim.when_released = claim.release(now, ports.find_contacts(claim.standbys))
+                task_lease.when_released = task_lease.release(now, outputs.find_contacts(task_lease.standbys))
             case Effect.CLAIM:
-                claim.start_request(now)
+                task_lease.start_request(now)
             case Effect.INSIST:
-                if claim.retry_request(now):
+                if task_lease.retry_request(now):
                     self._publish(again=True)
             case Effect.CHANGE_COUNCIL:
-                ports.log_event(f"replaces the quorum after the loss of a member: {len(claim.next_members)} members")
-                claim.change_council(now, self.task.lease_ttl)
+                outputs.log_event(
+                    f"replaces the quorum after the loss of a member: {len(task_lease.next_members)} members"
+                )
+                task_lease.change_council(now, self.task.lease_ttl)
             case Effect.OFFER:
                 self.me = replace(self.me, available=True)
             case Effect.WITHDRAW:
                 nothing: dict[str, Any] = {"cost": None, "assigned": "", "digest": "", "token": 0, "progress": None}
                 self._publish(available=False, why=decision.why, post=None, **nothing)
             case Effect.START:
-                ports.log_event(f"acts: {decision.why}")
+                outputs.log_event(f"acts: {decision.why}")
             case Effect.COMPLETE:
                 self._record_outcome(COMPLETED, lease, now)
             case Effect.FAIL:
@@ -345,17 +347,17 @@ class Engagement:
                 assert self.result is not None
                 by_me = self.result.outcome == COMPLETED and self.result.by == self.me.name
                 why = f": {self.result.why}" if self.result.why else ""
-                ports.log_event("done" if by_me else f"{self.result.outcome.lower()} by {self.result.by}{why}")
+                outputs.log_event("done" if by_me else f"{self.result.outcome.lower()} by {self.result.by}{why}")
                 self._publish()
         return None
 
     def _execute(self, decision: Decision, lease: Lease, now: float) -> RobotCommand:
         self.task_lease.token = max(self.task_lease.token, lease.token)
-        turn = self._execution.step(now, lease.token, lease.deadline, decision.consensus)
-        self._publish_decision(decision, lease.token, now, turn.progress)
-        if turn.action is None:
+        step = self._execution.step(now, lease.token, lease.deadline, decision.consensus)
+        self._publish_decision(decision, lease.token, now, step.progress)
+        if step.action is None:
             self.apply_event(Event.FINISHED, now, lease=lease)
-        return RobotCommand(STAND if turn.action is None else turn.action, Permit(lease.token, lease.deadline))
+        return RobotCommand(STAND if step.action is None else step.action, Permit(lease.token, lease.deadline))
 
     def _hold(self, decision: Decision, now: float) -> RobotCommand | None:
         if self.lease_client is None:  # another task of its group has the robot
@@ -396,9 +398,9 @@ class Engagement:
         decided: dict[str, Any] = {"assigned": assigned, "digest": decision.digest, "why": decision.why}
         self._publish(token=token, progress=progress, post=post, **decided)
         self.task_lease.standbys = tuple(uuid for uuid in decision.ranking if uuid != self.me.uuid)[:STANDBYS]
-        verdict = self._decider.make_record(decision, self.me, token, now)
-        if verdict is not None:
-            self._outputs.publish_decision_record(verdict)
+        record = self._decider.make_record(decision, self.me, token, now)
+        if record is not None:
+            self._outputs.publish_decision_record(record)
 
     def _publish(self, again: bool = False, **changes: object) -> None:
         changes |= {"status": self.state_machine.state.status, "state": str(self.state_machine)}

@@ -36,8 +36,8 @@ Pose = tuple[float, float, float]
 class Exploration:
     """Exploration by one robot; a ``pose`` is its odometry: x and y in metres, yaw in radians."""
 
-    def __init__(self, rng: random.Random, means: MotionCapabilities | None = None) -> None:
-        self.motion = MotionCapabilities() if means is None else means
+    def __init__(self, rng: random.Random, motion: MotionCapabilities | None = None) -> None:
+        self.motion = MotionCapabilities() if motion is None else motion
         self._rng = rng
         self._side = rng.choice((-1.0, 1.0))
         self._turned_rad = 0.0
@@ -103,8 +103,8 @@ class Exploration:
 class Detour:
     """A detour around an obstacle: back off, turn away, and walk on a little."""
 
-    def __init__(self, means: MotionCapabilities) -> None:
-        self.motion = means
+    def __init__(self, motion: MotionCapabilities) -> None:
+        self.motion = motion
         self._legs: list[str] = []
         self._heading = 0.0
         self._from: Pose = (0.0, 0.0, 0.0)
@@ -154,18 +154,18 @@ def clip(value: float, limit: float) -> float:
     return max(-limit, min(limit, value))
 
 
-def turn_to(means: MotionCapabilities, off: float) -> Action | None:
+def turn_to(motion: MotionCapabilities, off: float) -> Action | None:
     """Turn on the spot to a heading ``off`` radians to the left; None if the robot faces it already."""
     return (
         None
-        if abs(off) <= max(AIM_TOLERANCE_RAD, means.facing_tolerance)
-        else means.spin(clip(TURN_GAIN * off, means.look_turn))
+        if abs(off) <= max(AIM_TOLERANCE_RAD, motion.facing_tolerance)
+        else motion.spin(clip(TURN_GAIN * off, motion.look_turn))
     )
 
 
-def walk_to(means: MotionCapabilities, off: float) -> Action:
+def walk_to(motion: MotionCapabilities, off: float) -> Action:
     """Walk towards a heading ``off`` radians to the left."""
-    return means.go(means.walk, clip(TURN_GAIN * off, means.look_turn))
+    return motion.go(motion.walk, clip(TURN_GAIN * off, motion.look_turn))
 
 
 def is_blocked(ahead: float) -> bool:

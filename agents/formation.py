@@ -106,8 +106,8 @@ class PostPath:
     back to the target before the next one.  A robot without a ranger keeps its place.
     """
 
-    def __init__(self, means: MotionCapabilities | None = None) -> None:
-        self.motion = MotionCapabilities() if means is None else means
+    def __init__(self, motion: MotionCapabilities | None = None) -> None:
+        self.motion = MotionCapabilities() if motion is None else motion
         self._post: float | None = None
         self._is_blocked = False
         self._heading: float | None = None

@@ -144,13 +144,13 @@ class Agent(Service):
         ]
         holder = self._robot_user if self._robot_user in active else None
         current = None if holder is None else holder.engagement
-        heads = self._group_by_urgency(active)
+        participations_by_head = self._group_by_urgency(active)
         due_task = select_task(
-            [head.engagement.task for head in heads],
-            next((head.engagement.task for head, parts in heads.items() if holder in parts), None),
+            [head.engagement.task for head in participations_by_head],
+            next((head.engagement.task for head, parts in participations_by_head.items() if holder in parts), None),
             current is None or current.can_yield_robot,
         )
-        parts = next((parts for head, parts in heads.items() if head.engagement.task is due_task), [])
+        parts = next((parts for head, parts in participations_by_head.items() if head.engagement.task is due_task), [])
         part = select_participation(parts, holder) if parts else None
         if part is not self._robot_user:
             self._give_robot(part)
@@ -163,15 +163,15 @@ class Agent(Service):
         A task without a group stands alone.
         """
         for task_id, part in self._participations.items():
-            division = part.engagement.task_group
-            if division is not None and part in active:
-                part.engagement.join_group(division, self._clock.seconds())
-            elif division is not None:
-                division.leave(task_id)
+            task_group = part.engagement.task_group
+            if task_group is not None and part in active:
+                part.engagement.join_group(task_group, self._clock.seconds())
+            elif task_group is not None:
+                task_group.leave(task_id)
         groups: dict[object, list[Participation]] = {}
         for part in sorted(active, key=lambda part: urgency_key(part.engagement.task)):
-            division = part.engagement.task_group
-            groups.setdefault(part if division is None else division, []).append(part)
+            task_group = part.engagement.task_group
+            groups.setdefault(part if task_group is None else task_group, []).append(part)
         return {parts[0]: parts for parts in groups.values()}
 
     def _engagements_with_robot(self) -> list[Engagement]:
@@ -220,9 +220,9 @@ class Agent(Service):
 
     def _leave(self, task_id: str) -> Deferred[object]:
         part = self._participations.pop(task_id)
-        division = part.engagement.task_group
-        if division is not None:
-            division.leave(task_id)
+        task_group = part.engagement.task_group
+        if task_group is not None:
+            task_group.leave(task_id)
             left = [part.engagement.task_group for part in self._participations.values()]
             self._task_groups = {key: each for key, each in self._task_groups.items() if each in left}
         if part is self._robot_user:
@@ -253,15 +253,15 @@ class Agent(Service):
         engagement = self.engagement
         if engagement is None:
             return
-        has_body = self._robot.is_responding
-        if not has_body:
+        has_robot = self._robot.is_responding
+        if not has_robot:
             for each in self._engagements_with_robot():
                 each.on_robot_lost()
         # The robot may have obeyed another agent before: it rejects older tokens.
         engagement.task_lease.raise_token(self._robot.driver.token)
-        deed = engagement.step(self._clock.seconds())
+        command = engagement.step(self._clock.seconds())
         self._token = max(self._token, engagement.task_lease.token)
-        if deed is not None and has_body and not self._robot.perform(deed):
+        if command is not None and has_robot and not self._robot.perform(command):
             engagement.apply_event(Event.OUTRANKED, self._clock.seconds())
 
     def _apply_stop(self) -> str:
@@ -271,14 +271,18 @@ class Agent(Service):
         """
         if not self.running:
             return NO_ROBOT
-        halt = self._node.stop_state
-        if halt.is_stopped != self._was_stopped:
-            self._was_stopped = halt.is_stopped
-            self._log_event(f"stopped by {halt.operators}" if halt.is_stopped else f"released by {halt.released_by}")
-        if not halt.is_motion_forbidden:
+        stop_state = self._node.stop_state
+        if stop_state.is_stopped != self._was_stopped:
+            self._was_stopped = stop_state.is_stopped
+            self._log_event(
+                f"stopped by {stop_state.operators}"
+                if stop_state.is_stopped
+                else f"released by {stop_state.released_by}"
+            )
+        if not stop_state.is_motion_forbidden:
             return CONTINUES
-        if not halt.is_known:
-            halt.request_stops()  # no node has answered yet
+        if not stop_state.is_known:
+            stop_state.request_stops()  # no node has answered yet
         self._robot.driver.stop()
         return (
             STANDS_STILL if self._robot.driver.state == "ready" else "does not reach its robot, which stops by itself"
@@ -286,12 +290,12 @@ class Agent(Service):
 
     def _finish(self, part: Participation) -> None:
         engagement = part.engagement
-        had_body = part is self._robot_user
-        if had_body:
+        had_robot = part is self._robot_user
+        if had_robot:
             self._robot.driver.stop()
         self._task_queue.mark_over(engagement.task.task_id, self._clock.seconds())
         self._leave(engagement.task.task_id)
-        if had_body:
+        if had_robot:
             by_me = engagement.result is not None and engagement.result.by == engagement.me.name
             self._node.presence.change(task="", status=DONE if by_me else IDLE)
 

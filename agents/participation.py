@@ -54,8 +54,8 @@ class CouncilMaintainer:
         if now < self._next_check_at or not engagement.is_council_maintainer(now):
             return
         self._next_check_at = now + COUNCIL_CHECK_S
-        lessee = engagement.lease_client if engagement.is_acting else None
-        council = self._probe_council() if lessee is None else lessee.proposer
+        lease_client = engagement.lease_client if engagement.is_acting else None
+        council = self._probe_council() if lease_client is None else lease_client.proposer
         if now >= self._next_search_at and self._node.council_manager.has_vacancy(engagement.task, council):
             self._next_search_at = now + SUCCESSOR_RETRY_S
             following = Deferred.fromCoroutine(self._node.council_manager.find_successors(engagement.task, council))
@@ -84,7 +84,7 @@ def _ignore_unreachable(failure: Any) -> None:
 
 
 class Participation:
-    """The agent of ``node`` at ``task``; ``told`` is called with each report that is sent."""
+    """The agent of ``node`` at ``task``; ``on_report_sent`` is called with each report that is sent."""
 
     def __init__(
         self,
@@ -94,15 +94,15 @@ class Participation:
         strategy: ConsensusAlgorithm,
         clock: IReactorTime,
         token: int,
-        told: Callable[[Participation, Member], None],
-        halt: Callable[[], float],
+        on_report_sent: Callable[[Participation, Member], None],
+        stop_robot: Callable[[], float],
     ) -> None:
         self.has_left = False
-        self.stop_robot = halt
+        self.stop_robot = stop_robot
         self.find_contacts = node.find_contacts
         self._node = node
         self._clock = clock
-        self._on_report_sent = told
+        self._on_report_sent = on_report_sent
         self._close_behaviour: Callable[[], None] = getattr(behaviour, "close", lambda: None)
         me = Member(node.uuid, node.presence.device.name, IDLE)
         age = max(0.0, node.wall() - task.created)
@@ -143,18 +143,18 @@ class Participation:
         self._group.report(member)
         self._on_report_sent(self, member)
 
-    def publish_decision_record(self, verdict: DecisionRecord) -> None:
+    def publish_decision_record(self, record: DecisionRecord) -> None:
         """Publish the record of a decision, if the agent's report is visible to the others."""
         if self._panel.is_known(self._clock.seconds()):
-            self._node.publish_decision_record(verdict)
+            self._node.publish_decision_record(record)
 
     def record_outcome(self, result: Result) -> None:
         """Record the outcome, while this agent may record it."""
-        lessee = self.engagement.lease_client
-        if self.has_left or lessee is None:
+        lease_client = self.engagement.lease_client
+        if self.has_left or lease_client is None:
             return
-        result = replace(result, token=max(result.token, lessee.token))
-        proved = lessee.close_task(result.token)
+        result = replace(result, token=max(result.token, lease_client.token))
+        proved = lease_client.close_task(result.token)
         proved.addCallback(lambda proof: self._group.conclude(result, proof))
         proved.addErrback(self._retry_record_outcome, result)
 

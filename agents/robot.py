@@ -85,14 +85,14 @@ class AgentRobot:
             self._responded_at = now
         return self.is_enabled and has_motors and now - self._responded_at <= RESPONSE_TIMEOUT_S
 
-    def perform(self, deed: RobotCommand) -> bool:
-        """Perform ``deed``; False if the robot has obeyed a newer fencing token, so that another agent may act."""
+    def perform(self, command: RobotCommand) -> bool:
+        """Perform ``command``; False if the robot has obeyed a newer fencing token, so that another agent may act."""
         if self.driver.state != "ready":
             return True
         try:
-            action = self.motion.remove_missing_axes(deed.action)
-            self._permit_ends_at = deed.permit.deadline
-            self.motion.learn(action, self.driver.act(action, deed.permit))
+            action = self.motion.remove_missing_axes(command.action)
+            self._permit_ends_at = command.permit.deadline
+            self.motion.learn(action, self.driver.act(action, command.permit))
         except UsageError as error:
             self.driver.stop()
             self._log.debug("the robot rejected an action: {error}", error=error)

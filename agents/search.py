@@ -78,10 +78,10 @@ class SearchAndApproach:
         self._initial_gap = 0.0
         self._north: float | None = None
 
-    def embody(self, means: MotionCapabilities) -> None:
+    def embody(self, motion: MotionCapabilities) -> None:
         """Use the motion capabilities of this robot."""
-        self._motion = self._exploration.motion = self._post_path.motion = self._detour.motion = means
-        self._detector.run = means.run
+        self._motion = self._exploration.motion = self._post_path.motion = self._detour.motion = motion
+        self._detector.run = motion.run
 
     # -- observing --------------------------------------------------------------------------------------------------
 

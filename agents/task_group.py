@@ -113,13 +113,13 @@ class GroupStrategy:
     """
 
     def __init__(
-        self, division: TaskGroup, task_id: str, reports: tuple[Report, ...], acting: Mapping[str, str], why: str
+        self, task_group: TaskGroup, task_id: str, reports: tuple[Report, ...], acting: Mapping[str, str], why: str
     ) -> None:
-        strategy = division.strategy
+        strategy = task_group.strategy
         self.name, self.version, self.reads = strategy.name, strategy.version, strategy.reads
         self.improves, self.merge = strategy.improves, strategy.merge
         self.basis: tuple[object, ...] = (task_id, reports, tuple(sorted(acting.items())), why)
-        self._task_group = division
+        self._task_group = task_group
         self._task_id = task_id
         self._reports = reports
         self._acting = acting

@@ -32,9 +32,9 @@ class TurnAround:
         self._turned_rad = 0.0
         self._is_acting = False
 
-    def embody(self, means: MotionCapabilities) -> None:
+    def embody(self, motion: MotionCapabilities) -> None:
         """Use the motion capabilities of this robot."""
-        self._motion = means
+        self._motion = motion
 
     def look(self, seen: Observation, now: float) -> None:
         """Process the battery charge and the heading."""

@@ -55,9 +55,9 @@ class WatchTarget:
         self._watched_s = 0.0
         self._looked_at: float | None = None
 
-    def embody(self, means: MotionCapabilities) -> None:
+    def embody(self, motion: MotionCapabilities) -> None:
         """Use the motion capabilities of this robot."""
-        self._motion = means
+        self._motion = motion
 
     def look(self, seen: Observation, now: float) -> None:
         """Process an observation; the first one shows the kind of device."""

@@ -103,7 +103,7 @@ class AuctionSimulation:
         self,
         n: int,
         seed: int,
-        weather: LinkFaults,
+        faults: LinkFaults,
         waiting: float = 0.5,
         spread: float = 0.1,
         way: str = "",
@@ -119,7 +119,7 @@ class AuctionSimulation:
         council = select_closest(contacts, key, LARGE_COUNCIL if n >= LARGE_FROM else SMALL_COUNCIL)
         self.auction = Auction(task, 1, tuple(council), waiting_period=waiting, exclusive=exclusive)
         self.way = way or PathChoice().choose(n)
-        self.faults = weather
+        self.faults = faults
         self.sent = [0] * n
         self.handled = [0] * n
         self.views: list[tuple[Report, ...]] = [()] * n
@@ -132,7 +132,7 @@ class AuctionSimulation:
         self._rule = MergeRule(load_strategy("nearest"))
         members = {self._places[c.node_id] for c in council}
         rng = random.Random(f"{seed}/dead")
-        self.dead = {i for i in range(n) if i not in members and rng.random() < weather.dead}
+        self.dead = {i for i in range(n) if i not in members and rng.random() < faults.dead}
         if council_is_dead:
             self.dead |= members
         self.parties = [self._get_party(i) for i in range(n)]
@@ -190,10 +190,10 @@ class AuctionSimulation:
 
     def send_pending(self, place: int) -> None:
         """Send the pending messages of a node, and schedule its next call."""
-        party = self.parties[place]
-        for errand in party.take_due_messages(self.now):
-            self._send_message(place, errand)
-        due = party.due
+        participant = self.parties[place]
+        for message in participant.take_due_messages(self.now):
+            self._send_message(place, message)
+        due = participant.due
         if due != math.inf and due < self._due[place]:
             self._due[place] = due
             self.schedule(max(due, self.now), self._on_timer, place, due)
@@ -203,19 +203,19 @@ class AuctionSimulation:
             self._due[place] = math.inf
             self.send_pending(place)
 
-    def _send_message(self, place: int, errand: OutgoingMessage) -> None:
-        to = self._places[errand.to.node_id]
-        if isinstance(errand, FloodedBids):
-            self._send(place, to, self._deliver_flood, place, to, errand)
+    def _send_message(self, place: int, message: OutgoingMessage) -> None:
+        to = self._places[message.to.node_id]
+        if isinstance(message, FloodedBids):
+            self._send(place, to, self._deliver_flood, place, to, message)
             return
         state: dict[str, object] = {}
         for wait in RETRANSMISSION_DELAYS_S:
-            self.schedule(self.now + wait, self._send_attempt, place, to, errand, state)
-        self.schedule(self.now + ANSWER_LIMIT_S, self._handle_timeout, place, errand, state)
+            self.schedule(self.now + wait, self._send_attempt, place, to, message, state)
+        self.schedule(self.now + ANSWER_LIMIT_S, self._handle_timeout, place, message, state)
 
-    def _send_attempt(self, place: int, to: int, errand: OutgoingMessage, state: dict[str, object]) -> None:
+    def _send_attempt(self, place: int, to: int, message: OutgoingMessage, state: dict[str, object]) -> None:
         if "settled" not in state:
-            self._send(place, to, self._deliver, place, to, errand, state)
+            self._send(place, to, self._deliver, place, to, message, state)
 
     def _send(self, place: int, to: int, call: Callable[..., None], *arguments: object) -> None:
         self.sent[place] += 1
@@ -229,44 +229,44 @@ class AuctionSimulation:
         self.handled[to] += 1
         call(*arguments)
 
-    def _deliver_flood(self, place: int, to: int, cry: FloodedBids) -> None:
-        self.parties[to].on_flood(cry.bids, self.ring.contacts[place], self.now)
+    def _deliver_flood(self, place: int, to: int, flood: FloodedBids) -> None:
+        self.parties[to].on_flood(flood.bids, self.ring.contacts[place], self.now)
         self.send_pending(to)
 
-    def _deliver(self, place: int, to: int, errand: OutgoingMessage, state: dict[str, object]) -> None:
+    def _deliver(self, place: int, to: int, message: OutgoingMessage, state: dict[str, object]) -> None:
         if (
             "reply" not in state or self.faults.duplicate
         ):  # with duplicates the method runs twice, too (it is idempotent)
-            state["reply"] = self._handle(place, to, errand)
-        self._send(to, place, self._handle_reply, place, errand, state)
+            state["reply"] = self._handle(place, to, message)
+        self._send(to, place, self._handle_reply, place, message, state)
         self.send_pending(to)
 
-    def _handle(self, place: int, to: int, errand: OutgoingMessage) -> Announcement | None:
-        party, sender = self.parties[to], self.ring.contacts[place]
-        if isinstance(errand, Offer):
-            reply = party.on_offer(errand.bids, sender, errand.age, errand.is_shared, self.now)
-            has_best = any(report.agent == self.best for report in party.summary.standing)
+    def _handle(self, place: int, to: int, message: OutgoingMessage) -> Announcement | None:
+        participant, sender = self.parties[to], self.ring.contacts[place]
+        if isinstance(message, Offer):
+            reply = participant.on_offer(message.bids, sender, message.age, message.is_shared, self.now)
+            has_best = any(report.agent == self.best for report in participant.summary.standing)
             if has_best and self.auction.find_rank(self.ring.contacts[to].node_id) == 0:
                 self.gathered = min(self.gathered, self.now)
             return reply
-        assert isinstance(errand, Notice)
-        party.on_announcement(errand.announcement, self.now)
+        assert isinstance(message, Notice)
+        participant.on_announcement(message.announcement, self.now)
         return None
 
-    def _handle_reply(self, place: int, errand: OutgoingMessage, state: dict[str, object]) -> None:
+    def _handle_reply(self, place: int, message: OutgoingMessage, state: dict[str, object]) -> None:
         if "settled" in state:
             return
         state["settled"] = True
         reply = state["reply"]
         if isinstance(reply, Announcement):
             self.parties[place].on_announcement(reply, self.now)
-        self.parties[place].on_answer(errand, self.now)
+        self.parties[place].on_answer(message, self.now)
         self.send_pending(place)
 
-    def _handle_timeout(self, place: int, errand: OutgoingMessage, state: dict[str, object]) -> None:
+    def _handle_timeout(self, place: int, message: OutgoingMessage, state: dict[str, object]) -> None:
         if "settled" not in state:
             state["settled"] = True
-            self.parties[place].on_failure(errand, self.now)
+            self.parties[place].on_failure(message, self.now)
             self.send_pending(place)
 
     def _get_party(self, place: int) -> Participant:
@@ -349,19 +349,19 @@ def main(arguments: list[str]) -> int:
     parser.add_argument("--waiting", type=float, default=0.5, help="the waiting period in seconds")
     parser.add_argument("--seed", type=int, default=1)
     parser.add_argument("--json", help="write the rows to this file as well")
-    chosen = parser.parse_args(arguments)
+    args = parser.parse_args(arguments)
     print(
         "     n way     loss  dead  runs  messages/agent  busiest  agreed p50   p95  last  right     targets",
         flush=True,
     )
     rows = []
-    for n in chosen.n:
-        for dead in chosen.dead:
-            for loss in chosen.loss:
-                runs = chosen.runs or max(1, min(40, 3_000 // n))
-                began = time.process_time()
-                row = measure(n, loss, dead, runs, chosen.seed, waiting=chosen.waiting, spread=chosen.spread)
-                row["cpu"] = time.process_time() - began
+    for n in args.n:
+        for dead in args.dead:
+            for loss in args.loss:
+                runs = args.runs or max(1, min(40, 3_000 // n))
+                started_at = time.process_time()
+                row = measure(n, loss, dead, runs, args.seed, waiting=args.waiting, spread=args.spread)
+                row["cpu"] = time.process_time() - started_at
                 rows.append(row)
                 verdict = "yes" if not row["missed"] else "NO: " + ", ".join(row["missed"])  # type: ignore[arg-type]
                 print(
@@ -369,8 +369,8 @@ def main(arguments: list[str]) -> int:
                     f"{row['p50']:11.3f} {row['p95']:5.3f} {row['last']:5.3f} {row['right']:8.4%}  {verdict}",
                     flush=True,
                 )
-    if chosen.json:
-        Path(chosen.json).write_text(json.dumps(rows, indent=1) + "\n", encoding="utf-8")
+    if args.json:
+        Path(args.json).write_text(json.dumps(rows, indent=1) + "\n", encoding="utf-8")
     return 1 if any(row["missed"] for row in rows) else 0
 
 

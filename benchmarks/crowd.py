@@ -43,41 +43,41 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("--seconds", type=float, default=3.0, help="processor time for each size (default %(default)s)")
     parser.add_argument("--out", type=Path, help="write the figures to this file, as JSON")
     parser.add_argument("--one", type=int, help=argparse.SUPPRESS)
-    given = parser.parse_args(arguments)
-    sizes = given.bodies.split(",")
+    args = parser.parse_args(arguments)
+    sizes = args.bodies.split(",")
     if not all(size.isdecimal() and 1 <= int(size) <= 100_000 for size in sizes):
-        parser.error(f"--bodies must be comma-separated numbers from 1 to 100000, not {given.bodies!r}")
-    shared = given.tasks.split(",")
+        parser.error(f"--bodies must be comma-separated numbers from 1 to 100000, not {args.bodies!r}")
+    shared = args.tasks.split(",")
     if not all(size.isdecimal() and int(size) <= 1000 for size in shared):
-        parser.error(f"--tasks must be comma-separated numbers from 0 to 1000, not {given.tasks!r}")
-    if not 0.1 <= given.seconds <= 600 or not 0 <= given.agents <= 1000:
+        parser.error(f"--tasks must be comma-separated numbers from 0 to 1000, not {args.tasks!r}")
+    if not 0.1 <= args.seconds <= 600 or not 0 <= args.agents <= 1000:
         parser.error("--seconds must be 0.1 to 600, and --agents 0 to 1000")
-    if given.one is not None:
-        sys.stdout.write(json.dumps(_measure_robots(given.one, given.controller, given.seconds)) + "\n")
+    if args.one is not None:
+        sys.stdout.write(json.dumps(_measure_robots(args.one, args.controller, args.seconds)) + "\n")
         return 0
     sys.stdout.write(
         f"{'robots':>8}{'rays ms':>9}{'moves':>9}{'control':>9}{'step ms':>9}{'x real time':>13}{'MiB':>8}\n"
     )
     rows = []
     for size in sizes:
-        command = [sys.executable, "-m", "benchmarks.crowd", "--one", size, "--controller", given.controller]
+        command = [sys.executable, "-m", "benchmarks.crowd", "--one", size, "--controller", args.controller]
         child = subprocess.run(
-            [*command, "--seconds", str(given.seconds)], stdout=subprocess.PIPE, text=True, check=True
+            [*command, "--seconds", str(args.seconds)], stdout=subprocess.PIPE, text=True, check=True
         )
         row = json.loads(child.stdout)
         rows.append(row)
         cells = (f"{row[key]:9.3f}" for key in ("rays", "moves", "control", "step"))
         _print_line(f"{row['robots']:>8,}{''.join(cells)}{row['factor']:13.1f}{row['mib']:8.1f}")
     _print_line(
-        f"8 rays each, steps of 32 ms, all {given.controller}, one thread; MiB: more than the program without robots"
+        f"8 rays each, steps of 32 ms, all {args.controller}, one thread; MiB: more than the program without robots"
     )
     _print_line(f"{ARGOS}: the same order, on one core")
     figures: dict[str, Any] = {"alone": rows}
-    if given.agents:
-        figures["attached"] = _measure_agents(given.agents)
+    if args.agents:
+        figures["attached"] = _measure_agents(args.agents)
     figures["tasks"] = _measure_tasks([int(size) for size in shared if int(size)])
-    if given.out is not None:
-        given.out.write_text(json.dumps(figures, indent=1) + "\n", encoding="utf-8")
+    if args.out is not None:
+        args.out.write_text(json.dumps(figures, indent=1) + "\n", encoding="utf-8")
     return 0 if all(row["factor"] >= 1.0 for row in rows) else 1
 
 
@@ -91,9 +91,9 @@ def _measure_robots(bodies: int, controller: str, seconds: float) -> dict[str, f
         rays = 0.0
 
         def cast_rays(self) -> Any:
-            began = time.process_time()
+            started_at = time.process_time()
             met = super().cast_rays()
-            self.rays = 1e3 * (time.process_time() - began)
+            self.rays = 1e3 * (time.process_time() - started_at)
             return met
 
     before = read_memory_bytes("VmHWM") / MIB
@@ -103,13 +103,13 @@ def _measure_robots(bodies: int, controller: str, seconds: float) -> dict[str, f
     parts: dict[str, list[float]] = {"rays": [], "moves": [], "control": [], "step": []}
     end = time.process_time() + seconds
     while time.process_time() < end or len(parts["step"]) < 20:
-        began = time.process_time()
+        started_at = time.process_time()
         crowd.commands[:] = control(senses)
         controlled = time.process_time()
         crowd.step()
         stepped = time.process_time()
-        parts["step"].append(1e3 * (stepped - began))
-        parts["control"].append(1e3 * (controlled - began))
+        parts["step"].append(1e3 * (stepped - started_at))
+        parts["control"].append(1e3 * (controlled - started_at))
         parts["rays"].append(crowd.rays)
         parts["moves"].append(1e3 * (stepped - controlled) - crowd.rays)
     means = {key: statistics.fmean(costs) for key, costs in parts.items()}
@@ -126,10 +126,10 @@ def _measure_agents(agents: int) -> dict[str, float]:
     from sim.robots.crowd.scene import make_square_scene
     from swarmnode.crowd import CAMERA_FPS, CrowdTeam
 
-    began = time.process_time()
+    started_at = time.process_time()
     team = CrowdTeam(1, agents, make_square_scene(max(1000, agents)), stopwatch=time.process_time)
     team.clock.advance(SETTLE_S)
-    figures = {"agents": float(agents), "joining": time.process_time() - began}
+    figures = {"agents": float(agents), "joining": time.process_time() - started_at}
     _print_line(
         f"\n{agents} agents attached to {team.simulator.crowd.scene.robots:,} robots, without a task; ms a virtual second"
     )
@@ -141,9 +141,9 @@ def _measure_agents(agents: int) -> dict[str, float]:
                 driver.set_camera_fps(fps)
         team.clock.advance(0.5)
         moving, telling, sent = team.simulator.moving_s, team.simulator.reporting_s, team.switchboard.counters["sent"]
-        began = time.process_time()
+        started_at = time.process_time()
         team.clock.advance(POLL_S)
-        whole = (time.process_time() - began) / POLL_S
+        whole = (time.process_time() - started_at) / POLL_S
         moving, telling = (team.simulator.moving_s - moving) / POLL_S, (team.simulator.reporting_s - telling) / POLL_S
         rate = (team.switchboard.counters["sent"] - sent) / POLL_S
         yard = moving + telling

@@ -158,7 +158,7 @@ def _process_name(pid: int) -> str:
 @contextmanager
 def run_demonstration(run_dir: Path, seed: int) -> Iterator[tuple[subprocess.Popen[str], str, float]]:
     """Start the demonstration; yield its process, the page's address, and the seconds until it was ready."""
-    began = time.monotonic()
+    started_at = time.monotonic()
     command = [sys.executable, "-m", "sim.demo", "--seed", str(seed), "--run-dir", str(run_dir)]
     process = subprocess.Popen(command, stdout=subprocess.PIPE, text=True)
     try:
@@ -167,7 +167,7 @@ def run_demonstration(run_dir: Path, seed: int) -> Iterator[tuple[subprocess.Pop
             found = re.match(r"The page: (\S+)", line)
             if found:
                 threading.Thread(target=process.stdout.read, daemon=True).start()
-                yield process, found[1], time.monotonic() - began
+                yield process, found[1], time.monotonic() - started_at
                 return
         raise SystemExit("bench-demo: the demonstration ended before its page was up; run it alone to see why")
     finally:
@@ -203,13 +203,13 @@ def run_plain_node(run_dir: Path) -> Iterator[int]:
 def measure_task(page: PageClient, least_s: float) -> float:
     """Press Run Demo and return the seconds until the task is completed; wait at least ``least_s``."""
     task = json.loads(page.request("/api/v1/demo", "POST")[1])["id"]
-    began, took = time.monotonic(), 0.0
-    while not took or time.monotonic() - began < least_s:
-        if time.monotonic() - began > TASK_LIMIT_S:
+    started_at, took = time.monotonic(), 0.0
+    while not took or time.monotonic() - started_at < least_s:
+        if time.monotonic() - started_at > TASK_LIMIT_S:
             raise SystemExit(f"bench-demo: the task was not completed within {TASK_LIMIT_S:g} s")
         done = [row["id"] for row in page.read_state()["tasks"] if row["status"] == "COMPLETED"]
         if not took and task in done:
-            took = time.monotonic() - began
+            took = time.monotonic() - started_at
         time.sleep(0.5)
     return took
 
@@ -229,14 +229,14 @@ def measure(seed: int, seconds: float, run_dir: Path) -> list[str]:
         viewer = Viewer(page, host)
         viewer.open()
         time.sleep(2.0)
-        before, heard, began = (
+        before, heard, started_at = (
             {pid: read_cpu_s(pid) for pid in names},
             read_udp_counter("InDatagrams"),
             time.monotonic(),
         )
         pictures, carried = viewer.pictures, viewer.bytes
         took = measure_task(page, seconds)
-        span = time.monotonic() - began
+        span = time.monotonic() - started_at
         shares = {pid: (read_cpu_s(pid) - before[pid]) / span for pid in names}
         rate = (read_udp_counter("InDatagrams") - heard) / span
         pictures, carried = viewer.pictures - pictures, viewer.bytes - carried
@@ -277,9 +277,9 @@ def main(arguments: Sequence[str]) -> int:
         default=20.0,
         help="minimum time of the measurement of the processor (default %(default)s)",
     )
-    given = parser.parse_args(arguments)
+    args = parser.parse_args(arguments)
     with tempfile.TemporaryDirectory() as folder:
-        lines = measure(given.seed, given.seconds, Path(folder) / "run")
+        lines = measure(args.seed, args.seconds, Path(folder) / "run")
     sys.stdout.write("\n".join(lines) + "\n")
     return 1 if any("MISSED" in line or "NOT JOINED" in line for line in lines) else 0
 

@@ -142,12 +142,12 @@ class Team(SwarmTeam):
 
     def make_row(self, what: str) -> list[str]:
         """Return a row of the table for the present state of the team."""
-        began, sent, at = time.process_time(), self.switchboard.counters["sent"], self.clock.seconds()
+        started_at, sent, at = time.process_time(), self.switchboard.counters["sent"], self.clock.seconds()
         self.clock.advance(20.0)
         running = [node for node in self.nodes if node.running]
         n, held = len(running), self.count_held()
         each = n * (self.clock.seconds() - at)
-        cpu, datagrams = (time.process_time() - began) / each, (self.switchboard.counters["sent"] - sent) / each
+        cpu, datagrams = (time.process_time() - started_at) / each, (self.switchboard.counters["sent"] - sent) / each
         depths = [node.presence.device.depth for node in running]
         here = {node.uuid for node in running}
         unseen, strange, reads = 0, 0, 0
@@ -208,11 +208,11 @@ def main(arguments: Sequence[str]) -> int:
     )
     parser.add_argument("--team", type=int, default=0, help="number of real nodes, in a second table")
     parser.add_argument("--seed", type=int, default=1)
-    chosen = parser.parse_args(arguments)
-    rows = [make_model_row(n, chosen.seed, wrong) for n in chosen.devices for wrong in (0.0, 0.2)]
+    args = parser.parse_args(arguments)
+    rows = [make_model_row(n, args.seed, wrong) for n in args.devices for wrong in (0.0, 0.2)]
     print(format_table([MODEL_HEADER, *rows]), flush=True)
-    if chosen.team:
-        for row in run_team(chosen.team, chosen.seed):  # each row takes minutes of processor time for large teams
+    if args.team:
+        for row in run_team(args.team, args.seed):  # each row takes minutes of processor time for large teams
             print(", ".join(f"{name} {cell}" for name, cell in zip(TEAM_HEADER, row, strict=True)), flush=True)
     # Only rows with unmodified estimates count: with deliberate errors a listing may miss one device in some thousands.
     right = [row for row in rows if row[1] == "0%"]

@@ -50,16 +50,16 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("--rate", type=int, default=RATE_PER_S, help="datagrams a second (default %(default)s)")
     parser.add_argument("--out", type=Path, help="write the figures to this file, as JSON")
     parser.add_argument("--fire", help=argparse.SUPPRESS)
-    given = parser.parse_args(arguments)
-    if given.fire:
+    args = parser.parse_args(arguments)
+    if args.fire:
         return _send_flood(json.loads(sys.stdin.readline()))
-    if given.seconds < len(KINDS) or not 0 < given.rate <= 100_000:
+    if args.seconds < len(KINDS) or not 0 < args.rate <= 100_000:
         parser.error(f"--seconds must be {len(KINDS)} or more, --rate 1 to 100000")
-    found = _measure(given.seconds, given.rate)
+    found = _measure(args.seconds, args.rate)
     missed = _print_table(found)
-    if given.out:
-        given.out.parent.mkdir(parents=True, exist_ok=True)
-        given.out.write_text(json.dumps({**found, "missed": missed}, indent=1) + "\n")
+    if args.out:
+        args.out.parent.mkdir(parents=True, exist_ok=True)
+        args.out.write_text(json.dumps({**found, "missed": missed}, indent=1) + "\n")
     return 1 if missed else 0
 
 
@@ -111,9 +111,9 @@ def _send_flood(order: dict[str, Any]) -> int:
     fired = {}
     for kind, seconds in order["kinds"]:
         made_one = made[kind]
-        began, count = time.monotonic(), 0
-        while (now := time.monotonic()) < began + seconds:
-            due = int((now - began) * order["rate"])
+        started_at, count = time.monotonic(), 0
+        while (now := time.monotonic()) < started_at + seconds:
+            due = int((now - started_at) * order["rate"])
             while count < due:
                 with suppress(BlockingIOError):
                     senders[count % SOURCES].sendto(made_one(), to)

@@ -56,7 +56,7 @@ class Node(Protocol):
             reactor,
             rng,
             wall=time.time,
-            door=self.team.admission,
+            admission=self.team.admission,
         )
         self.team.attach(self.node, reactor)
         self.endpoint = self.node.endpoint
@@ -133,12 +133,12 @@ class Node(Protocol):
         return [contact for contact in self.node.overlay.contacts() if contact.public in self._others]
 
     def _call(self) -> None:
-        began = reactor.seconds()
+        started_at = reactor.seconds()
         value = os.urandom(16)
 
         def done(answer: object) -> None:
             self.calls["good" if answer == value else "bad"] += 1
-            self.trips.append(reactor.seconds() - began)
+            self.trips.append(reactor.seconds() - started_at)
 
         def failed(failure: object) -> None:
             self.calls["bad"] += 1
@@ -165,7 +165,7 @@ class Node(Protocol):
     def _report(self) -> dict[str, Any]:
         times = os.times()
         endpoint = self.endpoint
-        half, reach = endpoint._half_open, self.node.nat
+        half, nat = endpoint._half_open, self.node.nat
         report = {
             "at": reactor.seconds(),
             "cpu": times.user + times.system,
@@ -185,7 +185,7 @@ class Node(Protocol):
                 "peers": len(endpoint._peers._peers),
                 "assemblies": len(endpoint._fragmenter._incoming),
                 "led": len(self.network._port_by_target),
-                "seen": len(reach.external._reports),
+                "seen": len(nat.external._reports),
             },
         }
         self._clear()

@@ -50,11 +50,11 @@ class OperationBenchmark:
         sent, moment = self.team.total_traffic.sent, self.team.clock.seconds()
         quarter, best = -(-times // QUARTERS), math.inf
         for start in range(0, times, quarter):
-            began, end = time.process_time(), min(times, start + quarter)
+            started_at, end = time.process_time(), min(times, start + quarter)
             for first in range(start, end, wide):
                 for waiting in [work(number) for number in range(first, min(end, first + wide))]:
                     self.wait(waiting)
-            best = min(best, (time.process_time() - began) / (end - start))
+            best = min(best, (time.process_time() - started_at) / (end - start))
         span = self.team.clock.seconds() - moment
         cost = f"{best * 1e6:7.0f} us of CPU {(self.team.total_traffic.sent - sent) / times:6.1f} datagrams"
         return f"{cost} {span / times * 1e3:6.2f} ms, {self.failed} failed"
@@ -67,10 +67,10 @@ class OperationBenchmark:
         clock = self.team.clock
         newcomer = self.team.make_node(place)
         lines = []
-        sent, moment, began = self.team.total_traffic.sent, clock.seconds(), time.process_time()
+        sent, moment, started_at = self.team.total_traffic.sent, clock.seconds(), time.process_time()
 
         def lap(what: str) -> None:
-            cpu, span = (time.process_time() - began) * 1e3, (clock.seconds() - moment) * 1e3
+            cpu, span = (time.process_time() - started_at) * 1e3, (clock.seconds() - moment) * 1e3
             lines.append(f"{what} {cpu:.1f} ms of CPU, {self.team.total_traffic.sent - sent} datagrams, {span:.1f} ms")
 
         newcomer.start()
@@ -107,9 +107,9 @@ def main() -> int:
         return others[number % len(others)]
 
     print("put         ", hot.measure_each(lambda n: nodes[n % len(nodes)].put(key[n], "v", b"x" * 100), times))
-    asker = {number: remote(number) for number in range(times)}
-    print("get fast    ", hot.measure_each(lambda n: asker[n].get(key[n % 50], "fast"), times))
-    print("get majority", hot.measure_each(lambda n: asker[n].get(key[n % 50], "majority"), times))
+    requester = {number: remote(number) for number in range(times)}
+    print("get fast    ", hot.measure_each(lambda n: requester[n].get(key[n % 50], "fast"), times))
+    print("get majority", hot.measure_each(lambda n: requester[n].get(key[n % 50], "majority"), times))
     if arguments.profile:
         profile.disable()
         pstats.Stats(profile).sort_stats("tottime").print_stats(35)

@@ -40,9 +40,9 @@ class Team(EntangledTeam):
 
     def measure_idle(self, seconds: float) -> tuple[float, float, float]:
         """Return the datagrams and bytes that an idle node sends per second, and its share of a core."""
-        before, began = self.count_sent(), time.process_time()
+        before, started_at = self.count_sent(), time.process_time()
         self.clock.advance(seconds)
-        took = time.process_time() - began
+        took = time.process_time() - started_at
         each = seconds * len(self.nodes)
         datagrams, octets = self.count_sent()
         return (datagrams - before[0]) / each, (octets - before[1]) / each, took / each
@@ -54,13 +54,13 @@ class Team(EntangledTeam):
         before, failed = self.total_traffic.sent, 0
         took: list[float] = []
         for _ in range(times):
-            began = self.clock.seconds()
+            started_at = self.clock.seconds()
             ended: list[Any] = []
             done = work(self.random.choice([node for node in self.nodes if node._running]))
             done.addErrback(lambda failure: failure.trap(EntangledError)).addCallback(ended.append)
             while not ended:
                 self.clock.advance(0.0001)
-            took.append(self.clock.seconds() - began)
+            took.append(self.clock.seconds() - started_at)
             failed += isinstance(ended[0], type) or ended[0] == []
         self.clock.advance(0.05)
         return (self.total_traffic.sent - before) / times, sorted(took), failed

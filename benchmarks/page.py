@@ -128,13 +128,13 @@ class PageLoad:
     async def run_dribbler(self, number: int) -> None:
         """Run one client that sends a byte a second, until it is disconnected."""
         async with Connection(self._where, number) as line:
-            began = time.monotonic()
+            started_at = time.monotonic()
             over = asyncio.ensure_future(line.reader.read())
             for byte in b"GET /" + b"a" * 1000:
                 line.writer.write(bytes([byte]))
                 if (await asyncio.wait([over], timeout=DRIBBLE_S))[0]:
                     break
-            self.closed.append(time.monotonic() - began)
+            self.closed.append(time.monotonic() - started_at)
 
     async def send_requests(self, rate: float) -> None:
         """Send ``rate`` requests a second in total, each timed from its scheduled time."""
@@ -240,7 +240,7 @@ def main(arguments: Sequence[str]) -> int:
     parser.add_argument("--cameras", type=int, default=12)
     parser.add_argument("--dribblers", type=int, default=500)
     parser.add_argument("--rate", type=float, default=100.0, help="requests a second")
-    given = parser.parse_args(arguments)
+    args = parser.parse_args(arguments)
     most = resource.getrlimit(resource.RLIMIT_NOFILE)[1]
     # Both ends of each connection are files; the child processes inherit this limit.
     resource.setrlimit(resource.RLIMIT_NOFILE, (min(4096, most), most))
@@ -253,7 +253,7 @@ def main(arguments: Sequence[str]) -> int:
     try:
         for child in (web, robots):
             child.read()
-        lines = asyncio.run(measure(given, web, where))
+        lines = asyncio.run(measure(args, web, where))
     finally:
         robots.end()
         web.end()

@@ -87,8 +87,8 @@ def main(arguments: list[str]) -> None:
     if arguments[0] == "web":
         ports = [int(word) for word in arguments[1:]]
         wanted = make_settings("vaio", ports[0], web={"host": "127.0.0.1", "port": ports[1], "code": CODE})
-        seams = make_dependencies(wanted, reactor)
-        services = [NodeService(wanted, seams, [partial(make_web_page, wanted, seams, reactor)])]
+        dependencies = make_dependencies(wanted, reactor)
+        services = [NodeService(wanted, dependencies, [partial(make_web_page, wanted, dependencies, reactor)])]
 
         def tick(due: float) -> None:
             now = reactor.seconds()

@@ -35,14 +35,14 @@ def main(arguments: Sequence[str] | None = None) -> int:
     )
     parser.add_argument("--yard", help=argparse.SUPPRESS)
     parser.add_argument("--drive", help=argparse.SUPPRESS)
-    given = parser.parse_args(arguments)
-    if given.seconds < 2:
+    args = parser.parse_args(arguments)
+    if args.seconds < 2:
         parser.error("--seconds must be 2 or more")
-    if given.yard:
-        return _emulate(json.loads(given.yard))
-    if given.drive:
-        return _drive(json.loads(given.drive), given.seconds)
-    return _measure(given.seconds)
+    if args.yard:
+        return _emulate(json.loads(args.yard))
+    if args.drive:
+        return _drive(json.loads(args.drive), args.seconds)
+    return _measure(args.seconds)
 
 
 # -- the robots ---------------------------------------------------------------------------------------------------
@@ -61,11 +61,11 @@ def _emulate(ports: list[dict[str, int]]) -> int:
     from sim.robots.simulator import RobotSimulator
 
     reactor: Any = running
-    yard = RobotSimulator(reactor, Random(1), load_scene("three-dogs"))
+    simulator = RobotSimulator(reactor, Random(1), load_scene("three-dogs"))
     # The output is read at the end only, and a full pipe would block the simulator.
     legs: list[tuple[int, float, float]] = []
     for number, served in enumerate(ports):
-        body: Any = yard.reserve_for_emulator(f"dog{number + 1}", LIMITS)
+        body: Any = simulator.reserve_for_emulator(f"dog{number + 1}", LIMITS)
         drive = body.drive
 
         def stamped(vx: float, vy: float, wz: float, number: int = number, drive: Any = drive) -> None:
@@ -75,7 +75,7 @@ def _emulate(ports: list[dict[str, int]]) -> int:
 
         body.drive = stamped
         AiboServer(reactor, AiboEmulator(reactor, body, Random(number), ports={**served, "gains": 0})).start()
-    yard.start()
+    simulator.start()
     reactor.callWhenRunning(print, "ready", flush=True)
     reactor.run()
     for dog, vx, at in legs:
@@ -174,7 +174,7 @@ def _measure(seconds: float) -> int:
             raise SystemExit("bench-robots: the robot simulator did not start")
         parts = {}
         spent = read_cpu_s(yard.pid)
-        began = time.monotonic()
+        started_at = time.monotonic()
         for part, fps in (("30 pictures a second", 30.0), ("no camera", 0.0)):
             drivers.clear()
             for served in ports:
@@ -182,7 +182,7 @@ def _measure(seconds: float) -> int:
                 command = [*module, "--seconds", str(seconds), "--drive", options]
                 drivers.append(subprocess.Popen(command, stdout=subprocess.PIPE, text=True))
             parts[part] = [json.loads(one.communicate(timeout=seconds + START_LIMIT_S)[0]) for one in drivers]
-        share = (read_cpu_s(yard.pid) - spent) / (time.monotonic() - began)
+        share = (read_cpu_s(yard.pid) - spent) / (time.monotonic() - started_at)
     finally:
         for one in drivers:
             one.kill()

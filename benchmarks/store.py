@@ -145,12 +145,12 @@ def serve(path: str) -> None:
 
     settings = Settings.from_mapping({"node": {"name": "bench", "host": "127.0.0.1", "port": 0}}, "benchmark")
     settings = settings.with_flags(store=path, team_key="of the benchmark, and of nobody else")
-    seams = make_dependencies(settings, reactor)
-    service = NodeService(settings, seams)
+    dependencies = make_dependencies(settings, reactor)
+    service = NodeService(settings, dependencies)
 
     def serving() -> None:
         service.startService()
-        _print_line(len(seams.store), read_memory_bytes(), read_memory_bytes("VmHWM"))
+        _print_line(len(dependencies.store), read_memory_bytes(), read_memory_bytes("VmHWM"))
 
     reactor.callWhenRunning(serving)
     reactor.run()

@@ -28,17 +28,17 @@ def main(arguments: list[str] | None = None) -> int:
         "--light", action="store_true", help="do not replicate records: checks only the councils, much faster"
     )
     parser.add_argument("--calm", action="store_true", help="kill no nodes and cut no links")
-    wanted = parser.parse_args(arguments)
-    kind = SharedStoreTrial if wanted.light else TakingTrial
-    low, _, high = wanted.loss.partition("-")
+    args = parser.parse_args(arguments)
+    kind = SharedStoreTrial if args.light else TakingTrial
+    low, _, high = args.loss.partition("-")
     least, most = float(low), float(high or low)
     print("seed  loss  churn  tuples  confirmed  twice  lost  seen again  simulated s  datagrams/tuple  real s")
     wrong: list[str] = []
-    for number in range(wanted.trials):
-        loss = least + (most - least) * number / max(1, wanted.trials - 1)
-        began = time.monotonic()
-        tuples = wanted.tuples * (number + 1) // wanted.trials - wanted.tuples * number // wanted.trials
-        trial = kind(wanted.seed + number, tuples, loss, not wanted.calm, wanted.takers, wanted.nodes)
+    for number in range(args.trials):
+        loss = least + (most - least) * number / max(1, args.trials - 1)
+        started_at = time.monotonic()
+        tuples = args.tuples * (number + 1) // args.trials - args.tuples * number // args.trials
+        trial = kind(args.seed + number, tuples, loss, not args.calm, args.takers, args.nodes)
         sent = trial.switchboard.counters["sent"]
         trial.run_trial()
         found = trial.find_violations()
@@ -46,10 +46,10 @@ def main(arguments: list[str] | None = None) -> int:
         broken = Counter(line[:2] for line in found)
         confirmed = len(trial.recorder.tuples) - len(trial.recorder.list_undecided())
         print(
-            f"{trial.seed:4d}  {loss:4.2f}  {'no' if wanted.calm else 'yes':>5}  {tuples:6d}  {confirmed:9d}"
+            f"{trial.seed:4d}  {loss:4.2f}  {'no' if args.calm else 'yes':>5}  {tuples:6d}  {confirmed:9d}"
             f"  {broken['T1']:5d}  {broken['T2'] + broken['T5']:4d}  {broken['T3']:10d}"
             f"  {trial.clock.seconds():11.0f}  {(trial.switchboard.counters['sent'] - sent) / max(1, tuples):15.0f}"
-            f"  {time.monotonic() - began:6.0f}",
+            f"  {time.monotonic() - started_at:6.0f}",
             flush=True,
         )
         wrong += [f"seed {trial.seed}, loss {loss:.2f}: {text}" for text in found]

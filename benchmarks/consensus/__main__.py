@@ -49,11 +49,11 @@ def main() -> int:
     )  # fmt: skip
     parser.add_argument("--out", type=Path, help="write everything as JSON")
     parser.add_argument("--plot", type=Path, help="draw the costs as SVG")
-    wanted = parser.parse_args()
-    sizes = [int(n) for n in wanted.sizes.split(",")] if wanted.sizes else list(QUICK_SIZES if wanted.quick else SIZES)
-    seeds = wanted.seeds or (QUICK_SEEDS if wanted.quick else SEEDS)
+    args = parser.parse_args()
+    sizes = [int(n) for n in args.sizes.split(",")] if args.sizes else list(QUICK_SIZES if args.quick else SIZES)
+    seeds = args.seeds or (QUICK_SEEDS if args.quick else SEEDS)
     gc.disable()  # otherwise the garbage collector scans a thousand agents in one process, without finding garbage
-    began = time.monotonic()
+    started_at = time.monotonic()
     print(f"{'agents':>6s} {'missions':>8s} {'strategy':24s} {'cost':>6s} {'failed':>7s} {'moved':>6s} {'messages':>8s}"
           f" {'kB':>6s} {'rounds':>6s} {'agree s':>7s} {'CPU ms':>8s}")  # fmt: skip
     rows = []
@@ -61,7 +61,7 @@ def main() -> int:
         for row in measure_size(size, range(1, 1 + max(1, min(seeds, MAX_AGENTS // size)))):
             rows.append(row)
             print(format_row(row), flush=True)
-    ways = compare_routes(1 if wanted.quick else 5, QUICK_ROUTE_SEARCH_S if wanted.quick else ROUTE_SEARCH_S)
+    ways = compare_routes(1 if args.quick else 5, QUICK_ROUTE_SEARCH_S if args.quick else ROUTE_SEARCH_S)
     found = check_targets(rows, ways, range(1, 1 + seeds))
     print(f"\nRoutes through several tasks, sequential, relative to the best known ({ways['by']}), and the maximum:")
     for key, ratio in ways["ratios"].items():
@@ -70,11 +70,11 @@ def main() -> int:
     for target in found:
         word = "yes" if target["is_met"] else "NO"
         print(f"    {word:3s}  {target['what']:58s} {target['is']:9.3f} (at most {target['most']:g})")
-    print(f"\nThe run took {time.monotonic() - began:.0f} s, {time.process_time():.0f} s of processor time.")
-    if wanted.out:
-        wanted.out.write_text(json.dumps({"rows": rows, "ways": ways, "targets": found}, indent=1), encoding="utf-8")
-    if wanted.plot:
-        wanted.plot.write_text(draw_svg(rows), encoding="utf-8")
+    print(f"\nThe run took {time.monotonic() - started_at:.0f} s, {time.process_time():.0f} s of processor time.")
+    if args.out:
+        args.out.write_text(json.dumps({"rows": rows, "ways": ways, "targets": found}, indent=1), encoding="utf-8")
+    if args.plot:
+        args.plot.write_text(draw_svg(rows), encoding="utf-8")
     return int(not all(target["is_met"] for target in found))
 
 
@@ -88,10 +88,10 @@ def run_mission(size: int, seed: int) -> dict[str, dict[str, Any]]:
     """Return the results of each strategy on one mission."""
     calm, after = Mission(size, size, seed), Mission(size, size, seed, FAILED_PERCENT)
     (least, by), (least_after, _) = solve_assignment(calm), solve_assignment(after)
-    talk, alive = run_cbba(calm), set(after.alive)
+    cbba_run, alive = run_cbba(calm), set(after.alive)
     found = {}
     for name in DECIDERS:
-        now, then = make_outcome(name, calm, talk), make_outcome(name, after)
+        now, then = make_outcome(name, calm, cbba_run), make_outcome(name, after)
         kept = [task for task, agent in now.owners.items() if agent in alive]
         is_greedy = name == "cbba" and size <= MAX_FULL_BIDDERS  # otherwise CBBA did not use every bid
         found[name] = {
@@ -103,7 +103,7 @@ def run_mission(size: int, seed: int) -> dict[str, dict[str, Any]]:
             "rounds": now.rounds,
             "cpu_ms": now.cpu_ms,
             "by": by,
-            "two_owners": sum(len(o) > 1 for o in talk.owners.values()) if name in EXCHANGING else 0,
+            "two_owners": sum(len(o) > 1 for o in cbba_run.owners.values()) if name in EXCHANGING else 0,
             "unlike_greedy": len(make_collected_outcome(name, calm).owners.items() ^ now.owners.items())
             if is_greedy
             else 0,
@@ -175,9 +175,9 @@ def measure_solver_ms(size: int, seeds: range) -> float:
         mission = Mission(size, size, seed)
         costs = [list(row.values()) for row in mission.costs.values()]
         for _ in range(5 if size <= 100 else 1):
-            began = time.process_time()
+            started_at = time.process_time()
             hungarian.solve(costs)
-            took.append((time.process_time() - began) * 1000.0)
+            took.append((time.process_time() - started_at) * 1000.0)
     return median(took)
 
 

@@ -115,7 +115,7 @@ def run_cbba(mission: Mission, pause: int = PAUSE_ROUNDS, loss: float = 0.0, qui
     """
     graph = make_graph(mission.alive, mission.seed)
     rng = random.Random(f"loss/{mission.seed}")
-    began = time.process_time()
+    started_at = time.process_time()
     bidders = {
         name: Bidder(name, mission.task_positions, make_score(mission.costs[name]), mission.capacity, graph[name])
         for name in mission.alive
@@ -148,7 +148,7 @@ def run_cbba(mission: Mission, pause: int = PAUSE_ROUNDS, loss: float = 0.0, qui
         for task in bidder.bundle:
             owners.setdefault(task, []).append(name)
     each = len(bidders)
-    return CbbaRun(owners, last, messages / each, octets / each, time.process_time() - began - measured)
+    return CbbaRun(owners, last, messages / each, octets / each, time.process_time() - started_at - measured)
 
 
 def encode_message(said: tuple[Statement, ...]) -> bytes:

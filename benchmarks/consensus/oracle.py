@@ -58,7 +58,7 @@ def _anneal(mission: Mission, ways: dict[str, list[str]], steps: int) -> float:
     owner = {task: agent for agent, way in now.items() for task in way}
     tasks = sorted(owner)
     for step in range(steps):
-        warmth = heat * (1.0 - step / steps) ** 2 + 1e-9
+        temperature = heat * (1.0 - step / steps) ** 2 + 1e-9
         task = rng.choice(tasks)
         here = owner[task]
         # Choose the same agent, an agent of a random task, or a random agent.
@@ -71,7 +71,7 @@ def _anneal(mission: Mission, ways: dict[str, list[str]], steps: int) -> float:
         more, where = find_insertion(
             mission.agent_positions[there], [mission.task_positions[t] for t in target], mission.task_positions[task]
         )
-        if more - spared <= 0.0 or rng.random() < math.exp((spared - more) / warmth):
+        if more - spared <= 0.0 or rng.random() < math.exp((spared - more) / temperature):
             now[here] = rest
             now[there] = [*target[:where], task, *target[where:]]
             owner[task] = there

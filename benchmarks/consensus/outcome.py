@@ -28,9 +28,13 @@ class Outcome:
     cpu_ms: float
 
 
-def make_outcome(name: str, mission: Mission, talk: CbbaRun | None = None) -> Outcome:
-    """Return the result of a strategy; strategies without collection use ``talk``, if given."""
-    found = make_collected_outcome(name, mission) if talk is None or name not in EXCHANGING else make_cbba_outcome(talk)
+def make_outcome(name: str, mission: Mission, cbba_run: CbbaRun | None = None) -> Outcome:
+    """Return the result of a strategy; strategies without collection use ``cbba_run``, if given."""
+    found = (
+        make_collected_outcome(name, mission)
+        if cbba_run is None or name not in EXCHANGING
+        else make_cbba_outcome(cbba_run)
+    )
     if name != MEETINGS:
         return found
     owners, messages = run_meetings(mission, found.owners)
@@ -43,10 +47,10 @@ def make_outcome(name: str, mission: Mission, talk: CbbaRun | None = None) -> Ou
     )
 
 
-def make_cbba_outcome(talk: CbbaRun) -> Outcome:
+def make_cbba_outcome(cbba_run: CbbaRun) -> Outcome:
     """Return the agreement between the agents; if two agents claim a task, the first one owns it."""
-    owners = {task: agents[0] for task, agents in talk.owners.items()}
-    return Outcome(owners, talk.messages, talk.message_bytes / 1000.0, talk.rounds, talk.cpu_s * 1000.0)
+    owners = {task: agents[0] for task, agents in cbba_run.owners.items()}
+    return Outcome(owners, cbba_run.messages, cbba_run.message_bytes / 1000.0, cbba_run.rounds, cbba_run.cpu_s * 1000.0)
 
 
 def make_collected_outcome(name: str, mission: Mission) -> Outcome:
@@ -59,9 +63,9 @@ def make_collected_outcome(name: str, mission: Mission) -> Outcome:
     while True:
         times += 1
         reports = mission.make_reports(mission.alive, most, holes)
-        began = time.process_time()
+        started_at = time.process_time()
         owners = DECIDERS[name](mission, reports)
-        took += (time.process_time() - began) * 1000.0
+        took += (time.process_time() - started_at) * 1000.0
         more = set(mission.task_positions) - set(owners)
         if more <= holes:
             each = len(reports) / len(mission.alive)

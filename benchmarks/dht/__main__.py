@@ -27,13 +27,13 @@ KEYS = 200
 EXIT_INTERRUPTED = 130
 
 
-async def run_part(course: Workload, part: str) -> None:
+async def run_part(workload: Workload, part: str) -> None:
     """Run one part of the comparison with a separate team."""
     if part != "steady":
-        await measure_losses(course, is_silent=part == "silent")
-    elif await course.run_healthy():
+        await measure_losses(workload, is_silent=part == "silent")
+    elif await workload.run_healthy():
         for verb in (measure_watches, measure_long_values, measure_space):
-            await verb(course)
+            await verb(workload)
 
 
 async def measure_library(entry: Library, size: int, plan: Plan, parts: Sequence[str], result: Result) -> None:
@@ -72,17 +72,17 @@ def main(arguments: Sequence[str]) -> int:
     parser.add_argument("--profile", default="", help="prefix of files for profiles of two nodes under load")
     parser.add_argument("--out", help="write all figures to this file, as JSON")
     parser.add_argument("--plot", help="draw the main figures to this file, as SVG")
-    given = parser.parse_args(arguments)
+    args = parser.parse_args(arguments)
     try:
-        entries = select_libraries(given.peers)
-        sizes = [int(size) for size in given.nodes.split(",")]
+        entries = select_libraries(args.peers)
+        sizes = [int(size) for size in args.nodes.split(",")]
     except ValueError as error:
         parser.error(str(error))
-    parts = given.parts.split(",")
-    if min(sizes) < 3 or given.seconds <= 0 or not set(parts) <= set(PARTS):
+    parts = args.parts.split(",")
+    if min(sizes) < 3 or args.seconds <= 0 or not set(parts) <= set(PARTS):
         parser.error("--nodes must be 3 or more, --seconds above 0, --parts some of " + ", ".join(PARTS))
-    keys = min(KEYS, max(10, int(KEYS * given.seconds)))
-    plan = Plan(keys, given.seconds, seed=given.seed, profile=given.profile)
+    keys = min(KEYS, max(10, int(KEYS * args.seconds)))
+    plan = Plan(keys, args.seconds, seed=args.seed, profile=args.profile)
     for entry in entries:
         if not entry.is_installed:
             sys.stderr.write(f"{entry.name}: skipped, the package {entry.package} is missing: pip install '.[bench]'\n")
@@ -98,13 +98,13 @@ def main(arguments: Sequence[str]) -> int:
         sys.stderr.write("ended early; what was measured until now:\n")
         ended = EXIT_INTERRUPTED
     sys.stdout.write(format_table(results))
-    if given.out:
+    if args.out:
         about = {"python": platform.python_version(), "machine": platform.machine(), **vars(plan)}
         behind = {e.name: {"behind": e.storage, "promise": e.guarantee, "largest": e.largest} for e in entries}
         text = json.dumps({"about": about, "behind": behind, "results": results}, indent=1)
-        Path(given.out).write_text(text + "\n", encoding="utf-8")
-    if given.plot:
-        Path(given.plot).write_text(draw_svg(results), encoding="utf-8")
+        Path(args.out).write_text(text + "\n", encoding="utf-8")
+    if args.plot:
+        Path(args.plot).write_text(draw_svg(results), encoding="utf-8")
     return ended
 
 

@@ -60,11 +60,11 @@ class OrderExecutor:
 
     def _do_start(self, order: Order) -> None:
         """Join; with an existing key ``wanted``, measure the time until it has been read."""
-        began = time.monotonic()
+        started_at = time.monotonic()
         wanted = order.get("wanted")
 
         def ms() -> float:
-            return (time.monotonic() - began) * 1000
+            return (time.monotonic() - started_at) * 1000
 
         def joined() -> None:
             if wanted is None:
@@ -73,7 +73,7 @@ class OrderExecutor:
                 self._start_timing("get", wanted[0], bytes.fromhex(wanted[1]), TRY_LIMIT_S, read)
 
         def read(is_good: bool, _: float) -> None:
-            if is_good or time.monotonic() - began > order["limit_s"]:
+            if is_good or time.monotonic() - started_at > order["limit_s"]:
                 self._answer(order, join_ms=ms() if is_good else None)
             else:
                 self._node.call_later(RETRY_S, joined)
@@ -98,11 +98,11 @@ class OrderExecutor:
 
     def _do_space(self, order: Order) -> None:
         """Execute one operation on the tuple space; ``moments`` are its start and end."""
-        began = time.monotonic()
+        started_at = time.monotonic()
 
         def done(is_good: bool) -> None:
             ended = time.monotonic()
-            self._answer(order, good=is_good, ms=(ended - began) * 1000, moments=[began, ended])
+            self._answer(order, good=is_good, ms=(ended - started_at) * 1000, moments=[started_at, ended])
 
         self._node.run_space_operation(order["verb"], order["fields"], order["limit_s"], done)
 
@@ -143,14 +143,14 @@ class OrderExecutor:
         self, kind: str, key: str, value: bytes, limit_s: float, done: Callable[[bool, float], None]
     ) -> None:
         is_open = True
-        began = time.monotonic()
+        started_at = time.monotonic()
 
         def finish(result: object) -> None:
             nonlocal is_open
             if is_open:
                 is_open = False
                 in_time()
-                done(result == value if kind == "get" else bool(result), (time.monotonic() - began) * 1000)
+                done(result == value if kind == "get" else bool(result), (time.monotonic() - started_at) * 1000)
 
         in_time = self._node.call_later(limit_s, finish, None)
         (self._node.get if kind == "get" else self._node.put)(key, value, finish)

@@ -88,8 +88,8 @@ class Library:
     def make_node(self, folder: str) -> LibraryNode:
         """Create a node; ``folder`` is for its files."""
         maker = getattr(importlib.import_module(f"benchmarks.dht.{self.module}"), self.class_name)
-        contestant: LibraryNode = maker(folder, *self.options)
-        return contestant
+        node: LibraryNode = maker(folder, *self.options)
+        return node
 
 
 OURS = "swarm-sqlite"

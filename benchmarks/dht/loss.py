@@ -18,25 +18,25 @@ MIN_NODES = 8
 """In a smaller network half of the nodes is too few for a meaningful result."""
 
 
-async def measure_losses(course: Workload, is_silent: bool) -> None:
+async def measure_losses(workload: Workload, is_silent: bool) -> None:
     """Store, fail nodes, read; the figures are stored under the number of failed nodes."""
-    nodes, plan = course.nodes, course.plan
-    async with course.phase("store", 180.0):
-        await course.start_nodes(nodes)
-        items = [(f"loss {n}", course.make_value()) for n in range(plan.keys)]
+    nodes, plan = workload.nodes, workload.plan
+    async with workload.phase("store", 180.0):
+        await workload.start_nodes(nodes)
+        items = [(f"loss {n}", workload.make_value()) for n in range(plan.keys)]
         parts = [
-            course.run_load(nodes[n], "put", items[n::WRITERS], 2, SINGLES_LIMIT_S, once=True) for n in range(WRITERS)
+            workload.run_load(nodes[n], "put", items[n::WRITERS], 2, SINGLES_LIMIT_S, once=True) for n in range(WRITERS)
         ]
         done = {key for outcome in await asyncio.gather(*parts) for key in outcome["done"]}
         # Only values that the library reported as stored can count as missing.
         stored = [item for item in items if item[0] in done]
-        course.result["stored"] = len(stored)
+        workload.result["stored"] = len(stored)
         await asyncio.sleep(plan.scale_pause(1.0))
-    if "trouble" in course.result:
+    if "trouble" in workload.result:
         return
     step, half = len(nodes) // 4, len(stored) // 2
-    victims = course.rng.sample(nodes[WRITERS:], 2 * step)
-    readers = course.rng.sample([node for node in nodes[1:] if node not in victims], 2)
+    victims = workload.rng.sample(nodes[WRITERS:], 2 * step)
+    readers = workload.rng.sample([node for node in nodes[1:] if node not in victims], 2)
     for number, reader in enumerate(readers):
         for victim in victims[number * step : (number + 1) * step]:
             victim.send_signal(signal.SIGSTOP if is_silent else signal.SIGKILL)
@@ -44,9 +44,9 @@ async def measure_losses(course: Workload, is_silent: bool) -> None:
         wanted = stored[number * half : (number + 1) * half]
         if not wanted:
             continue
-        async with course.phase(f"{(number + 1) * step} gone"):
-            outcome = await course.run_load(reader, "get", wanted, IN_FLIGHT, LOSS_LIMIT_S, once=True)
-            course.result["a half" if number else "a quarter"] = {
+        async with workload.phase(f"{(number + 1) * step} gone"):
+            outcome = await workload.run_load(reader, "get", wanted, IN_FLIGHT, LOSS_LIMIT_S, once=True)
+            workload.result["a half" if number else "a quarter"] = {
                 "gone": (number + 1) * step,
                 "wanted": len(wanted),
                 "found_percent": 100 * outcome["good"] / len(wanted),

@@ -40,8 +40,8 @@ async def run(count: int, lossy: int, seed: int) -> list[Outcome]:
         asyncio.get_running_loop().add_signal_handler(number, task.cancel)
     with tempfile.TemporaryDirectory(prefix="nat-") as folder, Internet(list_sites(), seed) as net:
         print_line(f"{len(net.hosts)} hosts on {len(net.sites)} sites")
-        async with Hosts(net, net.hosts, Path(folder)) as fleet:
-            matrix = Matrix(net, fleet, seed, print_line)
+        async with Hosts(net, net.hosts, Path(folder)) as hosts:
+            matrix = Matrix(net, hosts, seed, print_line)
             await matrix.run(count, lossy)
             return matrix.outcomes
 
@@ -54,29 +54,29 @@ def main(arguments: Sequence[str] = tuple(sys.argv[1:])) -> int:
     parser.add_argument("--seed", type=int, default=1, help="seed of losses and keys (%(default)s)")
     parser.add_argument("--out", type=Path, default=Path("build"), help="folder for the JSON and the picture")
     parser.add_argument("--docs", action="store_true", help=f"also write table and picture to {DOCUMENT}")
-    given = parser.parse_args(list(arguments))
+    args = parser.parse_args(list(arguments))
     why = find_unavailable_reason()
     if why:
         sys.stderr.write(f"!!!\n!!! live-nat CANNOT RUN HERE: {why}\n!!!\n")
         return 2
     try:
-        given.out.mkdir(parents=True, exist_ok=True)
+        args.out.mkdir(parents=True, exist_ok=True)
     except OSError as error:
-        parser.error(f"--out {given.out} cannot be created ({error.strerror}); choose another folder")
-    began = time.monotonic()
+        parser.error(f"--out {args.out} cannot be created ({error.strerror}); choose another folder")
+    started_at = time.monotonic()
     try:
-        outcomes = asyncio.run(run(given.count, given.lossy, given.seed))
+        outcomes = asyncio.run(run(args.count, args.lossy, args.seed))
     except asyncio.CancelledError:
         sys.stderr.write("live-nat: ended before its time; all it had made is gone\n")
         return 130
     kept = check_requirements(outcomes)
-    file = given.out / "live-nat"
+    file = args.out / "live-nat"
     trials = {"promises": [asdict(one) for one in kept], "trials": [asdict(one) for one in outcomes]}
     file.with_suffix(".json").write_text(json.dumps(trials, indent=1) + "\n", encoding="utf-8")
     picture = draw_svg([one for one in outcomes if one.part == PLAIN], "Seconds until the first answer")
     file.with_suffix(".svg").write_text(picture, encoding="utf-8")
-    print_line(f"\n{format_table(outcomes)}\n{file}.json, .svg; {time.monotonic() - began:.0f} s")
-    if given.docs:
+    print_line(f"\n{format_table(outcomes)}\n{file}.json, .svg; {time.monotonic() - started_at:.0f} s")
+    if args.docs:
         DOCUMENT.write_text(update_document(DOCUMENT.read_text(encoding="utf-8"), outcomes), encoding="utf-8")
         (DOCUMENT.parent / PICTURE).write_text(picture, encoding="utf-8")
     return 0 if all(one.is_kept for one in kept) else 1

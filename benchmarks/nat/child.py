@@ -50,9 +50,11 @@ class Member:
     """A node of a trial, with hooks that record its requests."""
 
     def __init__(self, settings: Settings, seed: bytes) -> None:
-        seams = make_dependencies(settings, reactor)
-        identity, network = Identity(seed), seams.network()
-        self.node = EntangledNode(identity, settings.node.team_secret, network, seams.store, reactor, seams.rng)
+        dependencies = make_dependencies(settings, reactor)
+        identity, network = Identity(seed), dependencies.network()
+        self.node = EntangledNode(
+            identity, settings.node.team_secret, network, dependencies.store, reactor, dependencies.rng
+        )
         self.observations: dict[bytes, PeerObservation] = {}
         self.wanted_peers: dict[bytes, float] = {}
         """Peers that are called as soon as they are known, with the maximum duration in seconds."""
@@ -75,7 +77,7 @@ class Member:
 
     def call(self, public: bytes, done: Callable[[float], None], limit_s: float) -> None:
         """Call a peer until it answers; call ``done`` with the duration in seconds, or -1 after ``limit_s``."""
-        began = reactor.seconds()
+        started_at = reactor.seconds()
         state = {"open": True, "in flight": 0}
 
         def over(seconds: float) -> None:
@@ -85,7 +87,7 @@ class Member:
 
         def answered(_: object) -> None:
             state["in flight"] -= 1
-            over(reactor.seconds() - began)
+            over(reactor.seconds() - started_at)
 
         def failed(failure: Any) -> None:
             state["in flight"] -= 1
@@ -94,11 +96,11 @@ class Member:
         def again() -> None:
             if not state["open"]:
                 return
-            if reactor.seconds() - began > limit_s:
+            if reactor.seconds() - started_at > limit_s:
                 over(-1.0)
                 return
-            sight = self.get_observation(public)
-            contact = sight.confirmed or sight.contact
+            observation = self.get_observation(public)
+            contact = observation.confirmed or observation.contact
             if contact is not None and state["in flight"] < IN_FLIGHT:
                 state["in flight"] += 1
                 asked: Deferred[Any] = self.node.call(contact, CALL_METHOD)
@@ -113,29 +115,29 @@ class Member:
         return "" if proved is None else find_path_kind(proved)
 
     def _ask_and_record(self, contact: Contact, method: str, *arguments: object, **options: Any) -> Deferred[Any]:
-        sight = self.get_observation(contact.public)
-        self._record_contact(contact, sight)
+        observation = self.get_observation(contact.public)
+        self._record_contact(contact, observation)
         asked = self._ask(contact, method, *arguments, **options)
 
         def answered(answer: object) -> object:
-            if sight.answered_at < 0:
-                sight.answered_at = reactor.seconds()
-                sight.path = self.get_path(contact.public)
-                for waiting in sight.waiting:
+            if observation.answered_at < 0:
+                observation.answered_at = reactor.seconds()
+                observation.path = self.get_path(contact.public)
+                for waiting in observation.waiting:
                     waiting()
             return answer
 
         return asked.addCallback(answered)
 
     def _on_contact(self, contact: Contact) -> None:
-        sight = self.get_observation(contact.public)
-        sight.confirmed = contact
-        self._record_contact(contact, sight)
+        observation = self.get_observation(contact.public)
+        observation.confirmed = contact
+        self._record_contact(contact, observation)
 
-    def _record_contact(self, contact: Contact, sight: PeerObservation) -> None:
-        sight.contact = contact
-        if sight.known_at < 0:
-            sight.known_at = reactor.seconds()
+    def _record_contact(self, contact: Contact, observation: PeerObservation) -> None:
+        observation.contact = contact
+        if observation.known_at < 0:
+            observation.known_at = reactor.seconds()
             if contact.public in self.wanted_peers:
                 # Simulate an application that calls each discovered peer; its call follows the node's own request.
                 reactor.callLater(0.0, self.call, contact.public, lambda _: None, self.wanted_peers[contact.public])
@@ -187,13 +189,13 @@ class OrderExecutor:
         settings = Settings.from_mapping({"node": order["node"]}, "trial")
         member = self._members[order["trial"]] = Member(settings, bytes.fromhex(order["seed"]))
         member.wanted_peers = {bytes.fromhex(public): order["limit_s"] for public in order["sought"]}
-        port, began = member.start(), reactor.seconds()
+        port, started_at = member.start(), reactor.seconds()
         late = reactor.callLater(order["limit_s"], self._answer, order, port=port, joined_s=None)
 
         def joined(_: object) -> None:
             if late.active():
                 late.cancel()
-                self._answer(order, port=port, joined_s=reactor.seconds() - began)
+                self._answer(order, port=port, joined_s=reactor.seconds() - started_at)
 
         member.node.join(settings.node.known_nodes).addCallbacks(joined, lambda _: None)
 
@@ -201,22 +203,22 @@ class OrderExecutor:
         """Wait until a peer has answered; return the time since the node learnt of it."""
         member = self._members[order["trial"]]
         public = bytes.fromhex(order["peer"])
-        sight = member.get_observation(public)
+        observation = member.get_observation(public)
 
         def tell() -> None:
             if not timer.active():
                 return
             timer.cancel()
-            self._answer(order, took_s=sight.answered_at - sight.known_at, path=sight.path)
+            self._answer(order, took_s=observation.answered_at - observation.known_at, path=observation.path)
 
         def late() -> None:
-            self._answer(order, took_s=None, path="", known=sight.known_at >= 0)
+            self._answer(order, took_s=None, path="", known=observation.known_at >= 0)
 
         timer = reactor.callLater(order["limit_s"], late)
-        if sight.answered_at >= 0:
+        if observation.answered_at >= 0:
             tell()
         else:
-            sight.waiting.append(tell)
+            observation.waiting.append(tell)
 
     def _do_call(self, order: Order) -> None:
         """Call a peer until it answers."""

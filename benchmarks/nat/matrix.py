@@ -90,9 +90,9 @@ IDLE_PAIR = Pair(IDLE, "port", "port", "short1", "portb1", "mappings of the firs
 class Trial:
     """A team of three: a bootstrap node on the public host, and the two nodes of a pair."""
 
-    def __init__(self, fleet: Hosts, pair: Pair, number: int, rng: Random) -> None:
+    def __init__(self, hosts: Hosts, pair: Pair, number: int, rng: Random) -> None:
         self.pair = pair
-        self._hosts = fleet
+        self._hosts = hosts
         self._name = f"t{number}"
         self._number = number
         self._key = rng.randbytes(16).hex()
@@ -184,10 +184,10 @@ class Trial:
 class Matrix:
     """A run: ``count`` rounds of every pair, ``lossy`` rounds with loss; ``say`` receives progress messages."""
 
-    def __init__(self, net: Internet, fleet: Hosts, seed: int, say: Callable[[str], None]) -> None:
+    def __init__(self, net: Internet, hosts: Hosts, seed: int, say: Callable[[str], None]) -> None:
         self.outcomes: list[Outcome] = []
         self._net = net
-        self._hosts = fleet
+        self._hosts = hosts
         self._rng = Random(seed)
         self._say = say
         self._numbers = itertools.count(1)
@@ -199,7 +199,7 @@ class Matrix:
         for site in ("lateleaky", "lateport"):
             self._net.impair(PUBLIC_HOST, to=f"{site}-gw", delay=LATE_MS)
         (idle,) = await self._run_wave([IDLE_PAIR], JOIN_S, MEET_S)
-        began = time.monotonic()
+        started_at = time.monotonic()
         pairs = [*list_plain_pairs(PLAIN), *list_special_pairs()]
         for number in range(count):
             trials = await self._run_wave(pairs, JOIN_S, MEET_S)
@@ -219,7 +219,7 @@ class Matrix:
         for name in self._net.sites:
             self._net.heal(name)
         if count and lossy:
-            self._report(f"{time.monotonic() - began:.0f} s without a call between the two of the idle pair")
+            self._report(f"{time.monotonic() - started_at:.0f} s without a call between the two of the idle pair")
             self.outcomes.append(await idle.measure_reconnection(IDLE, 1))
 
     async def _run_wave(self, pairs: Sequence[Pair], join_s: float, meet_s: float) -> list[Trial]:

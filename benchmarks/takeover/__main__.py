@@ -97,24 +97,24 @@ def main(arguments: Sequence[str] = tuple(sys.argv[1:])) -> int:
     parser.add_argument("--jobs", type=parse_count, default=os.cpu_count() or 1, help="trials at the same time")
     parser.add_argument("--out", type=Path, default=Path("build"), help="folder for the JSON and the pictures")
     parser.add_argument(INSIDE, action="store_true", help=argparse.SUPPRESS)
-    given = parser.parse_args(list(arguments))
-    causes = [cause for cause in Cause if not given.cause or cause.name.lower() in given.cause]
-    if not given.count and not given.real:
+    args = parser.parse_args(list(arguments))
+    causes = [cause for cause in Cause if not args.cause or cause.name.lower() in args.cause]
+    if not args.count and not args.real:
         parser.error("--count and --real are both 0; there is nothing to do")
     try:
-        given.out.mkdir(parents=True, exist_ok=True)
+        args.out.mkdir(parents=True, exist_ok=True)
     except OSError as error:
-        parser.error(f"--out {given.out} cannot be created ({error.strerror}); choose another folder")
-    if given.inside:
-        real_ones = run_real(causes, given.real, given.seed)
-        return _write_report(real_ones, given.out, "real", f"real processes, {given.real} a cause")
+        parser.error(f"--out {args.out} cannot be created ({error.strerror}); choose another folder")
+    if args.inside:
+        real_ones = run_real(causes, args.real, args.seed)
+        return _write_report(real_ones, args.out, "real", f"real processes, {args.real} a cause")
     worst = 0
-    if given.count:
-        title = f"virtual time, {given.count} a cause, {given.loss:.0%} of the datagrams lost"
+    if args.count:
+        title = f"virtual time, {args.count} a cause, {args.loss:.0%} of the datagrams lost"
         worst = _write_report(
-            run_virtual(causes, given.count, given.seed, given.loss, given.jobs), given.out, "virtual", title
+            run_virtual(causes, args.count, args.seed, args.loss, args.jobs), args.out, "virtual", title
         )
-    if given.real:
+    if args.real:
         worst = max(worst, run_in_network(["-m", "benchmarks.takeover", INSIDE, *arguments]))
     return worst
 

@@ -182,17 +182,17 @@ async def _run_trial(reactor: Any, cause: Cause, seed: int, team: Team, rng: ran
     await _wait_until(reactor, lambda: bool(team.list_moving()), "no dog goes", POLL_S)
     lost = team.list_moving()[0]
     await deferLater(reactor, rng.uniform(*PHASE_S))
-    began = time.monotonic()
+    started_at = time.monotonic()
     team.inject_fault(cause, lost)
-    judge = TakeoverObserver(cause, seed, lost, began, rng, LIMIT_S)
-    while not judge.is_over(time.monotonic()):
+    observer = TakeoverObserver(cause, seed, lost, started_at, rng, LIMIT_S)
+    while not observer.is_over(time.monotonic()):
         await deferLater(reactor, POLL_S)
         now = time.monotonic()
-        if judge.take_thaw(now):
+        if observer.take_thaw(now):
             team.thaw(lost)
-        is_sought = judge.takeover is not None and judge.result is None  # the files are read from disk
-        judge.record(now, team.list_moving(), team.find_outcome(task_id, lost) if is_sought else None)
-    return judge.make_trial()
+        is_sought = observer.takeover is not None and observer.result is None  # the files are read from disk
+        observer.record(now, team.list_moving(), team.find_outcome(task_id, lost) if is_sought else None)
+    return observer.make_trial()
 
 
 async def _wait_until(reactor: Any, holds: Any, problem: str, pause: float) -> None:

@@ -25,15 +25,15 @@ def run_trial(cause: Cause, seed: int, loss: float = 0.1) -> Trial:
     others = (WEB, *WITNESSES) if cause is Cause.TRIPLE_KILL else ()
     team = SimulatedTeam(seed, 0.1, others=others)
     team.scatter(seed)
-    asker = WEB if others else SimulatedTeam.BOOTSTRAP
-    node = team.services[asker].assembly.node
+    requester = WEB if others else SimulatedTeam.BOOTSTRAP
+    node = team.services[requester].assembly.node
     task = replace(create_task("turn-around", f"turn{seed}", 0.0), waiting_period=1.0)
     if cause is Cause.TRIPLE_KILL:
         task = replace(task, tolerates=3)
     submitted: list[Task] = []
     Deferred.fromCoroutine(node.submit(task)).addCallback(submitted.append)
     team.switchboard.conditions = replace(LINK_CONDITIONS, loss=loss)
-    watcher = team.services[WITNESSES[0] if others else asker].assembly.node
+    watcher = team.services[WITNESSES[0] if others else requester].assembly.node
     group: list[Record] = []
     watcher.watch_group(task.task_id, lambda records: group.__setitem__(slice(None), records))
     lost = _wait_for_motion(team)
@@ -42,15 +42,15 @@ def run_trial(cause: Cause, seed: int, loss: float = 0.1) -> Trial:
         return Trial(cause.value, seed, "", "", False, None, 0, 0)
     team.clock.advance(rng.uniform(*PHASE_S))
     _inject_fault(team, cause, lost)
-    judge = TakeoverObserver(cause, seed, lost, team.clock.seconds(), rng, LIMIT_S, AFTER_S)
-    while not judge.is_over(team.clock.seconds()):
+    observer = TakeoverObserver(cause, seed, lost, team.clock.seconds(), rng, LIMIT_S, AFTER_S)
+    while not observer.is_over(team.clock.seconds()):
         team.clock.advance(POLL_S)
         now = team.clock.seconds()
-        if judge.take_thaw(now):
+        if observer.take_thaw(now):
             team.unfreeze(lost)
-        judge.record(now, _moving_robots(team), find_outcome(submitted[0], group))
+        observer.record(now, _moving_robots(team), find_outcome(submitted[0], group))
     team.stop()
-    return judge.make_trial()
+    return observer.make_trial()
 
 
 def _moving_robots(team: SimulatedTeam) -> list[str]:

@@ -234,12 +234,12 @@ def _parse_arguments(arguments: Sequence[str]) -> argparse.Namespace:
         help=f"port of the page (default {WEB_PORT}, or a free one; 0: only free ports, for several demonstrations)",
     )
     parser.add_argument("--tls", action="store_true", help="also serve the page over TLS, on this machine only")
-    given = parser.parse_args(arguments)
-    if given.lose == "link" and given.robot == "sim":
+    args = parser.parse_args(arguments)
+    if args.lose == "link" and args.robot == "sim":
         parser.error("--lose link: a simulated dog has no link; choose another --robot")
-    if given.report is not None and not given.report.absolute().parent.is_dir():
-        parser.error(f"--report {given.report}: no such folder; create it, or choose another file")
-    return given
+    if args.report is not None and not args.report.absolute().parent.is_dir():
+        parser.error(f"--report {args.report}: no such folder; create it, or choose another file")
+    return args
 
 
 def _parse_port(word: str) -> int:
@@ -249,26 +249,26 @@ def _parse_port(word: str) -> int:
     return int(word)
 
 
-async def _run(reactor: Any, given: argparse.Namespace) -> None:
+async def _run(reactor: Any, args: argparse.Namespace) -> None:
     try:
-        with lock_run_dir(given.run_dir.absolute()):
-            folder = given.run_dir.absolute()
+        with lock_run_dir(args.run_dir.absolute()):
+            folder = args.run_dir.absolute()
             # For this machine alone browsers trust http, so TLS is not needed.
-            with_tls = given.tls or (has_tls() and not given.headless and given.web_host != LOOPBACK)
-            if given.tls and not has_tls():
+            with_tls = args.tls or (has_tls() and not args.headless and args.web_host != LOOPBACK)
+            if args.tls and not has_tls():
                 raise DemoError("--tls needs libraries that are not installed; run: pip install 'swarm-node[tls]'")
-            is_usual = not given.headless and given.web_port != 0
-            plan = make_plan(folder, given.web_host, given.web_port, is_usual, print_line, with_tls, given.robot)
-            demonstration = Demonstration(reactor, plan, given.seed, print_line, given.lose == "link")
+            is_usual = not args.headless and args.web_port != 0
+            plan = make_plan(folder, args.web_host, args.web_port, is_usual, print_line, with_tls, args.robot)
+            demonstration = Demonstration(reactor, plan, args.seed, print_line, args.lose == "link")
             reactor.addSystemEventTrigger("before", "shutdown", demonstration.stop)
 
             async def begun() -> None:
                 _print_addresses(demonstration, plan)
-                if not given.headless:
+                if not args.headless:
                     demonstration.watch_processes()
                     await Deferred()
 
-            await run_experiments(demonstration, begun, given.report, print_line)
+            await run_experiments(demonstration, begun, args.report, print_line)
     except (DemoError, PageError, PortBusy, OSError) as problem:
         sys.stderr.write(f"swarm demo: {problem}\n")
         raise SystemExit(2 if isinstance(problem, PortBusy) else 1) from None

@@ -30,9 +30,9 @@ def main() -> None:
     """Run the program of the command line and watch standard input."""
     if len(sys.argv) < 2 or sys.argv[1:] == ["-m"]:
         raise SystemExit("usage: python -m sim.demo.parent_monitor FILE|-m MODULE [ARGUMENTS]")
-    leash = os.dup(0)
-    os.set_inheritable(leash, False)
-    threading.Thread(target=_wait_for_parent, args=(leash,), name="leash", daemon=True).start()
+    parent_pipe = os.dup(0)
+    os.set_inheritable(parent_pipe, False)
+    threading.Thread(target=_wait_for_parent, args=(parent_pipe,), name="leash", daemon=True).start()
     if sys.argv[1] == "-m":
         module = sys.argv[2]
         sys.argv = sys.argv[2:]

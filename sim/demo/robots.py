@@ -46,9 +46,9 @@ class Robot:
 
 
 def make_robots(
-    wish: str, names: tuple[str, ...], folder: Path, ports: Iterator[int], yard_port: int
+    robot_set: str, names: tuple[str, ...], folder: Path, ports: Iterator[int], yard_port: int
 ) -> dict[str, Robot]:
-    """Return the robots of the cast ``wish`` by name; they take ports from ``ports`` and put cables into ``folder``."""
+    """Return the robots of the cast ``robot_set`` by name; they take ports from ``ports`` and put cables into ``folder``."""
     makers: dict[str, Callable[[str], Robot]] = {
         "aibo": lambda name: _make_aibo(name, ports),
         "bittle": lambda name: _make_bittle(name, folder, ports),
@@ -56,7 +56,7 @@ def make_robots(
         "rosbridge": lambda name: _make_rosbridge(ports),
         "sim": lambda name: _make_simulated(name, yard_port),
     }
-    return {name: makers[kind](name) for name, kind in zip(names, ROBOT_SETS[wish], strict=True)}
+    return {name: makers[kind](name) for name, kind in zip(names, ROBOT_SETS[robot_set], strict=True)}
 
 
 def _make_aibo(name: str, ports: Iterator[int]) -> Robot:

@@ -89,13 +89,13 @@ def run_trial(make_team: MakeTeam, experiment: int, seed: int, pictures: Path | 
     team.scatter(seed)
     draw = _make_draw(team, pictures, experiment, seed)
     draw("1-without-target", "The dogs in the yard, no target yet")
-    began = team.clock.seconds()
-    run = Experiment(f"experiment {experiment}", team.run_demo(), experiment == 2, began)
+    started_at = team.clock.seconds()
+    run = Experiment(f"experiment {experiment}", team.run_demo(), experiment == 2, started_at)
     outcome = Outcome(seed, experiment)
-    while not run.is_over and team.clock.seconds() - began < LIMIT_S:
+    while not run.is_over and team.clock.seconds() - started_at < LIMIT_S:
         team.clock.advance(POLL_S)
         state, truth = team.state(), team.get_true_state()
-        _record_times(outcome, state, truth, team.clock.seconds() - began, draw)
+        _record_times(outcome, state, truth, team.clock.seconds() - started_at, draw)
         killed = run.update(team.clock.seconds(), state, truth)
         if killed:
             draw("5-lost", f"{killed} is lost on its way")
@@ -201,24 +201,24 @@ def main(arguments: Sequence[str], make_team: MakeTeam) -> int:
     parser.add_argument("--out", type=Path, default=Path("run/trials"), help="folder for the report and the pictures")
     parser.add_argument("--pictures", type=parse_count, default=1, help="number of seeds for which pictures are drawn")
     parser.add_argument("--jobs", type=parse_count, default=os.cpu_count() or 1, help="parallel trials")
-    given = parser.parse_args(list(arguments))
+    args = parser.parse_args(list(arguments))
     try:
-        given.out.mkdir(parents=True, exist_ok=True)
+        args.out.mkdir(parents=True, exist_ok=True)
     except OSError as error:
-        parser.error(f"--out: cannot create {given.out} ({error.strerror}); choose another folder")
+        parser.error(f"--out: cannot create {args.out} ({error.strerror}); choose another folder")
     jobs = [
-        (make_team, experiment, given.seed + n, given.out if n < given.pictures else None)
-        for n in range(given.count)
+        (make_team, experiment, args.seed + n, args.out if n < args.pictures else None)
+        for n in range(args.count)
         for experiment in (1, 2)
     ]
     outcomes = []
-    began = time.monotonic()
+    started_at = time.monotonic()
     with ExitStack() as stack:
         spread: Callable[..., Iterable[Outcome]] = map
-        if given.jobs > 1:
+        if args.jobs > 1:
             # Forking a process with threads may deadlock.
             spawn = multiprocessing.get_context("spawn")
-            spread = stack.enter_context(ProcessPoolExecutor(given.jobs, spawn)).map
+            spread = stack.enter_context(ProcessPoolExecutor(args.jobs, spawn)).map
         for outcome in spread(_run_job, jobs):
             outcomes.append(outcome)
             text = "ok  " if outcome.held else "FAIL"
@@ -226,12 +226,12 @@ def main(arguments: Sequence[str], make_team: MakeTeam) -> int:
             line = f"{len(outcomes):4}/{len(jobs)} {text} experiment {outcome.experiment} seed {outcome.seed}"
             sys.stdout.write(f"{line}: {outcome.by or 'nobody'} reached it{broken}\n")
             sys.stdout.flush()
-    (given.out / "trials.json").write_text(json.dumps([asdict(o) for o in outcomes], indent=1), encoding="utf-8")
+    (args.out / "trials.json").write_text(json.dumps([asdict(o) for o in outcomes], indent=1), encoding="utf-8")
     sys.stdout.write(f"\n{format_table(outcomes)}\n")
     virtual = sum(o.reach or 0.0 for o in outcomes)
-    spent = time.monotonic() - began
-    sys.stdout.write(f"{virtual:.0f} s of team time in {spent:.0f} s; report and pictures in {given.out}\n")
-    held = run_real(given.real, given.seed, given.out)
+    spent = time.monotonic() - started_at
+    sys.stdout.write(f"{virtual:.0f} s of team time in {spent:.0f} s; report and pictures in {args.out}\n")
+    held = run_real(args.real, args.seed, args.out)
     if held:
         sys.stdout.write(f"real processes: {sum(held)} of {len(held)} runs held, both experiments each\n")
     return 0 if all(o.held for o in outcomes) and all(held) else 1

@@ -69,14 +69,14 @@ def _with_cable_address(robot: Robot, yard: str) -> Robot:
     return replace(robot, options=there["options"], parts=tuple(there["parts"]))
 
 
-def run_inside(given: argparse.Namespace) -> None:
+def run_inside(args: argparse.Namespace) -> None:
     """Run and judge both experiments; called on the host of the browser."""
     from twisted.internet.base import ReactorBase
     from twisted.internet.defer import Deferred
     from twisted.internet.task import react
 
     ReactorBase.seconds = staticmethod(time.monotonic)
-    folder = given.run_dir.absolute()
+    folder = args.run_dir.absolute()
 
     async def run(reactor: Any) -> None:
         try:
@@ -85,19 +85,21 @@ def run_inside(given: argparse.Namespace) -> None:
                 places = {
                     name: Location(**{**each, "enter": tuple(each["enter"])}) for name, each in given_places.items()
                 }
-                plan = make_namespace_plan(folder, given.robot, places, "over-there")
-                demonstration = Demonstration(reactor, plan, given.seed, print_line, given.lose == "link")
+                plan = make_namespace_plan(folder, args.robot, places, "over-there")
+                demonstration = Demonstration(reactor, plan, args.seed, print_line, args.lose == "link")
                 reactor.addSystemEventTrigger("before", "shutdown", demonstration.stop)
 
                 async def begun() -> None:
-                    print_line(f"{time.monotonic() - began:7.2f} s  the page lists all dogs: {demonstration.address}")
+                    print_line(
+                        f"{time.monotonic() - started_at:7.2f} s  the page lists all dogs: {demonstration.address}"
+                    )
 
-                await run_experiments(demonstration, begun, given.report, print_line)
+                await run_experiments(demonstration, begun, args.report, print_line)
         except (DemoError, PageError, OSError) as problem:
             sys.stderr.write(f"demo across namespaces: {problem}\n")
             raise SystemExit(1) from None
 
-    began = time.monotonic()
+    started_at = time.monotonic()
     react(lambda reactor: Deferred.fromCoroutine(run(reactor)))
 
 
@@ -111,9 +113,9 @@ def main(arguments: Sequence[str] = tuple(sys.argv[1:])) -> int:
     for ignored in ("--headless", "--tls"):
         parser.add_argument(ignored, action="store_true", help=argparse.SUPPRESS)
     parser.add_argument("--inside", action="store_true", help=argparse.SUPPRESS)
-    given = parser.parse_args(list(arguments))
-    if given.inside:
-        run_inside(given)
+    args = parser.parse_args(list(arguments))
+    if args.inside:
+        run_inside(args)
     why = find_unavailable_reason()
     if why:
         sys.stderr.write(f"!!!\n!!! NO DEMONSTRATION ACROSS NAMESPACES HERE: {why}\n!!!\n")
@@ -121,11 +123,11 @@ def main(arguments: Sequence[str] = tuple(sys.argv[1:])) -> int:
     # The namespaces are removed when the block is left, so signals must leave it.
     for number in (signal.SIGTERM, signal.SIGINT):
         signal.signal(number, lambda *_: sys.exit(130))
-    with Internet(SITES, given.seed) as net:
+    with Internet(SITES, args.seed) as net:
         places = connect_robots(net)
         for site in net.sites:
-            net.impair(site, loss=given.loss)
-        net.record_frames(given.record)
+            net.impair(site, loss=args.loss)
+        net.record_frames(args.record)
         print_line(
             f"dog1 behind a router ({KINDS[0].description}), dog2 behind another ({KINDS[1].description}), dog3 at home"
         )

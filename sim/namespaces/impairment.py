@@ -58,8 +58,8 @@ class LinkDirection:
         return self._impairments
 
     @impairments.setter
-    def impairments(self, weather: Impairments) -> None:
-        self._impairments, self._is_in_burst = weather, False
+    def impairments(self, value: Impairments) -> None:
+        self._impairments, self._is_in_burst = value, False
 
     @property
     def counts(self) -> dict[str, int]:
@@ -68,8 +68,8 @@ class LinkDirection:
 
     def draw_delivery_times(self, size: int, now: float) -> list[float]:
         """Return the delivery times of a frame of ``size`` bytes: none if it is lost, two if it is duplicated."""
-        weather = self._impairments
-        if weather.is_perfect:
+        impairments = self._impairments
+        if impairments.is_perfect:
             self.passed += 1
             self.passed_bytes += size
             return [now]
@@ -77,20 +77,20 @@ class LinkDirection:
         if self._is_lost():
             self.lost += 1
             return []
-        if weather.rate:
+        if impairments.rate:
             begins = max(now, self._free_at)
-            if begins - now > weather.queue / 1000:
+            if begins - now > impairments.queue / 1000:
                 self.lost += 1
                 return []
-            self._free_at = begins + size * 8 / (weather.rate * 1000)
+            self._free_at = begins + size * 8 / (impairments.rate * 1000)
             moment = self._free_at
         # A reordered frame overtakes delayed ones.
-        if not self._draw(weather.reorder):
-            spread = self._rng.gauss(0.0, weather.jitter) if weather.jitter else 0.0
-            moment += max(0.0, weather.delay + spread) / 1000
+        if not self._draw(impairments.reorder):
+            spread = self._rng.gauss(0.0, impairments.jitter) if impairments.jitter else 0.0
+            moment += max(0.0, impairments.delay + spread) / 1000
         self.passed += 1
         self.passed_bytes += size
-        return [moment] * (2 if self._draw(weather.dup) else 1)
+        return [moment] * (2 if self._draw(impairments.dup) else 1)
 
     def corrupt_frame(self, frame: bytes, header: int) -> bytes:
         """Return ``frame``; if it is corrupted, with one bit after its first ``header`` bytes flipped."""

@@ -252,13 +252,13 @@ class Internet:
             raise RuntimeError("the switch of the wide area did not start")
 
     def _make_namespace(self, name: str) -> Namespace:
-        room = self._namespaces[name] = Namespace(self._namespaces[""])
-        self._disable_ipv6(room)
-        return room
+        namespace = self._namespaces[name] = Namespace(self._namespaces[""])
+        self._disable_ipv6(namespace)
+        return namespace
 
-    def _disable_ipv6(self, room: Namespace) -> None:
+    def _disable_ipv6(self, namespace: Namespace) -> None:
         # IPv6 would send unsolicited datagrams.
-        room.run("for f in /proc/sys/net/ipv6/conf/*/disable_ipv6; do echo 1 >$f; done\nip link set lo up\n")
+        namespace.run("for f in /proc/sys/net/ipv6/conf/*/disable_ipv6; do echo 1 >$f; done\nip link set lo up\n")
 
     def _connect_wan(self, name: str, addresses: Sequence[str]) -> None:
         """Connect a router or host to the wide area."""

@@ -33,15 +33,15 @@ REST = Motion()
 class Dog:
     """One dog: its position, its command, and its acceleration in the last substep."""
 
-    def __init__(self, kennel: DogPlacement, number: int) -> None:
-        self.name = kennel.name
-        self.stripes = kennel.stripes
+    def __init__(self, placement: DogPlacement, number: int) -> None:
+        self.name = placement.name
+        self.stripes = placement.stripes
         self.limits: Mapping[str, tuple[float, float]] = LIMITS
         self.command = REST
         self.acceleration = (0.0, 0.0)
         self.body = pymunk.Body(MASS_KG, pymunk.moment_for_circle(MASS_KG, 0.0, FOOTPRINT_RADIUS_M))
-        self.body.position = kennel.x, kennel.y
-        self.body.angle = kennel.heading
+        self.body.position = placement.x, placement.y
+        self.body.angle = placement.heading
         self.shape = pymunk.Circle(self.body, FOOTPRINT_RADIUS_M)
         self.shape.friction = 0.3
         self.shape.collision_type = DOG

@@ -37,26 +37,26 @@ class EmulatedRobots:
     Raises ``UsageError`` if the simulator has no such dog, or no emulator of such a robot.
     """
 
-    def __init__(self, reactor: Any, rng: random.Random, yard: RobotSimulator, table: Mapping[str, Table]) -> None:
+    def __init__(self, reactor: Any, rng: random.Random, simulator: RobotSimulator, table: Mapping[str, Table]) -> None:
         self._servers: dict[str, list[EmulatorServer]] = {}
         for name, robot in table.items():
             (kind, options), *parts = _check_robot(name, robot)
             try:
-                body = yard.reserve_for_emulator(name, describe(kind, options, name, parts).limits)
+                body = simulator.reserve_for_emulator(name, describe(kind, options, name, parts).limits)
                 own = random.Random(rng.getrandbits(64))
                 self._servers[name] = [_make_server(reactor, body, own, kind, options, str(robot.get("dialect", "T4")))]
                 self._servers[name] += [_make_server(reactor, body, own, *part) for part in parts]
             except UsageError as error:
                 raise UsageError(f"[{name}] {error}") from None
-        yard.add_order("unplug", self.unplug, (str,))
-        yard.add_order("plug", self.plug, (str,))
+        simulator.add_order("unplug", self.unplug, (str,))
+        simulator.add_order("plug", self.plug, (str,))
 
     def start(self) -> None:
         """Start all servers; raise ``UsageError`` that names the robot if an address is not available."""
-        for name, wires in self._servers.items():
-            for wire in wires:
+        for name, transports in self._servers.items():
+            for transport in transports:
                 try:
-                    wire.start()
+                    transport.start()
                 except FileExistsError as error:
                     raise UsageError(
                         f"[{name}] {error.filename2} is there already; end its program, or choose another port"
@@ -66,7 +66,7 @@ class EmulatedRobots:
 
     def stop(self) -> Deferred[Any]:
         """Stop all servers; fires when every address is free."""
-        return gatherResults([wire.stop() for wire in self._all_servers])
+        return gatherResults([transport.stop() for transport in self._all_servers])
 
     def unplug(self, name: str) -> None:
         """Break the links to this robot: no data passes, and no connection is closed."""
@@ -78,13 +78,13 @@ class EmulatedRobots:
 
     @property
     def _all_servers(self) -> list[EmulatorServer]:
-        return [wire for wires in self._servers.values() for wire in wires]
+        return [transport for transports in self._servers.values() for transport in transports]
 
     def _set_silent(self, name: str, is_silent: bool) -> None:
         if name not in self._servers:
             raise NotPossible(f"{name!r} does not emulate a robot; these do: {', '.join(self._servers)}")
-        for wire in self._servers[name]:
-            wire.faults.half_open = is_silent
+        for transport in self._servers[name]:
+            transport.faults.half_open = is_silent
 
 
 def _check_robot(name: str, robot: Any) -> list[tuple[str, Table]]:

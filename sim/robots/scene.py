@@ -80,11 +80,11 @@ def parse_scene(text: str, source: str) -> Scene:
     entries = top.fields.get("dogs")
     if not isinstance(entries, list) or not entries:
         raise SceneError(f"scene {source}: dogs must be a list with at least one dog")
-    kennels = tuple(
+    placements = tuple(
         _parse_dog(_Table(entry, f"scene {source}, dog {place}"), width, height)
         for place, entry in enumerate(entries, 1)
     )
-    _check_apart(kennels, source)
+    _check_apart(placements, source)
     return Scene(
         name=top.read_text("name"),
         width=width,
@@ -92,7 +92,7 @@ def parse_scene(text: str, source: str) -> Scene:
         wall_height=top.read_number("wall_height", 0.05, 2.0),
         target_radius=target.read_number("radius", 0.02, 0.3),
         target_height=target.read_number("height", 0.05, 1.0),
-        dogs=kennels,
+        dogs=placements,
     )
 
 
@@ -107,9 +107,9 @@ def _parse_dog(table: _Table, width: float, height: float) -> DogPlacement:
     )
 
 
-def _check_apart(kennels: tuple[DogPlacement, ...], source: str) -> None:
-    for place, one in enumerate(kennels):
-        for other in kennels[:place]:
+def _check_apart(placements: tuple[DogPlacement, ...], source: str) -> None:
+    for place, one in enumerate(placements):
+        for other in placements[:place]:
             if one.name == other.name:
                 raise SceneError(f"scene {source}: two dogs are named {one.name}; give each its own name")
             if math.hypot(one.x - other.x, one.y - other.y) < 2 * FOOTPRINT_RADIUS_M:

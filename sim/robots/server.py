@@ -69,13 +69,13 @@ def main(arguments: list[str] | None = None, output: TextIO = sys.stdout, errors
     globalLogBeginner.beginLoggingTo(
         [FilteringLogObserver(textFileLogObserver(errors), [warnings])], redirectStandardIO=False
     )
-    yard = RobotSimulator(reactor, Random(args.seed), scene)
+    simulator = RobotSimulator(reactor, Random(args.seed), scene)
     try:
-        robots = _make_emulators(reactor, args.seed, yard, table)
+        robots = _make_emulators(reactor, args.seed, simulator, table)
     except UsageError as error:
         return _print_error(errors, f"{args.robots}: {error}")
     try:
-        port = reactor.listenTCP(args.port, TcpLinkFactory(yard.attach), interface=args.host)
+        port = reactor.listenTCP(args.port, TcpLinkFactory(simulator.attach), interface=args.host)
     except CannotListenError as error:
         why: OSError = error.socketError
         is_taken = why.errno in (errno.EADDRINUSE, errno.EACCES)
@@ -89,9 +89,9 @@ def main(arguments: list[str] | None = None, output: TextIO = sys.stdout, errors
     except UsageError as error:
         robots.stop()
         return _print_error(errors, f"{args.robots}: {error}")
-    yard.start()
-    reactor.addSystemEventTrigger("before", "shutdown", yard.stop)
-    dogs = ", ".join(yard.world.dogs)
+    simulator.start()
+    reactor.addSystemEventTrigger("before", "shutdown", simulator.stop)
+    dogs = ", ".join(simulator.world.dogs)
     line = f"yard {scene.name} ready on {address.host}:{address.port}: {dogs}"
     # Printed after signal handlers are installed: a reader of this line may end the process at once.
     reactor.callWhenRunning(print, line, file=output, flush=True)
@@ -109,13 +109,13 @@ def _read_table(path: Path | None) -> dict[str, Any]:
     return table
 
 
-def _make_emulators(reactor: Any, seed: int, yard: RobotSimulator, table: dict[str, Any]) -> Any:
+def _make_emulators(reactor: Any, seed: int, simulator: RobotSimulator, table: dict[str, Any]) -> Any:
     """Return the emulators of ``table``; without any, their modules are not imported, to save memory."""
     if not table:
         return None
     from sim.robots.emulated_robots import EmulatedRobots
 
-    return EmulatedRobots(reactor, Random(seed), yard, table)
+    return EmulatedRobots(reactor, Random(seed), simulator, table)
 
 
 def _print_error(errors: TextIO, problem: str) -> int:

@@ -58,8 +58,8 @@ class World:
         self._target_shape: pymunk.Shape | None = None
         self._build_walls()
         self.dogs: dict[str, Dog] = {}
-        for number, kennel in enumerate(scene.dogs, 1):
-            dog = self.dogs[kennel.name] = Dog(kennel, number)
+        for number, placement in enumerate(scene.dogs, 1):
+            dog = self.dogs[placement.name] = Dog(placement, number)
             self._space.add(dog.body, dog.shape)
         for other in (DOG, TARGET, WALL):
             self._space.on_collision(DOG, other, begin=self._on_collision)

@@ -61,22 +61,22 @@ def run(arguments: Sequence[str], world: Environment, kinds: WorkloadKinds = KIN
         progress.update(run)
         return world.is_stopped()
 
-    going = Run(scenario, wanted.seed, kinds, looked, world.on_allocated, watched, world.wall)
-    check_targets(scenario, [figure.name for figure in going.collect_metrics()], wanted.scenario)
+    scenario_run = Run(scenario, wanted.seed, kinds, looked, world.on_allocated, watched, world.wall)
+    check_targets(scenario, [metric.name for metric in scenario_run.collect_metrics()], wanted.scenario)
     faults: list[tuple[float, str]] = []
     with ExitStack() as files:
         # Opened before the run, so that a missing folder is reported at once and not after an hour.
         json_out = _open_file(wanted.json, "--json", files)
         trace_out = _open_file(wanted.trace, "--trace", files)
         picture_out = _open_file(wanted.picture, "--picture", files)
-        going.team.event_listeners.append(
+        scenario_run.team.event_listeners.append(
             lambda now, what, _, more: faults.append((now, more)) if what == "fault" else None
         )
         trace = None if trace_out is None else Trace(trace_out)
         if trace is not None:
             trace.begin(scenario=scenario.name, seed=wanted.seed, nodes=scenario.nodes, again=line)
-            going.team.event_listeners.append(trace.write_event)
-        outcome = going.run()
+            scenario_run.team.event_listeners.append(trace.write_event)
+        outcome = scenario_run.run()
         progress.close()
         cost = Cost(world.cpu() - cpu, world.wall() - began, memory())
         if trace is not None:

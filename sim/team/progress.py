@@ -44,9 +44,9 @@ class Progress:
         if run.began_at is not None and now - self._metrics_at >= METRICS_INTERVAL_S:
             self._metrics_at = now
             self._metrics = "".join(
-                f", {figure.name} {format_number(figure.value)}{'' if figure.holds else ' (!)'}"
-                for figure in run.collect_metrics()
-                if figure.target and figure.value is not None
+                f", {metric.name} {format_number(metric.value)}{'' if metric.holds else ' (!)'}"
+                for metric in run.collect_metrics()
+                if metric.target and metric.value is not None
             )
         self._write(self.format_line(run, (moment - then) / (now - before)))
 

@@ -51,9 +51,9 @@ class Samples:
             self._add("bytes per node and second", now, (bytes_sent - size) / passed / alive)
         self._before = now, total, bytes_sent
         if run.began_at is not None and self._taken % METRICS_EVERY == 0:
-            for figure in run.collect_metrics():
-                if figure.is_exact and figure.value is not None:
-                    self._add(figure.name, now, figure.value)
+            for metric in run.collect_metrics():
+                if metric.is_exact and metric.value is not None:
+                    self._add(metric.name, now, metric.value)
         if self._taken > 2 * MAX_SAMPLES:
             self.series = {name: points[::2] for name, points in self.series.items()}
             self._every *= 2
@@ -109,9 +109,9 @@ def format_json(scenario: Scenario, outcome: Outcome, cost: Cost, line: str, ser
         "partial": outcome.is_partial,
         "phase": outcome.phase,
         "seconds": round(outcome.seconds, 6),
-        "figures": [figure.to_json() for figure in outcome.metrics],
+        "figures": [metric.to_json() for metric in outcome.metrics],
         "violations": outcome.violations,
-        "missed": [figure.name for figure in outcome.missed],
+        "missed": [metric.name for metric in outcome.missed],
         "hash": outcome.digest,
         "again": line,
         "cpu_seconds": round(cost.cpu, 3),

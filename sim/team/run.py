@@ -53,7 +53,7 @@ class Outcome:
     @property
     def missed(self) -> list[Metric]:
         """The figures that miss their targets."""
-        return [figure for figure in self.metrics if figure.holds is False]
+        return [metric for metric in self.metrics if metric.holds is False]
 
 
 class Run:
@@ -121,28 +121,28 @@ class Run:
 
     def collect_metrics(self) -> list[Metric]:
         """Return every figure so far, with the targets of the scenario."""
-        found = [figure for _, workload in self.workloads for figure in workload.collect_metrics()]
+        found = [metric for _, workload in self.workloads for metric in workload.collect_metrics()]
         targets: dict[str, Bound] = dict(self.scenario.targets)
-        return [figure.with_target(targets[figure.name]) if figure.name in targets else figure for figure in found]
+        return [metric.with_target(targets[metric.name]) if metric.name in targets else metric for metric in found]
 
     def make_outcome(self) -> Outcome:
         """Return the result so far."""
         team = self.team
-        figures = self.collect_metrics()
+        metrics = self.collect_metrics()
         violations = [
             *self.violations,
-            *self._find_unmatched_targets(figures),
+            *self._find_unmatched_targets(metrics),
             *(line for _, workload in self.workloads for line in workload.find_violations()),
             *find_violations(team.history),
         ]
         whole = hashlib.blake2b(digest_size=16)
         whole.update(team.digest().encode())
-        for figure in figures:
+        for figure in metrics:
             if figure.is_exact:
                 whole.update(f"{figure.name} {figure.value!r}\n".encode())
         for line in violations:
             whole.update(f"{line}\n".encode())
-        return Outcome(team.seed, self.phase, team.clock.seconds(), figures, violations, whole.hexdigest())
+        return Outcome(team.seed, self.phase, team.clock.seconds(), metrics, violations, whole.hexdigest())
 
     # -- inside -----------------------------------------------------------------------------------------------------
 
@@ -171,11 +171,11 @@ class Run:
     def _run_workloads(self) -> None:
         """Apply faults and sessions while the workloads run."""
         scenario, clock = self.scenario, self.team.clock
-        self.began_at = began = clock.seconds()
+        self.began_at = started_at = clock.seconds()
         self._faults.begin()
-        end = began + scenario.seconds
+        end = started_at + scenario.seconds
         while not self._is_ended and clock.seconds() < end - EPSILON_S:
-            if clock.seconds() >= began + scenario.lead - EPSILON_S:
+            if clock.seconds() >= started_at + scenario.lead - EPSILON_S:
                 for _, workload in self.workloads:
                     workload.step()
             self._advance(min(scenario.step, end - clock.seconds()))

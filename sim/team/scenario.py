@@ -249,8 +249,8 @@ class _Reader:
         parts: dict[str, Any] = {key: self._read_value(key, content[key]) for key in own if key in content}
         for key, value in changes.items():
             parts[key] = self._read_value(key, value, f"--{key}")
-        for key, sort in TABLES.items():
-            parts[key] = self._read_table(sort, content.get(key, {}), key)
+        for key, table_type in TABLES.items():
+            parts[key] = self._read_table(table_type, content.get(key, {}), key)
         faults = content.get("fault", [])
         if not isinstance(faults, list) or len(faults) > MAX_FAULTS:
             raise self.make_error("", "fault", f"must be tables, {MAX_FAULTS} at most", "write [[fault]] for each")
@@ -301,9 +301,9 @@ class _Reader:
 
     # -- inside -----------------------------------------------------------------------------------------------------
 
-    def _read_table(self, sort: type[T], content: object, where: str) -> T:
+    def _read_table(self, table_type: type[T], content: object, where: str) -> T:
         try:
-            return convert_table(content, sort)
+            return convert_table(content, table_type)
         except InvalidValue as error:
             raise self.make_error(
                 *((where, error.key) if error.key else ("", where)), error.problem, error.remedy
@@ -324,11 +324,11 @@ class _Reader:
         if not isinstance(content, dict):
             raise self.make_error("", "load", "must be tables", "write [load.NAME] for each")
         for name, table in content.items():
-            sort = settings.get(name)
-            if sort is None:
+            table_type = settings.get(name)
+            if table_type is None:
                 known = ", ".join(sorted(settings)) or "none"
                 raise self.make_error(f"load.{name}", "", "is an unknown workload", f"there are {known}")
-            yield name, self._read_table(sort, table, f"load.{name}")
+            yield name, self._read_table(table_type, table, f"load.{name}")
 
     def _read_targets(self, content: object) -> Iterator[tuple[str, Bound]]:
         if not isinstance(content, dict):

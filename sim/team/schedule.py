@@ -74,28 +74,28 @@ class Schedule:
 
     def run(self, workloads: Sequence[Workload]) -> list[str]:
         """Run the schedule; returns the violations, one line each."""
-        fleet = self.team
-        fleet.run(2.0)
-        fleet.switchboard.conditions = self.conditions
+        team = self.team
+        team.run(2.0)
+        team.switchboard.conditions = self.conditions
         timeline, now = Timeline(self.faults, self.trim), 0.0
         while now < self.seconds:
             for fault, is_end in timeline.pop_due(now):
                 (self._end_fault if is_end else self._start_fault)(fault)
             for workload in workloads:
                 workload.step()
-            fleet.run(STEP_S)
+            team.run(STEP_S)
             now += STEP_S
-        fleet.switchboard.heal()
-        fleet.switchboard.conditions = PERFECT
+        team.switchboard.heal()
+        team.switchboard.conditions = PERFECT
         for place in sorted(self.restarting):
             self.restart(place)
-        fleet.run(REPAIR_S)
+        team.run(REPAIR_S)
         self.history.record(Settled)
         for workload in workloads:
             workload.make_final_requests()
-        fleet.run(10.0)
+        team.run(10.0)
         found = [line for workload in workloads for line in workload.find_violations()]
-        fleet.stop()
+        team.stop()
         return found + find_violations(self.history)
 
     def restart(self, place: int) -> None:
@@ -137,7 +137,7 @@ class Schedule:
         return faults + [TimedFault(first + n, first + n, "join", (place, *few)) for n, place in enumerate(newcomers)]
 
     def _start_fault(self, fault: TimedFault) -> None:
-        board = self.team.switchboard
+        switchboard = self.team.switchboard
         if fault.kind == "join":
             known: Sequence[int] = fault.places[1:]
             if not {*self.alive(), *self.restarting}.intersection(known):
@@ -145,10 +145,10 @@ class Schedule:
             self.team.restart(len(self.team.nodes), known)
             self.n += 1
         elif fault.kind == "cut":
-            board.partition(self.addresses(fault.places))
+            switchboard.partition(self.addresses(fault.places))
         elif fault.kind == "one way":
             source, target = self.addresses(fault.places)
-            board.cut(source, target, one_way=True)
+            switchboard.cut(source, target, one_way=True)
         else:
             for place in fault.places:
                 if place in self.team.living:

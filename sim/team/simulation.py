@@ -44,10 +44,10 @@ LifeWatcher = Callable[[int, Any], object]
 class Simulation:
     """The clock, the network, the stores and the history, which survive the nodes."""
 
-    def __init__(self, seed: int | str, weather: LinkConditions = PERFECT) -> None:
+    def __init__(self, seed: int | str, conditions: LinkConditions = PERFECT) -> None:
         self.seed = seed
         self.clock = HeapClock()
-        self.switchboard = Switchboard(self.clock, self.make_rng("board"), weather)
+        self.switchboard = Switchboard(self.clock, self.make_rng("board"), conditions)
         self.history = History(self.clock.seconds)
         """The events for the checker: lives of nodes, and clients' requests and answers."""
         self.total_traffic = TrafficCounters()
@@ -124,8 +124,8 @@ class Simulation:
 class EntangledTeam(Simulation):
     """``n`` nodes of the library that join one after the other through the first."""
 
-    def __init__(self, n: int, seed: int = 1, weather: LinkConditions = PERFECT) -> None:
-        super().__init__(seed, weather)
+    def __init__(self, n: int, seed: int = 1, conditions: LinkConditions = PERFECT) -> None:
+        super().__init__(seed, conditions)
         self.nodes: list[EntangledNode] = []
         for place in range(n):
             self.restart(place, [0] if place else [])
@@ -183,8 +183,8 @@ class EntangledTeam(Simulation):
 class SwarmTeam(Simulation):
     """``n`` swarm nodes named dog0, dog1 ...; with ``pause`` 0 all of them join at the same time."""
 
-    def __init__(self, n: int, seed: int = 1, weather: LinkConditions = PERFECT, pause: float = JOIN_S) -> None:
-        super().__init__(seed, weather)
+    def __init__(self, n: int, seed: int = 1, conditions: LinkConditions = PERFECT, pause: float = JOIN_S) -> None:
+        super().__init__(seed, conditions)
         self.nodes: list[SwarmNode] = []
         for place in range(n):
             self.nodes.append(self.make_node(place))

@@ -154,7 +154,7 @@ class SqliteTeam(EntangledTeam):
     writes that were missing in the next life, ``overlooked`` corruption that was not detected.
     """
 
-    def __init__(self, n: int, seed: int = 1, weather: LinkConditions = PERFECT) -> None:
+    def __init__(self, n: int, seed: int = 1, conditions: LinkConditions = PERFECT) -> None:
         self._folder = tempfile.TemporaryDirectory(
             prefix="schedule-", dir=MEMORY_FOLDER if os.path.isdir(MEMORY_FOLDER) else None
         )
@@ -165,7 +165,7 @@ class SqliteTeam(EntangledTeam):
         self.corrupted: list[int] = []
         self.lost: list[str] = []
         self.undetected: list[str] = []
-        super().__init__(n, seed, weather)
+        super().__init__(n, seed, conditions)
 
     def get_store_number(self, place: int) -> int:
         """Return the number of the store of the node at a place."""
@@ -243,16 +243,16 @@ class SqliteTeam(EntangledTeam):
         return str(Path(self._folder.name) / f"{place}-{self._store_numbers[place]}")
 
     def _open_store(self, path: str) -> CheckedStore:
-        dice = random.Random(f"{self._disk_rng.random()}/{Path(path).name}")
+        rng = random.Random(f"{self._disk_rng.random()}/{Path(path).name}")
         clock = self.clock
 
         class Store(CheckedStore):
             make_writer = staticmethod(
                 # Only the file name, without the folder: refusals name it to peers, and the folder varies.
-                lambda path, connection, deliver: ClockedWriter(Path(path).name, connection, clock, dice)
+                lambda path, connection, deliver: ClockedWriter(Path(path).name, connection, clock, rng)
             )
 
-        store = Store.open(path, clock.seconds(), fresh_epoch=dice.randbytes(8))
+        store = Store.open(path, clock.seconds(), fresh_epoch=rng.randbytes(8))
         assert isinstance(store, CheckedStore)
         return store
 

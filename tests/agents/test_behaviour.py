@@ -35,19 +35,19 @@ class BehaviourTests(SynchronousTestCase):
         class Bodied:
             def __init__(self, parameters: object, rng: object) -> None: ...
 
-            def embody(self, means: MotionCapabilities) -> None:
-                told.append(means)
+            def embody(self, motion: MotionCapabilities) -> None:
+                told.append(motion)
 
         class Other:
             def __init__(self, parameters: object, rng: object) -> None: ...
 
-        means = MotionCapabilities()
+        motion = MotionCapabilities()
         deployed = {("behaviour", "bodied"): Loopback.of(Bodied), ("behaviour", "other"): Loopback.of(Other)}
         for kind in ("deployed:bodied", "deployed:other"):
-            create_behaviour(replace(TASK, kind=kind), random.Random(1), deployed, means)
-        self.assertEqual([vars(each) for each in told], [vars(means)])
-        turn: Any = create_behaviour(TASK, random.Random(1), None, means)
-        self.assertIs(turn._motion, means)
+            create_behaviour(replace(TASK, kind=kind), random.Random(1), deployed, motion)
+        self.assertEqual([vars(each) for each in told], [vars(motion)])
+        turn: Any = create_behaviour(TASK, random.Random(1), None, motion)
+        self.assertIs(turn._motion, motion)
 
     def test_unknown_kind_names_those_there_are(self) -> None:
         """An unknown kind is refused with the list of the known kinds."""

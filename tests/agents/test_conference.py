@@ -37,43 +37,43 @@ class EpochTests(SynchronousTestCase):
 
 
 class CircleTests(SynchronousTestCase):
-    def costs(self, circle: PeerReports, now: float) -> dict[str, float | None]:
+    def costs(self, peer_reports: PeerReports, now: float) -> dict[str, float | None]:
         """Return the valid cost of each member."""
-        return {member.uuid: member.cost for member in circle.members(now)}
+        return {member.uuid: member.cost for member in peer_reports.members(now)}
 
     def test_old_round_is_ignored(self) -> None:
         """A report of an older round is ignored, whenever it arrives; a report of a newer round counts."""
-        circle = PeerReports("a")
-        circle.update([B], 0.0)
-        circle.update([replace(B, cost=9.0, epoch=2, serial=7)], 1.0)
-        self.assertEqual(self.costs(circle, 1.0), {"b": 2.0})
-        circle.update([replace(B, cost=1.0, epoch=4, serial=0)], 2.0)
-        self.assertEqual(self.costs(circle, 2.0), {"b": 1.0})
+        peer_reports = PeerReports("a")
+        peer_reports.update([B], 0.0)
+        peer_reports.update([replace(B, cost=9.0, epoch=2, serial=7)], 1.0)
+        self.assertEqual(self.costs(peer_reports, 1.0), {"b": 2.0})
+        peer_reports.update([replace(B, cost=1.0, epoch=4, serial=0)], 2.0)
+        self.assertEqual(self.costs(peer_reports, 2.0), {"b": 1.0})
 
     def test_who_left_is_forgotten_after_a_while(self) -> None:
         """A late report of a member that left is ignored; after ``LINGERING`` a restarted member is accepted."""
-        circle = PeerReports("a")
-        circle.update([B], 0.0)
-        circle.update([], 1.0)
+        peer_reports = PeerReports("a")
+        peer_reports.update([B], 0.0)
+        peer_reports.update([], 1.0)
         again = replace(B, epoch=0, serial=0)
-        circle.update([again], 1.5)
-        self.assertEqual(len(circle), 0)
-        circle.update([again], 1.0 + DEPARTED_MEMORY_S + 0.1)
-        self.assertEqual(len(circle), 1)
+        peer_reports.update([again], 1.5)
+        self.assertEqual(len(peer_reports), 0)
+        peer_reports.update([again], 1.0 + DEPARTED_MEMORY_S + 0.1)
+        self.assertEqual(len(peer_reports), 1)
 
     def test_stale_report_is_no_bid(self) -> None:
         """A bid expires after its validity period, reduced by its age on arrival; a newer serial number renews it."""
-        circle = PeerReports("a")
+        peer_reports = PeerReports("a")
         bid = replace(B, valid_for=3.0, age=1.0)
-        circle.update([bid], 10.0)
-        self.assertEqual(self.costs(circle, 12.0), {"b": 2.0})
-        circle.update([bid], 12.1)  # the same record has no effect
-        self.assertEqual(self.costs(circle, 12.1), {"b": None})
-        circle.update([replace(bid, serial=2)], 12.2)
-        self.assertEqual(self.costs(circle, 12.3), {"b": 2.0})
+        peer_reports.update([bid], 10.0)
+        self.assertEqual(self.costs(peer_reports, 12.0), {"b": 2.0})
+        peer_reports.update([bid], 12.1)  # the same record has no effect
+        self.assertEqual(self.costs(peer_reports, 12.1), {"b": None})
+        peer_reports.update([replace(bid, serial=2)], 12.2)
+        self.assertEqual(self.costs(peer_reports, 12.3), {"b": 2.0})
 
     def test_own_report_comes_back(self) -> None:
         """An agent's own report from an earlier run is not a member; it only shows the last round and serial number."""
-        circle = PeerReports("b")
-        circle.update([B], 0.0)
-        self.assertEqual((len(circle), circle.own_report), (0, B))
+        peer_reports = PeerReports("b")
+        peer_reports.update([B], 0.0)
+        self.assertEqual((len(peer_reports), peer_reports.own_report), (0, B))

@@ -146,13 +146,13 @@ class PanelTests(SynchronousTestCase):
 
     def test_council_is_waited_for(self) -> None:
         """Complete reports of the subset decide nothing until the council answers or a timeout ends."""
-        panel = member("a", 2.0), member("b", 1.0)
-        self.assertIsNone(self.panelled(0.0, False, *panel))
-        self.assertIsNone(self.panelled(8.0 + ANNOUNCEMENT_TIMEOUT_S - 0.1, False, *panel))
-        self.assertEqual(self.panelled(8.0 + ANNOUNCEMENT_TIMEOUT_S, False, *panel), "b")
+        reporters = member("a", 2.0), member("b", 1.0)
+        self.assertIsNone(self.panelled(0.0, False, *reporters))
+        self.assertIsNone(self.panelled(8.0 + ANNOUNCEMENT_TIMEOUT_S - 0.1, False, *reporters))
+        self.assertEqual(self.panelled(8.0 + ANNOUNCEMENT_TIMEOUT_S, False, *reporters), "b")
 
     def test_word_of_the_council_decides(self) -> None:
         """After the council's answer, or while an agent acts, no missing report is waited for."""
-        panel = member("a", 2.0), member("b", 1.0), member("c", None)
-        self.assertEqual(self.panelled(0.0, True, *panel), "b")
-        self.assertEqual(self.panelled(0.0, False, member("a", 1.0, EXECUTING), *panel[1:]), "a")
+        reporters = member("a", 2.0), member("b", 1.0), member("c", None)
+        self.assertEqual(self.panelled(0.0, True, *reporters), "b")
+        self.assertEqual(self.panelled(0.0, False, member("a", 1.0, EXECUTING), *reporters[1:]), "a")

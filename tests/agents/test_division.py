@@ -40,11 +40,11 @@ def members(costs: dict[str, float | None], acting: str = "") -> list[Member]:
 class DivisionTests(SynchronousTestCase):
     def division(self, costs: Costs, strategy: str = "group_optimal", **acting: str) -> TaskGroup:
         """Return the division of all tasks after the gathering period; ``acting`` maps a task to its acting agent."""
-        division = TaskGroup(GuardedStrategy(load_strategy(strategy)))
+        task_group = TaskGroup(GuardedStrategy(load_strategy(strategy)))
         for name, row in costs.items():
             here = members(row, acting.get(name, ""))
-            division.join(task(name), lambda now, here=here: here, 0.0)  # type: ignore[misc]
-        return division
+            task_group.join(task(name), lambda now, here=here: here, 0.0)  # type: ignore[misc]
+        return task_group
 
     def decided(self, costs: Costs, now: float = 50.0, since: float = 40.0, **acting: Any) -> dict[str, Decision]:
         """Return the decision on each task."""

@@ -20,27 +20,27 @@ OLD, NEW, URGENT = task("old", 1.0), task("new", 2.0), task("urgent", 3.0, 5)
 class DocketTests(SynchronousTestCase):
     def test_order(self) -> None:
         """The task with the highest priority is first, then the oldest; the number of followed tasks is limited."""
-        docket = TaskQueue()
+        task_queue = TaskQueue()
         for one in (NEW, URGENT, OLD):
-            docket.add(one)
-        self.assertEqual(docket.list_followed(), [URGENT, OLD, NEW])
+            task_queue.add(one)
+        self.assertEqual(task_queue.list_followed(), [URGENT, OLD, NEW])
         for number in range(2 * MAX_FOLLOWED):
-            docket.add(task(f"t{number}", 9.0))
-        self.assertEqual(len(docket.list_followed()), MAX_FOLLOWED)
+            task_queue.add(task(f"t{number}", 9.0))
+        self.assertEqual(len(task_queue.list_followed()), MAX_FOLLOWED)
 
     def test_ended_task_never_starts_again(self) -> None:
         """An ended task is not accepted again within the longest lease plus the longest absence of a node."""
-        docket = TaskQueue()
-        docket.add(OLD)
-        docket.mark_over("old", 0.0)
-        self.assertFalse(docket.is_new("old"))
-        self.assertFalse(docket.add(OLD))
-        docket.expire_tombstones([], TOLERATED_ABSENCE_S + MAX_LEASE_TTL_S)
-        self.assertFalse(docket.add(OLD))
-        docket.expire_tombstones(["old"], 2 * TOMBSTONE_TTL_S)
-        self.assertFalse(docket.add(OLD))
-        docket.expire_tombstones([], 2 * TOMBSTONE_TTL_S)
-        self.assertTrue(docket.is_new("old"))
+        task_queue = TaskQueue()
+        task_queue.add(OLD)
+        task_queue.mark_over("old", 0.0)
+        self.assertFalse(task_queue.is_new("old"))
+        self.assertFalse(task_queue.add(OLD))
+        task_queue.expire_tombstones([], TOLERATED_ABSENCE_S + MAX_LEASE_TTL_S)
+        self.assertFalse(task_queue.add(OLD))
+        task_queue.expire_tombstones(["old"], 2 * TOMBSTONE_TTL_S)
+        self.assertFalse(task_queue.add(OLD))
+        task_queue.expire_tombstones([], 2 * TOMBSTONE_TTL_S)
+        self.assertTrue(task_queue.is_new("old"))
 
 
 class NextTaskTests(SynchronousTestCase):

@@ -95,9 +95,9 @@ class DriverTests(SynchronousTestCase):
         driver = driven(kind, body, clock)
         fps = FPS.get(kind, 15.0)
         has_camera = "camera" in driver.description.capabilities
-        means = MotionCapabilities(driver.description if has_camera else filming(driver.description, fps))
+        motion = MotionCapabilities(driver.description if has_camera else filming(driver.description, fps))
         behaviour = SearchAndApproach({}, Random(seed))
-        behaviour.embody(means)
+        behaviour.embody(motion)
         enabled: list[bool] = []
         driver.connect().addCallback(lambda _: driver.enable()).addCallback(enabled.append)
         frame, seen_at, began = Frame(0, 208, 160, b"", 0.0), 0.0, math.inf
@@ -119,8 +119,8 @@ class DriverTests(SynchronousTestCase):
                 for _ in range(100):
                     clock.advance(0.01)
                 return body, now - began
-            action = means.remove_missing_axes(action)
-            means.learn(action, driver.act(action, Permit(1, now + 0.5)))
+            action = motion.remove_missing_axes(action)
+            motion.learn(action, driver.act(action, Permit(1, now + 0.5)))
         self.fail(f"{kind} never reached the target")
 
     def test_robots_reach_the_target_over_their_own_wire(self) -> None:

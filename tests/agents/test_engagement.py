@@ -96,9 +96,9 @@ class Council:
         """Record the rank among the standbys."""
         self.places.append(rank)
 
-    def release(self, heirs: Sequence[Contact] = (), rest: float = 0.0) -> Deferred[object]:
+    def release(self, standbys: Sequence[Contact] = (), rest: float = 0.0) -> Deferred[object]:
         """Return the lease."""
-        self.heirs = heirs
+        self.heirs = standbys
         if self.token:
             self.rest = rest
             self._events.append("released")
@@ -145,9 +145,9 @@ class Recorder:
         """Record a log line."""
         self.said.append(text)
 
-    def publish_decision_record(self, verdict: DecisionRecord) -> None:
+    def publish_decision_record(self, record: DecisionRecord) -> None:
         """Record a decision record."""
-        self.accounts.append(verdict)
+        self.accounts.append(record)
 
     def stop_robot(self) -> float:
         """Stop the robot, which may not receive the message."""
@@ -173,8 +173,8 @@ class EngagementTests(SynchronousTestCase):
     def begin(self, task: Task, strategy: ConsensusAlgorithm | None = None) -> None:
         """Take part in ``task`` with the robot."""
         uuid = ME.node_id.hex()
-        me, panel, now = Member(uuid, "dog1", ""), Reporters(uuid), self.clock.seconds()
-        self.engagement = Engagement(task, me, self.dog, strategy or Nearest(), self.ports, panel, 4, now)
+        me, reporters, now = Member(uuid, "dog1", ""), Reporters(uuid), self.clock.seconds()
+        self.engagement = Engagement(task, me, self.dog, strategy or Nearest(), self.ports, reporters, 4, now)
         self.engagement.take_robot(self.council, 4)  # type: ignore[arg-type]
 
     def report(self, number: int, cost: float | None, status: str = WAITING) -> Member:
@@ -196,9 +196,9 @@ class EngagementTests(SynchronousTestCase):
 
     def step(self) -> RobotCommand:
         """Run one step that must return an action."""
-        deed = self.engagement.step(self.clock.seconds())
-        assert deed is not None
-        return deed
+        command = self.engagement.step(self.clock.seconds())
+        assert command is not None
+        return command
 
     def acting(self, token: int = 5) -> None:
         """Make the agent act: it is the nearest of two and has the lease."""
@@ -233,8 +233,10 @@ class EngagementTests(SynchronousTestCase):
         self.assertTrue(self.council.is_wanted)
         self.assertEqual(self.dog.executed, 0)
         self.council.grant(5)
-        deed = self.step()
-        self.assertEqual((deed.action, deed.permit.token, deed.permit.deadline), (GO, 5, self.council.deadline))
+        command = self.step()
+        self.assertEqual(
+            (command.action, command.permit.token, command.permit.deadline), (GO, 5, self.council.deadline)
+        )
         self.clock.advance(1.6)
         self.assertEqual(self.step().action, HOLD)
         self.assertEqual(self.events, ["halted"])
@@ -366,8 +368,8 @@ class EngagementTests(SynchronousTestCase):
         """The agent stops, records the outcome once, and returns the lease when the outcome is confirmed."""
         self.dog.steps = 1
         self.acting()
-        deed = self.step()
-        self.assertEqual((deed.action, deed.permit.token), (STAND, 5))
+        command = self.step()
+        self.assertEqual((command.action, command.permit.token), (STAND, 5))
         self.assertIsNone(self.engagement.step(self.clock.seconds()))
         self.assertEqual([(r.outcome, r.by, r.token) for r in self.results], [(COMPLETED, "dog1", 5)])
         self.assertEqual(self.results[0].bids, (("dog1", 1.0), ("dog2", 2.0)))

@@ -64,43 +64,43 @@ class GuardedTests(SynchronousTestCase):
 
     def test_stands_after_it_raised(self) -> None:
         """After an exception the robot stands, reports no cost, and the behaviour is not called again."""
-        behaviour, way = guarded(Spin(turns=9))
+        behaviour, connection = guarded(Spin(turns=9))
         self.assertEqual(behaviour.execute(Context(0.0)), STAND)
-        self.assertTrue(behaviour.has_failed and way.is_closed)
-        asked = list(way.asked)
+        self.assertTrue(behaviour.has_failed and connection.is_closed)
+        asked = list(connection.asked)
         self.assertEqual((behaviour.execute(Context(0.1)), behaviour.search(0.1), behaviour.cost), (STAND, STAND, None))
-        self.assertEqual(way.asked, asked)
+        self.assertEqual(connection.asked, asked)
 
     def test_never_waits(self) -> None:
         """While no answer arrives the previous action is valid for ``FRESH_S`` seconds; then the robot stands."""
-        behaviour, way = guarded(Spin())
+        behaviour, connection = guarded(Spin())
         self.assertEqual(behaviour.search(1.0), GO)
-        way.is_held = True
+        connection.is_held = True
         self.assertEqual(behaviour.search(0.99 + ACTION_TTL_S), GO)
         self.assertEqual(behaviour.search(1.01 + ACTION_TTL_S), STAND)
-        self.assertEqual(way.asked, ["search", "search"])
-        way.let()
+        self.assertEqual(connection.asked, ["search", "search"])
+        connection.let()
         self.assertEqual(behaviour.search(1.1 + ACTION_TTL_S), GO)
 
     def test_action_of_another_lease_or_method(self) -> None:
         """An answer to a call with another token or of another method moves nothing."""
-        behaviour, way = guarded(Spin(turns=2))
+        behaviour, connection = guarded(Spin(turns=2))
         self.assertEqual(behaviour.execute(Context(0.0, token=4)), GO)
-        way.is_held = True
+        connection.is_held = True
         self.assertEqual(behaviour.execute(Context(0.05, token=5)), STAND)
         self.assertEqual(behaviour.hold(0.06), STAND)
 
     def test_looks_are_left_out(self) -> None:
         """A slow behaviour receives the next observation only after it has answered the previous one."""
         spin = Spin()
-        behaviour, way = guarded(spin)
-        way.is_held = True
+        behaviour, connection = guarded(spin)
+        connection.is_held = True
         for now in (0.0, 0.1, 0.2):
             behaviour.look(SEEN, now)
-        way.let()
+        connection.let()
         behaviour.look(SEEN, 0.3)
-        way.has_unsent = True
-        way.let()
+        connection.has_unsent = True
+        connection.let()
         behaviour.look(SEEN, 0.4)
         self.assertEqual([now for _, now in spin.seen], [0.0, 0.3])
 
@@ -118,25 +118,25 @@ class GuardedTests(SynchronousTestCase):
             ["go", [None] * 9],
         ]
         for answer in answers:
-            behaviour, way = guarded(Spin())
+            behaviour, connection = guarded(Spin())
 
             def ask(method: str, arguments: list[Any], take: Callable[[bool, Any], None], a: object = answer) -> bool:
                 take(True, a)
                 return True
 
-            way.send_request = ask  # type: ignore[method-assign]
+            connection.send_request = ask  # type: ignore[method-assign]
             self.assertEqual((behaviour.search(0.0), behaviour.has_failed), (STAND, True), answer)
 
     def test_what_it_may_have_beside(self) -> None:
         """Optional attributes of a behaviour are passed on; a missing one, or a failure, gives the default."""
         spin = Spin()
         spin.value, spin.choice = (1.0,), "left"  # type: ignore[attr-defined]
-        behaviour, way = guarded(spin)
+        behaviour, connection = guarded(spin)
         self.assertEqual(
             (behaviour.value, behaviour.choice, behaviour.weight, behaviour.is_safe), ((1.0,), "left", 1.0, True)
         )
         self.assertFalse(hasattr(behaviour, "take_post"))
-        way.fault = "gone"
+        connection.fault = "gone"
         self.assertEqual((behaviour.value, behaviour.choice), ((), ""))
 
     def test_means_follow(self) -> None:
@@ -144,14 +144,14 @@ class GuardedTests(SynchronousTestCase):
         told: list[MotionCapabilities] = []
         spin = Spin()
         spin.embody = told.append  # type: ignore[attr-defined]
-        behaviour, way = guarded(spin)
-        means = MotionCapabilities()
-        behaviour.embody(means)
-        means.circle = 0.25
+        behaviour, connection = guarded(spin)
+        motion = MotionCapabilities()
+        behaviour.embody(motion)
+        motion.circle = 0.25
         behaviour.look(SEEN, 0.0)
         behaviour.look(SEEN, 0.1)
         self.assertEqual([each.circle for each in told], [0.25])
-        self.assertEqual(way.asked, ["embody", "embody", "look", "look"])
+        self.assertEqual(connection.asked, ["embody", "embody", "look", "look"])
 
     def test_cost_that_is_no_distance(self) -> None:
         """A cost that is negative, infinite, NaN or not a number becomes None."""

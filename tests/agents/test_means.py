@@ -76,52 +76,52 @@ class FittedTests(SynchronousTestCase):
 
 
 class LearningTests(SynchronousTestCase):
-    def turned(self, means: MotionCapabilities, wished: float, done: float) -> None:
+    def turned(self, motion: MotionCapabilities, wished: float, done: float) -> None:
         """Record a turn on the spot that was executed at another velocity."""
-        means.learn({"base.vx": 0.0, "base.wz": wished}, {"base.vx": 0.0, "base.wz": done})
+        motion.learn({"base.vx": 0.0, "base.wz": wished}, {"base.vx": 0.0, "base.wz": done})
 
     def test_who_does_what_it_is_told_learns_nothing(self) -> None:
         """A robot that executes an action exactly, or clipped to its limits, keeps its fine aim."""
-        means = MotionCapabilities(WHEELS)
+        motion = MotionCapabilities(WHEELS)
         for wished, done in ((0.5, 0.5), (5.0, 2.0), (0.01, 0.0100001)):
-            self.turned(means, wished, done)
+            self.turned(motion, wished, done)
         self.assertEqual(
-            (means.facing_tolerance, means.is_coarse, means.circle, means.spin(0.01)),
+            (motion.facing_tolerance, motion.is_coarse, motion.circle, motion.spin(0.01)),
             (FACING_TOLERANCE_RAD, False, 0.0, {**STAND, "base.wz": 0.01}),
         )
 
     def test_faster_turn_than_asked_for_is_a_coarse_aim(self) -> None:
         """The larger a robot's smallest turn is, the coarser is its aim, up to a limit."""
-        means = MotionCapabilities(replace(WHEELS, rates={"camera": 5.0}))
-        self.turned(means, 0.1, 1.0)
-        large = means.facing_tolerance
-        self.turned(means, 0.1, 0.5)
-        self.assertTrue(FACING_TOLERANCE_RAD < means.facing_tolerance < large <= MAX_FACING_TOLERANCE_RAD)
-        self.assertTrue(means.is_coarse)
+        motion = MotionCapabilities(replace(WHEELS, rates={"camera": 5.0}))
+        self.turned(motion, 0.1, 1.0)
+        large = motion.facing_tolerance
+        self.turned(motion, 0.1, 0.5)
+        self.assertTrue(FACING_TOLERANCE_RAD < motion.facing_tolerance < large <= MAX_FACING_TOLERANCE_RAD)
+        self.assertTrue(motion.is_coarse)
 
     def test_turn_that_was_too_slow_is_tried_faster(self) -> None:
         """If a turn was too slow to move the robot, the next one is faster, in both directions."""
-        means = MotionCapabilities(WHEELS)
-        self.turned(means, 0.1, 0.0)
-        self.assertAlmostEqual(means.spin(-0.05)["base.wz"], -0.15)
-        self.assertEqual(means.spin(0.0), STAND)
+        motion = MotionCapabilities(WHEELS)
+        self.turned(motion, 0.1, 0.0)
+        self.assertAlmostEqual(motion.spin(-0.05)["base.wz"], -0.15)
+        self.assertEqual(motion.spin(0.0), STAND)
 
     def test_who_cannot_turn_on_the_spot_walks_on_arcs(self) -> None:
         """A robot that does not turn on the spot at full speed walks while it turns, and learns its turning circle."""
-        means = MotionCapabilities(WHEELS)
-        self.turned(means, means.look_turn, 0.0)
-        action = means.spin(1.0)
+        motion = MotionCapabilities(WHEELS)
+        self.turned(motion, motion.look_turn, 0.0)
+        action = motion.spin(1.0)
         self.assertGreater(action["base.vx"], 0.0)
-        means.learn(action, {"base.vx": 0.06, "base.wz": 0.4})
-        self.assertAlmostEqual(means.circle, 0.15)
-        self.assertEqual(means.spin(0.0), STAND)
+        motion.learn(action, {"base.vx": 0.06, "base.wz": 0.4})
+        self.assertAlmostEqual(motion.circle, 0.15)
+        self.assertEqual(motion.spin(0.0), STAND)
 
     def test_creep_that_was_too_slow_is_tried_faster(self) -> None:
         """If a walk was too slow to move the robot, the next one is faster; too long a stride makes it stop earlier."""
-        means = MotionCapabilities(WHEELS)
-        before = means.stop_distance
-        means.learn({"base.vx": 0.04, "base.wz": 0.0}, {"base.vx": 0.0, "base.wz": 0.0})
-        self.assertAlmostEqual(means.go(0.04)["base.vx"], 0.06)
-        self.assertAlmostEqual(means.go(-0.04)["base.vx"], -0.06)
-        means.learn({"base.vx": 0.06, "base.wz": 0.0}, {"base.vx": 0.15, "base.wz": 0.0})
-        self.assertTrue(before < means.stop_distance < before + 0.05)
+        motion = MotionCapabilities(WHEELS)
+        before = motion.stop_distance
+        motion.learn({"base.vx": 0.04, "base.wz": 0.0}, {"base.vx": 0.0, "base.wz": 0.0})
+        self.assertAlmostEqual(motion.go(0.04)["base.vx"], 0.06)
+        self.assertAlmostEqual(motion.go(-0.04)["base.vx"], -0.06)
+        motion.learn({"base.vx": 0.06, "base.wz": 0.0}, {"base.vx": 0.15, "base.wz": 0.0})
+        self.assertTrue(before < motion.stop_distance < before + 0.05)

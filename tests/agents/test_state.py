@@ -62,15 +62,15 @@ class TableTests(SynchronousTestCase):
 
     def test_rank_is_shown(self) -> None:
         """The text of a waiting agent contains its rank, which stays until an event changes it."""
-        course = StateMachine()
-        course.state = S.OBSERVING
+        machine = StateMachine()
+        machine.state = S.OBSERVING
         for event, rank, shown in (
             (Event.PASSED_OVER, 2, "WAITING(2)"),
             (Event.LENT, None, "WAITING(2)"),
             (Event.NAMED, 0, "CLAIMING"),
         ):
-            course.apply(event, rank)
-            self.assertEqual(str(course), shown)
+            machine.apply(event, rank)
+            self.assertEqual(str(machine), shown)
 
     def test_page_has_the_table(self) -> None:
         """The documentation contains the states as generated from the table."""
@@ -117,16 +117,16 @@ class Rig:
         was_over = self.engagement.is_over
         now = self.clock.seconds()
         INPUTS[name](self, self.engagement, now)
-        deed = None if self.has_left else self.engagement.step(now)
-        faults = self.faults(deed)
-        if was_over and (deed or self.events not in ([], ["released"]) or self.ports.told):
+        command = None if self.has_left else self.engagement.step(now)
+        faults = self.faults(command)
+        if was_over and (command or self.events not in ([], ["released"]) or self.ports.told):
             faults.append("something follows the outcome")
         if was_over and self.engagement.state_machine.state is not S.DONE:
             faults.append("the outcome does not stay")
         return faults
 
-    def faults(self, deed: RobotCommand | None) -> list[str]:
-        """Return the invariants that the events and ``deed`` of a step violate."""
+    def faults(self, command: RobotCommand | None) -> list[str]:
+        """Return the invariants that the events and ``command`` of a step violate."""
         faults = []
         for event in self.events:
             if event == "halted":
@@ -134,11 +134,11 @@ class Rig:
             elif self.is_moving and (event == "released" or event.startswith("moved")):
                 faults.append("the lease is given back while the body moves")
         lease = self.council.lease
-        if deed is not None and deed.action == GO:
+        if command is not None and command.action == GO:
             self.is_moving = True
-            if lease is None or (deed.permit.token, deed.permit.deadline) != (lease.token, lease.deadline):
+            if lease is None or (command.permit.token, command.permit.deadline) != (lease.token, lease.deadline):
                 faults.append("the body acts without a lease")
-        elif self.is_moving and deed is not None:
+        elif self.is_moving and command is not None:
             faults.append("the body is not stopped before it does something else")
         if self.is_moving and (lease is None or self.engagement.lease_client is None):
             faults.append("the body moves on without a lease")

@@ -46,27 +46,27 @@ def main() -> int:
     parser.add_argument("--resume", action="store_true", help="leave out the seeds that the logbook has")
     parser.add_argument("--bug", choices=sorted(BUGS), metavar="NAME", help="run with a bug put in, until it shows")
     parser.add_argument("--bugs", action="store_true", help="run with each bug in turn, and say when it showed")
-    wanted = parser.parse_args()
-    only = tuple(name for name in wanted.only.split(",") if name)
+    args = parser.parse_args()
+    only = tuple(name for name in args.only.split(",") if name)
     if unknown := [name for name in only if name not in NAMES]:
         parser.error(f"--only: no workload {unknown[0]}; there are {', '.join(NAMES)}")
-    count = wanted.schedules or (BOUND if wanted.bugs or wanted.bug else 200)
-    if count < 1 or wanted.jobs < 1:
+    count = args.schedules or (BOUND if args.bugs or args.bug else 200)
+    if count < 1 or args.jobs < 1:
         parser.error("--schedules, --jobs: at least 1")
-    if wanted.seconds is not None and not wanted.seconds > 0.0:
+    if args.seconds is not None and not args.seconds > 0.0:
         parser.error("--seconds: more than 0")
-    if wanted.resume and not wanted.log:
+    if args.resume and not args.log:
         parser.error("--resume: name the logbook with --log FILE")
-    if wanted.log and (wanted.bug or wanted.bugs):
+    if args.log and (args.bug or args.bugs):
         parser.error("--log: runs with a bug put in are not logged")
-    if wanted.bug:
-        only = only or FINDERS[wanted.bug]
+    if args.bug:
+        only = only or FINDERS[args.bug]
     try:
-        seeds = range(wanted.seed, wanted.seed + count)
-        if wanted.bugs:
-            return show_bugs(seeds, wanted.jobs, wanted.scheduler)
-        trim = Reduction(numbers(wanted.keep), wanted.calm, only, wanted.seconds)
-        return Session(wanted, trim).run(seeds)
+        seeds = range(args.seed, args.seed + count)
+        if args.bugs:
+            return show_bugs(seeds, args.jobs, args.scheduler)
+        trim = Reduction(numbers(args.keep), args.calm, only, args.seconds)
+        return Session(args, trim).run(seeds)
     except (BadSetting, OSError, ValueError) as error:
         parser.error(str(error))
     except KeyboardInterrupt:
@@ -87,8 +87,8 @@ def numbers(told: str | None) -> tuple[int, ...] | None:
 class Session:
     """One call of the command: runs the schedules, prints failures, and writes the logbook."""
 
-    def __init__(self, wanted: argparse.Namespace, trim: Reduction) -> None:
-        self._wanted = wanted
+    def __init__(self, args: argparse.Namespace, trim: Reduction) -> None:
+        self._wanted = args
         self._trim = trim
         self._began = time.monotonic()
         self._is_interrupted = False
@@ -148,7 +148,7 @@ class Session:
         say(f"{len(left)} of {len(seeds)} schedules, from seed {left[0]}" if left else "all are in the logbook")
         commit, outcomes = commit_of(Path(__file__).resolve().parents[2]), self._outcomes(left)
         for stretch in seed_log.split_ranges(left, STRETCH):
-            began, failures, ran = time.monotonic(), [], 0
+            started_at, failures, ran = time.monotonic(), [], 0
             try:
                 for _ in stretch:
                     outcome = next(outcomes)
@@ -158,7 +158,7 @@ class Session:
             finally:
                 if ran:
                     date = time.strftime("%Y-%m-%dT%H:%M:%SZ", time.gmtime())
-                    seconds = round(time.monotonic() - began, 1)
+                    seconds = round(time.monotonic() - started_at, 1)
                     entry = seed_log.SeedRun(date, commit, what, stretch[0], ran, tuple(failures), seconds)
                     seed_log.append_entry(wanted.log, entry)
                     say(f"{self._ran} of {len(left)} schedules, {self._failed} failed; up to seed {stretch[ran - 1]}")
@@ -179,7 +179,7 @@ def commit_of(tree: Path) -> str:
 
 def show_bugs(seeds: range, jobs: int, scheduler: str) -> int:
     """Print for each bug the schedule that detected it, the number of schedules, and the violations."""
-    hidden, began = 0, time.monotonic()
+    hidden, started_at = 0, time.monotonic()
     say(f"{'bug':48s} {'workloads':16s} {'seed':>5s}  {'needed':>6s}  shows as")
     for bug, only, number, outcome in hunt_all(seeds, jobs, scheduler):
         if outcome is None:
@@ -188,7 +188,7 @@ def show_bugs(seeds: range, jobs: int, scheduler: str) -> int:
         else:
             broken = sorted({violation.partition(":")[0] for violation in outcome.found})
             say(f"{bug:48s} {'+'.join(only):16s} {outcome.seed:5d}  {number:6d}  {', '.join(broken)}")
-    say(f"{len(BUGS) - hidden} of {len(BUGS)} bugs were found, {time.monotonic() - began:.0f} s")
+    say(f"{len(BUGS) - hidden} of {len(BUGS)} bugs were found, {time.monotonic() - started_at:.0f} s")
     return int(hidden > 0)
 
 

@@ -214,9 +214,11 @@ async def _decided_by_the_new(self: LeaseProposer, ballot: Any, members: Any, ke
     return await self.start_round("lease.change", *question, others=members).outcome
 
 
-def _row(event: Event, stand: BallotRelation, kind: ReplyKind, state: State = State.OPEN) -> list[tuple[Any, str, Any]]:
+def _row(
+    event: Event, relation: BallotRelation, kind: ReplyKind, state: State = State.OPEN
+) -> list[tuple[Any, str, Any]]:
     """Return a change of the table with another answer in one row."""
-    return [(acceptor_, "TABLE", {**TABLE, (state, event, stand): (kind, TABLE[state, event, stand][1])})]
+    return [(acceptor_, "TABLE", {**TABLE, (state, event, relation): (kind, TABLE[state, event, relation][1])})]
 
 
 def _wakes_free(self: Register, now: float, lives: int) -> None:
@@ -229,8 +231,8 @@ def _any_configuration(self: Acceptor[Any], register: Register, question: Any) -
 
 
 def _nothing_is_lower(self: Acceptor[Any], register: Register, question: Any) -> Any:
-    stand = _GENUINE[Acceptor, "_find_relation"](self, register, question)
-    return BallotRelation.FREE if stand is BallotRelation.LOWER else stand
+    relation = _GENUINE[Acceptor, "_find_relation"](self, register, question)
+    return BallotRelation.FREE if relation is BallotRelation.LOWER else relation
 
 
 def _release_ends_nothing(self: Acceptor[Any], *_: Any) -> Reply:
@@ -347,5 +349,5 @@ def seeded(name: str | None) -> Iterator[None]:
     try:
         yield
     finally:
-        for place, attribute, genuine in kept:
-            setattr(place, attribute, genuine)
+        for place, attribute, original in kept:
+            setattr(place, attribute, original)

@@ -260,7 +260,7 @@ class Lessee:
     def stand_by(self, rank: int = 1) -> None:
         """Do nothing: this council does not notify standbys, and each client polls it."""
 
-    def release(self, heirs: object = (), rest: float = 0.0) -> Deferred[object]:
+    def release(self, standbys: object = (), rest: float = 0.0) -> Deferred[object]:
         """Return the lease; while the robot still moves, let it expire instead."""
         self._wanted, self._deadline = False, 0.0
         self._life += 1

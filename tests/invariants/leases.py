@@ -35,17 +35,17 @@ KINDS = (
 )  # fmt: skip
 
 
-def draw_faults(dice: random.Random, n: int, agents: Sequence[int], has_stores: bool) -> list[TimedFault]:
+def draw_faults(rng: random.Random, n: int, agents: Sequence[int], has_stores: bool) -> list[TimedFault]:
     """Return random faults for a schedule with ``n`` places; places of agents are chosen more often."""
     faults = []
-    for _ in range(dice.choice([1, 2, 3, 3, 4, 6])):
-        at = dice.uniform(0.5, 12.0)
-        kind = dice.choice(KINDS)
-        seconds = dice.choice([0.5, 1.0, 2.0, 2.0, 3.0, 5.0, 10.0])
-        count = dice.choice([1, 1, 2, 3]) if kind in ("kill", "wipe", "freeze", "cut") else 1
-        places = tuple(dice.sample(range(n), min(count, n - 1)))
-        if dice.random() < 0.4:
-            places = (dice.choice(agents), *places[1:])
+    for _ in range(rng.choice([1, 2, 3, 3, 4, 6])):
+        at = rng.uniform(0.5, 12.0)
+        kind = rng.choice(KINDS)
+        seconds = rng.choice([0.5, 1.0, 2.0, 2.0, 3.0, 5.0, 10.0])
+        count = rng.choice([1, 1, 2, 3]) if kind in ("kill", "wipe", "freeze", "cut") else 1
+        places = tuple(rng.sample(range(n), min(count, n - 1)))
+        if rng.random() < 0.4:
+            places = (rng.choice(agents), *places[1:])
         if kind == "blackout":
             kind, places = "kill", tuple(range(n))
         if kind == "wipe" and has_stores:
@@ -58,32 +58,32 @@ class Leases(LeaseTeam):
     """The run of ``seed``, which determines everything."""
 
     def __init__(self, seed: int, trim: Reduction = NO_REDUCTION, ttl: float = TTL) -> None:
-        dice = self._dice = random.Random(f"leases/{seed}")
-        n = dice.choice([4, 5, 5, 6, 7])
-        agents = dice.choice([2, 3, 3, 4])
-        stop_time = dice.choice([0.0, 0.0, 0.3])
-        drift = dice.choice([0.0, 0.01, 0.01, 0.01, 0.05])
+        rng = self._dice = random.Random(f"leases/{seed}")
+        n = rng.choice([4, 5, 5, 6, 7])
+        agents = rng.choice([2, 3, 3, 4])
+        stop_time = rng.choice([0.0, 0.0, 0.3])
+        drift = rng.choice([0.0, 0.01, 0.01, 0.01, 0.05])
         # The worst permitted case must occur often: a slow holder and fast members.
-        rates = [1.0 + dice.choice([-1, 1]) * drift for _ in range(n)]
+        rates = [1.0 + rng.choice([-1, 1]) * drift for _ in range(n)]
         # Without stores a restarted member loses all state: then councils do not change, and tokens may decrease.
-        has_stores = dice.random() < 0.7
+        has_stores = rng.random() < 0.7
         super().__init__(f"leases/{seed}", rates, agents, ttl, stop_time, drift, has_stores)
         self.air = LinkQuality(
-            dice.choice([0.001, 0.005, 0.02, 0.05, 0.2]),
-            dice.choice([0.0, 0.01, 0.05]),
-            dice.choice([0.0, 0.05, 0.1, 0.2, 0.3, 0.5]),
-            dice.choice([0.0, 0.1, 0.3]),
-            dice.choice([1.0, 1.0, 5.0]),
+            rng.choice([0.001, 0.005, 0.02, 0.05, 0.2]),
+            rng.choice([0.0, 0.01, 0.05]),
+            rng.choice([0.0, 0.05, 0.1, 0.2, 0.3, 0.5]),
+            rng.choice([0.0, 0.1, 0.3]),
+            rng.choice([1.0, 1.0, 5.0]),
         )
         if trim.calm:
             self.air = LinkQuality(self.air.delay)
-        self.faults = draw_faults(dice, n, self.agents, has_stores)
+        self.faults = draw_faults(rng, n, self.agents, has_stores)
         self._trim = trim
         self.seconds = 0.0
         self._is_well = False
-        for task_id in ["t0", "t1"][: dice.choice([1, 1, 2])]:
-            size = 5 if n >= 5 and dice.random() < 0.25 else 3
-            self.add_task(task_id, sorted(dice.sample(range(n), size)))
+        for task_id in ["t0", "t1"][: rng.choice([1, 1, 2])]:
+            size = 5 if n >= 5 and rng.random() < 0.25 else 3
+            self.add_task(task_id, sorted(rng.sample(range(n), size)))
 
     # -- the run ----------------------------------------------------------------------------------------------------
 
@@ -106,9 +106,9 @@ class Leases(LeaseTeam):
         self.recorder.record_assumptions()
         timeline = Timeline(self.faults, self._trim)
         self.seconds = end = self._trim.limit_duration(self._dice.choice([8.0, 12.0, 16.0]))
-        began = self.clock.seconds()
-        while self.clock.seconds() - began < end:
-            for fault, is_end in timeline.pop_due(self.clock.seconds() - began):
+        started_at = self.clock.seconds()
+        while self.clock.seconds() - started_at < end:
+            for fault, is_end in timeline.pop_due(self.clock.seconds() - started_at):
                 (self._end if is_end else self._begin)(fault)
             self._choose()
             self.clock.advance(0.25)
@@ -151,11 +151,11 @@ class Leases(LeaseTeam):
             # A lease that no member remembers must end first, as the next one may have its token.
             self.clock.advance(self.ttl)
         for rank, place in enumerate(self._dice.sample(self.agents, len(self.agents))):
-            lessee = self.nodes[place].get_lease_client(task_id)
+            lease_client = self.nodes[place].get_lease_client(task_id)
             if rank:
-                lessee.stand_by(rank)
+                lease_client.stand_by(rank)
             else:
-                lessee.claim()
+                lease_client.claim()
         # A restarted member is silent for one TTL, and a device may have to report its token first.
         since, most = self.clock.seconds(), 2 * self.ttl + SLACK + 1.0
         if not self._wait_for_command(task_id, f"all is well with {task_id}", 0, since, most, most):
@@ -177,23 +177,23 @@ class Leases(LeaseTeam):
 
     def _depart_suddenly(self, task_id: str, token: int, holder: int) -> None:
         """Kill, freeze or disconnect the executor, with one member of the council."""
-        gone_at, dice = self.clock.seconds(), self._dice
+        gone_at, rng = self.clock.seconds(), self._dice
         members = [self.get_place(member) for member in self.charters[task_id].members]
         spare = [place for place in members if place not in self.agents]
-        also = [dice.choice(spare)] if spare and holder not in members else []
-        how = dice.choice(["kill", "freeze", "suspend", "cut"])
+        also = [rng.choice(spare)] if spare and holder not in members else []
+        how = rng.choice(["kill", "freeze", "suspend", "cut"])
         self._begin(TimedFault(0, 0, how, (holder, *also)))
         others = [place for place in self.agents if place != holder]
         within = self.ttl / (1.0 - self.drift) + SLACK + STAGGER_S * (len(self.agents) - 1)
-        if len(others) > 1 and dice.random() < 0.75:
+        if len(others) > 1 and rng.random() < 0.75:
             # The strategy assigns one agent when the lease ends, then another.
-            fickle = dice.choice(others)
+            fickle = rng.choice(others)
             self.nodes[fickle].leave(task_id)
-            self.clock.advance(dice.uniform(0.8, 1.0) * self.ttl)
+            self.clock.advance(rng.uniform(0.8, 1.0) * self.ttl)
             self.nodes[fickle].get_lease_client(task_id).claim()
             while self.clock.seconds() < gone_at + 1.1 * self.ttl and self.recorder.accepted[task_id][-1][1] <= token:
-                self.clock.advance(dice.choice([0.004, 0.011, 0.017]))
-                if dice.random() < 0.2:
+                self.clock.advance(rng.choice([0.004, 0.011, 0.017]))
+                if rng.random() < 0.2:
                     break
             # A robot that this agent has moved must stop first.
             within += self.stop_time if self.nodes[fickle].has_lease(task_id) else 0.0
@@ -210,11 +210,11 @@ class Leases(LeaseTeam):
             self.recorder.stop_robot(holder, task_id)
         history = self.recorder.history
         asked = history.record_request(place, "close", task_id)
-        lessee = self.nodes[place].get_lease_client(task_id)
-        closing: Deferred[Any] = lessee.close_task(token) if place == holder else lessee.proposer.close()
+        lease_client = self.nodes[place].get_lease_client(task_id)
+        closing: Deferred[Any] = lease_client.close_task(token) if place == holder else lease_client.proposer.close()
 
         def ended(_: object) -> None:
-            lessee.release()
+            lease_client.release()
 
         record_outcome(history, asked, closing.addCallback(ended))
         self.clock.advance(2 * self.ttl)
@@ -224,11 +224,11 @@ class Leases(LeaseTeam):
 
     def _wait_for_command(self, task_id: str, why: str, above: int, since: float, within: float, most: float) -> bool:
         """Wait up to ``most`` s for a command with a token above ``above``, due ``within`` s of ``since``."""
-        began = self.clock.seconds()
+        started_at = self.clock.seconds()
         self.recorder.history.record(CommandExpected, task_id, why, above, since, within)
         accepted = self.recorder.accepted[task_id]
-        while self.clock.seconds() - began < most:
-            if accepted and accepted[-1][1] > above and accepted[-1][0] >= began:
+        while self.clock.seconds() - started_at < most:
+            if accepted and accepted[-1][1] > above and accepted[-1][0] >= started_at:
                 return True
             self.clock.advance(0.02)
         return False

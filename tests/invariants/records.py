@@ -117,15 +117,15 @@ class Records(Workload):
     # -- observations -----------------------------------------------------------------------------------------------
 
     def _look(self) -> None:
-        fleet = self._schedule.team
+        team = self._schedule.team
         for place in self._schedule.alive():
             met = self._met[place]
             for contact in self._schedule.node(place).overlay.contacts():
                 if contact not in met:
                     met.add(contact)
                     self._history.record(ContactKnown, place, contact.public, str(contact.address))
-            memory = fleet.get_store_number(place)
-            for record in fleet.stores[place].records():
+            memory = team.get_store_number(place)
+            for record in team.stores[place].records():
                 at, mark = (place, memory, Slot(*record.slot)), (record.sequence, record.signature)
                 if mark != self._held.get(at):
                     self._held[at] = mark

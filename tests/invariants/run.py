@@ -81,9 +81,9 @@ class Outcome:
 
 def drawn(seed: int) -> list[str]:
     """Return the workloads of a seed."""
-    dice = random.Random(f"workloads/{seed}")
+    rng = random.Random(f"workloads/{seed}")
     return [
-        *(name for name, share in SHARES.items() if dice.random() < share),
+        *(name for name, share in SHARES.items() if rng.random() < share),
         *(name for name in ALONE if name not in SHARES),
     ]
 

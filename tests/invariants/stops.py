@@ -500,10 +500,10 @@ def main() -> int:
     parser = argparse.ArgumentParser(prog="python -m tests.invariants.stops", description=__doc__)
     parser.add_argument("--sequences", type=int, default=10_000, help="how many to run (default 10000)")
     parser.add_argument("--seed", type=int, default=1, help="the seed of the first; the others follow (default 1)")
-    wanted = parser.parse_args()
+    args = parser.parse_args()
     counts: Counter[str] = Counter()
     failed = 0
-    for seed in range(wanted.seed, wanted.seed + wanted.sequences):
+    for seed in range(args.seed, args.seed + args.sequences):
         try:
             run(seed, counts)
         except Violation as violation:

@@ -135,8 +135,10 @@ class Stores(Workload):
             self._say("S-c", f"node {place} left because its disk is full")
         others = [other for other in self._schedule.alive() if other != place]
         if others:
-            asker = self._schedule.node(self._rng.choice(others))
-            asked = asker.endpoint.ask(node.contact, "store", [self._record(asker).pack()], [60.0], changes=True)
+            requester = self._schedule.node(self._rng.choice(others))
+            asked = requester.endpoint.ask(
+                node.contact, "store", [self._record(requester).pack()], [60.0], changes=True
+            )
             asked.addCallbacks(self._taken, self._refused, (place, store), {}, (place,))
 
     def _taken(self, answer: Any, place: int, store: CheckedStore) -> None:

@@ -110,35 +110,35 @@ class Tasks:
 
     def step(self) -> None:
         """Run random events."""
-        dice = self.rng.random
-        if dice() < 0.12 and len(self.tasks) < 4:
+        rng = self.rng.random
+        if rng() < 0.12 and len(self.tasks) < 4:
             self.submit()
         open_ = [name for name in self.tasks if name not in self.ether.acknowledged]
-        if open_ and dice() < 0.03:
+        if open_ and rng() < 0.03:
             self.ether.conclude(OPERATOR, self.rng.choice(open_), Result(CANCELLED, "operator")).addErrback(lambda _: 0)
-        if open_ and dice() < 0.05:
+        if open_ and rng() < 0.05:
             order = Order(self.rng.choice([PAUSE, RESUME]), "operator", self.clock.seconds())
             self.ether.order(self.rng.choice(open_), order)
-        if open_ and dice() < 0.03:
+        if open_ and rng() < 0.03:
             name = self.rng.choice(open_)
             self.tasks[name] = faded(self.tasks[name], priority=self.rng.choice([0, 5]))
             self.ether.submit(self.tasks[name])
-        if dice() < 0.2:
+        if rng() < 0.2:
             self.robots[self.rng.randint(1, self.n)].drift = self.rng.choice([0.0, 0.0, 1.0, 2.0])
         if not self.is_calm:
             self.fault()
 
     def fault(self) -> None:
         """Stop or restart a member, or change the partition."""
-        dice = self.rng.random()
+        rng = self.rng.random()
         place = self.rng.randint(1, self.n)
-        if dice >= 0.09:
+        if rng >= 0.09:
             return
         number = len(self.faults)
-        self.faults.append(f"{self.clock.seconds():.1f} {'dog' if dice < 0.06 else 'cut'}{place}")
+        self.faults.append(f"{self.clock.seconds():.1f} {'dog' if rng < 0.06 else 'cut'}{place}")
         if not self._trim.keeps(number):
             return
-        if dice >= 0.06:
+        if rng >= 0.06:
             self.ether.side = {place: 1} if not self.ether.side else {}
         elif place in self.agents:
             self.death(place)
@@ -185,8 +185,8 @@ class Tasks:
         """Return whether all agents and the operator know the outcome of each task."""
         if any(self.ether.outcome(OPERATOR, name) is None for name in self.tasks):
             return False
-        dockets = [agent._task_queue for agent in self.agents.values()]
-        return not any(docket.open_ids or any(map(docket.is_new, self.tasks)) for docket in dockets)
+        task_queues = [agent._task_queue for agent in self.agents.values()]
+        return not any(task_queue.open_ids or any(map(task_queue.is_new, self.tasks)) for task_queue in task_queues)
 
     def late(self) -> None:
         """Expire the outcome's record while the task is still listed."""
@@ -235,7 +235,7 @@ class Tasks:
     def _recorded(self) -> Iterator[None]:
         """Record each decision of each agent."""
         place: Any = import_module("agents.decider")
-        genuine = place.decide
+        original = place.decide
 
         def decide(
             members: Iterable[Member],
@@ -246,7 +246,7 @@ class Tasks:
             has_word: bool | None,
         ) -> Decision:
             listed = list(members)
-            decision: Decision = genuine(listed, strategy, hysteresis, period, since, has_word)
+            decision: Decision = original(listed, strategy, hysteresis, period, since, has_word)
             self.decided(listed, decision, hysteresis)
             return decision
 
@@ -255,7 +255,7 @@ class Tasks:
         try:
             yield
         finally:
-            place.decide = genuine
+            place.decide = original
             del KINDS["walk"]
 
     def decided(self, members: list[Member], decision: Decision, hysteresis: float) -> None:
@@ -297,8 +297,12 @@ class Groups(Tasks):
 
     def holding(self, agent: Agent) -> tuple[str, ...]:
         """Return the tasks for which an agent holds the lease."""
-        lessees = {name: part.engagement.lease_client for name, part in agent._participations.items()}
-        return tuple(name for name, lessee in lessees.items() if lessee is not None and lessee.lease is not None)
+        lease_clients = {name: part.engagement.lease_client for name, part in agent._participations.items()}
+        return tuple(
+            name
+            for name, lease_client in lease_clients.items()
+            if lease_client is not None and lease_client.lease is not None
+        )
 
 
 def faded(task: Task, **changes: Any) -> Task:

@@ -105,12 +105,14 @@ class Tuples(Workload):
         """Return the acknowledged tuples that were not taken and must still be takeable."""
         return [p for p in self._witness.list_undecided() if p.fields in self._acknowledged and self._can_decide(p)]
 
-    def _can_decide(self, posted: StoredTuple) -> bool:
+    def _can_decide(self, stored_tuple: StoredTuple) -> bool:
         """Return whether a majority of the council is online with its state."""
-        seats = {node.identity.public: node.take_acceptor for node in map(self._schedule.node, self._schedule.alive())}
-        there = [m for m in posted.council if m.contact.public in seats]
-        able = [m for m in there if seats[m.contact.public].incarnation == m.incarnation]
-        return 2 * len(able) > len(posted.council)
+        acceptors = {
+            node.identity.public: node.take_acceptor for node in map(self._schedule.node, self._schedule.alive())
+        }
+        there = [m for m in stored_tuple.council if m.contact.public in acceptors]
+        able = [m for m in there if acceptors[m.contact.public].incarnation == m.incarnation]
+        return 2 * len(able) > len(stored_tuple.council)
 
     # -- operations of clients --------------------------------------------------------------------------------------
 
@@ -162,21 +164,23 @@ class Tuples(Workload):
         decided = [one for one in self._witness.tuples.values() if self._witness.find_takers(one.tuple_id)]
         if not decided:
             return
-        posted = self._rng.choice(decided)
+        stored_tuple = self._rng.choice(decided)
         node = self._schedule.node(place)
-        for (counter, taker, value), members in sorted(self._witness.votes[posted.tuple_id].items()):
-            if 2 * len(members) <= len(posted.council):
+        for (counter, taker, value), members in sorted(self._witness.votes[stored_tuple.tuple_id].items()):
+            if 2 * len(members) <= len(stored_tuple.council):
                 continue
-            for member in posted.council:
+            for member in stored_tuple.council:
                 if member.contact.public in members - {node.identity.public}:
-                    places = [posted.tuple_id.pack()]
-                    question = (posted.tuple_id.key, places, member.incarnation, counter, taker, value)
+                    places = [stored_tuple.tuple_id.pack()]
+                    question = (stored_tuple.tuple_id.key, places, member.incarnation, counter, taker, value)
                     asked = node.endpoint.ask(member.contact, "decree.confirm", *question, changes=True)
-                    asked.addCallbacks(self._said_again, _weather, (posted, value))
+                    asked.addCallbacks(self._said_again, _weather, (stored_tuple, value))
 
-    def _said_again(self, answer: Any, posted: StoredTuple, value: bytes) -> None:
+    def _said_again(self, answer: Any, stored_tuple: StoredTuple, value: bytes) -> None:
         reply = unpack_reply(answer[0], Event.ACCEPT) if isinstance(answer, list) and answer else None
-        self._history.record(event.AnswerRepeated, posted.fields, value, reply.value if reply is not None else None)
+        self._history.record(
+            event.AnswerRepeated, stored_tuple.fields, value, reply.value if reply is not None else None
+        )
 
     # -- the end ----------------------------------------------------------------------------------------------------
 

@@ -107,8 +107,8 @@ class Wire(Workload):
         for _ in range(self._rng.randrange(1, 3)):
             self._shoot(self._rng.choice(alive))
         if len(alive) > 1:
-            asker, answerer = self._rng.sample(alive, 2)
-            self._ask(asker, answerer)
+            requester, responder = self._rng.sample(alive, 2)
+            self._ask(requester, responder)
 
     def make_final_requests(self) -> None:
         """Inject a last datagram at each node, and flood one with handshakes."""
@@ -193,10 +193,10 @@ class Wire(Workload):
         """Start more handshakes at once than a node answers, from unknown members."""
         node = self._schedule.node(place)
         static = derive_exchange_key(node.identity.public)
-        dice = random.Random(f"flood/{self._schedule.seed}")
-        own = Credentials.derive(Identity(dice.randbytes(32)), TEAM_KEY)
+        rng = random.Random(f"flood/{self._schedule.seed}")
+        own = Credentials.derive(Identity(rng.randbytes(32)), TEAM_KEY)
         for number in range(FLOOD):
-            datagram = InitiatorHandshake(own, static, dice.randbytes(32), number, b"").make_init()
+            datagram = InitiatorHandshake(own, static, rng.randbytes(32), number, b"").make_init()
             self._got_from_stranger += len(datagram)
             node._network.receiver(datagram, STRANGER)  # type: ignore[attr-defined]
         half_open = len(node.endpoint._half_open._unconfirmed)
@@ -214,16 +214,16 @@ class Wire(Workload):
 
         node.endpoint.expose("run", run, changes=True)
 
-    def _ask(self, asker: int, answerer: int) -> None:
+    def _ask(self, requester: int, responder: int) -> None:
         self._number += 1
-        number, life = self._number, self._schedule.team.life_numbers[answerer]
-        contact = self._schedule.node(answerer).contact
-        asked = self._history.record_request(asker, "run", number)
+        number, life = self._number, self._schedule.team.life_numbers[responder]
+        contact = self._schedule.node(responder).contact
+        asked = self._history.record_request(requester, "run", number)
 
         def shown(answer: object) -> object:
-            return answer, answerer, life, self._schedule.team.life_numbers[answerer]
+            return answer, responder, life, self._schedule.team.life_numbers[responder]
 
-        asking = self._schedule.node(asker).endpoint.ask(contact, "run", number, changes=True)
+        asking = self._schedule.node(requester).endpoint.ask(contact, "run", number, changes=True)
         record_outcome(self._history, asked, asking, shown)
 
     # -- tables (R4) ------------------------------------------------------------------------------------------------
@@ -231,7 +231,7 @@ class Wire(Workload):
     def _tables(self, node: EntangledNode) -> list[tuple[str, int, int]]:
         """Return all tables that peers can fill, with their sizes and limits."""
         endpoint: Any = node.endpoint
-        peers, answerer = endpoint._peers, endpoint._dispatcher
+        peers, responder = endpoint._peers, endpoint._dispatcher
         usage = node.store.usage
         return [
             ("peers", len(peers._peers), MAX_PEERS),
@@ -239,8 +239,8 @@ class Wire(Workload):
             ("sessions", len(peers.sessions), MAX_SESSIONS * len(peers._peers) + MAX_UNCONFIRMED),
             ("sessions that nobody confirmed", len(endpoint._half_open._unconfirmed), MAX_UNCONFIRMED),
             ("answers to handshakes", len(endpoint._half_open._responses), MAX_RESPONSES),
-            ("questions", len(answerer._history), MAX_ENTRIES),
-            ("cancelled questions", len(answerer._cancelled), MAX_CANCELLED),
+            ("questions", len(responder._history), MAX_ENTRIES),
+            ("cancelled questions", len(responder._cancelled), MAX_CANCELLED),
             ("found keys", len(node.overlay._lookup_results), MAX_FOUND),
             *_ways(node),
             ("rows", usage.rows, usage.max_rows),

@@ -26,24 +26,24 @@ def played(text: str, seed: int = 1) -> tuple[Outcome, dict[str, Metric]]:
     """Run a scenario and return the outcome and its figures by name."""
     settings = {name: kind.settings for name, kind in LOADS.items()}
     outcome = Run(parse_scenario(text, "test", "test", settings), seed, LOADS).run()
-    return outcome, {figure.name: figure for figure in outcome.metrics}
+    return outcome, {metric.name: metric for metric in outcome.metrics}
 
 
 class CensusTests(SynchronousTestCase):
     def test_closest(self) -> None:
         """``closest`` matches a search of all living nodes after random joins and deaths."""
-        dice, census, living = random.Random(1), NodeIdIndex(), set()
+        rng, census, living = random.Random(1), NodeIdIndex(), set()
         for _ in range(300):
-            born = dice.randbytes(20)
+            born = rng.randbytes(20)
             census.add(born)
             living.add(born)
-            if dice.random() < 0.4:
-                gone = dice.choice(sorted(living))
+            if rng.random() < 0.4:
+                gone = rng.choice(sorted(living))
                 census.remove(gone)
                 living.remove(gone)
-            key, without = dice.randbytes(20), dice.choice([*sorted(living), b"\0" * 20])
-            if dice.random() < 0.3:
-                key = dice.choice([*sorted(living), key])
+            key, without = rng.randbytes(20), rng.choice([*sorted(living), b"\0" * 20])
+            if rng.random() < 0.3:
+                key = rng.choice([*sorted(living), key])
             wanted = sorted(living - {without}, key=lambda each: distance(each, key))[:8]
             self.assertEqual(census.find_closest(key, 8, without), wanted)
         self.assertEqual(len(census), len(living))

@@ -162,6 +162,6 @@ class SurveyTests(SynchronousTestCase):
         one, same = measure_size(5, settings), measure_size(5, settings)
         self.assertEqual(one.violations, [])
         self.assertEqual(one.hash, same.hash)
-        figures = {figure.name: figure.value for figure in one.metrics}
-        self.assertEqual([curve.metric for curve in CURVES if figures.get(curve.metric) is None], [])
-        self.assertEqual((figures["lookups.success"], figures["auctions.right"]), (1.0, 1.0))
+        metrics = {metric.name: metric.value for metric in one.metrics}
+        self.assertEqual([curve.metric for curve in CURVES if metrics.get(curve.metric) is None], [])
+        self.assertEqual((metrics["lookups.success"], metrics["auctions.right"]), (1.0, 1.0))

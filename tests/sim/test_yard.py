@@ -35,13 +35,13 @@ from sim.robots.world import TICK_S
 class Client:
     """A client with a link to the simulator that stores the received messages."""
 
-    def __init__(self, yard: RobotSimulator) -> None:
+    def __init__(self, simulator: RobotSimulator) -> None:
         self.is_busy = False
         self.is_open = True
         self.heard: list[Message] = []
         self._reader = FrameReader()
         self.session: Session | None = None
-        self.session = yard.attach(self)
+        self.session = simulator.attach(self)
 
     def send(self, data: bytes) -> None:
         """Receive data from the simulator."""

@@ -30,19 +30,19 @@ class TeamCase(SynchronousTestCase):
         others: tuple[str, ...] = (),
     ) -> SimulatedTeam:
         """Start a team that stops with the test."""
-        team = SimulatedTeam(seed, weather=replace(LAN, loss=loss), dogs=dogs, others=others)
+        team = SimulatedTeam(seed, conditions=replace(LAN, loss=loss), dogs=dogs, others=others)
         self.addCleanup(team.stop)
         return team
 
     def until(self, team: SimulatedTeam, is_so: Callable[[], bool], limit: float = 90.0) -> float:
         """Run the team until a condition holds; return the seconds, or fail after ``limit``."""
-        began = team.clock.seconds()
+        started_at = team.clock.seconds()
         while not is_so():
-            if team.clock.seconds() - began > limit:
+            if team.clock.seconds() - started_at > limit:
                 self.fail(f"not so within {limit:g} s: {team.state()['tasks']}")
             team.clock.advance(LOOK_S)
             self.look(team)
-        return team.clock.seconds() - began
+        return team.clock.seconds() - started_at
 
     def look(self, team: SimulatedTeam) -> None:
         """Hook that ``until`` calls after each step."""

@@ -287,7 +287,11 @@ class MembershipTests(TeamCase):
             leases = []
             for name, service in team.services.items():
                 engagement = getattr(service.assembly.agent, "engagement", None)
-                if engagement is not None and engagement.lessee is not None and engagement.lessee.lease is not None:
+                if (
+                    engagement is not None
+                    and engagement.lease_client is not None
+                    and engagement.lease_client.lease is not None
+                ):
                     leases.append(name)
             self.assertLessEqual(len(leases), 1, leases)
             if leases and not killed and team.clock.seconds() > 8.0:

@@ -48,7 +48,7 @@ class HaltTests(TeamCase):
     def test_all_stand_at_once_and_go_on(self) -> None:
         """After a stop all dogs stand within 0.2 s and for 10 s; after the release the same dog continues."""
         acting = self.until_executing()
-        token = self.team.services[acting].assembly.agent.engagement.lessee.token  # type: ignore[union-attr]
+        token = self.team.services[acting].assembly.agent.engagement.lease_client.token  # type: ignore[union-attr]
         asked = self.halts.stop("ann")
         self.team.clock.advance(BRAKING)
         self.assertEqual(self.moving(self.team), [])
@@ -58,7 +58,7 @@ class HaltTests(TeamCase):
         self.assertTrue(self.team.state()["halted"])
         self.assertEqual(self.executing(self.team), [acting])
         agent: Any = self.team.services[acting].assembly.agent
-        self.assertEqual(agent.engagement.lessee.lease.token, token)
+        self.assertEqual(agent.engagement.lease_client.lease.token, token)
         self.halts.release("ann")
         self.assertIn(acting, self.moved_in(1.0))
         self.team.clock.advance(30.0)
@@ -104,7 +104,7 @@ class HaltTests(TeamCase):
         self.assertEqual(self.told(asked)["dog2"], NO_ANSWER)
         self.team.switchboard.heal()
         self.team.clock.advance(15.0)
-        self.assertTrue(self.node("dog2").stop.is_stopped)
+        self.assertTrue(self.node("dog2").stop_state.is_stopped)
         self.assertEqual(self.moved_in(3.0), set())
 
     def test_a_release_ends_the_stops_that_it_names(self) -> None:
@@ -129,7 +129,7 @@ class HaltTests(TeamCase):
         self.halts.stop("ann")
         self.team.clock.advance(BRAKING)
         self.assertNotIn(acting, self.moving(self.team))
-        self.assertTrue(self.node(acting).stop.is_stopped)
+        self.assertTrue(self.node(acting).stop_state.is_stopped)
         self.team.clock.advance(3.0)
         state = self.team.state()
         self.assertEqual((state["halted"], [other["name"] for other in state["halt"]["others"]]), (False, [silent]))
@@ -145,7 +145,7 @@ class HaltTests(TeamCase):
         self.assertEqual(self.team.state()["halt"]["standing"], ["dog2"])
         self.team.switchboard.heal()
         self.team.clock.advance(15.0)
-        self.assertFalse(self.node("dog2").stop.is_motion_forbidden)
+        self.assertFalse(self.node("dog2").stop_state.is_motion_forbidden)
         self.assertEqual(self.team.state()["halt"]["stops"], [])
 
     def test_a_record_that_is_no_statement_is_nothing(self) -> None:
@@ -154,7 +154,7 @@ class HaltTests(TeamCase):
             self.node("vaio").entangled.put(STOPS_KEY, SLOT, value, "team")
             self.team.clock.advance(0.5)
             self.assertFalse(self.team.state()["halted"])
-        self.assertFalse(self.node("dog1").stop.is_motion_forbidden)
+        self.assertFalse(self.node("dog1").stop_state.is_motion_forbidden)
 
     def test_the_device_says_who(self) -> None:
         """Each device logs the operator that stopped it and the operator that released it."""

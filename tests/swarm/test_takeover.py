@@ -41,9 +41,9 @@ class TakeoverTests(TeamCase):
             first = self.moving_for_it(team, "")
             for gone in (first, SimulatedTeam.BOOTSTRAP):
                 team.kill(gone)
-            began = team.clock.seconds()
+            started_at = team.clock.seconds()
             self.assertNotEqual(self.moving_for_it(team, first), first)
-            self.assertLess(team.clock.seconds() - began, 3.0, seed)
+            self.assertLess(team.clock.seconds() - started_at, 3.0, seed)
 
     def moving_for_it(self, team: SimulatedTeam, besides: str) -> str:
         """Return the first dog other than ``besides`` that holds a lease and moves."""

@@ -59,17 +59,17 @@ def main(arguments: Sequence[str], make_team: MakeTeam | None = None) -> int:
         parser.error(str(error))
 
 
-def _run_search(args: argparse.Namespace, ground: CrowdScene, make_team: MakeTeam) -> int:
-    if not 1 <= args.agents <= ground.robots:
-        raise SceneError(f"--agents must be from 0 to {ground.robots}, the robots here, not {args.agents}")
+def _run_search(args: argparse.Namespace, scene: CrowdScene, make_team: MakeTeam) -> int:
+    if not 1 <= args.agents <= scene.robots:
+        raise SceneError(f"--agents must be from 0 to {scene.robots}, the robots here, not {args.agents}")
     started_at = time.process_time()
     controller = CONTROLLERS[args.controller or "wander"]
-    team = make_team(args.seed, args.agents, ground, controller, time.process_time)
+    team = make_team(args.seed, args.agents, scene, controller, time.process_time)
     spent = time.process_time() - started_at
     _print(f"{args.agents} agents joined in {team.clock.seconds():.1f} virtual seconds, {spent:.1f} s of processor")
     with _interruptible() as is_over:
         outcome = run_search(team, args.seed, args.seconds, time.process_time, _print_progress, is_over)
-    caption = f"{ground.robots:,} robots, {args.agents} agents, seed {args.seed}, after {outcome.seconds:.0f} s"
+    caption = f"{scene.robots:,} robots, {args.agents} agents, seed {args.seed}, after {outcome.seconds:.0f} s"
     _write_results(
         args, draw_svg(team.simulator.crowd, caption, list_kinds(team, outcome), outcome.trail), asdict(outcome)
     )
@@ -98,9 +98,9 @@ def _interruptible() -> Iterator[Callable[[], bool]]:
         signal.signal(signal.SIGINT, usual)
 
 
-def _run_without_agents(args: argparse.Namespace, ground: CrowdScene) -> int:
+def _run_without_agents(args: argparse.Namespace, scene: CrowdScene) -> int:
     name = args.controller or "search"
-    crowd = Crowd(args.seed, ground)
+    crowd = Crowd(args.seed, scene)
     crowd.place_target_at_random()
     target = crowd.target
     assert target is not None
@@ -113,7 +113,7 @@ def _run_without_agents(args: argparse.Namespace, ground: CrowdScene) -> int:
     spent = time.process_time() - started_at
     at_it = int((((crowd.x - target.x) ** 2 + (crowd.y - target.y) ** 2) ** 0.5 < TARGET_DISTANCE_M).sum())
     rows = {
-        "robots": ground.robots,
+        "robots": scene.robots,
         "controller": name,
         "virtual_s": round(crowd.t, 3),
         "ms_a_step": round(1e3 * spent / max(1, crowd.ticks), 3),
@@ -123,7 +123,7 @@ def _run_without_agents(args: argparse.Namespace, ground: CrowdScene) -> int:
         "digest": crowd.digest(),
     }
     _write_results(
-        args, draw_svg(crowd, f"{ground.robots:,} robots, {name}, seed {args.seed}, after {crowd.t:.0f} s"), rows
+        args, draw_svg(crowd, f"{scene.robots:,} robots, {name}, seed {args.seed}, after {crowd.t:.0f} s"), rows
     )
     for key, value in rows.items():
         _print(f"{key.replace('_', ' '):20}{value}")

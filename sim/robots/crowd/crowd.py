@@ -35,23 +35,23 @@ _SPANS = [LIMITS[key] for key in ("base.vx", "base.vy", "base.wz")]
 
 
 class Crowd:
-    """The robots of ``ground``, numbered from 0; ``seed`` determines their initial positions.
+    """The robots of ``scene``, numbered from 0; ``seed`` determines their initial positions.
 
     ``x y heading`` are their poses, ``vx vy wz`` their velocities in the world's frame, ``ax ay`` their accelerations
     in the last step, ``wish`` their commanded velocities (forward, left, turn), ``ranges`` the length of each ray.
     """
 
-    def __init__(self, seed: int, ground: CrowdScene) -> None:
-        self.scene = ground
+    def __init__(self, seed: int, scene: CrowdScene) -> None:
+        self.scene = scene
         self.target: Target | None = None
         self.ticks = 0
         self._rng = np.random.default_rng(seed)
-        self.x, self.y, self.heading = ground.draw_poses(self._rng)
-        count = ground.robots
+        self.x, self.y, self.heading = scene.draw_poses(self._rng)
+        count = scene.robots
         self.vx, self.vy, self.wz = np.zeros(count), np.zeros(count), np.zeros(count)
         self.ax, self.ay = np.zeros(count), np.zeros(count)
         self.commands = np.zeros((count, 3))
-        self._rays = Rays(ground.width, ground.height, RAYS, RAY_LENGTH_M)
+        self._rays = Rays(scene.width, scene.height, RAYS, RAY_LENGTH_M)
         self._neighbours = Neighbours(CLOSE_M, SKIN_M)
         self.ranges = self.cast_rays()
 
@@ -80,17 +80,17 @@ class Crowd:
 
     def place_target(self, x: float, y: float) -> None:
         """Move the target to this place; raise ``NotPossible`` if a robot or a wall is in the way."""
-        ground = self.scene
-        radius = ground.target_radius
-        if not (radius <= x <= ground.width - radius and radius <= y <= ground.height - radius):
+        scene = self.scene
+        radius = scene.target_radius
+        if not (radius <= x <= scene.width - radius and radius <= y <= scene.height - radius):
             raise NotPossible(
-                f"the target does not fit at ({x:.2f}, {y:.2f}); x must be {radius:g} to {ground.width - radius:g}, "
-                f"y {radius:g} to {ground.height - radius:g}"
+                f"the target does not fit at ({x:.2f}, {y:.2f}); x must be {radius:g} to {scene.width - radius:g}, "
+                f"y {radius:g} to {scene.height - radius:g}"
             )
         gap = np.hypot(self.x - x, self.y - y)
         if gap.min() < FOOTPRINT_RADIUS_M + radius:
             raise NotPossible(f"robot {int(gap.argmin())} stands at ({x:.2f}, {y:.2f}); choose a free place")
-        self.target = Target(x, y, radius, ground.target_height)
+        self.target = Target(x, y, radius, scene.target_height)
         self.ranges = self.cast_rays()
 
     def place_target_at_random(self) -> None:
@@ -104,10 +104,10 @@ class Crowd:
 
     def move(self, body: int, x: float, y: float, heading: float) -> None:
         """Move a robot to this place, at rest; raise ``NotPossible`` if another robot or a wall is in the way."""
-        ground = self.scene
+        scene = self.scene
         inside = (
-            FOOTPRINT_RADIUS_M <= x <= ground.width - FOOTPRINT_RADIUS_M
-            and FOOTPRINT_RADIUS_M <= y <= ground.height - FOOTPRINT_RADIUS_M
+            FOOTPRINT_RADIUS_M <= x <= scene.width - FOOTPRINT_RADIUS_M
+            and FOOTPRINT_RADIUS_M <= y <= scene.height - FOOTPRINT_RADIUS_M
         )
         gap = np.hypot(self.x - x, self.y - y)
         gap[body] = math.inf

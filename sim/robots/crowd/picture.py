@@ -29,10 +29,10 @@ def draw_svg(
     ``kinds`` maps numbers of robots to keys of ``INK``; ``trail`` is the path of the selected robot.
     """
     kinds = kinds or {}
-    ground = crowd.scene
-    scale = (WIDTH - 2 * MARGIN) / ground.width
-    high = scale * ground.height
-    present_kinds = sorted({kinds.get(body, OTHER) for body in range(ground.robots)}, key=list(INK).index)
+    scene = crowd.scene
+    scale = (WIDTH - 2 * MARGIN) / scene.width
+    high = scale * scene.height
+    present_kinds = sorted({kinds.get(body, OTHER) for body in range(scene.robots)}, key=list(INK).index)
 
     def at(x: float, y: float) -> str:
         return f"{MARGIN + scale * x:.1f} {MARGIN + high - scale * y:.1f}"
@@ -49,7 +49,7 @@ def draw_svg(
     rows = list(zip(crowd.x.tolist(), crowd.y.tolist(), crowd.heading.tolist(), strict=True))
     for kind in present_kinds:
         # One path per kind: a disc is a stroke of zero length with round ends, its nose a short line.
-        bodies = [rows[body] for body in range(ground.robots) if kinds.get(body, OTHER) == kind]
+        bodies = [rows[body] for body in range(scene.robots) if kinds.get(body, OTHER) == kind]
         discs = "".join(f"M{at(x, y)}h0" for x, y, _ in bodies)
         wide = f'stroke-width="{2 * FOOTPRINT_RADIUS_M * scale:.2f}" stroke-linecap="round"'
         parts.append(f'<path d="{discs}" stroke="{INK[kind]}" {wide}/>')

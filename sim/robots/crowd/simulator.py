@@ -27,7 +27,7 @@ CONTACT_GAP_M = 0.001
 
 
 class CrowdSimulator(PacedSimulator):
-    """A simulator of many robots, on ``ground``.
+    """A simulator of many robots, on ``scene``.
 
     The first ``driven`` robots, ``robot1`` and so on, obey drivers and stand still without one; ``controller`` moves
     the others.  ``stopwatch`` measures the time spent in ``moving`` robots and in ``telling`` drivers the sensor
@@ -38,16 +38,14 @@ class CrowdSimulator(PacedSimulator):
         self,
         clock: IReactorTime,
         rng: Random,
-        ground: CrowdScene,
+        scene: CrowdScene,
         driven: int = 0,
         controller: Controller = wander,
         stopwatch: Callable[[], float] = lambda: 0.0,
     ) -> None:
-        if type(driven) is not int or not 0 <= driven <= ground.robots:
-            raise SceneError(
-                f"driven must be a whole number from 0 to {ground.robots}, the robots here, not {driven!r}"
-            )
-        self.crowd = Crowd(rng.getrandbits(64), ground)
+        if type(driven) is not int or not 0 <= driven <= scene.robots:
+            raise SceneError(f"driven must be a whole number from 0 to {scene.robots}, the robots here, not {driven!r}")
+        self.crowd = Crowd(rng.getrandbits(64), scene)
         self.names = [f"robot{number}" for number in range(1, driven + 1)]
         self.moving_s = self.reporting_s = 0.0
         self._controller = controller
@@ -97,11 +95,11 @@ class CrowdSimulator(PacedSimulator):
 class CrowdRobot:
     """The robot ``number`` of ``crowd``; without a gate, like a robot that does not know tokens."""
 
-    def __init__(self, number: int, crowd: Crowd, feelings: CrowdSensors, eyes: CrowdCameras) -> None:
+    def __init__(self, number: int, crowd: Crowd, sensors: CrowdSensors, cameras: CrowdCameras) -> None:
         self._number = number
         self._crowd = crowd
-        self._sensors = feelings
-        self._cameras = eyes
+        self._sensors = sensors
+        self._cameras = cameras
 
     def drive(self, vx: float, vy: float, wz: float) -> None:
         """Set the velocity in the robot's frame, until the next command.

@@ -283,9 +283,9 @@ class AiboEmulator:
 
 
 class _Client:
-    def __init__(self, dog: AiboEmulator, service: str, outlet: FaultyOutput, link: Link) -> None:
+    def __init__(self, dog: AiboEmulator, service: str, output: FaultyOutput, link: Link) -> None:
         self.service = service
-        self.output = outlet
+        self.output = output
         self.link = link
         self.lines = LineReader()
         self.commands = CommandReader()

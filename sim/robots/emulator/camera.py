@@ -20,8 +20,8 @@ MAX_REQUEST_BYTES = 8192
 
 
 class _Client(Client):
-    def __init__(self, device: Broadcast[Client], link: Link, outlet: FaultyOutput) -> None:
-        super().__init__(device, link, outlet)
+    def __init__(self, device: Broadcast[Client], link: Link, output: FaultyOutput) -> None:
+        super().__init__(device, link, output)
         self.is_watching = False
         self._camera: Any = device
         self._request: bytes | None = b""

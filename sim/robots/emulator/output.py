@@ -38,9 +38,9 @@ class FaultyOutput:
 class Client:
     """A client of ``device``; its data is ignored."""
 
-    def __init__(self, device: Broadcast[Client], link: Link, outlet: FaultyOutput) -> None:
+    def __init__(self, device: Broadcast[Client], link: Link, output: FaultyOutput) -> None:
         self.link = link
-        self.output = outlet
+        self.output = output
         self._device = device
 
     def data_received(self, data: bytes) -> None:

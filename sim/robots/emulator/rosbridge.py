@@ -203,8 +203,8 @@ class RosbridgeRobot:
 
 
 class _Client:
-    def __init__(self, robot: RosbridgeRobot, outlet: FaultyOutput) -> None:
-        self.output = outlet
+    def __init__(self, robot: RosbridgeRobot, output: FaultyOutput) -> None:
+        self.output = output
         self._robot = robot
         self._socket = WebSocket()
         self._topics: dict[str, dict[str, tuple[float, float]]] = {}

@@ -48,11 +48,11 @@ class _TupleSpaceState:
         quorum = len(self.tuples[mark].council) // 2 + 1
         return {taker for (_, taker), members in self.votes[mark].items() if len(members) >= quorum}
 
-    def can_decide(self, posted: TupleStored) -> bool:
+    def can_decide(self, stored_tuple: TupleStored) -> bool:
         """Return whether a majority of its council lives and has not lost its votes."""
-        seats = zip(posted.council, posted.incarnations, strict=True)
-        able = [member for member, incarnation in seats if self.members.get(member) == incarnation]
-        return 2 * len(able) > len(posted.council)
+        members = zip(stored_tuple.council, stored_tuple.incarnations, strict=True)
+        able = [member for member, incarnation in members if self.members.get(member) == incarnation]
+        return 2 * len(able) > len(stored_tuple.council)
 
 
 def t1(events: Iterable[Event]) -> Iterator[str]:
@@ -67,9 +67,9 @@ def t1(events: Iterable[Event]) -> Iterator[str]:
             case Answered(at, number, tuple() as taken) if number in taking:
                 for fields in taken:
                     confirmed[fields].append(f"node {taking[number].client} at {at:.1f}")
-    for mark, posted in space.tuples.items():
+    for mark, stored_tuple in space.tuples.items():
         if len(space.find_takers(mark)) > 1:
-            yield f"{posted.fields} was accepted for two"
+            yield f"{stored_tuple.fields} was accepted for two"
     for fields, ways in confirmed.items():
         if len(ways) > 1:
             yield f"{fields} was confirmed to {' and '.join(ways)}"
@@ -109,7 +109,7 @@ def t2(events: Iterable[Event]) -> Iterator[str]:
 def _find_unseen(
     space: _TupleSpaceState, acknowledged: Iterable[Hashable], seen: set[Hashable], client: Hashable
 ) -> Iterator[str]:
-    known = {posted.fields: mark for mark, posted in space.tuples.items()}
+    known = {stored_tuple.fields: mark for mark, stored_tuple in space.tuples.items()}
     for fields in acknowledged:
         is_lost = fields not in known or not (space.find_takers(known[fields]) or fields in seen)
         if is_lost:
@@ -135,7 +135,10 @@ def t3(events: Iterable[Event]) -> Iterator[str]:
                     for fields in result:
                         confirmed.setdefault(fields, f"node {client} at {at:.1f}")
                 elif asked[number].what == SURVEY:
-                    before, known = over.pop(number), {posted.fields: posted for posted in space.tuples.values()}
+                    before, known = (
+                        over.pop(number),
+                        {stored_tuple.fields: stored_tuple for stored_tuple in space.tuples.values()},
+                    )
                     for fields in result:
                         if fields in before and space.can_decide(known[fields]):
                             yield f"{fields} was taken by {before[fields]}; node {client} still sees it"
@@ -164,9 +167,9 @@ def t5(events: Iterable[Event]) -> Iterator[str]:
                 putting[number] = fields
             case Answered(_, number) if number in putting:
                 acknowledged.add(putting.pop(number))
-    for mark, posted in space.tuples.items() if is_over else ():
-        if posted.fields in acknowledged and not space.find_takers(mark) and space.can_decide(posted):
-            yield f"{posted.fields} is not held by a living taker, and cannot be taken"
+    for mark, stored_tuple in space.tuples.items() if is_over else ():
+        if stored_tuple.fields in acknowledged and not space.find_takers(mark) and space.can_decide(stored_tuple):
+            yield f"{stored_tuple.fields} is not held by a living taker, and cannot be taken"
 
 
 def t6(events: Iterable[Event]) -> Iterator[str]:

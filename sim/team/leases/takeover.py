@@ -49,16 +49,16 @@ def measure_takeover(seed: int, loss: float = 0.1, ttl: float = 1.5, is_polite: 
     """Return the virtual seconds from the holder's death (or leave) until another agent holds the lease."""
     team = make_team(seed, loss, ttl)
     gone = find_holder(team) or 0
-    began = team.clock.seconds()
+    started_at = team.clock.seconds()
     if is_polite:
         team.nodes[gone].leave(TASK, [place for place in team.agents if place != gone])
     else:
         team.kill(gone)
     while find_holder(team) in (None, gone):
         team.clock.advance(0.001)
-        if team.clock.seconds() - began > 40 * ttl:
+        if team.clock.seconds() - started_at > 40 * ttl:
             break
-    return team.clock.seconds() - began
+    return team.clock.seconds() - started_at
 
 
 def count_false_takeovers(seed: int, hours: float, loss: float = 0.2, ttl: float = 1.5) -> tuple[int, float]:
@@ -93,19 +93,19 @@ def main(arguments: list[str]) -> int:
     parser = argparse.ArgumentParser(prog="python -m sim.team.leases.takeover")
     parser.add_argument("--trials", type=int, default=500, help="trials of each case (default %(default)s)")
     parser.add_argument("--hours", type=int, default=24, help="virtual hours of a healthy holder (default %(default)s)")
-    given = parser.parse_args(arguments)
+    args = parser.parse_args(arguments)
     missed = 0
     for case, loss, ttl, is_polite, (most50, most99) in CASES:
-        took = sorted(measure_takeover(seed, loss, ttl, is_polite) for seed in range(1, given.trials + 1))
+        took = sorted(measure_takeover(seed, loss, ttl, is_polite) for seed in range(1, args.trials + 1))
         p50, p95, p99 = (took[max(0, math.ceil(share * len(took)) - 1)] for share in (0.5, 0.95, 0.99))
         reached = p50 <= most50 and p99 <= most99
         missed += not reached
         limits = ", ".join(f"{name} {most:g}" for name, most in (("p50", most50), ("p99", most99)) if most < math.inf)
         wanted = f"{limits}: {'yes' if reached else 'no'}" if limits else "no target"
         sys.stdout.write(f"{case:36}{p50:7.3f}{p95:7.3f}{p99:7.3f}{took[-1]:7.3f} s  {wanted}\n")
-    false = sum(count_false_takeovers(seed, 1.0, 0.2)[0] for seed in range(1, given.hours + 1))
+    false = sum(count_false_takeovers(seed, 1.0, 0.2)[0] for seed in range(1, args.hours + 1))
     messages = measure_upkeep()
-    sys.stdout.write(f"false takeovers in {given.hours} h at 20 % loss: {false}\n")
+    sys.stdout.write(f"false takeovers in {args.hours} h at 20 % loss: {false}\n")
     sys.stdout.write(f"upkeep of a lease: {messages:.1f} datagrams a second, at most {MAX_MESSAGES_PER_S:g}\n")
     return int(bool(missed or false or messages > MAX_MESSAGES_PER_S))
 

@@ -98,19 +98,19 @@ class LeaseNode:
 
     def has_lease(self, task_id: str) -> bool:
         """Return whether this agent lives and believes that it holds the lease."""
-        lessee = self.lease_clients.get(task_id)
-        return lessee is not None and lessee.lease is not None and self.machine.is_alive
+        lease_client = self.lease_clients.get(task_id)
+        return lease_client is not None and lease_client.lease is not None and self.machine.is_alive
 
-    def leave(self, task_id: str, heirs: Sequence[int] = ()) -> None:
+    def leave(self, task_id: str, agents: Sequence[int] = ()) -> None:
         """Stop the robot, then release the lease."""
         self.world.recorder.stop_robot(self.place, task_id)
-        lessee = self.lease_clients.get(task_id)
-        if lessee is not None:
-            lessee.release([self.world.contacts[heir] for heir in heirs])
+        lease_client = self.lease_clients.get(task_id)
+        if lease_client is not None:
+            lease_client.release([self.world.contacts[heir] for heir in agents])
 
     def _tick(self) -> None:
-        for task_id, lessee in self.lease_clients.items():
-            lease = lessee.lease
+        for task_id, lease_client in self.lease_clients.items():
+            lease = lease_client.lease
             if lease is not None:
                 now = self.machine.seconds()
                 permit = Permit(lease.token, lease.deadline)
@@ -122,13 +122,13 @@ class LeaseNode:
         self.machine.callLater(self.world.tick, self._tick)
 
     def _send_command(self, task_id: str, permit: Permit, device_time: float, remaining: float) -> None:
-        lessee = self.lease_clients[task_id]
+        lease_client = self.lease_clients[task_id]
         gate = self._gates[task_id]
         try:
             gate.admit(permit, self.machine.seconds())
         except StaleCommand:
             return
-        if lessee.lease is None and not lessee.token:
+        if lease_client.lease is None and not lease_client.token:
             return  # the lease was released meanwhile
         self.world.recorder.on_command_sent(self, task_id, permit)
         self.world.clock.callLater(

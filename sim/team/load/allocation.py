@@ -51,7 +51,7 @@ class TaskAllocation:
     def __init__(
         self,
         task: Task,
-        deputies: BiddingAgents,
+        agents: BiddingAgents,
         places: Sequence[int],
         clock: IReactorTime,
         rng: random.Random,
@@ -63,13 +63,13 @@ class TaskAllocation:
         self.held_at = math.inf
         self.overlaps = 0
         self.start_failure = ""
-        self._agents = deputies
+        self._agents = agents
         self._clock = clock
         self._rng = rng
         self._spread = spread
         self._claims = claims
-        known = [deputy for place in places if (deputy := deputies.get(place)) is not None]
-        self.bidders = {deputy.uuid: Bidder(deputy, rng.uniform(1.0, MAX_COST)) for deputy in known}
+        present = [agent for place in places if (agent := agents.get(place)) is not None]
+        self.bidders = {agent.uuid: Bidder(agent, rng.uniform(1.0, MAX_COST)) for agent in present}
 
     async def begin(self) -> None:
         """Pin a council, and let all agents bid."""

@@ -91,43 +91,43 @@ class Auctions(ClientWorkload):
 
     def _start_auction(self) -> None:
         self._begun += 1
-        self._before = {deputy.place: _read_counts(deputy) for deputy in self._agents.list_present()}
+        self._before = {agent.place: _read_counts(agent) for agent in self._agents.list_present()}
         task = Task(f"auction {self._begun}", "none", "nothing", waiting_period=self._settings.waiting)
         rng = self._team.make_rng(f"auction/{self._begun}")
         places = self._joined.list_places()
         rng.shuffle(places)  # the first one requests the council
-        contest = TaskAllocation(task, self._agents, places, self._clock, rng, self._settings.spread)
-        self._allocation = contest
-        Deferred.fromCoroutine(contest.begin())
+        allocation = TaskAllocation(task, self._agents, places, self._clock, rng, self._settings.spread)
+        self._allocation = allocation
+        Deferred.fromCoroutine(allocation.begin())
 
     def _evaluate_auction(self) -> None:
-        contest, self._allocation = self._allocation, None
-        if contest is None:
+        allocation, self._allocation = self._allocation, None
+        if allocation is None:
             return
-        if contest.start_failure:
-            self.start_failures.append(f"{contest.task.task_id} did not begin: {contest.start_failure}")
+        if allocation.start_failure:
+            self.start_failures.append(f"{allocation.task.task_id} did not begin: {allocation.start_failure}")
             return
-        present, best = contest.list_present(), contest.find_best()
-        traffic = [self._traffic_since_start(deputy) for deputy in self._agents.list_present()]
+        present, best = allocation.list_present(), allocation.find_best()
+        traffic = [self._traffic_since_start(agent) for agent in self._agents.list_present()]
         n = max(1, len(present))
         self.messages.append(sum(sent for sent, _, _ in traffic) / n)
         self.busiest.append(max((handled for _, handled, _ in traffic), default=0))
         self.bytes.append(sum(volume for _, _, volume in traffic) / n)
         right = [bidder for bidder in present if bidder.assigned == best]
-        delays = [max(0.0, bidder.changed_at - contest.waiting_ends_at) for bidder in right]
+        delays = [max(0.0, bidder.changed_at - allocation.waiting_ends_at) for bidder in right]
         self.right_shares.append(len(right) / n)
         self.agreement_times += delays
         self.last_agreement_times.append(max(delays) if len(right) == len(present) and delays else math.inf)
-        contest.end()
+        allocation.end()
 
-    def _traffic_since_start(self, deputy: BiddingAgent) -> tuple[int, int, int]:
+    def _traffic_since_start(self, agent: BiddingAgent) -> tuple[int, int, int]:
         """Return a node's datagrams sent and handled since the auction started, and its bytes of requests."""
-        sent, handled, volume = self._before.get(deputy.place, (0, 0, 0))
-        now_sent, now_handled, now_volume = _read_counts(deputy)
+        sent, handled, volume = self._before.get(agent.place, (0, 0, 0))
+        now_sent, now_handled, now_volume = _read_counts(agent)
         if now_handled < handled:  # another life
             return now_sent, now_handled, now_volume
         return now_sent - sent, now_handled - handled, now_volume - volume
 
 
-def _read_counts(deputy: BiddingAgent) -> tuple[int, int, int]:
-    return deputy.counter.sent, deputy.counter.handled_count, deputy.counter.bytes
+def _read_counts(agent: BiddingAgent) -> tuple[int, int, int]:
+    return agent.counter.sent, agent.counter.handled_count, agent.counter.bytes

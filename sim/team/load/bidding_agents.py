@@ -46,8 +46,8 @@ class CountingEndpoint:
         self._endpoint = endpoint
         self.sent = self.received = self.bytes = 0
         # Only the request table below knows the number of retransmissions.
-        asker = endpoint._requester
-        asker._send = self._make_counting_send(asker._send)
+        requester = endpoint._requester
+        requester._send = self._make_counting_send(requester._send)
 
     @property
     def handled_count(self) -> int:
@@ -117,9 +117,9 @@ class BiddingServices:
             return estimate_team_size(node.identity.node_id, node.overlay.contacts(), node.overlay.is_large)
 
         around = Environment(lambda: node.contact, node.overlay.contacts, size, load_strategy)
-        dissemination = AuctionService(node.identity, self._counter, around, self._clock, self._rng)
-        self._stop_calls.append(dissemination.stop)
-        return dissemination
+        auctions = AuctionService(node.identity, self._counter, around, self._clock, self._rng)
+        self._stop_calls.append(auctions.stop)
+        return auctions
 
     def stop(self) -> None:
         """Stop the services after the node's end."""
@@ -167,9 +167,9 @@ class BiddingAgent:
 
     @cached_property
     def _dissemination(self) -> AuctionService:
-        dissemination = self._services.auction_service
-        dissemination._endpoint = self.counter
-        return dissemination
+        auctions = self._services.auction_service
+        auctions._endpoint = self.counter
+        return auctions
 
     def _answer_offer(
         self, peer: Contact, auction: list[object], bids: list[object], age_ms: int, is_shared: bool
@@ -204,14 +204,14 @@ class BiddingAgents:
         """Return the deputies of living nodes, by place."""
         return [self._present[place] for place in sorted(self._present)]
 
-    def is_alive(self, deputy: BiddingAgent) -> bool:
+    def is_alive(self, agent: BiddingAgent) -> bool:
         """Return whether the deputy's node still lives."""
-        return self._present.get(deputy.place) is deputy
+        return self._present.get(agent.place) is agent
 
     def _on_birth(self, place: int, node: Node) -> None:
         self._lives += 1
-        dice = self._rng(f"rooms/{place}/{self._lives}")
-        self._present[place] = BiddingAgent(place, node, self._clock, dice)
+        rng = self._rng(f"rooms/{place}/{self._lives}")
+        self._present[place] = BiddingAgent(place, node, self._clock, rng)
 
     def _on_death(self, place: int, node: Node) -> None:
         deputy = self._present.get(place)

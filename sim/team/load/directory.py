@@ -89,13 +89,13 @@ class Directory(ClientWorkload):
         node = self._team.node(place)
         if not isinstance(node, SwarmNode):
             return
-        began, wanted = self._clock.seconds(), len(self._team.get_joined())
+        started_at, wanted = self._clock.seconds(), len(self._team.get_joined())
         self._max_listed = 0
 
         def changed(records: list[Record]) -> None:
             before, self._max_listed = self._max_listed, max(self._max_listed, len(parse_devices(records)))
             if before < wanted <= self._max_listed:
-                self.seconds.append(self._clock.seconds() - began)
+                self.seconds.append(self._clock.seconds() - started_at)
 
         watch = node.watch_devices(changed)
 

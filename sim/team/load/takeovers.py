@@ -115,16 +115,18 @@ class Takeovers(ClientWorkload):
             return
         for agent in trial.agents:
             trial.lease_clients.append(agent.make_lease_client(trial.task, lambda: self._on_lease_change(trial)))
-        for rank, lessee in enumerate(trial.lease_clients):
+        for rank, lease_client in enumerate(trial.lease_clients):
             if rank:
-                lessee.stand_by(rank)
+                lease_client.stand_by(rank)
             else:
-                lessee.claim()
+                lease_client.claim()
         ttl = self._settings.ttl
         self._clock.callLater(2.0 * ttl + self._rng.uniform(0.0, ttl), self._kill, trial)
 
     def _kill(self, trial: TakeoverTrial) -> None:
-        holder = next((place for place, lessee in enumerate(trial.lease_clients) if lessee.lease is not None), None)
+        holder = next(
+            (place for place, lease_client in enumerate(trial.lease_clients) if lease_client.lease is not None), None
+        )
         if holder is None or not all(self._agents.is_alive(agent) for agent in trial.agents):
             self.void_count += 1  # a fault of the scenario came first
             self._end(trial)
@@ -138,9 +140,9 @@ class Takeovers(ClientWorkload):
 
     def _on_lease_change(self, trial: TakeoverTrial) -> None:
         held = [
-            lessee
-            for agent, lessee in zip(trial.agents, trial.lease_clients, strict=False)
-            if lessee.lease is not None and self._agents.is_alive(agent)
+            lease_client
+            for agent, lease_client in zip(trial.agents, trial.lease_clients, strict=False)
+            if lease_client.lease is not None and self._agents.is_alive(agent)
         ]
         self.overlaps += max(0, len(held) - 1)
         if held and trial.died_at != math.inf:
@@ -166,7 +168,7 @@ class Takeovers(ClientWorkload):
             self._team.start(place)
 
     def _end(self, trial: TakeoverTrial) -> None:
-        for agent, lessee in zip(trial.agents, trial.lease_clients, strict=False):
+        for agent, lease_client in zip(trial.agents, trial.lease_clients, strict=False):
             if self._agents.is_alive(agent):
-                lessee.release()
+                lease_client.release()
         self._busy.difference_update(agent.place for agent in trial.agents)

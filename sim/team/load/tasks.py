@@ -65,25 +65,25 @@ class Tasks(ClientWorkload):
             waiting, ttl = self._settings.waiting, self._settings.ttl
             task = Task(f"task {number}", "none", "nothing", waiting_period=waiting, lease_ttl=ttl)
             places = self._joined.any(self._rng, self._settings.bidders)
-            contest = TaskAllocation(task, self._agents, places, self._clock, self._rng, claims=True)
-            self._allocations.append(contest)
-            if contest.bidders:
-                Deferred.fromCoroutine(contest.begin())
+            allocation = TaskAllocation(task, self._agents, places, self._clock, self._rng, claims=True)
+            self._allocations.append(allocation)
+            if allocation.bidders:
+                Deferred.fromCoroutine(allocation.begin())
 
     def make_final_requests(self) -> None:
         """Count the holders of each task, and end the contests."""
-        self._counted = [len(contest.find_holders()) for contest in self._allocations]
+        self._counted = [len(allocation.find_holders()) for allocation in self._allocations]
         self._right = self._count_nearest_holders()
-        for contest in self._allocations:
-            contest.end()
+        for allocation in self._allocations:
+            allocation.end()
 
     def find_violations(self) -> list[str]:
         """Return tasks without a holder, and tasks held by two agents at once (E2)."""
         found = [f"E2: two held {c.task.task_id} at once" for c in self._allocations if c.overlaps]
         found += [
-            f"{contest.task.task_id} is held by {held} agents{': ' if contest.start_failure else ''}{contest.start_failure}"
-            for contest, held in zip(self._allocations, self._counted, strict=False)
-            if held != 1 and contest.list_present()
+            f"{allocation.task.task_id} is held by {held} agents{': ' if allocation.start_failure else ''}{allocation.start_failure}"
+            for allocation, held in zip(self._allocations, self._counted, strict=False)
+            if held != 1 and allocation.list_present()
         ]
         more = len(found) - MAX_LISTED
         return found[:MAX_LISTED] + ([f"and {more} more tasks"] if more > 0 else [])
@@ -91,10 +91,12 @@ class Tasks(ClientWorkload):
     def collect_metrics(self) -> list[Metric]:
         """Return the share of tasks with exactly one holder, and the times until they had one."""
         n = len(self._allocations)
-        held = self._counted or [len(contest.find_holders()) for contest in self._allocations]
+        held = self._counted or [len(allocation.find_holders()) for allocation in self._allocations]
         right = self._right if self._counted else self._count_nearest_holders()
         took = [
-            contest.held_at - contest.waiting_ends_at for contest in self._allocations if contest.held_at != math.inf
+            allocation.held_at - allocation.waiting_ends_at
+            for allocation in self._allocations
+            if allocation.held_at != math.inf
         ]
         return [
             make_share("tasks.held_once", sum(count == 1 for count in held), n),
@@ -106,5 +108,6 @@ class Tasks(ClientWorkload):
     def _count_nearest_holders(self) -> int:
         """Return the number of tasks held by the nearest living agent."""
         return sum(
-            any(b.agent.uuid == contest.find_best() for b in contest.find_holders()) for contest in self._allocations
+            any(b.agent.uuid == allocation.find_best() for b in allocation.find_holders())
+            for allocation in self._allocations
         )

@@ -82,16 +82,16 @@ def run_scale(arguments: Sequence[str], world: Environment, measure: Measure = m
 def apply_targets(sized: SizeResult) -> list[Metric]:
     """Return the figures of one size with the targets for that size."""
     targets = {curve.metric: curve.get_target(sized.nodes) for curve in CURVES}
-    return [figure.with_target(targets.get(figure.name)) for figure in sized.metrics]
+    return [metric.with_target(targets.get(metric.name)) for metric in sized.metrics]
 
 
 def collect_points(sizes: Mapping[int, SizeResult]) -> dict[str, list[tuple[int, float]]]:
     """Return the values of each figure at the measured sizes, by name."""
     found: dict[str, list[tuple[int, float]]] = {}
     for nodes in sorted(sizes):
-        for figure in sizes[nodes].metrics:
-            if figure.value is not None and math.isfinite(figure.value):
-                found.setdefault(figure.name, []).append((nodes, figure.value))
+        for metric in sizes[nodes].metrics:
+            if metric.value is not None and math.isfinite(metric.value):
+                found.setdefault(metric.name, []).append((nodes, metric.value))
     return found
 
 

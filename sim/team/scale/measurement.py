@@ -106,12 +106,12 @@ class SizeMeasurement:
 
     def run(self) -> SizeResult:
         """Measure all figures; raises ``Ended``."""
-        began, sized = time.process_time(), self._result
+        started_at, sized = time.process_time(), self._result
         hashes = [self._measure_lookups(), self._measure_auctions()]
         if self._nodes <= self._settings.swarm_most:
             hashes.append(self._measure_directory())
         sized.hash = hashlib.blake2s("".join(hashes).encode(), digest_size=16).hexdigest()
-        sized.cpu = time.process_time() - began
+        sized.cpu = time.process_time() - started_at
         return sized
 
     # -- inside -----------------------------------------------------------------------------------------------------

@@ -66,7 +66,7 @@ class MeasurementFile:
 
 def _encode_size(sized: SizeResult) -> dict[str, Any]:
     return {
-        "figures": [figure.to_json() for figure in sized.metrics],
+        "figures": [metric.to_json() for metric in sized.metrics],
         "violations": sized.violations,
         "hash": sized.hash,
         "cpu": round(sized.cpu, 1),

@@ -203,12 +203,14 @@ class TakingTrial(Simulation):
 
     # -- results ----------------------------------------------------------------------------------------------------
 
-    def is_stored(self, posted: StoredTuple) -> bool:
+    def is_stored(self, stored_tuple: StoredTuple) -> bool:
         """Return whether a living node holds this tuple; an unacknowledged one may vanish with its nodes."""
-        held = [node.store.get_slot(posted.tuple_id.slot) for node in self.living.values()]
-        return any(record is not None and parse_record(record) == posted for record in held)
+        held = [node.store.get_slot(stored_tuple.tuple_id.slot) for node in self.living.values()]
+        return any(record is not None and parse_record(record) == stored_tuple for record in held)
 
     def find_violations(self) -> list[str]:
         """Return all violations; must be called while the nodes live."""
-        left = [posted for posted in self.recorder.list_undecided() if self.is_stored(posted)]
-        return find_violations(self.history) + [f"T5: {posted.fields} exists and was not taken" for posted in left]
+        left = [stored_tuple for stored_tuple in self.recorder.list_undecided() if self.is_stored(stored_tuple)]
+        return find_violations(self.history) + [
+            f"T5: {stored_tuple.fields} exists and was not taken" for stored_tuple in left
+        ]

@@ -37,16 +37,16 @@ class VoteRecorder:
         content = parse_record(record)
         if isinstance(content, StoredTuple):
             if content.tuple_id not in self.tuples:
-                seats = [(member.contact.public, member.incarnation) for member in content.council]
+                members = [(member.contact.public, member.incarnation) for member in content.council]
                 self._history.record(
-                    event.TupleStored, content.tuple_id, content.fields, *map(tuple, zip(*seats, strict=True))
+                    event.TupleStored, content.tuple_id, content.fields, *map(tuple, zip(*members, strict=True))
                 )
             self.tuples[content.tuple_id] = content
 
-    def wrap_member(self, seat: TakeAcceptor, expose: Callable[..., object], member: bytes) -> None:
+    def wrap_member(self, acceptor: TakeAcceptor, expose: Callable[..., object], member: bytes) -> None:
         """Wrap the answers of the council member ``member`` to record the takes that it accepts."""
-        confirm: Callable[..., Any] = seat.answer_confirm
-        claim: Callable[..., Any] = seat.answer_claim
+        confirm: Callable[..., Any] = acceptor.answer_confirm
+        claim: Callable[..., Any] = acceptor.answer_claim
 
         def parse_answers(
             asked: Event, key: bytes, places: list[object], answers: list[object]
@@ -73,7 +73,7 @@ class VoteRecorder:
 
             return maybeDeferred(claim, peer, key, places, *rest).addCallback(note_accepted)
 
-        seat.answer_confirm, seat.answer_claim = confirmed, claimed  # type: ignore[method-assign, assignment]
+        acceptor.answer_confirm, acceptor.answer_claim = confirmed, claimed  # type: ignore[method-assign, assignment]
         expose("decree.confirm", confirmed, changes=True)
         expose("decree.claim", claimed, changes=True)
 
@@ -98,4 +98,4 @@ class VoteRecorder:
 
     def list_undecided(self) -> list[StoredTuple]:
         """Return the tuples without a taker accepted by a majority."""
-        return [posted for place, posted in self.tuples.items() if not self.find_takers(place)]
+        return [stored_tuple for place, stored_tuple in self.tuples.items() if not self.find_takers(place)]

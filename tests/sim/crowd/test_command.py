@@ -34,14 +34,14 @@ class PlayedTeam:
         self,
         seed: int,
         agents: int,
-        ground: CrowdScene,
+        scene: CrowdScene,
         controller: Controller = stand,
         stopwatch: Callable[[], float] = lambda: 0.0,
         choose: Any = min,
     ) -> None:
         self.clock = HeapClock()
         self.switchboard: Any = SimpleNamespace(counters=Counter(sent=0), digest=lambda: "0" * 64)
-        self.simulator = CrowdSimulator(self.clock, Random(seed), ground, agents, controller, stopwatch)
+        self.simulator = CrowdSimulator(self.clock, Random(seed), scene, agents, controller, stopwatch)
         self.simulator.start()
         self._choose = choose
 

@@ -17,12 +17,20 @@ from sim.robots.world import World
 
 def twin(crowd: Crowd) -> World:
     """Build a ``World`` with the same robots and target at the same places."""
-    ground = crowd.scene
-    kennels = tuple(
+    crowd_scene = crowd.scene
+    placements = tuple(
         DogPlacement(f"dog{n}", float(crowd.x[n]), float(crowd.y[n]), float(crowd.heading[n]), 1)
         for n in range(len(crowd.x))
     )
-    scene = Scene("twin", ground.width, ground.height, 0.4, ground.target_radius, ground.target_height, kennels)
+    scene = Scene(
+        "twin",
+        crowd_scene.width,
+        crowd_scene.height,
+        0.4,
+        crowd_scene.target_radius,
+        crowd_scene.target_height,
+        placements,
+    )
     world = World(Random(1), scene)
     if crowd.target is not None:
         world.place_target(crowd.target.x, crowd.target.y)

@@ -156,9 +156,9 @@ class DrivenTests(SynchronousTestCase):
 
     def test_pictures_without_a_target_have_no_red(self) -> None:
         """The agents' vision finds no target in pictures of walls, floor and other robots."""
-        yard = CrowdSimulator(self.clock, Random(2), CrowdScene(60, 5.0, 5.0), 60, stand)
-        for name in yard.names:
-            picture = yard.reserve_for_emulator(name).picture()
+        simulator = CrowdSimulator(self.clock, Random(2), CrowdScene(60, 5.0, 5.0), 60, stand)
+        for name in simulator.names:
+            picture = simulator.reserve_for_emulator(name).picture()
             assert picture is not None
             self.assertIsNone(find_target(picture, TargetSize(0.08, 0.22)))
 
@@ -204,23 +204,23 @@ class DrivenTests(SynchronousTestCase):
     def test_costs_are_counted_apart(self) -> None:
         """The stopwatch counts the time for motion and the time for observations separately."""
         moments = iter(np.arange(0.0, 1000.0, 1.0).tolist())
-        yard = CrowdSimulator(self.clock, Random(1), CrowdScene(5, 6.0, 4.0), 1, stand, lambda: next(moments))
-        yard.start()
+        simulator = CrowdSimulator(self.clock, Random(1), CrowdScene(5, 6.0, 4.0), 1, stand, lambda: next(moments))
+        simulator.start()
         self.clock.advance(TICK_S * 10.5)
-        self.assertEqual((yard.moving_s, yard.reporting_s), (10.0, 10.0))
+        self.assertEqual((simulator.moving_s, simulator.reporting_s), (10.0, 10.0))
 
     def test_time_lost_is_not_made_up_for(self) -> None:
         """After a pause of the machine the simulation does not catch up, and drops commands from before it."""
         clock = Clock()
-        yard = CrowdSimulator(clock, Random(1), CrowdScene(5, 6.0, 4.0), 1, stand)
-        yard.start()
-        yard.drive("robot1", 0.16, 0.0, 0.0)
+        simulator = CrowdSimulator(clock, Random(1), CrowdScene(5, 6.0, 4.0), 1, stand)
+        simulator.start()
+        simulator.drive("robot1", 0.16, 0.0, 0.0)
         clock.advance(TICK_S)
-        self.assertGreater(float(yard.crowd.commands[0, 0]), 0.0)
+        self.assertGreater(float(simulator.crowd.commands[0, 0]), 0.0)
         clock.advance(5.0)
-        self.assertEqual((yard.crowd.ticks, float(yard.crowd.commands[0, 0])), (2, 0.0))
+        self.assertEqual((simulator.crowd.ticks, float(simulator.crowd.commands[0, 0])), (2, 0.0))
         clock.advance(TICK_S)
-        self.assertEqual(yard.crowd.ticks, 3)
-        yard.stop()
+        self.assertEqual(simulator.crowd.ticks, 3)
+        simulator.stop()
         clock.advance(1.0)
-        self.assertEqual(yard.crowd.ticks, 3)
+        self.assertEqual(simulator.crowd.ticks, 3)

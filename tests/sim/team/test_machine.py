@@ -35,13 +35,13 @@ class MachineTests(SynchronousTestCase):
 
     def test_waiting_for_what_is_left_ends(self) -> None:
         """A timer that is set again for the remaining time reaches its deadline in spite of rounding."""
-        dice = random.Random(1)
+        rng = random.Random(1)
         for _ in range(300):
-            self.world = HeapClock(1e6 + dice.random())  # coarser resolution than a clock that starts at 0
-            rate = dice.uniform(0.99, 1.01)
+            self.world = HeapClock(1e6 + rng.random())  # coarser resolution than a clock that starts at 0
+            rate = rng.uniform(0.99, 1.01)
             machine = Machine(self.world, rate, -rate * self.world.seconds())
             turns: list[int] = []
-            deadline = machine.seconds() + 0.3 * dice.random()
+            deadline = machine.seconds() + 0.3 * rng.random()
 
             def again(machine: Machine = machine, deadline: float = deadline, turns: list[int] = turns) -> None:
                 turns.append(1)

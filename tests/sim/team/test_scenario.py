@@ -132,20 +132,20 @@ class ScenarioTests(SynchronousTestCase):
 
     def test_any_file_is_a_scenario_or_is_refused(self) -> None:
         """A damaged file is either valid or rejected with a remedy; no other exception is raised."""
-        dice, refused = random.Random(1), 0
+        rng, refused = random.Random(1), 0
         values = ("-1", "nan", "inf", "true", "'x'", "[]", "{}", "[1, 'a']", "9" * 30, "[[1]]", "1979-05-27")
         for _ in range(600):
             lines = WHOLE.splitlines()
-            for _ in range(dice.randint(1, 3)):
-                at = dice.randrange(len(lines))
-                if dice.random() < 0.6 and "=" in lines[at]:
-                    lines[at] = f"{lines[at].partition('=')[0]}= {dice.choice(values)}"
-                elif dice.random() < 0.5:
+            for _ in range(rng.randint(1, 3)):
+                at = rng.randrange(len(lines))
+                if rng.random() < 0.6 and "=" in lines[at]:
+                    lines[at] = f"{lines[at].partition('=')[0]}= {rng.choice(values)}"
+                elif rng.random() < 0.5:
                     lines.insert(
-                        at, dice.choice([*lines, "[[join]]", "[fault]", "load = 3", "[load.lookups.x]", "x.y=1"])
+                        at, rng.choice([*lines, "[[join]]", "[fault]", "load = 3", "[load.lookups.x]", "x.y=1"])
                     )
                 else:
-                    lines[at] = lines[at][: len(lines[at]) // 2] + dice.choice('[]="{}\x00')
+                    lines[at] = lines[at][: len(lines[at]) // 2] + rng.choice('[]="{}\x00')
             try:
                 _read("\n".join(lines))
             except BadSetting as error:

@@ -66,12 +66,12 @@ class LargeTests(SynchronousTestCase):
             winner = crowd.costs.index(min(crowd.costs))
             carry = crowd._send_message
 
-            def killing(place: int, errand, crowd=crowd, winner=winner, carry=carry) -> None:  # type: ignore[no-untyped-def]
-                carry(place, errand)
+            def killing(place: int, message, crowd=crowd, winner=winner, carry=carry) -> None:  # type: ignore[no-untyped-def]
+                carry(place, message)
                 if place == winner and not crowd.dead:
                     # The first relay of the winning bid confirms it and then dies.
-                    to = crowd._places[errand.to.node_id]
-                    if crowd.auction.find_rank(errand.to.node_id) is None:
+                    to = crowd._places[message.to.node_id]
+                    if crowd.auction.find_rank(message.to.node_id) is None:
                         crowd.schedule(crowd.now + 0.1, crowd.dead.add, to)
 
             crowd._send_message = killing  # type: ignore[method-assign]
