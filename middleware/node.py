@@ -71,10 +71,10 @@ REVIEW_INTERVAL_S = 10.0
 class SwarmNode(Service):
     """One node of a team.
 
-    ``device`` is the node's own description; ``wall`` returns seconds since the epoch, for display only; ``door`` is
+    ``device`` is the node's own description; ``wall`` returns seconds since the epoch, for display only; ``admission`` is
     the admission check.  ``team`` is the closed team of that check, None in an open team; it starts and stops with the
     node.  ``deployed`` holds the modules that operators pushed and the device's owner allowed; ``stop_deployed`` ends
-    their processes.  ``halt`` is the stop state of the whole team.  ``later(seconds, call, ...)`` is a timer that ends
+    their processes.  ``stop_state`` is the stop state of the whole team.  ``later(seconds, call, ...)`` is a timer that ends
     with the node.
     """
 
@@ -92,16 +92,16 @@ class SwarmNode(Service):
         rng: random.Random,
         wall: Callable[[], float],
         lease: float = 1.0,
-        door: AdmissionCheck = OPEN_ADMISSION,
+        admission: AdmissionCheck = OPEN_ADMISSION,
         lan: Multicast | None = None,
     ) -> None:
         self.clock = clock
         self.rng = rng
         self.wall = wall
         self.store = store
-        self.entangled = EntangledNode(identity, team_key, network, store, clock, rng, lease, wall, door, lan)
+        self.entangled = EntangledNode(identity, team_key, network, store, clock, rng, lease, wall, admission, lan)
         self.uuid = identity.node_id.hex()
-        self._admission = door
+        self._admission = admission
         self._chores = Background(clock)
         self.later = self._chores.later
         self.team: Team | None = None
@@ -231,7 +231,7 @@ class SwarmNode(Service):
     # -- devices ----------------------------------------------------------------------------------------------------
 
     def watch_devices(self, changed: OnChanged, keep: bool = False) -> DeviceSubscription:
-        """Watch the devices of the team; ``devices_of`` reads the records, ``keep`` also stores them.
+        """Watch the devices of the team; ``parse_devices`` reads the records, ``keep`` also stores them.
 
         In a large team each update takes a round of reads, and ``keep`` has no effect.
         """
@@ -294,21 +294,21 @@ class SwarmNode(Service):
         return self.entangled.watch(group_key(task_id), changed, keep)
 
     def join_group(
-        self, task: Task, heard: OnMembers, ordered: OnChanged = lambda records: None, panel: Reporters | None = None
+        self, task: Task, on_members: OnMembers, ordered: OnChanged = lambda records: None, reporters: Reporters | None = None
     ) -> Group:
         """Take part in a task, and bid for it if it has a council.
 
-        In a large team only the reporters (``panel``) of a task with a council write records, except for tasks that
+        In a large team only the reporters (``reporters``) of a task with a council write records, except for tasks that
         are divided among devices, which need the records of all participants.
         """
         from middleware.consensus.bidding.reporters import make_reporters
 
-        panel = panel or make_reporters(self.uuid, group_key(task.task_id))
+        reporters = reporters or make_reporters(self.uuid, group_key(task.task_id))
         enter = partial(self.start_bidding, task, task.generation) if task.council else None
         view = self._make_view(task.strategy) if task.council else None
         devices = self.estimate_team_size if task.council and not task.group else lambda: 1
-        callbacks = (heard, self._log_failures, ordered, enter, view)
-        return Group(task, self.entangled, *callbacks, panel, devices, self.clock.seconds, self.later)
+        callbacks = (on_members, self._log_failures, ordered, enter, view)
+        return Group(task, self.entangled, *callbacks, reporters, devices, self.clock.seconds, self.later)
 
     def start_bidding(self, task: Task, epoch: int, on_summary: OnSummary) -> Bidding:
         """Bid for ``task`` in ``epoch``; call ``on_summary`` with the bids that the task's council announces."""
@@ -326,9 +326,9 @@ class SwarmNode(Service):
         """Record the result of a task; this node's role must allow orders."""
         return self.entangled.put(group_key(task_id), RESULT, result.pack(), "team")
 
-    def publish_decision_record(self, verdict: DecisionRecord) -> None:
+    def publish_decision_record(self, record: DecisionRecord) -> None:
         """Publish a decision record of this node's agent; it outlives this node's lease."""
-        put = maybeDeferred(self.entangled.put, verdict.key, verdict.slot, verdict.pack(), "team")
+        put = maybeDeferred(self.entangled.put, record.key, record.slot, record.pack(), "team")
         self._log_failures(put)
 
     async def cancel(self, task: Task, result: Result) -> Stored:
@@ -421,9 +421,9 @@ class SwarmNode(Service):
         around = Environment(
             lambda: entangled.contact, entangled.overlay.contacts, self.estimate_team_size, self.get_strategy, may_bid
         )
-        dissemination = AuctionService(entangled.identity, entangled.endpoint, around, self.clock, self.rng)
-        self._stop_calls.append(dissemination.stop)
-        return dissemination
+        service = AuctionService(entangled.identity, entangled.endpoint, around, self.clock, self.rng)
+        self._stop_calls.append(service.stop)
+        return service
 
     # -- requests of peers ---------------------------------------------------------------------------------------------
 

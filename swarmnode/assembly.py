@@ -71,12 +71,12 @@ def check_team(settings: Settings) -> None:
         raise BadSetting(settings.origin, "[node] team_key", problem, "remove team_key, or the membership")
 
 
-def assemble_node(settings: Settings, seams: Dependencies) -> Assembly:
+def assemble_node(settings: Settings, dependencies: Dependencies) -> Assembly:
     """Connect one node, agent and driver as ``settings`` require (thesis, Algorithm 4.1).
 
     Raises ``SwarmError`` or ``DriverError`` if that is not possible.
     """
-    if seams.membership is None:
+    if dependencies.membership is None:
         check_team(settings)
     _check_robot(settings)
     injector = None
@@ -84,17 +84,19 @@ def assemble_node(settings: Settings, seams: Dependencies) -> Assembly:
         from agents.catalogue import create_task
         from middleware.faults.injector import FaultInjector  # imported on demand, to save memory
 
-        injector = FaultInjector(seams.clock, seams.wall, seams.rng, seams.network, seams.process)
-        seams = replace(seams, network=injector.open_network, wall=injector.wall)
-    device, driver = _make_device(settings), _make_driver(settings, seams)
-    node = _make_node(device, settings, seams)
+        injector = FaultInjector(
+            dependencies.clock, dependencies.wall, dependencies.rng, dependencies.network, dependencies.process
+        )
+        dependencies = replace(dependencies, network=injector.open_network, wall=injector.wall)
+    device, driver = _make_device(settings), _make_driver(settings, dependencies)
+    node = _make_node(device, settings, dependencies)
     _expose_methods(node, settings, driver)
     if injector is not None:
         driver = None if driver is None else injector.wrap_driver(driver)
         injector.expose(node, create_task)
     if settings.deployment.allow:
-        _enable_deployment(node, settings, seams)
-    return Assembly(node, _make_agent(node, settings, driver, seams), driver)
+        _enable_deployment(node, settings, dependencies)
+    return Assembly(node, _make_agent(node, settings, driver, dependencies), driver)
 
 
 def _check_robot(settings: Settings) -> None:
@@ -127,36 +129,38 @@ def _make_device(settings: Settings) -> Device:
     )
 
 
-def _make_driver(settings: Settings, seams: Dependencies) -> Driver | None:
+def _make_driver(settings: Settings, dependencies: Dependencies) -> Driver | None:
     """Return the driver of the robot, not yet connected; None without a robot."""
     wanted = settings.driver
     if not wanted.kind:
         return None
-    return create_driver(wanted.kind, wanted.options, settings.node.name, seams.clock, seams.connector, wanted.parts)
+    return create_driver(
+        wanted.kind, wanted.options, settings.node.name, dependencies.clock, dependencies.connector, wanted.parts
+    )
 
 
-def _make_node(device: Device, settings: Settings, seams: Dependencies) -> SwarmNode:
+def _make_node(device: Device, settings: Settings, dependencies: Dependencies) -> SwarmNode:
     """Return the node of ``device``, a member of its team."""
-    team = _load_team(seams)
+    team = _load_team(dependencies)
     known = [] if team is None else team.membership.known_nodes
     node = SwarmNode(
         device,
-        load_identity(seams.store, seams.rng) if team is None else team.identity,
+        load_identity(dependencies.store, dependencies.rng) if team is None else team.identity,
         settings.node.team_secret if team is None else team.secret,
         list(dict.fromkeys([*settings.node.known_nodes, *known])),
-        seams.network(),
-        seams.store,
-        seams.clock,
-        seams.rng,
-        seams.wall,
+        dependencies.network(),
+        dependencies.store,
+        dependencies.clock,
+        dependencies.rng,
+        dependencies.wall,
         settings.node.presence_lease,
-        lan=None if seams.lan is None else seams.lan(),
-        door=OPEN_ADMISSION if team is None else team.admission,
+        lan=None if dependencies.lan is None else dependencies.lan(),
+        admission=OPEN_ADMISSION if team is None else team.admission,
     )
     if team is None:
         _log.warn("{name} is in an open team: {open}", name=device.name, open=OPEN_TEAM_WARNING)
     else:
-        team.attach(node.entangled, seams.clock)
+        team.attach(node.entangled, dependencies.clock)
         node.team = team
     return node
 
@@ -171,11 +175,13 @@ def _expose_methods(node: SwarmNode, settings: Settings, driver: Driver | None) 
     node.stop_state = expose_stops(node.entangled, node.rng, node.later, node.presence.announce_stops)
 
 
-def _make_agent(node: SwarmNode, settings: Settings, driver: Driver | None, seams: Dependencies) -> Service | None:
+def _make_agent(
+    node: SwarmNode, settings: Settings, driver: Driver | None, dependencies: Dependencies
+) -> Service | None:
     """Return the agent of the device; None if the settings have none."""
     if not settings.agent.module or driver is None:
         return None
-    agent = load_agent(settings.agent.module)(node, driver, seams.clock, seams.rng)
+    agent = load_agent(settings.agent.module)(node, driver, dependencies.clock, dependencies.rng)
     if settings.agent.name:
         place = f" on {settings.node.laptop}" if settings.node.laptop else ""
         _log.info(
@@ -184,13 +190,13 @@ def _make_agent(node: SwarmNode, settings: Settings, driver: Driver | None, seam
     return agent
 
 
-def _load_team(seams: Dependencies) -> Team | None:
+def _load_team(dependencies: Dependencies) -> Team | None:
     """Return the closed team of the node; None, without importing its modules, in an open team."""
-    if seams.membership is None:
+    if dependencies.membership is None:
         return None
     from middleware.admission.team import Team
 
-    return Team(seams.membership, seams.store, seams.wall, seams.rng)
+    return Team(dependencies.membership, dependencies.store, dependencies.wall, dependencies.rng)
 
 
 def _make_camera_knob(driver: Filming) -> TunableSetting:
@@ -199,7 +205,7 @@ def _make_camera_knob(driver: Filming) -> TunableSetting:
     return TunableSetting("camera_fps", about, read, driver.set_camera_fps, check, "per second", 0.0, MAX_FPS)
 
 
-def _enable_deployment(node: SwarmNode, settings: Settings, seams: Dependencies) -> None:
+def _enable_deployment(node: SwarmNode, settings: Settings, dependencies: Dependencies) -> None:
     """Let the node run modules that its operators push; the modules for this are imported only if it is allowed."""
     from middleware.deployment.deployment import Author, Deployment
     from middleware.deployment.module_store import MemoryModuleStore
@@ -217,9 +223,9 @@ def _enable_deployment(node: SwarmNode, settings: Settings, seams: Dependencies)
         node.wall,
         node.later,
         settings.deployment,
-        MemoryModuleStore() if seams.shelf is None else seams.shelf,
+        MemoryModuleStore() if dependencies.shelf is None else dependencies.shelf,
         author_of,
-        ProcessChannel if seams.spawn is None else seams.spawn,
+        ProcessChannel if dependencies.spawn is None else dependencies.spawn,
         node.clock.seconds,
     )
     node.deployed, node.stop_deployed = deployment.modules, deployment.stop

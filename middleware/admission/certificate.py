@@ -107,71 +107,71 @@ def wrap_grant(grant: bytes) -> bytes:
     return bytes(msgpack.packb([0, grant]))
 
 
-def sign_join(invitation: Identity, public: bytes, wish: str) -> bytes:
+def sign_join(invitation: Identity, public: bytes, requested_name: str) -> bytes:
     """Sign the newcomer's key ``public`` and the name that it asks for with the invitation's key."""
-    return invitation.sign(_join_content(public, wish))
+    return invitation.sign(_join_content(public, requested_name))
 
 
-def is_join_signature(invitation: bytes, public: bytes, wish: str, signature: bytes) -> bool:
-    """Return whether the invitation's key signed ``public`` and ``wish``."""
-    return is_signature_valid(invitation, _join_content(public, wish), signature)
+def is_join_signature(invitation: bytes, public: bytes, requested_name: str, signature: bytes) -> bool:
+    """Return whether the invitation's key signed ``public`` and ``requested_name``."""
+    return is_signature_valid(invitation, _join_content(public, requested_name), signature)
 
 
 def issue_certificate(
     bootstrap: Identity,
     grant: bytes,
     invite: tuple[bytes, Invite],
-    newcomer: tuple[bytes, str, bytes],
+    applicant: tuple[bytes, str, bytes],
     name: str,
     now: int,
 ) -> bytes:
     """Return the pass that a bootstrap node issues.
 
-    ``invite`` is the invitation, packed and parsed; ``newcomer`` is its key, wish and proof.
+    ``invite`` is the invitation, packed and parsed; ``applicant`` is its key, wish and proof.
     """
     packed, terms = invite
-    public, wish, signature = newcomer
+    public, requested_name, signature = applicant
     end = now + terms.life
     admission = bootstrap.sign(_admission_content(terms.public, public, name, now, end))
-    return bytes(msgpack.packb([1, packed, wish, signature, name, now, end, admission, grant]))
+    return bytes(msgpack.packb([1, packed, requested_name, signature, name, now, end, admission, grant]))
 
 
-def renew_certificate(bootstrap: Identity, grant: bytes, member: Member, shown: bytes, now: int) -> bytes:
-    """Renew the pass ``shown`` of ``member`` from ``now`` on, with its original validity.
+def renew_certificate(bootstrap: Identity, grant: bytes, member: Member, certificate: bytes, now: int) -> bytes:
+    """Renew the pass ``certificate`` of ``member`` from ``now`` on, with its original validity.
 
     ``grant`` is the grant of ``bootstrap``.  Raises ``Malformed`` for the pass of a guest.
     """
-    content, end = _extract_signed_content(member, shown), now + member.life
+    content, end = _extract_signed_content(member, certificate), now + member.life
     signature = bootstrap.sign(_renewal_content(member.public, content, now, end))
     return bytes(msgpack.packb([3, content, now, end, signature, grant]))
 
 
-def _extract_signed_content(member: Member, shown: bytes) -> list[Any]:
+def _extract_signed_content(member: Member, certificate: bytes) -> list[Any]:
     """Return the operator-signed content of the pass of ``member``."""
-    kind, *rest = unpack_fields(shown)
+    kind, *rest = unpack_fields(certificate)
     if kind == 0:
         return [rest[0]]
     if kind == 1:
-        invite, wish, signature, name, *_ = rest
-        return [invite, wish, signature, name, member.admitter]
+        invite, requested_name, signature, name, *_ = rest
+        return [invite, requested_name, signature, name, member.admitter]
     if kind == 3:
         return list(rest[0])
     raise Malformed("the pass of a guest cannot be renewed")
 
 
-def extract_grant(operator: bytes, shown: bytes) -> tuple[Grant, bytes] | None:
+def extract_grant(operator: bytes, certificate: bytes) -> tuple[Grant, bytes] | None:
     """Return the operator's grant in a renewed pass, parsed and packed; None if the member joined by a code."""
-    content = unpack_fields(shown)[1]
+    content = unpack_fields(certificate)[1]
     return (_parse_grant(operator, content[0]), content[0]) if len(content) == 1 else None
 
 
-def extract_entries(public: bytes, shown: bytes) -> list[bytes]:
+def extract_entries(public: bytes, certificate: bytes) -> list[bytes]:
     """Return the entries for the membership list that a valid pass of ``public`` contains; none for a guest."""
-    kind, *rest = unpack_fields(shown)
+    kind, *rest = unpack_fields(certificate)
     if kind == 0:
         return [bytes(rest[0])]
     grants = [bytes(rest[0][0])] if kind == 3 and len(rest[0]) == 1 else []
-    return [*grants, bytes(msgpack.packb([ADMISSION_KIND, public, shown]))] if kind in (1, 3) else []
+    return [*grants, bytes(msgpack.packb([ADMISSION_KIND, public, certificate]))] if kind in (1, 3) else []
 
 
 def issue_guest_certificate(
@@ -183,20 +183,20 @@ def issue_guest_certificate(
     """
     end = now + min(life, GUEST_LIFE_S)
     signature = gateway.sign(_guest_content(public, name, now, end))
-    shown = bytes(msgpack.packb([2, name, now, end, signature, gateway.public, own]))
-    if len(shown) > MAX_CERTIFICATE_BYTES:
+    certificate = bytes(msgpack.packb([2, name, now, end, signature, gateway.public, own]))
+    if len(certificate) > MAX_CERTIFICATE_BYTES:
         raise Malformed("the pass of this gateway is too long to embed in a guest's pass; run swarm promote for it")
-    return shown
+    return certificate
 
 
-def verify_certificate(operator: bytes, public: bytes, shown: bytes) -> Member:
+def verify_certificate(operator: bytes, public: bytes, certificate: bytes) -> Member:
     """Verify a pass of ``public`` against the ``operator``'s key; raises ``Malformed`` or ``Forged``.
 
     The caller checks dates and revocations.
     """
-    if len(shown) > MAX_CERTIFICATE_BYTES:
-        raise Malformed(f"the pass has {len(shown)} bytes, more than {MAX_CERTIFICATE_BYTES}")
-    fields = unpack_fields(shown)
+    if len(certificate) > MAX_CERTIFICATE_BYTES:
+        raise Malformed(f"the pass has {len(certificate)} bytes, more than {MAX_CERTIFICATE_BYTES}")
+    fields = unpack_fields(certificate)
     try:
         kind, *rest = fields
         if kind == 0:
@@ -242,30 +242,30 @@ def _verify_renewal(operator: bytes, public: bytes, fields: list[Any]) -> Member
 
 def _verify_invited(operator: bytes, public: bytes, content: list[Any]) -> Member:
     """Return the member that joined by a code, without dates."""
-    packed, wish, signature, name, admitter = content
-    invite = _verify_invitation(operator, public, packed, wish, signature, name)
+    packed, requested_name, signature, name, admitter = content
+    invite = _verify_invitation(operator, public, packed, requested_name, signature, name)
     since = max(0, invite.not_before - MAX_CLOCK_SKEW_S)
     origin = invite.public, check_bytes(admitter, 32)
     return Member(public, name, invite.roles, 0, 0, *origin, uses=invite.uses, since=since, life=invite.life)
 
 
-def _verify_invitation(operator: bytes, public: bytes, packed: Any, wish: Any, signature: Any, name: Any) -> Invite:
-    """Return the invitation: its key signed ``public`` and ``wish``, and with this wish it allows ``name``."""
+def _verify_invitation(operator: bytes, public: bytes, packed: Any, requested_name: Any, signature: Any, name: Any) -> Invite:
+    """Return the invitation: its key signed ``public`` and ``requested_name``, and with this wish it allows ``name``."""
     invite = open_statement(operator, packed)
     if not isinstance(invite, Invite):
         raise Malformed("the pass does not begin with an invitation")
-    if wish != "":
-        check_name(wish)
-    if not is_join_signature(invite.public, public, wish, check_bytes(signature, 64)):
+    if requested_name != "":
+        check_name(requested_name)
+    if not is_join_signature(invite.public, public, requested_name, check_bytes(signature, 64)):
         raise Forged("the invitation's signature does not cover this key")
-    if not invite.allows(check_name(name), wish):
+    if not invite.allows(check_name(name), requested_name):
         raise Forged("the invitation does not allow this name")
     return invite
 
 
 def _verify_admission(operator: bytes, public: bytes, fields: list[Any]) -> Member:
-    packed, wish, signature, name, begin, end, admission, packed_grant = fields
-    invite = _verify_invitation(operator, public, packed, wish, signature, name)
+    packed, requested_name, signature, name, begin, end, admission, packed_grant = fields
+    invite = _verify_invitation(operator, public, packed, requested_name, signature, name)
     check_number(begin, max(0, invite.not_before - MAX_CLOCK_SKEW_S), invite.not_after)
     check_number(end, begin + 1, begin + invite.life)
     grant = _parse_grant(operator, packed_grant)
@@ -281,19 +281,19 @@ def _verify_admission(operator: bytes, public: bytes, fields: list[Any]) -> Memb
 
 
 def _verify_guest(operator: bytes, public: bytes, fields: list[Any]) -> Member:
-    name, begin, end, signature, gateway, own = fields
+    name, begin, end, signature, gateway_key, own = fields
     if not isinstance(own, bytes):
         raise Malformed("the guest's pass does not contain a gateway's pass")
-    voucher = verify_certificate(operator, check_bytes(gateway, 32), own)
+    gateway = verify_certificate(operator, check_bytes(gateway_key, 32), own)
     check_number(begin)
     check_number(end, begin + 1, begin + GUEST_LIFE_S)
-    if voucher.gateway is not None:
+    if gateway.gateway is not None:
         raise Forged("a guest cannot vouch for another guest")
     if not is_signature_valid(
-        voucher.public, _guest_content(public, check_name(name), begin, end), check_bytes(signature, 64)
+        gateway.public, _guest_content(public, check_name(name), begin, end), check_bytes(signature, 64)
     ):
         raise Forged("the gateway's signature is not valid")
-    return Member(public, name, ("device",), begin, end, gateway=voucher)
+    return Member(public, name, ("device",), begin, end, gateway=gateway)
 
 
 def _guest_content(public: bytes, name: str, begin: int, end: int) -> bytes:
@@ -314,8 +314,8 @@ def _parse_own_grant(operator: bytes, public: bytes, packed_grant: Any) -> Grant
     return grant
 
 
-def _join_content(public: bytes, wish: str) -> bytes:
-    return _JOIN + public + wish.encode()
+def _join_content(public: bytes, requested_name: str) -> bytes:
+    return _JOIN + public + requested_name.encode()
 
 
 def _admission_content(invitation: bytes, public: bytes, name: str, begin: int, end: int) -> bytes:

@@ -57,7 +57,7 @@ def start_incarnation(store: Store, wall: float, rng: random.Random) -> Incarnat
 
 
 class ClosedAdmission:
-    """Verify passes against the membership list ``roll``; implements ``AdmissionCheck``.
+    """Verify passes against the membership list ``membership_list``; implements ``AdmissionCheck``.
 
     ``membership`` returns this node's own membership.  Verified passes are cached by digest, so each pass costs its
     signature checks once.
@@ -66,18 +66,18 @@ class ClosedAdmission:
     max_pass_bytes = MAX_CERTIFICATE_BYTES
 
     def __init__(
-        self, roll: MembershipList, membership: Callable[[], Membership], wall: Callable[[], float], life: Incarnation
+        self, membership_list: MembershipList, membership: Callable[[], Membership], wall: Callable[[], float], incarnation: Incarnation
     ) -> None:
-        self.incarnation = life
-        self.fingerprint = hashlib.blake2s(roll.operator, digest_size=8, person=b"team").digest()
-        self._membership_list = roll
+        self.incarnation = incarnation
+        self.fingerprint = hashlib.blake2s(membership_list.operator, digest_size=8, person=b"team").digest()
+        self._membership_list = membership_list
         self._membership = membership
         self._wall = wall
         self._own_member = membership().member
-        self.publish_entry: Callable[[bytes], object] = lambda packed: roll.add(packed, wall())
+        self.publish_entry: Callable[[bytes], object] = lambda packed: membership_list.add(packed, wall())
         self._verified: OrderedDict[bytes, Member] = OrderedDict()
         self._session_members: OrderedDict[bytes, Member] = OrderedDict()
-        self._unlisted_certificates: dict[bytes, bytes] = {}  # passes of members in ``_met`` that are not on the list
+        self._unlisted_certificates: dict[bytes, bytes] = {}  # passes of members in ``_session_members`` that are not on the list
         self._authorities: dict[bytes, Authority] = {}
         self._cached_at = (b"", 0.0)
 
@@ -93,10 +93,10 @@ class ClosedAdmission:
             self._own_member, self._membership().certificate, self._wall()
         )
 
-    def find_refusal(self, public: bytes, shown: bytes) -> str:
-        """Return the refusal for a node with key ``public`` and pass ``shown``; empty if it is accepted."""
+    def find_refusal(self, public: bytes, peer_pass: bytes) -> str:
+        """Return the refusal for a node with key ``public`` and pass ``peer_pass``; empty if it is accepted."""
         try:
-            member = self._verify_certificate(public, shown)
+            member = self._verify_certificate(public, peer_pass)
         except RemoteError:
             return FOREIGN
         now = self._wall()
@@ -104,18 +104,18 @@ class ClosedAdmission:
             self._membership_list.update_member(member, now), now
         ) or self._check_guest_quota(member)
 
-    def admit(self, public: bytes, shown: bytes) -> str:
+    def admit(self, public: bytes, peer_pass: bytes) -> str:
         """Judge a node that has confirmed its session, and remember it if it is accepted."""
-        refusal = self.find_refusal(public, shown)
+        refusal = self.find_refusal(public, peer_pass)
         if not refusal:
-            member = self._verify_certificate(public, shown)
-            refusal = self._add_to_list(public, shown, member)
+            member = self._verify_certificate(public, peer_pass)
+            refusal = self._add_to_list(public, peer_pass, member)
         if not refusal:
             self._session_members[public] = member
             self._session_members.move_to_end(public)
             self._authorities.pop(public, None)
             if self.is_unlisted(public):
-                self._unlisted_certificates[public] = shown
+                self._unlisted_certificates[public] = peer_pass
             if len(self._session_members) > MAX_SESSION_MEMBERS:
                 self._unlisted_certificates.pop(self._session_members.popitem(last=False)[0], None)
         return refusal
@@ -129,13 +129,13 @@ class ClosedAdmission:
         """Return the current roles of a key; none for strangers and for revoked or expired members."""
         return frozenset(self.find_authority(public).roles)
 
-    def _add_to_list(self, public: bytes, shown: bytes, member: Member) -> str:
+    def _add_to_list(self, public: bytes, peer_pass: bytes, member: Member) -> str:
         """Add a member to the membership list, so that all nodes know it and the operator can revoke it by name.
 
         Returns a refusal if the list is full, because only listed keys are members.  Guests are not listed; their
         gateway is.  Unknown renewals are listed, too.
         """
-        entries = extract_entries(public, shown) if member.gateway is None else []
+        entries = extract_entries(public, peer_pass) if member.gateway is None else []
         is_off_roll = self.is_unlisted(public)
         if public != self._own_member.public and (is_off_roll or member.renewer):
             try:
@@ -150,10 +150,10 @@ class ClosedAdmission:
         """Return a refusal if the guest's gateway already has the maximum number of other guests here."""
         if member.gateway is None:
             return ""
-        now, voucher = self._wall(), member.gateway.public
+        now, gateway = self._wall(), member.gateway.public
         others = sum(
             each.gateway is not None
-            and each.gateway.public == voucher
+            and each.gateway.public == gateway
             and each.public != member.public
             and not each.check_dates(now)
             for each in self._session_members.values()
@@ -216,11 +216,11 @@ class ClosedAdmission:
         """Return the known member with key ``public``, from a session or from the membership list."""
         if public == self._own_member.public:
             return self.me
-        met, now = self._session_members.get(public), self._wall()
+        members, now = self._session_members.get(public), self._wall()
         return (
             self._membership_list.find_member(public, now)
-            if met is None
-            else self._membership_list.update_member(met, now)
+            if members is None
+            else self._membership_list.update_member(members, now)
         )
 
     def remove_former_members(self) -> list[tuple[bytes, str]]:
@@ -245,11 +245,11 @@ class ClosedAdmission:
         refusal = self._membership_list.find_refusal(member, now)
         return Authority(refusal) if refusal else Authority("", member.roles, member.name)
 
-    def _verify_certificate(self, public: bytes, shown: bytes) -> Member:
-        key = hashlib.blake2s(public + shown, digest_size=16).digest()
+    def _verify_certificate(self, public: bytes, peer_pass: bytes) -> Member:
+        key = hashlib.blake2s(public + peer_pass, digest_size=16).digest()
         member = self._verified.get(key)
         if member is None:
-            member = self._verified[key] = verify_certificate(self._membership_list.operator, public, shown)
+            member = self._verified[key] = verify_certificate(self._membership_list.operator, public, peer_pass)
             if len(self._verified) > MAX_CACHED_CERTIFICATES:
                 self._verified.popitem(last=False)
         else:

@@ -46,7 +46,7 @@ _ASSOCIATED_DATA = b"swarm-terms-1"
 
 @dataclass(frozen=True)
 class JoinCode:
-    """A join code: its ``secret`` (75 bits) and the ``mark`` of the operator (20 bits)."""
+    """A join code: its ``secret`` (75 bits) and the ``fingerprint`` of the operator (20 bits)."""
 
     secret: int = field(repr=False)
     fingerprint: int
@@ -96,10 +96,10 @@ def parse_code(text: str) -> JoinCode:
         raise BadCode(f"the code contains {wrong!r}; a code has only digits and letters without U; check it")
     if len(letters) != CODE_LENGTH:
         raise BadCode(f"a code has {CODE_LENGTH} characters, this one has {len(letters)}; check it")
-    places = [ALPHABET.index(letter) for letter in letters]
-    if _compute_check(places[:-1]) != places[-1]:
+    digits = [ALPHABET.index(letter) for letter in letters]
+    if _compute_check(digits[:-1]) != digits[-1]:
         raise BadCode("the code is mistyped: its check character does not match; check it")
-    return JoinCode(_decode(places[:_SECRET_LETTERS]), _decode(places[_SECRET_LETTERS:-1]))
+    return JoinCode(_decode(digits[:_SECRET_LETTERS]), _decode(digits[_SECRET_LETTERS:-1]))
 
 
 @dataclass(frozen=True)
@@ -146,21 +146,21 @@ def open_terms(code: JoinCode, sealed: bytes) -> TermsContent:
 
 
 def _encode(number: int, count: int) -> str:
-    return "".join(ALPHABET[number >> 5 * place & 31] for place in reversed(range(count)))
+    return "".join(ALPHABET[number >> 5 * digit & 31] for digit in reversed(range(count)))
 
 
-def _decode(places: list[int]) -> int:
+def _decode(digits: list[int]) -> int:
     number = 0
-    for place in places:
-        number = number << 5 | place
+    for digit in digits:
+        number = number << 5 | digit
     return number
 
 
-def _compute_check(places: list[int]) -> int:
+def _compute_check(digits: list[int]) -> int:
     """Return the weighted sum of the positions; each has its own power of x, the check itself the weight 1."""
     total = 0
-    for place in places:
-        total = _multiply_by_x(total ^ place)
+    for digit in digits:
+        total = _multiply_by_x(total ^ digit)
     return total
 
 

@@ -39,19 +39,19 @@ class Gossip:
 
     def __init__(
         self,
-        roll: MembershipList,
+        membership_list: MembershipList,
         endpoint: Endpoint,
         contacts: Callable[[], list[Contact]],
         rng: random.Random,
-        chores: Background,
+        background: Background,
         wall: Callable[[], float],
         on_new: Callable[[Entry], None],
     ) -> None:
-        self._membership_list = roll
+        self._membership_list = membership_list
         self._endpoint = endpoint
         self._contacts = contacts
         self._rng = rng
-        self._chores = chores
+        self._chores = background
         self._wall = wall
         self._on_new_entry = on_new
         self._is_full = False

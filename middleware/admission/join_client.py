@@ -32,7 +32,7 @@ MAX_ADDRESSES = 64
 
 
 class JoinClient:
-    """Join a team with a code; ``seed`` is the newcomer's lasting identity, ``wish`` the name that it asks for.
+    """Join a team with a code; ``seed`` is the newcomer's lasting identity, ``requested_name`` the name that it asks for.
 
     The newcomer owns ``network`` while it joins, and closes it afterwards.
     """
@@ -44,7 +44,7 @@ class JoinClient:
         network: Network,
         clock: IReactorTime,
         rng: random.Random,
-        wish: str = "",
+        requested_name: str = "",
     ) -> None:
         self._code = code
         self._key = code.key
@@ -54,7 +54,7 @@ class JoinClient:
         self._clock = clock
         self._ephemeral = rng.randbytes(32)
         shared = bindings.crypto_scalarmult_base(self._ephemeral)
-        self._request = join_codec.make_request(self._key, self._public, shared, wish, rng)
+        self._request = join_codec.make_request(self._key, self._public, shared, requested_name, rng)
         self._addresses: list[Address] = []
         self._address_index = self._tries = 0
         self._retry_delay = FIRST_RETRY_S
@@ -63,8 +63,8 @@ class JoinClient:
         self._timeout_call: IDelayedCall | None = None
         self._done: Deferred[Membership] | None = None
 
-    def join(self, doors: Iterable[Address], timeout: float = JOIN_TIMEOUT_S) -> Deferred[Membership]:
-        """Send requests to the addresses ``doors`` until a bootstrap node admits the newcomer.
+    def join(self, addresses: Iterable[Address], timeout: float = JOIN_TIMEOUT_S) -> Deferred[Membership]:
+        """Send requests to the addresses ``addresses`` until a bootstrap node admits the newcomer.
 
         Fails with ``NotWelcome``, or with ``NoAnswer`` if there is no reply within ``timeout`` seconds; raises
         ``PortInUse``.
@@ -72,14 +72,14 @@ class JoinClient:
         self._done = Deferred(self._on_cancel)
         self._network.listen(self._on_datagram)
         self._timeout_call = self._clock.callLater(timeout, self._on_timeout)
-        for door in doors:
-            self.add_address(door)
+        for address in addresses:
+            self.add_address(address)
         return self._done
 
-    def add_address(self, door: Address) -> None:
+    def add_address(self, address: Address) -> None:
         """Add an address, such as one discovered on the local network."""
-        if door not in self._addresses and len(self._addresses) < MAX_ADDRESSES:
-            self._addresses.append(door)
+        if address not in self._addresses and len(self._addresses) < MAX_ADDRESSES:
+            self._addresses.append(address)
             if self._retry_call is None and self._done is not None:
                 self._send_request()
 
@@ -116,17 +116,17 @@ class JoinClient:
         if source == self._addresses[self._address_index % len(self._addresses)]:
             self._select_next_address()
 
-    def _accept_reply(self, terms: TermsContent, said: JoinReply, source: Address) -> None:
+    def _accept_reply(self, terms: TermsContent, reply: JoinReply, source: Address) -> None:
         try:
-            member = verify_certificate(terms.operator, self._public, said.certificate)
+            member = verify_certificate(terms.operator, self._public, reply.certificate)
         except RemoteError:
             return
         if member.invitation != self._key.public:
             return
-        known = dict.fromkeys([source, *(contact.address for contact in said.contacts)])
-        secrets = tuple(sorted(said.secrets, key=lambda each: -each[0]))
+        known = dict.fromkeys([source, *(contact.address for contact in reply.contacts)])
+        secrets = tuple(sorted(reply.secrets, key=lambda each: -each[0]))
         membership = Membership(
-            terms.team, self._seed, terms.operator, said.certificate, secrets, tuple(known), dict(terms.settings)
+            terms.team, self._seed, terms.operator, reply.certificate, secrets, tuple(known), dict(terms.settings)
         )
         done = self._finish()
         if done is not None:

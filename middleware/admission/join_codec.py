@@ -95,10 +95,10 @@ def derive_psk(invitation: bytes) -> bytes:
     return hashlib.blake2s(invitation, person=b"knock").digest()
 
 
-def make_request(invitation: Identity, public: bytes, ephemeral: bytes, wish: str, rng: random.Random) -> bytes:
-    """Return the KNOCK of the newcomer ``public`` that asks for the name ``wish`` (empty: any)."""
-    signature = sign_join(invitation, public, wish)
-    body = msgpack.packb([public, ephemeral, wish, signature]).ljust(_BODY_BYTES, b"\0")
+def make_request(invitation: Identity, public: bytes, ephemeral: bytes, requested_name: str, rng: random.Random) -> bytes:
+    """Return the KNOCK of the newcomer ``public`` that asks for the name ``requested_name`` (empty: any)."""
+    signature = sign_join(invitation, public, requested_name)
+    body = msgpack.packb([public, ephemeral, requested_name, signature]).ljust(_BODY_BYTES, b"\0")
     head, nonce = bytes([JOIN_REQUEST]) + invitation_id(invitation.public), rng.randbytes(_NONCE_BYTES)
     key = derive_psk(invitation.public)
     return head + nonce + bindings.crypto_aead_xchacha20poly1305_ietf_encrypt(body, head, nonce, key)
@@ -106,8 +106,8 @@ def make_request(invitation: Identity, public: bytes, ephemeral: bytes, wish: st
 
 def read_invitation_id(datagram: bytes) -> bytes:
     """Return the invitation id in a KNOCK or WELCOME; raises ``Malformed``."""
-    is_knock = datagram[:1] == bytes([JOIN_REQUEST])
-    if len(datagram) < _HEAD_BYTES or (is_knock and len(datagram) != JOIN_REQUEST_BYTES):
+    is_request = datagram[:1] == bytes([JOIN_REQUEST])
+    if len(datagram) < _HEAD_BYTES or (is_request and len(datagram) != JOIN_REQUEST_BYTES):
         raise Malformed(f"the join datagram has a wrong length, {len(datagram)} bytes")
     return datagram[1:_HEAD_BYTES]
 
@@ -128,13 +128,13 @@ def open_request(datagram: bytes, invitation: bytes) -> JoinRequest:
     unpacker = msgpack.Unpacker(max_buffer_size=_BODY_BYTES, max_map_len=0, max_ext_len=0, max_array_len=4)
     unpacker.feed(body)
     try:
-        public, ephemeral, wish, signature = unpacker.unpack()
+        public, ephemeral, requested_name, signature = unpacker.unpack()
     except Exception as error:  # untrusted bytes
         raise Malformed("the join request has invalid fields") from error
     return JoinRequest(
         check_bytes(public, 32),
         check_bytes(ephemeral, 32),
-        wish if wish == "" else check_name(wish),
+        requested_name if requested_name == "" else check_name(requested_name),
         check_bytes(signature, 64),
     )
 
@@ -173,8 +173,8 @@ def open_reply(datagram: bytes, code: JoinCode, public: bytes, ephemeral: bytes)
     if read_invitation_id(datagram) != invitation_id(invitation):
         raise Forged("the join reply names another invitation")
     if len(datagram) <= _HEAD_BYTES + MAX_REFUSAL_CODE_BYTES:
-        said = datagram[_HEAD_BYTES:].decode("ascii", "replace")
-        return UnsignedRefusal(said if said in REFUSAL_TEXTS else "unknown")
+        refusal_code = datagram[_HEAD_BYTES:].decode("ascii", "replace")
+        return UnsignedRefusal(refusal_code if refusal_code in REFUSAL_TEXTS else "unknown")
     body = sealed_box.unseal(datagram[_HEAD_BYTES:], ephemeral, derive_psk(invitation), datagram[:_HEAD_BYTES])
     try:
         terms, grant, signature, content = msgpack.unpackb(body, max_map_len=0, max_ext_len=0, max_array_len=4)
@@ -198,14 +198,14 @@ def _parse_content(packed: bytes) -> JoinReply | str:
     fields = msgpack.unpackb(packed, max_map_len=0, max_ext_len=0, max_array_len=MAX_CONTACTS)
     if len(fields) == 1:
         return fields[0] if fields[0] in REFUSAL_TEXTS else "unknown"
-    shown, secrets, contacts = fields
-    if not isinstance(shown, bytes) or len(shown) > MAX_CERTIFICATE_BYTES or not secrets:
+    certificate, secrets, contacts = fields
+    if not isinstance(certificate, bytes) or len(certificate) > MAX_CERTIFICATE_BYTES or not secrets:
         raise Malformed("the join reply has no pass or no secret")
     found = tuple(
         (check_number(number), check_bytes(secret, SECRET_BYTES), check_number(until))
         for number, secret, until in secrets
     )
-    return JoinReply(shown, found, tuple(contact for each in contacts if (contact := parse_contact(each)) is not None))
+    return JoinReply(certificate, found, tuple(contact for each in contacts if (contact := parse_contact(each)) is not None))
 
 
 def _sign_body(invitation: bytes, request: JoinRequest, content: bytes, signer: Signer) -> bytes:

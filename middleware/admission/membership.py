@@ -99,9 +99,9 @@ def parse_membership(found: Mapping[str, Any]) -> Membership:
             check_bytes(bytes.fromhex(found["operator"]), 32),
             check_bytes(bytes.fromhex(found["seed"]), 32),
         )
-        shown = bytes.fromhex(found["pass"])
+        certificate = bytes.fromhex(found["pass"])
         membership = Membership(
-            check_name(found["team"]), seed, operator, shown, tuple(secrets), tuple(known), dict(found["settings"])
+            check_name(found["team"]), seed, operator, certificate, tuple(secrets), tuple(known), dict(found["settings"])
         )
     except (KeyError, ValueError, TypeError, RemoteError) as error:
         raise BadKeyFile(f"not a valid membership ({error}); join again, or restore it from a backup") from error
@@ -111,7 +111,7 @@ def parse_membership(found: Mapping[str, Any]) -> Membership:
 
 
 class MembershipFile:
-    """The membership file of one member; ``keep`` replaces it."""
+    """The membership file of one member; ``save`` replaces it."""
 
     def __init__(self, path: Path) -> None:
         self.path = path

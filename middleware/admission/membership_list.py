@@ -123,9 +123,9 @@ def invitation_id(public: bytes) -> bytes:
     return hashlib.blake2s(public, digest_size=INVITATION_ID_BYTES, person=b"invite").digest()
 
 
-def pack_admission(public: bytes, shown: bytes) -> bytes:
+def pack_admission(public: bytes, certificate: bytes) -> bytes:
     """Pack an admission or a renewal; the pass in it is signed."""
-    return bytes(msgpack.packb([ADMISSION_KIND, public, shown]))
+    return bytes(msgpack.packb([ADMISSION_KIND, public, certificate]))
 
 
 class MembershipList:
@@ -267,10 +267,10 @@ class MembershipList:
             if end is not None and member_id(member.public) not in end.kept:
                 return "revoked"
         if member.gateway is not None:
-            voucher = self.update_member(member.gateway, now)
-            if GATEWAY not in voucher.roles:
+            gateway = self.update_member(member.gateway, now)
+            if GATEWAY not in gateway.roles:
                 return "role"
-            return self.find_refusal(voucher, now) or member.check_dates(now)
+            return self.find_refusal(gateway, now) or member.check_dates(now)
         return member.check_dates(now)
 
     def update_member(self, member: Member, now: float) -> Member:
@@ -311,8 +311,8 @@ class MembershipList:
             return self.update_member(make_member(grant[0]), now)
         return None if renewal is None else self.update_member(renewal.member, now)
 
-    def find_best_certificate(self, member: Member, shown: bytes, now: float) -> bytes:
-        """Return the pass with the latest end to show for ``member``, whose pass is ``shown``."""
+    def find_best_certificate(self, member: Member, certificate: bytes, now: float) -> bytes:
+        """Return the pass with the latest end to show for ``member``, whose pass is ``certificate``."""
         known, renewal, grant = (
             self.update_member(member, now),
             self.find_renewal(member.public),
@@ -320,11 +320,11 @@ class MembershipList:
         )
         if known.renewer:
             is_held = renewal is not None and renewal.member.not_after == known.not_after
-            return renewal.certificate if renewal is not None and is_held else shown
+            return renewal.certificate if renewal is not None and is_held else certificate
         if grant is not None and grant[0].not_before >= member.since:
             return wrap_grant(grant[1])
         admission = self.find_admission(member.public) if member.renewer else None
-        return shown if admission is None else admission.certificate
+        return certificate if admission is None else admission.certificate
 
     def list_known_members(self, now: float) -> list[tuple[Member, str]]:
         """Return all current and former members by name, each with its refusal (empty for a current member)."""
@@ -366,15 +366,15 @@ class MembershipList:
     def _parse(self, packed: bytes) -> Entry:
         fields = unpack_fields(packed)
         if len(fields) == 3 and fields[0] == ADMISSION_KIND:
-            public, shown = check_bytes(fields[1], 32), fields[2]
-            if not isinstance(shown, bytes):
+            public, certificate = check_bytes(fields[1], 32), fields[2]
+            if not isinstance(certificate, bytes):
                 raise Malformed("the admission has no pass")
-            member = verify_certificate(self.operator, public, shown)
+            member = verify_certificate(self.operator, public, certificate)
             if member.renewer:
-                return Renewal(member, shown, extract_grant(self.operator, shown))
+                return Renewal(member, certificate, extract_grant(self.operator, certificate))
             if not member.invitation:
                 raise Malformed("the admission has no invitation")
-            return Admission(member, shown)
+            return Admission(member, certificate)
         return open_statement(self.operator, packed)
 
     def _check_room(self, entry: Entry, packed: bytes, now: float) -> None:

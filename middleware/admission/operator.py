@@ -88,28 +88,28 @@ class Operator:
 
         Raises ``ValueError`` for values that an invitation cannot have.
         """
-        drawn = code.draw_code(self.public, rng)
+        join_code = code.draw_code(self.public, rng)
         end = int(now + expires)
-        invite = Invite(drawn.key.public, name, tuple(roles), uses, int(now), end, int(life))
-        sealed = seal_terms(drawn, TermsContent(self.public, self.team, self.settings), rng)
-        terms = Terms(drawn.key.public, sealed, int(now), end)
-        return Invitation(drawn, sign_statement(self.identity, invite), sign_statement(self.identity, terms))
+        invite = Invite(join_code.key.public, name, tuple(roles), uses, int(now), end, int(life))
+        sealed_terms = seal_terms(join_code, TermsContent(self.public, self.team, self.settings), rng)
+        terms = Terms(join_code.key.public, sealed_terms, int(now), end)
+        return Invitation(join_code, sign_statement(self.identity, invite), sign_statement(self.identity, terms))
 
     def revoke(
         self,
         public: bytes,
         name: str,
         now: float,
-        kept: Iterable[bytes] = (),
+        members: Iterable[bytes] = (),
         renewals: Iterable[tuple[bytes, int]] = (),
     ) -> bytes:
         """Revoke the key of a member or of an invitation.
 
-        ``kept`` are the public keys of members admitted by a revoked bootstrap node that stay members; the others are
+        ``members`` are the public keys of members admitted by a revoked bootstrap node that stay members; the others are
         revoked with it.  ``renewals`` are its renewals that stay valid, as pairs of key and end.  Raises
         ``ValueError`` if there are too many.
         """
-        ids = (*(member_id(each) for each in kept), *(renewal_id(*each) for each in renewals))
+        ids = (*(member_id(each) for each in members), *(renewal_id(*each) for each in renewals))
         if len(ids) > MAX_KEPT:
             raise ValueError(f"a revocation keeps at most {MAX_KEPT} members and renewals, not {len(ids)}")
         return sign_statement(self.identity, Revocation(public, name, int(now), int(now) + MAX_LIFE_S, ids))

@@ -30,22 +30,22 @@ MAX_RENEWALS_PER_SCAN = 8
 class Renewer:
     """Renew certificates at one node, if it may; ``now`` is in seconds of the wall clock.
 
-    ``pass_of`` returns the pass of a member, and ``add`` publishes an entry.
+    ``find_certificate`` returns the pass of a member, and ``add`` publishes an entry.
     """
 
     _log = Logger()
 
     def __init__(
         self,
-        roll: MembershipList,
+        membership_list: MembershipList,
         identity: Identity,
-        pass_of: Callable[[bytes], bytes],
+        find_certificate: Callable[[bytes], bytes],
         add: Callable[[bytes], object],
         rng: random.Random,
     ) -> None:
-        self._membership_list = roll
+        self._membership_list = membership_list
         self._identity = identity
-        self._find_certificate = pass_of
+        self._find_certificate = find_certificate
         self._add = add
         self._rng = rng
         self._next_at = 0.0
@@ -78,12 +78,12 @@ class Renewer:
 
     def renew(self, member: Member, now: float) -> bool:
         """Sign a new end date for ``member`` and publish it; returns whether that succeeded."""
-        grant, shown = self._membership_list.find_grant(self._identity.public), self._find_certificate(member.public)
+        grant, certificate = self._membership_list.find_grant(self._identity.public), self._find_certificate(member.public)
         try:
-            if grant is None or not shown:
+            if grant is None or not certificate:
                 return False
-            before = verify_certificate(self._membership_list.operator, member.public, shown)
-            after = renew_certificate(self._identity, grant[1], before, shown, int(now))
+            before = verify_certificate(self._membership_list.operator, member.public, certificate)
+            after = renew_certificate(self._identity, grant[1], before, certificate, int(now))
             verify_certificate(self._membership_list.operator, member.public, after)
             self._add(pack_admission(member.public, after))
         except (RemoteError, Full) as error:

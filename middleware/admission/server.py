@@ -48,7 +48,7 @@ class AdmissionServer:
 
     def __init__(
         self,
-        roll: MembershipList,
+        membership_list: MembershipList,
         identity: Identity,
         take: Callable[[Invite], Deferred[bool]],
         admit: Callable[[bytes], object],
@@ -59,7 +59,7 @@ class AdmissionServer:
         rng: random.Random,
         refused: Callable[[bytes, Address, str], None],
     ) -> None:
-        self._membership_list = roll
+        self._membership_list = membership_list
         self._identity = identity
         self._take_use = take
         self._publish_admission = admit
@@ -142,11 +142,11 @@ class AdmissionServer:
                 return "used"
         except EntangledError:
             return "later"
-        newcomer = (request.public, request.requested_name, request.proof)
+        applicant = (request.public, request.requested_name, request.proof)
         begin = max(now, invite.not_before)
-        shown = issue_certificate(self._identity, me[1], (packed, invite), newcomer, name, begin)
-        self._publish_admission(pack_admission(request.public, shown))
-        return shown
+        certificate = issue_certificate(self._identity, me[1], (packed, invite), applicant, name, begin)
+        self._publish_admission(pack_admission(request.public, certificate))
+        return certificate
 
     def _choose_name(self, request: JoinRequest, invite: Invite) -> str | None:
         """Choose the newcomer's name; None if another member has it already."""
@@ -205,10 +205,10 @@ class AdmissionServer:
         if failure.check(RemoteError) is None:  # an invalid ephemeral key is the newcomer's error
             self._log.failure("while admitting a newcomer", failure)
 
-    def _log_refusal(self, who: bytes, code: str, source: Address, name: str = "") -> None:
+    def _log_refusal(self, public: bytes, code: str, source: Address, name: str = "") -> None:
         """Log a refusal once per newcomer and reason; a rate limit protects the log from invented ids."""
-        self._on_refused(b"" if code == "unknown" else who, source, code)
-        if not self._log_limiter.should_log(self._now(), who, code):
+        self._on_refused(b"" if code == "unknown" else public, source, code)
+        if not self._log_limiter.should_log(self._now(), public, code):
             return
         via = f" by the invitation of {name}" if name else ""
         self._log.warn(

@@ -3,7 +3,7 @@
 A statement is packed as one msgpack array, ``[kind, field, ..., signature]``.  The Ed25519 signature covers
 ``"swarm-team-1 "``, the operator's public key, and the array without the signature, so a signature for another team or
 another purpose is not valid.  Times are whole seconds of the wall clock, because statements outlive every process.
-``opened`` is total: for any input it returns a valid statement or raises ``Malformed`` or ``Forged``.
+``open_statement`` is total: for any input it returns a valid statement or raises ``Malformed`` or ``Forged``.
 """
 
 from __future__ import annotations
@@ -53,7 +53,7 @@ _PUBLIC_BYTES, _SIGNATURE_BYTES, _FINGERPRINT_BYTES = 32, 64, 16
 class Entry:
     """An entry of the membership list.
 
-    Of two entries with the same ``slot`` the one with the higher ``rank`` wins.  An entry is kept ``until`` a time.
+    Of two entries with the same ``slot`` the one with the higher ``rank`` wins.  An entry is kept ``kept_until`` a time.
     """
 
     kind: ClassVar[str]
@@ -121,11 +121,11 @@ class Invite(Entry):
         """A week after the end date; until then the code is refused as expired."""
         return self.not_after + INVITATION_REMEMBERED_S
 
-    def allows(self, name: str, wish: str) -> bool:
-        """Return whether a newcomer that asked for the name ``wish`` (empty: any) can have got ``name``."""
+    def allows(self, name: str, requested_name: str) -> bool:
+        """Return whether a newcomer that asked for the name ``requested_name`` (empty: any) can have got ``name``."""
         if self.uses == 1:
             return name == self.name
-        return name == wish if wish else name.startswith(f"{self.name[:NAME_PREFIX_LETTERS]}-")
+        return name == requested_name if requested_name else name.startswith(f"{self.name[:NAME_PREFIX_LETTERS]}-")
 
 
 @dataclass(frozen=True)

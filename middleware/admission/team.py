@@ -42,20 +42,20 @@ MAX_GUESTS = 256
 
 
 class Team:
-    """The closed team of one node: created before the node, which uses its ``door``; ``attach`` connects them.
+    """The closed team of one node: created before the node, which uses its ``admission``; ``attach`` connects them.
 
-    ``kept`` stores the node's membership.
+    ``membership_store`` stores the node's membership.
     """
 
     _log = Logger()
 
-    def __init__(self, kept: MembershipStore, store: Store, wall: Callable[[], float], rng: random.Random) -> None:
-        self._membership_store = kept
+    def __init__(self, membership_store: MembershipStore, store: Store, wall: Callable[[], float], rng: random.Random) -> None:
+        self._membership_store = membership_store
         self._store = store
         self._wall = wall
         self._rng = rng
-        self.identity = kept.membership.identity
-        self.membership_list = MembershipList(kept.membership.operator)
+        self.identity = membership_store.membership.identity
+        self.membership_list = MembershipList(membership_store.membership.operator)
         self._load_list()
         self.admission = ClosedAdmission(
             self.membership_list, lambda: self.membership, wall, start_incarnation(store, wall(), rng)
@@ -76,7 +76,7 @@ class Team:
         return self.membership.secrets[0][1]
 
     def attach(self, node: EntangledNode, clock: IReactorTime) -> None:
-        """Connect to ``node``, which uses this team's ``door`` and is not started yet."""
+        """Connect to ``node``, which uses this team's ``admission`` and is not started yet."""
         self._node, self._clock = node, clock
         self._chores = Background(clock)
         endpoint = node.endpoint
@@ -93,7 +93,7 @@ class Team:
         self._renewer = Renewer(
             self.membership_list, self.identity, self.admission.find_certificate, self._gossip.add, self._rng
         )
-        reception = AdmissionServer(
+        server = AdmissionServer(
             self.membership_list,
             self.identity,
             lambda invite: self.use_counters.take(invite),
@@ -103,11 +103,11 @@ class Team:
             clock.seconds,
             self._wall,
             self._rng,
-            lambda who, source, code: endpoint.rejections.record(
-                who, str(source), "code", code, REFUSAL_TEXTS[code], clock.seconds()
+            lambda public, source, code: endpoint.rejections.record(
+                public, str(source), "code", code, REFUSAL_TEXTS[code], clock.seconds()
             ),
         )
-        endpoint.route(join_codec.JOIN_REQUEST, reception.on_request)
+        endpoint.route(join_codec.JOIN_REQUEST, server.on_request)
         endpoint.expose("roll.secret", self._answer_secret)
         node.overlay.on_new_contact.add(self._gossip.compare_with)
         if len(self._accepted_secrets) > 1:
@@ -119,10 +119,10 @@ class Team:
         self._log.info(
             "member {name} of the closed team {team}", name=self.admission.me.name, team=self.membership.team
         )
-        trouble = self.admission.me.check_dates(self._wall())
-        if trouble:
+        problem = self.admission.me.check_dates(self._wall())
+        if problem:
             # Whether the clock is right is unknown at this point, so the message has both causes.
-            self._log.warn("the certificate of this node is not valid by its clock: {why}", why=explain(trouble))
+            self._log.warn("the certificate of this node is not valid by its clock: {why}", why=explain(problem))
         self._gossip.start()
         self._chores.every(COMPARE_INTERVAL_S, self._run_periodic)
 
@@ -170,8 +170,8 @@ class Team:
     def create_guest(self, seed: bytes, name: str) -> Membership:
         """Return the membership of a guest of this node; raises ``Malformed`` if this node's pass is too long."""
         own, now = self.membership, int(self._wall())
-        shown = issue_guest_certificate(self.identity, self.admission.own_pass, Identity(seed).public, name, now)
-        return replace(own, seed=seed, certificate=shown, known_nodes=())
+        certificate = issue_guest_certificate(self.identity, self.admission.own_pass, Identity(seed).public, name, now)
+        return replace(own, seed=seed, certificate=certificate, known_nodes=())
 
     # -- implementation ---------------------------------------------------------------------------------------------
 
@@ -181,8 +181,8 @@ class Team:
             noted = msgpack.unpackb(self._store.get_note(LIST_NOTE) or b"\x90", max_array_len=MAX_ENTRIES)
         except Exception:  # damaged file
             noted = []
-        shown, public = self.membership.certificate, self.identity.public
-        for packed in [*(noted if isinstance(noted, list) else []), *extract_entries(public, shown)]:
+        certificate, public = self.membership.certificate, self.identity.public
+        for packed in [*(noted if isinstance(noted, list) else []), *extract_entries(public, certificate)]:
             try:
                 self.membership_list.add(packed, self._wall())
             except (RemoteError, Full):
@@ -192,8 +192,8 @@ class Team:
         """Load the stored passes of guests whose records this node holds."""
         try:
             noted = msgpack.unpackb(self._store.get_note(GUESTS_NOTE) or EMPTY_GUESTS, max_array_len=MAX_GUESTS)
-            for owner, shown in noted:
-                self.admission.add_certificate(owner, shown)
+            for owner, certificate in noted:
+                self.admission.add_certificate(owner, certificate)
         except Exception:  # damaged file
             self._log.warn("the stored passes of guests are damaged; other members will send them again")
 
@@ -310,13 +310,13 @@ class Team:
             return None
         return next((secret for known, secret, _ in self.membership.secrets if known == number), None)
 
-    def _build_reply(self, shown: bytes) -> JoinReply:
+    def _build_reply(self, certificate: bytes) -> JoinReply:
         membership = self.membership
         assert self._node is not None
         contacts = [contact for contact in self._node.overlay.contacts() if not contact.address.host.startswith("~")]
         picked = self._rng.sample(contacts, min(len(contacts), join_codec.MAX_CONTACTS))
         secrets = tuple(membership.list_accepted_secrets(self._wall()))
-        return JoinReply(shown, secrets, tuple(picked))
+        return JoinReply(certificate, secrets, tuple(picked))
 
     def _store_membership(self, membership: Membership) -> None:
         try:

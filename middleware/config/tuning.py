@@ -31,7 +31,7 @@ NOTE_NAME = "tuning"
 
 @dataclass(frozen=True)
 class TunableSetting:
-    """One changeable setting: ``check`` converts a value or raises ``Invalid``; ``turn`` applies it.
+    """One changeable setting: ``check`` converts a value or raises ``Invalid``; ``apply`` applies it.
 
     ``least`` and ``most`` are the bounds of a number, or of the length of a text, for display.
     """
@@ -54,12 +54,12 @@ class Tuning:
         self._settings: dict[str, TunableSetting] = {}
         self._stored = _load_stored(store)
 
-    def add(self, knob: TunableSetting) -> None:
+    def add(self, setting: TunableSetting) -> None:
         """Add a setting, and apply its stored value."""
-        self._settings[knob.key] = knob
-        if knob.key in self._stored:
+        self._settings[setting.key] = setting
+        if setting.key in self._stored:
             with suppress(InvalidValue):  # valid when it was stored; otherwise the file's value applies
-                knob.apply(knob.check(self._stored[knob.key]))
+                setting.apply(setting.check(self._stored[setting.key]))
 
     def list_settings(self) -> list[list[object]]:
         """Return each setting as ``[key, value, about, unit, least, most]``."""
@@ -148,7 +148,7 @@ def _make_refusal(key: object, wrong: InvalidValue) -> Refused:
 
 def _load_stored(store: Store) -> dict[str, Any]:
     try:
-        kept = msgpack.unpackb(store.get_note(NOTE_NAME) or b"\x80")
+        stored = msgpack.unpackb(store.get_note(NOTE_NAME) or b"\x80")
     except Exception:  # damaged file
         return {}
-    return kept if isinstance(kept, dict) else {}
+    return stored if isinstance(stored, dict) else {}

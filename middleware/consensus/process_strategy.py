@@ -28,16 +28,16 @@ LENGTH_PREFIX = struct.Struct("!I")
 
 
 class ProcessStrategy(RemoteStrategy):
-    """The strategy at ``place`` (``module:Class``), called through pipes; each method raises the strategy's error.
+    """The strategy at ``import_path`` (``module:Class``), called through pipes; each method raises the strategy's error.
 
     ``deadline`` is the maximum time of a call in seconds; ``path`` precedes this process's import path.
     """
 
     version = ""
 
-    def __init__(self, name: str, place: str, deadline: float = DEADLINE_S, path: Sequence[str] = ()) -> None:
+    def __init__(self, name: str, import_path: str, deadline: float = DEADLINE_S, path: Sequence[str] = ()) -> None:
         self.name = name
-        self._import_path = place
+        self._import_path = import_path
         self._deadline = deadline
         self._path = path
         self._process: subprocess.Popen[bytes] | None = None
@@ -118,11 +118,11 @@ class ProcessStrategy(RemoteStrategy):
             raise StrategyRaised(str(content))
         return content
 
-    def _write(self, question: bytes, end: float) -> None:
+    def _write(self, request: bytes, end: float) -> None:
         assert self._process is not None and self._process.stdin is not None
         pipe = self._process.stdin
         os.set_blocking(pipe.fileno(), False)
-        rest = LENGTH_PREFIX.pack(len(question)) + question
+        rest = LENGTH_PREFIX.pack(len(request)) + request
         while rest:
             _wait(pipe.fileno(), select.POLLOUT, end)
             rest = rest[os.write(pipe.fileno(), rest) :]

@@ -38,8 +38,8 @@ class StrategyRegistry:
     def stop(self) -> None:
         """Stop the processes of third-party strategies; later calls get the fallback's result."""
         self._is_stopped = True
-        for guard in self._third_party.values():
-            guard.stop()
+        for strategy in self._third_party.values():
+            strategy.stop()
 
 
 def load_guarded_strategy(name: str, dotted: bool = False, deployed: DeployedModules | None = None) -> GuardedStrategy:

@@ -31,14 +31,14 @@ def _send(out: BinaryIO, is_ok: bool, content: Any) -> None:
 
 def main() -> None:
     """Serve calls until the input is closed, or until a call exceeds its time limit and SIGALRM ends the process."""
-    place, limit_s = sys.argv[1], float(sys.argv[2])
+    import_path, limit_s = sys.argv[1], float(sys.argv[2])
     resource.setrlimit(resource.RLIMIT_AS, (MEMORY_BYTES, MEMORY_BYTES))
     out = os.fdopen(os.dup(1), "wb")
     os.dup2(2, 1)  # output of the strategy itself must not mix with results
     pipe = sys.stdin.buffer
     signal.signal(signal.SIGALRM, signal.SIG_DFL)  # the default action ends the process even if its parent is dead
     try:
-        module, _, attribute = place.partition(":")
+        module, _, attribute = import_path.partition(":")
         strategy = getattr(importlib.import_module(module), attribute)()
     except BaseException:  # third-party code may raise anything
         _send(out, False, traceback.format_exc()[-MAX_TRACE_CHARACTERS:])

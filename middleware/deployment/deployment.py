@@ -86,7 +86,7 @@ class Deployment:
         wall: Callable[[], float],
         later: Later,
         allowed: DeploymentSettings,
-        shelf: ModuleStore,
+        module_store: ModuleStore,
         author_of: Callable[[bytes], Author],
         spawn: Spawn,
         seconds: Callable[[], float],
@@ -97,7 +97,7 @@ class Deployment:
         self._wall = wall
         self._later = later
         self._allowed = allowed
-        self._module_store = shelf
+        self._module_store = module_store
         self._find_author = author_of
         self._spawn = spawn
         self._seconds = seconds
@@ -221,11 +221,11 @@ class Deployment:
         if self._wanted.get(manifest.name) != (manifest, record):
             return
         try:
-            asked: Deferred[list[Record]] = self._entangled.get(hash_key(source_key(manifest.digest)))
+            reading: Deferred[list[Record]] = self._entangled.get(hash_key(source_key(manifest.digest)))
         except NotRunning:
             return
-        asked.addCallback(self._on_source, manifest, record)
-        asked.addErrback(self._on_source_error, manifest, record)
+        reading.addCallback(self._on_source, manifest, record)
+        reading.addErrback(self._on_source_error, manifest, record)
 
     def _on_source(self, records: list[Record], manifest: Manifest, record: Record) -> None:
         sources = [each.value for each in records if each.value is not None and len(each.value) == manifest.size]
@@ -363,11 +363,11 @@ class Deployment:
 
     def _refuse(self, record: Record, manifest: Manifest | None, reason: str) -> None:
         version = "" if manifest is None else f" {manifest.version}"
-        shown = "".join(c for c in record.name[:32] if c.isprintable())
-        self._log.warn("refused: {name}{version} {reason}", name=shown, version=version, reason=reason)
+        shown_name = "".join(c for c in record.name[:32] if c.isprintable())
+        self._log.warn("refused: {name}{version} {reason}", name=shown_name, version=version, reason=reason)
         if record.name in self._allowed.modules:
             self._refusals[record.name] = f"{self._describe(record, manifest)} refused"
-        self._publish_message(f"refuses {shown}{version}: {reason}")
+        self._publish_message(f"refuses {shown_name}{version}: {reason}")
 
     def _report(self) -> None:
         described = {}

@@ -75,11 +75,11 @@ class ModuleHost:
         self._make: Factory | None = None
         self._instances: dict[int, object] = {}
 
-    def answer_request(self, question: bytes) -> bytes:
+    def answer_request(self, request: bytes) -> bytes:
         """Return the packed reply to one request; an exception of the module becomes an error reply."""
         number = 0
         try:
-            number, verb, arguments = module_channel.parse_request(question)
+            number, verb, arguments = module_channel.parse_request(request)
             verbs: dict[str, Callable[..., object]] = {
                 LOAD: self._load,
                 MAKE: self._create,
@@ -108,19 +108,19 @@ class ModuleHost:
             facts |= self._kind.describe_instance(thing)
         return facts
 
-    def _create(self, place: int, arguments: list[Any]) -> object:
+    def _create(self, instance_number: int, arguments: list[Any]) -> object:
         assert self._kind is not None and self._make is not None
         if len(self._instances) >= MAX_INSTANCES:
-            raise Undeployable(str(place), f"already has {MAX_INSTANCES} instances")
-        thing = self._instances[place] = self._kind.make(self._make, arguments)
+            raise Undeployable(str(instance_number), f"already has {MAX_INSTANCES} instances")
+        thing = self._instances[instance_number] = self._kind.make(self._make, arguments)
         return self._kind.describe_instance(thing)
 
-    def _call(self, place: int, method: str, arguments: list[Any]) -> object:
+    def _call(self, instance_number: int, method: str, arguments: list[Any]) -> object:
         assert self._kind is not None
-        return self._kind.call(self._instances[place], method, arguments)
+        return self._kind.call(self._instances[instance_number], method, arguments)
 
-    def _drop(self, place: int) -> object:
-        self._instances.pop(place, None)
+    def _drop(self, instance_number: int) -> object:
+        self._instances.pop(instance_number, None)
         return None
 
 
@@ -140,8 +140,8 @@ class MemoryChannel:
         if self._host is None:
             raise ProcessEnded("its process has ended")
         try:
-            for question in self._requests.feed(message):
-                self._ready += self._replies.feed(self._host.answer_request(question))
+            for request in self._requests.feed(message):
+                self._ready += self._replies.feed(self._host.answer_request(request))
         except BadFrame as error:
             raise ProcessEnded(f"its reply {error}") from error
 

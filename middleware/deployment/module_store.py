@@ -43,7 +43,7 @@ class MemoryModuleStore:
 
 
 class FileModuleStore:
-    """Module storage in a folder, created at the first ``keep`` with access for its owner only.
+    """Module storage in a folder, created at the first ``save`` with access for its owner only.
 
     A file is written under a temporary name, synced to disk, and then renamed, so after a power failure either the old
     or the new file exists.  ``move`` is ``os.replace``.

@@ -95,7 +95,7 @@ class Runner:
         self._started_at = 0.0
 
     def start(self) -> None:
-        """Start the process and have it load the module; poll the result with ``look``."""
+        """Start the process and have it load the module; poll the result with ``poll``."""
         why = self._find_objection()
         if why:
             return self.stop(why)

@@ -61,13 +61,13 @@ class Explanation:
     epochs: tuple[EpochExplanation, ...] = ()
 
 
-def explain_decisions(verdicts: Iterable[DecisionRecord]) -> Explanation:
+def explain_decisions(records: Iterable[DecisionRecord]) -> Explanation:
     """Compare the decision records of one task, in any order."""
     epochs: dict[int, dict[str, DecisionRecord]] = {}
     task = ""
-    for verdict in sorted(verdicts, key=lambda v: (v.epoch, v.agent, v.pack())):
-        task = verdict.task
-        epochs.setdefault(verdict.epoch, {})[verdict.agent] = verdict
+    for record in sorted(records, key=lambda v: (v.epoch, v.agent, v.pack())):
+        task = record.task
+        epochs.setdefault(record.epoch, {})[record.agent] = record
     rulings = [_explain_epoch(epoch, list(epochs[epoch].values())) for epoch in sorted(epochs, reverse=True)]
     return Explanation(task, tuple(rulings))
 
@@ -80,16 +80,16 @@ def format_explanation(explanation: Explanation) -> str:
 # -- implementation -----------------------------------------------------------------------------------------------
 
 
-def _explain_epoch(epoch: int, verdicts: Sequence[DecisionRecord]) -> EpochExplanation:
-    votes = Counter(v.winner for v in verdicts)
+def _explain_epoch(epoch: int, records: Sequence[DecisionRecord]) -> EpochExplanation:
+    votes = Counter(v.winner for v in records)
     winner = min(votes, key=lambda uuid: (-votes[uuid], not uuid, uuid))
-    agreeing = [v for v in verdicts if v.winner == winner]
+    agreeing = [v for v in records if v.winner == winner]
     grounds = Counter(_get_basis(v) for v in agreeing)
-    most = min(grounds, key=lambda ground: (-grounds[ground], ground))
+    most = min(grounds, key=lambda reason: (-grounds[reason], reason))
     reference = next(v for v in agreeing if _get_basis(v) == most)
-    names = {r.agent: r.name for v in verdicts for r in v.reports} | {v.agent: v.name for v in verdicts}
-    differ = [Difference(v.name, what) for v in verdicts if (what := _describe_differences(v, reference, names))]
-    deciders = {v.agent for v in verdicts}
+    names = {r.agent: r.name for v in records for r in v.reports} | {v.agent: v.name for v in records}
+    differ = [Difference(v.name, what) for v in records if (what := _describe_differences(v, reference, names))]
+    deciders = {v.agent for v in records}
     missing = [r.name for r in reference.reports if r.agent not in deciders]
     differ += [Difference(name, "has no decision record") for name in missing]
     return EpochExplanation(
@@ -97,7 +97,7 @@ def _explain_epoch(epoch: int, verdicts: Sequence[DecisionRecord]) -> EpochExpla
         winner,
         _find_name(winner, names),
         tuple(sorted(v.name for v in agreeing)),
-        max(len(verdicts), reference.participants if reference.participants <= MAX_REPORTS else len(reference.reports)),
+        max(len(records), reference.participants if reference.participants <= MAX_REPORTS else len(reference.reports)),
         tuple(sorted(differ, key=lambda each: (each.name, each.what))),
         reference.rule,
         reference.version,
@@ -112,28 +112,28 @@ def _explain_epoch(epoch: int, verdicts: Sequence[DecisionRecord]) -> EpochExpla
     )
 
 
-def _get_basis(verdict: DecisionRecord) -> tuple[str, str, str]:
-    return (verdict.rule, verdict.version, verdict.digest)
+def _get_basis(record: DecisionRecord) -> tuple[str, str, str]:
+    return (record.rule, record.version, record.digest)
 
 
-def _describe_differences(verdict: DecisionRecord, reference: DecisionRecord, names: Mapping[str, str]) -> str:
+def _describe_differences(record: DecisionRecord, reference: DecisionRecord, names: Mapping[str, str]) -> str:
     """Return the differences between a decision record and the majority's; empty if there are none."""
     differences = []
-    if verdict.winner != reference.winner:
-        differences.append(f"names {_find_name(verdict.winner, names)}")
-    if (verdict.rule, verdict.version) != (reference.rule, reference.version):
-        differences.append(f"decided by {_format_rule(verdict)}, not {_format_rule(reference)}")
-    agreed = format_agreement(verdict.value, verdict.choice)
+    if record.winner != reference.winner:
+        differences.append(f"names {_find_name(record.winner, names)}")
+    if (record.rule, record.version) != (reference.rule, reference.version):
+        differences.append(f"decided by {_format_rule(record)}, not {_format_rule(reference)}")
+    agreed = format_agreement(record.value, record.choice)
     if agreed != format_agreement(reference.value, reference.choice):
         differences.append(f"agreed on {agreed or 'nothing'}")
-    if verdict.digest != reference.digest:
-        differences.append(_describe_other_reports(verdict, reference))
+    if record.digest != reference.digest:
+        differences.append(_describe_other_reports(record, reference))
     return "; ".join(differences)
 
 
-def _describe_other_reports(verdict: DecisionRecord, reference: DecisionRecord) -> str:
-    are_whole = all(len(v.reports) == v.reported for v in (verdict, reference))
-    own, other = ({r.agent: r for r in v.reports} for v in (verdict, reference))
+def _describe_other_reports(record: DecisionRecord, reference: DecisionRecord) -> str:
+    are_whole = all(len(v.reports) == v.reported for v in (record, reference))
+    own, other = ({r.agent: r for r in v.reports} for v in (record, reference))
     differences = []
     for agent in sorted({**own, **other}, key=lambda agent: ({**other, **own}[agent].name, agent)):
         if agent not in own:
@@ -172,8 +172,8 @@ def _format_epoch(ruling: EpochExplanation) -> str:
     return "".join(f"{line}\n" for line in lines)
 
 
-def _format_rule(verdict: DecisionRecord) -> str:
-    return f"{verdict.rule} {verdict.version}".rstrip()
+def _format_rule(record: DecisionRecord) -> str:
+    return f"{record.rule} {record.version}".rstrip()
 
 
 def _find_name(uuid: str, names: Mapping[str, str]) -> str:

@@ -105,7 +105,7 @@ def describe_links(node: SwarmNode) -> dict[str, Any]:
     ``Rejection``, ``code``, ``reason``, ``ago`` (seconds since the last time) and ``count``.
     """
     now = node.clock.seconds()
-    rebuffs = node.entangled.endpoint.rejections.list_recent(now)[:MAX_REFUSALS]
+    rejections = node.entangled.endpoint.rejections.list_recent(now)[:MAX_REFUSALS]
     return {
         "links": node.link_metrics.read(),
         "refusals": [
@@ -118,7 +118,7 @@ def describe_links(node: SwarmNode) -> dict[str, Any]:
                 "ago": round(now - each.last_at, 1),
                 "count": each.count,
             }
-            for each in rebuffs
+            for each in rejections
         ],
     }
 

@@ -41,7 +41,7 @@ Matches = Callable[[Device], bool]
 class Page(NamedTuple):
     """Some of the devices.
 
-    ``following`` is the id from which to continue (None: the end).  ``is_complete`` is False if devices in
+    ``next_id`` is the id from which to continue (None: the end).  ``is_complete`` is False if devices in
     this range may be missing.
     """
 
@@ -53,10 +53,10 @@ class Page(NamedTuple):
 class Directory:
     """The directory from the view of the node ``entangled``."""
 
-    def __init__(self, entangled: EntangledNode, chores: Background) -> None:
+    def __init__(self, entangled: EntangledNode, background: Background) -> None:
         self.depth = 0
         self.entangled = entangled
-        self.chores = chores
+        self.chores = background
         self._own_id = entangled.identity.node_id
         self._current_places: set[tuple[bytes, str]] = set()
         self._old_places: set[tuple[bytes, str]] = set()
@@ -103,7 +103,7 @@ class Directory:
         return puts[0] if len(puts) == 1 and not self._old_places else self._release_old(puts)
 
     def _release_old(self, puts: list[Deferred[Any]]) -> Deferred[Any]:
-        def left(results: Any) -> None:
+        def record_left(results: Any) -> None:
             for key, name in self._old_places:
                 self.entangled.release(key, name)
             self._old_places.clear()
@@ -111,7 +111,7 @@ class Directory:
         def failed(failure: Any) -> Any:
             return failure.value.subFailure  # the previous places are kept until the next announcement
 
-        return DeferredList(puts, fireOnOneErrback=True, consumeErrors=True).addCallbacks(left, failed)
+        return DeferredList(puts, fireOnOneErrback=True, consumeErrors=True).addCallbacks(record_left, failed)
 
     # -- other devices
     # --------------------------------------------------------------------------------------------------
@@ -126,10 +126,10 @@ class Directory:
         self,
         concern: ReadConsistency = "majority",
         under: Prefix = ROOT,
-        heard: Callable[[Listing], None] = lambda listing: None,
+        on_found: Callable[[Listing], None] = lambda listing: None,
         pause: float = 0.0,
     ) -> Listing:
-        """List all devices, or those below a prefix; ``heard`` is called each time that more of them are known.
+        """List all devices, or those below a prefix; ``on_found`` is called each time that more of them are known.
 
         A ``fast`` read costs a fifth of a majority read, but may miss recent changes.  Never fails: unread places are
         in ``Listing.missed``.  ``pause`` is the time in seconds between two batches of reads.
@@ -154,7 +154,7 @@ class Directory:
             if not places:
                 return listing
             await run_limited(CONCURRENT_READS, map(visit, places))
-            heard(listing)
+            on_found(listing)
             if pause and not listing.is_over:
                 await self.chores.sleep(pause)
 

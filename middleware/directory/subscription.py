@@ -60,7 +60,7 @@ class DeviceSubscription:
         """Read all places repeatedly, until the team is small again."""
         while not self._is_stopped:
             listing = await self._directory.list_devices(
-                "fast", heard=self._report_new, pause=CONCURRENT_READS / READS_PER_S
+                "fast", on_found=self._report_new, pause=CONCURRENT_READS / READS_PER_S
             )
             self._remove_missing(listing)
             if listing.is_complete and listing.reads == 1 and self._directory.depth < 2:

@@ -32,7 +32,7 @@ def find_boot_clock() -> Callable[[], float]:
 
 
 def use_monotonic_time() -> None:
-    """Make every Twisted reactor of this process use ``boot_time`` for its timers.
+    """Make every Twisted reactor of this process use ``find_boot_clock`` for its timers.
 
     Twisted uses ``time.time``: if the wall clock is set back a minute (NTP, a robot that gets GPS time), every timer
     stops for that minute; if it is set forward, every pending timeout expires at once and all nodes suspect each other.

@@ -73,7 +73,7 @@ class EntangledNode:
 
     ``lease`` is the time in seconds that leased records outlive the node's last sign of life; more means fewer false
     failures, less means faster detection.  ``rng`` and ``clock`` are the only sources of randomness and time.  ``wall``
-    returns seconds that continue while the node is off, to measure its absence (None: assume a short one).  ``door`` is
+    returns seconds that continue while the node is off, to measure its absence (None: assume a short one).  ``admission`` is
     the admission check.  ``lan`` is the multicast group in which the node finds its team without known nodes.
     """
 
@@ -89,7 +89,7 @@ class EntangledNode:
         rng: random.Random,
         lease: float = 1.0,
         wall: Callable[[], float] | None = None,
-        door: AdmissionCheck = OPEN_ADMISSION,
+        admission: AdmissionCheck = OPEN_ADMISSION,
         lan: Multicast | None = None,
     ) -> None:
         self.identity = identity
@@ -97,24 +97,24 @@ class EntangledNode:
         self.lease = lease
         self._network = network
         self._wall = wall
-        self._background = chores = Background(clock)
+        self._background = background = Background(clock)
         paths = RelayedNetwork(network)
-        self.endpoint = Endpoint(identity, team_key, paths, clock, rng, door)
-        self.overlay = Overlay(lambda: self.contact, self.endpoint, clock, chores)
-        self.nat = NatTraversal(identity.node_id, self.endpoint, paths, self.overlay.contacts, clock, chores)
+        self.endpoint = Endpoint(identity, team_key, paths, clock, rng, admission)
+        self.overlay = Overlay(lambda: self.contact, self.endpoint, clock, background)
+        self.nat = NatTraversal(identity.node_id, self.endpoint, paths, self.overlay.contacts, clock, background)
         self.overlay.on_named.add(self.nat.selector.record_namer)
-        self.replica = Replica(store, self.endpoint, self.overlay, clock, chores)
-        self._owner = Owner(identity, lease, store, self.replica, self.overlay, self.endpoint, clock, chores)
-        self._membership = membership = Membership(self.overlay, self.endpoint, clock, rng, chores)
+        self.replica = Replica(store, self.endpoint, self.overlay, clock, background)
+        self._owner = Owner(identity, lease, store, self.replica, self.overlay, self.endpoint, clock, background)
+        self._membership = membership = Membership(self.overlay, self.endpoint, clock, rng, background)
         membership.prober.needs_keep_alive = self.nat.paths.needs_keep_alive
         self._alternate_paths = membership.alternate_paths
         self.discovery = (
-            None if lan is None else LanDiscovery(lan, self.endpoint, self.overlay, membership, clock, rng, chores)
+            None if lan is None else LanDiscovery(lan, self.endpoint, self.overlay, membership, clock, rng, background)
         )
-        self._handover = Handover(store, self.replica, self.overlay, self._owner, self.endpoint, clock, rng, chores)
-        self._reader = Reader(self.replica, self.overlay, self._owner, chores)
+        self._handover = Handover(store, self.replica, self.overlay, self._owner, self.endpoint, clock, rng, background)
+        self._reader = Reader(self.replica, self.overlay, self._owner, background)
         self._subscriber = Subscriber(
-            identity.node_id, self.replica, self.overlay, self._reader, self.endpoint, clock, chores
+            identity.node_id, self.replica, self.overlay, self._reader, self.endpoint, clock, background
         )
         self.replica.is_synced = self._handover.is_synced
         self._acceptor_arguments = (clock, rng)
@@ -135,9 +135,9 @@ class EntangledNode:
         # Imported on first use: a node without councils saves half a MiB.
         from middleware.entangled.space.take_acceptor import TakeAcceptor
 
-        seat = TakeAcceptor(self.endpoint, self.store, *self._acceptor_arguments)
-        seat.wait_for_write = self.store.wait_for_write
-        return seat
+        take_acceptor = TakeAcceptor(self.endpoint, self.store, *self._acceptor_arguments)
+        take_acceptor.wait_for_write = self.store.wait_for_write
+        return take_acceptor
 
     # -- lifecycle -----------------------------------------------------------------------------------------------------
 

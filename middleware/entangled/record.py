@@ -70,7 +70,7 @@ class Record:
 
     @property
     def message_bytes(self) -> int:
-        """The approximate size of this record in a message; ``data.store.weight`` is its size in a store."""
+        """The approximate size of this record in a message; ``data.store.count_bytes`` is its size in a store."""
         return len(self.value or b"") + len(self.name.encode()) + FRAME_BYTES
 
     def supersedes(self, other: Record | None) -> bool:

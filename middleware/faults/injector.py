@@ -232,8 +232,8 @@ class FaultInjector:
 
         self.wall.ahead = amount("skew")
         if self._network is not None:
-            weather = LinkConditions(delay_s=amount("delay"), loss=amount("loss"))
-            self._network.weather = PERFECT if weather == PERFECT else weather
+            conditions = LinkConditions(delay_s=amount("delay"), loss=amount("loss"))
+            self._network.weather = PERFECT if conditions == PERFECT else conditions
             self._network.is_receive_blocked = "radio" in self._active
             self._network.is_send_blocked = "radio" in self._active or "one-way" in self._active
         if self._battery is not None:

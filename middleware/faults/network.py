@@ -25,7 +25,7 @@ class FaultyNetwork:
     """``network`` with faults.
 
     ``weather`` applies to each datagram sent and to each one received, so to a request and its response twice.
-    ``is_deaf``: nothing is received; ``is_mute``: nothing is sent.
+    ``is_receive_blocked``: nothing is received; ``is_send_blocked``: nothing is sent.
     """
 
     def __init__(self, network: Network, clock: IReactorTime, rng: random.Random) -> None:

@@ -88,27 +88,27 @@ class FaultOutcome:
         )
 
 
-def run_scenario(scenario: Scenario, seed: int, stage: TeamUnderTest, say: Callable[[str], None]) -> list[FaultOutcome]:
+def run_scenario(scenario: Scenario, seed: int, team: TeamUnderTest, say: Callable[[str], None]) -> list[FaultOutcome]:
     """Run the scenario, and report each loss when it is settled; raises ``DeviceNotPresent``."""
     rng = random.Random(seed)
     losses: list[FaultOutcome] = []
     if scenario.task:
-        say(f"assigned {scenario.task} as {stage.assign(scenario.task)}")
-    began = stage.seconds()
+        say(f"assigned {scenario.task} as {team.assign(scenario.task)}")
+    began = team.seconds()
     for step in scenario.steps:
-        while stage.seconds() < began + step.at:
-            _update(stage, losses, say)
-        device = _wait_for_device(stage, step.device, rng, losses, say)
-        task = find_executing(stage.devices()).get(device.uuid, "")
-        now = stage.inject(device, step.fault) + stage.seconds()
+        while team.seconds() < began + step.at:
+            _update(team, losses, say)
+        device = _wait_for_device(team, step.device, rng, losses, say)
+        task = find_executing(team.devices()).get(device.uuid, "")
+        now = team.inject(device, step.fault) + team.seconds()
         lasts = "" if step.fault.kind == "kill" else f" for {step.fault.seconds:g} s"
         say(f"{device.name}: {step.fault.kind}{lasts}")
         losses.append(FaultOutcome(device.name, step.fault, Takeover(device.uuid, task, now, now + step.fault.seconds)))
-    while any(_is_open(loss, stage.seconds()) for loss in losses):
-        _update(stage, losses, say)
+    while any(_is_open(loss, team.seconds()) for loss in losses):
+        _update(team, losses, say)
     for loss in losses:
         if loss.takeover.seconds is None:
-            loss.is_ended = bool(loss.takeover.task) and stage.is_over(loss.takeover.task)
+            loss.is_ended = bool(loss.takeover.task) and team.is_over(loss.takeover.task)
             say(str(loss))
     return losses
 
@@ -122,25 +122,25 @@ def _is_given_up(loss: FaultOutcome, now: float) -> bool:
     return now > loss.takeover.began + max(SETTLE_S, min(loss.fault.seconds, 3 * SETTLE_S))
 
 
-def _update(stage: TeamUnderTest, losses: Iterable[FaultOutcome], say: Callable[[str], None]) -> None:
-    stage.wait(POLL_INTERVAL_S)
-    devices = stage.devices()
+def _update(team: TeamUnderTest, losses: Iterable[FaultOutcome], say: Callable[[str], None]) -> None:
+    team.wait(POLL_INTERVAL_S)
+    devices = team.devices()
     acts, names = find_executing(devices), {device.uuid: device.name for device in devices}
     for loss in losses:
-        if loss.takeover.observe(acts, stage.seconds()):
+        if loss.takeover.observe(acts, team.seconds()):
             loss.to = names[loss.takeover.to]
             say(str(loss))
 
 
 def _wait_for_device(
-    stage: TeamUnderTest, wanted: str, rng: random.Random, losses: Iterable[FaultOutcome], say: Callable[[str], None]
+    team: TeamUnderTest, wanted: str, rng: random.Random, losses: Iterable[FaultOutcome], say: Callable[[str], None]
 ) -> Device:
-    end = stage.seconds() + DEVICE_TIMEOUT_S
-    while stage.seconds() <= end:
-        if found := _matching_devices(stage, wanted, losses):
+    end = team.seconds() + DEVICE_TIMEOUT_S
+    while team.seconds() <= end:
+        if found := _matching_devices(team, wanted, losses):
             return rng.choice(found) if wanted == ANY_DEVICE else found[0]
-        _update(stage, losses, say)
-    names = ", ".join(device.name for device in stage.devices()) or "none"
+        _update(team, losses, say)
+    names = ", ".join(device.name for device in team.devices()) or "none"
     what = (
         "executes a task"
         if wanted == EXECUTING_DEVICE
@@ -151,15 +151,15 @@ def _wait_for_device(
     raise DeviceNotPresent(f"no device {what} within {DEVICE_TIMEOUT_S:g} s; present devices: {names}")
 
 
-def _matching_devices(stage: TeamUnderTest, wanted: str, losses: Iterable[FaultOutcome]) -> list[Device]:
-    here = stage.devices()
+def _matching_devices(team: TeamUnderTest, wanted: str, losses: Iterable[FaultOutcome]) -> list[Device]:
+    present = team.devices()
     if wanted == ANY_DEVICE:
         return sorted(
-            (each for each in here if not ROLES_WITHOUT_ROBOT & set(each.roles)), key=lambda device: device.name
+            (each for each in present if not ROLES_WITHOUT_ROBOT & set(each.roles)), key=lambda device: device.name
         )
     if wanted != EXECUTING_DEVICE:
-        return [device for device in here if device.name == wanted]
+        return [device for device in present if device.name == wanted]
     # An isolated device still reports that it executes the task; skip it.
-    lost = {loss.takeover.lost for loss in losses if loss.is_lost and stage.seconds() < loss.takeover.until}
-    acts = find_executing(here)
-    return [device for device in here if device.uuid in acts and device.uuid not in lost]
+    lost = {loss.takeover.lost for loss in losses if loss.is_lost and team.seconds() < loss.takeover.until}
+    acts = find_executing(present)
+    return [device for device in present if device.uuid in acts and device.uuid not in lost]

@@ -90,12 +90,12 @@ class TeamView:
 
     def explain(self, task_id: str) -> Explanation:
         """Explain the choice of the task's agent by the verdicts of the agents."""
-        verdicts = [
-            verdict
+        records = [
+            decision
             for record in self._read(decision_records_key(task_id))
-            if (verdict := parse_decision_record(record))
+            if (decision := parse_decision_record(record))
         ]
-        return explain_decisions(verdict for verdict in verdicts if verdict.task == task_id)
+        return explain_decisions(decision for decision in records if decision.task == task_id)
 
     def find_unable_devices(self, task: Task) -> dict[str, list[str]]:
         """Return the unmet requirements of ``task`` by the name of each device that cannot do it (Algorithm 4.4)."""

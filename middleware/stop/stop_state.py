@@ -64,7 +64,7 @@ Later = Callable[[float, Callable[[], None]], object]
 
 
 class StopState:
-    """The stops as this node knows them; agents check ``is_on`` before they act, and report their activity.
+    """The stops as this node knows them; agents check ``is_motion_forbidden`` before they act, and report their activity.
 
     ``later(seconds, call)`` is a timer that ends with the node, and ``report`` is called after each change.  Without a
     node, nothing is stopped.
@@ -75,7 +75,7 @@ class StopState:
         entangled: EntangledNode | None = None,
         rng: random.Random | None = None,
         later: Later = lambda seconds, call: None,
-        report: Report = lambda stops, words: None,
+        report: Report = lambda stops, text: None,
     ) -> None:
         self.is_known = True
         self.released_by = ""
@@ -246,7 +246,7 @@ class StopState:
         self._notify()
 
     def _ignore_unreachable(self, failure: Any) -> None:
-        """Ignore that no node answered; agents call ``learn`` again."""
+        """Ignore that no node answered; agents call ``request_stops`` again."""
         failure.trap(EntangledError)
         self._is_requesting = False
 
@@ -334,9 +334,9 @@ class StopState:
 
 def expose_stops(entangled: EntangledNode, rng: random.Random, later: Later, report: Report) -> StopState:
     """Create the stops of the node ``entangled`` and let peers order stops and releases."""
-    halt = StopState(entangled, rng, later, report)
-    entangled.endpoint.expose(METHOD, halt.answer, changes=True, idempotent=True)
-    return halt
+    stop_state = StopState(entangled, rng, later, report)
+    entangled.endpoint.expose(METHOD, stop_state.answer, changes=True, idempotent=True)
+    return stop_state
 
 
 def collect_stops(records: list[Record]) -> dict[bytes, str]:

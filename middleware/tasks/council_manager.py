@@ -75,36 +75,36 @@ class CouncilManager:
             return self.lease_service.call_member(self._entangled.contact, member, method, arguments, ttl / 3)
 
         def moved() -> None:
-            self._on_change(task.with_council(council.charter) if council.charter is not None else task)
+            self._on_change(task.with_council(proposer.charter) if proposer.charter is not None else task)
 
         pinned = task.task_id, self._entangled.contact.node_id.hex(), ttl, task.council
         read = self.charter_verifier.parse
-        council = LeaseProposer(
+        proposer = LeaseProposer(
             *pinned, ask, self._clock, self._rng, parse_charter(task.charter), read, task.configuration, floor, moved
         )
-        return council
+        return proposer
 
     def make_lease_client(self, task: Task, changed: Callable[[], None], floor: int) -> LeaseClient:
         """Create this node's lease client for ``task``, with tokens above ``floor``."""
-        lessee = LeaseClient(self.make_proposer(task, floor), self._clock, self._rng, changed, task.stop_time)
-        self.lease_service.register(lessee)
-        return lessee
+        client = LeaseClient(self.make_proposer(task, floor), self._clock, self._rng, changed, task.stop_time)
+        self.lease_service.register(client)
+        return client
 
-    def has_vacancy(self, task: Task, council: LeaseProposer) -> bool:
+    def has_vacancy(self, task: Task, proposer: LeaseProposer) -> bool:
         """Return whether a quorum member is silent, or there were too few nodes when they were chosen."""
-        return 0 < len(council.members) < self._choose_size(task) or bool(council.find_silent_members(SILENT_S))
+        return 0 < len(proposer.members) < self._choose_size(task) or bool(proposer.find_silent_members(SILENT_S))
 
-    async def find_successors(self, task: Task, council: LeaseProposer) -> tuple[Contact, ...] | None:
+    async def find_successors(self, task: Task, proposer: LeaseProposer) -> tuple[Contact, ...] | None:
         """Return the next quorum members of ``task``: the present ones that answer, and the closest other nodes.
 
         None if that would be no improvement.  Fails with ``EntangledError`` if no node answers.
         """
-        key, silent = group_key(task.task_id), council.find_silent_members(SILENT_S)
+        key, silent = group_key(task.task_id), proposer.find_silent_members(SILENT_S)
         silent_ids = {member.node_id for member in silent}
         nodes = await self._entangled.find_node(key)
         found = [node for node in nodes if node.node_id not in silent_ids and self._may_be_member(node.public)]
         candidates = select_closest([*found, self._entangled.contact], key, len(found) + 1)
-        return choose_successors(council.members, silent, candidates, self._choose_size(task))
+        return choose_successors(proposer.members, silent, candidates, self._choose_size(task))
 
     def _may_publish(self, public: bytes, task_id: str) -> bool:
         return self._entangled.replica.may_store(Slot(TASKS, public, task_id))

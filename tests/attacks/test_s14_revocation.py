@@ -57,7 +57,7 @@ class BackdatingTests(SiegeCase):
         """Members admitted by a revoked bootstrap node are refused, whatever their dates; a kept member stays."""
         kept, shown = self.mint(1, int(self.team.wall()))
         self.assertEqual(self.enter(kept, shown, 701), "")
-        revoke = self.team.signer.revoke(self.thief.public, "boot1", self.team.wall(), kept=[kept.public])
+        revoke = self.team.signer.revoke(self.thief.public, "boot1", self.team.wall(), members=[kept.public])
         self.outcome(self.team, self.team.tell(revoke))
         self.team.run(2.0)
         for number in (2, 3, 4):

@@ -21,7 +21,7 @@ from middleware.admission.operator import FIRST_NODE_ROLES
 from middleware.config.settings import Settings
 from swarmnode import page_access
 from swarmnode.simulated_team import SimulatedTeam
-from tests.webnode.memory import MemoryDesk
+from tests.webnode.memory import MemoryTeamControl
 from webnode.app import create_app
 from webnode.auth import OpenSessions, Token, User
 from webnode.errors import Refusal
@@ -317,7 +317,7 @@ class LogTests(SynchronousTestCase):
 class RebindingTests(SynchronousTestCase):
     def test_rebind_a_local_name(self) -> None:
         """A Host header with an unknown local name is refused; the node's and the configured names are accepted."""
-        board, state = Services(MemoryDesk(), OpenSessions()), format_state([], [], {}, node="vaio")
+        board, state = Services(MemoryTeamControl(), OpenSessions()), format_state([], [], {}, node="vaio")
         client = create_app(lambda: state, board, hosts=("vaio", "vaio.local", "robots.lan")).test_client()
 
         def status(host: str) -> int:

@@ -51,7 +51,7 @@ class LeaseTeam(Village):
             self.clock,
             self.make_life_rng(place),
             self.wall,
-            door=house.team.admission,
+            admission=house.team.admission,
         )
         house.team.attach(node.entangled, self.clock)
         node.team = house.team

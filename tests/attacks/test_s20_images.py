@@ -232,7 +232,7 @@ class QueueTests(BombCase):
                 clock = PooledClock()
                 driver: Any = StillDriver()
                 body = AgentRobot(driver, clock, lambda seen: None, lambda why: None)
-                behaviour = create_behaviour(Task("t", kind, "t"), random.Random(1), means=body.motion)
+                behaviour = create_behaviour(Task("t", kind, "t"), random.Random(1), motion=body.motion)
                 values = {"odom.x": 0.0, "odom.y": 0.0, "odom.yaw": 0.0}
                 self.decoded.clear()
                 for number in range(1, 101):

@@ -60,7 +60,7 @@ class EavesdroppingTests(TestCase):
         team = Team(MemoryMembership(paper), store, time.time, dice)
         network = UdpNetwork(reactor, "127.0.0.1", 0)
         node = EntangledNode(
-            *(team.identity, team.secret, network, store, reactor, dice), wall=time.time, door=team.admission
+            *(team.identity, team.secret, network, store, reactor, dice), wall=time.time, admission=team.admission
         )
         team.attach(node, reactor)
         node.endpoint.expose("device.message", lambda peer, text: text)

@@ -62,9 +62,9 @@ class Announcer:
         if len(self._bidders) < MAX_COUNTED_BIDDERS:
             self._bidders.update(bid.agent for bid in bids)
         changed = self.summary.join(bids)
-        for fellow in self._known:
-            if is_shared or fellow == sender:
-                self._record_known(fellow, bids)
+        for member_id in self._known:
+            if is_shared or member_id == sender:
+                self._record_known(member_id, bids)
         self._schedule_sharing(now + GATHER_S)
         if self._closes_at == math.inf and bids:
             self._closes_at = now + max(0.0, self._auction.waiting_period - age)
@@ -97,14 +97,14 @@ class Announcer:
     def take_due_offers(self, age: float, now: float) -> list[Offer]:
         """Return the messages to other members that are due now."""
         out = []
-        for fellow in self._other_members:
-            if now < self._send_at[fellow.node_id] or fellow.node_id in self._in_flight:
+        for member_id in self._other_members:
+            if now < self._send_at[member_id.node_id] or member_id.node_id in self._in_flight:
                 continue
-            self._send_at[fellow.node_id] = math.inf
-            missing = self._find_missing_bids(fellow.node_id)
+            self._send_at[member_id.node_id] = math.inf
+            missing = self._find_missing_bids(member_id.node_id)
             if missing:
-                self._in_flight.add(fellow.node_id)
-                out.append(Offer(fellow, missing, age))
+                self._in_flight.add(member_id.node_id)
+                out.append(Offer(member_id, missing, age))
         return out
 
     def on_answer(self, offer: Offer, now: float) -> None:
@@ -125,18 +125,18 @@ class Announcer:
 
     def _schedule_sharing(self, moment: float) -> None:
         """Schedule the missing bids for the first members that answer, from ``moment`` on."""
-        for fellow in [node_id for node_id in self._known if node_id not in self._silent][:INFORMED_MEMBERS]:
-            if self._find_missing_bids(fellow):
-                self._send_at[fellow] = min(self._send_at[fellow], moment)
+        for member_id in [node_id for node_id in self._known if node_id not in self._silent][:INFORMED_MEMBERS]:
+            if self._find_missing_bids(member_id):
+                self._send_at[member_id] = min(self._send_at[member_id], moment)
 
-    def _record_known(self, fellow: bytes, bids: Iterable[Bid]) -> None:
+    def _record_known(self, member_id: bytes, bids: Iterable[Bid]) -> None:
         """Record that a member has ``bids``; only bids to forward are remembered."""
-        known = {**self._known[fellow], **{bid.agent: bid.rank for bid in bids}}
-        self._known[fellow] = {b.agent: known[b.agent] for b in self.summary.list_bids() if b.agent in known}
+        known = {**self._known[member_id], **{bid.agent: bid.rank for bid in bids}}
+        self._known[member_id] = {b.agent: known[b.agent] for b in self.summary.list_bids() if b.agent in known}
 
-    def _find_missing_bids(self, fellow: bytes) -> tuple[Bid, ...]:
+    def _find_missing_bids(self, member_id: bytes) -> tuple[Bid, ...]:
         """Return the bids that a member is missing, at most as many as fit into one message."""
-        known = self._known[fellow]
+        known = self._known[member_id]
         return tuple(bid for bid in self.summary.list_bids() if known.get(bid.agent) != bid.rank)[:MAX_BIDS_PER_MESSAGE]
 
     def _make_entries(self) -> tuple[AnnouncedReport, ...]:

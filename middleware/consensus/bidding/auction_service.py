@@ -49,10 +49,10 @@ FALLBACK_STRATEGY = "nearest"
 class Bidding:
     """One agent's participation in ``auction``; ``on_summary`` is called with each announced set of reports."""
 
-    def __init__(self, auction: Auction, on_summary: OnSummary, dissemination: AuctionService) -> None:
+    def __init__(self, auction: Auction, on_summary: OnSummary, service: AuctionService) -> None:
         self.auction = auction
         self.on_summary = on_summary
-        self._service = dissemination
+        self._service = service
         self._last_report: Report | None = None
         self._has_published = False
 
@@ -149,8 +149,8 @@ class ParticipantTable:
         if entry is not None:
             entry.touched_at = now
 
-    def add(self, party: Participant, opener: bytes, now: float) -> list[Participant]:
-        """Add ``party``, which ``opener`` (a node id, or ``OWN_OPENER``) requested; returns the evicted parties."""
+    def add(self, participant: Participant, opener: bytes, now: float) -> list[Participant]:
+        """Add ``participant``, which ``opener`` (a node id, or ``OWN_OPENER``) requested; returns the evicted parties."""
         idle = [
             d
             for d, entry in self._entries.items()
@@ -164,7 +164,7 @@ class ParticipantTable:
             busiest = counts.most_common(1)[0][0]
             digest = next(digest for digest, entry in self._entries.items() if entry.opener == busiest)
             evicted.append(self._entries.pop(digest).participant)
-        self._entries[party.auction.digest] = _TableEntry(party, opener, now)
+        self._entries[participant.auction.digest] = _TableEntry(participant, opener, now)
         return evicted
 
     def mark_own(self, digest: bytes, is_own: bool, opener: bytes = b"left") -> None:
@@ -199,12 +199,12 @@ class AuctionService:
 
         ``on_summary`` is called with each announced set of reports, immediately if there is one.
         """
-        party = self._get_participant(auction, OWN_OPENER)
+        participant = self._get_participant(auction, OWN_OPENER)
         bidding = Bidding(auction, on_summary, self)
         self._biddings.setdefault(auction.digest, []).append(bidding)
         self._participants.mark_own(auction.digest, True)
-        if party.standing_reports:
-            on_summary(party.standing_reports)
+        if participant.standing_reports:
+            on_summary(participant.standing_reports)
         return bidding
 
     def stop(self) -> None:
@@ -230,21 +230,21 @@ class AuctionService:
         checked = self._check_bids(about, bids)
         # A peer may claim to send to all quorum members for its own bid only.
         is_own = all(bid.public == peer.public for bid in checked)
-        party = self._get_participant(about, peer.node_id)
-        if not party.has_room(peer):
+        participant = self._get_participant(about, peer.node_id)
+        if not participant.has_room(peer):
             raise Refused("too many nodes send their bids here; use another contact that is nearer to the key")
         now = self._clock.seconds()
-        announcement = party.on_offer(checked, peer, age_ms / 1000, is_shared and is_own, now)
-        self._send_due(party)
+        announcement = participant.on_offer(checked, peer, age_ms / 1000, is_shared and is_own, now)
+        self._send_due(participant)
         return announcement.pack() if announcement is not None else None
 
     def answer_announcement(self, peer: Contact, auction: list[object], announcement: list[object]) -> None:
         """Process an announcement of a quorum member, from any peer."""
         about = _require_auction(auction)
-        party = self._participants.get(about.digest)
-        if party is not None:  # other nodes do not need it
-            self._process_announcement(party, announcement)
-            self._send_due(party)
+        participant = self._participants.get(about.digest)
+        if participant is not None:  # other nodes do not need it
+            self._process_announcement(participant, announcement)
+            self._send_due(participant)
 
     def answer_flood(self, peer: Contact, auction: list[object], bids: list[object]) -> None:
         """Process flooded bids of a neighbour that reaches no quorum member."""
@@ -252,9 +252,9 @@ class AuctionService:
         if about.exclusive:
             raise Refused("bids for an exclusive task must be sent to its quorum members")
         checked = self._check_bids(about, bids)
-        party = self._get_participant(about, peer.node_id)
-        party.on_flood(checked, peer, self._clock.seconds())
-        self._send_due(party)
+        participant = self._get_participant(about, peer.node_id)
+        participant.on_flood(checked, peer, self._clock.seconds())
+        self._send_due(participant)
 
     # -- inside -----------------------------------------------------------------------------------------------------
 
@@ -267,7 +267,7 @@ class AuctionService:
         except UnknownStrategy:
             strategy = self._environment.strategy_for(FALLBACK_STRATEGY)
         rule = MergeRule(strategy, self._log_fault)
-        party = Participant(
+        participant = Participant(
             auction,
             self._environment.me(),
             rule,
@@ -276,15 +276,15 @@ class AuctionService:
             self._identity.sign,
             lambda reports: self._notify(auction.digest, reports),
         )
-        for evicted in self._participants.add(party, opener, self._clock.seconds()):
+        for evicted in self._participants.add(participant, opener, self._clock.seconds()):
             self._cancel_timer(evicted.auction.digest)
-        return party
+        return participant
 
     def _check_bids(self, auction: Auction, content: list[object]) -> list[Bid]:
         """Decode bids and check their signatures; raises ``Refused``."""
         if len(content) > MAX_BIDS_PER_MESSAGE:
             raise Refused(f"a message may have at most {MAX_BIDS_PER_MESSAGE} bids, not {len(content)}")
-        party = self._participants.get(auction.digest)
+        participant = self._participants.get(auction.digest)
         bids = []
         for each in content:
             bid = parse_bid(each)
@@ -292,7 +292,7 @@ class AuctionService:
                 raise Refused("a bid must have a key, a finite cost of at least 0, a revision and a signature")
             if not self._environment.may_bid(auction.key, bid.public):
                 continue  # the sender may also forward permitted bids
-            known = party.summary.get(bid.agent) if party is not None else None
+            known = participant.summary.get(bid.agent) if participant is not None else None
             if known is not None and known.rank == bid.rank:
                 bids.append(known)  # already checked; the signature of the copy may differ
             elif bid.is_genuine(auction):
@@ -303,18 +303,18 @@ class AuctionService:
             raise Refused(f"no valid bid: {explain(ROLE)}", ROLE)
         return bids
 
-    def _process_announcement(self, party: Participant, content: object) -> None:
+    def _process_announcement(self, participant: Participant, content: object) -> None:
         """Check and process an announcement; raises ``Refused``."""
         announcement = parse_announcement(content)
         if announcement is None:
             raise Refused("an announcement must have a number, the rank of a quorum member, reports and a signature")
-        if party.announcement is not None and announcement.precedence <= party.announcement.precedence:
+        if participant.announcement is not None and announcement.precedence <= participant.announcement.precedence:
             return
-        if not announcement.is_genuine(party.auction):
+        if not announcement.is_genuine(participant.auction):
             raise Refused("invalid signature of an announcement: no quorum member of the task made it")
-        party.on_announcement(announcement, self._clock.seconds())
-        if party.is_superseded and party.own_bid is not None:
-            self._bid(party, party.own_bid.report)
+        participant.on_announcement(announcement, self._clock.seconds())
+        if participant.is_superseded and participant.own_bid is not None:
+            self._bid(participant, participant.own_bid.report)
 
     def publish(self, auction: Auction, report: Report | None) -> None:
         """Make or withdraw this node's bid in ``auction``.  Raises ``ValueError`` for an invalid cost."""
@@ -323,19 +323,19 @@ class AuctionService:
                 raise ValueError(f"cost must be finite and at least 0, not {report.cost!r}")
             if report.agent != self._identity.node_id.hex():
                 raise ValueError("a node may bid for its own agent only")
-        party = self._get_participant(auction, OWN_OPENER)
-        self._bid(party, report)
-        self._send_due(party)
+        participant = self._get_participant(auction, OWN_OPENER)
+        self._bid(participant, report)
+        self._send_due(participant)
 
-    def _bid(self, party: Participant, report: Report | None) -> None:
-        bid = Bid(self._identity.public, report, party.next_revision).sign(self._identity, party.auction)
-        party.make_bid(bid, self._path_choice.choose(self._environment.team_size()), self._clock.seconds())
+    def _bid(self, participant: Participant, report: Report | None) -> None:
+        bid = Bid(self._identity.public, report, participant.next_revision).sign(self._identity, participant.auction)
+        participant.make_bid(bid, self._path_choice.choose(self._environment.team_size()), self._clock.seconds())
 
     def expect_bidders(self, auction: Auction, bidders: float) -> None:
         """Close the bidding as soon as that many agents have bid or abstained."""
-        party = self._get_participant(auction, OWN_OPENER)
-        party.expect_bidders(bidders)
-        self._send_due(party)
+        participant = self._get_participant(auction, OWN_OPENER)
+        participant.expect_bidders(bidders)
+        self._send_due(participant)
 
     def leave(self, bidding: Bidding) -> None:
         """Stop notifying ``bidding``."""
@@ -356,67 +356,67 @@ class AuctionService:
     def _log_fault(self, method: str, error: Exception) -> None:
         self._log.error("a strategy's {method} raised {error!r}; using nearest instead", method=method, error=error)
 
-    def _send_due(self, party: Participant) -> None:
+    def _send_due(self, participant: Participant) -> None:
         """Send all due messages, and set the timer for the next ones."""
-        digest = party.auction.digest
-        if self._is_stopped or digest in self._sending or self._participants.get(digest) is not party:
+        digest = participant.auction.digest
+        if self._is_stopped or digest in self._sending or self._participants.get(digest) is not participant:
             return
         self._sending.add(digest)
         self._participants.touch(digest, self._clock.seconds())
         try:
-            while errands := party.take_due_messages(self._clock.seconds()):
-                for errand in errands:
-                    self._send(party, errand)
+            while messages := participant.take_due_messages(self._clock.seconds()):
+                for message in messages:
+                    self._send(participant, message)
         finally:
             self._sending.discard(digest)
-        self._set_timer(party)
+        self._set_timer(participant)
 
-    def _set_timer(self, party: Participant) -> None:
-        self._cancel_timer(party.auction.digest)
-        if party.due != math.inf and not self._is_stopped:
-            wait = max(0.0, party.due - self._clock.seconds())
-            self._timers[party.auction.digest] = self._clock.callLater(wait, self._send_due, party)
+    def _set_timer(self, participant: Participant) -> None:
+        self._cancel_timer(participant.auction.digest)
+        if participant.due != math.inf and not self._is_stopped:
+            wait = max(0.0, participant.due - self._clock.seconds())
+            self._timers[participant.auction.digest] = self._clock.callLater(wait, self._send_due, participant)
 
     def _cancel_timer(self, digest: bytes) -> None:
         timer = self._timers.pop(digest, None)
         if timer is not None and timer.active():
             timer.cancel()
 
-    def _send(self, party: Participant, errand: OutgoingMessage) -> None:
-        head = party.auction.pack()
-        if isinstance(errand, FloodedBids):
+    def _send(self, participant: Participant, message: OutgoingMessage) -> None:
+        head = participant.auction.pack()
+        if isinstance(message, FloodedBids):
             try:
-                self._endpoint.notify(errand.to, FLOOD_METHOD, head, [bid.pack() for bid in errand.bids])
+                self._endpoint.notify(message.to, FLOOD_METHOD, head, [bid.pack() for bid in message.bids])
             except EntangledError as error:
                 self._log.debug("flooded bids were not sent: {error}", error=error)
             return
-        if isinstance(errand, Notice):
-            arguments: tuple[object, ...] = (ANNOUNCE_METHOD, head, errand.announcement.pack())
+        if isinstance(message, Notice):
+            arguments: tuple[object, ...] = (ANNOUNCE_METHOD, head, message.announcement.pack())
         else:
-            bids = [bid.pack() for bid in errand.bids]
-            arguments = (OFFER_METHOD, head, bids, _to_milliseconds(errand.age), errand.is_shared)
+            bids = [bid.pack() for bid in message.bids]
+            arguments = (OFFER_METHOD, head, bids, _to_milliseconds(message.age), message.is_shared)
         method, *others = arguments
-        request = self._endpoint.ask(errand.to, str(method), *others, timeout=REQUEST_TIMEOUT_S, changes=True)
+        request = self._endpoint.ask(message.to, str(method), *others, timeout=REQUEST_TIMEOUT_S, changes=True)
         request.addCallbacks(
-            self._on_answer, self._on_failure, callbackArgs=(party, errand), errbackArgs=(party, errand)
+            self._on_answer, self._on_failure, callbackArgs=(participant, message), errbackArgs=(participant, message)
         )
         request.addErrback(lambda failure: self._log.failure("sending bids failed", failure))
 
-    def _on_answer(self, answer: object, party: Participant, errand: OutgoingMessage) -> None:
-        if isinstance(errand, Offer) and answer is not None:
+    def _on_answer(self, answer: object, participant: Participant, message: OutgoingMessage) -> None:
+        if isinstance(message, Offer) and answer is not None:
             try:
-                self._process_announcement(party, answer)
+                self._process_announcement(participant, answer)
             except Refused as error:
-                self._log.info("{peer} returned an invalid announcement: {error}", peer=errand.to.address, error=error)
-        party.on_answer(errand, self._clock.seconds())
-        self._send_due(party)
+                self._log.info("{peer} returned an invalid announcement: {error}", peer=message.to.address, error=error)
+        participant.on_answer(message, self._clock.seconds())
+        self._send_due(participant)
 
-    def _on_failure(self, failure: Any, party: Participant, errand: OutgoingMessage) -> None:
+    def _on_failure(self, failure: Any, participant: Participant, message: OutgoingMessage) -> None:
         if failure.check(EntangledError) is None:
             self._log.failure("sending bids failed", failure)
         if failure.check(NotRunning) is None:
-            party.on_failure(errand, self._clock.seconds())
-            self._send_due(party)
+            participant.on_failure(message, self._clock.seconds())
+            self._send_due(participant)
 
 
 def _require_auction(content: list[object]) -> Auction:

@@ -96,24 +96,24 @@ class TaskMembers:
 class Group:
     """One participant's connection to the group of ``task``.
 
-    - ``heard``: called with the members and the outcome after each change
+    - ``on_members``: called with the members and the outcome after each change
     - ``quietly``: takes writes whose failure is only logged
     - ``ordered``: called with all records, which include an operator's orders
     - ``enter``: starts bidding for the task; None: reports are exchanged by records only
     - ``view``: the part of a report that the strategy reads
-    - ``panel``: decides which participants of a team of many ``devices`` write records
+    - ``reporters``: decides which participants of a team of many ``devices`` write records
     """
 
     def __init__(
         self,
         task: Task,
         entangled: EntangledNode,
-        heard: OnMembers,
+        on_members: OnMembers,
         quietly: Callable[[Deferred[Stored]], None],
         ordered: Callable[[list[Record]], None],
         enter: StartBidding | None,
         view: ReportView | None,
-        panel: Reporters,
+        reporters: Reporters,
         devices: Callable[[], int],
         seconds: Callable[[], float],
         later: Later,
@@ -121,20 +121,20 @@ class Group:
         self._task = task
         self._key = group_key(task.task_id)
         self._entangled = entangled
-        self._on_members = heard
+        self._on_members = on_members
         self._on_orders = ordered
         self._log_failures = quietly
         self._view = view or ReportView()
         self._members = TaskMembers(self._view)
         self._outcome: Result | None = None
-        self._reporters = panel
+        self._reporters = reporters
         self._devices = devices
         self._seconds = seconds
         self._later = later
         self._me: Member | None = None
         self._cancel: Callable[[], None] = lambda: None
         self._has_left = False
-        panel.on_records((), devices(), seconds())
+        reporters.on_records((), devices(), seconds())
         self._bidding = enter(self._on_announcement) if enter is not None else None
         self._watch = entangled.watch(self._key, self._on_records)
 

@@ -21,7 +21,7 @@ class Offer:
 
     - ``age``: the seconds since the first known bid was made
     - ``is_shared``: the bidder itself sends to every quorum member
-    - ``is_straight``: the sender asks a quorum member for a missing announcement, or its bid is missing there
+    - ``is_inquiry``: the sender asks a quorum member for a missing announcement, or its bid is missing there
     """
 
     to: Contact

@@ -1,6 +1,6 @@
 """One node's part in one auction: it bids, forwards bids, or announces the result; pure.
 
-``errands`` returns the outgoing messages, and ``due`` the time of the next call.
+``take_due_messages`` returns the outgoing messages, and ``due`` the time of the next call.
 """
 
 from __future__ import annotations
@@ -78,9 +78,9 @@ class Participant:
     @property
     def due(self) -> float:
         """The time of the next message."""
-        told_at = self.recipients.compute_due(self.announcement, self._is_mine)
+        notices_at = self.recipients.compute_due(self.announcement, self._is_mine)
         checked_at = self._bid_check.due if self._announcer is None else math.inf
-        return min(self._direct_sender.due, self._flood_result_at, told_at, self._collector.due, checked_at)
+        return min(self._direct_sender.due, self._flood_result_at, notices_at, self._collector.due, checked_at)
 
     @property
     def own_bid(self) -> Bid | None:
@@ -182,29 +182,29 @@ class Participant:
             self._notify()
         return out
 
-    def on_answer(self, errand: OutgoingMessage, now: float) -> None:
+    def on_answer(self, message: OutgoingMessage, now: float) -> None:
         """Record that a message was confirmed."""
-        if isinstance(errand, Notice):
-            self.recipients.on_answer(errand)
-        elif isinstance(errand, Offer):
-            if errand.is_inquiry:
+        if isinstance(message, Notice):
+            self.recipients.on_answer(message)
+        elif isinstance(message, Offer):
+            if message.is_inquiry:
                 self._bid_check.on_answer(self.announcement, now)
-            elif errand.is_shared:
-                self._direct_sender.on_answer(errand)
+            elif message.is_shared:
+                self._direct_sender.on_answer(message)
             else:
-                self._collector.on_answer(errand, now)
+                self._collector.on_answer(message, now)
 
-    def on_failure(self, errand: OutgoingMessage, now: float) -> None:
+    def on_failure(self, message: OutgoingMessage, now: float) -> None:
         """Record that a message was not answered."""
-        if isinstance(errand, Notice):
-            self.recipients.on_failure(errand, now)
-        elif isinstance(errand, Offer):
-            if errand.is_inquiry:
-                self._bid_check.on_failure(errand.to, now)
-            elif errand.is_shared:
-                self._direct_sender.on_failure(errand, now)
+        if isinstance(message, Notice):
+            self.recipients.on_failure(message, now)
+        elif isinstance(message, Offer):
+            if message.is_inquiry:
+                self._bid_check.on_failure(message.to, now)
+            elif message.is_shared:
+                self._direct_sender.on_failure(message, now)
             else:
-                self._collector.on_failure(errand, now)
+                self._collector.on_failure(message, now)
             is_alone = self._bid_check.is_isolated or self._direct_sender.is_isolated or self._tree_node.is_isolated
             if is_alone and self._announcer is None:
                 self._flood_own_bid(now)

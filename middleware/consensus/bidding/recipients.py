@@ -18,7 +18,7 @@ NO_PRECEDENCE = (0, 0)
 
 @dataclass
 class _Recipient:
-    """``knows`` is the precedence of the last announcement that the listener has confirmed."""
+    """``known_precedence`` is the precedence of the last announcement that the listener has confirmed."""
 
     contact: Contact
     is_shared: bool
@@ -48,7 +48,7 @@ class Recipients:
     @property
     def is_shared(self) -> bool:
         """Whether most listeners are shared, as in a small team, in which every bidder sends to all quorum members."""
-        shared = sum(1 for listener in self._recipients.values() if listener.is_shared)
+        shared = sum(1 for recipient in self._recipients.values() if recipient.is_shared)
         return 2 * shared > len(self._recipients)
 
     def add(self, contact: Contact, is_shared: bool = False) -> None:
@@ -64,48 +64,48 @@ class Recipients:
 
     def record_known(self, contact: Contact, announcement: Announcement) -> None:
         """Record that a listener has this announcement."""
-        listener = self._recipients.get(contact.node_id)
-        if listener is not None:
-            listener.known_precedence = max(listener.known_precedence, announcement.precedence)
+        recipient = self._recipients.get(contact.node_id)
+        if recipient is not None:
+            recipient.known_precedence = max(recipient.known_precedence, announcement.precedence)
 
     def compute_due(self, announcement: Announcement | None, is_mine: bool) -> float:
         """Return the time of the next message to a listener."""
-        owed = self._find_uninformed(announcement, is_mine)
-        return min((listener.send_at for listener in owed), default=math.inf)
+        uninformed = self._find_uninformed(announcement, is_mine)
+        return min((recipient.send_at for recipient in uninformed), default=math.inf)
 
     def take_due_notices(self, announcement: Announcement | None, is_mine: bool, now: float) -> list[Notice]:
         """Return the messages that are due now, at most one per listener."""
         out = []
-        for listener in self._find_uninformed(announcement, is_mine):
-            if announcement is not None and listener.send_at <= now:
-                listener.is_pending = True
-                out.append(Notice(listener.contact, announcement))
+        for recipient in self._find_uninformed(announcement, is_mine):
+            if announcement is not None and recipient.send_at <= now:
+                recipient.is_pending = True
+                out.append(Notice(recipient.contact, announcement))
         return out
 
     def on_answer(self, notice: Notice) -> None:
         """Record that a listener confirmed the announcement."""
-        listener = self._recipients.get(notice.to.node_id)
-        if listener is not None:
-            listener.is_pending, listener.failures, listener.send_at = False, 0, 0.0
+        recipient = self._recipients.get(notice.to.node_id)
+        if recipient is not None:
+            recipient.is_pending, recipient.failures, recipient.send_at = False, 0, 0.0
         self.record_known(notice.to, notice.announcement)
 
     def on_failure(self, notice: Notice, now: float) -> None:
         """Record that a listener did not answer."""
-        listener = self._recipients.get(notice.to.node_id)
-        if listener is not None:
-            listener.is_pending = False
-            is_last = listener.failures >= len(RETRY_PAUSES_S)
-            listener.send_at = math.inf if is_last else now + RETRY_PAUSES_S[listener.failures]
-            listener.failures += 1
+        recipient = self._recipients.get(notice.to.node_id)
+        if recipient is not None:
+            recipient.is_pending = False
+            is_last = recipient.failures >= len(RETRY_PAUSES_S)
+            recipient.send_at = math.inf if is_last else now + RETRY_PAUSES_S[recipient.failures]
+            recipient.failures += 1
 
     def _find_uninformed(self, announcement: Announcement | None, is_mine: bool) -> list[_Recipient]:
         """Return the listeners that do not know ``announcement`` and have no message under way."""
         if announcement is None:
             return []
         return [
-            listener
-            for listener in self._recipients.values()
-            if listener.known_precedence < announcement.precedence
-            and not listener.is_pending
-            and (is_mine or not listener.is_shared)
+            recipient
+            for recipient in self._recipients.values()
+            if recipient.known_precedence < announcement.precedence
+            and not recipient.is_pending
+            and (is_mine or not recipient.is_shared)
         ]

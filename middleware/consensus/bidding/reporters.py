@@ -37,14 +37,14 @@ ANNOUNCEMENT_TIMEOUT_S = 3.0
 
 
 class Reporters:
-    """The reporters of one task, as the participant ``uuid`` sees them; ``place``, 0 to 1, is the order of its turn.
+    """The reporters of one task, as the participant ``uuid`` sees them; ``turn_share``, 0 to 1, is the order of its turn.
 
-    ``due`` returns when to write.  In a small team all participants are reporters.
+    ``compute_due`` returns when to write.  In a small team all participants are reporters.
     """
 
-    def __init__(self, uuid: str, place: float = 0.0) -> None:
+    def __init__(self, uuid: str, turn_share: float = 0.0) -> None:
         self._uuid = uuid
-        self.place = place
+        self.place = turn_share
         self._devices = 1
         self._is_recorded = False
         self._turn_at = self._complete_at = math.inf

@@ -80,7 +80,7 @@ class Charter:
     @property
     def token(self) -> int:
         """The token above which the newest council grants leases."""
-        return min(MAX_TOKEN, max((token for link in self.changes for _, token, _ in link.votes), default=0))
+        return min(MAX_TOKEN, max((token for change in self.changes for _, token, _ in change.votes), default=0))
 
     @property
     def first_council_id(self) -> tuple[bytes, bytes]:
@@ -100,10 +100,10 @@ class Charter:
     @cached_property
     def packed(self) -> bytes:
         """The encoding for messages, records and notes."""
-        links = [
-            [pack_members(link.members), *link.ballot, [list(vote) for vote in link.votes]] for link in self.changes
+        changes = [
+            [pack_members(change.members), *change.ballot, [list(vote) for vote in change.votes]] for change in self.changes
         ]
-        return bytes(msgpack.packb([self.owner, pack_members(self.first), self.signature, links]))
+        return bytes(msgpack.packb([self.owner, pack_members(self.first), self.signature, changes]))
 
 
 def create_charter(identity: Identity, task_id: str, members: tuple[Contact, ...]) -> Charter:
@@ -177,10 +177,10 @@ def parse_end_proof(packed: object, pinned: Charter) -> EndProof | None:
 
 
 class CharterVerifier:
-    """Checks charters from peers; ``may_pin`` returns whether the owner of a key may publish the task."""
+    """Checks charters from peers; ``may_publish`` returns whether the owner of a key may publish the task."""
 
-    def __init__(self, may_pin: Callable[[bytes, str], bool]) -> None:
-        self._may_publish = may_pin
+    def __init__(self, may_publish: Callable[[bytes, str], bool]) -> None:
+        self._may_publish = may_publish
 
     def parse(self, task_id: str, packed: object) -> Charter | None:
         """Decode and check the charter of ``task_id``; None if anything in it is invalid."""
@@ -230,9 +230,9 @@ def _parse_charter(packed: bytes) -> Charter | None:
         return None
     if not isinstance(rows, list) or len(rows) > MAX_CHANGES:
         return None
-    links = [_parse_change(row) for row in rows]
-    valid = tuple(link for link in links if link is not None)
-    return Charter(owner, members, signature, valid) if len(valid) == len(links) else None
+    changes = [_parse_change(row) for row in rows]
+    valid = tuple(change for change in changes if change is not None)
+    return Charter(owner, members, signature, valid) if len(valid) == len(changes) else None
 
 
 def _parse_change(row: Any) -> CouncilChange | None:

@@ -85,7 +85,7 @@ class _Standby:
 
 
 class LeaseClient:
-    """The claim of one agent to the task of ``council``.
+    """The claim of one agent to the task of ``proposer``.
 
     :param clock: a clock that runs while the machine is suspended
     :param rng: the source of random pauses
@@ -95,14 +95,14 @@ class LeaseClient:
 
     def __init__(
         self,
-        council: LeaseProposer,
+        proposer: LeaseProposer,
         clock: IReactorTime,
         rng: random.Random,
         changed: Callable[[], None],
         stop_time: float = 0.0,
     ) -> None:
-        self.task_id = council.task_id
-        self.proposer = council
+        self.task_id = proposer.task_id
+        self.proposer = proposer
         self.late_timer_count = 0
         self.state = State.IDLE
         self._step_count = 0

@@ -49,7 +49,7 @@ class LeaseProposer:
 
     ``moved`` is called after a change of the council, to update the task's record.  ``token`` is the highest known
     token; new claims are above it.  ``charter`` proves the council, ``read`` decodes and checks charters from members,
-    and ``ending`` is the proof that the task was closed under a token.
+    and ``end_proof`` is the proof that the task was closed under a token.
     """
 
     def __init__(
@@ -102,7 +102,7 @@ class LeaseProposer:
         is_genuine: IsGenuine = lambda place, reply: True,
         others: tuple[Contact, ...] = (),
     ) -> Round:
-        """Start a round with all members, or with ``others``; pass its outcome to ``hear``.
+        """Start a round with all members, or with ``others``; pass its outcome to ``learn_from``.
 
         If another agent's lease at a member ends within ``short`` seconds, the round repeats the request then.
         """
@@ -124,7 +124,7 @@ class LeaseProposer:
         return round_
 
     def ping_members(self) -> None:
-        """Ping the members, to update ``silent``."""
+        """Ping the members, to update ``find_silent_members``."""
         self.start_round("lease.prepare", 0, self.ttl)
 
     def find_silent_members(self, seconds: float) -> tuple[Contact, ...]:

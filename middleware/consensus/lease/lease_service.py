@@ -39,7 +39,7 @@ class LeaseService:
     """The lease service of one node: its acceptor, and the lease clients to notify of releases.
 
     It may be created at the first request: ``born_at`` is the start of the node, from which the acceptor's silence
-    counts.  ``judge`` checks charters; ``may_sit`` returns whether the owner of a key may be a council member.
+    counts.  ``charter_verifier`` checks charters; ``may_sit`` returns whether the owner of a key may be a council member.
     """
 
     def __init__(
@@ -49,12 +49,12 @@ class LeaseService:
         store: Store,
         clock: IReactorTime,
         born_at: float,
-        judge: CharterVerifier,
+        charter_verifier: CharterVerifier,
         may_sit: Callable[[bytes], bool],
     ) -> None:
         self._endpoint = endpoint
         self._identity = identity
-        self._charter_verifier = judge
+        self._charter_verifier = charter_verifier
         self._may_be_member = may_sit
         self._store = store
         self._clock = clock
@@ -79,17 +79,17 @@ class LeaseService:
         """Run a method for a peer and return the answer; raise ``Refused`` for invalid arguments."""
         return self._methods[method].run(peer, arguments)
 
-    def register(self, lessee: LeaseClient) -> None:
-        """Notify ``lessee`` when the lease of its task is released."""
-        self._clients[lessee.task_id] = lessee
+    def register(self, client: LeaseClient) -> None:
+        """Notify ``client`` when the lease of its task is released."""
+        self._clients[client.task_id] = client
 
     def call_member(
-        self, own: Contact, member: Contact, method: str, arguments: tuple[Any, ...], patience: float
+        self, own: Contact, member: Contact, method: str, arguments: tuple[Any, ...], timeout_s: float
     ) -> Deferred[Any]:
         """Call a method of a member, which may be this node itself."""
         if member.node_id == own.node_id:
             return maybeDeferred(self.answer, method, own, arguments)
-        return self._endpoint.ask(member, method, *arguments, changes=True, timeout=patience)
+        return self._endpoint.ask(member, method, *arguments, changes=True, timeout=timeout_s)
 
     # -- requests of peers ---------------------------------------------------------------------------------------------
 
@@ -178,9 +178,9 @@ class LeaseService:
         _check_arguments(task_id, token + 1, rest=rest)
         agent, now = peer.node_id.hex(), self._clock.seconds()
         self._notify(self._acceptor.release_by_token(task_id, agent, token, now, float(rest)), task_id, rest)
-        lessee = self._clients.get(task_id)
-        if lessee is not None:
-            lessee.on_released(token, float(rest))
+        client = self._clients.get(task_id)
+        if client is not None:
+            client.on_released(token, float(rest))
 
     # -- inside -----------------------------------------------------------------------------------------------------
 

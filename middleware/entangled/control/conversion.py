@@ -48,7 +48,7 @@ def to_json(value: Any) -> Any:
 
 
 def from_json(field: Any) -> Any:
-    """Convert the result of ``plain`` back to the value; raise ``InvalidValue``."""
+    """Convert the result of ``to_json`` back to the value; raise ``InvalidValue``."""
     if isinstance(field, dict) and set(field) == {"base64"}:
         try:
             return base64.b64decode(field["base64"], validate=True)

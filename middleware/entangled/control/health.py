@@ -65,14 +65,14 @@ async def measure_links(node: EntangledNode, clock: IReactorTime) -> list[Mappin
 
 def describe_path(node: EntangledNode, clock: IReactorTime, contact: Contact) -> dict[str, Any]:
     """Return the path to a peer: ``way`` is a ``path_kind.PathKind``, ``by`` the id of the relay, or empty."""
-    passage = node.nat.paths.find_path(contact)
+    path = node.nat.paths.find_path(contact)
     return {
         "id": contact.node_id.hex(),
-        "address": str(passage.address or contact.address),
-        "way": passage.kind,
-        "by": passage.by.hex(),
-        "for": None if passage.since is None else round(clock.seconds() - passage.since, 1),
-        "relayed": is_relayed(passage.address or contact.address),
+        "address": str(path.address or contact.address),
+        "way": path.kind,
+        "by": path.by.hex(),
+        "for": None if path.since is None else round(clock.seconds() - path.since, 1),
+        "relayed": is_relayed(path.address or contact.address),
     }
 
 
@@ -96,16 +96,16 @@ async def _ping_repeatedly(node: EntangledNode, clock: IReactorTime, contact: Co
 
 
 class LinkMetrics:
-    """Measures the paths from ``node`` to its peers, only while ``links`` is called.
+    """Measures the paths from ``node`` to its peers, only while ``read`` is called.
 
     The first call returns at once, without figures; later calls have more.  Each peer gets several pings in quick
-    succession, then one per second, until ``links`` has not been called for ``IDLE_S`` seconds.
+    succession, then one per second, until ``read`` has not been called for ``IDLE_S`` seconds.
     """
 
-    def __init__(self, node: EntangledNode, clock: IReactorTime, chores: Background) -> None:
+    def __init__(self, node: EntangledNode, clock: IReactorTime, background: Background) -> None:
         self._node = node
         self._clock = clock
-        self._background = chores
+        self._background = background
         self._times: dict[bytes, deque[float | None]] = {}
         self._ping_rounds = 0
         self._called_at = float("-inf")
@@ -114,7 +114,7 @@ class LinkMetrics:
     def read(self) -> list[dict[str, Any]]:
         """Return the path to each peer with the figures measured so far, and keep measuring.
 
-        Each entry has the fields of ``way``, ``loss``, ``round_trip`` and ``jitter`` (None: unknown).
+        Each entry has the fields of ``describe_path``, ``loss``, ``round_trip`` and ``jitter`` (None: unknown).
         """
         self._called_at = self._clock.seconds()
         if not self._is_running:
@@ -148,8 +148,8 @@ class LinkMetrics:
         self._times = {public: times for public, times in self._times.items() if public in present}
         for contact in peers:
             # The first ping opens the session and takes longer, so it is not counted.
-            is_met = self._node.endpoint.has_session(contact)
-            self._background.fork(self._record_ping(contact) if is_met else ping(self._node, self._clock, contact))
+            has_session = self._node.endpoint.has_session(contact)
+            self._background.fork(self._record_ping(contact) if has_session else ping(self._node, self._clock, contact))
         pause = PING_INTERVAL_S if self._ping_rounds < PINGS else SLOW_INTERVAL_S
         self._background.later(pause * max(1.0, len(peers) / FEW_PEERS), self._ping_peers)
 

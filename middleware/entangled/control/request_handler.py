@@ -49,20 +49,20 @@ class RequestHandler:
         """Return the verbs of ``node``, with the default tuple space."""
         return cls(node, TupleSpace(node, clock, rng), Keywords(node), clock)
 
-    def run(self, name: object, args: object, tell: SendEvent) -> Deferred[Any]:
-        """Run the verb ``name``; call ``tell`` with events, fire with the answer; can be cancelled.
+    def run(self, name: object, args: object, send_event: SendEvent) -> Deferred[Any]:
+        """Run the verb ``name``; call ``send_event`` with events, fire with the answer; can be cancelled.
 
         All errors are failures of the Deferred: ``BadRequest`` for an invalid verb or argument.
         """
-        return maybeDeferred(self._run, name, args, tell)
+        return maybeDeferred(self._run, name, args, send_event)
 
-    def _run(self, name: object, args: object, tell: SendEvent) -> object:
+    def _run(self, name: object, args: object, send_event: SendEvent) -> object:
         verb = self._find_handlers().get(name) if isinstance(name, str) else None
         if verb is None:
             raise BadRequest(f"no verb {name!r}; there are {', '.join(sorted(self._find_handlers()))}")
         if not isinstance(args, dict):
             raise BadRequest("the arguments of a verb must be a JSON object")
-        return verb(Arguments(args), tell)
+        return verb(Arguments(args), send_event)
 
     def _find_handlers(self) -> Mapping[str, Callable[[Arguments, SendEvent], object]]:
         return {
@@ -85,44 +85,44 @@ class RequestHandler:
 
     # -- dht --------------------------------------------------------------------------------------------------------
 
-    def _dht_get(self, args: Arguments, tell: SendEvent) -> object:
+    def _dht_get(self, args: Arguments, send_event: SendEvent) -> object:
         concern = cast(ReadConsistency, args.choice("concern", "majority", get_args(ReadConsistency)))
         return self.node.get(parse_key(args.text("key")), concern).addCallback(make_rows)
 
-    def _dht_put(self, args: Arguments, tell: SendEvent) -> object:
+    def _dht_put(self, args: Arguments, send_event: SendEvent) -> object:
         lifetime = cast(Lifetime, args.choice("lifetime", "team", get_args(Lifetime)))
         concern = cast(ConsistencyLevel, args.choice("concern", "majority", get_args(ConsistencyLevel)))
         key, name, value = parse_key(args.text("key")), args.text("name", ""), args.data("value")
         put = self.node.put(key, name, value, lifetime, concern, args.integer("expect"))
         return put.addCallback(_make_stored)
 
-    def _dht_remove(self, args: Arguments, tell: SendEvent) -> object:
+    def _dht_remove(self, args: Arguments, send_event: SendEvent) -> object:
         removed = self.node.remove(parse_key(args.text("key")), args.text("name", ""))
         return removed.addCallback(_make_stored)
 
-    def _dht_find(self, args: Arguments, tell: SendEvent) -> object:
+    def _dht_find(self, args: Arguments, send_event: SendEvent) -> object:
         found = self.node.find_node(parse_key(args.text("key")))
         return found.addCallback(lambda contacts: [_make_contact(contact) for contact in contacts])
 
-    def _dht_watch(self, args: Arguments, tell: SendEvent) -> object:
-        return _until_cancelled(self.node.watch(parse_key(args.text("key")), lambda records: tell(make_rows(records))))
+    def _dht_watch(self, args: Arguments, send_event: SendEvent) -> object:
+        return _until_cancelled(self.node.watch(parse_key(args.text("key")), lambda records: send_event(make_rows(records))))
 
     # -- keywords and tuples ----------------------------------------------------------------------------------------
 
-    def _keyword_search(self, args: Arguments, tell: SendEvent) -> object:
+    def _keyword_search(self, args: Arguments, send_event: SendEvent) -> object:
         return self.keywords.search(args.text("words")).addCallback(_make_matches)
 
-    def _keyword_watch(self, args: Arguments, tell: SendEvent) -> object:
+    def _keyword_watch(self, args: Arguments, send_event: SendEvent) -> object:
         return _until_cancelled(
-            self.keywords.watch_keyword(args.text("words"), lambda found: tell(_make_matches(found)))
+            self.keywords.watch_keyword(args.text("words"), lambda found: send_event(_make_matches(found)))
         )
 
-    def _tuple_get(self, args: Arguments, tell: SendEvent) -> object:
+    def _tuple_get(self, args: Arguments, send_event: SendEvent) -> object:
         template, wait = args.template("template"), args.seconds("wait")
         found: Deferred[Any] = self.space.get(template, wait) if wait else self.space.get_if_exists(template)
         return found.addCallback(conversion.to_json)
 
-    def _tuple_read(self, args: Arguments, tell: SendEvent) -> object:
+    def _tuple_read(self, args: Arguments, send_event: SendEvent) -> object:
         template, wait = args.template("template"), args.seconds("wait")
         found: Deferred[Any]
         if args.flag("all"):
@@ -133,7 +133,7 @@ class RequestHandler:
 
     # -- rpc --------------------------------------------------------------------------------------------------------
 
-    def _rpc(self, args: Arguments, tell: SendEvent) -> object:
+    def _rpc(self, args: Arguments, send_event: SendEvent) -> object:
         return Deferred.fromCoroutine(
             self._ask(
                 args.text("node"),

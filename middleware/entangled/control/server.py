@@ -99,21 +99,21 @@ class ControlProtocol(Protocol):
 class RequestRunner(Shape):
     """Runs verbs; ``control.request_handler.RequestHandler`` implements it."""
 
-    def run(self, name: object, arguments: object, tell: Callable[[Any], None]) -> Deferred[Any]:
+    def run(self, name: object, arguments: object, send_event: Callable[[Any], None]) -> Deferred[Any]:
         """Run the verb ``name``; see ``RequestHandler.run``."""
 
 
 class ControlServer(Service):
     """The control socket of one node, open while the service runs.
 
-    ``verbs`` is called at the first request, so that a node without requests does not load them.
+    ``make_handler`` is called at the first request, so that a node without requests does not load them.
     """
 
     _log = Logger()
 
-    def __init__(self, reactor: Any, path: Path, verbs: Callable[[], RequestRunner]) -> None:
+    def __init__(self, reactor: Any, path: Path, make_handler: Callable[[], RequestRunner]) -> None:
         self.connections: set[ControlProtocol] = set()
-        self._make_handler = verbs
+        self._make_handler = make_handler
         self._handler: RequestRunner | None = None
         self._reactor = reactor
         self._path = path

@@ -27,7 +27,7 @@ CHUNK_BYTES = 2**20
 
 def is_store(path: str) -> bool:
     """Return whether an unreadable file was a store: by its header, its tables, or because it is all zeros."""
-    return _has_store_header(path) or _is_blank(path) or any(_has_trace(path + part) for part in FILE_SUFFIXES[:2])
+    return _has_store_header(path) or _is_blank(path) or any(_has_trace(path + suffix) for suffix in FILE_SUFFIXES[:2])
 
 
 def set_aside(path: str) -> str:
@@ -36,9 +36,9 @@ def set_aside(path: str) -> str:
     while os.path.lexists(f"{path}.rotten-{number}"):
         number += 1
     aside = f"{path}.rotten-{number}"
-    for part in FILE_SUFFIXES:
-        if os.path.lexists(path + part):
-            os.rename(path + part, aside + part)
+    for suffix in FILE_SUFFIXES:
+        if os.path.lexists(path + suffix):
+            os.rename(path + suffix, aside + suffix)
     return aside
 
 

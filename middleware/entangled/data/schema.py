@@ -105,9 +105,9 @@ def check_version(path: str, connection: sqlite3.Connection) -> int:
         raise BadStore(f"store {path}: has the newer schema {version}; update this program, or name another file")
     if (CREATE_RECORDS if version == SCHEMA_VERSION else CREATE_RECORDS_1) not in tables:
         raise CorruptStore(f"it lacks the tables of schema {version}")
-    (verdict,) = connection.execute("PRAGMA integrity_check(1)").fetchone()
-    if _decode_text(verdict) != "ok":
-        raise CorruptStore(str(_decode_text(verdict)))
+    (result,) = connection.execute("PRAGMA integrity_check(1)").fetchone()
+    if _decode_text(result) != "ok":
+        raise CorruptStore(str(_decode_text(result)))
     return int(version)
 
 
@@ -155,14 +155,14 @@ def read_contents(connection: sqlite3.Connection) -> Contents:
 def read_notes(connection: sqlite3.Connection) -> tuple[dict[str, bytes], int]:
     """Return the notes with a valid checksum, and the number of corrupt ones."""
     notes: dict[str, bytes] = {}
-    rotten = 0
+    corrupt_rows = 0
     for raw, value, crc in connection.execute("SELECT name, value, crc FROM notes ORDER BY name"):
         name = _decode_text(raw)
         if isinstance(name, str) and isinstance(value, bytes) and _crc([name, value]) == crc:
             notes[name] = value
         else:
-            rotten += 1
-    return notes, rotten
+            corrupt_rows += 1
+    return notes, corrupt_rows
 
 
 def _migrate_from_1(connection: sqlite3.Connection) -> None:

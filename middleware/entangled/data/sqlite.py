@@ -82,7 +82,7 @@ class SqliteStore(Store):
 
         Team records expire a whole ttl after ``now``, because the time since it was closed is unknown; leased
         records are removed.  A corrupt file is renamed, and the store starts empty except for the notes that could be
-        read.  ``deliver`` is ``reactor.callFromThread``, or None if the caller never waits for ``written``.
+        read.  ``deliver`` is ``reactor.callFromThread``, or None if the caller never waits for ``wait_for_write``.
         ``fresh_epoch`` is the epoch of a new store, random if None.  With ``durable`` set to ``power``, written data
         survives a power failure.  With ``crash`` it survives a crash of the process: commits do not wait for the disk,
         and a power failure may lose the last of them, without other damage.
@@ -137,7 +137,7 @@ class SqliteStore(Store):
         return self._writer.error
 
     def set_note(self, name: str, value: bytes) -> None:
-        """Store a small value for the node's own use under ``name``; it is durable once ``written`` fires."""
+        """Store a small value for the node's own use under ``name``; it is durable once ``wait_for_write`` fires."""
         self._check_open()
         if self.get_note(name) != value:
             super().set_note(name, value)

@@ -26,10 +26,10 @@ from middleware.entangled.errors import OWNER_FULL, Full
 from middleware.entangled.record import Record, Slot
 
 MAX_ROWS = 12_000
-"""Slots of a store.  More serve a larger network; each takes 1.2 KiB of memory in addition to its ``weight``.  Together
+"""Slots of a store.  More serve a larger network; each takes 1.2 KiB of memory in addition to its ``count_bytes``.  Together
 with ``MAX_BYTES`` a full store adds 22 MiB to a node of 40 MiB, the limit for a device with 64 MB."""
 MAX_BYTES = 8 * 2**20
-"""Bytes of a store by ``weight``.  More hold more large values, at the cost of memory and flash."""
+"""Bytes of a store by ``count_bytes``.  More hold more large values, at the cost of memory and flash."""
 TOMBSTONE_HOLD_S = 86_400.0
 """Seconds before a tombstone may be removed for room: the longest absence after which a returning node does not bring
 back a deleted record.  More is safer; less frees space earlier."""
@@ -125,7 +125,7 @@ class Store:
 
         Storing an equal record again only extends its life.  Raises ``Full`` if there is no room or the owner is above
         its share, ``Unwritable`` if the file is not writable.  The record is durable, and may be acknowledged, once
-        ``written`` has fired.
+        ``wait_for_write`` has fired.
         """
         slot = record.slot
         held = self._slots.get(slot)

@@ -1,7 +1,7 @@
 """The thread that writes a SQLite file, with many changes to a commit.
 
 A single commit can stall for a quarter of a second on a busy flash card, so callers do not block on it: changes are
-queued, and ``written`` fires when they are durable.  A change that a caller waits for is committed at once, together
+queued, and ``wait_for_write`` fires when they are durable.  A change that a caller waits for is committed at once, together
 with all changes queued during the commit before; other changes share a later commit.
 """
 
@@ -63,7 +63,7 @@ class Writer:
         self._connection = connection
         self._call_in_thread = deliver
         self._condition = threading.Condition()
-        # Access to these needs the lock of ``_turn``.
+        # Access to these needs the lock of ``_condition``.
         self._pending = _Batch()
         self._waiting: list[Deferred[None]] = []
         self._is_writing = False
@@ -151,11 +151,11 @@ class Writer:
     def _notify_waiting(self) -> None:
         """Notify waiting callers; runs in the caller's thread."""
         while self._notifications:
-            waiting, trouble = self._notifications.popleft()
+            waiting, error = self._notifications.popleft()
             if waiting.called:
                 continue  # cancelled by its caller
-            if trouble:
-                waiting.errback(self.make_error(trouble))
+            if error:
+                waiting.errback(self.make_error(error))
             else:
                 waiting.callback(None)
 
@@ -166,8 +166,8 @@ class Writer:
         ended = False
         while not ended:
             batch, waiting = self._take_batch()
-            trouble = self._commit(batch) if batch else ""
-            ended = self._finish_batch(batch, waiting, trouble)
+            error = self._commit(batch) if batch else ""
+            ended = self._finish_batch(batch, waiting, error)
             if self._notifications and self._call_in_thread is not None:
                 self._call_in_thread(self._notify_waiting)
 
@@ -186,24 +186,24 @@ class Writer:
             self._is_writing = True
             return batch, waiting
 
-    def _finish_batch(self, batch: _Batch, waiting: list[Deferred[None]], trouble: str) -> bool:
+    def _finish_batch(self, batch: _Batch, waiting: list[Deferred[None]], error: str) -> bool:
         """Requeue the changes of a failed commit, schedule notifications, and return whether to end the thread."""
         with self._condition:
-            if trouble:
+            if error:
                 self._pending = batch.merge(self._pending)
-            if trouble or not self._pending:
+            if error or not self._pending:
                 waiting += self._waiting
                 self._waiting = []
-            self._notifications.extend((each, trouble) for each in waiting)
-            if trouble != self._error:
-                self._log.warn("store {path}: {what}", path=self._path, what=trouble or "writable again")
-            self._error = trouble
+            self._notifications.extend((each, error) for each in waiting)
+            if error != self._error:
+                self._log.warn("store {path}: {what}", path=self._path, what=error or "writable again")
+            self._error = error
             self._is_writing = False
             self._condition.notify_all()
-            left = len(self._pending)
-            if self._is_closing and trouble:
-                self._log.error("store {path}: {left} changes are lost: {why}", path=self._path, left=left, why=trouble)
-            return self._is_closing and (bool(trouble) or not left)
+            lost_changes = len(self._pending)
+            if self._is_closing and error:
+                self._log.error("store {path}: {left} changes are lost: {why}", path=self._path, left=lost_changes, why=error)
+            return self._is_closing and (bool(error) or not lost_changes)
 
     def _commit(self, batch: _Batch) -> str:
         """Write the batch in one transaction; return the error, empty if none."""

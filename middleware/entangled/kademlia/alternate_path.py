@@ -47,14 +47,14 @@ class AlternatePaths:
         endpoint: Endpoint,
         clock: IReactorTime,
         rng: random.Random,
-        chores: Background,
+        background: Background,
         enter: Enter,
     ) -> None:
         self._overlay = overlay
         self._endpoint = endpoint
         self._clock = clock
         self._rng = rng
-        self._background = chores
+        self._background = background
         self._enter = enter
         self._tunnels: tuple[Address, ...] = ()
         self._known: tuple[Address, ...] = ()
@@ -66,10 +66,10 @@ class AlternatePaths:
         """Whether any tunnel is configured."""
         return bool(self._tunnels)
 
-    def configure(self, ways: Sequence[Address], known: Sequence[Address]) -> None:
+    def configure(self, tunnels: Sequence[Address], known: Sequence[Address]) -> None:
         """Set the tunnels, and the addresses of known nodes to return to over UDP; called once."""
-        self._tunnels, self._known = tuple(ways), tuple(known)
-        if ways:
+        self._tunnels, self._known = tuple(tunnels), tuple(known)
+        if tunnels:
             self._background.every(CHECK_INTERVAL_S, self._try_direct)
 
     async def enter_with_fallback(self, join: Coroutine[Any, Any, None] | None) -> None:
@@ -90,7 +90,7 @@ class AlternatePaths:
 
     async def try_once(self) -> bool:
         """Return whether a node of the team answers through any tunnel; the first answer is enough."""
-        return bool(await gather_first(1, [self._enter_by(way) for way in self._tunnels]))
+        return bool(await gather_first(1, [self._enter_by(tunnel) for tunnel in self._tunnels]))
 
     # -- private ----------------------------------------------------------------------------------------------------
 

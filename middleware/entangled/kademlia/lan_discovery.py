@@ -63,7 +63,7 @@ class LanDiscovery:
         membership: Membership,
         clock: IReactorTime,
         rng: random.Random,
-        chores: Background,
+        background: Background,
     ) -> None:
         self.counters: Counter[str] = Counter()
         self._group = group
@@ -72,7 +72,7 @@ class LanDiscovery:
         self._membership = membership
         self._clock = clock
         self._rng = rng
-        self._background = chores
+        self._background = background
         self._tries = 0
         self._due_at = 0.0
         self._own_multicast = b""

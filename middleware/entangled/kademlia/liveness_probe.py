@@ -1,7 +1,7 @@
 """Probe the contacts of a node in a network that is too large to know all its members.
 
 A node probes its neighbours often, because they hold the same records, and of the others the one with the longest
-silence, at a ``pace`` that adapts to the rate of failures.
+silence, at a ``interval`` that adapts to the rate of failures.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ DISCONNECTED_S = 3.0
 LOOKUP_INTERVALS_S = (3.0, 60.0)
 """The first and longest interval in seconds between a newcomer's lookups of its neighbours; it doubles each time."""
 NEIGHBOUR_SILENCE_S = 12.0
-"""The silence in seconds after which a neighbour, or a contact that ``needs_use``, is probed in a large network."""
+"""The silence in seconds after which a neighbour, or a contact that ``needs_keep_alive``, is probed in a large network."""
 PROBES_PER_STEP = 2
 """The number of distant contacts that are probed per ``STEP_S``."""
 MAINTENANCE_S = 15.0
@@ -63,7 +63,7 @@ class ProbeInterval:
 class LivenessProber:
     """The probes of one node's contacts in a large network.
 
-    ``upkeep`` is called with the time at each run of infrequent maintenance.  ``needs_use`` returns whether the path to
+    ``upkeep`` is called with the time at each run of infrequent maintenance.  ``needs_keep_alive`` returns whether the path to
     a contact stays open only while it is used.
     """
 
@@ -72,7 +72,7 @@ class LivenessProber:
         overlay: Overlay,
         endpoint: Endpoint,
         rng: random.Random,
-        chores: Background,
+        background: Background,
         upkeep: Callable[[float], None],
     ) -> None:
         self.needs_keep_alive: Callable[[Contact], bool] = lambda contact: False
@@ -80,7 +80,7 @@ class LivenessProber:
         self._overlay = overlay
         self._endpoint = endpoint
         self._rng = rng
-        self._background = chores
+        self._background = background
         self._on_maintenance = upkeep
         self._probing: set[bytes] = set()
         self._next_distant_at = self._next_maintenance_at = float("-inf")

@@ -4,7 +4,7 @@ Every ping contains a digest of the live members; when two nodes differ, one req
 members that it does not know (no member is added without authentication).  So in a small team all nodes know each
 other, and after a partition the two sides merge through any pair of nodes, even without the original bootstrap node.
 
-A network of more than ``MAX_MEMBERS`` nodes is too large for that.  There a node probes its contacts (``sounding``).
+A network of more than ``MAX_MEMBERS`` nodes is too large for that.  There a node probes its contacts (``liveness_probe``).
 """
 
 from __future__ import annotations
@@ -61,22 +61,22 @@ class Membership:
     _log = Logger()
 
     def __init__(
-        self, overlay: Overlay, endpoint: Endpoint, clock: IReactorTime, rng: random.Random, chores: Background
+        self, overlay: Overlay, endpoint: Endpoint, clock: IReactorTime, rng: random.Random, background: Background
     ) -> None:
         self._overlay = overlay
         self._endpoint = endpoint
         self._clock = clock
         self._rng = rng
-        self._background = chores
+        self._background = background
         self._former_addresses: dict[Address, None] = {}
         self._tried_at: dict[bytes, float] = {}
         self._listed_at: dict[bytes, float] = {}
         self._is_rejoining = False
         self._large_until = float("-inf")
-        self.prober = LivenessProber(overlay, endpoint, rng, chores, self._maintain)
+        self.prober = LivenessProber(overlay, endpoint, rng, background, self._maintain)
         self._is_joining = False
         self._has_entered = False
-        self.alternate_paths = AlternatePaths(overlay, endpoint, clock, rng, chores, self._enter)
+        self.alternate_paths = AlternatePaths(overlay, endpoint, clock, rng, background, self._enter)
         endpoint.expose("ping", self._answer_ping, changes=True, idempotent=True)
         endpoint.expose("members", self._answer_members, early=True)
         endpoint.expose("known", self._answer_known, early=True)
@@ -261,14 +261,14 @@ class Membership:
         half of the answers name it, so a lying node cannot invent members.  The answers of newcomers count only if
         there are no others.  Raises ``NoAnswer`` if no node answers.
         """
-        there = self._overlay.members.list_live()[:MAX_PARALLEL]
-        asked = [Deferred.fromCoroutine(self._overlay.ask(contact, "known")) for contact in there]
-        answers = await DeferredList(asked, consumeErrors=True)
+        live = self._overlay.members.list_live()[:MAX_PARALLEL]
+        requests = [Deferred.fromCoroutine(self._overlay.ask(contact, "known")) for contact in live]
+        answers = await DeferredList(requests, consumeErrors=True)
         answers_by_id: dict[bytes, dict[Contact, int]] = {}
-        for contact, (ok, answer) in zip(there, answers, strict=True):
+        for contact, (ok, answer) in zip(live, answers, strict=True):
             if ok or not answer.check(NoAnswer):  # a node that refuses has no opinion
                 answers_by_id[contact.node_id] = _decode_known(answer)
-        if there and not answers_by_id:
+        if live and not answers_by_id:
             raise NoAnswer("no member answered with the members that it knows")
         settled = [opinion for own, opinion in answers_by_id.items() if any(named.node_id == own for named in opinion)]
         opinions = settled or list(answers_by_id.values())
@@ -312,9 +312,9 @@ class Membership:
         if not contacts and (self._former_addresses or self.alternate_paths.is_configured) and not self._is_rejoining:
             self._background.fork(self._rejoin())
         # Each pair of n members needs one ping per interval, so the interval grows with n and the total stays constant.
-        patience = min(MAX_PING_INTERVAL_S, MIN_PING_INTERVAL_S * max(1.0, len(contacts) / SMALL_TEAM))
+        timeout_s = min(MAX_PING_INTERVAL_S, MIN_PING_INTERVAL_S * max(1.0, len(contacts) / SMALL_TEAM))
         for contact in contacts:
-            if overlay.silence(contact) > patience:
+            if overlay.silence(contact) > timeout_s:
                 self._background.fork(self._ping(contact))
         absent = [
             c
@@ -358,9 +358,9 @@ class Membership:
 
     def _answer_known(self, peer: Contact) -> list[object]:
         """KNOWN: the settled members, and the seconds of their absence; a newcomer does not include itself."""
-        roster = self._overlay.members
-        known = [(self._overlay.own_contact(), 0.0)] if roster.is_voter else []
-        return [[contact.pack(), int(away)] for contact, away in known + roster.list_voters(self._clock.seconds())]
+        members = self._overlay.members
+        known = [(self._overlay.own_contact(), 0.0)] if members.is_voter else []
+        return [[contact.pack(), int(away)] for contact, away in known + members.list_voters(self._clock.seconds())]
 
     def _answer_members(self, peer: Contact, after: bytes) -> list[object] | int | None:
         """MEMBERS: the next page; None if the network is large, or the seconds for which reports of that are valid."""

@@ -1,7 +1,7 @@
 """Keep the contacts of a node, and find the nodes closest to an id (Kademlia, sections 2.2 to 2.4).
 
 A contact is added only after it has answered from its address with its key.  Records are stored at the k closest live
-nodes of their key.  A node that knows all members of its team (``roster``) determines these without a search; in a
+nodes of their key.  A node that knows all members of its team (``members``) determines these without a search; in a
 larger network iterative lookups find them.
 """
 
@@ -83,22 +83,22 @@ class LookupStats(NamedTuple):
 class Overlay:
     """The contacts of a node.
 
-    ``patience`` is the silence in seconds up to which a contact is not pinged when a new one would take its place.
-    ``on_newcomer`` and ``on_lost`` are called with contacts that appear and disappear, ``on_named`` with each contact
+    ``max_silence`` is the silence in seconds up to which a contact is not pinged when a new one would take its place.
+    ``on_new_contact`` and ``on_lost`` are called with contacts that appear and disappear, ``on_named`` with each contact
     in an answer and the contact that named it.
 
-    ``is_whole``: all members of the team are known; ``is_large``: there are too many for that; ``is_placed``: this node
+    ``has_all_members``: all members of the team are known; ``is_large``: there are too many for that; ``has_found_neighbours``: this node
     has looked up its neighbours, so if it knows few nodes there are few.  ``Membership`` and ``LivenessProber`` set them.  In
     a large network the routing table is authoritative, and the roster has only contacts without a place in the table,
     while few are known.
     """
 
-    def __init__(self, me: Callable[[], Contact], endpoint: Endpoint, clock: IReactorTime, chores: Background) -> None:
+    def __init__(self, me: Callable[[], Contact], endpoint: Endpoint, clock: IReactorTime, background: Background) -> None:
         self.own_contact = me
         self.own_id = me().node_id
         self._endpoint = endpoint
         self._clock = clock
-        self._background = chores
+        self._background = background
         self.table = RoutingTable(self.own_id, K)
         self.members = MemberTable(self.own_id)
         self.has_all_members = False
@@ -289,7 +289,7 @@ class Overlay:
     ) -> Any:
         """Send a request to ``contact``; a missing answer counts as a miss."""
         began = self._clock.seconds()
-        is_met = self._endpoint.has_session(contact)
+        has_session = self._endpoint.has_session(contact)
         try:
             answer = await self._endpoint.ask(
                 contact, method, *arguments, changes=changes, timeout=timeout, is_light=is_light
@@ -297,7 +297,7 @@ class Overlay:
         except NoAnswer:
             self.record_miss(contact)
             raise
-        if is_met:  # otherwise the time includes a handshake
+        if has_session:  # otherwise the time includes a handshake
             self._round_trip.add_sample(self._clock.seconds() - began)
         return answer
 
@@ -379,9 +379,9 @@ class Overlay:
         doubtful = self.table.record_contact(contact, now)
         if doubtful is not None and self.silence(doubtful) >= self.max_silence:
             self._background.fork(self.check(doubtful))
-        has_place = self.table.get(node_id) is not None
-        is_new_here = self._belongs_to_members(node_id, has_place) and self.members.mark_alive(contact, now)
-        if is_new_here or (is_new and has_place):
+        is_in_table = self.table.get(node_id) is not None
+        is_new_here = self._belongs_to_members(node_id, is_in_table) and self.members.mark_alive(contact, now)
+        if is_new_here or (is_new and is_in_table):
             # One reactor turn later: messages to a newcomer must not overtake the answer to its own request.
             self._background.later(0.0, self.on_new_contact, contact)
 
@@ -505,13 +505,13 @@ class Overlay:
         kept = frozenset(extra[:spare])
         self.members.remove_all([c.node_id for c in (*live, *self.members.list_absent()) if c.node_id not in kept])
         before = self._clock.seconds() - CHECK_INTERVAL_S
-        heard = self._last_received_at
-        unheard = {c.node_id: float("-inf") for c in table.list_contacts() if c.node_id not in heard}
+        senders = self._last_received_at
+        unheard = {c.node_id: float("-inf") for c in table.list_contacts() if c.node_id not in senders}
         for node_id in [node_id for node_id in self._misses if self.find_contact(node_id) is None]:
             del self._misses[node_id]
         self._last_received_at = unheard | {
             node_id: at
-            for node_id, at in heard.items()
+            for node_id, at in senders.items()
             if at > before or node_id in kept or table.get(node_id) is not None
         }
 
@@ -524,10 +524,10 @@ class Overlay:
                 return
             await self._background.sleep(step)
 
-    def _belongs_to_members(self, node_id: bytes, has_place: bool) -> bool:
+    def _belongs_to_members(self, node_id: bytes, is_in_table: bool) -> bool:
         if not self.is_large:
             return True
-        return not has_place and (self.members.get(node_id) is not None or not self.is_surely_large)
+        return not is_in_table and (self.members.get(node_id) is not None or not self.is_surely_large)
 
     def _forget(self, contact: Contact) -> None:
         for memory in (self._last_received_at, self._misses):

@@ -108,7 +108,7 @@ class RoutingTable:
         """Record that ``contact`` has proved its key and its address.
 
         Returns the least recently seen contact of a full bucket: the caller pings it, and if it does not answer
-        (``failed``) the new contact replaces it.  A known contact at a new address has moved there.
+        (``record_miss``) the new contact replaces it.  A known contact at a new address has moved there.
         """
         if contact.node_id == self._own_id:
             return None
@@ -203,12 +203,12 @@ class RoutingTable:
         number = int.from_bytes(node_id)
         return self._buckets[bisect_right(self._lows, number) - 1]
 
-    def _may_split(self, bucket: _Bucket, newcomer: bytes) -> bool:
+    def _may_split(self, bucket: _Bucket, contact: bytes) -> bool:
         if bucket.high - bucket.low == 1:
             return False
         if bucket.low <= self._own < bucket.high:
             return True
-        apart = int.from_bytes(newcomer) ^ self._own
+        apart = int.from_bytes(contact) ^ self._own
         return len(self._nearest()) < self._k or apart < self._nearest()[-1]
 
     def _nearest(self) -> list[int]:
@@ -228,8 +228,8 @@ class RoutingTable:
             halves[int.from_bytes(node_id) >= middle].entries[node_id] = entry
         for node_id, contact in bucket.replacements.items():
             halves[int.from_bytes(node_id) >= middle].replacements[node_id] = contact
-        place = self._buckets.index(bucket)
-        self._buckets[place : place + 1] = halves
+        position = self._buckets.index(bucket)
+        self._buckets[position : position + 1] = halves
         self._lows = [each.low for each in self._buckets]
 
     def _remove_entry(self, bucket: _Bucket, node_id: bytes, now: float) -> None:
@@ -238,13 +238,13 @@ class RoutingTable:
         self._size -= 1
         self.version += 1
         if bucket.replacements:
-            newcomer_id, newcomer = bucket.replacements.popitem()
-            bucket.entries[newcomer_id] = _Entry(newcomer, now, now)
+            contact_id, contact = bucket.replacements.popitem()
+            bucket.entries[contact_id] = _Entry(contact, now, now)
             self._size += 1
 
-    def _cache(self, bucket: _Bucket, newcomer: Contact, now: float) -> Contact | None:
-        """Add ``newcomer`` to the replacement cache, and return the contact to ping."""
-        put_bounded(bucket.replacements, newcomer.node_id, newcomer, self._k)
+    def _cache(self, bucket: _Bucket, contact: Contact, now: float) -> Contact | None:
+        """Add ``contact`` to the replacement cache, and return the contact to ping."""
+        put_bounded(bucket.replacements, contact.node_id, contact, self._k)
         oldest = next(iter(bucket.entries.values()))
         # Many new contacts must not cause many pings to one old contact.
         if now - max(oldest.seen_at, oldest.pinged_at) < PING_INTERVAL_S:

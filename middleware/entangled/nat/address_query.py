@@ -38,13 +38,13 @@ class AddressQuery:
         ports: LocalPorts,
         clock: IReactorTime,
         rng: Callable[[], random.Random],
-        chores: Background,
+        background: Background,
     ) -> None:
         self._send = send
         self._ports = ports
         self._clock = clock
         self._rng = rng
-        self._background = chores
+        self._background = background
         self._bucket = TokenBucket(REPLIES_PER_S, REPLY_BURST)
         self._pending: dict[bytes, Callable[[Address | None], None]] = {}
 

@@ -43,7 +43,7 @@ class ExternalAddresses:
         contacts: Callable[[], Iterable[Contact]],
         moved: Callable[[Contact], None],
         clock: IReactorTime,
-        chores: Background,
+        background: Background,
     ) -> None:
         self.is_translated = False
         self._on_changed = moved
@@ -52,7 +52,7 @@ class ExternalAddresses:
         self._network = paths
         self._contacts = contacts
         self._clock = clock
-        self._background = chores
+        self._background = background
         self._reports: dict[bytes, tuple[Address, float]] = {}
         self._last: Address | None = None
         self._notified_at: dict[bytes, float] = {}
@@ -80,10 +80,10 @@ class ExternalAddresses:
     def answer_seen(self, peer: Contact, host: str, port: int) -> None:
         """REACH.SEEN: this node's address changed, so the NAT mappings of its other paths are lost."""
         if is_possible(Address(host, port)):
-            self.record(peer, Address(host, port), is_told=True)
+            self.record(peer, Address(host, port), is_change=True)
 
-    def record(self, peer: Contact, address: Address, is_told: bool = False) -> None:
-        """Record the address at which a peer sees this node; ``is_told``: the peer reports a change."""
+    def record(self, peer: Contact, address: Address, is_change: bool = False) -> None:
+        """Record the address at which a peer sees this node; ``is_change``: the peer reports a change."""
         before, at = self._reports.get(peer.public, (None, -NOTIFY_INTERVAL_S))
         now = self._clock.seconds()
         if now - at < NOTIFY_INTERVAL_S or is_relayed(peer.address):
@@ -95,7 +95,7 @@ class ExternalAddresses:
         self.is_translated = self.is_translated or address.host not in self._network.local_hosts()
         # From an additional port of this node its address differs anyway.
         is_usual = self._network.source_address(peer.address).port == self._network.address.port
-        if is_usual and address != before and (is_told or before is not None):
+        if is_usual and address != before and (is_change or before is not None):
             self._on_changed(peer)
 
     # -- reports to peers -------------------------------------------------------------------------------------------

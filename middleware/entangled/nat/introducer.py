@@ -42,9 +42,9 @@ class IntroductionLimits:
     def __len__(self) -> int:
         return len(self._buckets)
 
-    def may_introduce(self, asker: bytes) -> bool:
+    def may_introduce(self, requester: bytes) -> bool:
         """Return whether that peer may request another introduction, and count it."""
-        return self._take_token("introduce", asker, INTRODUCTIONS_PER_S, 2 * INTRODUCTIONS_PER_S)
+        return self._take_token("introduce", requester, INTRODUCTIONS_PER_S, 2 * INTRODUCTIONS_PER_S)
 
     def may_meet(self, introducer: bytes) -> bool:
         """Return whether that peer may cause another attempt of this node, and count it."""
@@ -74,14 +74,14 @@ class Introducer:
         self,
         endpoint: Endpoint,
         known: KnownPeers,
-        carriers: RelayClient,
+        relays: RelayClient,
         relay: Relay,
         allowance: IntroductionLimits,
         clock: IReactorTime,
     ) -> None:
         self._endpoint = endpoint
         self._known = known
-        self._relays = carriers
+        self._relays = relays
         self._relay = relay
         self._limits = allowance
         self._clock = clock
@@ -111,8 +111,8 @@ class Introducer:
         fields, was_fresh = answer if isinstance(answer, list) and len(answer) == 2 else ([], False)
         found = [*_observed_address(session.contact, was_fresh is True), *parse_candidates(fields)]
         is_direct = not (is_relayed(session.contact.address) or is_relayed(peer.address))
-        carriers = self._relays.find_contacts(wanted) if is_relayed(session.contact.address) else []
-        return [pack_candidates(found), [contact.pack() for contact in carriers], is_direct and self._relay.has_room]
+        relays = self._relays.find_contacts(wanted) if is_relayed(session.contact.address) else []
+        return [pack_candidates(found), [contact.pack() for contact in relays], is_direct and self._relay.has_room]
 
 
 def _observed_address(contact: Contact, is_fresh: bool) -> list[Address]:

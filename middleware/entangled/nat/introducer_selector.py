@@ -24,7 +24,7 @@ MAX_NAMERS = 3
 class IntroducerSelector:
     """The peers that may introduce this node, and the ones that named each contact.
 
-    ``contacts`` returns the known contacts; ``bootstraps`` are addresses of nodes that are asked first.  ``rng``
+    ``contacts`` returns the known contacts; ``bootstrap_addresses`` are addresses of nodes that are asked first.  ``rng``
     returns the random generator when it is needed.
     """
 
@@ -33,8 +33,8 @@ class IntroducerSelector:
         own_id: bytes,
         peers: Peers,
         contacts: Callable[[], Iterable[Contact]],
-        outside: ExternalAddresses,
-        carriers: RelayClient,
+        external: ExternalAddresses,
+        relays: RelayClient,
         clock: IReactorTime,
         rng: Callable[[], random.Random],
     ) -> None:
@@ -42,8 +42,8 @@ class IntroducerSelector:
         self._own_id = own_id
         self._peers = peers
         self._contacts = contacts
-        self._external = outside
-        self._relays = carriers
+        self._external = external
+        self._relays = relays
         self._clock = clock
         self._rng = rng
         self._namers: dict[bytes, dict[bytes, None]] = {}

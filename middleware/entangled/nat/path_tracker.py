@@ -32,14 +32,14 @@ class PathTracker:
         self,
         peers: Peers,
         paths: RelayedNetwork,
-        outside: ExternalAddresses,
-        carriers: RelayClient,
+        external: ExternalAddresses,
+        relays: RelayClient,
         clock: IReactorTime,
     ) -> None:
         self._peers = peers
         self._network = paths
-        self._external = outside
-        self._relays = carriers
+        self._external = external
+        self._relays = relays
         self._clock = clock
         self._path_kinds: dict[bytes, tuple[PathKind, float]] = {}
         self._introduced_at: dict[bytes, float] = {}
@@ -52,8 +52,8 @@ class PathTracker:
             return PeerPath("none")
         kind = self._classify(session)
         noted, since = self._path_kinds.get(contact.public, (kind, session.opened_at))
-        carrier = self._relays.find_session(contact.node_id) if kind == "carried" else None
-        by = b"" if carrier is None else carrier.contact.node_id
+        relay = self._relays.find_session(contact.node_id) if kind == "carried" else None
+        by = b"" if relay is None else relay.contact.node_id
         return PeerPath(kind, session.contact.address, by, since if noted == kind else session.opened_at)
 
     def needs_keep_alive(self, contact: Contact) -> bool:
@@ -87,13 +87,13 @@ class PathTracker:
         if not is_relayed(address) and self._external.is_far(address):
             put_bounded(self._mapped_peers, session.contact.public, None, MAX_KNOWN)
 
-    def reopen(self, teller: bytes) -> None:
-        """Reopen the latest sessions through NAT mappings, except the one with ``teller``, which reported it."""
+    def reopen(self, reporter: bytes) -> None:
+        """Reopen the latest sessions through NAT mappings, except the one with ``reporter``, which reported it."""
         for public in list(reversed(self._mapped_peers))[:MAX_REOPENED]:
             peer = self._peers.get(public)
             if peer is None or peer.session is None:
                 del self._mapped_peers[public]
-            elif public != teller:
+            elif public != reporter:
                 self._peers.open(peer, peer.session.contact.address)
 
     def forget_path(self, contact: Contact) -> None:
@@ -131,9 +131,9 @@ class PathTracker:
 class AdditionalPorts:
     """Additional local ports for hole punching, if early INITs may have spoilt the usual port."""
 
-    def __init__(self, paths: RelayedNetwork, ways: PathTracker, clock: IReactorTime) -> None:
+    def __init__(self, paths: RelayedNetwork, tracker: PathTracker, clock: IReactorTime) -> None:
         self._network = paths
-        self._tracker = ways
+        self._tracker = tracker
         self._clock = clock
         self._opened_at: dict[int, float] = {}
 

@@ -32,7 +32,7 @@ ONE_SIDED_S = 120.0
 
 @dataclass(slots=True)
 class _Pair:
-    """Two peers; ``heard`` has the time of the latest datagram of each, by its id."""
+    """Two peers; ``last_received_at`` has the time of the latest datagram of each, by its id."""
 
     started_at: float
     bucket: TokenBucket = field(default_factory=lambda: TokenBucket(PAIR_RATE, PAIR_BURST))

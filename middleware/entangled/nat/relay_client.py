@@ -34,13 +34,13 @@ class RelayClient:
     def __len__(self) -> int:
         return len(self._relays)
 
-    def add_relay(self, to: bytes, carrier: bytes) -> None:
+    def add_relay(self, to: bytes, relay: bytes) -> None:
         """Record that a peer relays to the node with that id."""
-        carriers = self._relays.pop(to, None) or {}
-        carriers[carrier] = self._clock.seconds()
-        if len(carriers) > MAX_RELAYS:
-            del carriers[min(carriers, key=lambda public: carriers[public])]
-        put_bounded(self._relays, to, carriers, MAX_KNOWN)
+        relays = self._relays.pop(to, None) or {}
+        relays[relay] = self._clock.seconds()
+        if len(relays) > MAX_RELAYS:
+            del relays[min(relays, key=lambda public: relays[public])]
+        put_bounded(self._relays, to, relays, MAX_KNOWN)
 
     def relay_keys(self, to: bytes) -> list[bytes]:
         """Return the public keys of the relays to the node with that id."""
@@ -53,8 +53,8 @@ class RelayClient:
 
     def find_session(self, to: bytes) -> Session | None:
         """Return the direct session with the latest known relay to the node with that id."""
-        carriers = self._relays.get(to, {})
-        for public in sorted(carriers, key=lambda public: -carriers[public]):
+        relays = self._relays.get(to, {})
+        for public in sorted(relays, key=lambda public: -relays[public]):
             session = self._endpoint.peers.find_direct_session(public)
             if session is not None:
                 return session
@@ -63,11 +63,11 @@ class RelayClient:
     def send(self, datagram: bytes, to: Address) -> None:
         """Send a datagram through a relay to the node with that virtual address; it is lost if there is no relay."""
         target = _parse_node_id(to)
-        carrier = self.find_session(target) if target else None
-        if carrier is None:
+        relay = self.find_session(target) if target else None
+        if relay is None:
             self._endpoint.counters["uncarried"] += 1
         else:
-            self._endpoint.send_sealed(carrier, bytes([RELAY_REQUEST]) + target + datagram)
+            self._endpoint.send_sealed(relay, bytes([RELAY_REQUEST]) + target + datagram)
 
     def on_relayed(self, session: Session, plain: bytes, source: Address) -> None:
         """Process a datagram that the peer of ``session`` relayed to this node."""

@@ -1,6 +1,6 @@
 """Wrap a network so that nodes behind relays have addresses.
 
-Datagrams to such an address are passed to ``carry``; relayed datagrams are passed to the receiver with such a source
+Datagrams to such an address are passed to ``send_relayed``; relayed datagrams are passed to the receiver with such a source
 address.
 """
 

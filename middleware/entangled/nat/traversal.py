@@ -90,18 +90,18 @@ class NatTraversal:
         paths: RelayedNetwork,
         contacts: Callable[[], Iterable[Contact]],
         clock: IReactorTime,
-        chores: Background,
+        background: Background,
     ) -> None:
         self._own_id = own_id
         self._endpoint = endpoint
         self._peers = endpoint.peers
         self._network = paths
         self._clock = clock
-        self._background = chores
+        self._background = background
         self._known = KnownPeers(endpoint.peers)
         self._is_maintenance_scheduled = False
         self._reopened_at = float("-inf")
-        self.external = ExternalAddresses(endpoint, paths, contacts, self._reopen, clock, chores)
+        self.external = ExternalAddresses(endpoint, paths, contacts, self._reopen, clock, background)
         self._relays = RelayClient(own_id, endpoint, paths, clock)
         self.selector = IntroducerSelector(
             own_id, endpoint.peers, contacts, self.external, self._relays, clock, lambda: self._rng
@@ -112,7 +112,7 @@ class NatTraversal:
         self._limits = IntroductionLimits(clock)
         self.introducer = Introducer(endpoint, self._known, self._relays, self.relay, self._limits, clock)
         self._upgrades = PathUpgrades(endpoint.peers)
-        self.query = AddressQuery(endpoint.send_sealed, paths, clock, lambda: self._rng, chores)
+        self.query = AddressQuery(endpoint.send_sealed, paths, clock, lambda: self._rng, background)
         endpoint.route_message(RELAY_REQUEST, self.relay.on_request)
         endpoint.route_message(RELAYED_DATAGRAM, self._relays.on_relayed)
         endpoint.route_message(ADDRESS_REQUEST, self.query.on_request)
@@ -122,7 +122,7 @@ class NatTraversal:
         endpoint.expose("reach.meet", self._answer_meet, changes=True)
         endpoint.expose("reach.seen", self.external.answer_seen, changes=True)
         self._peers.is_far = self.external.is_far
-        self._peers.on_slow_handshake.add(lambda opening: chores.fork(self._find_path(opening)))
+        self._peers.on_slow_handshake.add(lambda opening: background.fork(self._find_path(opening)))
         self._peers.on_established.add(self._on_session)
         self._peers.on_moved.add(self.external.report_change)
         endpoint.on_seen.add(self.external.record)
@@ -237,13 +237,13 @@ class NatTraversal:
         )
         if not (isinstance(answer, list) and len(answer) == 3):
             return []
-        fields, carriers, may_carry = answer
+        fields, relays, may_carry = answer
         found = [address for address in parse_candidates(fields) if self._is_usable(address)]
         attempt.introducers.append(helper)
         attempt.candidates.update(dict.fromkeys(found))
         if may_carry is True and not is_relayed(helper.address):
             self._relays.add_relay(attempt.node_id, helper.public)
-        for each in carriers[:MAX_RELAYS] if isinstance(carriers, list) else ():
+        for each in relays[:MAX_RELAYS] if isinstance(relays, list) else ():
             contact = contact_in(each)
             if contact is not None:
                 attempt.suggested.append(contact)
@@ -310,13 +310,13 @@ class NatTraversal:
 
     # -- maintenance ------------------------------------------------------------------------------------------------
 
-    def _reopen(self, teller: Contact) -> None:
+    def _reopen(self, reporter: Contact) -> None:
         """Reopen the sessions through NAT mappings, and soon retry direct paths."""
         now = self._clock.seconds()
         if now - self._reopened_at < REOPEN_INTERVAL_S:
             return
         self._reopened_at = now
-        self.paths.reopen(teller.public)
+        self.paths.reopen(reporter.public)
         self._upgrades.retry_now(now)
 
     def _on_session(self, session: Session) -> None:

@@ -38,10 +38,10 @@ class SimulatedLan:
     ``is_blocked``: multicast does not pass, as at many access points.
     """
 
-    def __init__(self, board: Switchboard) -> None:
+    def __init__(self, switchboard: Switchboard) -> None:
         self.is_blocked = False
         self.groups: list[SimulatedMulticast] = []
-        self._switchboard = board
+        self._switchboard = switchboard
 
     def join(self, host: str = "10.0.0.1") -> SimulatedMulticast:
         """Create a membership of the group for the node at ``host``."""

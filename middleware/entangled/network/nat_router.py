@@ -29,7 +29,7 @@ _FIRST_PORT, _LAST_PORT = 20_000, 60_000
 
 @dataclass(slots=True)
 class _Mapping:
-    """A port of the router for an inner address; ``heard`` has the time of the last datagram to each target."""
+    """A port of the router for an inner address; ``last_sent_at`` has the time of the last datagram to each target."""
 
     inner: Address
     port: int

@@ -45,7 +45,7 @@ def relayed_address(node_id: bytes) -> Address:
 
 
 def is_relayed(address: Address) -> bool:
-    """Return whether an address is the result of ``relayed``."""
+    """Return whether an address is the result of ``relayed_address``."""
     return len(address.host) == _RELAYED_LENGTH and address.host[0] == "~"
 
 

@@ -121,7 +121,7 @@ class _Host:
 class Pipe:
     """One end of a stream, with the interface of a Twisted transport.
 
-    With ``is_read`` False nothing more is read from it; ``is_still`` drops everything that this end sends; ``moved`` is
+    With ``is_reading`` False nothing more is read from it; ``is_stalled`` drops everything that this end sends; ``acknowledged`` is
     the number of bytes that the other end has acknowledged.
     """
 

@@ -91,12 +91,12 @@ class SwitchboardNetwork:
 
     def __init__(
         self,
-        board: Switchboard,
+        switchboard: Switchboard,
         address: Address,
         home: NatRouter | None = None,
         traffic: TrafficCounters | None = None,
     ) -> None:
-        self._switchboard = board
+        self._switchboard = switchboard
         self._address = address
         self._port_by_target: dict[Address, int] = {}
         self.traffic = TrafficCounters() if traffic is None else traffic
@@ -170,7 +170,7 @@ class SwitchboardNetwork:
 
 
 class Switchboard:
-    """Connects the networks of one process; ``weather`` applies to every link without separate conditions.
+    """Connects the networks of one process; ``conditions`` applies to every link without separate conditions.
 
     A ``link`` determines the delays instead, unless two addresses have separate conditions.  Each of the ``barriers``
     may block datagrams.
@@ -179,8 +179,8 @@ class Switchboard:
     address), unsent (the sender is closed or unplugged), blocked (by a router) and oversized.
     """
 
-    def __init__(self, clock: IReactorTime, rng: random.Random, weather: LinkConditions = PERFECT) -> None:
-        self.conditions = weather
+    def __init__(self, clock: IReactorTime, rng: random.Random, conditions: LinkConditions = PERFECT) -> None:
+        self.conditions = conditions
         self.link_model: LinkModel | None = None
         self.barriers: list[Barrier] = []
         self.counters: Counter[str] = Counter()
@@ -207,19 +207,19 @@ class Switchboard:
         """Create a network at that address, behind the router ``home``; port 0 takes the next free one."""
         return SwitchboardNetwork(self, Address(host, port or self._free_port(host, home)), home, traffic)
 
-    def add_router(self, nat: NatRouter, weather: LinkConditions = PERFECT) -> NatRouter:
-        """Add a router; ``weather`` applies to all datagrams through it, in addition to the link's."""
+    def add_router(self, nat: NatRouter, conditions: LinkConditions = PERFECT) -> NatRouter:
+        """Add a router; ``conditions`` applies to all datagrams through it, in addition to the link's."""
         self._routers[nat.host] = nat
-        self.router_conditions[nat] = weather
+        self.router_conditions[nat] = conditions
         return nat
 
-    def set_conditions(self, a: Address, b: Address, weather: LinkConditions | None, one_way: bool = False) -> None:
+    def set_conditions(self, a: Address, b: Address, conditions: LinkConditions | None, one_way: bool = False) -> None:
         """Set the conditions of the link between ``a`` and ``b`` (or from ``a`` to ``b``); None resets them."""
         for link in [(a, b)] if one_way else [(a, b), (b, a)]:
-            if weather is None:
+            if conditions is None:
                 self._links.pop(link, None)
             else:
-                self._links[link] = weather
+                self._links[link] = conditions
 
     def cut(self, a: Address, b: Address, one_way: bool = False) -> None:
         """Block datagrams between ``a`` and ``b`` (or from ``a`` to ``b``), including those in flight."""
@@ -297,7 +297,7 @@ class Switchboard:
             self.counters["cut"] += 1
             return
         own = self._links.get((source, to)) if self._links else None
-        weather = own or self.conditions
+        conditions = own or self.conditions
         routers = (home, self._routers.get(to.host)) if self._routers else ()
         router_conditions = (
             [self.router_conditions[router] for router in routers if router is not None] if routers else []
@@ -305,11 +305,11 @@ class Switchboard:
         delays: Sequence[float]
         if self.link_model is not None and own is None:
             delays = self.link_model.draw_delays(source, to, len(datagram), self._clock.seconds(), self._rng)
-        elif weather is PERFECT and not router_conditions:
+        elif conditions is PERFECT and not router_conditions:
             self._clock.callLater(0.0, self._deliver, source, to, datagram)
             return
         else:
-            delays = weather.draw_delays(self._rng)
+            delays = conditions.draw_delays(self._rng)
         for each in router_conditions:
             delays = [delay + more for delay in delays for more in each.draw_delays(self._rng)]
         if len(delays) != 1:

@@ -78,7 +78,7 @@ class TunnelNetwork:
 
     def __init__(
         self,
-        carrier: StreamTransport,
+        transport: StreamTransport,
         clock: IReactorTime,
         rng: random.Random,
         urls: Sequence[Url] = (),
@@ -87,7 +87,7 @@ class TunnelNetwork:
         proxy_for: Callable[[Url], Proxy | None] = lambda url: None,
     ) -> None:
         self.counters: Counter[str] = Counter()
-        self._transport = carrier
+        self._transport = transport
         self._clock = clock
         self._rng = rng
         self._targets = {url.address: _Target(url) for url in urls}
@@ -113,7 +113,7 @@ class TunnelNetwork:
     @property
     def peers(self) -> list[Address]:
         """The addresses of open tunnels."""
-        return [address for address, bundle in self._tunnels.items() if bundle.is_open]
+        return [address for address, tunnel in self._tunnels.items() if tunnel.is_open]
 
     def listen(self, receiver: Receiver) -> None:
         """Start serving, if configured, and pass each datagram to ``receiver``; raises ``PortInUse``."""
@@ -123,78 +123,78 @@ class TunnelNetwork:
 
     def send(self, datagram: bytes, to: Address) -> None:
         """Send a datagram; if its tunnel is being opened the datagram is queued, or lost."""
-        bundle = self._tunnels.get(to) or self._open_tunnel(to)
-        if bundle is None or self._receiver is None or len(datagram) > MAX_PAYLOAD_BYTES:
+        tunnel = self._tunnels.get(to) or self._open_tunnel(to)
+        if tunnel is None or self._receiver is None or len(datagram) > MAX_PAYLOAD_BYTES:
             self.counters["unsent"] += 1
             return
         now = self._clock.seconds()
-        self.counters["sent" if bundle.send(datagram, now) else "dropped"] += 1
-        self._adjust_connections(bundle, now)
+        self.counters["sent" if tunnel.send(datagram, now) else "dropped"] += 1
+        self._adjust_connections(tunnel, now)
 
     def close(self) -> None:
         """Close all tunnels; may be called twice."""
         self._receiver = None
         self._transport.close()
-        for link in self._connections:
-            link.close("the node stops")
-        for link in list(self._closing):
-            link.cancel_close()
+        for connection in self._connections:
+            connection.close("the node stops")
+        for connection in list(self._closing):
+            connection.cancel_close()
         self._closing.clear()
         cancel(self._timer)
         self._timer = None
 
     # -- called by the links ----------------------------------------------------------------------------------------
 
-    def on_connection_open(self, link: TunnelConnection) -> bool:
+    def on_connection_open(self, connection: TunnelConnection) -> bool:
         """Register a link that is open, unless there are too many from its address."""
-        if self._is_plain and link.address not in self._targets:
-            host = _address_block(link.socket.forwarded) or link.host
-            if link.socket.forwarded and self._is_crowded(host):
+        if self._is_plain and connection.address not in self._targets:
+            host = _address_block(connection.socket.forwarded) or connection.host
+            if connection.socket.forwarded and self._is_crowded(host):
                 self.counters["crowded"] += 1
                 return False
-            link.host = host
+            connection.host = host
         self.counters["opened"] += 1
         now = self._clock.seconds()
-        link.started_at = now
-        bundle = self._tunnels[link.address]
-        if link.address not in self._targets:
-            self._group_connection(link, bundle, now)
-        elif sum(each.is_open for each in bundle.connections) == 1:
-            bundle.active_at = now
-            self._log.info("tunnel to {url} opened", url=str(self._targets[link.address].url))
+        connection.started_at = now
+        tunnel = self._tunnels[connection.address]
+        if connection.address not in self._targets:
+            self._group_connection(connection, tunnel, now)
+        elif sum(each.is_open for each in tunnel.connections) == 1:
+            tunnel.active_at = now
+            self._log.info("tunnel to {url} opened", url=str(self._targets[connection.address].url))
         return True
 
-    def on_connection_datagram(self, link: TunnelConnection, datagram: bytes) -> None:
+    def on_connection_datagram(self, connection: TunnelConnection, datagram: bytes) -> None:
         """Pass a datagram to the receiver."""
         if self._receiver is not None:
             self.counters["received"] += 1
-            bundle = self._tunnels.get(link.address)
-            if bundle is not None:
-                bundle.active_at = self._clock.seconds()
-            self._receiver(datagram, link.address)
+            tunnel = self._tunnels.get(connection.address)
+            if tunnel is not None:
+                tunnel.active_at = self._clock.seconds()
+            self._receiver(datagram, connection.address)
 
-    def on_connection_closed(self, link: TunnelConnection, why: str) -> None:
+    def on_connection_closed(self, connection: TunnelConnection, why: str) -> None:
         """Forget a link, and delay the next attempt if it was dialled."""
         now = self._clock.seconds()
-        bundle = self._tunnels.get(link.address)
-        if bundle is not None:
-            bundle.remove(link, now)
-            if not bundle.connections:
-                del self._tunnels[link.address]
-                if self._tunnels_by_token.get(bundle.token) is bundle:
-                    del self._tunnels_by_token[bundle.token]
+        tunnel = self._tunnels.get(connection.address)
+        if tunnel is not None:
+            tunnel.remove(connection, now)
+            if not tunnel.connections:
+                del self._tunnels[connection.address]
+                if self._tunnels_by_token.get(tunnel.token) is tunnel:
+                    del self._tunnels_by_token[tunnel.token]
         if self._receiver is not None:
-            self._closing.add(link)
-        self.counters["lost" if link.socket.is_open else "refused"] += 1
-        target = self._targets.get(link.address)
-        if target is None or (bundle is not None and bundle.connections):
+            self._closing.add(connection)
+        self.counters["lost" if connection.socket.is_open else "refused"] += 1
+        target = self._targets.get(connection.address)
+        if target is None or (tunnel is not None and tunnel.connections):
             return
-        if link.socket.is_open and now - link.started_at > MAX_REDIAL_S:
+        if connection.socket.is_open and now - connection.started_at > MAX_REDIAL_S:
             target.redial_delay_s = MIN_REDIAL_S
         # Measured from the attempt: an attempt that took long to fail has waited already.
-        target.redial_at = link.started_at + target.redial_delay_s * (0.75 + self._rng.random() / 2)
+        target.redial_at = connection.started_at + target.redial_delay_s * (0.75 + self._rng.random() / 2)
         target.redial_delay_s = min(2 * target.redial_delay_s, MAX_REDIAL_S)
-        if link.socket.is_open or target.last_failure != why:
+        if connection.socket.is_open or target.last_failure != why:
             target.last_failure = why
             self._log.info("tunnel to {url} is not available: {why}", url=str(target.url), why=why)
 
@@ -210,45 +210,45 @@ class TunnelNetwork:
 
     @property
     def _connections(self) -> list[TunnelConnection]:
-        return [link for bundle in self._tunnels.values() for link in bundle.connections]
+        return [connection for tunnel in self._tunnels.values() for connection in tunnel.connections]
 
     def _open_tunnel(self, to: Address) -> TunnelConnections | None:
         """Open a tunnel to a URL with one connection; return None if it may not be dialled now."""
         target, now = self._targets.get(to), self._clock.seconds()
         if target is None or self._receiver is None or now < target.redial_at:
             return None
-        bundle = TunnelConnections(to, self._transport.read_state, now)
-        bundle.token = self._rng.randbytes(16)
-        self._dial(target, bundle)
+        tunnel = TunnelConnections(to, self._transport.read_state, now)
+        tunnel.token = self._rng.randbytes(16)
+        self._dial(target, tunnel)
         return self._tunnels.get(to)
 
-    def _adjust_connections(self, bundle: TunnelConnections, now: float) -> None:
+    def _adjust_connections(self, tunnel: TunnelConnections, now: float) -> None:
         """Adjust the number of connections of a dialled tunnel to its loss."""
-        target = self._targets.get(bundle.address)
-        if target is None or len(bundle.connections) == bundle.target_count(now) == 1:
+        target = self._targets.get(tunnel.address)
+        if target is None or len(tunnel.connections) == tunnel.target_count(now) == 1:
             return
-        for link in bundle.find_surplus(now):
-            is_still = link.is_open and bundle.target_count(now) > 1
-            link.close("the connection stalled" if is_still else "one connection is enough", is_rude=is_still)
-        while bundle.connections and len(bundle.connections) < bundle.target_count(now) and now >= bundle.hold_until:
-            self._dial(target, bundle)
+        for connection in tunnel.find_surplus(now):
+            is_still = connection.is_open and tunnel.target_count(now) > 1
+            connection.close("the connection stalled" if is_still else "one connection is enough", is_rude=is_still)
+        while tunnel.connections and len(tunnel.connections) < tunnel.target_count(now) and now >= tunnel.hold_until:
+            self._dial(target, tunnel)
 
-    def _group_connection(self, link: TunnelConnection, bundle: TunnelConnections, now: float) -> None:
+    def _group_connection(self, connection: TunnelConnection, tunnel: TunnelConnections, now: float) -> None:
         """Add an accepted connection to the tunnel that it names; if there are too many, close the most stalled."""
-        token = link.socket.token
+        token = connection.socket.token
         if not token:
             return
-        whole = self._tunnels_by_token.setdefault(token, bundle)
-        if whole is bundle:
-            bundle.token = token
+        whole = self._tunnels_by_token.setdefault(token, tunnel)
+        if whole is tunnel:
+            tunnel.token = token
             return
-        del self._tunnels[bundle.address]
-        link.address = whole.address
-        whole.add(link)
+        del self._tunnels[tunnel.address]
+        connection.address = whole.address
+        whole.add(connection)
         if len(whole.connections) > MAX_CONNECTIONS:
             whole.find_most_stalled(now).close("replaced by a newer connection of the same tunnel", is_rude=True)
 
-    def _dial(self, target: _Target, bundle: TunnelConnections) -> None:
+    def _dial(self, target: _Target, tunnel: TunnelConnections) -> None:
         url, proxy = target.url, self._proxy_for(target.url)
         layers: list[StreamLayer] = []
         where = Address(url.host, url.port)
@@ -258,9 +258,9 @@ class TunnelNetwork:
             where = Address(proxy.host, proxy.port)
         if url.is_tls:
             layers.append(TlsLayer(self._client_context, url.host))
-        socket = WebSocket(url, bundle.token)
-        link = self._register(TunnelConnection(self, self._clock, bundle.address, url.host, layers, socket), bundle)
-        self._transport.dial(where, link, lambda why: link.close(why, is_rude=True))
+        socket = WebSocket(url, tunnel.token)
+        connection = self._register(TunnelConnection(self, self._clock, tunnel.address, url.host, layers, socket), tunnel)
+        self._transport.dial(where, connection, lambda why: connection.close(why, is_rude=True))
 
     def _accept(self, host: str) -> TunnelConnection | None:
         """Return a link for a client at ``host``; None if there is no room for it."""
@@ -269,32 +269,32 @@ class TunnelNetwork:
         if self._receiver is None or (not self._is_plain and self._is_crowded(place)):
             self.counters["crowded"] += 1
             return None
-        served = [link for link in self._connections if link.address not in self._targets]
-        begun = [link for link in served if not link.is_open]
-        unproved = [link for link in served if link.is_open and not self._tunnels[link.address].is_answered]
+        served = [connection for connection in self._connections if connection.address not in self._targets]
+        begun = [connection for connection in served if not connection.is_open]
+        unproved = [connection for connection in served if connection.is_open and not self._tunnels[connection.address].is_answered]
         if len(begun) >= MAX_HANDSHAKES:
             begun[0].close("replaced by a newer connection", is_rude=True)
         elif len(served) >= MAX_TOTAL_CONNECTIONS:
-            further = [link for link in served if link is not self._tunnels[link.address].connections[0]]
+            further = [connection for connection in served if connection is not self._tunnels[connection.address].connections[0]]
             if not (begun or unproved or further):
                 self.counters["crowded"] += 1
                 return None
             (begun or unproved or further)[0].close("replaced by a newer connection", is_rude=True)
         address = Address(VIRTUAL_PREFIX + self._rng.randbytes(6).hex(), 1)
         layers = [] if self._is_plain else [TlsLayer(self._server_context, is_server=True)]
-        bundle = TunnelConnections(address, self._transport.read_state, self._clock.seconds())
-        return self._register(TunnelConnection(self, self._clock, address, place, layers, WebSocket()), bundle)
+        tunnel = TunnelConnections(address, self._transport.read_state, self._clock.seconds())
+        return self._register(TunnelConnection(self, self._clock, address, place, layers, WebSocket()), tunnel)
 
-    def _register(self, link: TunnelConnection, bundle: TunnelConnections) -> TunnelConnection:
-        self._tunnels[link.address] = bundle
-        bundle.add(link)
+    def _register(self, connection: TunnelConnection, tunnel: TunnelConnections) -> TunnelConnection:
+        self._tunnels[connection.address] = tunnel
+        tunnel.add(connection)
         if self._timer is None:
             self._timer = self._clock.callLater(CHECK_INTERVAL_S, self._check_connections)
-        return link
+        return connection
 
     def _is_crowded(self, host: str) -> bool:
         """Return whether there are too many connections of one address for another one."""
-        there = [self._tunnels[link.address] for link in self._connections if link.host == host]
+        there = [self._tunnels[connection.address] for connection in self._connections if connection.host == host]
         return (
             len(there) >= MAX_CONNECTIONS * MAX_PER_HOST or sum(not each.is_answered for each in there) >= MAX_PER_HOST
         )
@@ -302,23 +302,23 @@ class TunnelNetwork:
     def _check_connections(self) -> None:
         now = self._clock.seconds()
         self._timer = None
-        self._closing = {link for link in self._closing if link.is_closing}
-        for link in self._connections:
-            bundle = self._tunnels.get(link.address)
-            if bundle is None or link.is_closed:
+        self._closing = {connection for connection in self._closing if connection.is_closing}
+        for connection in self._connections:
+            tunnel = self._tunnels.get(connection.address)
+            if tunnel is None or connection.is_closed:
                 continue
-            is_ours, age = link.address in self._targets, now - link.started_at
-            if not link.is_open:
+            is_ours, age = connection.address in self._targets, now - connection.started_at
+            if not connection.is_open:
                 if age > (DIAL_TIMEOUT_S if is_ours else ACCEPT_TIMEOUT_S):
-                    link.close("the handshake timed out", is_rude=True)
-            elif is_ours and now - bundle.active_at > IDLE_TIMEOUT_S:
-                link.close("the tunnel is idle")
-            elif not is_ours and not bundle.is_answered and age > UNANSWERED_TIMEOUT_S:
-                link.close("the client is not a member of this team")
+                    connection.close("the handshake timed out", is_rude=True)
+            elif is_ours and now - tunnel.active_at > IDLE_TIMEOUT_S:
+                connection.close("the tunnel is idle")
+            elif not is_ours and not tunnel.is_answered and age > UNANSWERED_TIMEOUT_S:
+                connection.close("the client is not a member of this team")
             else:
-                link.check(now)
-        for bundle in list(self._tunnels.values()):
-            self._adjust_connections(bundle, now)
+                connection.check(now)
+        for tunnel in list(self._tunnels.values()):
+            self._adjust_connections(tunnel, now)
         if self._tunnels or self._closing:
             self._timer = self._clock.callLater(CHECK_INTERVAL_S, self._check_connections)
 

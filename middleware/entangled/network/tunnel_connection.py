@@ -41,13 +41,13 @@ CLOSE_S = 2.0
 class ConnectionListener(Protocol):
     """Receives the events of its links."""
 
-    def on_connection_open(self, link: TunnelConnection) -> bool:
+    def on_connection_open(self, connection: TunnelConnection) -> bool:
         """Called when datagrams can be sent; returning False closes the link."""
 
-    def on_connection_datagram(self, link: TunnelConnection, datagram: bytes) -> None:
+    def on_connection_datagram(self, connection: TunnelConnection, datagram: bytes) -> None:
         """Process a datagram."""
 
-    def on_connection_closed(self, link: TunnelConnection, why: str) -> None:
+    def on_connection_closed(self, connection: TunnelConnection, why: str) -> None:
         """Called once when the link is closed."""
 
 
@@ -210,9 +210,9 @@ class TunnelConnection(StreamProtocol):
     def _send_opening(self, number: int) -> None:
         """Send the first bytes of a layer, or of the WebSocket inside all layers."""
         part = self._layers[number] if number < len(self._layers) else self.socket
-        words = part.opening()
-        if words:
-            self._write(self._layers[:number], words)
+        opening = part.opening()
+        if opening:
+            self._write(self._layers[:number], opening)
 
     def _process(self, data: bytes) -> None:
         was_open = self.socket.is_open

@@ -67,48 +67,48 @@ class TunnelConnections:
     @property
     def is_open(self) -> bool:
         """Whether datagrams can be sent."""
-        return any(link.is_open for link in self.connections)
+        return any(connection.is_open for connection in self.connections)
 
-    def add(self, link: TunnelConnection) -> None:
+    def add(self, connection: TunnelConnection) -> None:
         """Add a connection."""
-        self.connections.append(link)
+        self.connections.append(connection)
 
-    def remove(self, link: TunnelConnection, now: float) -> None:
+    def remove(self, connection: TunnelConnection, now: float) -> None:
         """Remove a connection."""
-        if link in self.connections:
-            self.connections.remove(link)
+        if connection in self.connections:
+            self.connections.remove(connection)
             self.hold_until = now + REDIAL_DELAY_S
-        self._progress.pop(link, None)
+        self._progress.pop(connection, None)
 
     def send(self, datagram: bytes, now: float) -> bool:
         """Send a datagram over the connections that make progress; return False if it was dropped."""
         self.is_answered, self.active_at = True, now
-        links = self.order_by_progress(now) or self.connections[:1]
+        connections = self.order_by_progress(now) or self.connections[:1]
         sent = 0
-        for link in links:
-            pace = self._progress.get(link)
+        for connection in connections:
+            pace = self._progress.get(connection)
             if pace is not None and self._is_stalled(pace, now) and pace.unacked > MAX_STALLED_BYTES:
                 continue
-            dropped = link.dropped
-            link.send(datagram)
-            sent += link.dropped == dropped
+            dropped = connection.dropped
+            connection.send(datagram)
+            sent += connection.dropped == dropped
             if sent == COPIES:
                 break
         return sent > 0
 
     def order_by_progress(self, now: float) -> list[TunnelConnection]:
         """Return the open connections, first the ones that make progress and hold the fewest bytes."""
-        links = [link for link in self.connections if link.is_open]
-        for link in links:
-            self._measure_progress(link, now)
-        if len(links) > 1:
-            links.sort(key=lambda link: self._rank(self._progress[link], now))
-        return links
+        connections = [connection for connection in self.connections if connection.is_open]
+        for connection in connections:
+            self._measure_progress(connection, now)
+        if len(connections) > 1:
+            connections.sort(key=lambda connection: self._rank(self._progress[connection], now))
+        return connections
 
     def find_most_stalled(self, now: float) -> TunnelConnection:
         """Return the most stalled connection except the newest, or the oldest if none is stalled."""
         self.order_by_progress(now)
-        return max(self.connections[:-1], key=lambda link: self._rank(self._progress.get(link) or _Progress(now), now))
+        return max(self.connections[:-1], key=lambda connection: self._rank(self._progress.get(connection) or _Progress(now), now))
 
     def target_count(self, now: float) -> int:
         """Return the number of connections that the tunnel should have."""
@@ -118,20 +118,20 @@ class TunnelConnections:
 
     def find_surplus(self, now: float) -> list[TunnelConnection]:
         """Return the connections to close: stalled ones, and surplus ones."""
-        links = self.order_by_progress(now)
-        if not links:
+        connections = self.order_by_progress(now)
+        if not connections:
             return []
         if self.target_count(now) == 1:
-            return [link for link in self.connections if link is not links[0]]
-        if self._is_stalled(self._progress[links[0]], now):
+            return [connection for connection in self.connections if connection is not connections[0]]
+        if self._is_stalled(self._progress[connections[0]], now):
             return []
-        return [link for link in links if self._stalled_s(self._progress[link], now) > REPLACE_STALLED_S]
+        return [connection for connection in connections if self._stalled_s(self._progress[connection], now) > REPLACE_STALLED_S]
 
     # -- private ----------------------------------------------------------------------------------------------------
 
-    def _measure_progress(self, link: TunnelConnection, now: float) -> None:
-        pace = self._progress.setdefault(link, _Progress(now))
-        strain = self._read_state(link.transport)
+    def _measure_progress(self, connection: TunnelConnection, now: float) -> None:
+        pace = self._progress.setdefault(connection, _Progress(now))
+        strain = self._read_state(connection.transport)
         if strain is None:
             return
         if pace.acked < 0 and strain.retransmissions >= LOSSY_RETRANSMISSIONS:

@@ -37,8 +37,8 @@ class WebSocket(WebSocketEnd):
         if SUBPROTOCOL not in request.subprotocols:
             return RejectConnection(426)
         self.forwarded = fields.get(b"x-forwarded-for", b"").rpartition(b",")[2].strip()[:45].decode("latin-1")
-        said = fields.get(TOKEN_HEADER.lower().encode(), b"")
-        self.token = bytes.fromhex(said.decode()) if re.fullmatch(b"[0-9a-f]{32}", said) else b""
+        token = fields.get(TOKEN_HEADER.lower().encode(), b"")
+        self.token = bytes.fromhex(token.decode()) if re.fullmatch(b"[0-9a-f]{32}", token) else b""
         return AcceptConnection(subprotocol=SUBPROTOCOL)
 
     def _find_error(self, answer: AcceptConnection | RejectConnection | Exception) -> str:

@@ -42,7 +42,7 @@ class NoteStore(Protocol):
 class Codec(Generic[Key]):
     """The encoding of the registers of one use as notes; no decoder raises.
 
-    ``name`` is the format of the names of the ``buckets``; ``nobody`` is a name below all names of proposers.  The
+    ``name`` is the format of the names of the ``buckets``; ``lowest_name`` is a name below all names of proposers.  The
     counters of two lives of a proposer differ modulo ``lives`` (1 if their names differ).  ``unpack`` also returns
     whether the note was complete.
     """

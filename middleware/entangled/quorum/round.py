@@ -86,7 +86,7 @@ class Round:
 
     ``ask`` sends the request to the member of a place.  If another proposer's lease at a member ends within ``short``
     seconds, the request is repeated then, or sooner if that is long.  ``outcome`` also fires, undecided, when all
-    members have answered, after ``patience`` seconds, and shortly after a majority has answered.  A silent member is
+    members have answered, after ``timeout_s`` seconds, and shortly after a majority has answered.  A silent member is
     asked every ``RETRY_INTERVAL_S`` seconds until the round is decided, and at least ``MIN_TRIES`` times.  With ``single`` it is
     asked once, the transport retransmits, and a failure counts as its answer.
     """
@@ -97,7 +97,7 @@ class Round:
         ask: Callable[[int], Deferred[Any]],
         decode: Decode,
         clock: IReactorTime,
-        patience: float = math.inf,
+        timeout_s: float = math.inf,
         short: float = RETRY_INTERVAL_S,
         single: bool = False,
     ) -> None:
@@ -107,7 +107,7 @@ class Round:
         self._ask = ask
         self._decode = decode
         self._clock = clock
-        self._patience = patience
+        self._patience = timeout_s
         self._short_s = short
         self._single = single
         self._sent_times: dict[int, float] = {}
@@ -115,7 +115,7 @@ class Round:
         self._attempts = 0
         self._is_closed = False
         self._timer: IDelayedCall | None = None
-        self._end_timer: IDelayedCall | None = None if math.isinf(patience) else clock.callLater(patience, self._finish)
+        self._end_timer: IDelayedCall | None = None if math.isinf(timeout_s) else clock.callLater(timeout_s, self._finish)
         self._send_requests()
 
     @property

@@ -29,18 +29,18 @@ Waiting = deque[tuple[Record, Deferred[object]]]
 class RecordBatcher:
     """Sends the own records of a node to their replicas."""
 
-    def __init__(self, overlay: Overlay, chores: Background) -> None:
+    def __init__(self, overlay: Overlay, background: Background) -> None:
         self._overlay = overlay
-        self._background = chores
+        self._background = background
         self._waiting: dict[bytes, Waiting] = {}
 
-    async def store(self, contact: Contact, record: Record, left: float | None = None) -> object:
+    async def store(self, contact: Contact, record: Record, lifetime_s: float | None = None) -> object:
         """Send STORE for ``record`` and return the reply; raise the errors of the request.
 
-        A record of another owner, with ``left`` seconds of remaining lifetime, is sent at once by itself.
+        A record of another owner, with ``lifetime_s`` seconds of remaining lifetime, is sent at once by itself.
         """
-        if left is not None:
-            return (await self._send(contact, [record], [left]))[0]
+        if lifetime_s is not None:
+            return (await self._send(contact, [record], [lifetime_s]))[0]
         if record.message_bytes > MAX_LOAD_BYTES:
             return (await self._send(contact, [record]))[0]  # sent in fragments, so it takes longer
         waiting = self._waiting.get(contact.node_id)

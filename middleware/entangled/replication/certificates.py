@@ -25,7 +25,7 @@ OWNER_BYTES = 32
 
 
 class Certificates:
-    """Fetches and serves certificates of record owners; the admission check ``door`` verifies them."""
+    """Fetches and serves certificates of record owners; the admission check ``admission`` verifies them."""
 
     def __init__(self, endpoint: Endpoint, clock: IReactorTime) -> None:
         self.admission: AdmissionCheck = endpoint.admission

@@ -38,7 +38,7 @@ Mark = tuple[int, bytes]
 class Comparison:
     """The team records of one node as its peers see them.
 
-    ``asked_at`` maps peers to the time of their last request for digests; ``standing`` returns this node's sync state.
+    ``requested_at`` maps peers to the time of their last request for digests; ``standing`` returns this node's sync state.
     """
 
     def __init__(self, replica: Replica, overlay: Overlay, endpoint: Endpoint, clock: IReactorTime) -> None:
@@ -90,7 +90,7 @@ class Comparison:
 
     # -- requests of peers ---------------------------------------------------------------------------------------------
 
-    def _answer_digests(self, peer: Contact, bit: int, standing: int) -> list[object]:
+    def _answer_digests(self, peer: Contact, bit: int, sync_state: int) -> list[object]:
         """DIGESTS: the digest of each part, the number of records that only the peer should hold, and the lifetimes.
 
         Both nodes exchange their sync states as well.
@@ -102,7 +102,7 @@ class Comparison:
         self.requested_at[peer.node_id] = self._clock.seconds()
         if len(self.requested_at) > MAX_PEERS:
             del self.requested_at[next(iter(self.requested_at))]
-        self._overlay.members.set_voter(peer.node_id, standing > NEVER_SYNCED)
+        self._overlay.members.set_voter(peer.node_id, sync_state > NEVER_SYNCED)
         lives = [self.sum_lifetimes(group, bit) for group in groups]
         return [[digest_of(group) for group in groups], len(extra), lives, self.get_sync_state()]
 
@@ -150,7 +150,7 @@ class Comparison:
     # -- inside -----------------------------------------------------------------------------------------------------
 
     def _make_snapshot(self, peer: Contact) -> list[list[Record]]:
-        """Return ``both`` as sorted lists, records for the peer only last; keep them as its snapshot."""
+        """Return ``find_shared`` as sorted lists, records for the peer only last; keep them as its snapshot."""
         groups, extra = self.find_shared(peer)
         lists = [sorted(records, key=lambda record: record.slot) for records in (*groups, extra)]
         now = self._clock.seconds()

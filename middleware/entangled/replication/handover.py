@@ -57,14 +57,14 @@ class Handover:
         endpoint: Endpoint,
         clock: IReactorTime,
         rng: random.Random,
-        chores: Background,
+        background: Background,
     ) -> None:
         self._replica = replica
         self._overlay = overlay
         self._owner = owner
         self._clock = clock
         self._rng = rng
-        self._background = chores
+        self._background = background
         self._own_id = overlay.own_id
         self._contact_at = clock.seconds()
         self._sync_state = SyncState(store)
@@ -159,7 +159,7 @@ class Handover:
             answer = await self._overlay.ask(
                 contact, "digests", bit, self._current_sync_state(), is_light=self._overlay.is_large
             )
-            digests, extra, lives, standing = (
+            digests, extra, lives, sync_state = (
                 answer if isinstance(answer, list) and len(answer) == 4 else ([], 0, [], 0)
             )
             own, for_peer = self._comparison.find_shared(contact)
@@ -173,8 +173,8 @@ class Handover:
                 await self._compare_group(contact, -1, [])
             await self._send_lacking(contact, for_peer)
             self._reconciled_at[contact.node_id] = began
-            self._sync_states[contact.node_id] = standing if standing in (STALE, CURRENT) else NEVER_SYNCED
-            self._overlay.members.set_voter(contact.node_id, standing in (STALE, CURRENT))
+            self._sync_states[contact.node_id] = sync_state if sync_state in (STALE, CURRENT) else NEVER_SYNCED
+            self._overlay.members.set_voter(contact.node_id, sync_state in (STALE, CURRENT))
         finally:
             self._reconciling.discard(contact.node_id)
 

@@ -80,7 +80,7 @@ class Owner:
         overlay: Overlay,
         endpoint: Endpoint,
         clock: IReactorTime,
-        chores: Background,
+        background: Background,
     ) -> None:
         self._identity = identity
         self._lease = lease
@@ -89,8 +89,8 @@ class Owner:
         self._overlay = overlay
         self._endpoint = endpoint
         self._clock = clock
-        self._background = chores
-        self._batcher = RecordBatcher(overlay, chores)
+        self._background = background
+        self._batcher = RecordBatcher(overlay, background)
         self._own: dict[Slot, Record] = {}
         self._incomplete: dict[Slot, None] = {}
         self._published_at: dict[Slot, float] = {}

@@ -41,10 +41,10 @@ class _Watcher:
 class Pusher:
     """The watchers of the keys that one replica holds."""
 
-    def __init__(self, endpoint: Endpoint, clock: IReactorTime, chores: Background) -> None:
+    def __init__(self, endpoint: Endpoint, clock: IReactorTime, background: Background) -> None:
         self._endpoint = endpoint
         self._clock = clock
-        self._background = chores
+        self._background = background
         self._watchers: dict[bytes, dict[bytes, _Watcher]] = {}
         self._batches: dict[bytes, dict[Slot, tuple[Record, bool]]] = {}
 

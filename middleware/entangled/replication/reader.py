@@ -40,11 +40,11 @@ class ReplicaReply(NamedTuple):
 class Reader:
     """Reads keys for one node."""
 
-    def __init__(self, replica: Replica, overlay: Overlay, owner: Owner, chores: Background) -> None:
+    def __init__(self, replica: Replica, overlay: Overlay, owner: Owner, background: Background) -> None:
         self._replica = replica
         self._overlay = overlay
         self._owner = owner
-        self._background = chores
+        self._background = background
 
     async def read(self, key: bytes, concern: ReadConsistency) -> list[Record]:
         """Return the records of ``key``, without tombstones, in the order of (owner, name); raise ``Unavailable``.
@@ -74,7 +74,7 @@ class Reader:
         contact: Contact,
         key: bytes,
         page: object = None,
-        wants_sure: bool = True,
+        wants_synced: bool = True,
         same: list[Record] | None = None,
     ) -> ReplicaReply:
         """Read the records that ``contact`` holds under ``key``, from ``page`` on (None: from the first one).
@@ -84,7 +84,7 @@ class Reader:
         records: list[Record] = []
         if page is None:
             digest = (digest_of(same),) if same else ()
-            page = await self._overlay.ask(contact, "find_value", key, None, wants_sure, *digest)
+            page = await self._overlay.ask(contact, "find_value", key, None, wants_synced, *digest)
             if same and isinstance(page, list) and len(page) == 3 and page[0] is None:
                 return ReplicaReply(same, SYNCED_REPLY if page[2] == SYNCED_REPLY else UNSYNCED_REPLY, [])
         worth, nearer = UNSYNCED_REPLY, []
@@ -99,7 +99,7 @@ class Reader:
             nearer = parse_contacts(page[3]) if len(page) > 3 else []
             if page[1] is None or not page[0]:
                 break
-            page = await self._overlay.ask(contact, "find_value", key, page[1], wants_sure)
+            page = await self._overlay.ask(contact, "find_value", key, page[1], wants_synced)
         return ReplicaReply(records, worth, nearer)
 
     def is_credible(self, record: Record, key: bytes, contact: Contact) -> bool:
@@ -113,14 +113,14 @@ class Reader:
     # -- inside -----------------------------------------------------------------------------------------------------
 
     async def _read_fast(self, key: bytes) -> list[Record]:
-        here = self._replica.get_held(key)
+        local = self._replica.get_held(key)
         # Records from a time when this node was among the closest may be outdated.
         if (
-            _has_values(here)
+            _has_values(local)
             and self._replica.is_synced()
             and self._overlay.is_replica(key, self._overlay.own_contact())
         ):
-            return here
+            return local
         if self._overlay.is_sparse:
             return await self._find_value(key)
         targets = await self._overlay.lookup_replicas(key)
@@ -195,10 +195,10 @@ class Reader:
         """
         answers: dict[bytes, ReplicaReply] = {}
         own_id = self._overlay.own_id
-        here: list[Record] = []
+        local: list[Record] = []
         if any(c.node_id == own_id for c in targets):
-            here = self._replica.get_held(key)
-            answers[own_id] = ReplicaReply(here, SYNCED_REPLY if self._replica.is_synced() else UNSYNCED_REPLY, [])
+            local = self._replica.get_held(key)
+            answers[own_id] = ReplicaReply(local, SYNCED_REPLY if self._replica.is_synced() else UNSYNCED_REPLY, [])
             width -= 1
         waiting = self._overlay.order_by_speed(c for c in targets if c.node_id != own_id)
         done: Deferred[None] = Deferred()
@@ -223,7 +223,7 @@ class Reader:
             in_time = self._background.later(self._overlay.hedge_delay(), hedge, contact)
             more = 1
             try:
-                answer = answers[contact.node_id] = await self.read_pages(contact, key, same=here)
+                answer = answers[contact.node_id] = await self.read_pages(contact, key, same=local)
                 if answer.sync_level == SYNCED_REPLY and contact.node_id in voters.ids:
                     more = 2 if initial == 1 else 0
             except EntangledError:
@@ -255,7 +255,7 @@ class Reader:
         answers: dict[bytes, ReplicaReply] = {}
 
         async def visit(contact: Contact) -> None:
-            answer = await self.read_pages(contact, key, wants_sure=False)
+            answer = await self.read_pages(contact, key, wants_synced=False)
             if _has_values(answer.records) and answer.sync_level in (SYNCED_REPLY, CACHED_REPLY):
                 found[:] = found or answer.records
             else:

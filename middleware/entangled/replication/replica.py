@@ -44,25 +44,25 @@ UNSYNCED_REPLY, SYNCED_REPLY, CACHED_REPLY = 0, 1, 2
 
 
 class Replica:
-    """The records that one node holds for other owners; ``keepsakes`` are its watched copies, invisible to peers.
+    """The records that one node holds for other owners; ``watched_copies`` are its watched copies, invisible to peers.
 
     ``may_store`` returns whether the owner of a slot may write there by its present certificate; ``may_stay`` whether
-    a record in it may be kept and served, which differs for few slots.  ``is_sure`` returns whether this node is
+    a record in it may be kept and served, which differs for few slots.  ``is_synced`` returns whether this node is
     synced.
 
-    ``on_record`` is called with each accepted record, ``on_gone`` with each removed one, ``on_silent`` with the public
+    ``on_record`` is called with each accepted record, ``on_gone`` with each removed one, ``on_owner_expired`` with the public
     key of each owner whose lease expired or that said goodbye.
     """
 
     def __init__(
-        self, store: Store, endpoint: Endpoint, overlay: Overlay, clock: IReactorTime, chores: Background
+        self, store: Store, endpoint: Endpoint, overlay: Overlay, clock: IReactorTime, background: Background
     ) -> None:
         self.watched_copies = WatchedCopies(store)
         self._store = store
         self._endpoint = endpoint
         self._overlay = overlay
         self._clock = clock
-        self.pusher = Pusher(endpoint, clock, chores)
+        self.pusher = Pusher(endpoint, clock, background)
         self.cache = PathCache()
         self._signature_cache = SignatureCache()
         self.certificates = Certificates(endpoint, clock)
@@ -76,7 +76,7 @@ class Replica:
         self.on_record = Listeners[[Record]]()
         self.on_gone = Listeners[[Record]]()
         self.on_owner_expired = Listeners[[bytes]]()
-        self._background = chores
+        self._background = background
         endpoint.expose("store", self._wait_for_write(self.answer_store), changes=True, idempotent=True)
         endpoint.expose("find_value", self.answer_find_value, early=True)
         endpoint.expose("cache", self.answer_cache, changes=True, idempotent=True)
@@ -129,7 +129,7 @@ class Replica:
         return STORED
 
     def store(self, record: Record, left: float | None = None) -> StoreReply:
-        """Store ``record`` as ``keep`` does; return UNSYNCED instead of STORED if this replica is not synced."""
+        """Store ``record`` as ``store_locally`` does; return UNSYNCED instead of STORED if this replica is not synced."""
         reply = self.store_locally(record, left)
         return UNSYNCED if reply is STORED and not self.is_synced() else reply
 
@@ -144,8 +144,8 @@ class Replica:
         Watchers are notified that a record is gone if its owner may no longer write it.  The record is removed if that
         is final; if the reason is the clock or a missing certificate, it is hidden until it is allowed or expires.
         """
-        before, door = self._authorities, self.certificates.admission
-        self._authorities = {owner: door.find_authority(owner) for owner in self._store.owners()}
+        before, admission = self._authorities, self.certificates.admission
+        self._authorities = {owner: admission.find_authority(owner) for owner in self._store.owners()}
         changed = [owner for owner, authority in self._authorities.items() if before.get(owner) != authority]
         for owner in changed:
             self._apply_authority(owner, self._authorities[owner], before.get(owner))
@@ -177,12 +177,12 @@ class Replica:
         peer: Contact,
         key: bytes,
         after: list[object] | None = None,
-        wants_sure: bool = False,
+        wants_synced: bool = False,
         digest: bytes = b"",
     ) -> list[object]:
         """FIND_VALUE: return a page of the records under ``key``, the cursor of the next page or None, and its worth.
 
-        Without records, the contacts closest to the key follow, and unless ``wants_sure`` a cached copy may be
+        Without records, the contacts closest to the key follow, and unless ``wants_synced`` a cached copy may be
         returned.  A node that is not among the closest to the key also returns these contacts to a lookup, since its
         records, such as its own, may be incomplete.  If ``digest`` equals the digest of all records held, None is
         returned instead of them.
@@ -191,10 +191,10 @@ class Replica:
             return [None, None, self._sync_level()]
         page, following = self._make_page(_check_key(key), after)
         is_nothing = not page and after is None
-        cached = self.cache.get(key, self._clock.seconds()) if is_nothing and not wants_sure else None
+        cached = self.cache.get(key, self._clock.seconds()) if is_nothing and not wants_synced else None
         if cached:
             return [[record.pack() for record in cached if self.may_store(record.slot)], None, CACHED_REPLY]
-        is_aside = not is_nothing and not wants_sure and not self._overlay.is_responsible(key)
+        is_aside = not is_nothing and not wants_synced and not self._overlay.is_responsible(key)
         if not (is_nothing or is_aside):
             return [page, following, self._sync_level()]
         near = [contact.pack() for contact in self._overlay.find_nearest(key) if contact.node_id != peer.node_id]

@@ -41,14 +41,14 @@ class Subscriber:
         reader: Reader,
         endpoint: Endpoint,
         clock: IReactorTime,
-        chores: Background,
+        background: Background,
     ) -> None:
         self._own_id = own_id
         self._replica = replica
         self._overlay = overlay
         self._reader = reader
         self._clock = clock
-        self._background = chores
+        self._background = background
         self._watches: list[Watch] = []
         replica.on_owner_expired.add(self._forget_silent)
         endpoint.expose("push", self._answer_push, changes=True, idempotent=True)

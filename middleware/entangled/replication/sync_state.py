@@ -17,7 +17,7 @@ SETTLED, LOST = b"1", b"lost"
 
 
 class SyncState:
-    """The sync state of one node; its owner clears ``is_sure`` when the node loses contact to a majority."""
+    """The sync state of one node; its owner clears ``is_synced`` when the node loses contact to a majority."""
 
     def __init__(self, store: Store) -> None:
         self._store = store

@@ -48,10 +48,10 @@ class _Slots:
 class SlotMaintenance:
     """Maintains the slots of one node in one space."""
 
-    def __init__(self, node: NodeInterface, rng: random.Random, chores: Background) -> None:
+    def __init__(self, node: NodeInterface, rng: random.Random, background: Background) -> None:
         self._node = node
         self._rng = rng
-        self._background = chores
+        self._background = background
         # Slot names are unique to this run: tuples of earlier runs must not be overwritten.
         self._run_id = rng.randbytes(4).hex()
         self._slot_count = 0
@@ -73,23 +73,23 @@ class SlotMaintenance:
     async def put_tuple(self, key: bytes, fields: Tuple, council: list[Member], ttl: float | None) -> None:
         """Put a tuple, and remove it after ``ttl`` seconds if it was not taken; fails as ``NodeInterface.put`` does."""
         name = self._take_slot(key)
-        place = TupleId(key, self._node.identity.public, name, self._rng.randbytes(MARK_BYTES))
-        self._slots_by_key[key].contents[name] = place
+        tuple_id = TupleId(key, self._node.identity.public, name, self._rng.randbytes(MARK_BYTES))
+        self._slots_by_key[key].contents[name] = tuple_id
         if ttl is not None:
-            self._background.later(ttl, self._expire, place)
-        await self._node.put(key, name, pack_tuple(place.mark, fields, council))
+            self._background.later(ttl, self._expire, tuple_id)
+        await self._node.put(key, name, pack_tuple(tuple_id.mark, fields, council))
 
-    async def put_taken_note(self, place: TupleId, taker: bytes) -> None:
-        """Write a note that the tuple of ``place`` was taken, which hides it from readers."""
-        name = self._take_slot(place.key)
-        self._slots_by_key[place.key].contents[name] = place
-        await self._node.put(place.key, name, pack_taken(place, taker))
+    async def put_taken_note(self, tuple_id: TupleId, taker: bytes) -> None:
+        """Write a note that the tuple of ``tuple_id`` was taken, which hides it from readers."""
+        name = self._take_slot(tuple_id.key)
+        self._slots_by_key[tuple_id.key].contents[name] = tuple_id
+        await self._node.put(tuple_id.key, name, pack_taken(tuple_id, taker))
 
-    def check_taken_note(self, place: TupleId, taker: bytes) -> None:
+    def check_taken_note(self, tuple_id: TupleId, taker: bytes) -> None:
         """Check after ``GRACE_S`` seconds whether ``taker`` has noted its take, and note it otherwise."""
         if not self._unconfirmed:
             self._background.later(GRACE_S, lambda: self._background.fork(self._check_unconfirmed()))
-        self._unconfirmed[place] = taker
+        self._unconfirmed[tuple_id] = taker
 
     # -- inside -----------------------------------------------------------------------------------------------------
 
@@ -105,12 +105,12 @@ class SlotMaintenance:
         self._slot_count += 1
         return f"{self._run_id}/{self._slot_count:x}"
 
-    def _expire(self, place: TupleId) -> None:
-        slots = self._slots_by_key[place.key]
-        if slots.contents.get(place.name) == place:
-            del slots.contents[place.name]
-            slots.free.append(place.name)
-            self._remove(place.key, place.name)
+    def _expire(self, tuple_id: TupleId) -> None:
+        slots = self._slots_by_key[tuple_id.key]
+        if slots.contents.get(tuple_id.name) == tuple_id:
+            del slots.contents[tuple_id.name]
+            slots.free.append(tuple_id.name)
+            self._remove(tuple_id.key, tuple_id.name)
 
     def _remove(self, key: bytes, name: str) -> None:
         async def removed() -> None:
@@ -120,7 +120,7 @@ class SlotMaintenance:
 
     async def _check_unconfirmed(self) -> None:
         doubtful, self._unconfirmed = self._unconfirmed, {}
-        for key in dict.fromkeys(place.key for place in doubtful):
+        for key in dict.fromkeys(tuple_id.key for tuple_id in doubtful):
             for item in parse_records(await self._node.get(key))[0]:
                 if item.tuple_id in doubtful:
                     self._background.fork(self.put_taken_note(item.tuple_id, doubtful[item.tuple_id]))

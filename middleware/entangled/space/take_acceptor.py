@@ -52,7 +52,7 @@ class MethodRegistry(Protocol):
 class TakeAcceptor:
     """The acceptor of one node for all councils that it is a member of.
 
-    ``written`` may be set to a function that returns a Deferred which fires when all notes are on disk; answers then
+    ``wait_for_write`` may be set to a function that returns a Deferred which fires when all notes are on disk; answers then
     wait for it, so that even a power failure loses no vote that was sent.
     """
 
@@ -84,31 +84,31 @@ class TakeAcceptor:
         if self._acceptor is None:
             self._acceptor = self._load()
 
-    def find_vote(self, place: TupleId) -> Register | None:
-        """Return this node's vote about the tuple of ``place``, or None."""
-        return self._loaded_acceptor.log.get(place)
+    def find_vote(self, tuple_id: TupleId) -> Register | None:
+        """Return this node's vote about the tuple of ``tuple_id``, or None."""
+        return self._loaded_acceptor.log.get(tuple_id)
 
     def list_unfinished(self) -> list[StoredTuple]:
         """Return the tuples with a take accepted here that has had no known end for ``UNFINISHED_S`` seconds.
 
-        Each is returned again after ``UNFINISHED_S`` seconds, until ``settle`` is called.
+        Each is returned again after ``UNFINISHED_S`` seconds, until ``finish`` is called.
         """
         now = self._clock.seconds()
-        late = [place for place, since in self._unfinished.items() if since + UNFINISHED_S <= now]
+        late = [tuple_id for tuple_id, since in self._unfinished.items() if since + UNFINISHED_S <= now]
         found = []
-        for place in late:
-            record = self._store.get_slot(place.slot)
+        for tuple_id in late:
+            record = self._store.get_slot(tuple_id.slot)
             parsed = parse_record(record) if record is not None else None
-            if isinstance(parsed, StoredTuple) and parsed.tuple_id == place:
-                self._unfinished[place] = now
+            if isinstance(parsed, StoredTuple) and parsed.tuple_id == tuple_id:
+                self._unfinished[tuple_id] = now
                 found.append(parsed)
             else:
-                self.finish(place)  # removed, or stored at other nodes, which complete it
+                self.finish(tuple_id)  # removed, or stored at other nodes, which complete it
         return found
 
-    def finish(self, place: TupleId) -> None:
-        """Note that the decision about ``place`` is complete."""
-        self._unfinished.pop(place, None)
+    def finish(self, tuple_id: TupleId) -> None:
+        """Note that the decision about ``tuple_id`` is complete."""
+        self._unfinished.pop(tuple_id, None)
 
     # -- requests of claimants --------------------------------------------------------------------------------------
 
@@ -120,61 +120,61 @@ class TakeAcceptor:
         self,
         peer: Contact,
         key: bytes,
-        places: list[object],
+        tuple_ids: list[object],
         incarnation: bytes,
         counter: int,
         taker: bytes,
         lease: float,
     ) -> Answers:
-        """CLAIM: promise and lease the ballot for each of ``places`` under ``key``, or reply with the reason."""
-        wanted, ballot = self._parse_request(key, places, incarnation, counter, taker)
+        """CLAIM: promise and lease the ballot for each of ``tuple_ids`` under ``key``, or reply with the reason."""
+        wanted, ballot = self._parse_request(key, tuple_ids, incarnation, counter, taker)
         if not 0.0 < lease <= MAX_LEASE_S:
             raise Refused(f"a lease lasts more than 0 and at most {MAX_LEASE_S:.0f} seconds")
         now = self._clock.seconds()
-        return self._pack_answer(Event.PREPARE, [self._prepare(place, ballot, float(lease), now) for place in wanted])
+        return self._pack_answer(Event.PREPARE, [self._prepare(tuple_id, ballot, float(lease), now) for tuple_id in wanted])
 
     def answer_confirm(
         self,
         peer: Contact,
         key: bytes,
-        places: list[object],
+        tuple_ids: list[object],
         incarnation: bytes,
         counter: int,
         taker: bytes,
         value: bytes,
     ) -> Answers:
-        """CONFIRM: accept ``value`` as the taker of each of ``places`` under the ballot, or reply with the reason."""
-        wanted, ballot = self._parse_request(key, places, incarnation, counter, taker)
+        """CONFIRM: accept ``value`` as the taker of each of ``tuple_ids`` under the ballot, or reply with the reason."""
+        wanted, ballot = self._parse_request(key, tuple_ids, incarnation, counter, taker)
         if not is_taker_name(value):
             raise Refused("decree.confirm needs the name of a taker")
         now, acceptor = self._clock.seconds(), self._loaded_acceptor
-        replies = [acceptor.accept(place, FIRST_CONFIGURATION, ballot, value, now) for place in wanted]
-        for place, reply in zip(wanted, replies, strict=True):
+        replies = [acceptor.accept(tuple_id, FIRST_CONFIGURATION, ballot, value, now) for tuple_id in wanted]
+        for tuple_id, reply in zip(wanted, replies, strict=True):
             if reply.accepted != NO_BALLOT:
-                self._unfinished.setdefault(place, now)
+                self._unfinished.setdefault(tuple_id, now)
         return self._pack_answer(Event.ACCEPT, replies)
 
     def answer_release(
-        self, peer: Contact, key: bytes, places: list[object], incarnation: bytes, counter: int, taker: bytes
+        self, peer: Contact, key: bytes, tuple_ids: list[object], incarnation: bytes, counter: int, taker: bytes
     ) -> Answers:
-        """RELEASE: end the ballot's lease on each of ``places``."""
-        wanted, ballot = self._parse_request(key, places, incarnation, counter, taker)
+        """RELEASE: end the ballot's lease on each of ``tuple_ids``."""
+        wanted, ballot = self._parse_request(key, tuple_ids, incarnation, counter, taker)
         now = self._clock.seconds()
-        replies = [self._loaded_acceptor.release(place, ballot, now) for place in wanted]
+        replies = [self._loaded_acceptor.release(tuple_id, ballot, now) for tuple_id in wanted]
         return [pack_reply(reply, Event.RELEASE) for reply in replies]
 
     # -- inside -----------------------------------------------------------------------------------------------------
 
     def _parse_request(
-        self, key: bytes, places: list[object], incarnation: bytes, counter: int, taker: bytes
+        self, key: bytes, tuple_ids: list[object], incarnation: bytes, counter: int, taker: bytes
     ) -> tuple[list[TupleId], Ballot]:
         """Check the common arguments of a request; return the tuples and the ballot; raise ``Refused``."""
         if incarnation != self.incarnation:
             raise Refused("this member has lost its votes since it joined that council")
-        if len(key) != KEY_BYTES or not 0 < len(places) <= MAX_TUPLES:
+        if len(key) != KEY_BYTES or not 0 < len(tuple_ids) <= MAX_TUPLES:
             raise Refused(f"a request names a key and 1 to {MAX_TUPLES} places")
-        wanted = [place for place in (parse_tuple_id(key, fields) for fields in places) if place is not None]
-        if len(wanted) < len(places) or len(set(wanted)) < len(wanted):
+        wanted = [tuple_id for tuple_id in (parse_tuple_id(key, fields) for fields in tuple_ids) if tuple_id is not None]
+        if len(wanted) < len(tuple_ids) or len(set(wanted)) < len(wanted):
             raise Refused("a place is an owner, a name and a mark, and a request names each place once")
         if not (is_counter(counter) and is_taker_name(taker)):
             raise Refused("a ballot is a positive number and the name of a taker")
@@ -186,25 +186,25 @@ class TakeAcceptor:
         assert self._acceptor is not None
         return self._acceptor
 
-    def _prepare(self, place: TupleId, ballot: Ballot, lease: float, now: float) -> Reply:
-        if self.find_vote(place) is None and self._is_over(place):
+    def _prepare(self, tuple_id: TupleId, ballot: Ballot, lease: float, now: float) -> Reply:
+        if self.find_vote(tuple_id) is None and self._is_over(tuple_id):
             return Reply(ReplyKind.OUTBID, ballot)
-        reply = self._loaded_acceptor.prepare(place, FIRST_CONFIGURATION, ballot, 0.0, now, lease)
+        reply = self._loaded_acceptor.prepare(tuple_id, FIRST_CONFIGURATION, ballot, 0.0, now, lease)
         if reply.kind is ReplyKind.QUIET:
             raise Refused(f"this member has room for {MAX_REGISTERS} votes and all are in use; try another tuple")
         return reply
 
-    def _is_over(self, place: TupleId) -> bool:
+    def _is_over(self, tuple_id: TupleId) -> bool:
         """Return whether the publisher has removed this tuple or reused its slot."""
-        record = self._store.get_slot(place.slot)
+        record = self._store.get_slot(tuple_id.slot)
         if record is None:
             return False
         parsed = parse_record(record)
-        return not isinstance(parsed, StoredTuple) or parsed.tuple_id != place
+        return not isinstance(parsed, StoredTuple) or parsed.tuple_id != tuple_id
 
-    def _may_forget(self, place: TupleId, vote: Register, now: float) -> bool:
+    def _may_forget(self, tuple_id: TupleId, vote: Register, now: float) -> bool:
         """Return whether a vote is no longer needed: its lease has expired, or its tuple does not exist."""
-        return (vote.accepted == NO_BALLOT and vote.reserved_until <= now) or self._is_over(place)
+        return (vote.accepted == NO_BALLOT and vote.reserved_until <= now) or self._is_over(tuple_id)
 
     def _pack_answer(self, event: Event, replies: list[Reply]) -> Answers:
         packed: list[object] = [pack_reply(reply, event) for reply in replies]
@@ -218,5 +218,5 @@ class TakeAcceptor:
             log.clear()
             self._incarnation = self._rng.randbytes(INCARNATION_BYTES)
             self._store.set_note(_INCARNATION, self._incarnation)
-        self._unfinished = {place: now for place, vote in log.registers.items() if vote.accepted != NO_BALLOT}
+        self._unfinished = {tuple_id: now for tuple_id, vote in log.registers.items() if vote.accepted != NO_BALLOT}
         return Acceptor(log, TERMS)

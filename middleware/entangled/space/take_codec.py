@@ -62,9 +62,9 @@ def _bucket_of(key: TupleId) -> str:
 
 def _pack(registers: dict[TupleId, Register]) -> bytes:
     rows: list[list[Any]] = []
-    for place, register in registers.items():
+    for tuple_id, register in registers.items():
         accepted = _pack_accepted(register.accepted, register.value)
-        rows.append([place.key, place.pack(), *register.promised, register.reserve, accepted])
+        rows.append([tuple_id.key, tuple_id.pack(), *register.promised, register.reserve, accepted])
     return bytes(msgpack.packb(rows))
 
 
@@ -89,12 +89,12 @@ def _unpack_row(row: object) -> tuple[TupleId, Register] | None:
     if not isinstance(row, list) or len(row) != 6 or not isinstance(row[0], bytes) or len(row[0]) != KEY_BYTES:
         return None
     key, fields, counter, taker, lease, accepted = row
-    place, decoded = parse_tuple_id(key, fields), _unpack_accepted(accepted)
-    if place is None or decoded is None or not (is_counter(counter) and is_taker_name(taker) and is_lease(lease)):
+    tuple_id, decoded = parse_tuple_id(key, fields), _unpack_accepted(accepted)
+    if tuple_id is None or decoded is None or not (is_counter(counter) and is_taker_name(taker) and is_lease(lease)):
         return None
     ballot, value = decoded
     ceiling = Ceiling(0.0, 1)
-    return place, Register(ceiling, promised=Ballot(counter, taker), accepted=ballot, value=value, reserve=lease)
+    return tuple_id, Register(ceiling, promised=Ballot(counter, taker), accepted=ballot, value=value, reserve=lease)
 
 
 def _pack_accepted(ballot: Ballot, value: object) -> list[object] | None:

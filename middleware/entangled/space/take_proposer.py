@@ -30,38 +30,38 @@ Ask = Callable[[Contact, str, tuple[object, ...]], "Deferred[Any]"]
 
 
 class TakeProposer:
-    """The requests of one claimant to councils; ``chores`` ends with the claimant."""
+    """The requests of one claimant to councils; ``background`` ends with the claimant."""
 
-    def __init__(self, ask: Ask, clock: IReactorTime, rng: random.Random, chores: Background) -> None:
+    def __init__(self, ask: Ask, clock: IReactorTime, rng: random.Random, background: Background) -> None:
         self._ask = ask
         self._clock = clock
         self._rng = rng
-        self._background = chores
+        self._background = background
 
-    async def claim(self, posted: Sequence[StoredTuple], ballot: Ballot, lease: float) -> list[Outcome]:
+    async def claim(self, tuples: Sequence[StoredTuple], ballot: Ballot, lease: float) -> list[Outcome]:
         """Run one round of claims for tuples of one key and council; release the others afterwards."""
-        outcomes = await self.renew(posted, ballot, lease)
-        lost = [p for p, o in zip(posted, outcomes, strict=True) if o.result not in (Result.WON, Result.DECIDED)]
+        outcomes = await self.renew(tuples, ballot, lease)
+        lost = [p for p, o in zip(tuples, outcomes, strict=True) if o.result not in (Result.WON, Result.DECIDED)]
         if lost:
             # The promises of a minority must not delay another claimant.
             self.release(lost, ballot)
         return outcomes
 
-    async def renew(self, posted: Sequence[StoredTuple], ballot: Ballot, lease: float) -> list[Outcome]:
+    async def renew(self, tuples: Sequence[StoredTuple], ballot: Ballot, lease: float) -> list[Outcome]:
         """Run one round of claims under a ballot that has won before; if it fails, the present lease stays valid."""
-        return await self._run_round(posted, "decree.claim", Event.PREPARE, ballot, lease)
+        return await self._run_round(tuples, "decree.claim", Event.PREPARE, ballot, lease)
 
-    async def confirm(self, posted: Sequence[StoredTuple], ballot: Ballot, value: bytes) -> list[Outcome]:
+    async def confirm(self, tuples: Sequence[StoredTuple], ballot: Ballot, value: bytes) -> list[Outcome]:
         """Run one round that confirms takes of tuples of one key and council."""
-        return await self._run_round(posted, "decree.confirm", Event.ACCEPT, ballot, value)
+        return await self._run_round(tuples, "decree.confirm", Event.ACCEPT, ballot, value)
 
-    def release(self, posted: Sequence[StoredTuple], ballot: Ballot) -> None:
+    def release(self, tuples: Sequence[StoredTuple], ballot: Ballot) -> None:
         """Release the leases at all reachable members; at the others they expire."""
-        for member in posted[0].council:
-            request = self._ask(member.contact, "decree.release", _make_arguments(posted, member, ballot))
+        for member in tuples[0].council:
+            request = self._ask(member.contact, "decree.release", _make_arguments(tuples, member, ballot))
             request.addErrback(lambda failure: failure.trap(EntangledError))
 
-    async def resolve(self, posted: StoredTuple, bidder: bytes, value: bytes | None, counter: int = 0) -> bytes | None:
+    async def resolve(self, stored: StoredTuple, bidder: bytes, value: bytes | None, counter: int = 0) -> bytes | None:
         """Retry until the council has decided about a tuple, and return the decided value.
 
         Proposes ``value`` if no other value was accepted.  With None it proposes none, and returns None if no value was
@@ -69,10 +69,10 @@ class TakeProposer:
         """
 
         async def prepare(ballot: Ballot) -> Outcome:
-            return (await self.claim([posted], ballot, RESOLVE_LEASE_S))[0]
+            return (await self.claim([stored], ballot, RESOLVE_LEASE_S))[0]
 
         async def accept(ballot: Ballot, chosen: bytes) -> Outcome:
-            return (await self.confirm([posted], ballot, chosen))[0]
+            return (await self.confirm([stored], ballot, chosen))[0]
 
         async def sleep(seconds: float) -> None:
             if self._background.is_stopped:
@@ -82,28 +82,28 @@ class TakeProposer:
         ballot = Ballot(counter + 1, bidder)
         ballot, decided = await decide(ballot, value, prepare, accept, sleep, self._rng)
         if decided is None:
-            self.release([posted], ballot)
+            self.release([stored], ballot)
         return decided  # type: ignore[no-any-return]
 
     async def _run_round(
-        self, posted: Sequence[StoredTuple], method: str, event: Event, ballot: Ballot, argument: object
+        self, tuples: Sequence[StoredTuple], method: str, event: Event, ballot: Ballot, argument: object
     ) -> list[Outcome]:
-        council = posted[0].council
+        council = tuples[0].council
 
-        def ask(place: int) -> Deferred[Any]:
+        def ask(index: int) -> Deferred[Any]:
             return self._ask(
-                council[place].contact, method, (*_make_arguments(posted, council[place], ballot), argument)
+                council[index].contact, method, (*_make_arguments(tuples, council[index], ballot), argument)
             )
 
-        def decode(place: int, answer: object) -> list[Reply | None] | None:
-            replies = answer if isinstance(answer, list) and len(answer) == len(posted) else None
+        def decode(index: int, answer: object) -> list[Reply | None] | None:
+            replies = answer if isinstance(answer, list) and len(answer) == len(tuples) else None
             return replies and [unpack_reply(fields, event) for fields in replies]
 
-        tallies = [Tally(len(council)) for _ in posted]
+        tallies = [Tally(len(council)) for _ in tuples]
         await Round(tallies, ask, decode, self._clock, short=0.0, single=True).outcome
         return [conclude(tally) for tally in tallies]
 
 
-def _make_arguments(posted: Sequence[StoredTuple], member: Member, ballot: Ballot) -> tuple[object, ...]:
-    places = [each.tuple_id.pack() for each in posted]
-    return (posted[0].tuple_id.key, places, member.incarnation, ballot.counter, ballot.proposer)
+def _make_arguments(tuples: Sequence[StoredTuple], member: Member, ballot: Ballot) -> tuple[object, ...]:
+    packed_ids = [each.tuple_id.pack() for each in tuples]
+    return (tuples[0].tuple_id.key, packed_ids, member.incarnation, ballot.counter, ballot.proposer)

@@ -99,7 +99,7 @@ class Claim:
 
 
 class Taker:
-    """The takes of one node in one space; ``held`` are its claimed tuples, ``gone`` the tuples known to be taken.
+    """The takes of one node in one space; ``claimed`` are its claimed tuples, ``taken`` the tuples known to be taken.
 
     ``freed`` is called when this node gives up a tuple that it held or failed to claim, ``put_back`` with a tuple
     that was confirmed for a call that has ended.
@@ -110,8 +110,8 @@ class Taker:
         node: NodeInterface,
         clock: IReactorTime,
         rng: random.Random,
-        chores: Background,
-        keeper: SlotMaintenance,
+        background: Background,
+        slots: SlotMaintenance,
         council: int,
         freed: Callable[[TupleId], None],
         put_back: Callable[[Tuple], object],
@@ -123,15 +123,15 @@ class Taker:
         self._node = node
         self._clock = clock
         self._rng = rng
-        self._background = chores
-        self._slots = keeper
+        self._background = background
+        self._slots = slots
         self._council_size = council
-        self._proposer = TakeProposer(self._ask, clock, rng, chores)
+        self._proposer = TakeProposer(self._ask, clock, rng, background)
         self._seed = zlib.crc32(node.identity.node_id)
         self._counters: dict[TupleId, int] = {}
         self._not_before: dict[TupleId, float] = {}
         self._members: dict[bytes, tuple[float, list[Member]]] = {}
-        chores.every(REPAIR_INTERVAL_S, self._complete_unfinished)
+        background.every(REPAIR_INTERVAL_S, self._complete_unfinished)
 
     # -- councils ---------------------------------------------------------------------------------------------------
 
@@ -181,7 +181,7 @@ class Taker:
     # -- choosing ---------------------------------------------------------------------------------------------------
 
     def find_candidates(
-        self, posted: Sequence[StoredTuple], template: Template, is_patient: bool = True
+        self, tuples: Sequence[StoredTuple], template: Template, is_patient: bool = True
     ) -> tuple[list[StoredTuple], float | None]:
         """Return the tuples to try now, in this node's order, and the seconds until another may be tried.
 
@@ -189,7 +189,7 @@ class Taker:
         claim come last, the oldest failure first, so that tuples with an unreachable council do not block the others.
         """
         now = self._clock.seconds()
-        open_ = [p for p in posted if p.tuple_id not in self.taken and p.tuple_id not in self.claimed]
+        open_ = [p for p in tuples if p.tuple_id not in self.taken and p.tuple_id not in self.claimed]
         fitting = [p for p in open_ if template.matches(p.fields)]
         ready = [p for p in fitting if not is_patient or self._not_before.get(p.tuple_id, 0.0) <= now]
         ready.sort(
@@ -198,22 +198,22 @@ class Taker:
         times = [self._not_before[p.tuple_id] for p in fitting if p.tuple_id in self._not_before]
         return ready, min((max(0.001, time - now) for time in times), default=None)
 
-    def select_batch(self, posted: Sequence[StoredTuple], most: int) -> list[StoredTuple]:
-        """Return the first of ``posted`` and others with the same council, as many as fit into one request."""
-        same_council = [one for one in posted if one.council == posted[0].council]
+    def select_batch(self, tuples: Sequence[StoredTuple], most: int) -> list[StoredTuple]:
+        """Return the first of ``tuples`` and others with the same council, as many as fit into one request."""
+        same_council = [one for one in tuples if one.council == tuples[0].council]
         return same_council[: min(most, MAX_TUPLES)]
 
     # -- taking -----------------------------------------------------------------------------------------------------
 
-    async def claim(self, posted: Sequence[StoredTuple], lease: float) -> tuple[list[Claim], bool]:
+    async def claim(self, tuples: Sequence[StoredTuple], lease: float) -> tuple[list[Claim], bool]:
         """Claim tuples of one council; return the claims won, and whether too few members answered."""
-        places = [one.tuple_id for one in posted]
+        places = [one.tuple_id for one in tuples]
         self.claimed.update(places)
-        ballot = Ballot(1 + max(self._counters.get(place, 0) for place in places), self._make_proposer_name())
+        ballot = Ballot(1 + max(self._counters.get(tuple_id, 0) for tuple_id in places), self._make_proposer_name())
         sent = self._clock.seconds()
-        outcomes = await self._proposer.claim(posted, ballot, lease)
+        outcomes = await self._proposer.claim(tuples, ballot, lease)
         claims = []
-        for one, outcome in zip(posted, outcomes, strict=True):
+        for one, outcome in zip(tuples, outcomes, strict=True):
             self._counters[one.tuple_id] = max(ballot.counter, outcome.counter)
             if outcome.result is Result.WON and outcome.value is None:
                 deadline = sent + lease * (1.0 - CLOCK_DRIFT)
@@ -248,56 +248,56 @@ class Taker:
             error.subFailure.raiseException()
 
     async def _finish_decision(self, claim: Claim, outcome: Outcome, wait: WaitingCall | None) -> bool:
-        taker, place = claim.ballot.proposer, claim.stored_tuple.tuple_id
+        taker, tuple_id = claim.ballot.proposer, claim.stored_tuple.tuple_id
         winner = taker if outcome.result is Result.WON else outcome.value
         if winner is None:
             counter = max(claim.ballot.counter, outcome.counter)
             winner = await self._proposer.resolve(claim.stored_tuple, taker, taker, counter) or taker
-        self._forget_taken(place, winner)
+        self._forget_taken(tuple_id, winner)
         if winner != taker:
-            self._slots.check_taken_note(place, winner)
+            self._slots.check_taken_note(tuple_id, winner)
             return False
         with suppress(EntangledError):  # the node republishes the note later, and the council knows the taker
-            await self._slots.put_taken_note(place, winner)
+            await self._slots.put_taken_note(tuple_id, winner)
         if wait is not None and wait.is_over:
             self._on_unwanted(claim.fields)
         return True
 
-    async def _complete(self, posted: StoredTuple, value: bytes | None) -> None:
-        place = posted.tuple_id
-        self.claimed.add(place)
+    async def _complete(self, stored: StoredTuple, value: bytes | None) -> None:
+        tuple_id = stored.tuple_id
+        self.claimed.add(tuple_id)
         try:
             winner = await self._proposer.resolve(
-                posted, self._make_proposer_name(), value, self._counters.get(place, 0)
+                stored, self._make_proposer_name(), value, self._counters.get(tuple_id, 0)
             )
         finally:
-            self.claimed.discard(place)
+            self.claimed.discard(tuple_id)
         if winner is not None:
-            self._forget_taken(place, winner)
-            self._slots.check_taken_note(place, winner)
-            self._node.take_acceptor.finish(place)
+            self._forget_taken(tuple_id, winner)
+            self._slots.check_taken_note(tuple_id, winner)
+            self._node.take_acceptor.finish(tuple_id)
         else:
-            self._on_freed(place)
+            self._on_freed(tuple_id)
 
-    def _note_failed_claim(self, place: TupleId, outcome: Outcome) -> None:
+    def _note_failed_claim(self, tuple_id: TupleId, outcome: Outcome) -> None:
         now = self._clock.seconds()
         if outcome.result is Result.DECIDED and outcome.value is not None:
-            self._forget_taken(place, outcome.value)
-            self._slots.check_taken_note(place, outcome.value)
+            self._forget_taken(tuple_id, outcome.value)
+            self._slots.check_taken_note(tuple_id, outcome.value)
         elif outcome.result is Result.HELD:
-            self._not_before[place] = now + min(outcome.remaining, LEASED_RETRY_S) + self._rng.uniform(*CONTEST_RETRY_S)
+            self._not_before[tuple_id] = now + min(outcome.remaining, LEASED_RETRY_S) + self._rng.uniform(*CONTEST_RETRY_S)
         elif outcome.result is Result.OUTBID:
-            self._not_before[place] = now + self._rng.uniform(*CONTEST_RETRY_S)
+            self._not_before[tuple_id] = now + self._rng.uniform(*CONTEST_RETRY_S)
         else:
-            self._not_before[place] = now + self._rng.uniform(*SILENT_RETRY_S)
+            self._not_before[tuple_id] = now + self._rng.uniform(*SILENT_RETRY_S)
         # Wake other calls of this node that wait because this one held the tuple.
-        self._free_tuple(place)
+        self._free_tuple(tuple_id)
 
-    def _forget_taken(self, place: TupleId, winner: bytes) -> None:
-        self.claimed.discard(place)
-        self._counters.pop(place, None)
-        self._not_before.pop(place, None)
-        self.taken[place] = winner
+    def _forget_taken(self, tuple_id: TupleId, winner: bytes) -> None:
+        self.claimed.discard(tuple_id)
+        self._counters.pop(tuple_id, None)
+        self._not_before.pop(tuple_id, None)
+        self.taken[tuple_id] = winner
         _limit_size(self.taken)
 
     def _make_proposer_name(self) -> bytes:
@@ -307,15 +307,15 @@ class Taker:
     def _complete_unfinished(self) -> None:
         """Complete takes that this node accepted as a council member without seeing their end."""
         late = [
-            posted for posted in self._node.take_acceptor.list_unfinished() if posted.tuple_id.key in self._slots.keys
+            stored for stored in self._node.take_acceptor.list_unfinished() if stored.tuple_id.key in self._slots.keys
         ]
-        for key in dict.fromkeys(posted.tuple_id.key for posted in late):
+        for key in dict.fromkeys(stored.tuple_id.key for stored in late):
             _, taken = parse_records(self._node.store.get(key))
-            for posted in late:
-                if posted.tuple_id in taken:
-                    self._node.take_acceptor.finish(posted.tuple_id)
-                elif posted.tuple_id.key == key and posted.tuple_id not in self.claimed:
-                    self._background.fork(self._complete(posted, None))
+            for stored in late:
+                if stored.tuple_id in taken:
+                    self._node.take_acceptor.finish(stored.tuple_id)
+                elif stored.tuple_id.key == key and stored.tuple_id not in self.claimed:
+                    self._background.fork(self._complete(stored, None))
 
     # -- methods of a claim -----------------------------------------------------------------------------------------
 
@@ -360,9 +360,9 @@ class Taker:
         else:
             self._free_tuple(claim.stored_tuple.tuple_id)
 
-    def _free_tuple(self, place: TupleId) -> None:
-        self.claimed.discard(place)
-        self._on_freed(place)
+    def _free_tuple(self, tuple_id: TupleId) -> None:
+        self.claimed.discard(tuple_id)
+        self._on_freed(tuple_id)
 
 
 def _limit_size(remembered: dict[TupleId, Any]) -> None:

@@ -68,7 +68,7 @@ Field = Value | Wildcard | type | Predicate
 
 @dataclass(frozen=True)
 class Template:
-    """A pattern for tuples, made by ``template_of``."""
+    """A pattern for tuples, made by ``make_template``."""
 
     fields: tuple[Field, ...]
 

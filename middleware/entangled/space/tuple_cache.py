@@ -23,13 +23,13 @@ LINGER_S = 5.0
 
 
 class TupleCache:
-    """The tuples under ``key``; ``posted`` are those not known to be taken."""
+    """The tuples under ``key``; ``tuples`` are those not known to be taken."""
 
-    def __init__(self, node: NodeInterface, key: bytes, chores: Background) -> None:
+    def __init__(self, node: NodeInterface, key: bytes, background: Background) -> None:
         self.key = key
         self.tuples: list[StoredTuple] = []
         self._node = node
-        self._background = chores
+        self._background = background
         self._parser = RecordParser()
         self._watch: Watch | None = None
         self._wait_count = 0
@@ -44,7 +44,7 @@ class TupleCache:
         return self._watch is not None
 
     def start_waiting(self) -> None:
-        """Register a waiting call; ``leave`` must follow."""
+        """Register a waiting call; ``stop_waiting`` must follow."""
         self._wait_count += 1
         self._stop_lingering()
         if self._watch is None:

@@ -81,9 +81,9 @@ def pack_tuple(mark: bytes, fields: Tuple, council: Sequence[Member]) -> bytes:
     return bytes(msgpack.packb([_TUPLE, mark, list(fields), members]))
 
 
-def pack_taken(place: TupleId, taker: bytes) -> bytes:
+def pack_taken(tuple_id: TupleId, taker: bytes) -> bytes:
     """Return the value of a note that a tuple was taken."""
-    return bytes(msgpack.packb([_TAKEN, place.pack(), taker]))
+    return bytes(msgpack.packb([_TAKEN, tuple_id.pack(), taker]))
 
 
 def parse_record(record: Record) -> StoredTuple | TakenNote | None:
@@ -133,16 +133,16 @@ class RecordParser:
     def parse(self, records: Iterable[Record]) -> SpaceContents:
         """Return the tuples in ``records`` that were not taken, in order, and the notes of taken ones."""
         before, self._parsed = self._parsed, {}
-        posted: list[StoredTuple] = []
+        stored: list[StoredTuple] = []
         taken: dict[TupleId, TakenNote] = {}
         for record in records:
             mark = (record.owner, record.signature)
             parsed = self._parsed[mark] = before[mark] if mark in before else parse_record(record)
             if isinstance(parsed, StoredTuple):
-                posted.append(parsed)
+                stored.append(parsed)
             elif parsed is not None:
                 taken[parsed.tuple_id] = parsed
-        return [one for one in posted if one.tuple_id not in taken], taken
+        return [one for one in stored if one.tuple_id not in taken], taken
 
 
 def parse_records(records: Iterable[Record]) -> SpaceContents:

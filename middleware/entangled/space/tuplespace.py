@@ -1,6 +1,6 @@
 """The tuple space: put, get, read and claim tuples by template; at most one taker gets each tuple.
 
-A tuple is a record of its publisher that names the council which decides about its taker; ``seat`` has the acceptors,
+A tuple is a record of its publisher that names the council which decides about its taker; ``take_acceptor`` has the acceptors,
 ``taker`` the proposers.  ``docs/reference/tuple-space.md`` describes the conditions that calls wait for.
 """
 
@@ -76,8 +76,8 @@ class TupleSpace:
         if self._background.is_stopped:
             return
         self._background.stop()
-        for shelf in self._caches.values():
-            shelf.close()
+        for cache in self._caches.values():
+            cache.close()
         for wait in list(self._waiting_calls):
             if not wait.is_over:
                 wait.end()
@@ -145,34 +145,34 @@ class TupleSpace:
 
     async def _claim(self, template: Template, wait: WaitingCall, lease: float) -> Claim | None:
         """Wait for and claim a matching tuple; return None when the call has ended."""
-        shelf = self._find_cache(space_key(self.name, template.arity))
-        shelf.start_waiting()
-        wait.on_end.add(shelf.wake)
+        cache = self._find_cache(space_key(self.name, template.arity))
+        cache.start_waiting()
+        wait.on_end.add(cache.wake)
         try:
             while not wait.is_over:
-                ready, pause = self._taker.find_candidates(shelf.tuples, template)
+                ready, pause = self._taker.find_candidates(cache.tuples, template)
                 if ready:
                     claims, _ = await self._taker.claim(ready[:1], lease)
                     if claims:
                         return claims[0]
                 else:
-                    await shelf.sleep(pause)
+                    await cache.sleep(pause)
         finally:
-            shelf.stop_waiting()
+            cache.stop_waiting()
         return None
 
     async def _get_many(self, template: Template, most: int) -> list[Tuple]:
         key = space_key(self.name, template.arity)
-        shelf = self._find_cache(key)
-        shelf.record_call()
+        cache = self._find_cache(key)
+        cache.record_call()
         taken: list[Tuple] = []
         is_silent = False
         for number in range(MAX_PASSES):
             # Tuples under watch need no read: the council refuses a tuple that was taken.
-            ready = self._taker.find_candidates(shelf.tuples, template)[0] if shelf.is_open and not number else []
+            ready = self._taker.find_candidates(cache.tuples, template)[0] if cache.is_open and not number else []
             if not ready:
-                posted, _ = parse_records(await self._node.get(key))
-                ready, _ = self._taker.find_candidates(posted, template, is_patient=False)
+                tuples, _ = parse_records(await self._node.get(key))
+                ready, _ = self._taker.find_candidates(tuples, template, is_patient=False)
             left = [one for one in ready if one.tuple_id not in self._taker.claimed]
             if not left:
                 return taken
@@ -207,23 +207,23 @@ class TupleSpace:
         return self._start(self._read_all(make_template(template)))
 
     async def _read(self, template: Template, wait: WaitingCall) -> Tuple | None:
-        shelf = self._find_cache(space_key(self.name, template.arity))
-        shelf.start_waiting()
-        wait.on_end.add(shelf.wake)
+        cache = self._find_cache(space_key(self.name, template.arity))
+        cache.start_waiting()
+        wait.on_end.add(cache.wake)
         try:
             while not wait.is_over:
-                for one in shelf.tuples:
+                for one in cache.tuples:
                     if one.tuple_id not in self._taker.taken and template.matches(one.fields):
                         return one.fields
-                await shelf.sleep(None)
+                await cache.sleep(None)
         finally:
-            shelf.stop_waiting()
+            cache.stop_waiting()
         return None
 
     async def _read_all(self, template: Template) -> list[Tuple]:
-        posted, _ = parse_records(await self._node.get(space_key(self.name, template.arity)))
+        tuples, _ = parse_records(await self._node.get(space_key(self.name, template.arity)))
         gone = self._taker.taken
-        return [one.fields for one in posted if one.tuple_id not in gone and template.matches(one.fields)]
+        return [one.fields for one in tuples if one.tuple_id not in gone and template.matches(one.fields)]
 
     # -- inside -----------------------------------------------------------------------------------------------------
 
@@ -231,9 +231,9 @@ class TupleSpace:
         self._slots.add_key(key)
         return self._caches.setdefault(key, TupleCache(self._node, key, self._background))
 
-    def _on_freed(self, place: TupleId) -> None:
-        if place.key in self._caches:
-            self._caches[place.key].wake()
+    def _on_freed(self, tuple_id: TupleId) -> None:
+        if tuple_id.key in self._caches:
+            self._caches[tuple_id.key].wake()
 
     def _start(self, work: Coroutine[Any, Any, T]) -> Deferred[T]:
         async def checked() -> T:

@@ -80,7 +80,7 @@ class Authority(NamedTuple):
 class AdmissionCheck(Protocol):
     """The admission check of a team; the endpoint repeats it at each handshake, so its results may change.
 
-    ``room`` is the maximum length of a pass in this team, at most ``MAX_PASS_BYTES`` and equal for all members; 0 in an open
+    ``max_pass_bytes`` is the maximum length of a pass in this team, at most ``MAX_PASS_BYTES`` and equal for all members; 0 in an open
     team.  ``shown`` is this node's pass, ``life`` its current incarnation.  ``fingerprint`` is the public identifier of
     the team, 8 bytes (zero: none).  The default methods behave as in an open team.
     """
@@ -101,15 +101,15 @@ class AdmissionCheck(Protocol):
     def fingerprint(self) -> bytes:
         """Eight bytes that distinguish this team from others without its key; zero if it has none."""
 
-    def find_refusal(self, public: bytes, shown: bytes) -> str:
+    def find_refusal(self, public: bytes, peer_pass: bytes) -> str:
         """Return the refusal code of a node with this key that shows this pass; empty if it would be admitted.
 
         It changes no state, because the handshake may be a replay.
         """
         return ""
 
-    def admit(self, public: bytes, shown: bytes) -> str:
-        """Like ``judge``, for a node that has confirmed its session and may be recorded."""
+    def admit(self, public: bytes, peer_pass: bytes) -> str:
+        """Like ``find_refusal``, for a node that has confirmed its session and may be recorded."""
         return ""
 
     def may_call(self, public: bytes, method: str) -> bool:
@@ -188,20 +188,20 @@ class Incarnations:
     def __len__(self) -> int:
         return len(self._known)
 
-    def find_refusal(self, public: bytes, life: Incarnation) -> str:
+    def find_refusal(self, public: bytes, incarnation: Incarnation) -> str:
         """Return the refusal code of this incarnation; empty if it is the latest or a later one.  Changes no state."""
-        last, before = self._known.get(public, (life, life))
-        if life == last or life.number > last.number or not life.number:
+        last, before = self._known.get(public, (incarnation, incarnation))
+        if incarnation == last or incarnation.number > last.number or not incarnation.number:
             return ""
-        return SUPERSEDED if life == before else DOUBLED
+        return SUPERSEDED if incarnation == before else DOUBLED
 
-    def record(self, public: bytes, life: Incarnation) -> bool:
+    def record(self, public: bytes, incarnation: Incarnation) -> bool:
         """Record an incarnation that was verified and admitted; return whether it replaces another one."""
-        if not life.number:
+        if not incarnation.number:
             return False
-        last, before = self._known.get(public, (life, life))
-        put_bounded(self._known, public, (last, before) if life == last else (life, last), MAX_IDENTITIES)
-        return life != last
+        last, before = self._known.get(public, (incarnation, incarnation))
+        put_bounded(self._known, public, (last, before) if incarnation == last else (incarnation, last), MAX_IDENTITIES)
+        return incarnation != last
 
     def forget(self, public: bytes) -> None:
         """Forget the incarnations of an identity."""
@@ -217,18 +217,18 @@ class InitTimestamps:
     def __len__(self) -> int:
         return len(self._newest)
 
-    def accept(self, public: bytes, life: Incarnation, stamp: int) -> bool:
+    def accept(self, public: bytes, incarnation: Incarnation, timestamp: int) -> bool:
         """Return whether an INIT is newer than every earlier one of its sender, and record it.
 
         An INIT may be recorded before its session is confirmed: a replay is never newer than the next INIT of its
         sender.  An INIT without an incarnation or a timestamp counts as new.
         """
-        if not life.number or not stamp:
+        if not incarnation.number or not timestamp:
             return True
         last, newest = self._newest.get(public, (UNNUMBERED, 0))
-        if life.number < last.number or (life == last and stamp <= newest):
+        if incarnation.number < last.number or (incarnation == last and timestamp <= newest):
             return False
-        put_bounded(self._newest, public, (life, stamp), MAX_IDENTITIES)
+        put_bounded(self._newest, public, (incarnation, timestamp), MAX_IDENTITIES)
         return True
 
 

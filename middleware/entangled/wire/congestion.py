@@ -30,7 +30,7 @@ MAX_TRIES_AT_LOSS = 12
 
 
 class RoundTrip:
-    """The measured round trips of one peer, in seconds; ``wait`` is the timeout of the next first try.
+    """The measured round trips of one peer, in seconds; ``timeout`` is the timeout of the next first try.
 
     After Jacobson (1988) and RFC 6298, with shorter bounds: smoothed time plus four deviations. An answer after more
     than one try is not measured (Karn's algorithm); it only keeps the longer timeout until a first try is answered
@@ -169,7 +169,7 @@ class CongestionWindow:
 
 
 class LossRate:
-    """Measures the recent loss rate (``share``) of the datagrams to this node.
+    """Measures the recent loss rate (``rate``) of the datagrams to this node.
 
     Each session numbers the datagrams that it sends, so a gap in the received numbers is a loss, as in the reports of
     RTP (RFC 3550, section 6.4.1).  Unlike a count of retransmissions, it does not mistake a slow answer for a lost one.

@@ -177,18 +177,18 @@ class Discoverer(ProbeSender[Contact]):
         if found is None:
             return
         own, token, public = found
-        greeting = self._pending.get(token)
-        if greeting is None:
+        pending = self._pending.get(token)
+        if pending is None:
             self._counters["unasked"] += 1
-        elif greeting.address != source:
+        elif pending.address != source:
             self._counters["misdirected"] += 1
         else:
             self._forget(token)
             contact = Contact(public, source)
             self._peers.record_credentials(contact, own)
             if not self._peers.overall_round_trip.is_measured:  # an estimate: the HERE may answer a later try
-                self._peers.overall_round_trip.add_sample(self._clock.seconds() - greeting.started_at)
-            greeting.deferred.callback(contact)
+                self._peers.overall_round_trip.add_sample(self._clock.seconds() - pending.started_at)
+            pending.deferred.callback(contact)
 
     def on_cookie(self, datagram: bytes, source: Address) -> None:
         """Resend an INIT with the cookie that the responder requested."""

@@ -62,7 +62,7 @@ class Dispatcher:
         self,
         clock: IReactorTime,
         send: Callable[[Session, bytes], None],
-        courier: Fragmenter,
+        fragmenter: Fragmenter,
         counters: Counter[str],
         may: Callable[[bytes, str], bool],
         refused: Callable[[Contact, str], None],
@@ -72,7 +72,7 @@ class Dispatcher:
         self._on_refused_call = refused
         self._clock = clock
         self._send = send
-        self._fragmenter = courier
+        self._fragmenter = fragmenter
         self._counters = counters
         self._history = RequestHistory()
         self._cancelled: dict[tuple[bytes, int], None] = {}
@@ -94,78 +94,78 @@ class Dispatcher:
         for public in [public for public, bucket in self._rate_limits.items() if bucket.is_full(now)]:
             del self._rate_limits[public]
 
-    def dispatch(self, question: Request, session: Session, is_bulky: bool = False) -> None:
+    def dispatch(self, request: Request, session: Session, is_bulky: bool = False) -> None:
         """Answer a request of an established session, immediately or when its method is done.
 
         ``is_bulky``: the request arrived in fragments.  Its answer is then sent in fragments too, however short: they
         are retransmitted by the responder, and the requester need not send the whole request again for a lost answer.
         """
         public = session.contact.public
-        if (public, question.id) in self._cancelled:
+        if (public, request.id) in self._cancelled:
             self._counters["cancelled"] += 1
             return
-        method = self.methods.get(question.method)
+        method = self.methods.get(request.method)
         if method is not None and method.runs_once:
-            if self._history.is_settled(public, question.id):
+            if self._history.is_settled(public, request.id):
                 self._counters["late"] += 1
                 return
-            self._history.forget_before(public, question.id - question.behind, self._clock.seconds())
-        entry = self._history.get(public, question.id)
-        is_known = entry is not None or self._fragmenter.is_sending(public, MessageKey(True, question.id))
+            self._history.forget_before(public, request.id - request.behind, self._clock.seconds())
+        entry = self._history.get(public, request.id)
+        is_known = entry is not None or self._fragmenter.is_sending(public, MessageKey(True, request.id))
         if is_known:
             self._counters["repeated"] += 1
             if entry is not None and entry.answer is not None:
-                self._reply(session, question.id, entry.answer, is_bulky)
+                self._reply(session, request.id, entry.answer, is_bulky)
             else:
                 if entry is not None:
                     entry.session = session
                 self._send(session, b"")  # a keep-alive: the requester continues to wait
             return
-        if not question.left_ms:
+        if not request.left_ms:
             self._counters["late"] += 1
             return
         if not self._take_token(public):
-            self._reply(session, question.id, self._fail_busy(question.id, _RATE_LIMITED_TEXT), is_bulky)
+            self._reply(session, request.id, self._fail_busy(request.id, _RATE_LIMITED_TEXT), is_bulky)
             return
-        answer = self._run(question, session.contact, session, is_bulky)
+        answer = self._run(request, session.contact, session, is_bulky)
         if answer is not None:
-            self._reply(session, question.id, answer, is_bulky)
+            self._reply(session, request.id, answer, is_bulky)
 
-    def answer_early(self, question: Request, peer: Contact, room: int) -> bytes:
+    def answer_early(self, request: Request, peer: Contact, room: int) -> bytes:
         """Return the encoded answer to a request in an INIT, or nothing if it has to wait for the session.
 
         An INIT may be replayed, and its source address is not verified. Therefore only methods that were exposed with
         ``early`` run, no state is kept, and an answer that is not available immediately or exceeds ``room`` bytes is
         dropped.
         """
-        method = self.methods.get(question.method)
-        if method is None or not method.is_early or not question.left_ms:
+        method = self.methods.get(request.method)
+        if method is None or not method.is_early or not request.left_ms:
             return b""
-        if not self._may_call(peer.public, question.method) or self._history.get(peer.public, question.id) is not None:
+        if not self._may_call(peer.public, request.method) or self._history.get(peer.public, request.id) is not None:
             return b""
-        result = self._call_method(method, peer, question.arguments, math.inf)
+        result = self._call_method(method, peer, request.arguments, math.inf)
         if isinstance(result, Deferred):
-            result.addErrback(lambda trouble: None)
+            result.addErrback(lambda failure: None)
             result.cancel()
             return b""
-        answer = self._encode_result(method, question.id, result)
+        answer = self._encode_result(method, request.id, result)
         return answer if len(answer) <= room else b""
 
-    def run_notification(self, told: Notification, peer: Contact) -> None:
+    def run_notification(self, notification: Notification, peer: Contact) -> None:
         """Run the method of a notification; nothing is sent back."""
-        method = self.methods.get(told.method)
+        method = self.methods.get(notification.method)
         if not self._take_token(peer.public):
             self._counters["busy"] += 1
             return
         if method is None:
             self._counters["unknown method"] += 1
             return
-        if not self._may_call(peer.public, told.method):
-            self._refuse(peer, told.method)
+        if not self._may_call(peer.public, notification.method):
+            self._refuse(peer, notification.method)
             return
-        result = self._call_method(method, peer, told.arguments, math.inf)
+        result = self._call_method(method, peer, notification.arguments, math.inf)
         if isinstance(result, Deferred):
-            result.addErrback(lambda trouble: self._log_notification_error(method, trouble))
+            result.addErrback(lambda failure: self._log_notification_error(method, failure))
         elif isinstance(result, Trouble):
             self._log_notification_error(method, result)
 
@@ -180,28 +180,28 @@ class Dispatcher:
             self._counters["cancelled"] += 1
             self._stop(entry)
 
-    def _run(self, question: Request, peer: Contact, session: Session, is_bulky: bool) -> bytes | None:
+    def _run(self, request: Request, peer: Contact, session: Session, is_bulky: bool) -> bytes | None:
         """Run a new request; return its encoded answer, or None if the answer comes later."""
-        method = self.methods.get(question.method)
+        method = self.methods.get(request.method)
         if method is None:
-            return encode(Failure(question.id, UNKNOWN_METHOD, f"{question.method}: no such method here"))
-        if not self._may_call(peer.public, question.method):
-            self._refuse(peer, question.method)
-            return encode(Failure(question.id, ROLE, f"{question.method}: {explain(ROLE)}"))
+            return encode(Failure(request.id, UNKNOWN_METHOD, f"{request.method}: no such method here"))
+        if not self._may_call(peer.public, request.method):
+            self._refuse(peer, request.method)
+            return encode(Failure(request.id, ROLE, f"{request.method}: {explain(ROLE)}"))
         public, entry, now = peer.public, None, self._clock.seconds()
         if method.runs_once:
-            entry = self._history.begin(public, question.id, session, now, is_bulky)
+            entry = self._history.begin(public, request.id, session, now, is_bulky)
             if entry is None:
-                return self._fail_busy(question.id)
-        deadline = math.inf if question.left_ms == NO_LIMIT_MS else now + question.left_ms / 1000
-        result = self._call_method(method, peer, question.arguments, deadline)
+                return self._fail_busy(request.id)
+        deadline = math.inf if request.left_ms == NO_LIMIT_MS else now + request.left_ms / 1000
+        result = self._call_method(method, peer, request.arguments, deadline)
         if isinstance(result, Deferred):
             early: list[object] = []
             is_late = False
 
             def arrived(outcome: object) -> None:
                 if is_late:
-                    self._finish(outcome, method, question.id, public, entry)
+                    self._finish(outcome, method, request.id, public, entry)
                 else:
                     early.append(outcome)
 
@@ -209,18 +209,18 @@ class Dispatcher:
             if not early:
                 is_late = True
                 if entry is None:
-                    entry = self._history.begin(public, question.id, session, now, is_bulky)
+                    entry = self._history.begin(public, request.id, session, now, is_bulky)
                 if entry is None:
                     result.cancel()
-                    return self._fail_busy(question.id)
+                    return self._fail_busy(request.id)
                 entry.work = result
                 if deadline < math.inf:
                     entry.timer = self._clock.callLater(deadline - now, self._expire, entry)
                 return None
             result = early[0]
-        answer = self._encode_result(method, question.id, result)
+        answer = self._encode_result(method, request.id, result)
         if entry is not None:
-            self._history.finish(public, question.id, _limit_kept_answer(question.id, answer), self._clock.seconds())
+            self._history.finish(public, request.id, _limit_kept_answer(request.id, answer), self._clock.seconds())
         return answer
 
     def _finish(self, result: object, method: Method, number: int, public: bytes, entry: RequestEntry | None) -> None:
@@ -228,8 +228,8 @@ class Dispatcher:
         if entry is None or self._history.get(public, number) is not entry:
             return  # the peer was evicted, or the node stopped meanwhile
         session = entry.session
-        kept = _limit_kept_answer(number, answer) if method.runs_once else None
-        self._history.finish(public, number, kept, self._clock.seconds())
+        kept_answer = _limit_kept_answer(number, answer) if method.runs_once else None
+        self._history.finish(public, number, kept_answer, self._clock.seconds())
         if session is not None:
             self._reply(session, number, answer, entry.is_fragmented)
 
@@ -292,11 +292,11 @@ class Dispatcher:
             return encode(Failure(number, REFUSED, text))
         return answer
 
-    def _log_notification_error(self, method: Method, trouble: Trouble) -> None:
-        if make_failure(0, trouble) is not None:
+    def _log_notification_error(self, method: Method, failure: Trouble) -> None:
+        if make_failure(0, failure) is not None:
             self._counters["refused"] += 1
         else:
-            self._log.failure("{method} failed for a peer", failure=trouble, method=method.name)
+            self._log.failure("{method} failed for a peer", failure=failure, method=method.name)
 
 
 def _limit_kept_answer(number: int, answer: bytes) -> bytes:

@@ -85,13 +85,13 @@ class Endpoint:
 
     ``team_key`` (32 bytes) is the secret of the team: a node without it can neither decrypt nor cause an answer.
     ``rng`` generates the ephemeral keys, so outside of simulations it must be ``random.SystemRandom``; in simulations a
-    restarted node must not repeat the numbers of its earlier incarnations.  ``door`` decides which nodes are admitted,
+    restarted node must not repeat the numbers of its earlier incarnations.  ``admission`` decides which nodes are admitted,
     and which methods a peer may call.
 
     ``on_contact`` is called when a peer has proved its key and its address, by an answer or by confirming a session
-    that it opened; ``on_seen`` with a peer and this node's address as the peer sees it; ``on_refused`` when a peer
-    rejects this node, and ``on_refusing`` when this node rejects an authenticated peer, each with the refusal code;
-    ``on_let_go`` with the key of a peer that was forgotten after a long silence.
+    that it opened; ``on_seen`` with a peer and this node's address as the peer sees it; ``on_rejected`` when a peer
+    rejects this node, and ``on_rejecting`` when this node rejects an authenticated peer, each with the refusal code;
+    ``on_forgotten`` with the key of a peer that was forgotten after a long silence.
 
     ``counters`` counts dropped datagrams by reason: oversized, unknown, malformed, forged, replayed, stale (no such
     session), repeated, misdirected, unasked, late, cancelled, abandoned (an incomplete fragmented message); requests
@@ -107,9 +107,9 @@ class Endpoint:
         network: Network,
         clock: IReactorTime,
         rng: random.Random,
-        door: AdmissionCheck = OPEN_ADMISSION,
+        admission: AdmissionCheck = OPEN_ADMISSION,
     ) -> None:
-        self.admission = door
+        self.admission = admission
         self.on_contact = Listeners[[Contact]]()
         self.on_seen = Listeners[[Contact, Address]]()
         self.on_rejected = Listeners[[Contact, str]]()
@@ -129,7 +129,7 @@ class Endpoint:
         self._incarnations = Incarnations()
         self._timestamps = InitTimestamps()
         self._log_limiter = LogLimiter()
-        self._peers = Peers([self._credentials], clock, rng, network, self.counters, door)
+        self._peers = Peers([self._credentials], clock, rng, network, self.counters, admission)
         self._fragmenter = Fragmenter(
             clock,
             self._send_to,
@@ -140,12 +140,12 @@ class Endpoint:
             self.counters,
         )
         self._dispatcher = Dispatcher(
-            clock, self._send, self._fragmenter, self.counters, door.may_call, self._record_refused_call
+            clock, self._send, self._fragmenter, self.counters, admission.may_call, self._record_refused_call
         )
         self._requester = Requester(clock, rng, self._peers, self._fragmenter, self._send, self.counters)
         self.discoverer = Discoverer(identity.public, self._peers, network, clock, rng, self.counters)
         self._cookies = CookieCheck(self._credentials.cookie_key, rng)
-        self.probe_responder = ProbeResponder(self.send_datagram, clock, lambda: door.fingerprint)
+        self.probe_responder = ProbeResponder(self.send_datagram, clock, lambda: admission.fingerprint)
         self.prober = Prober(self.send_datagram, clock, rng)
         self._sessions = self._peers.sessions
         self._half_open = HalfOpenSessions(self._sessions)
@@ -509,19 +509,19 @@ class Endpoint:
             self.counters["replayed"] += 1
             return b""
         try:
-            rider = decode(acceptance.early_message) if acceptance.early_message else None
+            early_message = decode(acceptance.early_message) if acceptance.early_message else None
         except Malformed:
             self.counters["malformed"] += 1
             return b""
         answer = b""
-        if isinstance(rider, Request):
-            answer = self._dispatcher.answer_early(rider, contact, acceptance.max_answer_bytes(hello))
+        if isinstance(early_message, Request):
+            answer = self._dispatcher.answer_early(early_message, contact, acceptance.max_answer_bytes(hello))
         if not self.is_running:
             return b""  # the method stopped the endpoint
         index = self._peers.new_index()
         response, keys = acceptance.accept(index, answer, source, hello)
         session = Session(
-            contact, index, acceptance.remote_index, keys, now, is_confirmed=False, life=acceptance.incarnation
+            contact, index, acceptance.remote_index, keys, now, is_confirmed=False, incarnation=acceptance.incarnation
         )
         session.peer_pass = acceptance.peer_pass
         self._half_open.add(session, now)
@@ -556,7 +556,7 @@ class Endpoint:
             reply.keys,
             self._clock.seconds(),
             is_confirmed=True,
-            life=reply.incarnation,
+            incarnation=reply.incarnation,
         )
         code = self._find_refusal(contact.public, reply.peer_pass, reply.incarnation, self.admission.admit)
         if code:
@@ -580,11 +580,11 @@ class Endpoint:
     # -- admission --------------------------------------------------------------------------------------------------
 
     def _find_refusal(
-        self, public: bytes, shown: bytes, life: Incarnation, judge: Callable[[bytes, bytes], str]
+        self, public: bytes, peer_pass: bytes, incarnation: Incarnation, judge: Callable[[bytes, bytes], str]
     ) -> str:
-        if len(shown) > self.admission.max_pass_bytes:
+        if len(peer_pass) > self.admission.max_pass_bytes:
             return FOREIGN
-        return self._incarnations.find_refusal(public, life) or judge(public, shown)
+        return self._incarnations.find_refusal(public, incarnation) or judge(public, peer_pass)
 
     def _reject(self, session: Session, code: str) -> None:
         """Notify a peer on ``session`` that it is rejected, and close its sessions."""
@@ -600,9 +600,9 @@ class Endpoint:
         if code not in (DOUBLED, SUPERSEDED) or peer is None or not peer.sessions:
             self._disconnect(contact.public, f"{contact.address} is rejected: {explain(code)}", code)
 
-    def _on_refusal(self, session: Session, said: bytes) -> None:
+    def _on_refusal(self, session: Session, reported: bytes) -> None:
         """Process the notification of a peer that it rejects this node."""
-        code = said.decode("ascii", errors="replace")
+        code = reported.decode("ascii", errors="replace")
         if not is_refusal(code):
             self.counters["malformed"] += 1
             return

@@ -77,10 +77,10 @@ class FragmentedMessage:
 
     def next_fragment(self, limit: int | None = None) -> int | None:
         """Return the next fragment to send, lost ones first; None if all are under way or the receiver has no room."""
-        here, most = self.acknowledged, self.window_end if limit is None else limit
-        while self._lost_fragments and here >> self._lost_fragments[0] & 1:
+        acknowledged, most = self.acknowledged, self.window_end if limit is None else limit
+        while self._lost_fragments and acknowledged >> self._lost_fragments[0] & 1:
             self._lost_fragments.popleft()
-        while self._next < self.count and here >> self._next & 1:
+        while self._next < self.count and acknowledged >> self._next & 1:
             self._next += 1
         number = self._lost_fragments[0] if self._lost_fragments else self._next
         return number if number < min(self.count, most) else None
@@ -175,45 +175,45 @@ class Flow:
 
     def drop(self, key: MessageKey) -> None:
         """Stop sending a message."""
-        parcel = self.messages.get(key)
-        if parcel is not None:
-            self._end(parcel)
+        message = self.messages.get(key)
+        if message is not None:
+            self._end(message)
             self._send_fragments(self._clock.seconds())
 
     def restart(self) -> None:
         """Restart every message, because the peer may have lost its fragments."""
         self._in_flight.clear()
-        for parcel in self.messages.values():
-            parcel.restart()
+        for message in self.messages.values():
+            message.restart()
         self._send_fragments(self._clock.seconds())
 
     def process_receipt(self, receipt: Receipt) -> None:
         """Process a receipt."""
-        parcel = self.messages.get(receipt.key)
-        if parcel is None:
+        message = self.messages.get(receipt.key)
+        if message is None:
             return  # a late receipt
         now = self._clock.seconds()
         self._silent_probes = 0
         count, newest, round_trip = 0, -1, None
-        for number in parcel.process_receipt(receipt, now):
-            order = parcel.send_orders.pop(number, -1)
+        for number in message.process_receipt(receipt, now):
+            order = message.send_orders.pop(number, -1)
             if order < 0:
                 self._window.count_losses(-1)  # it was considered lost, and arrived after all
                 continue
             _, _, sent_at = self._in_flight.pop(order)
             count += 1
             newest = max(newest, order)
-            if number == receipt.cause and not parcel.retransmitted >> number & 1:
+            if number == receipt.cause and not message.retransmitted >> number & 1:
                 round_trip = now - sent_at
         if round_trip is not None:
             self._round_trip.add_sample(round_trip)
         if count:
             self._newest_acknowledged = max(self._newest_acknowledged, newest)
             self._window.acknowledge(count, newest, self._order, round_trip, now)
-        if receipt.is_done or parcel.is_done:
-            self._end(parcel)
+        if receipt.is_done or message.is_done:
+            self._end(message)
         elif not receipt.room:
-            self._mark_lost([order for order, (owner, _, _) in self._in_flight.items() if owner is parcel])
+            self._mark_lost([order for order, (owner, _, _) in self._in_flight.items() if owner is message])
         self._detect_losses(now)
         self._send_fragments(now)
 
@@ -229,23 +229,23 @@ class Flow:
 
     def _mark_lost(self, orders: list[int]) -> None:
         for order in orders:
-            parcel, number, _ = self._in_flight.pop(order)
-            parcel.mark_lost(number)
+            message, number, _ = self._in_flight.pop(order)
+            message.mark_lost(number)
 
     def _send_fragments(self, now: float) -> None:
         """Send the fragments that the window allows, and set the timer."""
         picked: list[tuple[FragmentedMessage, int]] = []
         free = int(self._window.size) - len(self._in_flight)
         while len(picked) < free:
-            parcel, number = self._pick_next()
-            if parcel is None:
+            message, number = self._pick_next()
+            if message is None:
                 break
-            self._mark_sent(parcel, number, now)
-            picked.append((parcel, number))
+            self._mark_sent(message, number, now)
+            picked.append((message, number))
         # Each message requests its own receipts: for its last fragment in the burst, and for some in between.
-        last = {parcel.key: place for place, (parcel, _) in enumerate(picked)}
-        for place, (parcel, number) in enumerate(picked):
-            self._send_sealed(parcel.make_fragment(number, parcel.requests_receipt() or place == last[parcel.key]))
+        last = {message.key: place for place, (message, _) in enumerate(picked)}
+        for place, (message, number) in enumerate(picked):
+            self._send_sealed(message.make_fragment(number, message.requests_receipt() or place == last[message.key]))
         self._set_timer(now)
 
     def _pick_next(self) -> tuple[FragmentedMessage | None, int]:
@@ -253,11 +253,11 @@ class Flow:
         turns = self._rotation
         self._fill_rotation()
         for _ in range(len(turns)):
-            parcel = turns[0]
+            message = turns[0]
             turns.rotate(-1)
-            number = parcel.next_fragment()
+            number = message.next_fragment()
             if number is not None:
-                return parcel, number
+                return message, number
         return None, 0
 
     def _fill_rotation(self) -> None:
@@ -266,9 +266,9 @@ class Flow:
             others = (one for one in self.messages.values() if one not in turns)
             turns.extend(islice(others, MAX_PARALLEL_MESSAGES - len(turns)))
 
-    def _mark_sent(self, parcel: FragmentedMessage, number: int, now: float) -> None:
-        parcel.mark_sent(number, self._order)
-        self._in_flight[self._order] = (parcel, number, now)
+    def _mark_sent(self, message: FragmentedMessage, number: int, now: float) -> None:
+        message.mark_sent(number, self._order)
+        self._in_flight[self._order] = (message, number, now)
         self._order += 1
         self._sent_at = now
 
@@ -300,9 +300,9 @@ class Flow:
 
     def _on_timer(self) -> None:
         now = self._clock.seconds()
-        for parcel in list(self.messages.values()):
-            if now - parcel.progress_at >= IDLE_TIMEOUT_S:
-                self._end(parcel)
+        for message in list(self.messages.values()):
+            if now - message.progress_at >= IDLE_TIMEOUT_S:
+                self._end(message)
         if self.messages and now >= self._due_at():
             before = len(self._in_flight)
             self._detect_losses(now)
@@ -319,19 +319,19 @@ class Flow:
         elif self._in_flight:
             self._mark_lost(list(self._in_flight)[:PROBE_FRAGMENTS])
         self._fill_rotation()
-        parcel = self._rotation[0]
+        message = self._rotation[0]
         self._rotation.rotate(-1)
         for _ in range(PROBE_FRAGMENTS):
-            number = parcel.next_fragment(parcel.count)
+            number = message.next_fragment(message.count)
             if number is None:
                 break
-            self._mark_sent(parcel, number, now)
-            self._send_sealed(parcel.make_fragment(number, True))
+            self._mark_sent(message, number, now)
+            self._send_sealed(message.make_fragment(number, True))
 
-    def _end(self, parcel: FragmentedMessage) -> None:
-        del self.messages[parcel.key]
-        for order in parcel.send_orders.values():
+    def _end(self, message: FragmentedMessage) -> None:
+        del self.messages[message.key]
+        for order in message.send_orders.values():
             del self._in_flight[order]
-        if parcel in self._rotation:
-            self._rotation.remove(parcel)
-        self._on_ended(parcel)
+        if message in self._rotation:
+            self._rotation.remove(message)
+        self._on_ended(message)

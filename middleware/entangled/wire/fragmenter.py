@@ -52,7 +52,7 @@ PROGRESS_INTERVAL_S = 0.1
 
 @dataclass(slots=True)
 class IncomingMessage:
-    """A message that is being reassembled. Bit n of ``here`` is set if fragment n has arrived."""
+    """A message that is being reassembled. Bit n of ``received`` is set if fragment n has arrived."""
 
     total: int
     started_at: float
@@ -75,15 +75,15 @@ class IncomingMessage:
         age = now - self.started_at
         return age > SLOW_AFTER_S and self.received.bit_count() < MIN_FRAGMENTS_PER_S * age
 
-    def add(self, part: Fragment, now: float) -> bool:
+    def add(self, fragment: Fragment, now: float) -> bool:
         """Store a fragment; return whether to acknowledge it at once, because it leaves a gap or is a duplicate."""
         self.last_received_at = now
-        bit = 1 << part.number
+        bit = 1 << fragment.number
         if self.received & bit:
             return True
         leaves_gap = bit > 1 and not self.received & (bit >> 1)
         self.received |= bit
-        self.fragments[part.number] = part.data
+        self.fragments[fragment.number] = fragment.data
         return leaves_gap
 
     def join(self) -> bytes:
@@ -218,43 +218,43 @@ class Fragmenter:
     def on_fragment(self, session: Session, plain: bytes) -> None:
         """Process a PART."""
         try:
-            part = parse_fragment(plain)
+            fragment = parse_fragment(plain)
         except Malformed:
             self._counters["malformed"] += 1
             return
-        now, public, key = self._clock.seconds(), session.contact.public, part.key
+        now, public, key = self._clock.seconds(), session.contact.public, fragment.key
         where = (public, key)
         assembly = self._incoming.get(where)
         if assembly is None:
             is_over = not self._is_awaited(key.id, public) if key.is_answer else where in self._completed
             if is_over:
                 self._counters["unasked" if key.is_answer else "repeated"] += 1
-                if part.wants_receipt:
-                    self._send_sealed(public, pack_receipt(key, True, 0, part.number, 0))
+                if fragment.wants_receipt:
+                    self._send_sealed(public, pack_receipt(key, True, 0, fragment.number, 0))
                 return
-            if not self._has_room(public, part.total, now):
+            if not self._has_room(public, fragment.total, now):
                 self._counters["crowded"] += 1
-                if part.wants_receipt:
-                    self._send_sealed(public, pack_receipt(key, False, 0, part.number, 0))
+                if fragment.wants_receipt:
+                    self._send_sealed(public, pack_receipt(key, False, 0, fragment.number, 0))
                 return
-            assembly = self._incoming[where] = IncomingMessage.empty(part.total, now)
-            self._bytes_in[public] += part.total
+            assembly = self._incoming[where] = IncomingMessage.empty(fragment.total, now)
+            self._bytes_in[public] += fragment.total
             if self._sweeper is None or not self._sweeper.active():
                 self._sweeper = self._clock.callLater(1.0, self._sweep)
-        elif assembly.total != part.total:
+        elif assembly.total != fragment.total:
             self._counters["malformed"] += 1
             return
-        is_urgent = assembly.add(part, now)
+        is_urgent = assembly.add(fragment, now)
         if assembly.is_complete:
             self.forget_incoming(public, key)
             if not key.is_answer:
                 put_bounded(self._completed, where, None, MAX_COMPLETED)
-            self._send_sealed(public, pack_receipt(key, True, 0, part.number, assembly.received))
+            self._send_sealed(public, pack_receipt(key, True, 0, fragment.number, assembly.received))
             self._deliver(session, key, assembly.join())
             return
-        if is_urgent or part.wants_receipt:
+        if is_urgent or fragment.wants_receipt:
             room = max(MIN_RECEIVE_FRAGMENTS, RECEIVE_FRAGMENTS // len(self._incoming))
-            self._send_sealed(public, pack_receipt(key, False, room, part.number, assembly.received))
+            self._send_sealed(public, pack_receipt(key, False, room, fragment.number, assembly.received))
         if key.is_answer:
             self._on_progress(key.id, public)
 
@@ -284,9 +284,9 @@ class Fragmenter:
             for other in idle[:1]:
                 del self._flows[other]
 
-        def on_ended(parcel: FragmentedMessage) -> None:
-            if parcel.key.is_answer:
-                self.release(public, len(parcel.data))
+        def on_ended(message: FragmentedMessage) -> None:
+            if message.key.is_answer:
+                self.release(public, len(message.data))
 
         flow = Flow(self._clock, lambda plain: self._send_sealed(public, plain), on_ended, self._first_timeout(public))
         self._flows[public] = flow

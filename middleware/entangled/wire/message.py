@@ -1,6 +1,6 @@
 """Encode and decode the content of sealed datagrams: messages as strict msgpack, fragments, and receipts for fragments.
 
-``decoded``, ``part_of`` and ``receipt_of`` accept any bytes: they return a value or raise ``Malformed``.  Absolute
+``decode``, ``parse_fragment`` and ``parse_receipt`` accept any bytes: they return a value or raise ``Malformed``.  Absolute
 times are never transmitted.  A fragment (PART) and a receipt each fill one datagram::
 
     PART     0x01  flags 1  id 8  total bytes 4  number 2  the bytes of this fragment
@@ -104,7 +104,7 @@ def encode(message: Message) -> bytes:
     """Encode ``message``; raise ``TypeError``, ``ValueError`` or ``OverflowError`` if it cannot be packed."""
     match message:
         case Request(id=number, method=method, arguments=arguments, left_ms=left_ms, behind=behind):
-            # The remaining time is last and always has four bytes, so that ``aged`` can replace it.
+            # The remaining time is last and always has four bytes, so that ``set_remaining_time`` can replace it.
             head = bytes(msgpack.packb([_REQUEST, number, behind, method, arguments]))
             return b"\x96" + head[1:] + _UINT32 + left_ms.to_bytes(4, "big")
         case Answer(id=number, value=value):
@@ -118,10 +118,10 @@ def encode(message: Message) -> bytes:
     return bytes(msgpack.packb(fields))
 
 
-def set_remaining_time(question: bytes, seconds: float) -> bytes:
+def set_remaining_time(request: bytes, seconds: float) -> bytes:
     """Return an encoded request with another remaining time of ``seconds``."""
     left_ms = min(NO_LIMIT_MS, max(0, round(seconds * 1000)))
-    return question[:-4] + left_ms.to_bytes(4, "big")
+    return request[:-4] + left_ms.to_bytes(4, "big")
 
 
 def decode(data: bytes) -> Message:
@@ -273,14 +273,14 @@ def parse_receipt(plain: bytes) -> Receipt:
         raise Malformed("a receipt of the wrong length, or with unknown flags")
     first = int.from_bytes(plain[10:12], "little")
     room, cause = int.from_bytes(plain[12:14], "little"), int.from_bytes(plain[14:16], "little")
-    here = int.from_bytes(plain[_RECEIPT_HEADER_BYTES:], "little") << (first + 1) | (1 << first) - 1
-    return Receipt(_parse_key(plain), bool(plain[1] & DONE), first, room, cause, here)
+    received = int.from_bytes(plain[_RECEIPT_HEADER_BYTES:], "little") << (first + 1) | (1 << first) - 1
+    return Receipt(_parse_key(plain), bool(plain[1] & DONE), first, room, cause, received)
 
 
-def pack_receipt(key: MessageKey, is_done: bool, room: int, cause: int, here: int) -> bytes:
-    """Return the RECEIPT for a message of which the fragments in ``here`` have arrived, ``cause`` being the latest."""
-    first = ((here + 1) & ~here).bit_length() - 1  # the lowest bit that is not set
-    bitmap = here >> (first + 1)
+def pack_receipt(key: MessageKey, is_done: bool, room: int, cause: int, received: int) -> bytes:
+    """Return the RECEIPT for a message of which the fragments in ``received`` have arrived, ``cause`` being the latest."""
+    first = ((received + 1) & ~received).bit_length() - 1  # the lowest bit that is not set
+    bitmap = received >> (first + 1)
     head = bytes([RECEIPT, key.is_answer * IS_ANSWER | is_done * DONE]) + key.id.to_bytes(8, "little")
     head += first.to_bytes(2, "little") + room.to_bytes(2, "little") + cause.to_bytes(2, "little")
     return head + bitmap.to_bytes(-(-bitmap.bit_length() // 8), "little")

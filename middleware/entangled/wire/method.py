@@ -31,7 +31,7 @@ MAX_PER_PEER = 4096
 SEQUENCE_BITS = 32
 """The low bits of a request id, which a requester increments; the bits above are random and new after each restart."""
 MAX_INCARNATIONS = 4
-"""The number of restarts of one peer within ``KEEP_ANSWER_S`` for which ``settled`` is kept."""
+"""The number of restarts of one peer within ``KEEP_ANSWER_S`` for which ``lowest_open`` is kept."""
 MAX_ENTRIES = 16384
 MAX_REQUESTERS = 4096
 _PLAIN_TYPES = (int, float, bool, str, bytes, list, dict, type(None))
@@ -169,9 +169,9 @@ def _types_of_hint(hint: object) -> tuple[type, ...] | None:
     return (plain,) if plain in _PLAIN_TYPES else None
 
 
-def make_failure(number: int, trouble: Trouble) -> Failure | None:
+def make_failure(number: int, failure: Trouble) -> Failure | None:
     """Return the failure that reports an error to the requester of ``number``; None for an internal error."""
-    error = trouble.value
+    error = failure.value
     if isinstance(error, Refused):
         return Failure(number, error.code if is_code(error.code) else Refused.code, str(error))
     if isinstance(error, CancelledError):
@@ -198,7 +198,7 @@ class RequestEntry:
 
 @dataclass(slots=True)
 class _PeerRequests:
-    """The requests of one peer; ``settled`` has, for each incarnation of the peer, the id below which none is open."""
+    """The requests of one peer; ``lowest_open`` has, for each incarnation of the peer, the id below which none is open."""
 
     running: dict[int, RequestEntry] = field(default_factory=dict)
     finished: dict[int, RequestEntry] = field(default_factory=dict)
@@ -221,15 +221,15 @@ class RequestHistory:
     def __len__(self) -> int:
         return self._count
 
-    def get(self, public: bytes, question: int) -> RequestEntry | None:
+    def get(self, public: bytes, number: int) -> RequestEntry | None:
         """Return the entry of a request."""
         account = self._peers.get(public)
-        return None if account is None else account.running.get(question) or account.finished.get(question)
+        return None if account is None else account.running.get(number) or account.finished.get(number)
 
-    def is_settled(self, public: bytes, question: int) -> bool:
+    def is_settled(self, public: bytes, number: int) -> bool:
         """Return whether the requester no longer waits for this request."""
         account = self._peers.get(public)
-        return account is not None and question < account.lowest_open.get(question >> SEQUENCE_BITS, 0)
+        return account is not None and number < account.lowest_open.get(number >> SEQUENCE_BITS, 0)
 
     def forget_before(self, public: bytes, oldest: int, now: float) -> None:
         """Forget the ended requests of a peer before ``oldest``: it has those answers, or gave them up."""
@@ -248,7 +248,7 @@ class RequestHistory:
             self._count -= len(had)
 
     def begin(
-        self, public: bytes, question: int, session: Session | None, now: float, is_bulky: bool
+        self, public: bytes, number: int, session: Session | None, now: float, is_bulky: bool
     ) -> RequestEntry | None:
         """Add a request that is about to run; return None if there is no room."""
         account = self._get_or_create(public, now)
@@ -258,23 +258,23 @@ class RequestHistory:
             or len(account.running) + len(account.finished) >= MAX_PER_PEER
         ):
             return None
-        entry = account.running[question] = RequestEntry(session, is_bulky)
+        entry = account.running[number] = RequestEntry(session, is_bulky)
         self._count += 1
         return entry
 
-    def finish(self, public: bytes, question: int, answer: bytes | None, now: float) -> None:
+    def finish(self, public: bytes, number: int, answer: bytes | None, now: float) -> None:
         """Store the ``answer`` of a request that ran, or forget the request if it is None and may run again."""
         account = self._peers.get(public)
-        entry = account.running.pop(question, None) if account is not None else None
+        entry = account.running.pop(number, None) if account is not None else None
         if account is None or entry is None:
             return
         cancel(entry.timer)
         entry.work = None
-        if answer is None or self.is_settled(public, question):
+        if answer is None or self.is_settled(public, number):
             self._count -= 1
         else:
             entry.answer, entry.ended_at, entry.session = answer, now, None
-            account.finished[question] = entry
+            account.finished[number] = entry
 
     def evict(self, public: bytes) -> list[Deferred[object]]:
         """Forget the requests of a peer; return the running work, which the caller cancels."""

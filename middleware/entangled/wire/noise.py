@@ -69,7 +69,7 @@ def seal(key: bytes, counter: int, plaintext: bytes, ad: bytes) -> bytes:
 
 
 def open_sealed(key: bytes, counter: int, ciphertext: bytes, ad: bytes) -> bytes:
-    """Decrypt the result of ``sealed``; raise ``Forged`` if anything was changed."""
+    """Decrypt the result of ``seal``; raise ``Forged`` if anything was changed."""
     if len(key) != KEY_BYTES:
         raise ValueError(f"a key must have {KEY_BYTES} bytes, not {len(key)}")
     size = len(ciphertext) - TAG_BYTES

@@ -75,10 +75,10 @@ def _remove_number(numbers: Mapping[int, None], number: int) -> Mapping[int, Non
 class OutgoingHandshake:
     """A handshake of this node that waits for its RESP.
 
-    It was begun at ``address``.  ``doors`` maps every address to which the INIT is sent to the cookie that was
-    requested there.  The session is needed ``within`` that many seconds.  Until ``held_until`` other nodes help with
-    hole punching, and the handshake continues regardless of its tries.  ``is_wanted``: a request waits for it;
-    otherwise it was begun to admit the peer or to find a better path.  While it ``is_resting`` it sends nothing and
+    It was begun at ``address``.  ``cookies`` maps every address to which the INIT is sent to the cookie that was
+    requested there.  The session is needed ``timeout_s`` that many seconds.  Until ``held_until`` other nodes help with
+    hole punching, and the handshake continues regardless of its tries.  ``has_request``: a request waits for it;
+    otherwise it was begun to admit the peer or to find a better path.  While it ``is_waiting`` it sends nothing and
     waits for a late RESP.
     """
 
@@ -162,13 +162,13 @@ class Peer:
 class Peers:
     """All peers of an endpoint, ``sessions`` by their index, and the handshakes of this node.
 
-    ``ring`` are the credentials under the team's secrets, newest first; ``door`` supplies the pass that is shown to
-    others.  ``on_unheard`` is called with a handshake that got no answer to any of its tries.  ``is_far`` returns
-    whether other nodes may know a path to an address; ``on_silence`` is called with a handshake to such an address that
+    ``ring`` are the credentials under the team's secrets, newest first; ``admission`` supplies the pass that is shown to
+    others.  ``on_handshake_failed`` is called with a handshake that got no answer to any of its tries.  ``is_far`` returns
+    whether other nodes may know a path to an address; ``on_slow_handshake`` is called with a handshake to such an address that
     gets no early answer, ``on_established`` with each new session, and ``on_moved`` with a session that received from a
     new address.
 
-    ``usual`` is the round trip to all peers together.  In a network that ``is_wide`` it is also the estimate for
+    ``overall_round_trip`` is the round trip to all peers together.  In a network that ``is_large`` it is also the estimate for
     unknown peers, because there are so many that needless retransmissions matter.  ``loss`` is the loss rate of
     incoming datagrams.
     """
@@ -180,10 +180,10 @@ class Peers:
         rng: random.Random,
         network: Network,
         counters: Counter[str],
-        door: AdmissionCheck = OPEN_ADMISSION,
+        admission: AdmissionCheck = OPEN_ADMISSION,
     ) -> None:
         self.ring = ring
-        self.admission = door
+        self.admission = admission
         self.sessions: dict[int, Session] = {}
         self.on_handshake_failed = Listeners[[OutgoingHandshake]]()
         self.is_far: Callable[[Address], bool] = lambda address: False
@@ -413,8 +413,8 @@ class Peers:
     @property
     def hello(self) -> HandshakeFields:
         """The handshake fields of this node."""
-        door = self.admission
-        return HandshakeFields(door.incarnation, door.own_pass, door.max_pass_bytes)
+        admission = self.admission
+        return HandshakeFields(admission.incarnation, admission.own_pass, admission.max_pass_bytes)
 
     def new_index(self) -> int:
         """Return an unused session index; never 0."""
@@ -438,11 +438,11 @@ class Peers:
     # -- outgoing handshakes ----------------------------------------------------------------------------------------
 
     def open(
-        self, peer: Peer, address: Address, rider: bytes = b"", is_wanted: bool = True, within: float = HANDSHAKE_S
+        self, peer: Peer, address: Address, early_message: bytes = b"", is_wanted: bool = True, within: float = HANDSHAKE_S
     ) -> bool:
         """Open a session, unless a handshake is under way; return False if there are too many handshakes.
 
-        ``rider`` is a message for the INIT; it is omitted if it does not fit.  ``within`` is the time in seconds in
+        ``early_message`` is a message for the INIT; it is omitted if it does not fit.  ``within`` is the time in seconds in
         which the session is needed.
         """
         if peer.handshake is not None:
@@ -458,12 +458,12 @@ class Peers:
             self._counters["crowded"] += 1
             return False
         own, hello = peer.credentials or self.ring[0], self.hello
-        rider = rider if len(rider) <= hello.max_early_bytes else b""
+        early_message = early_message if len(early_message) <= hello.max_early_bytes else b""
         now = self._clock.seconds()
         self._timestamp = max(self._timestamp + 1, int(now * 1e6))
         secret, index = self._rng.randbytes(32), self.new_index()
         invitation = InitiatorHandshake(
-            own, derive_exchange_key(peer.public), secret, index, rider, hello, self._timestamp
+            own, derive_exchange_key(peer.public), secret, index, early_message, hello, self._timestamp
         )
         opening = OutgoingHandshake(invitation, peer, address, now, {address: b""}, within)
         self._handshakes[invitation.local_index] = self._by_mac[invitation.mac] = peer.handshake = opening

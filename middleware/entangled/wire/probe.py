@@ -36,7 +36,7 @@ class ProbeReply(NamedTuple):
     """The content of an ECHO.
 
     ``fingerprint`` identifies the team (zero: an open team), ``wall`` is the clock of its node in Unix seconds (0:
-    unknown), ``seen`` is the source address of the HAIL.
+    unknown), ``observed_address`` is the source address of the HAIL.
     """
 
     token: bytes
@@ -51,13 +51,13 @@ def pack_probe(token: bytes) -> bytes:
     return (bytes([PROBE]) + token).ljust(PROBE_BYTES, b"\0")
 
 
-def pack_reply(asked: bytes, fingerprint: bytes, wall: float, source: Address) -> bytes:
-    """Return the ECHO for the HAIL ``asked`` from ``source``; raise ``Malformed`` if it is no HAIL."""
-    if len(asked) != PROBE_BYTES or asked[0] != PROBE:
+def pack_reply(probe: bytes, fingerprint: bytes, wall: float, source: Address) -> bytes:
+    """Return the ECHO for the HAIL ``probe`` from ``source``; raise ``Malformed`` if it is no HAIL."""
+    if len(probe) != PROBE_BYTES or probe[0] != PROBE:
         raise Malformed("the HAIL has the wrong length")
     moment = max(0, int(1000 * wall)).to_bytes(8, "little")
     return (
-        bytes([PROBE_REPLY]) + asked[1:_HEADER_BYTES] + bytes([VERSION]) + fingerprint + moment + pack_address(source)
+        bytes([PROBE_REPLY]) + probe[1:_HEADER_BYTES] + bytes([VERSION]) + fingerprint + moment + pack_address(source)
     )
 
 

@@ -43,14 +43,14 @@ class Rejections:
     def __len__(self) -> int:
         return len(self._known)
 
-    def record(self, who: bytes, address: str, side: Side, code: str, reason: str, now: float) -> None:
+    def record(self, public: bytes, address: str, side: Side, code: str, reason: str, now: float) -> None:
         """Record a rejection."""
-        known = self._known.get((who, side, code), None)
+        known = self._known.get((public, side, code), None)
         if known is None or now - known.last_at > HOUR_S:
-            met = Rejection(who, address, side, code, reason, now, now)
+            rejection = Rejection(public, address, side, code, reason, now, now)
         else:
-            met = replace(known, address=address, last_at=now, count=known.count + 1)
-        put_bounded(self._known, (who, side, code), met, MAX_REJECTIONS)
+            rejection = replace(known, address=address, last_at=now, count=known.count + 1)
+        put_bounded(self._known, (public, side, code), rejection, MAX_REJECTIONS)
 
     def list_recent(self, now: float, span: float = HOUR_S) -> list[Rejection]:
         """Return the rejections of the last ``span`` seconds, the newest first."""

@@ -52,8 +52,8 @@ _FULL_TEXT = "too many requests or bytes are under way; try again later"
 class PendingRequest:
     """A request that waits for its answer.
 
-    ``is_patient``: the caller gave a longer timeout than the default; ``is_bulky``: the request is sent in fragments;
-    ``is_light``: the request does not justify a handshake. ``grace`` is the time in seconds that the answer has after
+    ``has_long_timeout``: the caller gave a longer timeout than the default; ``is_fragmented``: the request is sent in fragments;
+    ``avoids_handshake``: the request does not justify a handshake. ``extension_s`` is the time in seconds that the answer has after
     the request left the queue and after each acknowledged fragment; 0 if the caller gave a timeout.
     """
 
@@ -89,7 +89,7 @@ class Requester:
         clock: IReactorTime,
         rng: random.Random,
         peers: Peers,
-        courier: Fragmenter,
+        fragmenter: Fragmenter,
         send: Callable[[Session, bytes], None],
         counters: Counter[str],
     ) -> None:
@@ -97,7 +97,7 @@ class Requester:
         self._peers = peers
         self._send = send
         self._counters = counters
-        self._fragmenter = courier
+        self._fragmenter = fragmenter
         self._requests: dict[int, PendingRequest] = {}
         self._queued = 0
         # A random start within 62 bits keeps the request ids of a restarted node apart from its earlier ones.
@@ -133,9 +133,9 @@ class Requester:
             return defer.fail(Crowded(f"{method} asked of {contact.address}: {_FULL_TEXT}"))
         self._next_number += 1
         now = self._clock.seconds()
-        patience = TIMEOUT_S if timeout is None else timeout
-        deferred: Deferred[object] = Deferred(lambda _: self._cancel(inquiry))
-        inquiry = PendingRequest(
+        timeout_s = TIMEOUT_S if timeout is None else timeout
+        deferred: Deferred[object] = Deferred(lambda _: self._cancel(request))
+        request = PendingRequest(
             number=number,
             method=method,
             peer=peer,
@@ -143,8 +143,8 @@ class Requester:
             message=message,
             changes=changes,
             created_at=now,
-            deadline=now + patience,
-            has_long_timeout=patience > TIMEOUT_S,
+            deadline=now + timeout_s,
+            has_long_timeout=timeout_s > TIMEOUT_S,
             is_fragmented=is_bulky,
             avoids_handshake=is_light,
             extension_s=TIMEOUT_S if timeout is None else 0.0,
@@ -153,16 +153,16 @@ class Requester:
         is_open = (
             self._peers.find_usable_session(peer) is not None
         )  # before the request itself marks the session as in use
-        self._requests[number] = inquiry
+        self._requests[number] = request
         peer.add_request(number)
-        if is_open and (peer.in_flight < MAX_IN_FLIGHT or not inquiry.is_counted):
-            self._send_request(inquiry)
+        if is_open and (peer.in_flight < MAX_IN_FLIGHT or not request.is_counted):
+            self._send_request(request)
             return deferred
         peer.enqueue(number)
         self._queued += 1
-        self._set_timer(inquiry, patience)
-        if not is_open and not self._open_session(inquiry):
-            self._fail(inquiry, _HANDSHAKES_TEXT)
+        self._set_timer(request, timeout_s)
+        if not is_open and not self._open_session(request):
+            self._fail(request, _HANDSHAKES_TEXT)
         return deferred
 
     def notify(self, contact: Contact, method: str, arguments: tuple[object, ...]) -> None:
@@ -200,30 +200,30 @@ class Requester:
 
     def is_pending(self, number: int, public: bytes) -> bool:
         """Return whether the request ``number`` waits for an answer from the peer with that key."""
-        inquiry = self._requests.get(number)
-        return inquiry is not None and inquiry.peer.public == public
+        request = self._requests.get(number)
+        return request is not None and request.peer.public == public
 
     def record_progress(self, number: int, public: bytes) -> None:
         """Record that the peer acknowledged a fragment of a request, or that a fragment of its answer arrived."""
         if self.is_pending(number, public):
-            inquiry = self._requests[number]
-            inquiry.progress_at = self._clock.seconds()
-            inquiry.deadline = max(inquiry.deadline, inquiry.progress_at + inquiry.extension_s)
+            request = self._requests[number]
+            request.progress_at = self._clock.seconds()
+            request.deadline = max(request.deadline, request.progress_at + request.extension_s)
 
     def resolve(self, message: Answer | Failure, public: bytes) -> None:
         """Pass an answer to its caller, or count an answer that no request waits for."""
-        inquiry = self._requests.get(message.id)
-        if inquiry is None or inquiry.peer.public != public:
+        request = self._requests.get(message.id)
+        if request is None or request.peer.public != public:
             self._counters["unasked"] += 1
             return
-        is_timed = inquiry.tries > 0 and inquiry.progress_at < 0 and not inquiry.is_fragmented
+        is_timed = request.tries > 0 and request.progress_at < 0 and not request.is_fragmented
         if is_timed:  # otherwise the time includes the handshake or the transfer
-            self._peers.record_answer(inquiry.peer, inquiry.tries, self._clock.seconds() - inquiry.sent_at)
-        self._forget(inquiry)
+            self._peers.record_answer(request.peer, request.tries, self._clock.seconds() - request.sent_at)
+        self._forget(request)
         if isinstance(message, Answer):
-            inquiry.deferred.callback(message.value)
+            request.deferred.callback(message.value)
         else:
-            inquiry.deferred.errback(make_error(message))
+            request.deferred.errback(make_error(message))
 
     def send_waiting(self, peer: Peer, session: Session, is_owed: bool) -> None:
         """Send the messages that waited for a session; ``is_owed``: the peer waits for a datagram in it."""
@@ -233,99 +233,99 @@ class Requester:
             sent += 1
         peer.notifications = ()
         if is_owed:  # the peer may have lost the session in which these requests were sent
-            for inquiry in self._requests_to(peer):
-                if inquiry.tries:
-                    self._send_request(inquiry)
+            for request in self._requests_to(peer):
+                if request.tries:
+                    self._send_request(request)
                     sent += 1
         sent += self._send_queued(peer)
         if is_owed and not sent:
             self._send(session, b"")
 
-    def _send_request(self, inquiry: PendingRequest) -> None:
+    def _send_request(self, request: PendingRequest) -> None:
         """Send a request in the peer's newest session and set its timer."""
-        session = inquiry.peer.sessions[-1]
+        session = request.peer.sessions[-1]
         now = self._clock.seconds()
-        inquiry.tries += 1
-        if inquiry.tries == 1:
-            inquiry.sent_at = now
-            inquiry.peer.in_flight += inquiry.is_counted
-        message = set_remaining_time(inquiry.message, inquiry.deadline - now)
-        if inquiry.is_fragmented:
-            self._fragmenter.send(inquiry.peer.public, MessageKey(False, inquiry.number), message)
+        request.tries += 1
+        if request.tries == 1:
+            request.sent_at = now
+            request.peer.in_flight += request.is_counted
+        message = set_remaining_time(request.message, request.deadline - now)
+        if request.is_fragmented:
+            self._fragmenter.send(request.peer.public, MessageKey(False, request.number), message)
         else:
             self._send(session, message)
-        within = inquiry.deadline - inquiry.created_at
-        wait = self._peers.retry_interval(inquiry.peer.round_trip, inquiry.tries, within)
-        if inquiry.has_long_timeout and inquiry.tries > 1:
+        within = request.deadline - request.created_at
+        wait = self._peers.retry_interval(request.peer.round_trip, request.tries, within)
+        if request.has_long_timeout and request.tries > 1:
             # A slow method: the later retransmissions are for an answer that was lost.
-            wait = max(wait, (inquiry.deadline - now) / max(1, self._peers.tries + 1 - inquiry.tries))
-        self._set_timer(inquiry, wait)
+            wait = max(wait, (request.deadline - now) / max(1, self._peers.tries + 1 - request.tries))
+        self._set_timer(request, wait)
 
-    def _on_timer(self, inquiry: PendingRequest) -> None:
+    def _on_timer(self, request: PendingRequest) -> None:
         """Retransmit a request, open a session for it, or fail it, when its timer fires."""
-        now, peer = self._clock.seconds(), inquiry.peer
-        left = inquiry.deadline - now
-        if left <= 0 and inquiry.number in peer.queue and peer.session is not None:
+        now, peer = self._clock.seconds(), request.peer
+        left = request.deadline - now
+        if left <= 0 and request.number in peer.queue and peer.session is not None:
             # The request is queued behind others that the peer is answering; its delay does not mean that the peer
             # failed.
-            left = min(peer.session.last_received_at, inquiry.created_at + MAX_QUEUED_S) + inquiry.extension_s - now
+            left = min(peer.session.last_received_at, request.created_at + MAX_QUEUED_S) + request.extension_s - now
             if left <= 0:
-                self._fail(inquiry, _QUEUE_TIMEOUT_TEXT)
+                self._fail(request, _QUEUE_TIMEOUT_TEXT)
             else:
-                inquiry.deadline = now + left
-                self._set_timer(inquiry, left)
+                request.deadline = now + left
+                self._set_timer(request, left)
             return
         if left <= 0:
-            self._fail(inquiry, f"no answer in {now - inquiry.created_at:.2f} s")
+            self._fail(request, f"no answer in {now - request.created_at:.2f} s")
             return
         session = self._peers.find_usable_session(peer)
-        is_silent = session is not None and session.last_received_at <= inquiry.sent_at
+        is_silent = session is not None and session.last_received_at <= request.sent_at
         if session is None:
-            if not self._open_session(inquiry):
-                self._fail(inquiry, _HANDSHAKES_TEXT)
+            if not self._open_session(request):
+                self._fail(request, _HANDSHAKES_TEXT)
             else:
-                self._set_timer(inquiry, left)
-        elif inquiry.is_fragmented or inquiry.progress_at >= 0:
+                self._set_timer(request, left)
+        elif request.is_fragmented or request.progress_at >= 0:
             # The courier retransmits fragments; a handshake is needed only if the peer lost the session.
             if is_silent or now - session.last_received_at > MAX_TIMEOUT_S:
-                self._open_session(inquiry)
-            self._set_timer(inquiry, MAX_TIMEOUT_S)
-        elif inquiry.tries >= self._peers.tries:
+                self._open_session(request)
+            self._set_timer(request, MAX_TIMEOUT_S)
+        elif request.tries >= self._peers.tries:
             is_opening = peer.handshake is not None and not peer.handshake.is_waiting
-            if inquiry.has_long_timeout or not is_silent or is_opening or not peer.round_trip.is_measured:
-                self._set_timer(inquiry, left)
+            if request.has_long_timeout or not is_silent or is_opening or not peer.round_trip.is_measured:
+                self._set_timer(request, left)
             else:
-                self._fail(inquiry, f"no answer to {inquiry.tries} tries")
+                self._fail(request, f"no answer to {request.tries} tries")
         else:
-            if is_silent and not inquiry.avoids_handshake and inquiry.tries >= self._peers.tries_before_check(peer):
-                self._open_session(inquiry)  # the peer may have restarted without the session
-            self._send_request(inquiry)
+            if is_silent and not request.avoids_handshake and request.tries >= self._peers.tries_before_check(peer):
+                self._open_session(request)  # the peer may have restarted without the session
+            self._send_request(request)
 
     def _send_queued(self, peer: Peer) -> int:
         """Send queued requests to a peer up to ``MAX_IN_FLIGHT``; return their number."""
         sent = 0
         while peer.queue and peer.in_flight < MAX_IN_FLIGHT and self._peers.find_usable_session(peer) is not None:
-            inquiry = self._requests[next(iter(peer.queue))]
-            self._leave_queue(inquiry)
+            request = self._requests[next(iter(peer.queue))]
+            self._leave_queue(request)
             # Without a timeout from the caller, the time for the answer starts now.
-            inquiry.deadline = max(inquiry.deadline, self._clock.seconds() + inquiry.extension_s)
-            self._send_request(inquiry)
+            request.deadline = max(request.deadline, self._clock.seconds() + request.extension_s)
+            self._send_request(request)
             sent += 1
         return sent
 
-    def _leave_queue(self, inquiry: PendingRequest) -> None:
-        if inquiry.number in inquiry.peer.queue:
-            inquiry.peer.dequeue(inquiry.number)
+    def _leave_queue(self, request: PendingRequest) -> None:
+        if request.number in request.peer.queue:
+            request.peer.dequeue(request.number)
             self._queued -= 1
 
     def _requests_to(self, peer: Peer) -> list[PendingRequest]:
         return [self._requests[number] for number in peer.requests]
 
-    def _open_session(self, inquiry: PendingRequest) -> bool:
+    def _open_session(self, request: PendingRequest) -> bool:
         """Open a session for a request, which the INIT carries if allowed; return False for too many handshakes."""
-        left = inquiry.deadline - self._clock.seconds()
-        rider = b"" if inquiry.changes else set_remaining_time(inquiry.message, left)
-        return self._peers.open(inquiry.peer, inquiry.address, rider, within=min(left, HANDSHAKE_S))
+        left = request.deadline - self._clock.seconds()
+        early_message = b"" if request.changes else set_remaining_time(request.message, left)
+        return self._peers.open(request.peer, request.address, early_message, within=min(left, HANDSHAKE_S))
 
     def _fail_unanswered(self, opening: OutgoingHandshake) -> None:
         """Fail the requests that waited for a handshake that got no answer."""
@@ -333,59 +333,59 @@ class Requester:
         self._counters["untold"] += len(peer.notifications)
         peer.notifications = ()
         if peer.sessions:
-            for inquiry in self._requests_to(peer):
-                if inquiry.tries >= self._peers.tries:  # it waited for this handshake only
-                    self._on_timer(inquiry)
+            for request in self._requests_to(peer):
+                if request.tries >= self._peers.tries:  # it waited for this handshake only
+                    self._on_timer(request)
             return  # the others have their own timers
-        for inquiry in self._requests_to(peer):
-            was_tried = inquiry.created_at <= opening.started_at and inquiry.address == opening.address
-            if inquiry.has_long_timeout or not was_tried:
-                if not self._open_session(inquiry):
-                    self._fail(inquiry, _HANDSHAKES_TEXT)
+        for request in self._requests_to(peer):
+            was_tried = request.created_at <= opening.started_at and request.address == opening.address
+            if request.has_long_timeout or not was_tried:
+                if not self._open_session(request):
+                    self._fail(request, _HANDSHAKES_TEXT)
             else:
-                self._fail(inquiry, f"no answer to {opening.tries} handshakes")
+                self._fail(request, f"no answer to {opening.tries} handshakes")
 
-    def _set_timer(self, inquiry: PendingRequest, wait: float) -> None:
-        cancel(inquiry.timer)
-        wait = max(0.0, min(wait, inquiry.deadline - self._clock.seconds()))
-        inquiry.timer = self._clock.callLater(wait, self._on_timer, inquiry)
+    def _set_timer(self, request: PendingRequest, wait: float) -> None:
+        cancel(request.timer)
+        wait = max(0.0, min(wait, request.deadline - self._clock.seconds()))
+        request.timer = self._clock.callLater(wait, self._on_timer, request)
 
-    def _fail_all(self, inquiries: list[PendingRequest], error: Callable[[], Exception]) -> None:
-        for inquiry in inquiries:
-            self._remove(inquiry)
-        for inquiry in inquiries:
-            inquiry.deferred.errback(error())
+    def _fail_all(self, requests: list[PendingRequest], error: Callable[[], Exception]) -> None:
+        for request in requests:
+            self._remove(request)
+        for request in requests:
+            request.deferred.errback(error())
 
-    def _fail(self, inquiry: PendingRequest, why: str) -> None:
-        self._forget(inquiry)
+    def _fail(self, request: PendingRequest, why: str) -> None:
+        self._forget(request)
         kind = Crowded if why in (_HANDSHAKES_TEXT, _QUEUE_TIMEOUT_TEXT) else NoAnswer
-        inquiry.deferred.errback(kind(f"{inquiry.method} asked of {inquiry.address}: {why}"))
+        request.deferred.errback(kind(f"{request.method} asked of {request.address}: {why}"))
 
-    def _cancel(self, inquiry: PendingRequest) -> None:
+    def _cancel(self, request: PendingRequest) -> None:
         """Forget a request that its caller cancelled, and notify the peer."""
-        self._forget(inquiry)
-        session = self._peers.find_usable_session(inquiry.peer)
-        if session is not None and inquiry.tries:
-            self._send(session, encode(Cancel(inquiry.number)))
+        self._forget(request)
+        session = self._peers.find_usable_session(request.peer)
+        if session is not None and request.tries:
+            self._send(session, encode(Cancel(request.number)))
 
-    def _forget(self, inquiry: PendingRequest) -> None:
+    def _forget(self, request: PendingRequest) -> None:
         """Remove a request and send the next queued one."""
-        self._remove(inquiry)
-        self._send_queued(inquiry.peer)
+        self._remove(request)
+        self._send_queued(request.peer)
 
-    def _remove(self, inquiry: PendingRequest) -> None:
-        cancel(inquiry.timer)
-        if self._requests.pop(inquiry.number, None) is None:
+    def _remove(self, request: PendingRequest) -> None:
+        cancel(request.timer)
+        if self._requests.pop(request.number, None) is None:
             return
-        inquiry.peer.remove_request(inquiry.number)
-        self._leave_queue(inquiry)
-        if inquiry.tries:
-            inquiry.peer.in_flight -= inquiry.is_counted
-        if inquiry.is_fragmented:
-            self._fragmenter.drop(inquiry.peer.public, MessageKey(False, inquiry.number))
-            self._fragmenter.release(inquiry.peer.public, len(inquiry.message))
-        if inquiry.progress_at >= 0:
-            self._fragmenter.forget_incoming(inquiry.peer.public, MessageKey(True, inquiry.number))
+        request.peer.remove_request(request.number)
+        self._leave_queue(request)
+        if request.tries:
+            request.peer.in_flight -= request.is_counted
+        if request.is_fragmented:
+            self._fragmenter.drop(request.peer.public, MessageKey(False, request.number))
+            self._fragmenter.release(request.peer.public, len(request.message))
+        if request.progress_at >= 0:
+            self._fragmenter.forget_incoming(request.peer.public, MessageKey(True, request.number))
 
 
 def _format_too_large(method: str, message: bytes, most: int) -> str:

@@ -97,7 +97,7 @@ class Credentials:
 class HandshakeFields(NamedTuple):
     """A node's fields of a handshake: its incarnation and its pass.
 
-    ``room`` is the maximum length of the other side's pass.
+    ``max_pass_bytes`` is the maximum length of the other side's pass.
     """
 
     incarnation: Incarnation = UNNUMBERED
@@ -137,7 +137,7 @@ class Response(NamedTuple):
 class InitiatorHandshake:
     """The initiator's half of a handshake; ``mac`` is the first of the two hashes in its INIT.
 
-    ``stamp`` is the timestamp of the INIT: higher than in every earlier INIT of this incarnation.
+    ``timestamp`` is the timestamp of the INIT: higher than in every earlier INIT of this incarnation.
     """
 
     def __init__(
@@ -146,9 +146,9 @@ class InitiatorHandshake:
         remote_static: bytes,
         ephemeral_secret: bytes,
         local_index: int,
-        rider: bytes,
+        early_message: bytes,
         hello: HandshakeFields = OPEN_TEAM_FIELDS,
-        stamp: int = 0,
+        timestamp: int = 0,
     ) -> None:
         self.credentials = own
         self._noise = Initiator(own.static, remote_static, ephemeral_secret, PROLOGUE, own.psk)
@@ -159,9 +159,9 @@ class InitiatorHandshake:
             + own.public
             + _pack_incarnation(hello.incarnation)
             + _prefix_length(hello.own_pass)
-            + _prefix_length(rider)
+            + _prefix_length(early_message)
         )
-        payload += stamp.to_bytes(TIMESTAMP_BYTES, "little")
+        payload += timestamp.to_bytes(TIMESTAMP_BYTES, "little")
         payload = payload.ljust(_PAYLOAD_BYTES + hello.min_init_bytes - _INIT_FIXED_BYTES, b"\0")
         bare = bytes([INIT]) + self._noise.write(payload)
         self.mac = _keyed_hash(own.mac_key, bare)
@@ -180,15 +180,15 @@ class InitiatorHandshake:
         """
         payload, keys = self._noise.copy().read(datagram[1 + INDEX_BYTES :])
         index = int.from_bytes(payload[:INDEX_BYTES], "little")
-        life = _unpack_incarnation(payload[INDEX_BYTES : INDEX_BYTES + _INCARNATION_BYTES])
+        incarnation = _unpack_incarnation(payload[INDEX_BYTES : INDEX_BYTES + _INCARNATION_BYTES])
         seen = parse_address(payload[INDEX_BYTES + _INCARNATION_BYTES : _RESP_PASS_AT])
-        shown, message = _split_prefixed(payload, _RESP_PASS_AT)
+        peer_pass, message = _split_prefixed(payload, _RESP_PASS_AT)
         if index:
-            return Response(index, life, seen, shown, message, "", keys)
+            return Response(index, incarnation, seen, peer_pass, message, "", keys)
         refusal = message.decode("ascii", errors="replace")
         if not is_refusal(refusal):
             raise Forged("the RESP has neither a session nor a refusal")
-        return Response(0, life, seen, b"", b"", refusal, keys)
+        return Response(0, incarnation, seen, b"", b"", refusal, keys)
 
 
 class ResponderHandshake:
@@ -222,7 +222,7 @@ class ResponderHandshake:
     def accept(
         self, local_index: int, answer: bytes, seen: Address, hello: HandshakeFields = OPEN_TEAM_FIELDS
     ) -> tuple[bytes, TransportKeys]:
-        """Return the RESP with ``answer`` (at most ``answer_room`` bytes), and the keys."""
+        """Return the RESP with ``answer`` (at most ``max_answer_bytes`` bytes), and the keys."""
         index = local_index.to_bytes(INDEX_BYTES, "little")
         payload = (
             index + _pack_incarnation(hello.incarnation) + pack_address(seen) + _prefix_length(hello.own_pass) + answer
@@ -230,9 +230,9 @@ class ResponderHandshake:
         message, keys = self._noise.write(payload)
         return bytes([RESP]) + self.remote_index.to_bytes(INDEX_BYTES, "little") + message, keys
 
-    def refuse(self, code: str, seen: Address, life: Incarnation) -> bytes:
+    def refuse(self, code: str, seen: Address, incarnation: Incarnation) -> bytes:
         """Return the RESP that rejects the initiator."""
-        return self.accept(0, code.encode("ascii"), seen, HandshakeFields(life))[0]
+        return self.accept(0, code.encode("ascii"), seen, HandshakeFields(incarnation))[0]
 
 
 def is_init_of_team(own: Credentials, datagram: bytes) -> bool:
@@ -259,8 +259,8 @@ def _keyed_hash(key: bytes, data: bytes) -> bytes:
     return hashlib.blake2s(data, key=key, digest_size=MAC_BYTES).digest()
 
 
-def _pack_incarnation(life: Incarnation) -> bytes:
-    return life.number.to_bytes(8, "little") + life.nonce
+def _pack_incarnation(incarnation: Incarnation) -> bytes:
+    return incarnation.number.to_bytes(8, "little") + incarnation.nonce
 
 
 def _unpack_incarnation(packed: bytes) -> Incarnation:
@@ -287,8 +287,8 @@ class Session:
 
     ``local_index`` identifies the session at this node, ``remote_index`` at the peer.  ``contact`` is the peer with the
     source address of its newest datagram.  ``is_confirmed``: the peer has proved at that address that it holds the
-    keys; before that nothing may be sent.  Times are seconds of the endpoint's clock.  ``life`` is the incarnation of
-    the peer; ``is_over``: a later incarnation has replaced it.  ``shown`` is the pass in its INIT, until the session is
+    keys; before that nothing may be sent.  Times are seconds of the endpoint's clock.  ``incarnation`` is the incarnation of
+    the peer; ``is_superseded``: a later incarnation has replaced it.  ``shown`` is the pass in its INIT, until the session is
     confirmed.
     """
 
@@ -317,10 +317,10 @@ class Session:
         keys: TransportKeys,
         now: float,
         is_confirmed: bool,
-        life: Incarnation = UNNUMBERED,
+        incarnation: Incarnation = UNNUMBERED,
     ) -> None:
         self.contact = contact
-        self.incarnation = life
+        self.incarnation = incarnation
         self.is_superseded = False
         self.peer_pass = b""
         self.local_index = local_index

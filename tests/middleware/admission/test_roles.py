@@ -36,7 +36,7 @@ from middleware.tasks import task as tasks
 from sim.demo.trials import run_trial
 from swarmnode import assembly, deploy
 from swarmnode.simulated_team import SimulatedTeam
-from tests.swarmnode.team import KEY, World
+from tests.swarmnode.team import KEY, MemoryTeam
 from webnode import revocation
 
 ABSENT = ("roll.", "reach.")
@@ -82,7 +82,7 @@ class TableTests(SynchronousTestCase):
             "faults": {"allow": True},
             "deployment": {"allow": True},
         }
-        made = assembly.assemble_node(Settings.from_mapping(tables, "test"), World().seams("a", 7000))
+        made = assembly.assemble_node(Settings.from_mapping(tables, "test"), MemoryTeam().make_dependencies("a", 7000))
         node = made.node
         _ = node.entangled.take_acceptor, node.council_manager, node.auction_service
         return set(node.entangled.endpoint._dispatcher.methods)

@@ -116,7 +116,7 @@ class Village(Simulation):
             self.clock,
             self.make_life_rng(place),
             wall=self.wall,
-            door=house.team.admission,
+            admission=house.team.admission,
         )
         house.team.attach(house.node, self.clock)
         house.node.start()

@@ -170,7 +170,7 @@ class WeatherTests(GroundCase):
         at_b = peer.session.contact.address
         port = ground.networks["a2"].source_address(at_b).port
         self.assertIn(port, a.nat._additional_ports)
-        a.nat.external.record(peer.session.contact, Address(ground.routers["a"].host, 3), is_told=True)
+        a.nat.external.record(peer.session.contact, Address(ground.routers["a"].host, 3), is_change=True)
         self.assertEqual(len(a.endpoint.peers._handshakes), 0)
         a.nat._assign_port(peer, [at_b], 0)
         self.assertEqual(ground.networks["a2"].source_address(at_b).port, port)
