@@ -165,9 +165,9 @@ class BaseDriver:
         """Return the newest observation, None before the first; never blocks."""
         return self._newest
 
-    def subscribe(self, seen: Callable[[Observation], None]) -> Callable[[], None]:
-        """Call ``seen`` with each observation; return a function that ends the subscription."""
-        return self._subscribers.add(seen)
+    def subscribe(self, callback: Callable[[Observation], None]) -> Callable[[], None]:
+        """Call ``callback`` with each observation; return a function that ends the subscription."""
+        return self._subscribers.add(callback)
 
     def invoke(self, name: str, **arguments: float | str) -> Deferred[Mapping[str, Value]]:
         """Run one of ``description.skills``, or query a value that is not part of the observations."""
@@ -346,9 +346,9 @@ class Reader(Protocol):
 
 
 class LinkedDriver(BaseDriver):
-    """A robot at the other end of one link, which ``connector`` opens to ``place`` (host and port, or device and baud).
+    """A robot at the end of one link, which ``connector`` opens to ``endpoint``: host and port, or device and baud.
 
-    A kind of robot creates ``_reader`` for each new link and handles the messages in ``_heard``.
+    A kind of robot creates ``_reader`` for each new link and handles the messages in ``_on_message``.
     """
 
     def __init__(
@@ -357,12 +357,12 @@ class LinkedDriver(BaseDriver):
         name: str,
         clock: IReactorTime,
         connector: Connector,
-        place: tuple[str, int],
+        endpoint: tuple[str, int],
         dead_man: DeadManSwitch | None = None,
     ) -> None:
         super().__init__(description, name, clock, dead_man)
         self._connector = connector
-        self._endpoint = place
+        self._endpoint = endpoint
         self._reconnector: Reconnector | None = None
         self._link: Link | None = None
         self._reader: Reader

@@ -133,9 +133,9 @@ class CompositeDriver:
             self._newest = None if source is None else self._merge_parts(source)
         return self._newest
 
-    def subscribe(self, seen: Callable[[Observation], None]) -> Callable[[], None]:
-        """Call ``seen`` with each observation of the robot; return a function that ends the subscription."""
-        return self._subscribers.add(seen)
+    def subscribe(self, callback: Callable[[Observation], None]) -> Callable[[], None]:
+        """Call ``callback`` with each observation of the robot; return a function that ends the subscription."""
+        return self._subscribers.add(callback)
 
     def invoke(self, name: str, **arguments: float | str) -> Deferred[Mapping[str, Value]]:
         """Run the skill on the robot, or on the first part that has it."""

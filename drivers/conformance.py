@@ -3,10 +3,10 @@
 ::
 
     class RoverTests(Conformance, SynchronousTestCase):
-        bench = partial(MemoryBench, Rover, Emulator, {"host": "rover"})
+        rig = partial(MemoryRig, Rover, Emulator, {"host": "rover"})
 
-Without a test case, ``broken(partial(MemoryBench, ...))`` returns a line for each rule that is broken.  For another
-kind of test rig set ``bench`` to a function that creates it, or implement the methods of ``Bench`` in the test case.
+Without a test case, ``find_violations(partial(MemoryRig, ...))`` returns a line for each rule that is broken.  For
+another kind of test rig set ``rig`` to a function that creates it, or implement ``Rig`` in the test case.
 
 Devices that only sense (a description without limits) are exempt from the rules of motion.
 """
@@ -62,7 +62,7 @@ class Rig(Protocol):
 
 
 class EmulatedRobot(Protocol):
-    """An emulated robot for ``MemoryBench``; it is created with its clock."""
+    """An emulated robot for ``MemoryRig``; it is created with its clock."""
 
     def accept(self, link: Link) -> Receiver:
         """Serve a new link; return the receiver of its data."""
@@ -127,9 +127,9 @@ class SubscriberError(Exception):
     """Raised deliberately by a subscriber."""
 
 
-def check_describes(bench: Rig) -> None:
+def check_describes(rig: Rig) -> None:
     """The driver describes its robot before it connects, and the description does not change."""
-    driver = bench.make_driver()
+    driver = rig.make_driver()
     robot = driver.description
     _require(driver.state == "idle", f"before connect its state is {driver.state!r}, not 'idle'")
     _require(driver.observe() is None, "it observes something before it is connected")
@@ -146,13 +146,13 @@ def check_describes(bench: Rig) -> None:
         json.dumps({name: dict(about) for name, about in robot.capabilities.items()}, allow_nan=False)
     except (TypeError, ValueError) as error:
         raise RuleViolation(f"its capabilities are not valid JSON: {error}") from error
-    _connect(bench, driver)
+    _connect(rig, driver)
     _require(driver.description == robot, "its description changes when it connects")
 
 
-def check_connects(bench: Rig) -> None:
+def check_connects(rig: Rig) -> None:
     """The Deferred of ``connect`` fires when the first observation has arrived, and not before."""
-    driver = bench.make_driver()
+    driver = rig.make_driver()
     has_seen: list[bool] = []
 
     def fired(description: Description) -> Description:
@@ -162,42 +162,42 @@ def check_connects(bench: Rig) -> None:
     connected = _Result(driver.connect().addCallback(fired))
     _require(not connected.has_fired, "connect fires within its own call")
     _require(driver.state == "connecting", f"while it connects its state is {driver.state!r}")
-    bench.pass_time(bench.settle_s)
+    rig.pass_time(rig.settle_s)
     _require(connected.value("connect") == driver.description, "connect does not fire with the description")
     _require(has_seen == [True], "connect fires before there is something to observe")
     _require(driver.state == "ready", f"connected its state is {driver.state!r}, not 'ready'")
     _require(_Result(driver.connect()).is_error(DriverError), "a connected driver can be connected again")
 
 
-def check_motors(bench: Rig) -> None:
+def check_motors(rig: Rig) -> None:
     """Nothing moves before ``enable`` or after ``disable``; ``enable`` permits motion again."""
-    driver = bench.make_driver()
+    driver = rig.make_driver()
     action = _make_half_speed_action(driver)
-    _check_refused(NotEnabled, driver, action, _grant(bench), "before it is connected")
-    _connect(bench, driver)
+    _check_refused(NotEnabled, driver, action, _grant(rig), "before it is connected")
+    _connect(rig, driver)
     if action:
-        _check_refused(NotEnabled, driver, action, _grant(bench), "before enable")
-        bench.pass_time(HALT_S)
-        _require_rest(bench, driver, "before enable")
-    _enable(bench, driver)
-    driver.act(action, _grant(bench, 30.0))
-    bench.pass_time(bench.settle_s)
+        _check_refused(NotEnabled, driver, action, _grant(rig), "before enable")
+        rig.pass_time(HALT_S)
+        _require_rest(rig, driver, "before enable")
+    _enable(rig, driver)
+    driver.act(action, _grant(rig, 30.0))
+    rig.pass_time(rig.settle_s)
     disabled = _Result(driver.disable())
-    bench.pass_time(bench.settle_s)
+    rig.pass_time(rig.settle_s)
     _require(disabled.value("disable") is True, "disable does not fire with True")
     _require(driver.state == "stopped", f"disabled its state is {driver.state!r}, not 'stopped'")
-    _require_rest(bench, driver, "after disable")
-    _check_refused(NotEnabled, driver, action, _grant(bench), "after disable")
-    _enable(bench, driver)
-    driver.act(action, _grant(bench))
+    _require_rest(rig, driver, "after disable")
+    _check_refused(NotEnabled, driver, action, _grant(rig), "after disable")
+    _enable(rig, driver)
+    driver.act(action, _grant(rig))
 
 
-def check_clips(bench: Rig) -> None:
+def check_clips(rig: Rig) -> None:
     """``act`` returns the action that is really performed, within the limits of the description."""
-    driver = _make_ready_driver(bench)
+    driver = _make_ready_driver(rig)
     for key, (low, high) in driver.description.limits.items():
         for wanted in (low - 99.0, high + 99.0):
-            done = driver.act({**dict.fromkeys(driver.description.limits, 0.0), key: wanted}, _grant(bench))
+            done = driver.act({**dict.fromkeys(driver.description.limits, 0.0), key: wanted}, _grant(rig))
             _require(isinstance(done, Mapping) and key in done, f"the result of act lacks {key}")
             for name, value in done.items():
                 least, most = driver.description.limits.get(name, (-math.inf, math.inf))
@@ -208,183 +208,183 @@ def check_clips(bench: Rig) -> None:
     axis = _select_axis(driver)
     if axis:
         high = driver.description.limits[axis][1]
-        done = driver.act({**dict.fromkeys(driver.description.limits, 0.0), axis: high + 99.0}, _grant(bench))
+        done = driver.act({**dict.fromkeys(driver.description.limits, 0.0), axis: high + 99.0}, _grant(rig))
         _require(done[axis] > 0.5 * high, f"beyond its limit it performs {axis} = {done[axis]:g}, not {high:g}")
 
 
-def check_keeps(bench: Rig) -> None:
+def check_keeps(rig: Rig) -> None:
     """A key that an action omits keeps its value while the last command holds, and is zero after a stop."""
-    driver = _make_ready_driver(bench)
+    driver = _make_ready_driver(rig)
     axis = _select_axis(driver)
     if not axis:
         return
-    first = driver.act(_make_half_speed_action(driver), _grant(bench))[axis]
-    _require(driver.act({}, _grant(bench)).get(axis) == first, f"{axis} changes though the next action omits it")
+    first = driver.act(_make_half_speed_action(driver), _grant(rig))[axis]
+    _require(driver.act({}, _grant(rig)).get(axis) == first, f"{axis} changes though the next action omits it")
     driver.stop()
-    after = driver.act({}, _grant(bench)).get(axis)
+    after = driver.act({}, _grant(rig)).get(axis)
     _require(after == 0.0, f"after a stop an empty action performs {axis} = {after!r}")
 
 
-def check_refuses(bench: Rig) -> None:
+def check_refuses(rig: Rig) -> None:
     """An unknown key, or a value that is not a finite number, raises ``Unsupported``, and nothing moves."""
-    driver = _make_ready_driver(bench)
-    _check_refused(Unsupported, driver, {"base.warp": 1.0}, _grant(bench), "with an unknown key")
+    driver = _make_ready_driver(rig)
+    _check_refused(Unsupported, driver, {"base.warp": 1.0}, _grant(rig), "with an unknown key")
     for value in INVALID_NUMBERS if _select_axis(driver) else ():
         action: Any = {_select_axis(driver): value}
-        _check_refused(Unsupported, driver, action, _grant(bench), f"with {value!r}")
+        _check_refused(Unsupported, driver, action, _grant(rig), f"with {value!r}")
         action = {**_make_half_speed_action(driver), "base.warp": 1.0}
-        _check_refused(Unsupported, driver, action, _grant(bench), "with a key too many")
-    bench.pass_time(HALT_S)
-    _require_rest(bench, driver, "after a refused action")
+        _check_refused(Unsupported, driver, action, _grant(rig), "with a key too many")
+    rig.pass_time(HALT_S)
+    _require_rest(rig, driver, "after a refused action")
 
 
-def check_deadline(bench: Rig) -> None:
+def check_deadline(rig: Rig) -> None:
     """The robot moves until its permit expires and then stops by itself; a new permit extends the motion."""
-    driver = _make_ready_driver(bench)
+    driver = _make_ready_driver(rig)
     if not _select_axis(driver):
         return
-    wanted = abs(driver.act(_make_half_speed_action(driver), _grant(bench, 0.6))[_select_axis(driver)])
-    bench.pass_time(0.5)
-    _require(bench.true_speed() > 0.5 * wanted, f"it reports {wanted:g} m/s and moves at {bench.true_speed():g}")
-    driver.act(_make_half_speed_action(driver), _grant(bench, 0.6))
-    bench.pass_time(0.5)
-    _require(bench.true_speed() > 0.5 * wanted, "it stops at the deadline of a command that was renewed")
-    bench.pass_time(0.1 + HALT_S)
-    _require_rest(bench, driver, "after its deadline")
+    wanted = abs(driver.act(_make_half_speed_action(driver), _grant(rig, 0.6))[_select_axis(driver)])
+    rig.pass_time(0.5)
+    _require(rig.true_speed() > 0.5 * wanted, f"it reports {wanted:g} m/s and moves at {rig.true_speed():g}")
+    driver.act(_make_half_speed_action(driver), _grant(rig, 0.6))
+    rig.pass_time(0.5)
+    _require(rig.true_speed() > 0.5 * wanted, "it stops at the deadline of a command that was renewed")
+    rig.pass_time(0.1 + HALT_S)
+    _require_rest(rig, driver, "after its deadline")
 
 
-def check_token(bench: Rig) -> None:
+def check_token(rig: Rig) -> None:
     """A lower token than one seen, or a deadline that has passed, raises ``StaleCommand`` and is counted."""
-    driver = _make_ready_driver(bench)
+    driver = _make_ready_driver(rig)
     action = _make_half_speed_action(driver)
-    driver.act(action, _grant(bench, token=5))
+    driver.act(action, _grant(rig, token=5))
     _require(driver.token == 5, f"after it obeyed token 5 its token is {driver.token!r}")
-    _check_refused(StaleCommand, driver, action, _grant(bench, token=4), "with a lower token")
-    for deadline in (bench.now(), bench.now() - 1.0, math.nan, math.inf):
-        when = f"with the deadline {deadline!r}, at {bench.now()!r}"
+    _check_refused(StaleCommand, driver, action, _grant(rig, token=4), "with a lower token")
+    for deadline in (rig.now(), rig.now() - 1.0, math.nan, math.inf):
+        when = f"with the deadline {deadline!r}, at {rig.now()!r}"
         _check_refused(StaleCommand, driver, action, Permit(6, deadline), when)
-    driver.act(action, _grant(bench, token=5))
+    driver.act(action, _grant(rig, token=5))
     driver.stop()
-    _check_refused(StaleCommand, driver, action, _grant(bench, token=4), "with a lower token, after a stop")
+    _check_refused(StaleCommand, driver, action, _grant(rig, token=4), "with a lower token, after a stop")
     counts = driver.diagnostics()
     _require((counts["accepted"], counts["lower token"], counts["late"]) == (2, 2, 4), "it miscounts commands")
 
 
-def check_stops(bench: Rig) -> None:
+def check_stops(rig: Rig) -> None:
     """``stop`` is never refused, in any state, and ends the motion."""
-    driver = bench.make_driver()
+    driver = rig.make_driver()
     driver.stop()
     connecting = _Result(driver.connect())
     driver.stop()
-    bench.pass_time(bench.settle_s)
+    rig.pass_time(rig.settle_s)
     connecting.value("connect, after stop,")
-    _enable(bench, driver)
-    driver.act(_make_half_speed_action(driver), _grant(bench, 30.0))
-    bench.pass_time(0.3)
+    _enable(rig, driver)
+    driver.act(_make_half_speed_action(driver), _grant(rig, 30.0))
+    rig.pass_time(0.3)
     done = driver.stop()
     _require(set(done) == set(driver.description.limits), "the result of stop lacks a key of the limits")
     _require(not any(done.values()), f"stop returns a motion that is not zero: {dict(done)!r}")
-    bench.pass_time(HALT_S)
-    _require_rest(bench, driver, "after stop")
+    rig.pass_time(HALT_S)
+    _require_rest(rig, driver, "after stop")
     _Result(driver.disable())
     driver.stop()
-    bench.pass_time(bench.settle_s)
+    rig.pass_time(rig.settle_s)
     driver.stop()
-    if _try_cut_link(bench, driver):
+    if _try_cut_link(rig, driver):
         driver.stop()
     _Result(driver.disconnect())
     driver.stop()
-    bench.pass_time(bench.settle_s)
+    rig.pass_time(rig.settle_s)
     driver.stop()
 
 
-def check_ends(bench: Rig) -> None:
+def check_ends(rig: Rig) -> None:
     """``disconnect`` stops the motion first, is final, and may be called twice and in any state."""
-    idle = bench.make_driver()
+    idle = rig.make_driver()
     left = _Result(idle.disconnect())
-    bench.pass_time(bench.settle_s)
+    rig.pass_time(rig.settle_s)
     left.value("disconnect before connect")
     _require(idle.state == "closed", f"disconnected before connect its state is {idle.state!r}")
-    early = bench.make_driver()
+    early = rig.make_driver()
     connecting = _Result(early.connect())
     _Result(early.disconnect())
-    bench.pass_time(bench.settle_s)
+    rig.pass_time(rig.settle_s)
     _require(connecting.is_error(DriverError), "disconnect during connect does not make connect fail")
-    driver = _make_ready_driver(bench)
-    driver.act(_make_half_speed_action(driver), _grant(bench, 30.0))
-    bench.pass_time(0.3)
+    driver = _make_ready_driver(rig)
+    driver.act(_make_half_speed_action(driver), _grant(rig, 30.0))
+    rig.pass_time(0.3)
     first, second = _Result(driver.disconnect()), _Result(driver.disconnect())
     _require(driver.state == "closed", f"disconnected its state is {driver.state!r}, not 'closed'")
-    bench.pass_time(bench.settle_s)
+    rig.pass_time(rig.settle_s)
     first.value("disconnect")
     second.value("disconnect, called twice,")
-    _require_rest(bench, driver, "after disconnect")
+    _require_rest(rig, driver, "after disconnect")
     _require(_Result(driver.connect()).is_error(DriverError), "after disconnect it can be connected again")
-    _check_refused(DriverError, driver, _make_half_speed_action(driver), _grant(bench), "after disconnect")
+    _check_refused(DriverError, driver, _make_half_speed_action(driver), _grant(rig), "after disconnect")
 
 
-def check_leaves(bench: Rig) -> None:
+def check_leaves(rig: Rig) -> None:
     """After ``disconnect``, or a cancelled ``connect``, it is closed and has no pending calls on its clock."""
-    driver = _make_ready_driver(bench)
-    driver.act(_make_half_speed_action(driver), _grant(bench, 30.0))
+    driver = _make_ready_driver(rig)
+    driver.act(_make_half_speed_action(driver), _grant(rig, 30.0))
     _Result(driver.disconnect())
-    bench.pass_time(bench.settle_s)
-    _require_no_pending_calls(bench, "")
+    rig.pass_time(rig.settle_s)
+    _require_no_pending_calls(rig, "")
     for seconds in (0.0, 0.01):
-        driver, seen = bench.make_driver(), list[Observation]()
+        driver, seen = rig.make_driver(), list[Observation]()
         connecting = driver.connect()
         _Result(connecting)
-        bench.pass_time(seconds)
+        rig.pass_time(seconds)
         if driver.observe() is not None:
             _Result(driver.disconnect())
-            bench.pass_time(bench.settle_s)
+            rig.pass_time(rig.settle_s)
             return
         driver.subscribe(seen.append)
         connecting.cancel()
-        bench.pass_time(bench.settle_s)
+        rig.pass_time(rig.settle_s)
         _require(driver.state == "closed", f"after a cancelled connect its state is {driver.state!r}, not 'closed'")
         _require(not seen, "after a cancelled connect it still observes")
-        _require_no_pending_calls(bench, "after a cancelled connect ")
+        _require_no_pending_calls(rig, "after a cancelled connect ")
 
 
-def check_link(bench: Rig) -> None:
+def check_link(rig: Rig) -> None:
     """A lost link makes it stale and ends the motion; it reconnects by itself, at rest."""
-    driver = _make_ready_driver(bench)
-    driver.act(_make_half_speed_action(driver), _grant(bench, 30.0))
-    bench.pass_time(0.3)
-    if not _try_cut_link(bench, driver):
+    driver = _make_ready_driver(rig)
+    driver.act(_make_half_speed_action(driver), _grant(rig, 30.0))
+    rig.pass_time(0.3)
+    if not _try_cut_link(rig, driver):
         return
     _require(driver.state == "stale", f"without its link its state is {driver.state!r}, not 'stale'")
-    _check_refused(NotEnabled, driver, _make_half_speed_action(driver), _grant(bench), "without its link")
-    bench.pass_time(max(1.0, 2.0 * bench.settle_s))
+    _check_refused(NotEnabled, driver, _make_half_speed_action(driver), _grant(rig), "without its link")
+    rig.pass_time(max(1.0, 2.0 * rig.settle_s))
     _require(driver.state == "ready", f"with its link back its state is {driver.state!r}, not 'ready'")
-    _require_rest(bench, driver, "after a lost link")
+    _require_rest(rig, driver, "after a lost link")
     counts = driver.diagnostics()
     _require(counts["reconnects"] == 1.0, f"it reconnected once and counts {counts['reconnects']:g} reconnects")
-    driver.act(_make_half_speed_action(driver), _grant(bench))
+    driver.act(_make_half_speed_action(driver), _grant(rig))
 
 
-def check_times(bench: Rig) -> None:
+def check_times(rig: Rig) -> None:
     """Observations arrive in order of time, none from the future, and ``observe`` returns the newest."""
-    driver = _make_ready_driver(bench)
+    driver = _make_ready_driver(rig)
     seen: list[Observation] = []
     driver.subscribe(seen.append)
-    bench.pass_time(2.0 * bench.settle_s)
-    _require(len(seen) > 1, f"in {2.0 * bench.settle_s:g} s it observes {len(seen)} times")
+    rig.pass_time(2.0 * rig.settle_s)
+    _require(len(seen) > 1, f"in {2.0 * rig.settle_s:g} s it observes {len(seen)} times")
     for before, after in zip(seen, seen[1:], strict=False):
         _require(before.t_host <= after.t_host, f"t_host goes back from {before.t_host} to {after.t_host}")
         _require(before.t_robot <= after.t_robot, f"t_robot goes back from {before.t_robot} to {after.t_robot}")
-    _require(seen[-1].t_host <= bench.now(), f"t_host {seen[-1].t_host} is later than now, {bench.now()}")
-    _require(seen[-1].t_host > bench.now() - bench.settle_s, "t_host is not a time on the driver's clock")
+    _require(seen[-1].t_host <= rig.now(), f"t_host {seen[-1].t_host} is later than now, {rig.now()}")
+    _require(seen[-1].t_host > rig.now() - rig.settle_s, "t_host is not a time on the driver's clock")
     _require(driver.observe() is seen[-1], "observe does not return the newest observation")
     for key, value in seen[-1].values.items():
         _require(isinstance(value, bool | int | float | str), f"{key} is {value!r}")
         _require(isinstance(value, str) or not math.isinf(value), f"{key} is infinite; use NaN for nothing in range")
 
 
-def check_subscribers(bench: Rig) -> None:
+def check_subscribers(rig: Rig) -> None:
     """Each subscriber is called until it unsubscribes, even if another one raises."""
-    driver = _make_ready_driver(bench)
+    driver = _make_ready_driver(rig)
     seen: list[Observation] = []
 
     def faulty(_observation: Observation) -> None:
@@ -392,21 +392,21 @@ def check_subscribers(bench: Rig) -> None:
 
     end_faulty = driver.subscribe(faulty)
     end = driver.subscribe(seen.append)
-    bench.pass_time(bench.settle_s)
+    rig.pass_time(rig.settle_s)
     _require(bool(seen), "a subscriber is not called if another one raises")
     end_faulty()
     end()
     end()
     count = len(seen)
-    bench.pass_time(bench.settle_s)
+    rig.pass_time(rig.settle_s)
     _require(len(seen) == count, "a subscriber is called after it unsubscribed")
 
 
-def check_counts(bench: Rig) -> None:
+def check_counts(rig: Rig) -> None:
     """``diagnostics`` returns numbers under the agreed names in any state; ``age`` is the newest observation's."""
-    driver = bench.make_driver()
+    driver = rig.make_driver()
     _require(driver.diagnostics().get("age") == math.inf, "before the first observation its age is not infinite")
-    _connect(bench, driver)
+    _connect(rig, driver)
     counts: Mapping[str, Any] = driver.diagnostics()
     missing = [name for name in COUNTER_NAMES if name not in counts]
     _require(not missing, f"diagnostics lack {', '.join(missing)}")
@@ -415,17 +415,17 @@ def check_counts(bench: Rig) -> None:
     _require(counts["frames"] > 0, "it counts no frames")
     _require(counts["bad_frames"] == 0, f"it counts {counts['bad_frames']} bad frames of a robot that sends none")
     newest = driver.observe()
-    age = math.inf if newest is None else bench.now() - newest.t_host
+    age = math.inf if newest is None else rig.now() - newest.t_host
     _require(abs(counts["age"] - age) < 1e-6, f"the newest is {age:g} s old, not {counts['age']:g} s as reported")
     _require(driver.state in STATES, f"its state is {driver.state!r}")
 
 
-def check_invoke(bench: Rig) -> None:
+def check_invoke(rig: Rig) -> None:
     """``invoke`` fails with ``Unsupported`` for an unknown skill."""
-    driver = _make_ready_driver(bench)
+    driver = _make_ready_driver(rig)
     for name in ("no such skill", ""):
         answer = _Result(driver.invoke(name))
-        bench.pass_time(0.1)
+        rig.pass_time(0.1)
         _require(answer.is_error(Unsupported), f"invoke({name!r}) does not fail with Unsupported")
 
 
@@ -436,7 +436,7 @@ CHECKS: dict[str, Callable[[Rig], None]] = {
 
 
 class Conformance:
-    """A mixin for test cases that set ``bench = ...`` or implement ``Bench`` themselves.
+    """A mixin for test cases that set ``rig = ...`` or implement ``Rig`` themselves.
 
     It has a method ``test_NAME`` for each rule of ``CHECKS``.
     """
@@ -445,8 +445,8 @@ class Conformance:
     settle_s = 0.3
 
     def _make_rig(self) -> Rig:
-        bench = type(self).rig
-        return cast(Rig, self if bench is None else bench())
+        rig = type(self).rig
+        return cast(Rig, self if rig is None else rig())
 
 
 def _make_test(check: Callable[[Rig], None]) -> Callable[[Conformance], None]:
@@ -463,12 +463,12 @@ for _name, _check in CHECKS.items():
     setattr(Conformance, f"test_{_name}", _make_test(_check))
 
 
-def find_violations(bench: Callable[[], Rig]) -> dict[str, str]:
-    """Return each broken rule with its message; an exception breaks the rule.  Each rule gets a new ``bench``."""
+def find_violations(rig: Callable[[], Rig]) -> dict[str, str]:
+    """Return each broken rule with its message; an exception breaks the rule.  Each rule gets a new ``rig``."""
     found = {}
     for name, check in CHECKS.items():
         try:
-            check(bench())
+            check(rig())
         except Exception as error:  # the driver is third-party code
             found[name] = str(error) if isinstance(error, RuleViolation) else f"{type(error).__name__}: {error}"
     return found
@@ -496,31 +496,31 @@ class _Result:
         return bool(self._results) and isinstance(self._results[0], Failure) and bool(self._results[0].check(kind))
 
 
-def _connect(bench: Rig, driver: Driver) -> None:
+def _connect(rig: Rig, driver: Driver) -> None:
     connected = _Result(driver.connect())
-    bench.pass_time(bench.settle_s)
+    rig.pass_time(rig.settle_s)
     connected.value("connect")
 
 
-def _enable(bench: Rig, driver: Driver) -> None:
+def _enable(rig: Rig, driver: Driver) -> None:
     enabled = _Result(driver.enable())
-    bench.pass_time(bench.settle_s)
+    rig.pass_time(rig.settle_s)
     _require(enabled.value("enable") is True, "enable does not fire with True")
 
 
-def _make_ready_driver(bench: Rig) -> Driver:
-    driver = bench.make_driver()
-    _connect(bench, driver)
-    _enable(bench, driver)
+def _make_ready_driver(rig: Rig) -> Driver:
+    driver = rig.make_driver()
+    _connect(rig, driver)
+    _enable(rig, driver)
     return driver
 
 
-def _grant(bench: Rig, seconds: float = 0.5, token: int = 1) -> Permit:
-    return Permit(token, bench.now() + seconds)
+def _grant(rig: Rig, seconds: float = 0.5, token: int = 1) -> Permit:
+    return Permit(token, rig.now() + seconds)
 
 
 def _select_axis(driver: Driver) -> str:
-    """Return the key of the motion that ``Bench.true_speed`` measures; empty if the device does not move."""
+    """Return the key of the motion that ``Rig.true_speed`` measures; empty if the device does not move."""
     limits = driver.description.limits
     return "base.vx" if "base.vx" in limits else next(iter(limits), "")
 
@@ -531,9 +531,9 @@ def _make_half_speed_action(driver: Driver) -> Action:
     return {axis: driver.description.limits[axis][1] / 2.0} if axis else {}
 
 
-def _try_cut_link(bench: Rig, driver: Driver) -> bool:
+def _try_cut_link(rig: Rig, driver: Driver) -> bool:
     try:
-        bench.cut_link()
+        rig.cut_link()
     except NotImplementedError:
         if driver.description.limits:
             raise
@@ -551,14 +551,14 @@ def _check_refused(kind: type[Exception], driver: Driver, action: Action, permit
     raise RuleViolation(f"act {when} does not raise {kind.__name__}")
 
 
-def _require_rest(bench: Rig, driver: Driver, when: str) -> None:
+def _require_rest(rig: Rig, driver: Driver, when: str) -> None:
     if driver.description.limits:
-        speed = bench.true_speed()
+        speed = rig.true_speed()
         _require(speed < REST_SPEED_MPS, f"{when} the robot moves at {speed:.3g}")
 
 
-def _require_no_pending_calls(bench: Rig, when: str) -> None:
-    left_over = getattr(bench, "left_over", None)
+def _require_no_pending_calls(rig: Rig, when: str) -> None:
+    left_over = getattr(rig, "left_over", None)
     count = 0 if left_over is None else left_over()
     _require(count == 0, f"{when}it leaves {count} pending calls on its clock")
 

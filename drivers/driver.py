@@ -80,8 +80,8 @@ class Driver(Protocol):
     def observe(self) -> Observation | None:
         """Return the newest observation, None before the first; never blocks."""
 
-    def subscribe(self, seen: Callable[[Observation], None]) -> Callable[[], None]:
-        """Call ``seen`` with each observation; return a function that ends the subscription."""
+    def subscribe(self, callback: Callable[[Observation], None]) -> Callable[[], None]:
+        """Call ``callback`` with each observation; return a function that ends the subscription."""
 
     def invoke(self, name: str, **arguments: float | str) -> Deferred[Mapping[str, Value]]:
         """Run one of ``description.skills``; fires with its results when it has finished.

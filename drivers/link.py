@@ -76,8 +76,8 @@ class Reconnector(Protocol):
 class Connector(Protocol):
     """Opens links."""
 
-    def connect(self, host: str, port: int, caller: LinkClient) -> Reconnector:
-        """Keep ``caller`` connected to this address, with back-off, until ``hang_up`` is called."""
+    def connect(self, host: str, port: int, client: LinkClient) -> Reconnector:
+        """Keep ``client`` connected to this address, with back-off, until ``disconnect`` is called."""
 
 
 Accept = Callable[[Link], Receiver]
@@ -193,24 +193,26 @@ class TcpConnector:
         self._retry_delays_s = waits
         self._logs_problems = says
 
-    def connect(self, host: str, port: int, caller: LinkClient) -> Reconnector:
-        """Keep ``caller`` connected to this address, with back-off, until ``hang_up`` is called."""
+    def connect(self, host: str, port: int, client: LinkClient) -> Reconnector:
+        """Keep ``client`` connected to this address, with back-off, until ``disconnect`` is called."""
         reactor = reactor_or_running(self._reactor)
 
         def accept(link: Link) -> Receiver:
-            caller.link_up(link)
-            return caller
+            client.link_up(link)
+            return client
 
-        line = _TcpReconnector(accept, reactor, self._retry_delays_s, f"{host}:{port}" if self._logs_problems else "")
-        line.connector = reactor.connectTCP(host, port, line, timeout=CONNECT_TIMEOUT_S)
-        return line
+        reconnector = _TcpReconnector(
+            accept, reactor, self._retry_delays_s, f"{host}:{port}" if self._logs_problems else ""
+        )
+        reconnector.connector = reactor.connectTCP(host, port, reconnector, timeout=CONNECT_TIMEOUT_S)
+        return reconnector
 
 
 class _TcpReconnector(protocol.ReconnectingClientFactory):
     """Reconnect with Twisted's older factory; ``ClientService`` has no advantage here and takes 0.6 MiB more per node.
 
     ``problem`` says in one line why there is no link; it is empty while the link is open and before the first attempt
-    ends.  The delay is reset only by a link that received data or lasted ``LAST_RETRY_S``: a server that accepts and
+    ends.  The delay is reset only by a link that received data or lasted ``MAX_RETRY_S``: a server that accepts and
     closes at once is retried no more often than one that refuses.
     """
 
@@ -320,7 +322,7 @@ class MemoryLink:
 class MemoryConnector:
     """Opens links to ``accept`` through ``clock``; host and port are ignored.
 
-    ``is_open`` False refuses new links, ``cut`` breaks the open ones, and ``silence`` leaves them open without data.
+    ``is_open`` False refuses new links, ``cut`` breaks the open ones, and ``block_data`` leaves them open without data.
     """
 
     def __init__(self, clock: IReactorTime, accept: Accept, delay: float = 0.0005) -> None:
@@ -330,9 +332,9 @@ class MemoryConnector:
         self._accept = accept
         self._delay = delay
 
-    def connect(self, host: str, port: int, caller: LinkClient) -> Reconnector:
-        """Keep ``caller`` connected, with back-off, until ``hang_up`` is called."""
-        return _MemoryReconnector(self, self._clock, caller)
+    def connect(self, host: str, port: int, client: LinkClient) -> Reconnector:
+        """Keep ``client`` connected, with back-off, until ``disconnect`` is called."""
+        return _MemoryReconnector(self, self._clock, client)
 
     def cut(self) -> None:
         """Break every open link."""
@@ -348,24 +350,24 @@ class MemoryConnector:
                 if end is not None:
                     end.is_blocked = True
 
-    def open_pair(self, caller: Receiver) -> MemoryLink | None:
-        """Open a new pair and return the caller's end; None if refused."""
+    def open_pair(self, client: Receiver) -> MemoryLink | None:
+        """Open a new pair and return the client's end; None if refused."""
         if not self.is_open:
             return None
         near, far = MemoryLink(self._clock, self._delay), MemoryLink(self._clock, self._delay)
         near.other, far.other = far, near
-        near.receiver = caller
+        near.receiver = client
         far.receiver = self._accept(far)
         self.links = [link for link in self.links if link.other is not None] + [near]
         return near
 
 
 class _MemoryReconnector:
-    """The counterpart of ``_TcpLine`` in memory; it stands between link and caller to notice when the link closes."""
+    """The counterpart of ``_TcpReconnector`` in memory; it sits between link and client to notice a closed link."""
 
-    def __init__(self, connector: MemoryConnector, clock: IReactorTime, caller: LinkClient) -> None:
+    def __init__(self, connector: MemoryConnector, clock: IReactorTime, client: LinkClient) -> None:
         self._connector = connector
-        self._client = caller
+        self._client = client
         self._retry_s = FIRST_RETRY_S
         self._link: MemoryLink | None = None
         self._is_wanted = True

@@ -116,7 +116,7 @@ def create_driver(
 
 
 def describe(kind: str, options: Mapping[str, object], name: str = "robot", parts: Parts = ()) -> Description:
-    """Return the description of a robot of ``kind`` with ``parts`` without a driver; raises as ``driver_for`` does."""
+    """Return the description of a robot of ``kind`` with ``parts``, without a driver; raises as ``create_driver``."""
     main = cast(Describe, _load_attribute(kind, "describe"))(options, name)
     if not parts:
         return main

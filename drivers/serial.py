@@ -1,7 +1,7 @@
 """Links over serial devices, for robots on a cable.
 
 ``SerialConnector`` has the interface of ``drivers.link.Connector``, so ``MemoryConnector`` can replace it: the host
-is the device, the port the baud rate.  pyserial (the extra ``serial``) is imported by the first ``call``.
+is the device, the port the baud rate.  pyserial (the extra ``serial``) is imported by the first ``connect``.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ from drivers.link import (
 from drivers.timer import Timer
 
 FLUSH_TIMEOUT_S = 1.0
-"""Seconds that data sent before ``hang_up`` may take to be written."""
+"""Seconds that data sent before ``disconnect`` may take to be written."""
 MAX_BACKLOG_BYTES = 4096
 """Number of unsent bytes above which a link is busy."""
 PROBLEMS = {
@@ -67,13 +67,13 @@ class SerialConnector:
         self._reactor = reactor
         self._opener = opener
 
-    def connect(self, host: str, port: int, caller: LinkClient) -> Reconnector:
-        """Keep ``caller`` connected to the device ``host`` at ``port`` baud, with back-off, until ``hang_up``.
+    def connect(self, host: str, port: int, client: LinkClient) -> Reconnector:
+        """Keep ``client`` connected to the device ``host`` at ``port`` baud, with back-off, until ``disconnect``.
 
         Raises ``UsageError`` if pyserial is missing.
         """
         reactor = reactor_or_running(self._reactor)
-        return SerialReconnector(host, port, caller, reactor, _load_opener() if self._opener is None else self._opener)
+        return SerialReconnector(host, port, client, reactor, _load_opener() if self._opener is None else self._opener)
 
 
 class SerialReconnector:
@@ -81,11 +81,11 @@ class SerialReconnector:
 
     log = Logger()
 
-    def __init__(self, device: str, baud: int, caller: LinkClient, reactor: Any, opener: Opener) -> None:
+    def __init__(self, device: str, baud: int, client: LinkClient, reactor: Any, opener: Opener) -> None:
         self.problem = ""
         self._device = device
         self._baud = baud
-        self._client = caller
+        self._client = client
         self._reactor = reactor
         self._opener = opener
         self._link: _SerialLink | None = None
@@ -137,9 +137,9 @@ class SerialReconnector:
 
 
 class _SerialLink(StreamLink):
-    def __init__(self, line: SerialReconnector, caller: LinkClient) -> None:
-        self._reconnector = line
-        self._client = caller
+    def __init__(self, reconnector: SerialReconnector, client: LinkClient) -> None:
+        self._reconnector = reconnector
+        self._client = client
 
     @property
     def is_busy(self) -> bool:

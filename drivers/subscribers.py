@@ -18,20 +18,20 @@ class Subscribers(Generic[T]):
         self._log = log
         self._callbacks: list[Callable[[T], None]] = []
 
-    def add(self, seen: Callable[[T], None]) -> Callable[[], None]:
-        """Call ``seen`` with each new item; return a function that ends the subscription."""
-        self._callbacks.append(seen)
+    def add(self, callback: Callable[[T], None]) -> Callable[[], None]:
+        """Call ``callback`` with each new item; return a function that ends the subscription."""
+        self._callbacks.append(callback)
 
         def end() -> None:
-            if seen in self._callbacks:
-                self._callbacks.remove(seen)
+            if callback in self._callbacks:
+                self._callbacks.remove(callback)
 
         return end
 
     def notify(self, newest: T) -> None:
         """Call the current subscribers; changes made during the calls take effect with the next item."""
-        for seen in list(self._callbacks):
+        for callback in list(self._callbacks):
             try:
-                seen(newest)
+                callback(newest)
             except Exception:
                 self._log.failure("a subscriber of {robot} failed", robot=self._robot)

@@ -1,7 +1,7 @@
 """Convert values of TOML or a command line to the types of dataclass fields.
 
 ``msgspec`` checks types and constraints (``Annotated[int, Meta(ge=0, le=65535)]``); this module converts its errors to
-``Invalid``, with the key, the problem and the remedy.  It uses dataclasses instead of ``msgspec.Struct`` because a
+``InvalidValue``, with the key, the problem and the remedy.  It uses dataclasses instead of ``msgspec.Struct`` because a
 dataclass can omit a secret from its ``repr``.
 """
 
@@ -81,7 +81,7 @@ UNIQUE = ConversionStep(lambda items: tuple(dict.fromkeys(items)))
 
 
 def convert_table(table: object, cls: type[T]) -> T:
-    """Convert a table to the dataclass ``cls``; raise ``Invalid``, with an empty key if it is not a table."""
+    """Convert a table to the dataclass ``cls``; raise ``InvalidValue``, with an empty key if it is not a table."""
     if not isinstance(table, Mapping):
         raise InvalidValue("", f"must be a table, is {show_value(table)}", "write { key = value }")
     known = {field.name: field for field in fields(cls)}  # type: ignore[arg-type]
@@ -105,7 +105,7 @@ def convert_field(value: object, cls: type[Any], key: str, is_text: bool = False
 
 
 def convert_value(value: object, hint: Any, key: str = "", default: object = None, is_text: bool = False) -> Any:
-    """Convert ``value`` to the type ``hint``; raise ``Invalid`` with ``key``, and ``default`` as the example.
+    """Convert ``value`` to the type ``hint``; raise ``InvalidValue`` with ``key``, and ``default`` as the example.
 
     ``is_text``: the value is a command-line argument, in which commas separate the entries of a list.
     """
@@ -138,7 +138,7 @@ def get_raw_type(hint: Any) -> Any:
 
 
 def show_value(value: object) -> str:
-    """Return ``value`` as JSON for an error, truncated to ``MAX_SHOWN`` characters."""
+    """Return ``value`` as JSON for an error, truncated to ``MAX_SHOWN_CHARS`` characters."""
     text = json.dumps(value, default=str, ensure_ascii=False)
     return text if len(text) <= MAX_SHOWN_CHARS else text[: MAX_SHOWN_CHARS - 3] + "..."
 

@@ -1,7 +1,7 @@
 """Read the headers of a JPEG (ITU-T T.81) before it is decoded.
 
 A few hundred bytes may declare an image of four thousand megapixels, or thousands of scans over the whole image.
-``size_of`` rejects images that would take much memory or time to decode, so call it before every decoder.
+``read_size`` rejects images that would take much memory or time to decode, so call it before every decoder.
 """
 
 from __future__ import annotations

@@ -27,7 +27,7 @@ class ControlClient:
     def get_records(self, key: str, concern: str = "majority") -> list[Record]:
         """Return the records of the network under the key of a text; the ``concern`` ``fast`` uses the first reply.
 
-        The node has verified the signatures; they are not sent over the socket.  Raises ``Refusal``.
+        The node has verified the signatures; they are not sent over the socket.  Raises ``Rejection``.
         """
         answer = self._request("dht get", key=key, concern=concern)
         if not isinstance(answer, list):
@@ -35,23 +35,23 @@ class ControlClient:
         return [_parse_record(hash_key(key), each) for each in answer]
 
     def list_devices(self) -> list[tuple[Device, Record]]:
-        """Return the team's devices in the order of joining, each with its record; raises ``Refusal``."""
+        """Return the team's devices in the order of joining, each with its record; raises ``Rejection``."""
         answer = self._request("devices")
         if not isinstance(answer, list):
             raise Rejection("the node's reply about the devices is not a list of records; update the node")
         return parse_devices([_parse_record(DEVICES, each) for each in answer])
 
     def put(self, key: str, name: str, value: bytes) -> int:
-        """Store ``value`` in the node's slot; returns the number of replicas that stored it.  Raises ``Refusal``."""
+        """Store ``value`` in the node's slot; returns the number of replicas that stored it.  Raises ``Rejection``."""
         given = {"base64": base64.b64encode(value).decode()}
         return int(self._request("dht put", key=key, name=name, value=given)["replicas"])
 
     def call(self, address: str, method: str, *arguments: Any) -> Any:
-        """Call a method of the node at ``address`` (HOST:PORT), once, and return its result; raises ``Refusal``."""
+        """Call a method of the node at ``address`` (HOST:PORT), once, and return its result; raises ``Rejection``."""
         return self._request("rpc", node=address, method=method, arguments=list(arguments), changes=True)
 
     def list_links(self) -> list[dict[str, Any]]:
-        """Return the links to the node's peers, with the round-trip times of some probes; raises ``Refusal``."""
+        """Return the links to the node's peers, with the round-trip times of some probes; raises ``Rejection``."""
         answer = self._request("links")
         if not isinstance(answer, list):
             raise Rejection("the node's reply about its links is not a list; update the node")

@@ -39,7 +39,7 @@ TASK_ID = "search"
 
 
 class CrowdTeam(Simulation):
-    """``agents`` nodes with the first robots of a crowd on ``ground``, and one node without a robot.
+    """``agents`` nodes with the first robots of a crowd on ``scene``, and one node without a robot.
 
     Node, agent, driver and detection are the real ones; the team is open.  A seed reproduces a run exactly.
     """
@@ -48,14 +48,14 @@ class CrowdTeam(Simulation):
         self,
         seed: int,
         agents: int,
-        ground: CrowdScene,
+        scene: CrowdScene,
         controller: Controller = wander,
         stopwatch: Callable[[], float] = lambda: 0.0,
         camera_fps: float = CAMERA_FPS,
     ) -> None:
         super().__init__(seed, LAN)
         yard_rng = random.Random(f"{seed}/yard")
-        self.simulator = CrowdSimulator(self.clock, yard_rng, ground, agents, controller, stopwatch)
+        self.simulator = CrowdSimulator(self.clock, yard_rng, scene, agents, controller, stopwatch)
         self.simulator.start()
         self.services: dict[str, NodeService] = {}
         self._fps = camera_fps
@@ -114,10 +114,10 @@ class CrowdTeam(Simulation):
             mapping["agent"] = {"module": "search"}
             mapping["driver"] = {"kind": "sim", "options": {"robot": name, "camera_fps": self._fps}}
         network = partial(self.network, number)
-        seams = Dependencies(
+        dependencies = Dependencies(
             self.clock, network, self.store(number), rng, self.clock.seconds, self.simulator.connector()
         )
-        self.services[name] = NodeService(Settings.from_mapping(mapping, f"seed {self.seed}"), seams)
+        self.services[name] = NodeService(Settings.from_mapping(mapping, f"seed {self.seed}"), dependencies)
         self.services[name].startService()
 
 

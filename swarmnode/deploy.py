@@ -71,8 +71,8 @@ def main(words: Sequence[str] | None = None, out: TextIO | None = None, ask: Sen
     """Run the command; returns 0, 1 if the node rejected the request, 2 if the command is wrong."""
     verbs = {"push": _push, "rollback": _rollback, "status": _status, "keys": _keys}
 
-    def work(options: argparse.Namespace, desk: CommandContext) -> Answer:
-        answer, lines = verbs[options.verb](options, desk.ask)
+    def work(options: argparse.Namespace, context: CommandContext) -> Answer:
+        answer, lines = verbs[options.verb](options, context.ask)
         return answer, [remove_control_characters(line) for line in lines]
 
     return run_verb(make_parser(), words, CommandContext(out or sys.stdout, ask), work)
@@ -91,8 +91,8 @@ def _push(options: argparse.Namespace, ask: SendRequest) -> Answer:
         compile_source(source, options.name)
     except Undeployable as error:
         raise InvalidCommand(f"{options.file}: {error.problem}") from error
-    asker = ControlClient(options.node, ask)
-    held = find_newest(each for each, _ in _list_manifests(asker) if each.name == options.name)
+    client = ControlClient(options.node, ask)
+    held = find_newest(each for each, _ in _list_manifests(client) if each.name == options.name)
     manifest = make_next_manifest(options.name, options.kind, source, held, options.version)
     if held is not None and manifest.kind != held.kind:
         raise Rejection(f"{held.name} is a {held.kind}; use another name for a {manifest.kind}")
@@ -101,13 +101,13 @@ def _push(options: argparse.Namespace, ask: SendRequest) -> Answer:
     if not 0 < manifest.version <= MAX_VERSION:
         raise Rejection(f"--version {manifest.version} is not between 1 and {MAX_VERSION}")
     # Store the source first: nodes request it as soon as they receive the manifest.
-    asker.put(source_key(manifest.digest), SOURCE_SLOT, source)
-    return _publish(asker, manifest, "pushed")
+    client.put(source_key(manifest.digest), SOURCE_SLOT, source)
+    return _publish(client, manifest, "pushed")
 
 
 def _rollback(options: argparse.Namespace, ask: SendRequest) -> Answer:
-    asker = ControlClient(options.node, ask)
-    manifests = [each for each, _ in _list_manifests(asker)]
+    client = ControlClient(options.node, ask)
+    manifests = [each for each, _ in _list_manifests(client)]
     held = find_newest(each for each in manifests if each.name == options.name)
     if held is None:
         there = ", ".join(sorted({each.name for each in manifests})) or "none"
@@ -115,16 +115,16 @@ def _rollback(options: argparse.Namespace, ask: SendRequest) -> Answer:
     manifest = make_rollback(held)
     if manifest is None:
         raise Rejection(f"{held.name} has no version before {held.version}")
-    return _publish(asker, manifest, f"rolled back from version {held.version}:")
+    return _publish(client, manifest, f"rolled back from version {held.version}:")
 
 
 def _status(options: argparse.Namespace, ask: SendRequest) -> Answer:
-    asker = ControlClient(options.node, ask)
-    devices = asker.list_devices()
+    client = ControlClient(options.node, ask)
+    devices = client.list_devices()
     names = {record.owner: device.name for device, record in devices}
     rows: list[dict[str, Any]] = []
     lines = []
-    pairs = _list_manifests(asker)
+    pairs = _list_manifests(client)
     for name in sorted({manifest.name for manifest, _ in pairs}):
         manifest, record = max((p for p in pairs if p[0].name == name), key=lambda p: (p[0].rank, p[0].digest))
         runs = {device.name: device.deployed.get(name, "") for device, _ in devices}
@@ -142,13 +142,13 @@ def _keys(options: argparse.Namespace, ask: SendRequest) -> Answer:
     return keys, [f"{name:{width}}  {key}" for name, key in keys.items()]
 
 
-def _list_manifests(asker: ControlClient) -> list[tuple[Manifest, Record]]:
-    records = asker.get_records(DEPLOYMENTS)
+def _list_manifests(client: ControlClient) -> list[tuple[Manifest, Record]]:
+    records = client.get_records(DEPLOYMENTS)
     return [(manifest, record) for record in records if (manifest := parse_manifest(record)) is not None]
 
 
-def _publish(asker: ControlClient, manifest: Manifest, verb: str) -> Answer:
-    replicas = asker.put(DEPLOYMENTS, manifest.name, manifest.pack())
+def _publish(client: ControlClient, manifest: Manifest, verb: str) -> Answer:
+    replicas = client.put(DEPLOYMENTS, manifest.name, manifest.pack())
     line = f"{verb} {manifest.kind} {manifest.name} {manifest.label}; stored by {replicas} replicas"
     return {**_to_json(manifest), "replicas": replicas}, [line]
 

@@ -92,10 +92,10 @@ def resolve_hosts(settings: Settings, look_up: LookUp = socket.getaddrinfo) -> S
             raise BadSetting(settings.origin, key, problem, "fix the name, or write a numeric address") from error
 
     known = tuple(figures(address, "[node] known_nodes", family) for address in settings.node.known_nodes)
-    yard = settings.web.yard
-    if yard is not None and "web" in settings.node.roles:
-        yard = figures(yard, "[web] yard", socket.AF_UNSPEC)
-    return replace(settings, node=replace(settings.node, known_nodes=known), web=replace(settings.web, yard=yard))
+    simulator = settings.web.yard
+    if simulator is not None and "web" in settings.node.roles:
+        simulator = figures(simulator, "[web] yard", socket.AF_UNSPEC)
+    return replace(settings, node=replace(settings.node, known_nodes=known), web=replace(settings.web, yard=simulator))
 
 
 def create_control_socket(settings: Settings, reactor: Any, node: SwarmNode) -> IService:

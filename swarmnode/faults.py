@@ -37,10 +37,10 @@ RUN, LIST = "run", "list"
 class TeamStage:
     """A running team, accessed through the control socket of a node on this machine."""
 
-    def __init__(self, asker: ControlClient, seconds: Callable[[], float], wait: Callable[[float], None]) -> None:
+    def __init__(self, client: ControlClient, seconds: Callable[[], float], wait: Callable[[float], None]) -> None:
         self.seconds = seconds
         self.wait = wait
-        self._client = asker
+        self._client = client
 
     def devices(self) -> list[Device]:
         """Return the present devices."""

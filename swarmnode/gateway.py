@@ -76,7 +76,7 @@ def check_picture(jpeg: bytes) -> tuple[int, int]:
 class Gateway:
     """The phones that take part through ``node``.
 
-    ``seams`` returns the dependencies of one more node; ``others`` returns the present devices.  When a phone leaves or
+    ``dependencies`` returns those of one more node; ``others`` returns the present devices.  When a phone leaves or
     falls silent, its node still runs and releases its lease, so another device continues at once.
     """
 
@@ -86,12 +86,12 @@ class Gateway:
         self,
         settings: Settings,
         node: SwarmNode,
-        seams: Callable[[], Dependencies],
+        dependencies: Callable[[], Dependencies],
         others: Callable[[], Sequence[Device]],
     ) -> None:
         self._settings = settings
         self._node = node
-        self._make_dependencies = seams
+        self._make_dependencies = dependencies
         self._list_devices = others
         self._phones: dict[str, _Phone] = {}
         self._stopping: dict[str, Deferred[Any]] = {}
@@ -167,14 +167,14 @@ class Gateway:
         return DeferredList(waiting, consumeErrors=True)
 
     def _start_phone(self, uuid: str, seed: bytes, name: str, can: Mapping[str, Any]) -> _Phone:
-        seams = self._make_dependencies()
-        seams.store.set_note("identity", seed)
+        dependencies = self._make_dependencies()
+        dependencies.store.set_note("identity", seed)
         if self._node.team is not None:
             from middleware.admission.membership import MemoryMembership
 
-            seams = replace(seams, membership=MemoryMembership(self._node.team.create_guest(seed, name)))
+            dependencies = replace(dependencies, membership=MemoryMembership(self._node.team.create_guest(seed, name)))
         settings = _make_settings(self._settings, self._node, name, can)
-        assembly = assemble_node(settings, seams)
+        assembly = assemble_node(settings, dependencies)
         assert isinstance(assembly.driver, PhoneDriver) and assembly.agent is not None
         phone = _Phone(assembly.node, assembly.agent, assembly.driver, partial(self._on_silence, uuid))
         assembly.node.on_disconnect(partial(self._on_removed, uuid))
@@ -212,7 +212,7 @@ class _Phone:
         self._position_sent_at = 0.0
 
     def start(self) -> None:
-        """Open the port and join; raises one of ``FAULTS`` if that fails."""
+        """Open the port and join; raises one of ``EXPECTED_ERRORS`` if that fails."""
         self._node.startService()
         self._agent.startService()
         self.restart_timer(FIRST_PICTURE_TIMEOUT_S)
@@ -287,13 +287,15 @@ def _make_settings(settings: Settings, node: SwarmNode, name: str, can: Mapping[
     )
 
 
-def make_gateway(settings: Settings, node: SwarmNode, seams: Dependencies, reactor: Any, view: TeamView) -> Gateway:
-    """Return the gateway of the web node with these ``seams``; each phone has a separate UDP port."""
+def make_gateway(
+    settings: Settings, node: SwarmNode, dependencies: Dependencies, reactor: Any, view: TeamView
+) -> Gateway:
+    """Return the gateway of the web node with these ``dependencies``; each phone has a separate UDP port."""
     from middleware.entangled.network.udp import UdpNetwork
 
     def of_phone() -> Dependencies:
-        store = MemoryStore(settings.node.store_rows, settings.node.store_bytes, epoch=seams.rng.randbytes(8))
+        store = MemoryStore(settings.node.store_rows, settings.node.store_bytes, epoch=dependencies.rng.randbytes(8))
         network = partial(UdpNetwork, reactor, settings.node.host, 0)
-        return Dependencies(reactor, network, store, seams.rng, seams.wall)
+        return Dependencies(reactor, network, store, dependencies.rng, dependencies.wall)
 
     return Gateway(settings, node, of_phone, lambda: view.devices)

@@ -47,9 +47,9 @@ def main(words: Sequence[str] | None = None, out: TextIO | None = None, ask: Sen
     out = out or sys.stdout
     options = make_parser().parse_args(words)
     try:
-        asker = ControlClient(options.node, ask)
-        links = asker.list_links()
-        names = {device.uuid: device.name for device, _ in asker.list_devices()}
+        client = ControlClient(options.node, ask)
+        links = client.list_links()
+        names = {device.uuid: device.name for device, _ in client.list_devices()}
     except (Rejection, NoControl) as problem:
         sys.stderr.write(remove_control_characters(f"swarm links: {problem}") + "\n")
         return EXIT_FAILED if isinstance(problem, Rejection) else EXIT_USAGE

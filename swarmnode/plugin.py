@@ -126,13 +126,13 @@ def makeService(options: Options) -> IService:
     try:
         settings = replace_busy_ports(resolve_hosts(settings))
         check_team(settings)
-        seams = make_dependencies(settings, reactor)
+        dependencies = make_dependencies(settings, reactor)
         fronts: list[Callable[[SwarmNode], IService]] = [partial(create_control_socket, settings, reactor)]
         if "web" in settings.node.roles:
-            settings = add_sign_in_code(settings, seams.rng)
-            fronts.append(partial(make_web_page, settings, seams, reactor))
+            settings = add_sign_in_code(settings, dependencies.rng)
+            fronts.append(partial(make_web_page, settings, dependencies, reactor))
         reactor.callLater(STARTUP_S, release_memory)
-        return CheckedService(settings, seams, fronts)
+        return CheckedService(settings, dependencies, fronts)
     except EXPECTED_ERRORS as error:
         _exit_with_error(format_error(error, settings.origin))
 

@@ -28,17 +28,17 @@ class NodeService(Service):
     _log = Logger()
 
     def __init__(
-        self, settings: Settings, seams: Dependencies, fronts: Sequence[Callable[[SwarmNode], IService]] = ()
+        self, settings: Settings, dependencies: Dependencies, fronts: Sequence[Callable[[SwarmNode], IService]] = ()
     ) -> None:
         self.settings = settings
-        self.assembly = assemble_node(settings, seams)
-        self._dependencies = seams
+        self.assembly = assemble_node(settings, dependencies)
+        self._dependencies = dependencies
         self._fronts = fronts
         self._open_fronts: list[IService] = []
         self._rejoin_call: IDelayedCall | None = None
 
     def startService(self) -> None:
-        """Open the port and join; raises one of ``FAULTS`` if that fails."""
+        """Open the port and join; raises one of ``EXPECTED_ERRORS`` if that fails."""
         super().startService()
         self._start_parts()
 

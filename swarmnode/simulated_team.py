@@ -52,7 +52,7 @@ class SimulatedTeam(Simulation):
 
     Node, agent, driver, simulator and detection are the real ones.  ``dogs`` are the dogs that join at the start; the
     simulator has a robot for each of ``DOGS``.  ``others`` are nodes without a robot, which join before the dogs.
-    ``weather`` applies to every link.  With ``faults`` the nodes accept fault injection.
+    ``conditions`` applies to every link.  With ``faults`` the nodes accept fault injection.
     """
 
     BOOTSTRAP = "vaio"
@@ -64,12 +64,12 @@ class SimulatedTeam(Simulation):
         self,
         seed: int,
         camera_fps: float = 10.0,
-        weather: LinkConditions = LAN,
+        conditions: LinkConditions = LAN,
         dogs: tuple[str, ...] = DOGS,
         others: tuple[str, ...] = (),
         faults: bool = False,
     ) -> None:
-        super().__init__(seed, weather)
+        super().__init__(seed, conditions)
         self.simulator = RobotSimulator(self.clock, random.Random(f"{seed}/yard"), load_scene("three-dogs"))
         self.simulator.start()
         self.services: dict[str, NodeService] = {}
@@ -109,7 +109,7 @@ class SimulatedTeam(Simulation):
         mapping.update(tables or {})
         machine = self.machines[name] = Machine(self.clock)
         connector = self.connectors[name] = self.simulator.connector()
-        seams = Dependencies(
+        dependencies = Dependencies(
             machine,
             lambda: MachineNetwork(machine, self.switchboard.make_network(*self.address_of(name))),
             MemoryStore(),
@@ -121,7 +121,7 @@ class SimulatedTeam(Simulation):
             membership=self._get_membership(name),
             spawn=make_memory_channel,
         )
-        self.services[name] = NodeService(Settings.from_mapping(mapping, f"seed {self.seed}"), seams)
+        self.services[name] = NodeService(Settings.from_mapping(mapping, f"seed {self.seed}"), dependencies)
         self.services[name].startService()
 
     def _get_membership(self, name: str) -> MemoryMembership:

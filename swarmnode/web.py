@@ -23,13 +23,15 @@ def add_sign_in_code(settings: Settings, rng: random.Random) -> Settings:
     return settings if web.code or not web.sign_in else replace(settings, web=replace(web, code=draw_code(rng)))
 
 
-def make_web_page(settings: Settings, seams: Dependencies, reactor: Any, node: SwarmNode) -> IService:
+def make_web_page(settings: Settings, dependencies: Dependencies, reactor: Any, node: SwarmNode) -> IService:
     """Return the page over the node's data store; raises ``MissingExtra``, or ``BadSetting`` if TLS is unavailable."""
     try:
         from swarmnode.page import make_page_service
     except ModuleNotFoundError as error:
         raise MissingExtra("the web role", "web") from error
-    return make_page_service(settings, seams, reactor, node, _load_tls_factory(settings) if settings.web.tls else None)
+    return make_page_service(
+        settings, dependencies, reactor, node, _load_tls_factory(settings) if settings.web.tls else None
+    )
 
 
 def _load_tls_factory(settings: Settings) -> Callable[..., Any]:

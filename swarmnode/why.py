@@ -42,15 +42,15 @@ def main(words: Sequence[str] | None = None, out: TextIO | None = None, ask: Sen
     out = out or sys.stdout
     options = make_parser().parse_args(words)
     try:
-        asker = ControlClient(options.node, ask)
-        task = select_task(options.task, list(parse_tasks(asker.get_records("tasks")).values()))
-        outcome = find_outcome(task, asker.get_records(f"task/{task.task_id}"))
-        records = asker.get_records(decision_records_key_text(task.task_id))
+        client = ControlClient(options.node, ask)
+        task = select_task(options.task, list(parse_tasks(client.get_records("tasks")).values()))
+        outcome = find_outcome(task, client.get_records(f"task/{task.task_id}"))
+        records = client.get_records(decision_records_key_text(task.task_id))
     except (Rejection, NoControl) as problem:
         sys.stderr.write(remove_control_characters(f"swarm why: {problem}") + "\n")
         return EXIT_FAILED if isinstance(problem, Rejection) else EXIT_USAGE
-    verdicts = [verdict for each in records if (verdict := parse_decision_record(each)) is not None]
-    explanation = explain_decisions(verdict for verdict in verdicts if verdict.task == task.task_id)
+    decisions = [record for each in records if (record := parse_decision_record(each)) is not None]
+    explanation = explain_decisions(record for record in decisions if record.task == task.task_id)
     if options.json:
         head_fields = {"task": task.task_id, "title": task.title, "strategy": task.strategy}
         ended = None if outcome is None else {"outcome": outcome.outcome, "by": outcome.by, "took": outcome.took}
@@ -65,7 +65,7 @@ def main(words: Sequence[str] | None = None, out: TextIO | None = None, ask: Sen
 
 
 def select_task(wanted: str, tasks: Sequence[Task]) -> Task:
-    """Return the task with the id prefix ``wanted``, or the newest for ``last``; raises ``Refusal`` with candidates."""
+    """Return the task with the id prefix ``wanted``, or the newest for ``last``; raises ``Rejection``."""
     newest = {task.task_id: task for task in tasks}
     known = sorted(tasks, key=lambda task: (-task.created, task.task_id))
     if not known:

@@ -57,7 +57,7 @@ def encode_string(text: str) -> bytes:
 
 
 class Cursor:
-    """Reads fields from ``data`` in order; raises ``Short`` at its end and ``BadFrame`` for invalid values."""
+    """Reads fields from ``data`` in order; raises ``IncompletePacket`` at its end, ``BadFrame`` for invalid values."""
 
     def __init__(self, data: bytes) -> None:
         self.at = 0

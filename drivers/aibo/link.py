@@ -81,11 +81,11 @@ class Port:
 
     def close(self) -> Deferred[None]:
         """Close for good after pending data is written, but wait at most ``FLUSH_S`` for a dead link."""
-        line, self._reconnector = self._reconnector, None
-        if line is None:
+        reconnector, self._reconnector = self._reconnector, None
+        if reconnector is None:
             return succeed(None)
         link, self.opened_at = self._link, None
-        closed = line.disconnect()
+        closed = reconnector.disconnect()
         if link is not None and not closed.called:
             timer = Timer(self._clock)
             timer.set(FLUSH_S, link.close)
@@ -158,14 +158,14 @@ class _UdpLink(DatagramProtocol):
 
 
 class Camera:
-    """Receives pictures and passes each to ``seen``; invalid data is counted in ``bad_frames``."""
+    """Receives pictures and passes each to ``on_picture``; invalid data is counted in ``bad_frames``."""
 
     def __init__(
         self,
         connector: Connector,
         clock: IReactorTime,
         address: tuple[str, int],
-        seen: Callable[[Picture], None],
+        on_picture: Callable[[Picture], None],
         datagrams: DatagramConnector | None = None,
     ) -> None:
         self.bad_frames = 0
@@ -173,7 +173,7 @@ class Camera:
         self.port = Port(connector, clock, address, self._on_up, lambda: None, self._on_bytes)
         self._clock = clock
         self._address = address
-        self._on_picture = seen
+        self._on_picture = on_picture
         self._datagrams = datagrams
         self._reader = PictureReader()
         self._link: Link | None = None
@@ -182,7 +182,7 @@ class Camera:
 
     @property
     def is_silent(self) -> bool:
-        """Whether datagrams were requested and none has arrived for ``SILENT_S``."""
+        """Whether datagrams were requested and none has arrived for ``SILENCE_S``."""
         return self._link is not None and self._clock.seconds() - self._last_data_at >= SILENCE_S
 
     def open(self) -> None:

@@ -66,8 +66,8 @@ class BittleDriver(LinkedDriver):
         clock: IReactorTime,
         dead_man: DeadManSwitch | None = None,
     ) -> None:
-        place = (options.host, options.http_port) if options.host else (options.port, int(options.baud))
-        super().__init__(make_description(options), name, clock, connector, place, dead_man)
+        endpoint = (options.host, options.http_port) if options.host else (options.port, int(options.baud))
+        super().__init__(make_description(options), name, clock, connector, endpoint, dead_man)
         self.STALE_S = 2.0 if options.host else 1.0
         self._options = options
         self._gaits = dict(options.gaits)

@@ -17,7 +17,7 @@ from drivers.timer import Timer
 REQUEST_TIMEOUT_S = 3.0
 """Seconds after which an unanswered request has failed."""
 STATUS_POLL_S = 0.05
-"""Interval at which a BiBoard's task is polled, for at most ``TASK_S``."""
+"""Interval at which a BiBoard's task is polled, for at most ``TASK_TIMEOUT_S``."""
 TASK_TIMEOUT_S = 16.0
 MAX_FAILURES = 3
 """Consecutive failures after which the link counts as lost."""
@@ -33,21 +33,21 @@ class HttpConnector:
         self._clock = clock
         self._board = board
 
-    def connect(self, host: str, port: int, caller: LinkClient) -> Reconnector:
-        """Keep ``caller`` connected to the robot at this address until ``hang_up``."""
-        return HttpLink(self._connector, self._clock, self._board, host, port, caller)
+    def connect(self, host: str, port: int, client: LinkClient) -> Reconnector:
+        """Keep ``client`` connected to the robot at this address until ``disconnect``."""
+        return HttpLink(self._connector, self._clock, self._board, host, port, client)
 
 
 class HttpLink:
     """A persistent connection and its one link; ``problem`` says why the robot cannot be reached.
 
-    ``may_leave`` is called when a queued command can be sent; if it returns False, the command is dropped.
+    ``should_send`` is called when a queued command can be sent; if it returns False, the command is dropped.
     """
 
     log = Logger()
 
     def __init__(
-        self, connector: Connector, clock: IReactorTime, board: str, host: str, port: int, caller: LinkClient
+        self, connector: Connector, clock: IReactorTime, board: str, host: str, port: int, client: LinkClient
     ) -> None:
         self.problem = ""
         self.should_send: Callable[[bytes], bool] = lambda _: True
@@ -57,7 +57,7 @@ class HttpLink:
         self._host = host
         self._port = port
         self._peer: tuple[str, int] | None = None
-        self._client = caller
+        self._client = client
         self._queue: deque[bytes] = deque()
         self._request: _Request | None = None
         self._is_up = False
@@ -200,7 +200,7 @@ class HttpLink:
             self._send_next()
 
     def on_command_dropped(self) -> None:
-        """Handle a request with a command that ``may_leave`` dropped."""
+        """Handle a request with a command that ``should_send`` dropped."""
         self._end_request()
         self._send_next()
 
@@ -247,16 +247,16 @@ def _has_end(lines: bytes, command: bytes) -> bool:
 class _Request:
     """One request over its own connection; ``command`` is the command that it carries, if any."""
 
-    def __init__(self, line: HttpLink, path: str, take: Callable[[bytes], None], command: bytes = b"") -> None:
-        self._http_link = line
+    def __init__(self, http_link: HttpLink, path: str, take: Callable[[bytes], None], command: bytes = b"") -> None:
+        self._http_link = http_link
         self._path = path
         self._on_body = take
         self._command = command
         self._reader = codec.ResponseReader()
         self._is_over = self._is_sent = False
-        self._timer = Timer(line.clock)
+        self._timer = Timer(http_link.clock)
         self._timer.set(REQUEST_TIMEOUT_S, self._on_timeout)
-        self._reconnector = line.open_connection(self)
+        self._reconnector = http_link.open_connection(self)
 
     def link_up(self, link: Link) -> None:
         if self._is_sent:

@@ -236,7 +236,8 @@ def _parse_delimiter(kind: str) -> bytes:
     name, *parameters = kind.split(";")
     if name.strip().lower() != CONTENT_TYPE:
         raise BadFrame(
-            f"it sends {_make_printable(name) or 'no content type'} instead of a stream ({CONTENT_TYPE}); correct the path of url"
+            f"it sends {_make_printable(name) or 'no content type'} instead of a stream ({CONTENT_TYPE}); "
+            "correct the path of url"
         )
     for parameter in parameters:
         key, _, value = parameter.partition("=")

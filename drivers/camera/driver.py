@@ -24,15 +24,15 @@ MANIFEST = Manifest("cv2", "vision", "except for a folder of JPEGs or a url")
 
 
 class CameraDriver(SensingDriver):
-    """One camera; ``film`` delivers its pictures."""
+    """One camera; ``stream`` delivers its pictures."""
 
     def __init__(
-        self, options: Options | Mapping[str, object], film: PictureStream, clock: IReactorTime, name: str
+        self, options: Options | Mapping[str, object], stream: PictureStream, clock: IReactorTime, name: str
     ) -> None:
         self._options = options if isinstance(options, Options) else parse_options(options)
         super().__init__(make_description(self._options), name, clock)
         self.STALE_S = max(0.5, 3.0 / self._options.fps)
-        self._stream = film
+        self._stream = stream
         self._fps = self._options.fps
         self._started_at = 0.0
         self._problem = ""
@@ -63,18 +63,18 @@ class CameraDriver(SensingDriver):
         """As for every driver; ``dropped`` is the number of pictures replaced by newer ones."""
         return {**super().diagnostics(), "dropped": float(getattr(self._stream, "dropped", 0))}
 
-    # -- called by the film -----------------------------------------------------------------------------------------
+    # -- called by the stream ---------------------------------------------------------------------------------------
 
-    def shown(self, shot: JpegPicture) -> None:
+    def shown(self, picture: JpegPicture) -> None:
         """Publish a picture."""
         self._problem = ""
         self._counts["frames"] += 1
         self._counts["pictures"] += 1
-        self._counts["bytes"] += len(shot.jpeg)
+        self._counts["bytes"] += len(picture.jpeg)
         if not self._is_up:
             self._up()
         t = self._clock.seconds() - self._started_at
-        self._frame = Frame(self._counts["pictures"], shot.width, shot.height, shot.jpeg, t)
+        self._frame = Frame(self._counts["pictures"], picture.width, picture.height, picture.jpeg, t)
         self._observed({}, t, frame=self._frame)
         if self._fps <= 0 and not self._idle_timer.is_set and not self._is_closed:
             self._report_idle()
@@ -85,7 +85,7 @@ class CameraDriver(SensingDriver):
         self.log.debug("{robot}: {reason}", robot=self._name, reason=reason)
 
     def gone(self, reason: str) -> None:
-        """Handle the loss of the source; it is logged once, and the film retries."""
+        """Handle the loss of the source; it is logged once, and the stream retries."""
         if reason != self._problem:
             self.log.warn("{robot}: {reason}; trying again", robot=self._name, reason=reason)
         self._problem = reason
@@ -126,5 +126,5 @@ def make_picture_stream(options: Options, clock: Any, connector: Connector | Non
         return MjpegStream(parse_url(options.url), size, TcpConnector() if connector is None else connector, clock)
     if isinstance(options.source, str) and not options.is_device and os.path.isdir(options.source):
         return TimedStream(FolderSource(options.source), clock)
-    shots = CaptureSource(options, lambda: import_module("cv2"))
-    return ThreadedStream(shots, clock.callFromThread) if options.is_device else TimedStream(shots, clock)
+    source = CaptureSource(options, lambda: import_module("cv2"))
+    return ThreadedStream(source, clock.callFromThread) if options.is_device else TimedStream(source, clock)

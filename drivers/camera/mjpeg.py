@@ -20,7 +20,7 @@ PICTURE_TIMEOUT_S = 5.0
 
 
 class MjpegStream:
-    """The pictures at ``place``; ``size`` is their width and height according to the options.
+    """The pictures at ``address``; ``size`` is their width and height according to the options.
 
     A camera sends at its own rate; pictures above the requested rate are dropped.  At rate 0 the connection is closed
     after the first picture, which shows that the camera is present.
@@ -28,10 +28,12 @@ class MjpegStream:
 
     log = Logger()
 
-    def __init__(self, place: StreamAddress, size: tuple[int, int], connector: Connector, clock: IReactorTime) -> None:
+    def __init__(
+        self, address: StreamAddress, size: tuple[int, int], connector: Connector, clock: IReactorTime
+    ) -> None:
         self.dropped = 0
         """Pictures above the requested rate."""
-        self._address = place
+        self._address = address
         self._size = size
         self._connector = connector
         self._clock = clock
@@ -43,9 +45,9 @@ class MjpegStream:
         self._attempt: _Attempt | None = None
         self._timer = Timer(clock)
 
-    def start(self, viewer: PictureReceiver, fps: float) -> None:
+    def start(self, receiver: PictureReceiver, fps: float) -> None:
         """Connect and start to deliver pictures."""
-        self._receiver, self._fps = viewer, fps
+        self._receiver, self._fps = receiver, fps
         self._connect()
 
     def set_fps(self, fps: float) -> None:
@@ -88,16 +90,16 @@ class MjpegStream:
             self._fail("it closed the connection")
 
     def _connect(self) -> None:
-        place = self._address
-        attempt = self._attempt = _Attempt(self, codec.encode_request(place.name, place.path, place.login))
+        address = self._address
+        attempt = self._attempt = _Attempt(self, codec.encode_request(address.name, address.path, address.login))
         self._timer.set(PICTURE_TIMEOUT_S, self._on_silence)
-        attempt.reconnector = self._connector.connect(place.host, place.port, attempt)
+        attempt.reconnector = self._connector.connect(address.host, address.port, attempt)
 
     def _on_picture(self, jpeg: bytes) -> None:
-        viewer, size = self._receiver, read_size(jpeg)
-        assert viewer is not None
+        receiver, size = self._receiver, read_size(jpeg)
+        assert receiver is not None
         if size is None:
-            viewer.spoilt(f"a picture of {len(jpeg)} bytes is no whole JPEG")
+            receiver.spoilt(f"a picture of {len(jpeg)} bytes is no whole JPEG")
             return
         self._backoff.reset()
         self._timer.set(PICTURE_TIMEOUT_S, self._on_silence)
@@ -113,7 +115,7 @@ class MjpegStream:
             self._size = size
             warning = "{place}: its pictures are {width} x {height}: write width = {width}, height = {height}"
             self.log.warn(warning, place=self._address.name, width=size[0], height=size[1])
-        viewer.shown(JpegPicture(jpeg, *size))
+        receiver.shown(JpegPicture(jpeg, *size))
         if self._fps <= 0:
             self._disconnect()
 
@@ -139,11 +141,11 @@ class MjpegStream:
 class _Attempt:
     """One connection attempt; data of an earlier one, which is still being closed, is ignored."""
 
-    def __init__(self, film: MjpegStream, request: bytes) -> None:
+    def __init__(self, stream: MjpegStream, request: bytes) -> None:
         self.reader = codec.StreamReader()
         self.reconnector: Reconnector | None = None
         self.is_up = False
-        self._stream = film
+        self._stream = stream
         self._request = request
 
     def link_up(self, link: Link) -> None:

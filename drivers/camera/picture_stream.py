@@ -28,21 +28,21 @@ RunInReactor = Callable[[Callable[[], None]], None]
 class PictureReceiver(Protocol):
     """Receives pictures and errors, always on the reactor's thread."""
 
-    def shown(self, shot: JpegPicture) -> None:
+    def shown(self, picture: JpegPicture) -> None:
         """Take a picture."""
 
     def spoilt(self, reason: str) -> None:
         """Handle an invalid picture."""
 
     def gone(self, reason: str) -> None:
-        """Handle the loss of the source; the film retries."""
+        """Handle the loss of the source; the stream retries."""
 
 
 class PictureStream(Protocol):
     """A source of pictures that reopens itself."""
 
-    def start(self, viewer: PictureReceiver, fps: float) -> None:
-        """Start to deliver pictures to ``viewer``."""
+    def start(self, receiver: PictureReceiver, fps: float) -> None:
+        """Start to deliver pictures to ``receiver``."""
 
     def set_fps(self, fps: float) -> None:
         """Set the frame rate in pictures per second; 0 stops."""
@@ -52,7 +52,7 @@ class PictureStream(Protocol):
 
 
 class Backoff:
-    """Delays after failures: doubled each time, up to ``LAST_RETRY_S``."""
+    """Delays after failures: doubled each time, up to ``MAX_RETRY_S``."""
 
     def __init__(self) -> None:
         self._next_s = FIRST_RETRY_S
@@ -70,11 +70,11 @@ class Backoff:
 class SourceReader:
     """Opens the source if necessary, takes pictures, and reports results.
 
-    ``tell`` gets the name of a method of ``Viewer`` and its argument; it must not block.
+    ``tell`` gets the name of a method of ``PictureReceiver`` and its argument; it must not block.
     """
 
-    def __init__(self, shots: PictureSource, tell: Callable[[str, Any], None]) -> None:
-        self._source = shots
+    def __init__(self, source: PictureSource, tell: Callable[[str, Any], None]) -> None:
+        self._source = source
         self._report = tell
         self._backoff = Backoff()
         self._is_open = False
@@ -85,7 +85,7 @@ class SourceReader:
             if not self._is_open:
                 self._source.open()
                 self._is_open = True
-            shot = self._source.read_picture()
+            picture = self._source.read_picture()
         except BadFrame as error:
             self._report("spoilt", str(error))
             return 0.0
@@ -98,7 +98,7 @@ class SourceReader:
             self._report("gone", f"{type(error).__name__}: {error}"[:300])
             return self._backoff.increase()
         self._backoff.reset()
-        self._report("shown", shot)
+        self._report("shown", picture)
         return 0.0
 
     def close(self) -> None:
@@ -110,15 +110,15 @@ class SourceReader:
 class TimedStream:
     """Pictures from files, timed by ``clock``: the same run shows the same pictures."""
 
-    def __init__(self, shots: PictureSource, clock: IReactorTime) -> None:
-        self._reader = SourceReader(shots, self._report)
+    def __init__(self, source: PictureSource, clock: IReactorTime) -> None:
+        self._reader = SourceReader(source, self._report)
         self._receiver: PictureReceiver | None = None
         self._fps = 0.0
         self._pending = Timer(clock)
 
-    def start(self, viewer: PictureReceiver, fps: float) -> None:
+    def start(self, receiver: PictureReceiver, fps: float) -> None:
         """Deliver the first picture immediately, but not within this call."""
-        self._receiver, self._fps = viewer, fps
+        self._receiver, self._fps = receiver, fps
         self._pending.set(0.0, self._on_time)
 
     def set_fps(self, fps: float) -> None:
@@ -147,11 +147,11 @@ class TimedStream:
 
 
 class ThreadedStream:
-    """Pictures of a blocking camera; ``hand`` transfers them to the reactor's thread."""
+    """Pictures of a blocking camera; ``run_in_reactor`` transfers them to the reactor's thread."""
 
-    def __init__(self, shots: PictureSource, hand: RunInReactor) -> None:
-        self._run_in_reactor = hand
-        self._reader = SourceReader(shots, self._report)
+    def __init__(self, source: PictureSource, run_in_reactor: RunInReactor) -> None:
+        self._run_in_reactor = run_in_reactor
+        self._reader = SourceReader(source, self._report)
         self._receiver: PictureReceiver | None = None
         self._fps = 0.0
         self._stop_event = threading.Event()
@@ -161,9 +161,9 @@ class ThreadedStream:
         self.dropped = 0
         """Pictures that were replaced by a newer one."""
 
-    def start(self, viewer: PictureReceiver, fps: float) -> None:
+    def start(self, receiver: PictureReceiver, fps: float) -> None:
         """Start the thread."""
-        self._receiver, self._fps = viewer, fps
+        self._receiver, self._fps = receiver, fps
         self._thread = threading.Thread(target=self._run, name="camera", daemon=True)
         self._thread.start()
 
@@ -174,7 +174,7 @@ class ThreadedStream:
             self._changed.notify_all()
 
     def stop(self) -> Deferred[None]:
-        """Stop the thread and wait up to ``JOIN_S`` for it, so that the camera is released."""
+        """Stop the thread and wait up to ``JOIN_TIMEOUT_S`` for it, so that the camera is released."""
         self._receiver = None
         self._stop_event.set()
         with self._changed:
@@ -191,7 +191,7 @@ class ThreadedStream:
                 fps, took = self._fps, time.monotonic() - began
                 pause = None if fps <= 0 else max(wait, 1.0 / fps - took)
                 if not self._stop_event.is_set() and (pause is None or pause > 0):
-                    # At rate 0 the camera is idle until the rate changes or the film stops.
+                    # At rate 0 the camera is idle until the rate changes or the stream stops.
                     self._changed.wait(pause)
         self._reader.close()
 

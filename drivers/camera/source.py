@@ -1,6 +1,6 @@
 """Sources of pictures: cameras, videos and folders with one interface.
 
-A source uses no threads; ``shoot`` is called when the next picture is wanted.
+A source uses no threads; ``read_picture`` is called when the next picture is wanted.
 """
 
 from __future__ import annotations

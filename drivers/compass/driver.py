@@ -93,13 +93,13 @@ class CompassDriver(SensingDriver, LinkedDriver):
             self._link.close()
 
     def _describe_silence(self) -> str:
-        place, scale = self._options.endpoint
+        endpoint, scale = self._options.endpoint
         if self._link is None:
             is_cable = bool(self._options.device)
             return (
-                f"{place} is not open"
+                f"{endpoint} is not open"
                 if is_cable
-                else f"nothing answers at {place}:{scale}; is it on, and in this network?"
+                else f"nothing answers at {endpoint}:{scale}; is it on, and in this network?"
             )
         if self._counts["bytes"] == self._bytes_at_start:
             return "it sends nothing; is it on, and is its output NMEA 0183?"

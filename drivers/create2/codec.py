@@ -1,6 +1,6 @@
 """Codec of iRobot's Open Interface: commands to the robot and sensor packets from it; pure.
 
-Numbers of two bytes are big-endian.  Both sides are implemented: ``stream_frame`` and ``CommandReader`` are for
+Numbers of two bytes are big-endian.  Both sides are implemented: ``encode_stream_frame`` and ``CommandReader`` are for
 emulators of the robot.
 """
 
@@ -143,7 +143,7 @@ _DATA_LENGTHS = {
 
 
 def encode_drive(velocity: int, radius: int) -> bytes:
-    """Drive at ``velocity`` mm/s on an arc of ``radius`` mm, left positive; or ``STRAIGHT``; 1 and -1 spin."""
+    """Drive at ``velocity`` mm/s on an arc of ``radius`` mm, left positive; or ``STRAIGHT_RADIUS``; 1 and -1 spin."""
     return struct.pack(">Bhh", DRIVE, velocity, radius)
 
 

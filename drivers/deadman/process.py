@@ -22,7 +22,7 @@ HEADER = Struct("<cdI")
 SET_LINK, SET_SERVER, ARM, DISARM, LINK_LOST = b"g", b"c", b"u", b"r", b"l"
 """Kinds of messages.
 
-``GUARD`` carries a descriptor and the bytes that halt; ``CALL`` host, port and a request, separated by NUL.
+``SET_LINK`` carries a descriptor and the bytes that halt; ``SET_SERVER`` host, port and a request, separated by NUL.
 """
 HALTED = b"."
 """Sent to the node after each halt."""
@@ -125,7 +125,7 @@ class HaltTimer:
             self._motion_ends_at = moment - GRACE_S
 
     def get_timeout(self, moment: float) -> float | None:
-        """Return the seconds until ``turn`` is due; None if nothing is in force."""
+        """Return the seconds until ``send_due_halts`` is due; None if nothing is in force."""
         if self._halts_left:
             return max(0.0, self._next_halt_at - moment)
         return None if self._motion_ends_at is None else max(0.0, self._motion_ends_at + GRACE_S - moment)
@@ -151,10 +151,10 @@ class HaltTimer:
 
 
 class MessageParser:
-    """Parses messages of the node, cut at any byte, and applies them to ``watch``."""
+    """Parses messages of the node, cut at any byte, and applies them to ``halt_timer``."""
 
-    def __init__(self, watch: HaltTimer) -> None:
-        self._halt_timer = watch
+    def __init__(self, halt_timer: HaltTimer) -> None:
+        self._halt_timer = halt_timer
         self._rest = b""
         self._descriptors: list[int] = []
 
@@ -190,22 +190,22 @@ def main() -> None:
     node.setblocking(False)
     poll = select.poll()
     poll.register(0, select.POLLIN)
-    watch = HaltTimer()
-    ear = MessageParser(watch)
+    halt_timer = HaltTimer()
+    parser = MessageParser(halt_timer)
     is_open = True
     while True:
-        halts_before = watch.halts
-        wait = watch.get_timeout(now())
+        halts_before = halt_timer.halts
+        wait = halt_timer.get_timeout(now())
         if not is_open:
             if wait is None:
                 return
             time.sleep(wait)
         elif poll.poll(None if wait is None else 1000.0 * min(wait, TICK_S) + 1.0):
-            is_open = read_messages(node, ear)
+            is_open = read_messages(node, parser)
             if not is_open:
-                watch.on_node_end(now())
-        watch.send_due_halts(now())
-        if watch.halts > halts_before and is_open:
+                halt_timer.on_node_end(now())
+        halt_timer.send_due_halts(now())
+        if halt_timer.halts > halts_before and is_open:
             report_halt(node)
 
 
@@ -217,7 +217,7 @@ def report_halt(node: _socket.socket) -> None:
         return  # the node is gone; the next read reports it
 
 
-def read_messages(node: _socket.socket, ear: MessageParser) -> bool:
+def read_messages(node: _socket.socket, parser: MessageParser) -> bool:
     """Read all pending messages, so that newer ones count before time does; return whether the node still runs."""
     while True:
         try:
@@ -234,7 +234,7 @@ def read_messages(node: _socket.socket, ear: MessageParser) -> bool:
         ]
         if not data:
             return False
-        ear.feed(data, descriptors)
+        parser.feed(data, descriptors)
 
 
 if __name__ == "__main__":

@@ -73,11 +73,11 @@ class Supervisor:
 
     # -- the switch -------------------------------------------------------------------------------------------------
 
-    def set_halt_command(self, word: HaltCommand) -> None:
+    def set_halt_command(self, command: HaltCommand) -> None:
         """Set the halt command; call this when a link opens or the command changes."""
         if self._closed is not None:
             return
-        self._halt_command, self._is_link_lost = word, False
+        self._halt_command, self._is_link_lost = command, False
         if self._socket is not None:
             self._send_halt_command()
         elif self._start_timer is None:

@@ -34,7 +34,7 @@ class DeadManSwitch(Protocol):
     def halts(self) -> int:
         """The number of times that it has halted the robot."""
 
-    def set_halt_command(self, word: HaltCommand) -> None:
+    def set_halt_command(self, command: HaltCommand) -> None:
         """Set the halt command; call this when a link opens or the command changes."""
 
     def arm(self, seconds: float) -> None:
@@ -60,9 +60,9 @@ class MemoryDeadManSwitch:
     is_closed: bool = False
     calls: list[str] = field(default_factory=list)
 
-    def set_halt_command(self, word: HaltCommand) -> None:
+    def set_halt_command(self, command: HaltCommand) -> None:
         """Record the halt command."""
-        self.command = word
+        self.command = command
         self.calls.append("guard")
 
     def arm(self, seconds: float) -> None:

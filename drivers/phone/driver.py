@@ -50,7 +50,7 @@ class PhoneDriver(SensingDriver):
 
 
 def make_driver(options: Mapping[str, object], name: str, clock: IReactorTime, connector: Any) -> PhoneDriver:
-    """Return a driver of a phone; it opens no link, because pictures are passed to ``look``."""
+    """Return a driver of a phone; it opens no link, because pictures are passed to ``process_picture``."""
     return PhoneDriver(options, clock)
 
 

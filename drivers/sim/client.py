@@ -39,7 +39,7 @@ class SimulatorClient:
     """A client that receives the state of the world ``rate`` times per second and can change it.
 
     The Deferred of an order fires with True when the simulator has carried it out; it fails with ``UsageError`` if the
-    simulator refuses it, with ``LinkLost`` without a link, with ``NoReply`` after ``REPLY_S``.
+    simulator refuses it, with ``LinkLost`` without a link, with ``NoReply`` after ``REPLY_TIMEOUT_S``.
     """
 
     log = Logger()
@@ -83,15 +83,15 @@ class SimulatorClient:
 
     def disconnect(self) -> Deferred[None]:
         """Close the link; may be called twice."""
-        line, self._reconnector = self._reconnector, None
+        reconnector, self._reconnector = self._reconnector, None
         connecting, self._connecting = self._connecting, None
         if connecting is not None:
             connecting.errback(LinkLost("disconnected before the first snapshot"))
-        return succeed(None) if line is None else line.disconnect()
+        return succeed(None) if reconnector is None else reconnector.disconnect()
 
-    def subscribe(self, seen: Callable[[Snapshot], None]) -> Callable[[], None]:
-        """Call ``seen`` with each snapshot; return a function that ends the subscription."""
-        return self._subscribers.add(seen)
+    def subscribe(self, callback: Callable[[Snapshot], None]) -> Callable[[], None]:
+        """Call ``callback`` with each snapshot; return a function that ends the subscription."""
+        return self._subscribers.add(callback)
 
     def place_target(self, x: float, y: float) -> Deferred[bool]:
         """Put the red target at this place, in metres from the lower left corner."""

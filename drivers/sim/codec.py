@@ -76,7 +76,7 @@ class KeepAlive(_Message, tag="alive", frozen=True):
 
 
 class WorldCommand(_Message, tag="order", frozen=True):
-    """From the operator: ``verb`` with ``arguments``; answered by a ``Done`` of the same ``number``."""
+    """From the operator: ``verb`` with ``arguments``; answered by a ``CommandResult`` of the same ``number``."""
 
     number: Count
     verb: Text

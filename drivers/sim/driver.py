@@ -43,8 +43,8 @@ class SimDriver(LinkedDriver):
 
     def __init__(self, options: Options | Mapping[str, object], connector: Connector, clock: IReactorTime) -> None:
         self._options = options if isinstance(options, Options) else parse_options(options)
-        place = (self._options.host, self._options.port)
-        super().__init__(make_description(self._options), self._options.robot, clock, connector, place)
+        endpoint = (self._options.host, self._options.port)
+        super().__init__(make_description(self._options), self._options.robot, clock, connector, endpoint)
         self._has_problem = False
         self._frame: Frame | None = None
 

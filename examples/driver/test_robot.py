@@ -12,4 +12,4 @@ from drivers.conformance import Conformance, MemoryRig
 class RoverTests(Conformance, SynchronousTestCase):
     """The template conforms."""
 
-    bench = partial(MemoryRig, Rover, Emulator, {"host": "rover"})
+    rig = partial(MemoryRig, Rover, Emulator, {"host": "rover"})

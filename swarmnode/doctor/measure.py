@@ -123,7 +123,7 @@ def load_team(settings: Settings) -> Team:
 
 
 def discover_on_lan() -> list[Answer]:
-    """Return the replies to a discovery probe on the LAN, of any team; takes ``TRIES`` times ``EACH_S`` seconds.
+    """Return the replies to a discovery probe on the LAN, of any team; takes ``PROBE_COUNT`` x ``PROBE_INTERVAL_S``.
 
     A newcomer without a team finds bootstrap nodes by this.  In a large team only some nodes reply to each call.
     """

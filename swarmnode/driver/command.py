@@ -57,7 +57,7 @@ def make_parser() -> argparse.ArgumentParser:
 
 
 def main(
-    words: Sequence[str] | None = None, out: TextIO | None = None, ground: CommandEnvironment | None = None
+    words: Sequence[str] | None = None, out: TextIO | None = None, environment: CommandEnvironment | None = None
 ) -> int:
     """Run the command; returns 0, 1 if the robot is not reachable or has a problem, 2 if the command is wrong."""
     out = out or sys.stdout
@@ -72,11 +72,11 @@ def main(
             return _list(options, say)
         if options.verb == "info":
             return _info(options, say)
-        ground = ground or RealEnvironment()
-        choice = select_robot(options)
-        if choice is None:
+        environment = environment or RealEnvironment()
+        selection = select_robot(options)
+        if selection is None:
             return _list_devices(options, say)
-        return _run(options, choice, ground, say)
+        return _run(options, selection, environment, say)
     except (DriverError, BadSetting) as problem:
         sys.stderr.write(f"swarm driver {options.verb}: {remove_control_characters(str(problem))}\n")
         return WRONG
@@ -109,10 +109,12 @@ def _list_devices(options: argparse.Namespace, say: WriteLines) -> int:
     return 0 if found else FAILED
 
 
-def _run(options: argparse.Namespace, choice: RobotSelection, ground: CommandEnvironment, say: WriteLines) -> int:
+def _run(
+    options: argparse.Namespace, selection: RobotSelection, environment: CommandEnvironment, say: WriteLines
+) -> int:
     """Create a driver of the robot, and probe, drive or monitor it."""
-    connector, of_links = ground.make_connector(options.verb == "drive")
-    driver = choice.create_driver(ground.clock, connector)
+    connector, of_links = environment.make_connector(options.verb == "drive")
+    driver = selection.create_driver(environment.clock, connector)
     observer = WarningCollector()
 
     def problems() -> list[str]:
@@ -120,25 +122,33 @@ def _run(options: argparse.Namespace, choice: RobotSelection, ground: CommandEnv
 
     try:
         return {"probe": _probe, "drive": _drive, "monitor": _monitor}[options.verb](
-            options, driver, ground, say, problems
+            options, driver, environment, say, problems
         )
     finally:
         observer.close()
 
 
 def _probe(
-    options: argparse.Namespace, driver: Driver, ground: CommandEnvironment, say: WriteLines, problems: ListProblems
+    options: argparse.Namespace,
+    driver: Driver,
+    environment: CommandEnvironment,
+    say: WriteLines,
+    problems: ListProblems,
 ) -> int:
     from swarmnode.driver.probe import Probe, format_result
 
-    probe = Probe(driver, ground.clock, options.seconds, problems)
-    finding = ground.run(probe.start, probe.end)
+    probe = Probe(driver, environment.clock, options.seconds, problems)
+    finding = environment.run(probe.start, probe.end)
     say([json.dumps(finding.to_data())] if options.json else format_result(finding))
     return 0 if finding.is_reachable else FAILED
 
 
 def _drive(
-    options: argparse.Namespace, driver: Driver, ground: CommandEnvironment, say: WriteLines, problems: ListProblems
+    options: argparse.Namespace,
+    driver: Driver,
+    environment: CommandEnvironment,
+    say: WriteLines,
+    problems: ListProblems,
 ) -> int:
     from swarmnode.driver.drive import DriveSession
 
@@ -146,21 +156,25 @@ def _drive(
         kind = driver.description.kind
         sys.stderr.write(f"swarm driver drive: a robot of kind {kind} does not move; use swarm driver monitor\n")
         return WRONG
-    terminal = ground.open_terminal()
+    terminal = environment.open_terminal()
     try:
-        drive = DriveSession(driver, ground.clock, terminal, problems)
-        return int(ground.run(drive.start, drive.end))
+        drive = DriveSession(driver, environment.clock, terminal, problems)
+        return int(environment.run(drive.start, drive.end))
     finally:
         terminal.close()
 
 
 def _monitor(
-    options: argparse.Namespace, driver: Driver, ground: CommandEnvironment, say: WriteLines, problems: ListProblems
+    options: argparse.Namespace,
+    driver: Driver,
+    environment: CommandEnvironment,
+    say: WriteLines,
+    problems: ListProblems,
 ) -> int:
     from swarmnode.driver.monitor import Monitor
 
-    monitor = Monitor(driver, ground.clock, say, options.seconds, options.picture, options.json, problems)
-    return int(ground.run(monitor.start, monitor.end))
+    monitor = Monitor(driver, environment.clock, say, options.seconds, options.picture, options.json, problems)
+    return int(environment.run(monitor.start, monitor.end))
 
 
 def _parse_seconds(text: str) -> Any:

@@ -127,9 +127,9 @@ class DriveSession:
         )
 
 
-def format_status(state: str, newest: Observation | None, pilot: KeyboardController, now: float) -> str:
+def format_status(state: str, newest: Observation | None, controller: KeyboardController, now: float) -> str:
     """Return the status line: state, motion, position, nearest range, battery, age of data, last message."""
-    words = [f"{state:10}", " ".join(f"{key[5:]} {value + 0.0:+.2f}" for key, value in pilot.last_motion.items())]
+    words = [f"{state:10}", " ".join(f"{key[5:]} {value + 0.0:+.2f}" for key, value in controller.last_motion.items())]
     if newest is not None:
         values = newest.values
         if values.get("estop.engaged") is True:
@@ -144,4 +144,4 @@ def format_status(state: str, newest: Observation | None, pilot: KeyboardControl
         if "power.level" in values:
             words.append(f"battery {100.0 * float(values['power.level']):.0f} %")
         words.append(f"age {now - newest.t_host:.2f} s")
-    return "  ".join(word for word in (*words, pilot.message) if word)
+    return "  ".join(word for word in (*words, controller.message) if word)

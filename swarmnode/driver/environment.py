@@ -99,17 +99,17 @@ class RecordingConnector:
         self._serial = serial
         self._reconnectors: dict[str, Any] = {}
 
-    def connect(self, host: str, port: int, caller: Any) -> Any:
-        """Keep ``caller`` connected, as the wrapped connector does."""
+    def connect(self, host: str, port: int, client: Any) -> Any:
+        """Keep ``client`` connected, as the wrapped connector does."""
         is_serial = SERIAL_PATTERN.fullmatch(host) is not None
-        line = (self._serial if is_serial else self._tcp).connect(host, port, caller)
+        reconnector = (self._serial if is_serial else self._tcp).connect(host, port, client)
         # Keep only the newest link to each place: a robot with an HTTP interface has one for each request.
-        self._reconnectors[host if is_serial else f"{host}:{port}"] = line
-        return line
+        self._reconnectors[host if is_serial else f"{host}:{port}"] = reconnector
+        return reconnector
 
     def list_problems(self) -> list[str]:
         """Return each link that is not open now, with the reason."""
-        results = {place: str(getattr(line, "problem", "")) for place, line in self._reconnectors.items()}
+        results = {place: str(getattr(reconnector, "problem", "")) for place, reconnector in self._reconnectors.items()}
         return [f"{place}: {problem}" for place, problem in results.items() if problem]
 
 

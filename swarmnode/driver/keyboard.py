@@ -27,7 +27,7 @@ END_KEYS = ("x", "\x03", "\x04", "")
 
 
 class KeyboardController:
-    """Drive ``driver`` by keys; ``said`` is the last message for the person at the keyboard.
+    """Drive ``driver`` by keys; ``message`` is the last message for the person at the keyboard.
 
     Commands carry the highest fencing token that the robot has obeyed: the person at the robot is outside of any team.
     """

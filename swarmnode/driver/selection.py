@@ -63,7 +63,7 @@ def select_robot(arguments: argparse.Namespace) -> RobotSelection | None:
 
 
 def select_robot_by_word(word: str, arguments: argparse.Namespace) -> RobotSelection:
-    """Return the robot for a settings file or a kind; raises as ``chosen`` does."""
+    """Return the robot for a settings file or a kind; raises as ``select_robot`` does."""
     if word.endswith(".toml") or os.path.isfile(word):
         return _select_by_settings(word, arguments)
     return _select_by_kind(word, arguments)

@@ -65,7 +65,7 @@ class VerifiedTeam:
         return [each for each, refusal in self.membership_list.list_known_members(now) if refusal == EXPIRED]
 
     def find_member(self, name: str, now: float, has_expired: bool = False) -> Member:
-        """Return the member with that name or key, with ``has_expired`` also an expired one; raises ``Refusal``."""
+        """Return the member with that name or key, with ``has_expired`` also an expired one; raises ``Rejection``."""
         members = self.list_members(now)
         called = [each for each in members if name in (each.name, each.public.hex())]
         if not called and has_expired:
@@ -105,18 +105,18 @@ Answer = tuple[Any, Sequence[str]]
 def run_verb(
     parser: argparse.ArgumentParser,
     words: Sequence[str] | None,
-    desk: CommandContext | None,
+    context: CommandContext | None,
     work: Callable[[argparse.Namespace, CommandContext], Answer],
 ) -> int:
     """Parse the command line of a verb, run it, and print the result; returns the exit code."""
-    desk = desk or CommandContext()
+    context = context or CommandContext()
     arguments = parser.parse_args(words)
     try:
-        answer, lines = work(arguments, desk)
+        answer, lines = work(arguments, context)
     except (Rejection, NoControl, InvalidCommand, BadKeyFile) as problem:
         sys.stderr.write(remove_control_characters(f"{parser.prog}: {problem}") + "\n")
         return EXIT_FAILED if isinstance(problem, Rejection) else EXIT_USAGE
-    desk.out.write(json.dumps(answer) + "\n" if arguments.json else "".join(f"{line}\n" for line in lines))
+    context.out.write(json.dumps(answer) + "\n" if arguments.json else "".join(f"{line}\n" for line in lines))
     return 0
 
 
@@ -131,7 +131,7 @@ def get_key_folder() -> Path:
 
 
 def load_operator(named: Path | None) -> Operator:
-    """Load the named operator's key, or the only one on this machine; raises ``Wrong`` or ``BadKeyFile``."""
+    """Load the named operator's key, or the only one on this machine; raises ``InvalidCommand`` or ``BadKeyFile``."""
     path = named or (Path(os.environ[OPERATOR_VARIABLE]) if os.environ.get(OPERATOR_VARIABLE) else None)
     if path is None:
         keys = sorted(get_key_folder().glob(f"*{KEY_FILE_SUFFIX}"))
@@ -143,25 +143,25 @@ def load_operator(named: Path | None) -> Operator:
     return operators.load_operator(path)
 
 
-def fetch_team(node: str | None, desk: CommandContext, operator: Operator | None = None) -> VerifiedTeam:
-    """Return a node's view of its team; raises ``Refusal`` if it is not the operator's team."""
-    reply = _request(node, desk, "team roll")
+def fetch_team(node: str | None, context: CommandContext, operator: Operator | None = None) -> VerifiedTeam:
+    """Return a node's view of its team; raises ``Rejection`` if it is not the operator's team."""
+    reply = _request(node, context, "team roll")
     public = bytes.fromhex(reply["operator"])
     if operator is not None and operator.public != public:
         raise Rejection(f"the node belongs to the team {reply['team']} of another operator; use that operator's key")
-    roll = MembershipList(public)
+    members = MembershipList(public)
     for packed in reply["entries"]:
         try:
-            roll.add(base64.b64decode(packed), desk.wall())
+            members.add(base64.b64decode(packed), context.wall())
         except RemoteError as error:
             raise Rejection(f"the node's membership list has an entry that is not valid: {error}") from error
-    here = {bytes.fromhex(key): address for key, address in reply["here"].items()}
-    return VerifiedTeam(reply["team"], roll, reply["secret"], here, tuple(reply["doors"]))
+    addresses = {bytes.fromhex(key): address for key, address in reply["here"].items()}
+    return VerifiedTeam(reply["team"], members, reply["secret"], addresses, tuple(reply["doors"]))
 
 
-def publish_statement(node: str | None, desk: CommandContext, statement: bytes) -> None:
-    """Publish a signed statement through a node on this machine; raises ``Refusal``."""
-    _request(node, desk, "team tell", statement={"base64": base64.b64encode(statement).decode()})
+def publish_statement(node: str | None, context: CommandContext, statement: bytes) -> None:
+    """Publish a signed statement through a node on this machine; raises ``Rejection``."""
+    _request(node, context, "team tell", statement={"base64": base64.b64encode(statement).decode()})
 
 
 def parse_duration(text: str) -> float:
@@ -180,8 +180,8 @@ def format_duration(seconds: float) -> str:
     return ""
 
 
-def _request(node: str | None, desk: CommandContext, verb: str, **given: Any) -> Any:
-    for line in desk.ask(find_socket(node), {"verb": verb, "with": given}):
+def _request(node: str | None, context: CommandContext, verb: str, **given: Any) -> Any:
+    for line in context.ask(find_socket(node), {"verb": verb, "with": given}):
         if "error" in line:
             raise Rejection(str(line.get("text", line["error"])))
         if "answer" in line:

@@ -52,7 +52,7 @@ class _Member:
         return self.folder / f"{self.name}{SETTINGS_SUFFIX}"
 
 
-def main(words: Sequence[str] | None = None, desk: CommandContext | None = None) -> int:
+def main(words: Sequence[str] | None = None, context: CommandContext | None = None) -> int:
     """Run the command; returns its exit code."""
     init = make_parser(
         "init",
@@ -77,11 +77,13 @@ def main(words: Sequence[str] | None = None, desk: CommandContext | None = None)
         default=[],
         help="create files for another node, to be copied to it; can be repeated (default role: device)",
     )
-    return run_verb(init, words, desk, _create)
+    return run_verb(init, words, context, _create)
 
 
-def _create(arguments: argparse.Namespace, desk: CommandContext) -> Answer:
-    operator = replace(operators.create_operator(arguments.team, desk.rng), settings=parse_team_settings(arguments.set))
+def _create(arguments: argparse.Namespace, context: CommandContext) -> Answer:
+    operator = replace(
+        operators.create_operator(arguments.team, context.rng), settings=parse_team_settings(arguments.set)
+    )
     key = arguments.operator or get_key_folder() / f"{arguments.team}{KEY_FILE_SUFFIX}"
     team = dict(operator.settings)
     first = _Member(arguments.first, FIRST_NODE_ROLES, arguments.folder)
@@ -95,7 +97,7 @@ def _create(arguments: argparse.Namespace, desk: CommandContext) -> Answer:
     for path in (key, *(each.membership_path for each in members), *texts):
         if path.exists():
             raise InvalidCommand(f"{path} is there already; choose another team name, or --folder DIR")
-    created = _create_memberships(operator, members, desk)
+    created = _create_memberships(operator, members, context)
     _make_folders(key.parent, arguments.folder)
     operators.create_operator_file(key, operator)
     for path, membership in created.items():
@@ -107,7 +109,8 @@ def _create(arguments: argparse.Namespace, desk: CommandContext) -> Answer:
         f"Created the team {arguments.team}.",
         f"  {key}  the operator's key: it admits and revokes members; no node needs it. Keep a copy in a safe place.",
         f"  {first.membership_path}  the first node's membership: a secret of that node",
-        f"  {first.settings_path}  its settings; start it by: twistd -n --pidfile= swarm-node --config {first.settings_path}",
+        f"  {first.settings_path}  its settings; start it by: "
+        f"twistd -n --pidfile= swarm-node --config {first.settings_path}",
         *(
             f"  {each.membership_path}  for {each.name} ({', '.join(each.roles)}): "
             f"copy it and {each.settings_path.name} to that node, then delete them here"
@@ -144,13 +147,15 @@ def _format_settings_files(
     return texts
 
 
-def _create_memberships(operator: Operator, members: Sequence[_Member], desk: CommandContext) -> dict[Path, Membership]:
-    """Return the memberships, all with the same team secret; raises ``Wrong``."""
+def _create_memberships(
+    operator: Operator, members: Sequence[_Member], context: CommandContext
+) -> dict[Path, Membership]:
+    """Return the memberships, all with the same team secret; raises ``InvalidCommand``."""
     found: dict[Path, Membership] = {}
     secret = None
     for each in members:
         try:
-            membership = operator.create_membership(each.name, each.roles, desk.wall(), desk.rng, secret)
+            membership = operator.create_membership(each.name, each.roles, context.wall(), context.rng, secret)
         except ValueError as error:
             raise InvalidCommand(f"a member's name or role: {error}") from error
         found[each.membership_path] = membership
@@ -167,7 +172,7 @@ def _make_folders(keys: Path, members: Path) -> None:
 
 
 def parse_team_settings(given: Sequence[str]) -> dict[str, Any]:
-    """Parse ``KEY=VALUE`` settings and check each by the rule of its key; raises ``Wrong``."""
+    """Parse ``KEY=VALUE`` settings and check each by the rule of its key; raises ``InvalidCommand``."""
     found: dict[str, Any] = {}
     for each in given:
         key, sign, value = each.partition("=")
@@ -184,7 +189,7 @@ def parse_team_settings(given: Sequence[str]) -> dict[str, Any]:
 def format_settings(
     name: str, membership: str, roles: Sequence[str], at: str | None, known: Sequence[str], team: Mapping[str, Any]
 ) -> str:
-    """Return the text of a settings file for a new member; raises ``Wrong`` for an invalid value."""
+    """Return the text of a settings file for a new member; raises ``InvalidCommand`` for an invalid value."""
     import tomli_w
 
     node: dict[str, Any] = {"name": name, "membership": membership, "store": f"{name}.sqlite", "roles": list(roles)}
@@ -205,7 +210,7 @@ def format_settings(
 
 
 def write_settings(path: Path, text: str) -> None:
-    """Create a settings file, unless it exists; raises ``Wrong``."""
+    """Create a settings file, unless it exists; raises ``InvalidCommand``."""
     try:
         # Private, because users may add codes and passwords.
         with open(os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o600), "w", encoding="utf-8") as file:

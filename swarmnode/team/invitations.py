@@ -12,17 +12,17 @@ from swarmnode.team.common import Answer, CommandContext, VerifiedTeam, fetch_te
 OPEN, USED, EXPIRED, REVOKED = "open", "used", "expired", "revoked"
 
 
-def main(words: Sequence[str] | None = None, desk: CommandContext | None = None) -> int:
+def main(words: Sequence[str] | None = None, context: CommandContext | None = None) -> int:
     """Run the command; returns its exit code."""
     purpose = "List the invitations that can be used; end one by swarm revoke."
     invitations = make_parser("invitations", purpose, needs_key=False, example="--all")
     invitations.add_argument("--all", action="store_true", help="also list used, expired and revoked invitations")
-    return run_verb(invitations, words, desk, _list)
+    return run_verb(invitations, words, context, _list)
 
 
-def _list(arguments: argparse.Namespace, desk: CommandContext) -> Answer:
-    now = desk.wall()
-    found = fetch_team(arguments.node, desk)
+def _list(arguments: argparse.Namespace, context: CommandContext) -> Answer:
+    now = context.wall()
+    found = fetch_team(arguments.node, context)
     rows = [_make_row(found, each, now) for each in found.membership_list.list_invitations()]
     rows = [row for row in rows if arguments.all or row["state"] == OPEN]
     width = max((len(row["name"]) for row in rows), default=0)

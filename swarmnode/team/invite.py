@@ -25,7 +25,7 @@ DAY_S = 86_400.0
 INVITABLE_ROLES = tuple(role for role in ROLES if role != "bootstrap")
 
 
-def main(words: Sequence[str] | None = None, desk: CommandContext | None = None) -> int:
+def main(words: Sequence[str] | None = None, context: CommandContext | None = None) -> int:
     """Run the command; returns its exit code."""
     invite = make_parser("invite", "Create a code by which a newcomer joins the team.", example="dog1 --expires 24h")
     invite.add_argument("name", metavar="NAME", help="name of the newcomer")
@@ -48,34 +48,34 @@ def main(words: Sequence[str] | None = None, desk: CommandContext | None = None)
         metavar="TIME",
         help="validity of the certificate (default: 365d); a year or more is renewed automatically",
     )
-    return run_verb(invite, words, desk, _invite)
+    return run_verb(invite, words, context, _invite)
 
 
-def _invite(arguments: argparse.Namespace, desk: CommandContext) -> Answer:
+def _invite(arguments: argparse.Namespace, context: CommandContext) -> Answer:
     operator = load_operator(arguments.operator)
     roles = arguments.role or ["device"]
     try:
         code, statement, terms = operator.invite(
-            arguments.name, roles, arguments.uses, desk.wall(), arguments.expires, desk.rng, arguments.life
+            arguments.name, roles, arguments.uses, context.wall(), arguments.expires, context.rng, arguments.life
         )
     except ValueError as error:
         raise InvalidCommand(
             f"{error}: a name has 1 to 40 letters, digits, _ or -, and a code 1 to {MAX_USES} uses"
         ) from error
-    found = fetch_team(arguments.node, desk, operator)
-    if arguments.uses == 1 and arguments.name in {each.name for each in found.list_members(desk.wall())}:
+    found = fetch_team(arguments.node, context, operator)
+    if arguments.uses == 1 and arguments.name in {each.name for each in found.list_members(context.wall())}:
         raise Rejection(
             f"the team already has a member {arguments.name}; choose another name, or revoke that member first"
         )
-    doors = found.bootstrap_addresses
-    publish_statement(arguments.node, desk, terms)
-    publish_statement(arguments.node, desk, statement)
-    text = f"{code.text}@{','.join(doors)}" if doors else code.text
-    answer = {"code": code.text, "at": list(doors), "text": text, "name": arguments.name, "roles": list(roles)}
+    addresses = found.bootstrap_addresses
+    publish_statement(arguments.node, context, terms)
+    publish_statement(arguments.node, context, statement)
+    text = f"{code.text}@{','.join(addresses)}" if addresses else code.text
+    answer = {"code": code.text, "at": list(addresses), "text": text, "name": arguments.name, "roles": list(roles)}
     times = "once" if arguments.uses == 1 else f"{arguments.uses} times"
     lines = [f"{code.text}   admits {arguments.name}, {times}, within {format_duration(arguments.expires)}"]
     lines.append(f"On the newcomer:  swarm join {text}")
-    if not doors:
+    if not addresses:
         lines.append("No bootstrap node is reachable now; name one by: swarm join CODE --at HOST:PORT")
     return answer, [*lines, *render_qr_code(text)]
 

@@ -39,9 +39,9 @@ FindNodes = Callable[[], Sequence[Address]]
 
 def main(
     words: Sequence[str] | None = None,
-    desk: CommandContext | None = None,
-    knocking: SendJoinRequests | None = None,
-    around: FindNodes | None = None,
+    context: CommandContext | None = None,
+    send_requests: SendJoinRequests | None = None,
+    find_nodes: FindNodes | None = None,
 ) -> int:
     """Run the command; returns its exit code."""
     purpose = "Join a closed team with a code of its operator."
@@ -61,13 +61,17 @@ def main(
         "--timeout", type=parse_duration, default=JOIN_TIMEOUT_S, metavar="TIME", help="maximum time (default: 20s)"
     )
 
-    def work(arguments: argparse.Namespace, desk: CommandContext) -> Answer:
-        return _join(arguments, desk, knocking or _make_join_function(arguments.tunnel), around or find_lan_nodes)
+    def work(arguments: argparse.Namespace, context: CommandContext) -> Answer:
+        return _join(
+            arguments, context, send_requests or _make_join_function(arguments.tunnel), find_nodes or find_lan_nodes
+        )
 
-    return run_verb(join, words, desk, work)
+    return run_verb(join, words, context, work)
 
 
-def _join(arguments: argparse.Namespace, desk: CommandContext, knocking: SendJoinRequests, around: FindNodes) -> Answer:
+def _join(
+    arguments: argparse.Namespace, context: CommandContext, send_requests: SendJoinRequests, find_nodes: FindNodes
+) -> Answer:
     text, _, behind = arguments.code.partition("@")
     try:
         code = codes.parse_code(text)
@@ -75,21 +79,23 @@ def _join(arguments: argparse.Namespace, desk: CommandContext, knocking: SendJoi
         raise InvalidCommand(str(error)) from error
     if arguments.name and not re.fullmatch(NAME_PATTERN, arguments.name, re.ASCII):
         raise InvalidCommand(f"--name {arguments.name}: a name has 1 to 40 letters, digits, _ or -")
-    doors = [address for each in [*arguments.at, *filter(None, behind.split(","))] for address in resolve_address(each)]
+    addresses = [
+        address for each in [*arguments.at, *filter(None, behind.split(","))] for address in resolve_address(each)
+    ]
     path = arguments.folder / f"{arguments.files}.membership"
     if path.exists():
         # A code has a single use: do not spend it if the result cannot be stored.
         raise InvalidCommand(
             f"{path} is there already: this is a member; remove it to join again, or pass --files NAME"
         )
-    doors = doors or list(around())
-    if not doors:
+    addresses = addresses or list(find_nodes())
+    if not addresses:
         raise InvalidCommand("no bootstrap node was named, and none replies on the LAN; pass --at HOST:PORT")
     try:
         arguments.folder.mkdir(parents=True, exist_ok=True)
         seed_file = arguments.folder / f".{arguments.files}.joining"
-        membership = knocking(
-            code, _load_or_create_seed(seed_file, code, desk), arguments.name, doors, arguments.timeout
+        membership = send_requests(
+            code, _load_or_create_seed(seed_file, code, context), arguments.name, addresses, arguments.timeout
         )
     except BadKeyFile:
         raise
@@ -120,13 +126,13 @@ def _join(arguments: argparse.Namespace, desk: CommandContext, knocking: SendJoi
     ignored = sorted(set(membership.settings) - set(given))
     if ignored:
         lines.append(f"Ignored settings of the invitation, which a team cannot set: {', '.join(map(repr, ignored))}")
-    if membership.member.check_dates(desk.wall()):
+    if membership.member.check_dates(context.wall()):
         lines.append("The clock of this machine or of the bootstrap node is wrong; set it before you start the node")
     answer = {"team": membership.team, "name": name, "roles": list(roles), "membership": str(path)}
     return {**answer, "settings": str(settings)}, lines
 
 
-def _load_or_create_seed(path: Path, code: JoinCode, desk: CommandContext) -> bytes:
+def _load_or_create_seed(path: Path, code: JoinCode, context: CommandContext) -> bytes:
     """Return the newcomer's key, stored at ``path`` before it is sent.
 
     After an interrupted join the same key is sent again, so the code's use is not lost.
@@ -139,13 +145,13 @@ def _load_or_create_seed(path: Path, code: JoinCode, desk: CommandContext) -> by
                 return check_bytes(bytes.fromhex(stored["seed"]), 32)
             except (KeyError, ValueError, TypeError, RemoteError):
                 pass
-    seed = desk.rng.randbytes(32)
+    seed = context.rng.randbytes(32)
     keyfile.write(path, {"kind": SEED_FILE_KIND, "invitation": invitation, "seed": seed.hex()})
     return seed
 
 
 def resolve_address(text: str) -> list[Address]:
-    """Resolve ``HOST:PORT``; raises ``Wrong``."""
+    """Resolve ``HOST:PORT``; raises ``InvalidCommand``."""
     host, colon, port = text.rpartition(":")
     if not colon or not port.isdecimal() or not 0 < int(port) < 65536:
         raise InvalidCommand(f"{text!r} is not an address; write HOST:PORT")
@@ -164,7 +170,7 @@ def find_lan_nodes() -> list[Address]:
 
 
 def _make_join_function(tunnels: Sequence[str]) -> SendJoinRequests:
-    """Return ``knocked`` with these tunnels and port 443 of each bootstrap node; raises ``Wrong``."""
+    """Return ``send_join_requests`` with ``tunnels`` and port 443 of each bootstrap node; raises ``InvalidCommand``."""
     try:
         named = Settings.from_mapping({"node": {"name": "newcomer", "tunnels": ["auto", *tunnels]}}, COMMAND_LINE)
     except BadSetting as error:
@@ -176,11 +182,11 @@ def send_join_requests(
     code: JoinCode,
     seed: bytes,
     wish: str,
-    doors: Sequence[Address],
+    addresses: Sequence[Address],
     timeout: float,
     settings: NodeSettings,
 ) -> Membership:
-    """Send join requests to ``doors`` over UDP, in a separate reactor run; raises the errors of ``Newcomer.join``.
+    """Send join requests to ``addresses`` over UDP, in a separate reactor run; raises as ``JoinClient.join``.
 
     Without an early reply it also uses the tunnels of ``settings``, because a firewall may block UDP.
     """
@@ -199,17 +205,17 @@ def send_join_requests(
     outcome: list[Membership | EntangledError] = []
 
     def go(clock: Any) -> Deferred[None]:
-        is_new = any(":" in door.host for door in doors)
+        is_new = any(":" in each.host for each in addresses)
         rng = random.SystemRandom()
         udp = partial(UdpNetwork, clock, "::" if is_new else "0.0.0.0")
-        network = add_tunnels(replace(settings, known_nodes=tuple(doors)), udp, clock, rng, os.environ)()
+        network = add_tunnels(replace(settings, known_nodes=tuple(addresses)), udp, clock, rng, os.environ)()
         mapped = [
-            Address(f"::ffff:{each.host}", each.port) if is_new and ":" not in each.host else each for each in doors
+            Address(f"::ffff:{each.host}", each.port) if is_new and ":" not in each.host else each for each in addresses
         ]
-        newcomer = JoinClient(code, seed, network, clock, rng, wish)
-        work = newcomer.join(mapped, timeout)
-        for way in getattr(network, "detours", ()):
-            clock.callLater(FALLBACK_AFTER_S, newcomer.add_address, way)
+        client = JoinClient(code, seed, network, clock, rng, wish)
+        work = client.join(mapped, timeout)
+        for address in getattr(network, "detours", ()):
+            clock.callLater(FALLBACK_AFTER_S, client.add_address, address)
 
         def failed(failure: Any) -> None:
             failure.trap(EntangledError)
@@ -228,7 +234,7 @@ def send_join_requests(
         raise found
     # A tunnel's address has no meaning for other nodes or after the next start.
     known = [
-        *(doors if found.known_nodes[0].is_virtual else ()),
+        *(addresses if found.known_nodes[0].is_virtual else ()),
         *(each for each in found.known_nodes if not each.is_virtual),
     ]
     plain = dict.fromkeys(Address(host.removeprefix("::ffff:"), port) for host, port in known)

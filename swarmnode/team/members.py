@@ -10,15 +10,15 @@ from middleware.entangled.network.url import VIRTUAL_PREFIX
 from swarmnode.team.common import Answer, CommandContext, fetch_team, format_time, make_parser, run_verb
 
 
-def main(words: Sequence[str] | None = None, desk: CommandContext | None = None) -> int:
+def main(words: Sequence[str] | None = None, context: CommandContext | None = None) -> int:
     """Run the command; returns its exit code."""
     members = make_parser("members", "List the members of the team.", needs_key=False, example="--json")
-    return run_verb(members, words, desk, _list)
+    return run_verb(members, words, context, _list)
 
 
-def _list(arguments: argparse.Namespace, desk: CommandContext) -> Answer:
-    now = desk.wall()
-    found = fetch_team(arguments.node, desk)
+def _list(arguments: argparse.Namespace, context: CommandContext) -> Answer:
+    now = context.wall()
+    found = fetch_team(arguments.node, context)
     rows: list[dict[str, Any]] = [
         {
             "name": each.name,

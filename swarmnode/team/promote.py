@@ -17,21 +17,21 @@ from swarmnode.team.common import (
 )
 
 
-def main(words: Sequence[str] | None = None, desk: CommandContext | None = None) -> int:
+def main(words: Sequence[str] | None = None, context: CommandContext | None = None) -> int:
     """Run the command; returns its exit code."""
     purpose = "Give a member another role; the role bootstrap lets it admit newcomers."
     promote = make_parser("promote", purpose, example="vaio --role bootstrap")
     promote.add_argument("name", metavar="NAME", help="name of the member")
     promote.add_argument("--role", choices=ROLES, default="bootstrap", help="role (default: bootstrap)")
-    return run_verb(promote, words, desk, _promote)
+    return run_verb(promote, words, context, _promote)
 
 
-def _promote(arguments: argparse.Namespace, desk: CommandContext) -> Answer:
+def _promote(arguments: argparse.Namespace, context: CommandContext) -> Answer:
     operator = load_operator(arguments.operator)
-    member = fetch_team(arguments.node, desk, operator).find_member(arguments.name, desk.wall())
+    member = fetch_team(arguments.node, context, operator).find_member(arguments.name, context.wall())
     roles = tuple(dict.fromkeys([*member.roles, arguments.role]))
     # The grant must be later than the operator's last one; a certificate that is not renewable keeps its end.
-    begin = max(int(desk.wall()), member.since + 1)
+    begin = max(int(context.wall()), member.since + 1)
     life = member.life if member.is_renewable else max(1, member.not_after - begin)
-    publish_statement(arguments.node, desk, operator.grant(member.public, member.name, roles, begin, life))
+    publish_statement(arguments.node, context, operator.grant(member.public, member.name, roles, begin, life))
     return {"name": member.name, "roles": list(roles)}, [f"{member.name} now has the roles {', '.join(roles)}"]

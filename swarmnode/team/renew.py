@@ -19,7 +19,7 @@ from swarmnode.team.common import (
 )
 
 
-def main(words: Sequence[str] | None = None, desk: CommandContext | None = None) -> int:
+def main(words: Sequence[str] | None = None, context: CommandContext | None = None) -> int:
     """Run the command; returns its exit code."""
     purpose = "Renew the certificate of a member, with the same key, name and roles; also an expired one."
     renew = make_parser("renew", purpose, example="dog1 --for 365d")
@@ -32,16 +32,16 @@ def main(words: Sequence[str] | None = None, desk: CommandContext | None = None)
         metavar="TIME",
         help="validity (default: 365d)",
     )
-    return run_verb(renew, words, desk, _renew)
+    return run_verb(renew, words, context, _renew)
 
 
-def _renew(arguments: argparse.Namespace, desk: CommandContext) -> Answer:
+def _renew(arguments: argparse.Namespace, context: CommandContext) -> Answer:
     operator = load_operator(arguments.operator)
-    member = fetch_team(arguments.node, desk, operator).find_member(arguments.name, desk.wall(), has_expired=True)
+    member = fetch_team(arguments.node, context, operator).find_member(arguments.name, context.wall(), has_expired=True)
     # The grant must be later than the operator's last one.
-    begin = max(int(desk.wall()), member.since + 1)
+    begin = max(int(context.wall()), member.since + 1)
     publish_statement(
-        arguments.node, desk, operator.grant(member.public, member.name, member.roles, begin, arguments.life)
+        arguments.node, context, operator.grant(member.public, member.name, member.roles, begin, arguments.life)
     )
     end = begin + int(arguments.life)
     renews = arguments.life >= DEFAULT_LIFE_S

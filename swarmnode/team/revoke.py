@@ -20,28 +20,28 @@ from swarmnode.team.common import (
 )
 
 
-def main(words: Sequence[str] | None = None, desk: CommandContext | None = None) -> int:
+def main(words: Sequence[str] | None = None, context: CommandContext | None = None) -> int:
     """Run the command; returns its exit code."""
     purpose = "Revoke a member, or an invitation with all members that joined by it."
     revoke = make_parser("revoke", purpose, example="dog1")
     revoke.add_argument("name", metavar="NAME", help="name of a member or an invitation, or its key in hexadecimal")
     revoke.add_argument("--invitation", action="store_true", help="revoke the invitation of that name, not the member")
     revoke.add_argument("--all", action="store_true", help="also revoke all that a bootstrap node admitted or renewed")
-    return run_verb(revoke, words, desk, _revoke)
+    return run_verb(revoke, words, context, _revoke)
 
 
-def _revoke(arguments: argparse.Namespace, desk: CommandContext) -> Answer:
+def _revoke(arguments: argparse.Namespace, context: CommandContext) -> Answer:
     operator = load_operator(arguments.operator)
-    found = fetch_team(arguments.node, desk, operator)
-    public, what, came = _resolve(found, arguments.name, arguments.invitation, desk.wall())
-    kept = [] if arguments.all else _list_admitted(found, public, desk.wall())
-    renewals = [] if arguments.all else _list_renewed(found, public, desk.wall())
+    found = fetch_team(arguments.node, context, operator)
+    public, what, came = _resolve(found, arguments.name, arguments.invitation, context.wall())
+    kept = [] if arguments.all else _list_admitted(found, public, context.wall())
+    renewals = [] if arguments.all else _list_renewed(found, public, context.wall())
     try:
         keys = [each.public for each in kept]
-        statement = operator.revoke(public, arguments.name[:40], desk.wall(), keys, renewals)
+        statement = operator.revoke(public, arguments.name[:40], context.wall(), keys, renewals)
     except ValueError as error:
         raise Rejection(f"{error}; pass --all, and invite the members again that are to stay") from error
-    publish_statement(arguments.node, desk, statement)
+    publish_statement(arguments.node, context, statement)
     lines = [f"revoked {what} {arguments.name}; effective at all reachable nodes within 10 seconds"]
     lines += [f"  also revoked: {name}" for name in came]
     lines += [f"  stays a member, although admitted by {arguments.name}: {each.name}" for each in kept]
@@ -61,7 +61,7 @@ def _list_renewed(found: VerifiedTeam, public: bytes, now: float) -> list[tuple[
 
 
 def _resolve(found: VerifiedTeam, name: str, is_invitation: bool, now: float) -> tuple[bytes, str, list[str]]:
-    """Return the key for ``name``, its kind, and the members revoked with it; raises ``Refusal``."""
+    """Return the key for ``name``, its kind, and the members revoked with it; raises ``Rejection``."""
     invites = [each for each in found.membership_list.list_invitations() if name in (each.name, each.public.hex())]
     invites = [each for each in invites if found.membership_list.find_revocation(each.public) is None]
     try:

@@ -23,7 +23,7 @@ GRACE_S = 7 * 86_400.0
 """Seconds for which the previous secret is accepted, so offline members can return.  Less is safer."""
 
 
-def main(words: Sequence[str] | None = None, desk: CommandContext | None = None) -> int:
+def main(words: Sequence[str] | None = None, context: CommandContext | None = None) -> int:
     """Run the command; returns its exit code."""
     purpose = "Replace the team's secret, for example after a member was lost or revoked."
     rotate = make_parser("rotate", purpose, example="--grace 7d")
@@ -34,19 +34,19 @@ def main(words: Sequence[str] | None = None, desk: CommandContext | None = None)
         metavar="TIME",
         help="validity of the previous secret (default: 7d)",
     )
-    return run_verb(rotate, words, desk, _rotate)
+    return run_verb(rotate, words, context, _rotate)
 
 
-def _rotate(arguments: argparse.Namespace, desk: CommandContext) -> Answer:
+def _rotate(arguments: argparse.Namespace, context: CommandContext) -> Answer:
     operator = load_operator(arguments.operator)
-    found = fetch_team(arguments.node, desk, operator)
-    members = found.list_members(desk.wall())
+    found = fetch_team(arguments.node, context, operator)
+    members = found.list_members(context.wall())
     if not members:
         raise Rejection("the node knows no members of this team; check it by swarm doctor")
     number = found.secret_number + 1
     keys = [each.public for each in members][:MAX_SECRET_RECIPIENTS]
     publish_statement(
-        arguments.node, desk, operator.rotate_secret(number, keys, desk.wall(), arguments.grace, desk.rng)
+        arguments.node, context, operator.rotate_secret(number, keys, context.wall(), arguments.grace, context.rng)
     )
     names = [each.name for each in members]
     lines = [f"created secret number {number} for {', '.join(names)}", _describe_grace(arguments.grace)]
@@ -54,4 +54,5 @@ def _rotate(arguments: argparse.Namespace, desk: CommandContext) -> Answer:
 
 
 def _describe_grace(grace: float) -> str:
-    return f"The previous secret is accepted for {format_duration(grace)}; members that are offline longer have to join again"
+    accepted = format_duration(grace)
+    return f"The previous secret is accepted for {accepted}; members that are offline longer have to join again"

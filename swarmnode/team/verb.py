@@ -31,7 +31,7 @@ class TeamVerbs:
         self._node = node
 
     def run(self, name: object, arguments: object, tell: Callable[[Any], None]) -> Deferred[Any]:
-        """Run the request ``name``, as ``Verbs.run`` does."""
+        """Run the request ``name``, as ``RequestHandler.run`` does."""
         if name == "devices":
             return self._node.list_devices().addCallback(lambda listing: make_rows(listing.records))
         work = {"team tell": self._publish_statement, "team roll": self._describe_team}.get(

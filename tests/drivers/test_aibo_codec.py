@@ -133,7 +133,7 @@ class StateTests(SynchronousTestCase):
                 list(StateReader().read(start + noise))
 
 
-class SenseTests(SynchronousTestCase):
+class SensorsTests(SynchronousTestCase):
     """Sensor values and their units."""
 
     def test_names_and_units(self) -> None:

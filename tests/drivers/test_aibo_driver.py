@@ -97,15 +97,15 @@ class AiboDriverTests(Conformance, AiboCase):
 
     def test_names_rubbish_once(self) -> None:
         """Invalid data is logged once, and a second time if it starts again after valid data."""
-        ear = WarningCollector()
-        self.addCleanup(ear.close)
+        collector = WarningCollector()
+        self.addCleanup(collector.close)
         self.ready()
         for lines in (1, 2):
             self.patch(self.dog, "_send_state", self._say_rubbish)
             self.dog.stop()
             self.dog.start()
             self.pass_time(60.0)
-            self.assertEqual(len([line for line in ear.warnings if "invalid world state" in line]), lines)
+            self.assertEqual(len([line for line in collector.warnings if "invalid world state" in line]), lines)
             del self.dog._send_state
             self.dog.stop()
             self.dog.start()
@@ -283,7 +283,7 @@ class OldAiboDriverTests(AiboDriverTests):
     dialect = T2
 
 
-class Way:
+class RecordingUdp:
     """A datagram path to the emulated dog, in memory."""
 
     is_busy = False
@@ -293,7 +293,7 @@ class Way:
         self._dog = dog
         self._received: Any = None
 
-    def open(self, host: str, port: int, received: Any) -> Way:
+    def open(self, host: str, port: int, received: Any) -> RecordingUdp:
         self.sent, self._received = 0, received
         return self
 
@@ -315,9 +315,9 @@ class AiboCameraTests(AiboCase):
         self.tearDown()
         self.setUp()
         self.body.jpeg = jpeg()
-        self.way = Way(self.dog)
+        self.udp = RecordingUdp(self.dog)
         options = {"host": "10.0.0.1", "camera_transport": transport, "camera_fps": fps}
-        driver = AiboDriver(options, "dog1", self.connector, self.clock, self.way)
+        driver = AiboDriver(options, "dog1", self.connector, self.clock, self.udp)
         self.drivers.append(driver)
         driver.connect()
         self.pass_time(2.0)
@@ -332,7 +332,7 @@ class AiboCameraTests(AiboCase):
             assert newest.frame is not None
             self.assertEqual((newest.frame.data, newest.frame.encoding), (jpeg(), "jpeg"))
             self.assertEqual((newest.frame.width, newest.frame.height), (104, 80))
-        self.assertEqual(self.way.sent, 1)
+        self.assertEqual(self.udp.sent, 1)
 
     def test_films_as_often_as_it_is_asked(self) -> None:
         """The frame rate can be changed, also to zero and back."""

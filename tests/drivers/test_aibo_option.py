@@ -76,7 +76,7 @@ class RecipeTests(SynchronousTestCase):
             self.assertEqual(menu.make_rate_commands(fps)[0], f"!set vision.rawcam.interval={wait}")
 
 
-class _Caller:
+class _Client:
     def link_up(self, link: Link) -> None:
         """Do nothing."""
 
@@ -93,7 +93,7 @@ class WaitTests(SynchronousTestCase):
     def test_waits_as_the_dogs_own_clients_do(self) -> None:
         """Delays after refusals are 0.5, 1, 2, 5 and 5 s, and 0.5 s again after an answer."""
         reactor: Any = MemoryReactorClock()
-        line = TcpConnector(reactor, RETRY_DELAYS_S).connect("dog1", 10050, _Caller())
+        line = TcpConnector(reactor, RETRY_DELAYS_S).connect("dog1", 10050, _Client())
         for wait in (0.5, 1.0, 2.0, 5.0, 5.0):
             self.refuse(reactor)
             self.assertEqual([call.getTime() - reactor.seconds() for call in reactor.getDelayedCalls()], [wait])
@@ -109,7 +109,7 @@ class WaitTests(SynchronousTestCase):
         """Delays grow for a peer that closes each connection at once; a connection that lasts resets them."""
         for waits, wanted in ((RETRY_DELAYS_S, [0.5, 1.0, 2.0, 5.0, 5.0]), ((), [0.1, 0.16, 0.256, 0.4096, 0.65536])):
             reactor: Any = MemoryReactorClock()
-            line: Any = TcpConnector(reactor, waits).connect("dog1", 10050, _Caller())
+            line: Any = TcpConnector(reactor, waits).connect("dog1", 10050, _Client())
             factory = reactor.tcpClients[0][2]
             found = []
             for _ in wanted:
@@ -134,19 +134,19 @@ class WaitTests(SynchronousTestCase):
 
     def test_says_once_what_keeps_a_link_from_being_opened(self) -> None:
         """An unreachable robot is logged once after several attempts, if ``says`` is set."""
-        ear = WarningCollector()
-        self.addCleanup(ear.close)
+        collector = WarningCollector()
+        self.addCleanup(collector.close)
         for says in (False, True):
             reactor: Any = MemoryReactorClock()
-            line = TcpConnector(reactor, says=says).connect("dog1", 9090, _Caller())
+            line = TcpConnector(reactor, says=says).connect("dog1", 9090, _Client())
             for _ in range(4):
                 self.refuse(reactor)
-            self.assertEqual(ear.warnings, [])
+            self.assertEqual(collector.warnings, [])
             for _ in range(50):
                 self.refuse(reactor)
-            self.assertEqual(len(ear.warnings), int(says))
+            self.assertEqual(len(collector.warnings), int(says))
             line.disconnect()
-        self.assertIn("dog1:9090: nothing listens at this port", ear.warnings[0])
+        self.assertIn("dog1:9090: nothing listens at this port", collector.warnings[0])
 
     def lose(self, reactor: Any) -> None:
         reactor.tcpClients[0][2].clientConnectionLost(_Retried(), Failure(ConnectionDone()))

@@ -207,7 +207,7 @@ class GaitTests(SynchronousTestCase):
                 self.assertFalse(done and not wished)
 
 
-class DialogueTests(SynchronousTestCase):
+class RequestTableTests(SynchronousTestCase):
     """The assignment of answers to requests."""
 
     def setUp(self) -> None:

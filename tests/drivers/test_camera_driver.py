@@ -169,7 +169,7 @@ class Lens:
         return self.can_encode, picture
 
 
-class ShotsTests(SynchronousTestCase):
+class PictureSourceTests(SynchronousTestCase):
     def capture(self, lens: Lens, **options: Any) -> CaptureSource:
         with tempfile.NamedTemporaryFile(suffix=".avi", delete=False) as file:
             self.addCleanup(Path(file.name).unlink)
@@ -177,24 +177,24 @@ class ShotsTests(SynchronousTestCase):
 
     def test_reduces_large_pictures(self) -> None:
         """A picture larger than requested is scaled with its aspect ratio; a smaller one is kept."""
-        shots = self.capture(Lens(Picture(1280, 720), Picture(100, 50)), width=320, height=240)
-        shots.open()
-        first, second = shots.read_picture(), shots.read_picture()
+        source = self.capture(Lens(Picture(1280, 720), Picture(100, 50)), width=320, height=240)
+        source.open()
+        first, second = source.read_picture(), source.read_picture()
         self.assertEqual((first.width, first.height), (320, 180))
         self.assertEqual((second.width, second.height), (100, 50))
 
     def test_begins_a_video_anew(self) -> None:
         """A video repeats after its end; one without any frame raises LinkLost, and is released once."""
         lens = Lens(Picture(10, 10), None, Picture(20, 20))
-        shots = self.capture(lens)
-        shots.open()
-        self.assertEqual([shots.read_picture().width, shots.read_picture().width], [10, 20])
+        source = self.capture(lens)
+        source.open()
+        self.assertEqual([source.read_picture().width, source.read_picture().width], [10, 20])
         self.assertEqual(lens.set_to[Lens.CAP_PROP_POS_FRAMES], 0)
-        self.assertRaises(LinkLost, shots.read_picture)
-        shots.close()
-        shots.close()
+        self.assertRaises(LinkLost, source.read_picture)
+        source.close()
+        source.close()
         self.assertEqual(lens.released, 1)
-        self.assertRaises(LinkLost, shots.read_picture)
+        self.assertRaises(LinkLost, source.read_picture)
 
     def test_names_why_there_are_no_pictures(self) -> None:
         """A missing OpenCV, camera or file, a busy camera and an invalid picture each raise an error with its cause."""
@@ -210,9 +210,9 @@ class ShotsTests(SynchronousTestCase):
         self.assertIn("else may be using", str(self.assertRaises(LinkLost, busy.open)))
         lens = Lens(Picture(10, 10))
         lens.can_encode = False
-        shots = self.capture(lens)
-        shots.open()
-        self.assertRaises(BadFrame, shots.read_picture)
+        source = self.capture(lens)
+        source.open()
+        self.assertRaises(BadFrame, source.read_picture)
         self.assertRaises(LinkLost, FolderSource("/nowhere").open)
         self.assertRaises(LinkLost, FolderSource("/nowhere").read_picture)
 
@@ -234,8 +234,8 @@ class ShotsTests(SynchronousTestCase):
                 pass
 
         told: list[tuple[str, Any]] = []
-        reel = SourceReader(Moody(), lambda what, said: told.append((what, said)))
-        self.assertGreater(reel.read_picture(), 0.0)
-        self.assertEqual(reel.read_picture(), 0.0)
+        reader = SourceReader(Moody(), lambda what, said: told.append((what, said)))
+        self.assertGreater(reader.read_picture(), 0.0)
+        self.assertEqual(reader.read_picture(), 0.0)
         self.assertEqual(told[0], ("gone", "RuntimeError: cv2.error: (-215)"))
         self.assertEqual(told[1], ("shown", JpegPicture(b"", 1, 1)))

@@ -1,4 +1,4 @@
-"""Tests of ``drivers.create2.codec``, ``odometry``, ``sense`` and ``option``."""
+"""Tests of ``drivers.create2.codec``, ``odometry``, ``sensors`` and ``option``."""
 
 from __future__ import annotations
 
@@ -155,7 +155,7 @@ class StreamTests(SynchronousTestCase):
         self.assertTrue(list(reader.read(SPECIFIED * 2)))
 
 
-class SenseTests(SynchronousTestCase):
+class SensorsTests(SynchronousTestCase):
     """The meaning of a frame."""
 
     def frame(self, **values: int) -> dict[str, int]:

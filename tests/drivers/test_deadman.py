@@ -46,7 +46,7 @@ from tests.drivers.contract import RobotCase
 from tests.formats.rfc6455 import masked
 
 
-class Way(SharedLink):
+class RecordingLink(SharedLink):
     """A channel that records halt messages; with ``is_answered``, each one is confirmed."""
 
     def __init__(self, is_answered: bool = False) -> None:
@@ -63,104 +63,104 @@ class Way(SharedLink):
         self.is_open = False
 
 
-class WatchTests(SynchronousTestCase):
+class HaltTimerTests(SynchronousTestCase):
     """The time and the number of halts."""
 
     def setUp(self) -> None:
         """Guard a robot that may move until 10."""
-        self.way = Way()
-        self.watch = HaltTimer()
-        self.watch.set_halt_command(self.way, b"halt")
-        self.watch.arm(10.0)
+        self.link = RecordingLink()
+        self.timer = HaltTimer()
+        self.timer.set_halt_command(self.link, b"halt")
+        self.timer.arm(10.0)
 
     def test_halts_when_the_time_is_over(self) -> None:
         """The halt is sent after the deadline plus a grace period, three times at intervals, and counted once."""
-        wait = self.watch.get_timeout(9.0)
+        wait = self.timer.get_timeout(9.0)
         self.assertIsNotNone(wait)
         self.assertAlmostEqual(wait or 0.0, 1.0 + GRACE_S)
-        self.watch.send_due_halts(10.0)
-        self.assertEqual(self.way.said, [])
-        self.watch.send_due_halts(10.1)
-        self.assertEqual(self.way.said, [b"halt"])
-        self.assertAlmostEqual(self.watch.get_timeout(10.1) or 0.0, HALT_REPEAT_S)
+        self.timer.send_due_halts(10.0)
+        self.assertEqual(self.link.said, [])
+        self.timer.send_due_halts(10.1)
+        self.assertEqual(self.link.said, [b"halt"])
+        self.assertAlmostEqual(self.timer.get_timeout(10.1) or 0.0, HALT_REPEAT_S)
         for moment in (10.15, 10.21, 10.32, 10.5, 20.0):
-            self.watch.send_due_halts(moment)
-        self.assertEqual(self.way.said, [b"halt"] * 3)
-        self.assertEqual(self.watch.halts, 1)
-        self.assertIsNone(self.watch.get_timeout(20.0))
+            self.timer.send_due_halts(moment)
+        self.assertEqual(self.link.said, [b"halt"] * 3)
+        self.assertEqual(self.timer.halts, 1)
+        self.assertIsNone(self.timer.get_timeout(20.0))
 
     def test_heeds_newer_words(self) -> None:
         """A new deadline replaces the old one, rest removes it, and both end the repetition of a halt."""
-        self.watch.arm(11.0)
-        self.watch.send_due_halts(10.5)
-        self.assertEqual(self.way.said, [])
-        self.watch.disarm()
-        self.watch.send_due_halts(12.0)
-        self.assertIsNone(self.watch.get_timeout(12.0))
-        self.assertEqual(self.way.said, [])
-        for newer in (self.watch.disarm, lambda: self.watch.arm(30.0)):
-            self.watch.arm(13.0)
-            self.watch.send_due_halts(14.0)
+        self.timer.arm(11.0)
+        self.timer.send_due_halts(10.5)
+        self.assertEqual(self.link.said, [])
+        self.timer.disarm()
+        self.timer.send_due_halts(12.0)
+        self.assertIsNone(self.timer.get_timeout(12.0))
+        self.assertEqual(self.link.said, [])
+        for newer in (self.timer.disarm, lambda: self.timer.arm(30.0)):
+            self.timer.arm(13.0)
+            self.timer.send_due_halts(14.0)
             newer()
-            self.way.said.clear()
-            self.watch.send_due_halts(14.5)
-            self.assertEqual(self.way.said, [])
+            self.link.said.clear()
+            self.timer.send_due_halts(14.5)
+            self.assertEqual(self.link.said, [])
 
     def test_halts_at_once_when_the_node_is_gone(self) -> None:
         """The end of the node halts the robot at once if it may move, and otherwise sends nothing."""
-        self.watch.on_node_end(5.0)
-        self.watch.send_due_halts(5.001)
-        self.assertEqual(self.way.said, [b"halt"])
+        self.timer.on_node_end(5.0)
+        self.timer.send_due_halts(5.001)
+        self.assertEqual(self.link.said, [b"halt"])
         still = HaltTimer()
-        still.set_halt_command(Way(), b"halt")
+        still.set_halt_command(RecordingLink(), b"halt")
         still.on_node_end(5.0)
         self.assertIsNone(still.get_timeout(5.0))
 
     def test_lets_go_of_what_was_guarded(self) -> None:
         """A new channel closes the old one and keeps the deadline; without a channel nothing is sent or counted."""
-        other = Way()
-        self.watch.set_halt_command(other, b"other")
-        self.assertFalse(self.way.is_open)
-        self.watch.send_due_halts(10.1)
-        self.assertEqual((self.way.said, other.said), ([], [b"other"]))
-        self.watch.arm(11.0)
-        self.watch.on_link_lost()
+        other = RecordingLink()
+        self.timer.set_halt_command(other, b"other")
+        self.assertFalse(self.link.is_open)
+        self.timer.send_due_halts(10.1)
+        self.assertEqual((self.link.said, other.said), ([], [b"other"]))
+        self.timer.arm(11.0)
+        self.timer.on_link_lost()
         self.assertFalse(other.is_open)
-        self.watch.arm(12.0)
-        self.watch.send_due_halts(13.0)
-        self.assertEqual((self.watch.halts, self.watch.get_timeout(13.0)), (1, None))
+        self.timer.arm(12.0)
+        self.timer.send_due_halts(13.0)
+        self.assertEqual((self.timer.halts, self.timer.get_timeout(13.0)), (1, None))
 
     def test_asks_a_server_until_it_answers(self) -> None:
         """A halt that a server confirmed is not repeated."""
-        server = Way(is_answered=True)
-        self.watch.set_halt_command(server, b"GET")
+        server = RecordingLink(is_answered=True)
+        self.timer.set_halt_command(server, b"GET")
         for moment in (10.1, 10.3, 10.5):
-            self.watch.send_due_halts(moment)
+            self.timer.send_due_halts(moment)
         self.assertEqual(server.said, [b"GET"])
 
 
-class Told(HaltTimer):
-    """A watch that records its calls."""
+class RecordingTimer(HaltTimer):
+    """A timer that records its calls."""
 
     def __init__(self) -> None:
         super().__init__()
-        self.told: list[Any] = []
+        self.calls: list[Any] = []
 
-    def set_halt_command(self, way: SharedLink | CommandServer, halt: bytes) -> None:
-        where = way._descriptor if isinstance(way, SharedLink) else way._address
-        self.told.append((type(way), where, halt))
+    def set_halt_command(self, link: SharedLink | CommandServer, halt: bytes) -> None:
+        where = link._descriptor if isinstance(link, SharedLink) else link._address
+        self.calls.append((type(link), where, halt))
 
     def arm(self, moment: float) -> None:
-        self.told.append(moment)
+        self.calls.append(moment)
 
     def disarm(self) -> None:
-        self.told.append("rest")
+        self.calls.append("rest")
 
     def on_link_lost(self) -> None:
-        self.told.append("leave")
+        self.calls.append("leave")
 
 
-class EarTests(SynchronousTestCase):
+class MessageParserTests(SynchronousTestCase):
     """The protocol of the process."""
 
     def test_hears_words_cut_anyhow(self) -> None:
@@ -177,13 +177,13 @@ class EarTests(SynchronousTestCase):
             (SharedLink, 6, b""),
             (CommandServer, ("10.0.0.5", 80), b"GET /x\0y"),
         ]
-        whole, slow = Told(), Told()
+        whole, slow = RecordingTimer(), RecordingTimer()
         MessageParser(whole).feed(said, [5, 6])
-        ear = MessageParser(slow)
+        parser = MessageParser(slow)
         for place in range(len(said)):
-            ear.feed(said[place : place + 1], {0: [5], 30: [6]}.get(place, []))
-        self.assertEqual(whole.told, wanted)
-        self.assertEqual(slow.told, wanted)
+            parser.feed(said[place : place + 1], {0: [5], 30: [6]}.get(place, []))
+        self.assertEqual(whole.calls, wanted)
+        self.assertEqual(slow.calls, wanted)
 
 
 class OrderedDeadMan(MemoryDeadManSwitch):
@@ -201,7 +201,7 @@ class Puppet(BaseDriver):
     def __init__(self, clock: Clock, switch: OrderedDeadMan | None) -> None:
         description = Description("puppet", "puppet", {"base2d": {}}, {"base.vx": (-1.0, 1.0)}, 0.1)
         super().__init__(description, "puppet", clock, switch)
-        self.told = [] if switch is None else switch.calls
+        self.calls = [] if switch is None else switch.calls
         self.link = MemoryLink(clock, 0.0)
 
     def up(self) -> None:
@@ -221,11 +221,11 @@ class Puppet(BaseDriver):
         return closed
 
     def _drive(self, motion: Action, permit: Permit) -> Action:
-        self.told.append("drive")
+        self.calls.append("drive")
         return motion
 
     def _halt(self) -> None:
-        self.told.append("halt")
+        self.calls.append("halt")
 
     def _make_halt_command(self) -> HaltCommand:
         return HaltCommand(b"halt", self.link)
@@ -286,7 +286,7 @@ class BaseDriverTests(SynchronousTestCase):
         self.assertNotIn("halts", Puppet(self.clock, None).diagnostics())
 
 
-class LastWordTests(RobotCase):
+class HaltCommandTests(RobotCase):
     """The bytes that halt each kind of robot."""
 
     def build(self) -> None:
@@ -308,10 +308,10 @@ class LastWordTests(RobotCase):
         dog = AiboEmulator(self.clock, self.body, Random(1))
         dog.start()
         driver = AiboDriver({"host": "dog", "camera": False}, "dog", dog.connector(), self.clock, dead_man=self.switch)
-        word = self.word(driver)
-        self.assertEqual(word.data, b"f\0\0\0\0s\0\0\0\0r\0\0\0\0")
+        command = self.word(driver)
+        self.assertEqual(command.data, b"f\0\0\0\0s\0\0\0\0r\0\0\0\0")
         dog.received_commands.clear()
-        word.link.send(word.data)
+        command.link.send(command.data)
         self.pass_time(0.01)
         self.assertEqual(dog.received_commands, [("f", 0.0), ("s", 0.0), ("r", 0.0)])
 
@@ -327,16 +327,16 @@ class LastWordTests(RobotCase):
         robot = Bittle(self.body, self.clock, Random(1))
         connector = MemoryConnector(self.clock, robot.accept)
         driver = BittleDriver(checked_bittle({"port": "x"}), "dog", connector, self.clock, self.switch)
-        word = self.word(driver)
-        self.assertEqual((word.data, word.address), (b"kup\n", None))
+        command = self.word(driver)
+        self.assertEqual((command.data, command.address), (b"kup\n", None))
         for board, path in (("biboard", b"/cmd?cmd=kup"), ("nyboard", b"/action?name=kup")):
             robot = Bittle(self.body, self.clock, Random(1), board=board)
             options = checked_bittle({"host": "10.0.0.5", "board": board})
             http = HttpConnector(MemoryConnector(self.clock, robot.accept_http), self.clock, board)
-            word = self.word(BittleDriver(options, "dog", http, self.clock, self.switch), 1.5)
-            self.assertEqual(word.address, ("10.0.0.5", 80))
-            self.assertTrue(word.data.startswith(b"GET " + path + b" HTTP/1.1\r\n"))
-            self.assertTrue(word.data.endswith(b"\r\n\r\n"))
+            command = self.word(BittleDriver(options, "dog", http, self.clock, self.switch), 1.5)
+            self.assertEqual(command.address, ("10.0.0.5", 80))
+            self.assertTrue(command.data.startswith(b"GET " + path + b" HTTP/1.1\r\n"))
+            self.assertTrue(command.data.endswith(b"\r\n\r\n"))
 
     def test_rosbridge(self) -> None:
         """A ROS base gets a masked text frame with zero velocity, of the type to which it subscribes."""
@@ -359,12 +359,12 @@ class LastWordTests(RobotCase):
         connector = MemoryConnector(self.clock, robot.accept)
         return RosbridgeDriver({}, connector, self.clock, "robot", self.switch)
 
-    def published(self, word: HaltCommand) -> dict[str, Any]:
-        head, size = word.data[0], word.data[1]
+    def published(self, command: HaltCommand) -> dict[str, Any]:
+        head, size = command.data[0], command.data[1]
         self.assertEqual(head, 0x81)
         at = 2 if size < 0x80 + 126 else 4
         self.assertGreaterEqual(size, 0x80)
-        said = json.loads(masked(word.data[at + 4 :], word.data[at : at + 4]))
+        said = json.loads(masked(command.data[at + 4 :], command.data[at : at + 4]))
         self.assertEqual((said["op"], said["topic"]), ("publish", "/cmd_vel"))
         message: dict[str, Any] = said["msg"]
         velocity = message.get("twist", message)

@@ -24,7 +24,7 @@ FROZEN_S = 2.0
 
 
 @dataclass
-class WatchedBody(MemoryRobot):
+class WatchedRobot(MemoryRobot):
     """A base that records its velocities."""
 
     told: list[tuple[float, float, float]] = field(default_factory=list)
@@ -39,7 +39,7 @@ class LateTests(RobotCase):
 
     def build(self) -> None:
         """Create the base that records its velocities."""
-        self.body = self.watched = WatchedBody()
+        self.body = self.watched = WatchedRobot()
 
     def tearDown(self) -> None:
         """Skip the check of the base class, as the robots are still running."""
@@ -84,8 +84,8 @@ class LateTests(RobotCase):
 
     def test_silence_of_a_frozen_node_is_not_the_robots(self) -> None:
         """After a pause of the node, a driver does not treat an active robot as silent."""
-        ear = WarningCollector()
-        self.addCleanup(ear.close)
+        collector = WarningCollector()
+        self.addCleanup(collector.close)
         for phase in range(5):
             self.setUp()
             vacuum, dog = Create2(self.body, self.clock, Random(1)), AiboEmulator(self.clock, self.body, Random(1))
@@ -104,7 +104,7 @@ class LateTests(RobotCase):
                 self.assertEqual(
                     [(one.state, one.diagnostics()["reconnects"]) for one in drivers], [("ready", 0.0)] * 3
                 )
-        self.assertEqual(ear.warnings, [])
+        self.assertEqual(collector.warnings, [])
 
     def test_bittle_without_an_answer(self) -> None:
         """A gait without an answer is not requested again after its deadline."""

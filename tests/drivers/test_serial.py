@@ -142,7 +142,7 @@ class SerialTests(SynchronousTestCase):
         self.assertEqual((self.downs, len(self.links)), (1, 2))
 
     def test_hangs_up_after_what_was_sent(self) -> None:
-        """``hang_up`` sends the last bytes, closes, and leaves no delayed call, also if called twice."""
+        """``disconnect`` sends the last bytes, closes, and leaves no delayed call, also if called twice."""
         line = self.line()
         self.clock.advance(0.0)
         self.links[0].send(b"stop")

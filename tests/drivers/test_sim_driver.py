@@ -194,7 +194,7 @@ class SimDriverAloneTests(SynchronousTestCase):
         self.assertEqual(self.robots[0].heard[len(before) :].count(b"halt"), 1)
 
 
-class YardOperatorTests(SynchronousTestCase):
+class SimulatorClientTests(SynchronousTestCase):
     """The operator's client of the same protocol."""
 
     def setUp(self) -> None:

@@ -58,7 +58,7 @@ class ConvertTests(SynchronousTestCase):
         return error
 
     def test_converts(self) -> None:
-        """Integers become floats where declared, lists become tuples, and the ``Then`` step is applied last."""
+        """Integers become floats where declared, lists become tuples, and the ``ConversionStep`` is applied last."""
         given = {"name": "a", "rate": 2, "sizes": [1, 1, 2], "parts": [{"kind": "camera"}], "word": "ay"}
         table = convert_table(given, _Table)
         self.assertEqual(table, _Table("a", 80, 2.0, "safe", (1, 2), (_Part("camera"),), "AY"))  # type: ignore[arg-type]

@@ -235,7 +235,7 @@ class KeeperTests(TestCase):
         self.assertEqual(self.keeper.halts, 1)
 
     async def test_stays_armed_until_the_halt_has_left(self) -> None:
-        """``rest`` disarms the switch only after the link has sent the driver's halt."""
+        """``disarm`` disarms the switch only after the link has sent the driver's halt."""
         self.keeper.set_halt_command(HaltCommand(b"halt", self.wire))
         self.keeper.arm(0.2)
         self.keeper.disarm()

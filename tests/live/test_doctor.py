@@ -144,7 +144,8 @@ class LanTests(DoctorCase):
 
     def test_one_of_no_team_finds_whom_to_ask(self) -> None:
         """A machine without a team finds the nodes on its LAN by discovery."""
-        program = "from swarmnode.doctor.measure import discover_on_lan; print(*[each.address for each in discover_on_lan()])"
+        imported = "from swarmnode.doctor.measure import discover_on_lan"
+        program = f"{imported}; print(*[each.address for each in discover_on_lan()])"
         done = self.net.run("a1", [sys.executable, "-c", program], timeout=LIMIT_S)
         self.assertEqual((done.stdout.strip(), done.stderr), (self.other, ""))
 

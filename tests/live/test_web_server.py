@@ -16,7 +16,7 @@ from twisted.trial.unittest import TestCase
 from twisted.web.client import Agent, HTTPConnectionPool, readBody
 from twisted.web.http_headers import Headers
 
-from tests.webnode.memory import MemoryDesk
+from tests.webnode.memory import MemoryTeamControl
 from tests.webnode.picture import jpeg
 from webnode.auth import OpenSessions
 from webnode.server import WORKERS, WebService
@@ -63,7 +63,7 @@ class WebServiceTests(TestCase):
         self.gate = threading.Event()
         self.gate.set()
         self.held = threading.Event()
-        self.desk = MemoryDesk()
+        self.desk = MemoryTeamControl()
         self.frames = self.desk.frames
         self.web = self.service(0)
         self.web.startService()
@@ -163,7 +163,7 @@ class WebServiceTests(TestCase):
             return opened[0]
 
         board = Services(self.desk, OpenSessions())
-        web = WebService(reactor, "127.0.0.1", 0, self.read, board, lambda: 1e9, doors=[door])
+        web = WebService(reactor, "127.0.0.1", 0, self.read, board, lambda: 1e9, port_openers=[door])
         web.startService()
         url = f"http://127.0.0.1:{opened[0].getHost().port}".encode()
         for path, words in ((b"/", b"vaio"), (b"/sw.js", b"caches"), (b"/api/v1/state", b"dog1")):

@@ -24,19 +24,19 @@ class Page(Service):
         pages.append(self)
 
 
-class World:
+class MemoryTeam:
     """A switchboard, a clock and the nodes on them."""
 
     def __init__(self) -> None:
         self.clock = HeapClock()
-        self.board = Switchboard(self.clock, random.Random(1))
+        self.switchboard = Switchboard(self.clock, random.Random(1))
         self.pages: list[Page] = []
 
-    def seams(self, name: str, port: int, store: MemoryStore | None = None) -> Dependencies:
+    def make_dependencies(self, name: str, port: int, store: MemoryStore | None = None) -> Dependencies:
         """Return the environment of one node."""
         return Dependencies(
             self.clock,
-            lambda: self.board.make_network("127.0.0.1", port),
+            lambda: self.switchboard.make_network("127.0.0.1", port),
             MemoryStore() if store is None else store,
             random.Random(name),
             self.clock.seconds,
@@ -48,7 +48,7 @@ class World:
         settings = Settings.from_mapping(
             {"node": {"name": name, "port": port, "known_nodes": known, "team_key": KEY}}, "test"
         )
-        return NodeService(settings, self.seams(name, port), [self.page] if is_web else [])
+        return NodeService(settings, self.make_dependencies(name, port), [self.page] if is_web else [])
 
     def page(self, node: SwarmNode) -> Page:
         """Return the page of a running node."""

@@ -28,7 +28,7 @@ from swarmnode.simulated_team import SimulatedTeam
 from swarmnode.team import init, invitations, invite, join, members, promote, renew, revoke, rotate
 from swarmnode.team.common import CommandContext
 from tests.swarmnode.shell import Shell, runtime_folder
-from tests.swarmnode.team import KEY, World
+from tests.swarmnode.team import KEY, MemoryTeam
 
 Main = Callable[[Sequence[str], CommandContext], int]
 
@@ -51,9 +51,9 @@ class AdmissionTests(SynchronousTestCase):
     def run_verb(self, main: Callable[..., int], *words: str, **more: Any) -> tuple[int, str]:
         """Run a verb; return exit code and output, and store the error output in ``said``."""
         out, complaint = io.StringIO(), io.StringIO()
-        desk = CommandContext(out, self.shell.ask, self.team.clock.seconds, self.dice)
+        context = CommandContext(out, self.shell.ask, self.team.clock.seconds, self.dice)
         with contextlib.redirect_stderr(complaint):
-            code = main(list(words), desk, **more)
+            code = main(list(words), context, **more)
         self.said = complaint.getvalue()
         return code, out.getvalue()
 
@@ -63,11 +63,11 @@ class AdmissionTests(SynchronousTestCase):
         self.assertEqual(code, 0, self.said)
         return json.loads(output)
 
-    def knock(self, code: JoinCode, seed: bytes, wish: str, doors: Sequence[Address], timeout: float) -> Membership:
+    def knock(self, code: JoinCode, seed: bytes, wish: str, addresses: Sequence[Address], timeout: float) -> Membership:
         """Send a join request like the verb, in the team's virtual time and network."""
         self.newcomers += 1
         network = self.team.switchboard.make_network("127.0.0.1", 9000 + self.newcomers)
-        work = JoinClient(code, seed, network, self.team.clock, self.dice, wish).join(doors, timeout)
+        work = JoinClient(code, seed, network, self.team.clock, self.dice, wish).join(addresses, timeout)
         outcome: list[Any] = []
         work.addCallbacks(outcome.append, lambda failure: outcome.append(failure.value))
         self.team.clock.advance(timeout + 0.1)
@@ -77,7 +77,7 @@ class AdmissionTests(SynchronousTestCase):
         return found
 
     def joined(self, text: str, folder: str = "new", **more: Any) -> Any:
-        return self.done(join.main, text, "--folder", str(self.folder / folder), knocking=self.knock, **more)
+        return self.done(join.main, text, "--folder", str(self.folder / folder), send_requests=self.knock, **more)
 
     def names(self) -> list[str]:
         return [each["name"] for each in self.done(members.main)["members"]]
@@ -120,7 +120,7 @@ class AdmissionTests(SynchronousTestCase):
             return replace(self.knock(*knock), known_nodes=(Address("192.0.2.7", 7000),))
 
         words = (found["text"], "--folder", str(self.folder / "far"))
-        settings = Settings.load(self.done(join.main, *words, knocking=elsewhere)["settings"])
+        settings = Settings.load(self.done(join.main, *words, send_requests=elsewhere)["settings"])
         self.assertEqual(settings.node.host, "*")
         near = self.joined(self.done(invite.main, "dog8")["text"], "near")
         self.assertEqual(Settings.load(near["settings"]).node.host, "127.0.0.1")
@@ -137,10 +137,10 @@ class AdmissionTests(SynchronousTestCase):
         settings = Settings.load(found["settings"])
         self.assertEqual((found["name"], settings.node.name, found["roles"]), ("dog9", "dog9", ["device"]))
         self.assertEqual(self.names(), ["dog1", "dog9", "vaio"])
-        world = World()
-        seams = world.seams("dog9", 7099)
+        team = MemoryTeam()
+        dependencies = team.make_dependencies("dog9", 7099)
         kept = MembershipFile(Path(settings.node.membership))
-        made_node = assemble_node(settings, type(seams)(**{**seams.__dict__, "membership": kept})).node
+        made_node = assemble_node(settings, type(dependencies)(**{**dependencies.__dict__, "membership": kept})).node
         self.assertEqual(made_node.entangled.identity, kept.membership.identity)
 
     def test_killed_while_joining(self) -> None:
@@ -153,9 +153,9 @@ class AdmissionTests(SynchronousTestCase):
             raise SystemExit(1)
 
         with self.assertRaises(SystemExit):
-            self.run_verb(join.main, *words, knocking=killed)
+            self.run_verb(join.main, *words, send_requests=killed)
         self.assertEqual([path.stat().st_mode & 0o777 for path in (self.folder / "new").iterdir()], [0o600])
-        self.assertEqual(self.done(join.main, *words, knocking=self.knock)["name"], "dog9")
+        self.assertEqual(self.done(join.main, *words, send_requests=self.knock)["name"], "dog9")
         self.assertEqual(self.names(), ["dog1", "dog9", "vaio"])
         left = sorted(path.name for path in (self.folder / "new").iterdir())
         self.assertEqual(left, ["swarm.membership", "swarm.toml"])
@@ -174,11 +174,11 @@ class AdmissionTests(SynchronousTestCase):
         where.mkdir()
         (where / "swarm.toml").write_text('[node]\nname = "mine"\n')
         text = self.done(invite.main, "dog9")["text"]
-        _, output = self.run_verb(join.main, text, "--folder", str(where), knocking=self.knock)
+        _, output = self.run_verb(join.main, text, "--folder", str(where), send_requests=self.knock)
         self.assertIn("was there already", output)
         self.assertEqual((where / "swarm.toml").read_text(), '[node]\nname = "mine"\n')
         text = self.done(invite.main, "dog8")["text"]
-        _, output = self.run_verb(join.main, text, "--folder", str(self.folder / "other"), knocking=self.knock)
+        _, output = self.run_verb(join.main, text, "--folder", str(self.folder / "other"), send_requests=self.knock)
         self.assertNotIn("was there already", output)
 
     def test_key_of_another_code_is_not_used(self) -> None:
@@ -192,32 +192,32 @@ class AdmissionTests(SynchronousTestCase):
 
         for text in (first, first, other):
             words = (text, "--folder", str(self.folder / "new"))
-            self.assertEqual(self.run_verb(join.main, *words, knocking=silent)[0], 1)
+            self.assertEqual(self.run_verb(join.main, *words, send_requests=silent)[0], 1)
         self.assertEqual((seeds[0], len(set(seeds))), (seeds[1], 2))
 
     def test_bad_codes_are_named(self) -> None:
         """A mistyped code is rejected before a request is sent, a used code by the bootstrap node, with remedies."""
         found = self.done(invite.main, "dog9")
         wrong = found["code"][:-1] + ("0" if found["code"][-1] != "0" else "1")
-        self.assertEqual(self.run_verb(join.main, wrong, "--at", "127.0.0.1:7000", knocking=self.knock)[0], 2)
+        self.assertEqual(self.run_verb(join.main, wrong, "--at", "127.0.0.1:7000", send_requests=self.knock)[0], 2)
         self.assertIn("mistyped", self.said)
         self.assertEqual(self.newcomers, 0)
         self.joined(found["text"])
         words = (found["text"], "--folder", str(self.folder / "other"))
-        self.assertEqual(self.run_verb(join.main, *words, knocking=self.knock)[0], 1)
+        self.assertEqual(self.run_verb(join.main, *words, send_requests=self.knock)[0], 1)
         self.assertIn("was used as often as it may be; ask the operator", self.said)
-        self.assertEqual(self.run_verb(join.main, found["code"], knocking=self.knock, around=lambda: [])[0], 2)
+        self.assertEqual(self.run_verb(join.main, found["code"], send_requests=self.knock, find_nodes=lambda: [])[0], 2)
         self.assertIn("--at HOST:PORT", self.said)
 
     def test_code_alone(self) -> None:
         """A code without address is tried on the LAN; a member that joins again does not spend its new code."""
         code = self.done(invite.main, "dog8")["code"]
         around = [Address("127.0.0.1", 7077), Address("127.0.0.1", 7000)]
-        self.assertEqual(self.joined(code, around=lambda: around)["name"], "dog8")
+        self.assertEqual(self.joined(code, find_nodes=lambda: around)["name"], "dog8")
         text = self.done(invite.main, "dog9")["text"]
-        knocked = self.newcomers
-        code, _ = self.run_verb(join.main, text, "--folder", str(self.folder / "new"), knocking=self.knock)
-        self.assertEqual((code, self.newcomers), (2, knocked))
+        send_requests = self.newcomers
+        code, _ = self.run_verb(join.main, text, "--folder", str(self.folder / "new"), send_requests=self.knock)
+        self.assertEqual((code, self.newcomers), (2, send_requests))
         self.assertIn("is a member", self.said)
         self.assertEqual(self.run_verb(invite.main, "dog1")[0], 1)
         self.assertIn("the team already has a member dog1", self.said)
@@ -346,7 +346,7 @@ class AdmissionTests(SynchronousTestCase):
 class TeamSettingsTests(SynchronousTestCase):
     def refusal(self, **node: str) -> str:
         settings = Settings.from_mapping({"node": {"name": "a", **node}}, "a.toml")
-        return str(self.assertRaises(BadSetting, assemble_node, settings, World().seams("a", 7000)))
+        return str(self.assertRaises(BadSetting, assemble_node, settings, MemoryTeam().make_dependencies("a", 7000)))
 
     def test_neither_and_both(self) -> None:
         """A node without a team is rejected with a hint to ``swarm join``, and so is a node with two teams."""
@@ -357,8 +357,8 @@ class TeamSettingsTests(SynchronousTestCase):
         """A membership sets the node's identity and certificate; no team key is needed."""
         dice = random.Random(1)
         membership = operators.create_operator("yard", dice).create_membership("a", ("device",), 0, dice)
-        seams = World().seams("a", 7000)
-        seams = type(seams)(**{**seams.__dict__, "membership": MemoryMembership(membership)})
-        node = assemble_node(Settings.from_mapping({"node": {"name": "a"}}, "a.toml"), seams).node
+        dependencies = MemoryTeam().make_dependencies("a", 7000)
+        dependencies = type(dependencies)(**{**dependencies.__dict__, "membership": MemoryMembership(membership)})
+        node = assemble_node(Settings.from_mapping({"node": {"name": "a"}}, "a.toml"), dependencies).node
         self.assertEqual(node.entangled.identity, membership.identity)
         self.assertEqual(node.entangled.endpoint.admission.own_pass, membership.certificate)

@@ -13,7 +13,7 @@ from middleware.config.settings import Settings
 from middleware.entangled.data.memory import MemoryStore
 from middleware.errors import BadSetting
 from swarmnode.assembly import assemble_node, load_identity
-from tests.swarmnode.team import KEY, World
+from tests.swarmnode.team import KEY, MemoryTeam
 
 
 class AssemblyTests(SynchronousTestCase):
@@ -25,13 +25,13 @@ class AssemblyTests(SynchronousTestCase):
 
     def test_driver_brings_kind_and_capabilities(self) -> None:
         """A node with a driver takes kind and capabilities from the robot; the settings override them."""
-        world = World()
+        team = MemoryTeam()
         settings = self.settings(
             node={"capabilities": {"base2d": {"max": 1}, "horn": {}}},
             driver={"kind": "sim"},
             agent={"module": "search"},
         )
-        made = assemble_node(settings, world.seams("a", 7000))
+        made = assemble_node(settings, team.make_dependencies("a", 7000))
         device = made.node.presence.device
         self.assertEqual(device.kind, "aibo-ers7")
         self.assertEqual(device.capabilities["base2d"], {"max": 1})
@@ -44,16 +44,16 @@ class AssemblyTests(SynchronousTestCase):
         """A robot with a camera as part has the capabilities of both, and its pictures can be requested."""
         parts = [{"kind": "camera", "options": {"source": "/pictures"}}]
         driver = {"kind": "create2", "options": {"port": "/dev/robot"}, "parts": parts}
-        made = assemble_node(self.settings(driver=driver), World().seams("a", 7000))
+        made = assemble_node(self.settings(driver=driver), MemoryTeam().make_dependencies("a", 7000))
         self.assertTrue({"camera", "bumper"} <= set(made.node.presence.device.capabilities))
         self.assertIsInstance(made.driver, Filming)
         with self.assertRaises(BadSetting) as caught:
-            assemble_node(self.settings(driver={"parts": parts}), World().seams("b", 7001))
+            assemble_node(self.settings(driver={"parts": parts}), MemoryTeam().make_dependencies("b", 7001))
         self.assertIn("[driver] parts: are set, but there is no robot", str(caught.exception))
 
     def test_node_without_body_has_no_agent(self) -> None:
         """A laptop has no driver and no agent, and takes its kind from the settings."""
-        made = assemble_node(self.settings(node={"kind": "laptop"}), World().seams("a", 7000))
+        made = assemble_node(self.settings(node={"kind": "laptop"}), MemoryTeam().make_dependencies("a", 7000))
         self.assertEqual((made.agent, made.driver, made.node.presence.device.kind), (None, None, "laptop"))
 
     def test_identity_is_kept_in_the_store(self) -> None:

@@ -143,7 +143,7 @@ class GatewayTests(SynchronousTestCase):
         self.assertLess(self.team.clock.seconds() - began, 2.0 + PICTURE_TIMEOUT_S)
 
     def test_first_look_may_take_longer(self) -> None:
-        """The first picture may take up to ``FIRST_S``; after it a phone that falls silent is removed."""
+        """The first picture may take ``FIRST_PICTURE_TIMEOUT_S``; after it a phone that falls silent is removed."""
         phone = Phone(self, self.gateways["vaio"])
         phone.looks = False
         self.live(FIRST_PICTURE_TIMEOUT_S - 0.2)
@@ -216,7 +216,7 @@ class GatewayTests(SynchronousTestCase):
         self.assertEqual(told, [f"dog1-{first.uuid[:4]}", "anna", f"anna-{third.uuid[:4]}"])
 
     def test_takes_so_many(self) -> None:
-        """A phone beyond ``MOST`` is rejected until another one leaves; a connected phone may join again."""
+        """A phone beyond ``MAX_PHONES`` is rejected until another one leaves; a connected phone may join again."""
         gateway = self.gateways["vaio"]
         phones = [Phone(self, gateway, bytes([n]) * 32, f"p{n}") for n in range(MAX_PHONES)]
         refusal = self.failureResultOf(gateway.join(b"x" * 32, "late", CAN), Refusal).value

@@ -20,7 +20,7 @@ from middleware.frontend.client import TeamClient
 from sim.robots.emulator.aibo_dog import AiboEmulator
 from sim.robots.emulator.simulated_robot import MemoryRobot
 from swarmnode.service import NodeService
-from tests.swarmnode.team import World
+from tests.swarmnode.team import MemoryTeam
 from webnode.state import DepartedDevices, make_device_view
 from webnode.state_builder import build_state
 from webnode.team_control import TeamControl
@@ -64,25 +64,25 @@ class PairingTests(SynchronousTestCase):
 
         globalLogPublisher.addObserver(seen)
         self.addCleanup(globalLogPublisher.removeObserver, seen)
-        world = World()
+        team = MemoryTeam()
         services: dict[str, NodeService] = {}
         for port, (name, settings) in enumerate(sorted(self.settings.items(), reverse=True), 7000):
-            seams = world.seams(name, port)
+            dependencies = team.make_dependencies(name, port)
             host = settings.node.host
-            seams = replace(seams, network=partial(world.board.make_network, host, port))
+            dependencies = replace(dependencies, network=partial(team.switchboard.make_network, host, port))
             if settings.driver.kind:
-                dog = AiboEmulator(world.clock, MemoryRobot(), random.Random(name))
+                dog = AiboEmulator(team.clock, MemoryRobot(), random.Random(name))
                 dog.start()
                 self.addCleanup(dog.stop)
-                seams = replace(seams, connector=dog.connector())
+                dependencies = replace(dependencies, connector=dog.connector())
             settings = replace(settings, node=replace(settings.node, store=":memory:"))
-            services[name] = NodeService(settings, seams, [])
+            services[name] = NodeService(settings, dependencies, [])
             services[name].startService()
             self.addCleanup(services[name].stopService)
-            world.clock.advance(1.0)
-        world.clock.advance(3.0)
+            team.clock.advance(1.0)
+        team.clock.advance(3.0)
         desk = TeamControl(TeamClient(services["vaio"].assembly.node), TASKS, DEMO_TASK, None)
-        devices = build_state(desk.read, DepartedDevices(), "vaio", world.clock.seconds())["devices"]
+        devices = build_state(desk.read, DepartedDevices(), "vaio", team.clock.seconds())["devices"]
         told = {device["name"]: (device["name"], device["laptop"], device["agent"]) for device in devices}
         self.assertEqual(told, {"vaio": ("vaio", "vaio", ""), **{row[0]: row for row in ROWS}})
         self.assertEqual({device["kind"] for device in devices}, {"laptop", "aibo-ers7"})

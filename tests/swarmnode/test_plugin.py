@@ -20,7 +20,7 @@ from swarmnode import plugin
 from swarmnode.environment import resolve_hosts
 from swarmnode.plugin import CheckedService, Options, format_error, makeService
 from swarmnode.ports import replace_busy_ports
-from tests.swarmnode.team import KEY, World
+from tests.swarmnode.team import KEY, MemoryTeam
 
 ROOT = Path(__file__).resolve().parents[2]
 
@@ -131,19 +131,25 @@ class RefusalTests(SynchronousTestCase):
 class CheckedServiceTests(SynchronousTestCase):
     def test_take_the_next_port(self) -> None:
         """A node with a default port that is in use starts at the next port; a configured port is rejected."""
-        world = World()
-        world.board.make_network("127.0.0.1", NODE_PORT).listen(lambda datagram, source: None)
+        team = MemoryTeam()
+        team.switchboard.make_network("127.0.0.1", NODE_PORT).listen(lambda datagram, source: None)
 
         def service(**more: Any) -> CheckedService:
             made = CheckedService(
                 Settings.from_mapping({"node": {"name": "a", "team_key": KEY, **more}}, "test"),
-                world.seams("a", NODE_PORT),
+                team.make_dependencies("a", NODE_PORT),
             )
-            self.patch(plugin, "make_network_factory", lambda node, *_: lambda: world.board.make_network(node.host, node.port))
+            self.patch(
+                plugin,
+                "make_network_factory",
+                lambda node, *_: lambda: team.switchboard.make_network(node.host, node.port),
+            )
             return made
 
         self.patch(
-            plugin, "replace_busy_ports", lambda settings: replace_busy_ports(settings, lambda _, host, port: port != NODE_PORT)
+            plugin,
+            "replace_busy_ports",
+            lambda settings: replace_busy_ports(settings, lambda _, host, port: port != NODE_PORT),
         )
         moved = service()
         moved.startService()

@@ -11,7 +11,7 @@ from twisted.trial.unittest import SynchronousTestCase
 from middleware.errors import BadSetting, MissingExtra
 from swarmnode.plugin import format_error
 from swarmnode.web import make_web_page
-from tests.swarmnode.team import World
+from tests.swarmnode.team import MemoryTeam
 
 
 class WebRoleTests(SynchronousTestCase):
@@ -26,11 +26,11 @@ class WebRoleTests(SynchronousTestCase):
 
         sys.modules["OpenSSL"] = None  # type: ignore[assignment]
         self.addCleanup(restore)
-        world = World()
-        service = world.service("a", 7000)
+        team = MemoryTeam()
+        service = team.service("a", 7000)
         settings = replace(service.settings, web=replace(service.settings.web, tls="auto"))
         error = self.assertRaises(
-            BadSetting, make_web_page, settings, world.seams("a", 7000), reactor, service.assembly.node
+            BadSetting, make_web_page, settings, team.make_dependencies("a", 7000), reactor, service.assembly.node
         )
         for words in ("[web] tls", "the library OpenSSL is not installed", "pip install 'swarm-node[tls]'"):
             self.assertIn(words, str(error))
@@ -50,10 +50,10 @@ class WebRoleTests(SynchronousTestCase):
             sys.modules.update(hidden)
 
         self.addCleanup(restore)
-        world = World()
-        service = world.service("a", 7000)
-        settings, seams = service.settings, world.seams("a", 7000)
-        error = self.assertRaises(MissingExtra, make_web_page, settings, seams, reactor, service.assembly.node)
+        team = MemoryTeam()
+        service = team.service("a", 7000)
+        settings, dependencies = service.settings, team.make_dependencies("a", 7000)
+        error = self.assertRaises(MissingExtra, make_web_page, settings, dependencies, reactor, service.assembly.node)
         self.assertEqual(
             format_error(error, "x.toml"),
             "x.toml: [node] roles: the web role needs libraries that are not installed; "

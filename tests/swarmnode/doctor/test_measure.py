@@ -12,7 +12,7 @@ from swarmnode.doctor.measure import measure_facts
 
 
 class MeasureTests(SynchronousTestCase):
-    """Tests of ``measured`` on the loopback interface, without packets to other machines."""
+    """Tests of ``measure_facts`` on the loopback interface, without packets to other machines."""
 
     def setUp(self) -> None:
         self.folder = Path(self.mktemp()).absolute()

@@ -18,7 +18,7 @@ from sim.robots.emulator.aibo_dog import AiboEmulator
 from sim.robots.emulator.simulated_robot import MemoryRobot
 from swarmnode.driver.command import main
 from swarmnode.driver.keyboard import KeyboardController
-from tests.swarmnode.driver.ground import MemoryGround
+from tests.swarmnode.driver.environment import MemoryEnvironment
 from tests.webnode.picture import jpeg
 
 JPEG = jpeg()
@@ -35,7 +35,7 @@ class DriverCommandTests(SynchronousTestCase):
         self.dog.start()
         self.connector = self.dog.connector()
         self.speeds: list[tuple[float, float, float]] = []
-        self.ground = MemoryGround(self.clock, self.connector, self.pass_time)
+        self.ground = MemoryEnvironment(self.clock, self.connector, self.pass_time)
 
     def tearDown(self) -> None:
         """After each command the robot stands with disabled motors, and no timer is left."""
@@ -214,11 +214,11 @@ class DriverCommandTests(SynchronousTestCase):
         driver.enable()
         self.turn(0.3)
         driver.act({}, Permit(7, self.clock.seconds() + 0.5))
-        pilot = KeyboardController(driver)
-        self.assertTrue(pilot.press("w", self.clock.seconds()))
-        self.assertEqual((pilot.message, driver.token, pilot.is_moving), ("", 7, True))
-        self.assertFalse(pilot.press("x", self.clock.seconds()))
-        self.assertEqual(pilot.last_motion["base.vx"], 0.0)
+        controller = KeyboardController(driver)
+        self.assertTrue(controller.press("w", self.clock.seconds()))
+        self.assertEqual((controller.message, driver.token, controller.is_moving), ("", 7, True))
+        self.assertFalse(controller.press("x", self.clock.seconds()))
+        self.assertEqual(controller.last_motion["base.vx"], 0.0)
         driver.disconnect()
 
     def turn(self, seconds: float) -> None:

@@ -24,7 +24,7 @@ from twisted.internet import reactor
 """
 
 
-class BallastTests(SynchronousTestCase):
+class MemorySavingsTests(SynchronousTestCase):
     def said(self, *words: str) -> str:
         """Run Python with a stub of pyOpenSSL that prints a line when it is imported, and return the output."""
         folder = Path(self.mktemp()) / "OpenSSL"
@@ -65,7 +65,7 @@ class BallastTests(SynchronousTestCase):
             self.assertNotIn("Traceback", told)
 
     def test_look_at_what_is_new_only(self) -> None:
-        """After ``warmed_up`` the garbage collector skips older objects and checks newer ones."""
+        """After ``release_memory`` the garbage collector skips older objects and checks newer ones."""
         self.addCleanup(gc.unfreeze)
         before: list[object] = [[]]
         release_memory()

@@ -81,7 +81,7 @@ class Lens(Part):
         self.camera_fps = fps
 
 
-class JoinedTests(Conformance, Create2Case):
+class CompositeDriverTests(Conformance, Create2Case):
     """A Create 2 with a camera passes the conformance tests."""
 
     END_S = 0.2
@@ -133,8 +133,8 @@ class JoinedTests(Conformance, Create2Case):
         ports = {81: MemoryConnector(self.clock, camera.accept), 10110: MemoryConnector(self.clock, compass.accept)}
 
         class Network:
-            def connect(_self, host: str, port: int, caller: LinkClient) -> Reconnector:  # noqa: N805
-                line: Reconnector = ports.get(port, self.connector).connect(host, port, caller)
+            def connect(_self, host: str, port: int, client: LinkClient) -> Reconnector:  # noqa: N805
+                line: Reconnector = ports.get(port, self.connector).connect(host, port, client)
                 return line
 
         parts = [("camera", {"url": "http://board:81/stream"}), ("compass", {"host": "board"})]

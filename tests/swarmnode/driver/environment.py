@@ -41,7 +41,7 @@ class ScriptedTerminal:
         self.closed += 1
 
 
-class MemoryGround:
+class MemoryEnvironment:
     """An environment in memory; ``pass_time`` is called at each step, for a robot that moves."""
 
     def __init__(self, clock: Clock, connector: Any, pass_time: Callable[[float], None] = lambda _: None) -> None:

@@ -47,7 +47,7 @@ class Stand:
         return STAND
 
 
-class ManyTests(SynchronousTestCase):
+class ReportersTests(SynchronousTestCase):
     """Two dozen agents bid for one task."""
 
     def setUp(self) -> None:

@@ -22,7 +22,7 @@ from tests.drivers.test_camera_driver import jpeg
 URL = "http://10.0.0.7:81/stream"
 
 
-class StreamTests(Conformance, RobotCase):
+class MjpegStreamTests(Conformance, RobotCase):
     """The driver of a network camera passes the conformance tests for sensors and further tests of its functions."""
 
     END_S = 1.0
@@ -80,12 +80,12 @@ class StreamTests(Conformance, RobotCase):
         driver.connect()
         self.camera.stop()
         self.pass_time(0.1)
-        film = driver._stream
+        stream = driver._stream
         for moment in (0.0, 0.09, 0.21, 0.29, 0.41, 0.49):
             self.clock.advance(10.0 + moment - self.now() if moment else 10.0 - self.now())
-            film._timer.set(100.0, lambda: None)
-            film._on_picture(jpeg(1))
-        self.assertEqual((film.dropped, driver.diagnostics()["pictures"]), (0, 6))
+            stream._timer.set(100.0, lambda: None)
+            stream._on_picture(jpeg(1))
+        self.assertEqual((stream.dropped, driver.diagnostics()["pictures"]), (0, 6))
 
     def test_comes_back_with_the_camera(self) -> None:
         """A lost link is logged once and retried with growing delays; then the camera is ready again."""
@@ -186,8 +186,8 @@ class StreamTests(Conformance, RobotCase):
     def test_hears_no_more_of_a_call_that_is_over(self) -> None:
         """Data and the end of a previous connection have no effect on the new one."""
         driver = self.ready()
-        film = driver._stream
-        old = film._attempt
+        stream = driver._stream
+        old = stream._attempt
         driver.set_camera_fps(0)
         driver.set_camera_fps(30)
         count = driver.diagnostics()["pictures"]

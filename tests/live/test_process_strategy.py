@@ -77,7 +77,7 @@ class Raising(Nearest):
         raise ZeroDivisionError("I divide")
 
 
-class WorkerTests(SynchronousTestCase):
+class ProcessStrategyTests(SynchronousTestCase):
     def guard(self, name: str, deadline: float = PATIENCE) -> GuardedStrategy:
         """Return a guard around a class of this module in a loaded child process."""
         worker = ProcessStrategy(name, f"{__name__}:{name}", deadline, path=(ROOT,))

@@ -46,7 +46,7 @@ class OptionTests(SynchronousTestCase):
             self.assertIn("--option", str(self.assertRaises(UsageError, parse_options, words)))
 
 
-class CandidateTests(SynchronousTestCase):
+class SerialDeviceTests(SynchronousTestCase):
     def test_serial_devices_are_shown(self) -> None:
         """Each serial device is listed with its description, the next command, and the remedy if access is denied."""
         found = list_serial_devices(
@@ -109,7 +109,7 @@ class CatalogueTests(SynchronousTestCase):
         self.assertTrue(told[1].startswith("torn  broken: driver 'torn' cannot be loaded"))
 
 
-class WitnessTests(SynchronousTestCase):
+class RecordingConnectorTests(SynchronousTestCase):
     def test_remembers_what_is_wrong_with_each_line(self) -> None:
         """Serial devices and addresses use different connectors, and a link's problem is reported while it lasts."""
         line = SimpleNamespace(problem="it is off")
@@ -144,13 +144,13 @@ class WitnessTests(SynchronousTestCase):
 
     def test_hears_the_warnings_of_drivers(self) -> None:
         """Each warning of a driver is recorded once; messages of other modules and of lower levels are not."""
-        ear = WarningCollector()
+        collector = WarningCollector()
         for namespace in ("drivers.aibo.driver", "drivers.aibo.driver", "middleware.node"):
             Logger(namespace).warn("{robot}: it\nis off", robot=namespace[:7])
         Logger("drivers.link").info("nothing")
-        ear.close()
+        collector.close()
         Logger("drivers.link").warn("too late")
-        self.assertEqual(ear.warnings, ["drivers: it is off"])
+        self.assertEqual(collector.warnings, ["drivers: it is off"])
 
     def test_tcp_line_says_why_there_is_no_link(self) -> None:
         """A refused connection, a timeout and similar errors are reported with a remedy until the link is up."""

@@ -44,7 +44,7 @@ async def running_yard() -> AsyncIterator[tuple[subprocess.Popen[str], int]]:
         process.communicate()
 
 
-class YardSocketTests(TestCase):
+class SimulatorSocketTests(TestCase):
     """A driver and an operator, each over TCP."""
 
     timeout = 20
@@ -97,7 +97,7 @@ class YardSocketTests(TestCase):
             again.communicate()
 
 
-class YardCommandTests(SynchronousTestCase):
+class SimulatorCommandTests(SynchronousTestCase):
     """Errors of the command line."""
 
     def refusal(self, *arguments: str) -> str:

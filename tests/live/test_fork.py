@@ -21,7 +21,7 @@ def ended(*signal: Any) -> None:
     raise Ended
 
 
-class ApartTests(SynchronousTestCase):
+class ForkTests(SynchronousTestCase):
     def test_returns_and_raises(self) -> None:
         """Results and exceptions of the call reach the parent, and changes of variables do not."""
         changed: list[int] = []

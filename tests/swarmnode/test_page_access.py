@@ -17,7 +17,7 @@ from swarmnode.web_code import main
 OWN = PageAccess("vaio", "http://127.0.0.1:8080/", "quiet-otter", os.getpid())
 
 
-class InvitationTests(SynchronousTestCase):
+class PageAccessTests(SynchronousTestCase):
     def setUp(self) -> None:
         # The note is next to a control socket, so its path must be short, outside the test folder.
         self.where = Path(self.mktemp())
