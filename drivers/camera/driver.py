@@ -65,7 +65,7 @@ class CameraDriver(SensingDriver):
 
     # -- called by the stream ---------------------------------------------------------------------------------------
 
-    def shown(self, picture: JpegPicture) -> None:
+    def on_picture(self, picture: JpegPicture) -> None:
         """Publish a picture."""
         self._problem = ""
         self._counts["frames"] += 1
@@ -79,12 +79,12 @@ class CameraDriver(SensingDriver):
         if self._fps <= 0 and not self._idle_timer.is_set and not self._is_closed:
             self._report_idle()
 
-    def spoilt(self, reason: str) -> None:
+    def on_invalid_picture(self, reason: str) -> None:
         """Count an invalid picture."""
         self._counts["bad_frames"] += 1
         self.log.debug("{robot}: {reason}", robot=self._name, reason=reason)
 
-    def gone(self, reason: str) -> None:
+    def on_source_lost(self, reason: str) -> None:
         """Handle the loss of the source; it is logged once, and the stream retries."""
         if reason != self._problem:
             self.log.warn("{robot}: {reason}; trying again", robot=self._name, reason=reason)

@@ -99,7 +99,7 @@ class MjpegStream:
         receiver, size = self._receiver, read_size(jpeg)
         assert receiver is not None
         if size is None:
-            receiver.spoilt(f"a picture of {len(jpeg)} bytes is no whole JPEG")
+            receiver.on_invalid_picture(f"a picture of {len(jpeg)} bytes is no whole JPEG")
             return
         self._backoff.reset()
         self._timer.set(PICTURE_TIMEOUT_S, self._on_silence)
@@ -115,7 +115,7 @@ class MjpegStream:
             self._size = size
             warning = "{place}: its pictures are {width} x {height}: write width = {width}, height = {height}"
             self.log.warn(warning, place=self._address.name, width=size[0], height=size[1])
-        receiver.shown(JpegPicture(jpeg, *size))
+        receiver.on_picture(JpegPicture(jpeg, *size))
         if self._fps <= 0:
             self._disconnect()
 
@@ -130,7 +130,7 @@ class MjpegStream:
         self._has_shown = False
         self._timer.set(self._backoff.increase(), self._connect)
         if self._receiver is not None:
-            self._receiver.gone(reason)
+            self._receiver.on_source_lost(reason)
 
     def _disconnect(self) -> Deferred[None]:
         attempt, self._attempt = self._attempt, None

@@ -28,13 +28,13 @@ RunInReactor = Callable[[Callable[[], None]], None]
 class PictureReceiver(Protocol):
     """Receives pictures and errors, always on the reactor's thread."""
 
-    def shown(self, picture: JpegPicture) -> None:
+    def on_picture(self, picture: JpegPicture) -> None:
         """Take a picture."""
 
-    def spoilt(self, reason: str) -> None:
+    def on_invalid_picture(self, reason: str) -> None:
         """Handle an invalid picture."""
 
-    def gone(self, reason: str) -> None:
+    def on_source_lost(self, reason: str) -> None:
         """Handle the loss of the source; the stream retries."""
 
 
@@ -87,18 +87,18 @@ class SourceReader:
                 self._is_open = True
             picture = self._source.read_picture()
         except BadFrame as error:
-            self._report("spoilt", str(error))
+            self._report("on_invalid_picture", str(error))
             return 0.0
         except LinkLost as error:
             self.close()
-            self._report("gone", str(error))
+            self._report("on_source_lost", str(error))
             return self._backoff.increase()
         except Exception as error:  # an error of OpenCV must not end the thread
             self.close()
-            self._report("gone", f"{type(error).__name__}: {error}"[:300])
+            self._report("on_source_lost", f"{type(error).__name__}: {error}"[:300])
             return self._backoff.increase()
         self._backoff.reset()
-        self._report("shown", picture)
+        self._report("on_picture", picture)
         return 0.0
 
     def close(self) -> None:
@@ -198,7 +198,7 @@ class ThreadedStream:
     def _report(self, method: str, argument: Any) -> None:
         with self._changed:
             is_first = not self._queue
-            if self._queue and method == "shown" and self._queue[-1][0] == "shown":
+            if self._queue and method == "on_picture" and self._queue[-1][0] == "on_picture":
                 self.dropped += 1
                 self._queue[-1] = (method, argument)
             elif len(self._queue) < 4:

@@ -237,5 +237,5 @@ class PictureSourceTests(SynchronousTestCase):
         reader = SourceReader(Moody(), lambda what, said: told.append((what, said)))
         self.assertGreater(reader.read_picture(), 0.0)
         self.assertEqual(reader.read_picture(), 0.0)
-        self.assertEqual(told[0], ("gone", "RuntimeError: cv2.error: (-215)"))
-        self.assertEqual(told[1], ("shown", JpegPicture(b"", 1, 1)))
+        self.assertEqual(told[0], ("on_source_lost", "RuntimeError: cv2.error: (-215)"))
+        self.assertEqual(told[1], ("on_picture", JpegPicture(b"", 1, 1)))
