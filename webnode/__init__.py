@@ -1,6 +1,6 @@
 """The web page of a node: the state of the team, and the HTTP API through which operators change it.
 
 ``state`` builds the view, ``app`` serves the page and JSON with Flask, ``live`` serves the native streams (state and
-cameras), ``server`` puts both on one port inside Twisted, and ``team`` carries out an operator's requests.  This
-package knows nothing of robots and peers.
+cameras), ``server`` puts both on one port inside Twisted, and ``team_control`` carries out an operator's requests.
+This package knows nothing of robots and peers.
 """

@@ -34,7 +34,7 @@ from twisted.protocols.basic import LineReceiver
 from middleware.faults.kinds import KINDS
 from swarmnode.gateway import check_picture
 from tests.live.keys import GATEWAYS, key_of
-from tests.webnode.memory import MemoryDesk, MemoryFaults, MemoryHalts, MemoryPhones, MemorySurvey
+from tests.webnode.memory import MemoryDiagnostics, MemoryFaults, MemoryPhones, MemoryStopControl, MemoryTeamControl
 from webnode.audit import AuditLog
 from webnode.auth import Token, User
 from webnode.camera import OnFrame
@@ -126,7 +126,7 @@ class Team:
         self.away: set[str] = set()
         self.node = "vaio"
         self.yard = deepcopy(YARD)
-        self.halts = MemoryHalts(*(f"{n:02x}" * 16 for n in (1, 2, 3)))
+        self.stop_control = MemoryStopControl(*(f"{n:02x}" * 16 for n in (1, 2, 3)))
         self.batch = 0
         self.version = 0
         self._made: tuple[object, State] = (None, {})
@@ -153,7 +153,7 @@ class Team:
 
     def read(self) -> State:
         """Return the state, updated each second and after each command."""
-        now = self.version, int(time.time()), self.halts.is_halted()
+        now = self.version, int(time.time()), self.stop_control.is_halted()
         if self._made[0] != now:
             self._made = now, self._state()
         return self._made[1]
@@ -178,7 +178,7 @@ class Team:
         ]
         gone = self._departed.update(here, time.time())
         state = format_state(here, self.tasks, {str(task): members}, departed=gone, node=self.node)
-        return {**state, "halted": self.halts.is_halted()}
+        return {**state, "halted": self.stop_control.is_halted()}
 
     def be_strange(self, words: list[str]) -> None:
         """Create a device, a task and a decision for each of ``words``, with this text in each text field."""
@@ -195,8 +195,8 @@ class Team:
             }
             strange |= {"capabilities": {said: {said: said}}, "network": {said: 1}, "deployed": {said: said}}
             self.devices.append({**dog(number, said, said, now), **strange})
-            told: dict[str, Any] = why()
-            for epoch in told["epochs"]:
+            explanation: dict[str, Any] = why()
+            for epoch in explanation["epochs"]:
                 epoch |= {"chosen": said, "rule": said, "hysteresis": said, "agree": [said], "standby": [said]}
                 epoch["differ"] = [{"name": said, "what": said}]
                 epoch["reports"] = [{"agent": said, "name": said, "cost": 1.0, "more": said}]
@@ -207,7 +207,7 @@ class Team:
                 "created": now + number,
                 "status": said,
             }
-            self.tasks.append({**task, "note": said, "strategy": said, "why": told, "requirements": {said: {}}})
+            self.tasks.append({**task, "note": said, "strategy": said, "why": explanation, "requirements": {said: {}}})
         self.yard["dogs"] = [{**YARD["dogs"][0], "name": said} for said in words[:20]]
         self._departed = DepartedDevices()
 
@@ -253,7 +253,7 @@ YARD: dict[str, Any] = {
     ],
     "target": {"x": 1.8, "y": 1.7, "radius": 0.08},
 }
-KNOBS: list[list[Any]] = [
+SETTINGS: list[list[Any]] = [
     ["description", "The dog with 1 yellow stripe on its head.", "A line about the device", "", None, 200],
     ["presence_lease", 1.0, "Time until other nodes consider a silent device lost", "s", 0.1, 60.0],
     [
@@ -279,7 +279,7 @@ class Orders(LineReceiver):
     _team: Team
     _web: WebService
     _sessions: SignedSessions
-    _desk: MemoryDesk
+    _desk: MemoryTeamControl
     _pages: list[Page]
 
     def lineReceived(self, line: bytes) -> None:
@@ -299,9 +299,9 @@ class Orders(LineReceiver):
         self._team = team = Team()
         pages = Fallbacks()
         self._pages = pages.pages
-        served = replace(board(team), fallbacks=pages)
-        assert isinstance(served.sessions, SignedSessions) and isinstance(served.control, MemoryDesk)
-        self._sessions, self._desk = served.sessions, served.control
+        served = replace(make_services(team), fallbacks=pages)
+        assert isinstance(served.sessions, SignedSessions) and isinstance(served.control, MemoryTeamControl)
+        self._sessions, self._control = served.sessions, served.control
         self._web = WebService(reactor, "127.0.0.1", port, team.read, served, time.time, ("vaio.local",))
         pages_here = ["http://192.168.0.7:8080", "https://192.168.0.7:8443", f"http://127.0.0.1:{port}"]
         served.invites = Invites(lambda: pages_here, b"PEM", "AB:CD:" * 10, reactor, reactor.getThreadPool())
@@ -329,7 +329,7 @@ class Orders(LineReceiver):
         elif verb == "crowd":
             self._team.be_many(int(rest[0]))
         elif verb == "outdoors":
-            self._desk.ground = None
+            self._control.map = None
         elif verb == "session":
             self._sessions.session_s = float(rest[0])
         elif verb == "strange":
@@ -341,29 +341,29 @@ class Orders(LineReceiver):
             reactor.stop()
 
 
-def board(team: Team) -> Services:
+def make_services(team: Team) -> Services:
     """Return the page's services: fakes in memory that accept each order."""
-    desk = MemoryDesk(CATALOGUE, team.yard)
+    control = MemoryTeamControl(CATALOGUE, team.yard)
     able = [{"uuid": f"{n:02x}" * 16, "name": f"dog{n}", "busy": "Patrol the yard" * (n == 2)} for n in (1, 2)]
-    desk.frames = team
-    desk.previews["search"] = {"able": able, "refused": {"dog3": ["no gripper", "no lift"]}, "likely": None}
-    desk.together["yard"] = [{"id": "t1", "title": "Find and touch the red target"}]
+    control.frames = team
+    control.previews["search"] = {"able": able, "refused": {"dog3": ["no gripper", "no lift"]}, "likely": None}
+    control.together["yard"] = [{"id": "t1", "title": "Find and touch the red target"}]
     gateways = {key_of(name).public for name in GATEWAYS}
     sessions = TeamSessions(key_of(team.node), gateways.__contains__, "quiet-otter", PASSWORD, random.Random(), checked)
-    desk.settings[able[0]["uuid"]] = KNOBS
-    survey = MemorySurvey(network(), {f"0{n}" * 16: inventory() for n in (1, 2)}, links(), membership())
-    parts: dict[str, Any] = {"stop_control": team.halts, "diagnostics": survey, "event_log": EventLog()}
+    control.settings[able[0]["uuid"]] = SETTINGS
+    diagnostics = MemoryDiagnostics(network(), {f"0{n}" * 16: inventory() for n in (1, 2)}, links(), membership())
+    parts: dict[str, Any] = {"stop_control": team.stop_control, "diagnostics": diagnostics, "event_log": EventLog()}
     parts["faults"], parts["phones"] = MemoryFaults(*KINDS), MemoryPhones(check=check_picture)
-    return Services(desk, sessions, AuditLog(wall=time.time), limits=AddressLimits(), **parts)
+    return Services(control, sessions, AuditLog(wall=time.time), limits=AddressLimits(), **parts)
 
 
 class TeamSessions(SignedSessions):
     """Sessions with tokens for gateways only."""
 
-    def issue_peer_tokens(self, who: User, nodes: Iterable[str], now: float) -> dict[str, Token]:
+    def issue_peer_tokens(self, user: User, nodes: Iterable[str], now: float) -> dict[str, Token]:
         """Return the tokens for gateways."""
         gateways = {key_of(name).node_id.hex() for name in GATEWAYS}
-        return super().issue_peer_tokens(who, [node for node in nodes if node in gateways], now)
+        return super().issue_peer_tokens(user, [node for node in nodes if node in gateways], now)
 
 
 def checked(text: str, password: str) -> Deferred[Any]:
@@ -394,10 +394,10 @@ def links() -> Any:
     """Return the links of the page's node: three path kinds, a revoked member and a rejected join code."""
     vaio, uuids = "0a" * 16, {n: f"0{n}" * 16 for n in (1, 2, 3)}
 
-    def way(n: int, kind: str, score: int | None, rtt: float | None = None, by: str = "") -> dict[str, Any]:
+    def make_link(n: int, kind: str, score: int | None, rtt: float | None = None, by: str = "") -> dict[str, Any]:
         loss = None if score is None else 0.0 if score > 90 else 0.2
-        told = {"uuid": uuids[n], "name": f"dog{n}", "way": kind, "by": by, "address": "192.0.2.1:8484"}
-        return told | {
+        link = {"uuid": uuids[n], "name": f"dog{n}", "way": kind, "by": by, "address": "192.0.2.1:8484"}
+        return link | {
             "for_s": None if kind == "none" else 150.0,
             "score": score,
             "loss": loss,
@@ -405,19 +405,19 @@ def links() -> Any:
             "jitter_ms": rtt and rtt / 10,
         }
 
-    def refusal(side: str, who: str, code: str, why: str, remedy: str, times: int = 1) -> dict[str, Any]:
-        told = {"who": who, "at": "192.0.2.66:8484", "side": side, "code": code, "why": why, "remedy": remedy}
-        return told | {"ago_s": 200.0, "count": times}
+    def refusal(side: str, node: str, code: str, why: str, remedy: str, times: int = 1) -> dict[str, Any]:
+        row = {"who": node, "at": "192.0.2.66:8484", "side": side, "code": code, "why": why, "remedy": remedy}
+        return row | {"ago_s": 200.0, "count": times}
 
     out = refusal(
         "we", "dog9", "revoked", "the operator revoked the certificate", "only a new invitation lets it in", 3
     )
-    own = [way(1, "lan", 98, 1.8), way(2, "punched", 63, 42.0), way(3, "carried", 24, 110.0, "dog1")]
+    own = [make_link(1, "lan", 98, 1.8), make_link(2, "punched", 63, 42.0), make_link(3, "carried", 24, 110.0, "dog1")]
     code = refusal("code", "", "used", "this code was used as often as it may be", "ask the operator for another one")
     devices = {
         vaio: {"links": own, "refusals": [out, code]},
-        uuids[1]: {"links": [way(2, "tunnel", 88, 12.0)], "refusals": [out]},
-        uuids[2]: {"links": [way(1, "tunnel", 70, 14.0), way(3, "none", None)], "refusals": []},
+        uuids[1]: {"links": [make_link(2, "tunnel", 88, 12.0)], "refusals": [out]},
+        uuids[2]: {"links": [make_link(1, "tunnel", 70, 14.0), make_link(3, "none", None)], "refusals": []},
     }
     return {"here": vaio, "devices": devices, "silent": [uuids[3]]}
 
@@ -436,8 +436,8 @@ def membership() -> Any:
         }
         for n, days in ((2, 9), (1, 365), (7, 365))
     ]
-    told = {"kind": "closed", "name": "yard", "fingerprint": "1a2b3c4d5e6f7081", "me": "0a" * 16}
-    return told | {"until": int(now + 4e7), "is_renewable": True, "is_ending": False, "known": 3, "members": members}
+    team = {"kind": "closed", "name": "yard", "fingerprint": "1a2b3c4d5e6f7081", "me": "0a" * 16}
+    return team | {"until": int(now + 4e7), "is_renewable": True, "is_ending": False, "known": 3, "members": members}
 
 
 def inventory() -> Any:

@@ -9,7 +9,7 @@ from webnode.auth import OpenSessions, Role, User
 
 class Guests(OpenSessions):
     def authenticate(self, token: str, now: float) -> User:
-        """Return a visitor with the role that the token names."""
+        """Return a user with the role that the token names."""
         for role in get_args(Role):
             if token == role:
                 return User(token, role, f"id of {token}")

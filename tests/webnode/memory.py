@@ -20,26 +20,26 @@ from webnode.stop_control import StopControl
 from webnode.team_control import TeamControl
 
 
-class MemorySurvey(Diagnostics):
-    """A survey that returns fixed answers for the network, each device, the links and the team."""
+class MemoryDiagnostics(Diagnostics):
+    """Diagnostics that return fixed answers for the network, each device, the links and the team."""
 
     def __init__(self, network: Json, inventories: Mapping[str, Json], links: Json = None, team: Json = None) -> None:
-        self._told_network = network
+        self._network = network
         self._inventories = inventories
-        self._told_links = links
-        self._told_team = team
+        self._links = links
+        self._team = team
 
     def query_network(self) -> Deferred[Json]:
         """Return the network."""
-        return succeed(self._told_network)
+        return succeed(self._network)
 
     def query_links(self) -> Deferred[Json]:
         """Return the links."""
-        return succeed(self._told_links)
+        return succeed(self._links)
 
     def describe_team(self) -> Json:
         """Return the team."""
-        return self._told_team
+        return self._team
 
     def query_inventory(self, uuid: str) -> Deferred[Json]:
         """Return the inventory, or fail with 504 for a device that does not answer."""
@@ -48,7 +48,7 @@ class MemorySurvey(Diagnostics):
         return succeed(self._inventories[uuid])
 
 
-class MemoryHalts(StopControl):
+class MemoryStopControl(StopControl):
     """The emergency stop of a team that obeys: ``devices`` are the answering uuids, ``said`` the requests."""
 
     def __init__(self, *devices: str) -> None:
@@ -71,22 +71,22 @@ class MemoryHalts(StopControl):
 
 
 class MemoryFaults(FaultControl):
-    """Fault control that only records: ``caused`` has (uuid, kind, seconds, amount), ``rows`` the active faults."""
+    """Fault control that only records: ``injected`` has (uuid, kind, seconds, amount), ``rows`` the active faults."""
 
     def __init__(self, *kinds: str) -> None:
-        self.caused: list[tuple[str, str, float, float | None]] = []
+        self.injected: list[tuple[str, str, float, float | None]] = []
         self.rows: list[dict[str, Json]] = []
-        self._can = kinds
+        self._allowed = kinds
 
     def get_kinds(self, uuid: str) -> Sequence[str]:
         """Return the given kinds."""
-        return self._can
+        return self._allowed
 
     def inject(self, uuid: str, kind: str, seconds: float, amount: float | None) -> Deferred[None]:
         """Record the fault without an effect."""
-        self.caused.append((uuid, kind, seconds, amount))
+        self.injected.append((uuid, kind, seconds, amount))
         row: dict[str, Json] = {
-            "n": len(self.caused),
+            "n": len(self.injected),
             "uuid": uuid,
             "name": uuid[:4],
             "kind": kind,
@@ -102,41 +102,41 @@ class MemoryFaults(FaultControl):
 
 
 class MemoryPhones:
-    """Phones that are only counted: ``here`` maps uuids to names, ``looks`` has (uuid, bytes, values).
+    """Phones that are only counted: ``registered`` maps uuids to names, ``pictures`` has (uuid, bytes, values).
 
     ``check`` raises ``Refusal`` for data that is not a picture.
     """
 
-    def __init__(self, most: int = 8, check: Callable[[bytes], object] = lambda jpeg: None) -> None:
-        self.here: dict[str, str] = {}
-        self.looks: list[tuple[str, bytes, Mapping[str, float]]] = []
+    def __init__(self, max_phones: int = 8, check: Callable[[bytes], object] = lambda jpeg: None) -> None:
+        self.registered: dict[str, str] = {}
+        self.pictures: list[tuple[str, bytes, Mapping[str, float]]] = []
         self.can: Mapping[str, Any] = {}
-        self._most = most
+        self._max_phones = max_phones
         self._check = check
 
     def join(self, secret: bytes, name: str, can: Mapping[str, Any]) -> Deferred[str]:
         """Add the phone; its uuid is the end of its secret."""
         uuid = secret[-20:].hex()
-        if uuid not in self.here and len(self.here) >= self._most:
+        if uuid not in self.registered and len(self.registered) >= self._max_phones:
             return fail(Refusal("phone", "too many take part", "wait until one leaves", 409))
-        self.here[uuid], self.can = name, can
+        self.registered[uuid], self.can = name, can
         return succeed(uuid)
 
     def receive_picture(self, uuid: str, jpeg: bytes, values: Mapping[str, float]) -> PictureReply:
         """Record the picture."""
         self._check(jpeg)
-        if uuid not in self.here:
+        if uuid not in self.registered:
             raise Refusal("uuid", "this phone takes no part here", "join by POST /api/v1/phones", 404)
-        self.looks.append((uuid, jpeg, values))
+        self.pictures.append((uuid, jpeg, values))
         return PictureReply(10.0, "Look for the red target: turn slowly.")
 
     def leave(self, uuid: str) -> None:
         """Remove the phone."""
-        self.here.pop(uuid, None)
+        self.registered.pop(uuid, None)
 
     def close(self) -> Deferred[Any]:
         """Remove all phones."""
-        self.here.clear()
+        self.registered.clear()
         return succeed(None)
 
 
@@ -179,15 +179,15 @@ class MemoryFrames:
             self.watched[uuid](seq, jpeg, age)
 
 
-class MemoryDesk(TeamControl):
-    """A desk that records each request in ``asked``, and has its own small map."""
+class MemoryTeamControl(TeamControl):
+    """A control that records each request in ``asked``, and has a small map."""
 
-    def __init__(self, catalogue: Sequence[Mapping[str, Any]] = (), yard: Mapping[str, Any] | None = None) -> None:
+    def __init__(self, catalogue: Sequence[Mapping[str, Any]] = (), robot_map: Mapping[str, Any] | None = None) -> None:
         self.asked: list[tuple[Any, ...]] = []
         self.tasks = list(catalogue)
         self.previews: dict[str, dict[str, Any]] = {}
         self.together: dict[str, list[dict[str, Any]]] = {}
-        self.ground: dict[str, Any] | None = dict(yard) if yard is not None else None
+        self.map: dict[str, Any] | None = dict(robot_map) if robot_map is not None else None
         self.settings: dict[str, list[list[Any]]] = {}
         self.frames: Any = MemoryFrames()
 
@@ -216,22 +216,22 @@ class MemoryDesk(TeamControl):
 
     def run_demo(self, task_id: str = "") -> str:
         """Return ``demo-N``, or the given id."""
-        noted = self._noted("demo")
-        return task_id or noted
+        recorded = self._record("demo")
+        return task_id or recorded
 
     def assign(self, name: str, tolerates: int = 1, group: str = "", task_id: str = "") -> dict[str, Any]:
         """Return ``assign-N``, or the given id, without any able or refused device."""
         if name not in [task["name"] for task in self.tasks]:
             raise Refusal("name", f"there is no task {name!r}", "choose one of /api/v1/catalogue", 404)
-        noted = self._noted("assign", name)
-        return {"id": task_id or noted, "able": [], "refused": {}}
+        recorded = self._record("assign", name)
+        return {"id": task_id or recorded, "able": [], "refused": {}}
 
     def preview(self, name: str, group: str = "") -> dict[str, Any]:
         """Return the entry of ``previews``, or a result without any able or refused device."""
         if name not in [task["name"] for task in self.tasks]:
             raise Refusal("name", f"there is no task {name!r}", "choose one of /api/v1/catalogue", 404)
-        told = self.previews.get(name, {"able": [], "refused": {}, "likely": None})
-        return {**told, "together": self.together.get(group, [])}
+        entry = self.previews.get(name, {"able": [], "refused": {}, "likely": None})
+        return {**entry, "together": self.together.get(group, [])}
 
     def list_predefined(self) -> list[Mapping[str, Any]]:
         """Return the given catalogue."""
@@ -239,50 +239,50 @@ class MemoryDesk(TeamControl):
 
     def cancel(self, task_id: str) -> None:
         """Record the request."""
-        self._noted("cancel", task_id)
+        self._record("cancel", task_id)
 
     def pause(self, task_id: str) -> None:
         """Record the request."""
-        self._noted("pause", task_id)
+        self._record("pause", task_id)
 
     def resume(self, task_id: str) -> None:
         """Record the request."""
-        self._noted("resume", task_id)
+        self._record("resume", task_id)
 
     def send_message(self, uuid: str, text: str) -> Deferred[dict[str, Any]]:
         """Record the request; the message reaches no device."""
-        self._noted("message", uuid, text)
+        self._record("message", uuid, text)
         return succeed({"delivered": [], "failed": {}})
 
     def disconnect(self, uuid: str, seconds: float) -> Deferred[Any]:
         """Record the request."""
-        return succeed(self._noted("disconnect", uuid, seconds))
+        return succeed(self._record("disconnect", uuid, seconds))
 
     def move_target(self, x: float, y: float) -> Deferred[bool]:
         """Move the target."""
         self._change(target={"x": x, "y": y, "radius": 0.08})
-        return succeed(bool(self._noted("target", x, y)))
+        return succeed(bool(self._record("target", x, y)))
 
     def clear_target(self) -> Deferred[bool]:
         """Remove the target."""
         self._change(target=None)
-        return succeed(bool(self._noted("clear")))
+        return succeed(bool(self._record("clear")))
 
     def move_robot(self, name: str, x: float, y: float, heading: float) -> Deferred[bool]:
         """Move the robot."""
         place = {"x": x, "y": y, "heading": heading}
-        if self.ground is not None:
-            self._change(dogs=[{**dog, **place} if dog["name"] == name else dog for dog in self.ground["dogs"]])
-        return succeed(bool(self._noted("robot", name, x, y, heading)))
+        if self.map is not None:
+            self._change(dogs=[{**dog, **place} if dog["name"] == name else dog for dog in self.map["dogs"]])
+        return succeed(bool(self._record("robot", name, x, y, heading)))
 
     def _change(self, **changes: Any) -> None:
-        if self.ground is not None:
-            self.ground = {**self.ground, **changes}
+        if self.map is not None:
+            self.map = {**self.map, **changes}
 
     def get_map(self) -> dict[str, Any] | None:
         """Return the map."""
-        return self.ground
+        return self.map
 
-    def _noted(self, *wish: Any) -> str:
-        self.asked.append(wish)
-        return f"{wish[0]}-{len(self.asked)}"
+    def _record(self, *request: Any) -> str:
+        self.asked.append(request)
+        return f"{request[0]}-{len(self.asked)}"

@@ -10,7 +10,7 @@ from twisted.internet.defer import Deferred, fail
 from twisted.trial.unittest import SynchronousTestCase
 
 from tests.webnode.guests import Guests
-from tests.webnode.memory import MemoryDesk, MemoryHalts
+from tests.webnode.memory import MemoryStopControl, MemoryTeamControl
 from webnode.app import create_app
 from webnode.errors import Refusal
 from webnode.event_log import EventLog
@@ -23,13 +23,13 @@ API = "/api/v1"
 
 class ActionTests(SynchronousTestCase):
     def setUp(self) -> None:
-        self.desk = MemoryDesk([{"name": "search"}], {"walls": [3.0, 2.4], "dogs": [DOG], "target": None})
-        self.halts = MemoryHalts("01", "02")
-        self.chronicle = EventLog()
-        self.desk.settings["01"] = [["description", "a dog", "A line", "", None, 200.0]]
-        self.board = Services(self.desk, Guests(), event_log=self.chronicle, stop_control=self.halts)
+        self.control = MemoryTeamControl([{"name": "search"}], {"walls": [3.0, 2.4], "dogs": [DOG], "target": None})
+        self.stop_control = MemoryStopControl("01", "02")
+        self.event_log = EventLog()
+        self.control.settings["01"] = [["description", "a dog", "A line", "", None, 200.0]]
+        self.services = Services(self.control, Guests(), event_log=self.event_log, stop_control=self.stop_control)
         state = format_state([{"uuid": "01", "name": "dog1", "joined": 1}], [], {}, node="vaio")
-        app = create_app(lambda: {**state, "halted": self.halts.is_halted()}, self.board, wall=lambda: 1e9)
+        app = create_app(lambda: {**state, "halted": self.stop_control.is_halted()}, self.services, wall=lambda: 1e9)
         app.logger.setLevel(logging.CRITICAL + 1)
         self.client: FlaskClient = app.test_client()
 
@@ -45,35 +45,35 @@ class ActionTests(SynchronousTestCase):
         self.assertEqual(self.ask("POST", "halt", {}), stopped)
         self.assertEqual(self.ask("GET", "halt", role="viewer"), (200, {"halted": True}))
         self.assertEqual(self.ask("DELETE", "halt")[1]["devices"], {"01": "goes on", "02": "goes on"})
-        self.assertEqual(self.halts.said, [("halt", "operator"), ("release", "operator")])
+        self.assertEqual(self.stop_control.said, [("halt", "operator"), ("release", "operator")])
         self.assertEqual(
-            [line["route"] for line in self.board.audit.list_newest(2)], [f"DELETE {API}/halt", f"POST {API}/halt"]
+            [line["route"] for line in self.services.audit.list_newest(2)], [f"DELETE {API}/halt", f"POST {API}/halt"]
         )
 
     def test_stop_is_for_operators(self) -> None:
         """A viewer cannot stop the team, and a node without the function rejects the request with an explanation."""
         for method in ("POST", "DELETE"):
             self.assertEqual(self.ask(method, "halt", {}, "viewer")[0], 403)
-        self.assertEqual(self.halts.said, [])
-        self.board.stop_control = None
+        self.assertEqual(self.stop_control.said, [])
+        self.services.stop_control = None
         status, answer = self.ask("POST", "halt", {})
         self.assertEqual((status, answer["error"]["field"]), (409, "halt"))
 
     def test_preview_is_for_viewers(self) -> None:
         """A viewer can read which devices would take a task; an unknown task is rejected by name."""
         preview = {"able": [{"uuid": "01", "name": "dog1", "busy": ""}], "refused": {"vaio": ["no camera"]}}
-        self.desk.previews["search"] = {**preview, "likely": None}
+        self.control.previews["search"] = {**preview, "likely": None}
         told = {**preview, "likely": None, "together": []}
         self.assertEqual(self.ask("POST", "tasks/preview", {"name": "search"}, "viewer"), (200, told))
         status, answer = self.ask("POST", "tasks/preview", {"name": "fly"}, "viewer")
         self.assertEqual((status, answer["error"]["field"]), (404, "name"))
-        self.assertEqual(self.desk.asked, [])
+        self.assertEqual(self.control.asked, [])
 
     def test_lift_a_robot(self) -> None:
         """A robot is moved to the given place, and keeps its heading unless another one is given."""
         self.assertEqual(self.ask("PUT", "yard/robots/dog1", {"x": 1, "y": 2})[0], 202)
         self.assertEqual(self.ask("PUT", "yard/robots/dog1", {"x": 1, "y": 2, "heading": -1.5})[0], 202)
-        self.assertEqual(self.desk.asked, [("robot", "dog1", 1.0, 2.0, 0.25), ("robot", "dog1", 1.0, 2.0, -1.5)])
+        self.assertEqual(self.control.asked, [("robot", "dog1", 1.0, 2.0, 0.25), ("robot", "dog1", 1.0, 2.0, -1.5)])
 
     def test_refuse_what_no_robot_can(self) -> None:
         """An unknown robot, a place outside the map and an invalid heading are rejected with field and remedy."""
@@ -88,8 +88,8 @@ class ActionTests(SynchronousTestCase):
             came, answer = self.ask("PUT", f"yard/robots/{name}", body)
             self.assertEqual((came, answer["error"]["field"]), (status, field), body)
             self.assertTrue(answer["error"]["remedy"])
-        self.assertEqual(self.desk.asked, [])
-        self.desk.ground = None
+        self.assertEqual(self.control.asked, [])
+        self.control.map = None
         self.assertEqual(self.ask("PUT", "yard/robots/dog1", {"x": 1, "y": 1})[0], 409)
 
     def test_settings(self) -> None:
@@ -120,14 +120,14 @@ class ActionTests(SynchronousTestCase):
         def lost(*wish: object) -> Deferred[Any]:
             return fail(left)
 
-        desk: Any = self.desk
-        desk.send_message = desk.disconnect = lost
+        control: Any = self.control
+        control.send_message = control.disconnect = lost
         for path, body in (("message", {"text": "sit"}), ("disconnect", {})):
             self.assertEqual(self.ask("POST", f"devices/01/{path}", body), (409, left.fields))
-        self.assertEqual(self.chronicle.list_since(0), [])
+        self.assertEqual(self.event_log.list_since(0), [])
 
     def test_disconnecting_is_a_fault_on_purpose(self) -> None:
-        """A device that is disconnected is a fault in the chronicle, so the takeover is timed from then on."""
+        """A device that is disconnected is a fault in the event log, so the takeover is timed from then on."""
         self.ask("POST", "devices/01/disconnect", {"seconds": 5})
-        (entry,) = self.chronicle.list_since(0)
+        (entry,) = self.event_log.list_since(0)
         self.assertEqual((entry.kind, entry.uuid, entry.at), ("fault", "01", 1e9))

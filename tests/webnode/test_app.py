@@ -11,7 +11,7 @@ from typing import Any
 from flask.testing import FlaskClient
 from twisted.trial.unittest import SynchronousTestCase
 
-from tests.webnode.memory import MemoryDesk
+from tests.webnode.memory import MemoryTeamControl
 from webnode.app import create_app
 from webnode.auth import OpenSessions
 from webnode.fallback import Fallbacks, Page
@@ -25,7 +25,7 @@ YARD: dict[str, Any] = {"walls": [3.0, 2.4], "dogs": [], "target": None}
 
 class AppTests(SynchronousTestCase):
     def setUp(self) -> None:
-        self.desk = MemoryDesk([{"name": "search", "title": "Search", "requirements": {}}], YARD)
+        self.control = MemoryTeamControl([{"name": "search", "title": "Search", "requirements": {}}], YARD)
         dogs = [{"uuid": f"{n:02x}", "name": f"dog{n}", "joined": n} for n in (2, 1, 3)]
         departed = DepartedDevices()
         departed.update(dogs, 1.0)
@@ -35,8 +35,8 @@ class AppTests(SynchronousTestCase):
 
     def client_of(self, read: Any) -> FlaskClient:
         fallbacks = Fallbacks(Page("02", "http://other:8080"))
-        self.board = Services(self.desk, OpenSessions(), fallbacks=fallbacks)
-        app = create_app(read, self.board, wall=lambda: 1e9)
+        self.services = Services(self.control, OpenSessions(), fallbacks=fallbacks)
+        app = create_app(read, self.services, wall=lambda: 1e9)
         app.logger.setLevel(logging.CRITICAL + 1)
         return app.test_client()
 
@@ -63,7 +63,7 @@ class AppTests(SynchronousTestCase):
         self.assertEqual([task["name"] for task in self.client.get("/api/v1/catalogue").get_json()], ["search"])
 
     def test_grant(self) -> None:
-        """Every valid request reaches the desk and is answered with 202."""
+        """Every valid request reaches the team control and is answered with 202."""
         wishes: list[tuple[str, Any]] = [
             ("/api/v1/demo", {}),
             ("/api/v1/tasks", {"name": "search"}),
@@ -80,7 +80,7 @@ class AppTests(SynchronousTestCase):
             self.assertEqual(self.client.post(path, json=body).status_code, 202, path)
         self.assertEqual(self.client.delete("/api/v1/target", headers={"X-Swarm": "1"}).status_code, 202)
         self.assertEqual(
-            self.desk.asked,
+            self.control.asked,
             [
                 ("demo",),
                 ("assign", "search"),
@@ -99,7 +99,7 @@ class AppTests(SynchronousTestCase):
     def test_tell_who_can(self) -> None:
         """Assigning returns the id, the able devices, and the refused devices with reasons."""
         answer = {"id": "t2", "able": ["dog1"], "refused": {"dog2": ["no camera"]}}
-        self.desk.assign = lambda name, tolerates=1, group="", task_id="": {**answer, "for": tolerates}  # type: ignore
+        self.control.assign = lambda name, tolerates=1, group="", task_id="": {**answer, "for": tolerates}  # type: ignore
         told = self.client.post("/api/v1/tasks", json={"name": "search"}).get_json()
         self.assertEqual(told, {**answer, "for": 1})
         told = self.client.post("/api/v1/tasks", json={"name": "search", "tolerates": 3}).get_json()
@@ -108,7 +108,7 @@ class AppTests(SynchronousTestCase):
     def test_groups(self) -> None:
         """A task can be assigned to a group with a name of 1 to 64 characters."""
         asked: list[Any] = []
-        self.desk.assign = lambda *wish: asked.append(wish) or {"id": "t"}  # type: ignore
+        self.control.assign = lambda *wish: asked.append(wish) or {"id": "t"}  # type: ignore
         for body, code in (({"group": "yard"}, 202), ({}, 202), ({"group": "x" * 65}, 400), ({"group": 5}, 400)):
             self.assertEqual(self.client.post("/api/v1/tasks", json={"name": "search", **body}).status_code, code)
         self.assertEqual(asked, [("search", 1, "yard", ""), ("search", 1, "", "")])
@@ -154,7 +154,7 @@ class AppTests(SynchronousTestCase):
             error = answer.get_json()["error"]
             self.assertEqual((answer.status_code, error["field"]), (status, field), (path, error))
             self.assertTrue(error["problem"] and error["remedy"])
-        self.assertEqual(self.desk.asked, [])
+        self.assertEqual(self.control.asked, [])
 
     def test_refuse_broken_bodies(self) -> None:
         """Malformed, deeply nested and non-finite bodies are answered with 400."""
@@ -168,7 +168,7 @@ class AppTests(SynchronousTestCase):
         answers = [self.client.post("/api/v1/demo", json={}, headers={"Idempotency-Key": "a1"}) for _ in range(2)]
         self.assertEqual([answer.status_code for answer in answers], [202, 202])
         self.assertEqual(answers[0].get_json(), answers[1].get_json())
-        self.assertEqual(self.desk.asked, [("demo",)])
+        self.assertEqual(self.control.asked, [("demo",)])
         bad = self.client.post("/api/v1/demo", json={}, headers={"Idempotency-Key": "x" * 65})
         self.assertEqual((bad.status_code, bad.get_json()["error"]["field"]), (400, "Idempotency-Key"))
 

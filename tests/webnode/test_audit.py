@@ -9,7 +9,7 @@ from pathlib import Path
 from twisted.trial.unittest import SynchronousTestCase
 
 from tests.webnode.guests import Guests
-from tests.webnode.memory import MemoryDesk
+from tests.webnode.memory import MemoryTeamControl
 from webnode.app import create_app
 from webnode.audit import MAX_LINES, QUIET_S, AuditLog
 from webnode.auth import User
@@ -25,11 +25,11 @@ class AuditTests(SynchronousTestCase):
         self.now = 1000.0
         self.path = Path(self.mktemp())
 
-    def audit(self, most: int = 1 << 20) -> AuditLog:
-        return AuditLog(self.path, lambda: self.now, most)
+    def audit(self, max_bytes: int = 1 << 20) -> AuditLog:
+        return AuditLog(self.path, lambda: self.now, max_bytes)
 
     def test_keep_each_line(self) -> None:
-        """Each change is one line of JSON with time, visitor, address, route, target and outcome, in a private file."""
+        """Each change is one line of JSON with time, user, address, route, target and outcome, in a private file."""
         self.audit().write(ANN, "10.0.0.9", "POST /x/{uuid}", "01\n\x1b[2J", "202")
         (line,) = self.path.read_text().splitlines()
         told = {"at": 1000.0, "who": "ann", "role": "operator", "from": "10.0.0.9", "session": "ab12"}
@@ -62,7 +62,7 @@ class AuditTests(SynchronousTestCase):
         self.assertEqual(len(audit.list_newest(1000)), MAX_LINES)
 
     def test_let_nobody_flood_it(self) -> None:
-        """Repeated requests of an unknown visitor are one line a minute with a count; other lines remain."""
+        """Repeated requests of an unknown user are one line a minute with a count; other lines remain."""
         audit = self.audit()
         audit.write(ANN, "h", "POST /x", "", "202")
         for _ in range(1000):
@@ -91,7 +91,7 @@ class AuditRouteTests(SynchronousTestCase):
     def test_tell_operators(self) -> None:
         """An operator reads the requested number of lines, the newest first; a viewer may not."""
         state = format_state([], [], {}, node="vaio")
-        client = create_app(lambda: state, Services(MemoryDesk(), Guests())).test_client()
+        client = create_app(lambda: state, Services(MemoryTeamControl(), Guests())).test_client()
         bearer = {"Authorization": "Bearer operator"}
         for _ in range(3):
             client.post("/api/v1/demo", json={}, headers=bearer)

@@ -7,7 +7,7 @@ from typing import Any
 from twisted.internet.defer import Deferred
 from twisted.trial.unittest import SynchronousTestCase
 
-from tests.webnode.memory import MemoryDesk
+from tests.webnode.memory import MemoryTeamControl
 from webnode.auth import OpenSessions, Role, User
 from webnode.dispatch import MAX_ANSWERS, Dispatch
 from webnode.errors import Refusal
@@ -17,13 +17,13 @@ from webnode.services import Services
 
 class DispatchTests(SynchronousTestCase):
     def setUp(self) -> None:
-        self.board = Services(MemoryDesk(), OpenSessions())
+        self.services = Services(MemoryTeamControl(), OpenSessions())
         self.dispatch = Dispatch()
         self.called: list[RouteRequest] = []
         self.told: Any = {"id": 1}
 
-    def answer(self, ask: RouteRequest) -> Any:
-        self.called.append(ask)
+    def answer(self, request: RouteRequest) -> Any:
+        self.called.append(request)
         if isinstance(self.told, Refusal):
             raise self.told
         return self.told
@@ -32,14 +32,14 @@ class DispatchTests(SynchronousTestCase):
         self,
         id: str = "",
         method: Any = "POST",
-        who: str = "ann",
+        name: str = "ann",
         path: str = "/things/{uuid}",
         role: Role = "operator",
     ) -> Deferred[Any]:
         route = Route(method, path, "", role, self.answer, status=202)
-        visitor = User(who, "operator", who)
+        user = User(name, "operator", name)
         return self.dispatch.carry_out(
-            route, RouteRequest({"uuid": "01", "x": 5}, visitor, self.board, {}, id, "10.0.0.9")
+            route, RouteRequest({"uuid": "01", "x": 5}, user, self.services, {}, id, "10.0.0.9")
         )
 
     def test_do_once_what_is_asked_twice(self) -> None:
@@ -57,14 +57,14 @@ class DispatchTests(SynchronousTestCase):
         self.assertEqual(len(self.called), 3)
 
     def test_tell_ids_apart(self) -> None:
-        """An id counts per visitor and route; requests without an id are all different."""
-        for each in (self.asked("a"), self.asked("a", who="bob"), self.asked("a", path="/others"), self.asked()):
+        """An id counts per user and route; requests without an id are all different."""
+        for each in (self.asked("a"), self.asked("a", name="bob"), self.asked("a", path="/others"), self.asked()):
             self.successResultOf(each)
         self.successResultOf(self.asked())
         self.assertEqual(len(self.called), 5)
 
     def test_forget_old_ids(self) -> None:
-        """Only the newest ``REMEMBERED`` ids are known."""
+        """Only the newest ``MAX_ANSWERS`` ids are known."""
         for number in range(MAX_ANSWERS + 1):
             self.successResultOf(self.asked(str(number)))
         self.successResultOf(self.asked("1"))
@@ -73,7 +73,7 @@ class DispatchTests(SynchronousTestCase):
         self.assertEqual(len(self.called), MAX_ANSWERS + 2)
 
     def test_note_each_change(self) -> None:
-        """Each change is audited with visitor, address, route, target and outcome; reads are not."""
+        """Each change is audited with user, address, route, target and outcome; reads are not."""
         self.successResultOf(self.asked("a"))
         self.successResultOf(self.asked("a"))
         self.successResultOf(self.asked(method="GET"))
@@ -84,7 +84,7 @@ class DispatchTests(SynchronousTestCase):
         failing = self.asked()
         self.told.errback(RuntimeError("secret"))
         self.failureResultOf(failing, RuntimeError)
-        lines = self.board.audit.list_newest(9)
+        lines = self.services.audit.list_newest(9)
         line = {"who": "ann", "role": "operator", "from": "10.0.0.9", "route": "POST /things/{uuid}", "target": "01"}
         when: dict[str, object] = {"at": 0.0, "session": "ann"}
         self.assertEqual(lines, [{**line, **when, "outcome": told} for told in ("500", "409 it left", "202")])

@@ -9,7 +9,7 @@ from twisted.trial.unittest import SynchronousTestCase
 
 from middleware.faults.kinds import KINDS
 from swarmnode.simulated_team import SimulatedTeam
-from tests.webnode.memory import MemoryDesk, MemoryFaults
+from tests.webnode.memory import MemoryFaults, MemoryTeamControl
 from webnode.app import create_app
 from webnode.auth import OpenSessions
 from webnode.errors import Refusal
@@ -116,24 +116,24 @@ class FaultControlTests(SynchronousTestCase):
 class RouteTests(SynchronousTestCase):
     def setUp(self) -> None:
         self.faults: MemoryFaults | None = MemoryFaults("kill", "loss")
-        self.chronicle = EventLog()
+        self.event_log = EventLog()
         self.open(self.faults)
 
     def open(self, faults: MemoryFaults | None) -> None:
         """Serve a dog with these faults."""
         state = format_state([{"uuid": "01", "name": "dog1", "joined": 1}], [], {}, node="vaio")
-        board = Services(MemoryDesk(), OpenSessions(), event_log=self.chronicle, faults=faults)
-        app = create_app(lambda: state, board, wall=lambda: 1e9)
+        services = Services(MemoryTeamControl(), OpenSessions(), event_log=self.event_log, faults=faults)
+        app = create_app(lambda: state, services, wall=lambda: 1e9)
         app.logger.setLevel(logging.CRITICAL + 1)
         self.client = app.test_client()
 
     def test_cause_and_tell(self) -> None:
-        """A fault is accepted with 202, added to the chronicle, and listed with the possible faults."""
+        """A fault is accepted with 202, added to the event log, and listed with the possible faults."""
         answer = self.client.post("/api/v1/devices/01/faults", json={"kind": "loss", "amount": 0.3})
         self.assertEqual((answer.status_code, answer.get_json()), (202, {"id": "01", "kind": "loss", "seconds": 15.0}))
         assert self.faults is not None
-        self.assertEqual(self.faults.caused, [("01", "loss", 15.0, 0.3)])
-        self.assertEqual([(each.uuid, each.at) for each in self.chronicle.list_since(0)], [("01", 1e9)])
+        self.assertEqual(self.faults.injected, [("01", "loss", 15.0, 0.3)])
+        self.assertEqual([(each.uuid, each.at) for each in self.event_log.list_since(0)], [("01", 1e9)])
         told = self.client.get("/api/v1/faults").get_json()
         self.assertEqual(told["can"], {"01": ["kill", "loss"]})
         self.assertEqual([kind["kind"] for kind in told["kinds"]], list(KINDS))
@@ -152,7 +152,7 @@ class RouteTests(SynchronousTestCase):
             answer = self.client.post(f"/api/v1/devices/{path}/faults", json=body)
             self.assertEqual((answer.status_code, answer.get_json()["error"]["field"]), (code, field), body)
         assert self.faults is not None
-        self.assertEqual(self.faults.caused, [])
+        self.assertEqual(self.faults.injected, [])
 
     def test_node_without_faults(self) -> None:
         """A node without fault injection lists no faults, and names the setting that enables it."""

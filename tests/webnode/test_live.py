@@ -11,7 +11,7 @@ from twisted.trial.unittest import SynchronousTestCase
 from twisted.web.resource import Resource
 
 from tests.webnode.browser import Connection, site_of
-from tests.webnode.memory import MemoryDesk, MemoryFrames
+from tests.webnode.memory import MemoryFrames, MemoryTeamControl
 from tests.webnode.picture import jpeg
 from webnode.auth import OpenSessions, User
 from webnode.camera import OnFrame
@@ -41,25 +41,25 @@ def last_id(data: bytes) -> str:
 
 
 class Quiet(EventLog):
-    """A chronicle that describes injected faults only."""
+    """An event log that describes injected faults only."""
 
     def record_state(self, state: State, now: float) -> None:
         """Ignore the state."""
 
 
-class EventsTests(SynchronousTestCase):
+class EventStreamsTests(SynchronousTestCase):
     def setUp(self) -> None:
         self.clock = Clock()
         self.state: dict[str, Any] = {"n": 0}
         self.reads = 0
         self.version: int | None = None
-        self.board = Services(MemoryDesk(), OpenSessions(), event_log=Quiet())
+        self.services = Services(MemoryTeamControl(), OpenSessions(), event_log=Quiet())
         self.serve(self.read)
 
     def serve(self, read: Callable[[], State]) -> None:
         """Serve the states that ``read`` returns."""
         wall = lambda: 1e9 + self.clock.seconds()  # noqa: E731
-        self.events = EventStreams(read, self.clock, wall, self.board, lambda: self.version)
+        self.events = EventStreams(read, self.clock, wall, self.services, lambda: self.version)
         root = Resource()
         root.putChild(b"events", self.events)
         self.site = site_of(root, self.clock)
@@ -147,7 +147,7 @@ class EventsTests(SynchronousTestCase):
                 is_in = now - 1e9 < until
                 return User("ann", "viewer", "a1", 1e9 + until, 1e9 + limit) if is_in else User()
 
-        self.board.sessions = Sessions()
+        self.services.sessions = Sessions()
         pages = {name: self.connected(f"?ticket={name}") for name in whos}
         self.clock.pump([0.1] * 80)
         tickets = {
@@ -165,16 +165,16 @@ class EventsTests(SynchronousTestCase):
         """Every open page learns of a web node that joins the team."""
         page = self.connected()
         page.taken()
-        self.board.fallbacks.pages.append(Page("01", "http://127.0.0.1:8081"))
+        self.services.fallbacks.pages.append(Page("01", "http://127.0.0.1:8081"))
         self.clock.advance(0.1)
         row = {"node": "01", "url": "http://127.0.0.1:8081", "is_secure": False, "is_self": False}
         self.assertEqual(events_in(page.taken()), [("pages", [row])])
 
     def test_tell_what_happened(self) -> None:
-        """Each entry of the chronicle is sent once to each page, and all entries to a new page."""
+        """Each entry of the event log is sent once to each page, and all entries to a new page."""
         page = self.connected()
         page.taken()
-        self.board.event_log.record_fault("01", "kill", 1e9)
+        self.services.event_log.record_fault("01", "kill", 1e9)
         self.clock.advance(0.1)
         ((name, (row,)),) = events_in(page.taken())
         self.assertEqual((name, row["n"], row["text"]), ("event", 1, "01: kill (injected fault)"))
@@ -194,8 +194,8 @@ class EventsTests(SynchronousTestCase):
         self.clock.advance(0.1)
         self.assertIn(("change", {"n": 1}), events_in(page.taken()))
 
-    def test_keep_the_chronicle_with_nobody_there(self) -> None:
-        """Between ``open`` and ``close`` the chronicle gets the state each second, even without a page."""
+    def test_keep_the_event_log_without_a_page(self) -> None:
+        """Between ``start`` and ``close`` the event log gets the state each second, even without a page."""
         self.events.start()
         self.clock.pump([0.5] * 6)
         self.assertEqual(self.reads, 3)
@@ -288,16 +288,16 @@ def blind(uuid: str, on_frame: OnFrame) -> Callable[[], None]:
     raise Refusal("device", "it has no camera", "choose another", 404)
 
 
-class ShotsTests(SynchronousTestCase):
+class CameraImagesTests(SynchronousTestCase):
     def setUp(self) -> None:
         self.clock = Clock()
         self.frames = MemoryFrames()
-        self.shots = CameraImages(self.frames.watch, self.clock)
-        self.site = self.site_with(self.shots)
+        self.images = CameraImages(self.frames.watch, self.clock)
+        self.site = self.site_with(self.images)
 
-    def site_with(self, shots: CameraImages) -> Any:
+    def site_with(self, images: CameraImages) -> Any:
         root = Resource()
-        root.putChild(b"shot", shots)
+        root.putChild(b"shot", images)
         return site_of(root, self.clock)
 
     def asked(self, after: str = "", viewer: str = "") -> Connection:
@@ -367,7 +367,7 @@ class ShotsTests(SynchronousTestCase):
         self.clock.advance(1.9)
         self.assertEqual(list(self.frames.watched), ["ab"])
         self.clock.advance(0.2)
-        self.assertEqual((list(self.frames.watched), self.shots.watched), ([], []))
+        self.assertEqual((list(self.frames.watched), self.images.watched), ([], []))
         self.assertEqual(self.clock.getDelayedCalls(), [])
         self.assertTrue(page.taken() and again.taken())
 
@@ -377,7 +377,7 @@ class ShotsTests(SynchronousTestCase):
         page.leave()
         self.frames.show("ab", 1, JPEG)
         self.clock.advance(2)
-        self.assertEqual((page.taken(), self.shots.watched), (b"", []))
+        self.assertEqual((page.taken(), self.images.watched), (b"", []))
 
     def test_drop_what_is_no_picture(self) -> None:
         """Incomplete or oversized JPEG data, and pictures with too many pixels, are dropped."""
@@ -390,11 +390,11 @@ class ShotsTests(SynchronousTestCase):
 
     def test_tell_of_no_camera(self) -> None:
         """A request to a device without a camera is answered with 404 and leaves no state."""
-        shots = CameraImages(blind, self.clock)
-        data = Connection(self.site_with(shots)).ask("/shot/cd?after=").taken()
+        images = CameraImages(blind, self.clock)
+        data = Connection(self.site_with(images)).ask("/shot/cd?after=").taken()
         self.assertIn(b" 404 ", data)
         self.assertIn(b"it has no camera", data)
-        self.assertEqual(shots.watched, [])
+        self.assertEqual(images.watched, [])
 
     def test_cap_waiting(self) -> None:
         """A request beyond ``MAX_WAITING`` is answered with 503."""
@@ -406,13 +406,13 @@ class ShotsTests(SynchronousTestCase):
         """A picture after the stop of the upstream has no effect."""
         self.asked()
         late = self.frames.watched["ab"]
-        self.shots.close()
+        self.images.close()
         late(1, JPEG, 0.0)
-        self.assertEqual((self.clock.getDelayedCalls(), self.shots.watched), ([], []))
+        self.assertEqual((self.clock.getDelayedCalls(), self.images.watched), ([], []))
 
     def test_close(self) -> None:
         """``close`` answers waiting requests and stops the upstream."""
         page = self.asked()
-        self.shots.close()
+        self.images.close()
         self.assertIn(b" 204 ", page.taken())
         self.assertEqual((list(self.frames.watched), self.clock.getDelayedCalls()), ([], []))

@@ -9,7 +9,7 @@ from typing import Any
 from twisted.trial.unittest import SynchronousTestCase
 
 from tests.webnode.guests import Guests
-from tests.webnode.memory import MemoryDesk
+from tests.webnode.memory import MemoryTeamControl
 from webnode.app import create_app
 from webnode.auth import User
 from webnode.limits import AddressLimits
@@ -25,12 +25,12 @@ class MetricsTests(SynchronousTestCase):
 
     def setUp(self) -> None:
         self.limits = AddressLimits()
-        self.board = Services(MemoryDesk(), Guests(), limits=self.limits)
+        self.services = Services(MemoryTeamControl(), Guests(), limits=self.limits)
         tasks = [{"id": "t1", "title": "Find", "created": 1.0, "status": "EXECUTING"}]
         state = format_state(
             [{**DOG, "status": "IDLE"}], tasks, {"t1": [{"uuid": "01", "name": "x", "cost": 1.0}]}, node="v"
         )
-        self.client = create_app(lambda: state, self.board, wall=lambda: 9.5).test_client()
+        self.client = create_app(lambda: state, self.services, wall=lambda: 9.5).test_client()
 
     def read(self) -> Any:
         answer = self.client.get("/metrics", headers={"Authorization": "Bearer viewer"})
@@ -59,7 +59,7 @@ class MetricsTests(SynchronousTestCase):
     def test_tell_the_page(self) -> None:
         """Connections by kind, and requests by role and status, are counted; reading the metrics is not."""
         self.limits.count("stream", "10.0.0.1", 2)
-        self.board.audit.write(User("ann", "operator"), "h", "POST /x", "", "409 it left")
+        self.services.audit.write(User("ann", "operator"), "h", "POST /x", "", "409 it left")
         told = self.read()
         self.assertEqual(told["swarm_page_connections", ("stream",)], 2)
         self.assertEqual(told["swarm_page_orders_total", ("operator", "409")], 1)

@@ -9,7 +9,7 @@ from typing import Any
 from twisted.trial.unittest import SynchronousTestCase
 
 from tests.webnode.guests import Guests
-from tests.webnode.memory import MemoryDesk
+from tests.webnode.memory import MemoryTeamControl
 from webnode.app import create_app
 from webnode.route import Field, Route
 from webnode.routes.openapi import make_document
@@ -86,7 +86,7 @@ class DocumentTests(SynchronousTestCase):
     def test_be_served(self) -> None:
         """A viewer gets the document of the served routes, with the node's name."""
         state = format_state([], [], {}, node="vaio")
-        client = create_app(lambda: state, Services(MemoryDesk(), Guests())).test_client()
+        client = create_app(lambda: state, Services(MemoryTeamControl(), Guests())).test_client()
         self.assertEqual(client.get("/api/v1/openapi.json").status_code, 401)
         told = client.get("/api/v1/openapi.json?ticket=viewer").get_json()
         self.assertIn("vaio", told["info"]["title"])

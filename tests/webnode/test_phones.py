@@ -15,7 +15,7 @@ from twisted.web.resource import Resource
 from middleware.entangled.identity import Identity
 from swarmnode.gateway import check_picture
 from tests.webnode.browser import Connection, site_of
-from tests.webnode.memory import MemoryDesk, MemoryPhones
+from tests.webnode.memory import MemoryPhones, MemoryTeamControl
 from tests.webnode.picture import jpeg
 from webnode.app import create_app
 from webnode.audit import AuditLog
@@ -39,14 +39,14 @@ class PhoneRouteTests(SynchronousTestCase):
         self.sessions = SignedSessions(
             TokenKey(Identity(bytes(32))), lambda _: True, "quiet-otter", "", random.Random(1), lambda *_: succeed(0)
         )
-        self.phones = MemoryPhones(most=2, check=check_picture)
-        self.board = Services(MemoryDesk(), self.sessions, AuditLog(), phones=self.phones)
+        self.phones = MemoryPhones(max_phones=2, check=check_picture)
+        self.services = Services(MemoryTeamControl(), self.sessions, AuditLog(), phones=self.phones)
         state = format_state([], [], {}, node="vaio")
-        self.client = create_app(lambda: state, self.board, wall=lambda: 1000.0).test_client()
+        self.client = create_app(lambda: state, self.services, wall=lambda: 1000.0).test_client()
         native: dict[str, Resource] = {
-            route.path: route.native(self.board, None) for route in ROUTES if route.native is not None
+            route.path: route.native(self.services, None) for route in ROUTES if route.native is not None
         }
-        self.site = site_of(Root(Resource(), native, self.board, lambda: 1000.0), Clock(), AddressLimits())
+        self.site = site_of(Root(Resource(), native, self.services, lambda: 1000.0), Clock(), AddressLimits())
         self.token = self.token_of("phone")
 
     def token_of(self, role: Any) -> str:
@@ -81,15 +81,17 @@ class PhoneRouteTests(SynchronousTestCase):
         self.assertEqual(self.phones.can, {"width": 208, "height": 156, "orientation": True, "position": False})
         status, told = self.look(phone, jpeg(), '{"target.bearing": 0.1, "target.distance": 1}')
         self.assertEqual((status, told["fps"]), (200, 10.0))
-        self.assertEqual(self.phones.looks, [(phone["uuid"], jpeg(), {"target.bearing": 0.1, "target.distance": 1.0})])
+        self.assertEqual(
+            self.phones.pictures, [(phone["uuid"], jpeg(), {"target.bearing": 0.1, "target.distance": 1.0})]
+        )
         self.assertEqual(self.joined()["uuid"], phone["uuid"], "the same secret is the same phone")
         status, told = self.send(f"phones/{phone['uuid']}/leave?ticket={phone['ticket']}")
-        self.assertEqual((status, told, self.phones.here), (200, {}, {}))
+        self.assertEqual((status, told, self.phones.registered), (200, {}, {}))
         self.assertEqual(self.look(phone, jpeg())[0], 404)
-        self.assertEqual([line["outcome"] for line in self.board.audit.list_newest(9)], ["200"] * 3)
+        self.assertEqual([line["outcome"] for line in self.services.audit.list_newest(9)], ["200"] * 3)
 
     def test_ask_for_the_role(self) -> None:
-        """Phones and operators join; viewers, unknown visitors and phones with another phone's ticket do not."""
+        """Phones and operators join; viewers, unknown users and phones with another phone's ticket do not."""
         self.assertEqual(self.join(self.token_of("operator")).status_code, 200)
         self.assertEqual(self.join(self.token_of("viewer")).status_code, 403)
         self.assertEqual(self.client.post("/api/v1/phones", json=JOIN).status_code, 401)
@@ -105,7 +107,7 @@ class PhoneRouteTests(SynchronousTestCase):
         self.assertEqual(self.look(one, jpeg(), ticket=self.token_of("viewer"))[0], 403)
         self.assertEqual(self.look(one, jpeg(), ticket="nonsense")[0], 401)
         self.assertEqual(self.look(one, jpeg(), ticket=self.token)[0], 403)
-        self.assertEqual(sorted(self.phones.here.values()), ["anna", "ben"])
+        self.assertEqual(sorted(self.phones.registered.values()), ["anna", "ben"])
         bearer = {"Authorization": f"Bearer {self.token_of('operator')}"}
         self.assertEqual(self.send(f"phones/{one['uuid']}/look", jpeg(), **bearer)[0], 200)
 
@@ -151,14 +153,14 @@ class PhoneRouteTests(SynchronousTestCase):
         for values in wrong:
             status, told = self.look(phone, jpeg(), values)
             self.assertEqual((status, told["error"]["field"]), (400, "values"), values[:50])
-        self.assertEqual(self.phones.looks, [])
+        self.assertEqual(self.phones.pictures, [])
         self.assertEqual(self.look(phone, jpeg() + bytes(MAX_BODY))[0], 413)
         at_bounds = {name: measure.maximum for name, measure in VALUE_RANGES.items()}
         self.assertEqual(self.look(phone, jpeg(), json.dumps(at_bounds))[0], 200)
 
     def test_answer_posts_alone(self) -> None:
         """Other methods are answered with 405 and ``Allow``, and paths below with 404."""
-        self.board.sessions = OpenSessions()
+        self.services.sessions = OpenSessions()
         for method, path, status in (("GET", "look", 405), ("PUT", "leave", 405), ("POST", "look/more", 404)):
             asked = Connection(self.site).ask(f"/api/v1/phones/01/{path}", method, X_Swarm="1").taken()
             self.assertIn(b" %d " % status, asked)
@@ -167,7 +169,7 @@ class PhoneRouteTests(SynchronousTestCase):
 
     def test_share_with_the_team(self) -> None:
         """A page of another web node of the team may send pictures here; a page of an unknown origin may not."""
-        self.board.fallbacks = Fallbacks(Page("02", "http://other:8080"))
+        self.services.fallbacks = Fallbacks(Page("02", "http://other:8080"))
         phone = self.joined()
         path = f"phones/{phone['uuid']}/look?ticket={phone['ticket']}"
         self.assertEqual(self.send(path, jpeg(), Origin="http://other:8080")[0], 200)
@@ -176,6 +178,6 @@ class PhoneRouteTests(SynchronousTestCase):
     def test_node_without_phones(self) -> None:
         """A node without phone support rejects phones with 409."""
         phone = self.joined()
-        self.board.phones = None
+        self.services.phones = None
         self.assertEqual(self.join().status_code, 409)
         self.assertEqual(self.look(phone, jpeg())[0], 409)

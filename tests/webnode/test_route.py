@@ -7,7 +7,7 @@ from typing import Any
 
 from twisted.trial.unittest import SynchronousTestCase
 
-from tests.webnode.memory import MemoryDesk
+from tests.webnode.memory import MemoryTeamControl
 from webnode.auth import OpenSessions, User
 from webnode.errors import Refusal
 from webnode.route import ALLOWED_ROLES, Field, Route, RouteRequest, check_request, check_role, find_device
@@ -17,10 +17,10 @@ from webnode.state import DepartedDevices, format_state
 
 
 def route(*fields: Field) -> Route:
-    return Route("POST", "/api/v1/things/{uuid}", "About a thing", "viewer", lambda ask: {}, fields)
+    return Route("POST", "/api/v1/things/{uuid}", "About a thing", "viewer", lambda request: {}, fields)
 
 
-class CheckedTests(SynchronousTestCase):
+class CheckRequestTests(SynchronousTestCase):
     def refusal(self, field: Field, value: Any) -> Refusal:
         place = {field.name: value}
         query = place if field.where == "query" else {}
@@ -90,9 +90,9 @@ class CheckedTests(SynchronousTestCase):
             self.assertEqual(self.assertRaises(Refusal, check_request, route(), {}, {}, body).field, "body")
 
 
-class GuardedTests(SynchronousTestCase):
+class CheckRoleTests(SynchronousTestCase):
     def test_let_in_by_role(self) -> None:
-        """Each role may use the routes that ``ALLOWED`` lists; an unknown visitor gets 401, others 403."""
+        """Each role may use the routes that ``ALLOWED_ROLES`` lists; an unknown user gets 401, others 403."""
         for wanted, lawful in ALLOWED_ROLES.items():
             for role in ALLOWED_ROLES:
                 if role in lawful:
@@ -108,11 +108,11 @@ class DeviceTests(SynchronousTestCase):
         departed, dogs = DepartedDevices(), [{"uuid": f"0{n}", "name": f"dog{n}", "joined": n} for n in (1, 2)]
         departed.update(dogs, 1.0)
         state = format_state(dogs[:1], [], {}, departed=departed.update(dogs[:1], 2.0))
-        board = Services(MemoryDesk(), OpenSessions())
-        self.assertEqual(find_device(RouteRequest({"uuid": "01"}, User(), board, state))["name"], "dog1")
+        services = Services(MemoryTeamControl(), OpenSessions())
+        self.assertEqual(find_device(RouteRequest({"uuid": "01"}, User(), services, state))["name"], "dog1")
         for uuid, status in (("02", 409), ("03", 404)):
-            ask = RouteRequest({"uuid": uuid}, User(), board, state)
-            self.assertEqual(self.assertRaises(Refusal, find_device, ask).status, status)
+            request = RouteRequest({"uuid": uuid}, User(), services, state)
+            self.assertEqual(self.assertRaises(Refusal, find_device, request).status, status)
 
 
 class TableTests(SynchronousTestCase):
@@ -137,4 +137,4 @@ class TableTests(SynchronousTestCase):
 
 
 FOR_ALL = ("/api/v1/node", "/api/v1/session", "/api/v1/tasks/preview", "/api/v1/ca.crt", "/static/{file}", "/sw.js")
-"""What is no secret, and what a visitor needs before it has signed in."""
+"""What is no secret, and what a user needs before signing in."""

@@ -16,7 +16,7 @@ from twisted.web.static import Data
 
 from tests.webnode.browser import Connection, site_of
 from tests.webnode.guests import Guests
-from tests.webnode.memory import MemoryDesk
+from tests.webnode.memory import MemoryTeamControl
 from webnode.auth import OpenSessions
 from webnode.errors import Refusal
 from webnode.fallback import Fallbacks, Page
@@ -43,7 +43,7 @@ class Stream(JsonResource):
 NATIVE: dict[str, Resource] = {"/stream": Stream()}
 
 
-class SentTests(SynchronousTestCase):
+class ReadStaticTests(SynchronousTestCase):
     def test_send_no_comments(self) -> None:
         """Scripts are sent without full-line comments, with unchanged line numbers and strings."""
         script = Path(self.mktemp()).with_suffix(".js")
@@ -54,8 +54,8 @@ class SentTests(SynchronousTestCase):
 class RootTests(SynchronousTestCase):
     def setUp(self) -> None:
         native: dict[str, Resource] = {"/events": Data(b"native", "text/plain"), "/static": StaticFiles()}
-        self.board = Services(MemoryDesk(), OpenSessions())
-        self.site = site_of(Root(PathResource(), native, self.board, lambda: 1e9), Clock())
+        self.services = Services(MemoryTeamControl(), OpenSessions())
+        self.site = site_of(Root(PathResource(), native, self.services, lambda: 1e9), Clock())
 
     def asked(self, path: str, method: str = "GET", **headers: str) -> bytes:
         return Connection(self.site).ask(path, method, **headers).taken()
@@ -76,7 +76,7 @@ class RootTests(SynchronousTestCase):
     def test_refuse_in_json(self) -> None:
         """Errors of native routes are JSON with the strict headers and without the server's version."""
         self.site = site_of(
-            Root(PathResource(), {**NATIVE, "/static": StaticFiles()}, self.board, lambda: 1e9), Clock()
+            Root(PathResource(), {**NATIVE, "/static": StaticFiles()}, self.services, lambda: 1e9), Clock()
         )
         asked = [
             ("/static/nothing.js", "GET", 404),
@@ -104,7 +104,7 @@ class RootTests(SynchronousTestCase):
 
     def test_ask_for_the_role(self) -> None:
         """A native route checks its role by header or ticket, and does not repeat an invalid ticket."""
-        self.board.sessions = Guests()
+        self.services.sessions = Guests()
         self.assertIn(b" 401 ", self.asked("/events"))
         self.assertIn(b" 401 ", self.asked("/events?ticket=nonsense"))
         self.assertNotIn(b"nonsense", self.asked("/events?ticket=nonsense"))
@@ -116,16 +116,16 @@ class RootTests(SynchronousTestCase):
     def test_find_deep_routes(self) -> None:
         """A native route can be below the API: its whole path must match, and its role is checked."""
         native: dict[str, Resource] = {"/api/v1/phones/{uuid}/look": Data(b"seen", "text/plain")}
-        self.site = site_of(Root(PathResource(), native, self.board, lambda: 1e9), Clock())
+        self.site = site_of(Root(PathResource(), native, self.services, lambda: 1e9), Clock())
         self.assertIn(b"seen", self.asked("/api/v1/phones/01/look"))
         for path in ("/api/v1/phones/01", "/api/v1/phones/01/leave", "/api/v1/phones//look"):
             self.assertIn(b"flask " + path[1:].encode(), self.asked(path))
-        self.board.sessions = Guests()
+        self.services.sessions = Guests()
         self.assertIn(b" 403 ", self.asked("/api/v1/phones/01/look?ticket=viewer"))
 
     def test_share_with_the_team(self) -> None:
         """A page of another web node of the team may send requests, also with a preflight; other origins may not."""
-        self.board.fallbacks = Fallbacks(Page("02", "http://other:8080"))
+        self.services.fallbacks = Fallbacks(Page("02", "http://other:8080"))
         for method in ("GET", "OPTIONS"):
             data = self.asked("/events", method, Origin="http://other:8080")
             self.assertIn(b"Access-Control-Allow-Origin: http://other:8080", data)
@@ -184,7 +184,7 @@ class QuickReactor:
 
 class CallerTests(SynchronousTestCase):
     def test_bring_the_answer(self) -> None:
-        """The caller returns the desk's result, also from a Deferred, and raises its refusals."""
+        """The caller returns the call's result, also from a Deferred, and raises its refusals."""
 
         def refuse() -> None:
             raise Refusal("name", "no", "ask another", 404)
@@ -195,7 +195,7 @@ class CallerTests(SynchronousTestCase):
         self.assertEqual(self.assertRaises(Refusal, on_reactor, refuse).status, 404)
 
     def test_wait_no_longer_than_the_limit(self) -> None:
-        """A desk that does not answer is given up after the limit, with 503."""
+        """A call that does not answer is given up after the limit, with 503."""
         never: Deferred[None] = Deferred()
         for usual_s, given in ((0.0, {}), (1e6, {"limit_s": 0.0})):
             error = self.assertRaises(Refusal, make_caller(QuickReactor(), usual_s), lambda: never, **given)

@@ -59,10 +59,10 @@ class SignedSessionsTests(SynchronousTestCase):
         for words in ("quiet-otter", " Quiet Otter ", "QUIETOTTER"):
             token = self.signed(words)
             self.assertEqual((token.role, token.until), ("operator", SESSION_S))
-        who = self.sessions.authenticate(token.text, SESSION_S - 1.0)
-        self.assertEqual((who.name, who.role), ("operator", "operator"))
+        user = self.sessions.authenticate(token.text, SESSION_S - 1.0)
+        self.assertEqual((user.name, user.role), ("operator", "operator"))
         looks = self.sessions.authenticate(token.ticket, SESSION_S - 1.0)
-        self.assertEqual((looks.role, looks.token_id), ("viewer", who.token_id))
+        self.assertEqual((looks.role, looks.token_id), ("viewer", user.token_id))
         for text in (token.text, token.ticket):
             self.assertEqual(self.sessions.authenticate(text, SESSION_S), User())
 
@@ -71,18 +71,18 @@ class SignedSessionsTests(SynchronousTestCase):
         pi, nuc = self.node("pi"), self.node("nuc")
         token = self.signed()
         self.assertEqual(pi.authenticate(token.text, 1.0), User())
-        who = self.sessions.authenticate(token.text, 1.0)
-        given = self.sessions.issue_peer_tokens(who, [uuid("pi")], 1.0)[uuid("pi")]
+        user = self.sessions.authenticate(token.text, 1.0)
+        given = self.sessions.issue_peer_tokens(user, [uuid("pi")], 1.0)[uuid("pi")]
         self.assertEqual((given.role, given.until), ("operator", 1.0 + PEER_TOKEN_S))
         self.assertEqual([each.authenticate(given.text, 2.0).role for each in (self.sessions, nuc)], ["anyone"] * 2)
         there = pi.authenticate(given.text, 2.0)
-        self.assertEqual((there.name, there.role, there.token_id), (who.name, who.role, who.token_id))
+        self.assertEqual((there.name, there.role, there.token_id), (user.name, user.role, user.token_id))
         self.assertEqual(pi.authenticate(given.ticket, 2.0).role, "viewer")
         renewed = pi.renew_token(there, 2.0)
-        self.assertEqual(pi.authenticate(renewed.text, SESSION_S).limit, who.limit)
+        self.assertEqual(pi.authenticate(renewed.text, SESSION_S).limit, user.limit)
         further = pi.issue_peer_tokens(pi.authenticate(renewed.text, 3.0), [uuid("vaio"), uuid("nuc")], 3.0)
-        self.assertEqual(self.sessions.authenticate(further[uuid("vaio")].text, 4.0).token_id, who.token_id)
-        self.assertEqual(nuc.authenticate(further[uuid("nuc")].text, 4.0).token_id, who.token_id)
+        self.assertEqual(self.sessions.authenticate(further[uuid("vaio")].text, 4.0).token_id, user.token_id)
+        self.assertEqual(nuc.authenticate(further[uuid("nuc")].text, 4.0).token_id, user.token_id)
         refusal = self.assertRaises(
             Refusal, pi.issue_peer_tokens, pi.authenticate(given.ticket, 2.0), [uuid("nuc")], 2.0
         )
@@ -108,8 +108,8 @@ class SignedSessionsTests(SynchronousTestCase):
 
     def test_end_what_was_made_of_it(self) -> None:
         """Revoking an invitation ends its sessions, and revoking a session ends its derived tickets."""
-        who = self.sessions.authenticate(self.signed().text, 1.0)
-        invitation = self.sessions.issue_guest_token(who, "guest", "phone", 1.0, 600.0)
+        user = self.sessions.authenticate(self.signed().text, 1.0)
+        invitation = self.sessions.issue_guest_token(user, "guest", "phone", 1.0, 600.0)
         guest = self.sessions.authenticate(self.signed(invitation.text, 2.0).text, 2.0)
         derived = self.sessions.issue_derived_token(guest, "phone/1", "phone", 2.0, 1e9)
         self.assertEqual((derived.until, self.sessions.authenticate(derived.ticket, 3.0).name), (601.0, "phone/1"))
@@ -118,7 +118,7 @@ class SignedSessionsTests(SynchronousTestCase):
         self.assertEqual(self.refused(invitation.text, 3.0).status, 401)
 
     def test_refuse_what_is_not_the_code(self) -> None:
-        """A wrong code is rejected with 401 and a hint to ``swarm web``; a visitor without a token is anonymous."""
+        """A wrong code is rejected with 401 and a hint to ``swarm web``; a user without a token is anonymous."""
         for words in ("", "quiet", "quiet-otter1", "\N{DOG FACE}", "A" * 60):
             refusal = self.refused(words)
             self.assertEqual((refusal.status, refusal.field), (401, "code"))
@@ -182,14 +182,14 @@ class SignedSessionsTests(SynchronousTestCase):
             now = token.until - 1.0
             token = self.sessions.renew_token(self.sessions.authenticate(token.text, now), now)
             self.assertEqual(token.until, min(now + SESSION_S, MAX_SESSION_S))
-        who = self.sessions.authenticate(token.text, now)
-        self.assertEqual(self.sessions.renew_token(who, now + 5.0).until, MAX_SESSION_S)
-        self.sessions.revoke(who.token_id, who.until)
+        user = self.sessions.authenticate(token.text, now)
+        self.assertEqual(self.sessions.renew_token(user, now + 5.0).until, MAX_SESSION_S)
+        self.sessions.revoke(user.token_id, user.until)
         self.assertEqual(self.sessions.authenticate(self.signed(now=now).text, now).role, "operator")
         self.assertEqual(self.sessions.authenticate(token.text, now), User())
 
     def test_renew_no_further_than_invited(self) -> None:
-        """A guest cannot renew beyond the invitation; a ticket and an unknown visitor cannot renew."""
+        """A guest cannot renew beyond the invitation; a ticket and an unknown user cannot renew."""
         invitation = self.sessions.issue_guest_token(OPERATOR, "guest", "viewer", 0.0, SESSION_S + 10.0)
         token = self.signed(invitation.text, 1.0)
         self.assertEqual(token.until, SESSION_S + 1.0)

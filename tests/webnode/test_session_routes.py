@@ -9,7 +9,7 @@ from twisted.internet.defer import succeed
 from twisted.trial.unittest import SynchronousTestCase
 
 from middleware.entangled.identity import Identity
-from tests.webnode.memory import MemoryDesk, MemoryInvites
+from tests.webnode.memory import MemoryInvites, MemoryTeamControl
 from webnode.app import create_app
 from webnode.audit import AuditLog
 from webnode.fallback import Fallbacks, Page
@@ -29,8 +29,8 @@ class SessionRouteTests(SynchronousTestCase):
         )
         self.audit = AuditLog()
         state = format_state([], [], {}, node="vaio")
-        self.board = Services(MemoryDesk(), sessions, self.audit)
-        self.client = create_app(lambda: state, self.board, wall=lambda: 1000.0).test_client()
+        self.services = Services(MemoryTeamControl(), sessions, self.audit)
+        self.client = create_app(lambda: state, self.services, wall=lambda: 1000.0).test_client()
 
     def signed(self, **body: str) -> dict[str, Any]:
         answer = self.client.post("/api/v1/session", json=body)
@@ -71,7 +71,7 @@ class SessionRouteTests(SynchronousTestCase):
         """A session gets a pass for each other web node by its uuid, none for this node; a ticket gets none."""
         told = self.signed(code="quiet-otter")
         other = "ab" * 20
-        self.board.fallbacks = Fallbacks(Page("here", "http://10.0.0.7:80", is_self=True), Page(other, "http://x"))
+        self.services.fallbacks = Fallbacks(Page("here", "http://10.0.0.7:80", is_self=True), Page(other, "http://x"))
         given = self.client.get("/api/v1/session/passes", headers=self.bearer(told["token"])).get_json()
         self.assertEqual(list(given), [other])
         self.assertEqual((given[other]["role"], given[other]["until"]), ("operator", 1600.0))
@@ -96,8 +96,8 @@ class SessionRouteTests(SynchronousTestCase):
         self.assertNotIn("s3cr3t", str(self.audit.list_newest(100)))
         self.assertIn("401", str(self.audit.list_newest(100)))
 
-    def test_answer_each_visitor_for_itself(self) -> None:
-        """Two visitors with the same idempotency key get separate answers."""
+    def test_answer_each_user_for_itself(self) -> None:
+        """Two users with the same idempotency key get separate answers."""
         key = {"Idempotency-Key": "1"}
         first = self.client.post("/api/v1/session", json={"code": "quiet-otter"}, headers=key)
         second = self.client.post("/api/v1/session", json={"code": "a wrong one"}, headers=key)
@@ -121,7 +121,7 @@ class SessionRouteTests(SynchronousTestCase):
     def test_invite_by_a_link(self) -> None:
         """An invitation has a link to the best page; the link for a phone opens the phone view."""
         bearer = self.bearer(self.signed(code="quiet-otter")["token"])
-        self.board.invites = MemoryInvites("https://10.0.0.7:8443", "http://10.0.0.7:8080", "http://127.0.0.1:8080")
+        self.services.invites = MemoryInvites("https://10.0.0.7:8443", "http://10.0.0.7:8080", "http://127.0.0.1:8080")
 
         def invited(**body: Any) -> dict[str, Any]:
             return dict(self.client.post("/api/v1/invitations", json=body, headers=bearer).get_json())
@@ -146,7 +146,7 @@ class SessionRouteTests(SynchronousTestCase):
         missing = self.client.get("/api/v1/ca.crt")
         self.assertEqual((missing.status_code, missing.get_json()["error"]["field"]), (404, "certificate"))
         pages = ("https://10.0.0.7:8443", "http://10.0.0.7:8080")
-        self.board.invites = MemoryInvites(*pages, authority=b"PEM", fingerprint="AB:CD")
+        self.services.invites = MemoryInvites(*pages, authority=b"PEM", fingerprint="AB:CD")
         answer = self.client.get("/api/v1/ca.crt")
         self.assertEqual((answer.data, answer.content_type), (b"PEM", "application/x-x509-ca-cert"))
         bearer = self.bearer(self.signed(code="quiet-otter")["token"])

@@ -137,7 +137,7 @@ class WhyTests(SynchronousTestCase):
         self.assertEqual(format_state([], [{"id": "t", "why": 7}], {})["tasks"][0]["why"], [])
 
 
-class DepartedTests(SynchronousTestCase):
+class DepartedDevicesTests(SynchronousTestCase):
     def test_remember_for_a_minute(self) -> None:
         """A device that left is listed as gone at its place for sixty seconds."""
         departed = DepartedDevices()

@@ -42,7 +42,7 @@ NO_CHECK_TIME = 0x200000
 DAY = 86400.0
 
 
-class CertifiedTests(SynchronousTestCase):
+class CertificateProviderTests(SynchronousTestCase):
     if MISSING:
         skip = SKIP
 
@@ -54,7 +54,7 @@ class CertifiedTests(SynchronousTestCase):
         self.names = ["192.168.0.7"]
         self.now = NOW
 
-    def certified(self, seed: int = 1) -> tuple[CertificateProvider, str]:
+    def provider(self, seed: int = 1) -> tuple[CertificateProvider, str]:
         """Return the certificate of a node after its start, and its log lines."""
         with capturedLogs() as said:
             made = CertificateProvider(
@@ -62,19 +62,19 @@ class CertifiedTests(SynchronousTestCase):
             )
         return made, "\n".join(formatEvent(each) for each in said)
 
-    def served(self, certified: CertificateProvider) -> list[str]:
+    def served(self, provider: CertificateProvider) -> list[str]:
         """Return the names in the certificate after the next connection."""
-        certified.serverConnectionForTLS(None)
-        return certified.names
+        provider.serverConnectionForTLS(None)
+        return provider.names
 
     def test_make_it_once(self) -> None:
         """The first start creates a private certificate file, and the next start uses it."""
-        _, said = self.certified()
+        _, said = self.provider()
         self.assertIn("there is none yet", said)
         pem = self.path.read_bytes()
         self.assertEqual(stat.S_IMODE(self.path.stat().st_mode), 0o600)
         self.assertEqual(set(parse_leaf(pem).names), {"localhost", "127.0.0.1", "::1", "192.168.0.7"})
-        self.assertEqual(self.certified(2)[1], "")
+        self.assertEqual(self.provider(2)[1], "")
         self.assertEqual(self.path.read_bytes(), pem)
 
     def test_make_it_anew(self) -> None:
@@ -101,10 +101,10 @@ class CertifiedTests(SynchronousTestCase):
             (aged, "it expires soon"),
         ]
         for seed, (fault, words) in enumerate(faults):
-            self.certified(seed)
+            self.provider(seed)
             before = parse_leaf(self.path.read_bytes()).certificate.serial_number
             fault()
-            _, said = self.certified(100 + seed)
+            _, said = self.provider(100 + seed)
             self.assertIn(words, said)
             self.assertIn("is replaced", said)
             self.assertNotEqual(parse_leaf(self.path.read_bytes()).certificate.serial_number, before)
@@ -113,41 +113,41 @@ class CertifiedTests(SynchronousTestCase):
     def test_go_on_without_a_place(self) -> None:
         """If the certificate cannot be stored, it is used nevertheless, and the log gives the reason."""
         self.path = self.path.parent / "nowhere" / "a.tls"
-        certified, said = self.certified()
+        provider, said = self.provider()
         self.assertIn("cannot store", said)
-        self.assertIn("192.168.0.7", self.served(certified))
+        self.assertIn("192.168.0.7", self.served(provider))
 
     def test_follow_the_machine(self) -> None:
         """A running node replaces its certificate for new local addresses and before its end."""
-        certified, _ = self.certified()
+        provider, _ = self.provider()
         self.names = ["10.0.0.5"]
-        self.assertNotIn("10.0.0.5", certified.names)
-        self.assertIn("10.0.0.5", self.served(certified))
-        certified.add_reached("172.16.0.9")
-        self.assertIn("172.16.0.9", self.served(certified))
-        certified.add_reached("8.8.8.8")
+        self.assertNotIn("10.0.0.5", provider.names)
+        self.assertIn("10.0.0.5", self.served(provider))
+        provider.add_reached("172.16.0.9")
+        self.assertIn("172.16.0.9", self.served(provider))
+        provider.add_reached("8.8.8.8")
         before = self.path.read_bytes()
-        self.served(certified)
+        self.served(provider)
         self.assertEqual(self.path.read_bytes(), before)
         self.now += 340 * DAY
-        self.served(certified)
+        self.served(provider)
         self.assertNotEqual(self.path.read_bytes(), before)
 
     def test_look_once_a_minute(self) -> None:
         """The node checks its addresses at most once a minute, for any number of connections."""
-        certified, _ = self.certified()
+        provider, _ = self.provider()
         looks: list[int] = []
-        certified._names = lambda: looks.append(1) or self.names  # type: ignore[func-returns-value]
+        provider._names = lambda: looks.append(1) or self.names  # type: ignore[func-returns-value]
         for _ in range(100):
             self.now += 0.5
-            certified.serverConnectionForTLS(None)
+            provider.serverConnectionForTLS(None)
         self.assertEqual(len(looks), 1)
         self.now -= 3600.0
-        certified.serverConnectionForTLS(None)
+        provider.serverConnectionForTLS(None)
         self.assertEqual(len(looks), 2)
 
 
-class DoorTests(SynchronousTestCase):
+class TlsPortTests(SynchronousTestCase):
     if MISSING:
         skip = SKIP
 
@@ -155,7 +155,7 @@ class DoorTests(SynchronousTestCase):
         self.folder = Path(self.mktemp()).resolve()
         self.folder.mkdir()
 
-    def door(self, store: str = "a.sqlite", kept: MemoryStore | None = None, seed: int = 1) -> TlsPort:
+    def tls_port(self, store: str = "a.sqlite", kept: MemoryStore | None = None, seed: int = 1) -> TlsPort:
         node = {"name": "a", "roles": ["web"], "store": store, "team_key": "of a test"}
         settings = Settings.from_mapping({"node": node, "web": {"tls": "auto"}}, str(self.folder / "a.toml"))
         return make_tls_port(
@@ -170,9 +170,9 @@ class DoorTests(SynchronousTestCase):
     def test_have_an_authority_of_its_own(self) -> None:
         """Each node has its own authority, which stays the same after a restart."""
         kept = MemoryStore()
-        first = self.door("a.sqlite", kept)
-        self.assertEqual(self.door("a.sqlite", kept, 2).signer.pem, first.signer.pem)
-        self.assertNotEqual(self.door("b.sqlite", seed=3).signer.pem, first.signer.pem)
+        first = self.tls_port("a.sqlite", kept)
+        self.assertEqual(self.tls_port("a.sqlite", kept, 2).signer.pem, first.signer.pem)
+        self.assertNotEqual(self.tls_port("b.sqlite", seed=3).signer.pem, first.signer.pem)
         self.assertEqual(sorted(os.listdir(self.folder)), ["a.sqlite.tls", "b.sqlite.tls"])
 
     def test_migrate(self) -> None:
@@ -180,12 +180,12 @@ class DoorTests(SynchronousTestCase):
         path = self.folder / "a.sqlite.tls"
         old = make_leaf(make_authority(b"7" * 32, "a"), "a", ["192.168.0.7"], NOW, random.Random(1))
         write_key_file(path, old.pem_with_key)
-        made = self.door()
+        made = self.tls_port()
         self.assertEqual(parse_leaf(path.read_bytes()).find_flaw(made.signer, ["192.168.0.7"], NOW), "")
 
     def test_keep_nothing_in_memory(self) -> None:
         """A node with a store in memory leaves no file."""
-        self.door(store=":memory:")
+        self.tls_port(store=":memory:")
         self.assertEqual(os.listdir(self.folder), [])
 
     def test_tell_of_a_taken_port(self) -> None:
@@ -195,7 +195,7 @@ class DoorTests(SynchronousTestCase):
             def listenTCP(self, port: int, *others: Any, **more: Any) -> Any:  # noqa: N802
                 raise CannotListenError("", port, OSError(98, "Address already in use"))
 
-        entrance = self.door()
+        entrance = self.tls_port()
         entrance._reactor = Taken()
         words = str(self.assertRaises(PortTaken, entrance.open, site_of(Data(b"hi", "text/plain"), Clock())))
         self.assertIn("127.0.0.1:8443", words)
@@ -218,12 +218,12 @@ class HandshakeTests(SynchronousTestCase):
     def setUp(self) -> None:
         self.signer = make_authority(b"1" * 32, "a")
         self.reactor = MemoryReactorClock()
-        certified = CertificateProvider(self.signer, "a", None, lambda: ["10.0.0.9"], lambda: NOW, random.Random(1))
+        provider = CertificateProvider(self.signer, "a", None, lambda: ["10.0.0.9"], lambda: NOW, random.Random(1))
         self.limits = AddressLimits()
         root = Resource()
         root.putChild(b"page", Data(b"hello", "text/plain"))
         self.site: Any = site_of(root, self.reactor, self.limits)
-        TlsPort(self.reactor, "127.0.0.1", 8443, self.signer, certified).open(self.site)
+        TlsPort(self.reactor, "127.0.0.1", 8443, self.signer, provider).open(self.site)
         self.connections = self.reactor.tcpServers[0][1]
 
     def connected(self) -> Connection:

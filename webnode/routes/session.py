@@ -131,9 +131,7 @@ ROUTES = (
         # Checking a password takes a small device some time.
         limit_s=4.5,
     ),
-    Route(
-        "GET", f"{API}/session", "The visitor; anyone if not signed in", "anyone", read_session, response="name, role"
-    ),
+    Route("GET", f"{API}/session", "The user; anyone if not signed in", "anyone", read_session, response="name, role"),
     Route(
         "PUT",
         f"{API}/session",

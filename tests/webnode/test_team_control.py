@@ -17,11 +17,11 @@ from webnode.errors import Refusal
 from webnode.team_control import ANSWER_LIMIT_S, PLACE_TARGET_S, TeamControl
 
 
-class TeamDeskTests(SynchronousTestCase):
+class TeamControlTests(SynchronousTestCase):
     def setUp(self) -> None:
         self.team = SimulatedTeam(3, dogs=("dog1", "dog2"))
         self.addCleanup(self.team.stop)
-        self.desk = self.team.desk
+        self.control = self.team.desk
 
     def uuid(self, name: str) -> str:
         """Return the uuid of a device."""
@@ -36,11 +36,11 @@ class TeamDeskTests(SynchronousTestCase):
 
     def test_say_who_has_a_message(self) -> None:
         """A message to all returns its recipients, and the reason for each device without it."""
-        told = self.desk.send_message("", "sit")
+        told = self.control.send_message("", "sit")
         self.team.clock.advance(0.1)
         self.assertEqual(self.successResultOf(told), {"delivered": ["dog1", "dog2", "vaio"], "failed": {}})
         self.team.block_datagrams("dog2")
-        told = self.desk.send_message("", "stay")
+        told = self.control.send_message("", "stay")
         self.team.clock.advance(ANSWER_LIMIT_S + 0.2)
         answer = self.successResultOf(told)
         self.assertEqual(answer["delivered"], ["dog1", "vaio"])
@@ -48,7 +48,7 @@ class TeamDeskTests(SynchronousTestCase):
 
     def test_device_that_vanishes_is_told(self) -> None:
         """A device that dies during a request is reported within the patience of the page."""
-        orders: list[tuple[Any, Any]] = [(self.desk.send_message, "sit"), (self.desk.disconnect, 5.0)]
+        orders: list[tuple[Any, Any]] = [(self.control.send_message, "sit"), (self.control.disconnect, 5.0)]
         for order, what in orders:
             uuid = self.uuid("dog2")
             self.team.kill("dog2")
@@ -62,19 +62,19 @@ class TeamDeskTests(SynchronousTestCase):
         """A device that is present but does not answer is reported with 504."""
         presence = self.team.services["dog2"].assembly.node
         presence.entangled.endpoint.expose("device.message", lambda peer, text: Deferred(), changes=True)
-        refusal = self.refusal(self.desk.send_message(self.uuid("dog2"), "sit"))
+        refusal = self.refusal(self.control.send_message(self.uuid("dog2"), "sit"))
         self.assertEqual((refusal.status, refusal.problem), (504, "dog2 did not answer"))
 
     def test_device_that_says_no_is_told(self) -> None:
         """A device's refusal is forwarded in its words, and an unknown uuid is reported as a lost device."""
-        refusal = self.refusal(self.desk.send_message(self.uuid("dog2"), "x" * 300))
+        refusal = self.refusal(self.control.send_message(self.uuid("dog2"), "x" * 300))
         self.assertEqual(refusal.status, 409)
         self.assertIn("dog2 refused: a message is a text of 1 to 200 characters", refusal.problem)
-        self.assertIn("has left the network", self.refusal(self.desk.disconnect("ab" * 16, 5.0)).problem)
+        self.assertIn("has left the network", self.refusal(self.control.disconnect("ab" * 16, 5.0)).problem)
 
     def test_disconnect_is_answered_before_it_leaves(self) -> None:
         """A device answers the request to disconnect before it leaves."""
-        gone = self.desk.disconnect(self.uuid("dog2"), 5.0)
+        gone = self.control.disconnect(self.uuid("dog2"), 5.0)
         self.team.clock.advance(0.03)
         self.assertEqual(self.successResultOf(gone), "leaving")
         self.team.state()
@@ -83,33 +83,33 @@ class TeamDeskTests(SynchronousTestCase):
 
     def test_preview(self) -> None:
         """The preview lists able and refused devices with reasons, and assigns nothing."""
-        preview = self.desk.preview("find-red-target")
+        preview = self.control.preview("find-red-target")
         self.assertEqual([(row["name"], row["busy"]) for row in preview["able"]], [("dog1", ""), ("dog2", "")])
         self.assertIn("vaio", preview["refused"])
         self.assertIsNone(preview["likely"])
         self.assertEqual(self.team.state()["tasks"], [])
-        self.assertEqual(self.assertRaises(Refusal, self.desk.preview, "fly").status, 404)
+        self.assertEqual(self.assertRaises(Refusal, self.control.preview, "fly").status, 404)
 
     def test_preview_of_a_group(self) -> None:
         """A task of a group is previewed together with the open tasks of the group that need the same."""
         wishes = [("turn-around", "yard"), ("find-red-target", "yard"), ("turn-around", "attic"), ("turn-around", "")]
-        ids = [self.desk.assign(name, group=group)["id"] for name, group in wishes]
+        ids = [self.control.assign(name, group=group)["id"] for name, group in wishes]
         self.team.clock.advance(1.0)
         first = self.team.state()["tasks"]
         title = next(row["title"] for row in first if row["id"] == ids[0])
-        self.assertEqual(self.desk.preview("turn-around", "yard")["together"], [{"id": ids[0], "title": title}])
-        self.assertEqual(self.desk.preview("turn-around", "cellar")["together"], [])
-        self.assertEqual(self.desk.preview("turn-around")["together"], [])
-        self.desk.cancel(ids[0])
+        self.assertEqual(self.control.preview("turn-around", "yard")["together"], [{"id": ids[0], "title": title}])
+        self.assertEqual(self.control.preview("turn-around", "cellar")["together"], [])
+        self.assertEqual(self.control.preview("turn-around")["together"], [])
+        self.control.cancel(ids[0])
         self.team.clock.advance(1.0)
-        self.assertEqual(self.desk.preview("turn-around", "yard")["together"], [])
+        self.assertEqual(self.control.preview("turn-around", "yard")["together"], [])
 
     def test_preview_by_what_is_reported(self) -> None:
         """While an equal task runs, its reports show the busy devices and the nearest one."""
         self.team.run_demo()
         for _ in range(60):
             self.team.clock.advance(0.5)
-            preview = self.desk.preview("find-red-target")
+            preview = self.control.preview("find-red-target")
             if preview["likely"]:
                 break
         (group,) = self.team.state()["groups"]
@@ -117,7 +117,7 @@ class TeamDeskTests(SynchronousTestCase):
         self.assertEqual(preview["likely"], min(costs, key=lambda name: costs[name]))
         title = self.team.state()["tasks"][0]["title"]
         self.assertEqual({row["busy"] for row in preview["able"]}, {title})
-        self.assertIsNone(self.desk.preview("turn-around")["likely"])
+        self.assertIsNone(self.control.preview("turn-around")["likely"])
 
     def test_target_comes_without_the_node_that_ordered_it(self) -> None:
         """If the web node dies after it started the demonstration, the simulator still places the target."""
@@ -130,12 +130,12 @@ class TeamDeskTests(SynchronousTestCase):
 
     def test_lift_a_robot(self) -> None:
         """A robot is moved to the given place, and a taken place is rejected with the simulator's error."""
-        moved = self.desk.move_robot("dog1", 1.0, 1.0, 0.5)
+        moved = self.control.move_robot("dog1", 1.0, 1.0, 0.5)
         self.team.clock.advance(0.1)
         self.assertIsNone(moved.addCallback(lambda _: None).result)
         dog = self.team.get_true_state()["dogs"][0]
         self.assertLess(abs(dog["x"] - 1.0) + abs(dog["y"] - 1.0), 0.05)
-        refusal = self.refusal(self.desk.move_robot("dog2", 1.0, 1.0, 0.5), 0.1)
+        refusal = self.refusal(self.control.move_robot("dog2", 1.0, 1.0, 0.5), 0.1)
         self.assertEqual((refusal.field, refusal.status), ("dog2", 409))
         self.assertIn("dog1 stands at", refusal.problem)
 
@@ -146,27 +146,27 @@ class RepeatedWishTests(SynchronousTestCase):
     def setUp(self) -> None:
         self.team = SimulatedTeam(3, dogs=("dog1", "dog2"), others=("pi",))
         self.addCleanup(self.team.stop)
-        self.desk = self.team.desk
+        self.control = self.team.desk
         self.reserve = TeamControl(TeamClient(self.team.services["pi"].assembly.node), TASKS, DEMO_TASK)
         self.team.clock.advance(1.0)
 
     def test_wish_that_is_repeated_elsewhere(self) -> None:
         """A request that another web node has carried out is not repeated, even if this node missed it."""
         wishes: list[Callable[[TeamControl], Any]] = [
-            lambda desk: desk.assign("find-red-target", 2, "yard", task_id="a1").addCallback(itemgetter("id")),
-            lambda desk: desk.run_demo("b2"),
+            lambda control: control.assign("find-red-target", 2, "yard", task_id="a1").addCallback(itemgetter("id")),
+            lambda control: control.run_demo("b2"),
         ]
         owner = self.team.services["vaio"].assembly.node.entangled.contact.public
         for wish, task_id in zip(wishes, ("a1", "b2"), strict=True):
             self.team.block_datagrams("pi")
-            first = wish(self.desk)
+            first = wish(self.control)
             self.team.clock.advance(1.0)
             self.team.switchboard.heal()
             self.assertNotIn(task_id, [record.name for record in self.reserve.read(ALL_TASKS)])
             again = wish(self.reserve)
             self.team.clock.advance(LOOKUP_S)
             self.assertEqual((self.successResultOf(first), self.successResultOf(again)), (task_id, task_id))
-            owners = [record.owner for record in self.desk.read(ALL_TASKS) if record.name == task_id]
+            owners = [record.owner for record in self.control.read(ALL_TASKS) if record.name == task_id]
             self.assertEqual(owners, [owner])
         statuses = sorted(task["status"] for task in self.team.state()["tasks"])
         self.assertEqual(statuses, ["ASSIGNED", "CANCELLED"])

@@ -13,7 +13,7 @@ from middleware.frontend.client import TeamClient
 from middleware.node import SwarmNode
 from tests.fleet import FleetCase, SwarmTeam
 from tests.webnode.guests import Guests
-from tests.webnode.memory import MemoryDesk, MemorySurvey
+from tests.webnode.memory import MemoryDiagnostics, MemoryTeamControl
 from webnode.app import create_app
 from webnode.diagnostics import ANSWER_LIMIT_S, Diagnostics
 from webnode.errors import Refusal
@@ -21,7 +21,7 @@ from webnode.services import Services
 from webnode.state import format_state
 
 
-class SurveyTests(FleetCase):
+class DiagnosticsTests(FleetCase):
     def setUp(self) -> None:
         super().setUp()
         self.team: SwarmTeam = self.swarm(3, weather=LinkConditions(delay_s=0.003))
@@ -31,10 +31,10 @@ class SurveyTests(FleetCase):
         self.dogs = [node.uuid for node in self.team.nodes]
         client = TeamClient(self.team.nodes[0])
         self.team.run(1)
-        self.survey = Diagnostics(self.team.nodes[0], client)
+        self.diagnostics = Diagnostics(self.team.nodes[0], client)
 
     def network(self) -> Any:
-        return self.done(self.team, self.survey.query_network(), ANSWER_LIMIT_S + 1)
+        return self.done(self.team, self.diagnostics.query_network(), ANSWER_LIMIT_S + 1)
 
     def test_tell_who_knows_whom(self) -> None:
         """Each of three nodes, in the order of joining, lists the two others with round trip and last contact."""
@@ -59,9 +59,9 @@ class SurveyTests(FleetCase):
 
         for node in self.team.nodes[1:]:
             expose(node)
-        waiting: list[Any] = [self.survey.query_network() for _ in range(20)]
+        waiting: list[Any] = [self.diagnostics.query_network() for _ in range(20)]
         self.team.run(0.5)
-        waiting.append(self.survey.query_network())
+        waiting.append(self.diagnostics.query_network())
         self.assertEqual(len([self.successResultOf(each) for each in waiting]), 21)
         self.assertEqual(sorted(asked), sorted(self.dogs[1:]))
         self.team.run(1)
@@ -71,7 +71,7 @@ class SurveyTests(FleetCase):
     def test_name_the_silent(self) -> None:
         """A device that does not answer is listed as silent, and the others are shown in time."""
         self.team.nodes[2].stop_silently()
-        waiting = self.survey.query_network()
+        waiting = self.diagnostics.query_network()
         self.team.run(ANSWER_LIMIT_S + 0.3)
         told: Any = self.successResultOf(waiting)
         self.assertEqual((list(told["devices"]), told["silent"]), (self.dogs[:2], self.dogs[2:]))
@@ -97,7 +97,7 @@ class SurveyTests(FleetCase):
                 self.assertIsNone(view)
 
     def links(self) -> Any:
-        return self.done(self.team, self.survey.query_links(), ANSWER_LIMIT_S + 1)
+        return self.done(self.team, self.diagnostics.query_links(), ANSWER_LIMIT_S + 1)
 
     def test_tell_how_each_is_reached(self) -> None:
         """Each of three nodes lists its paths to the two others; a later read has their scores."""
@@ -157,14 +157,14 @@ class SurveyTests(FleetCase):
 
     def test_open_team(self) -> None:
         """An open team lists the protections that it lacks."""
-        told: Any = self.survey.describe_team()
+        told: Any = self.diagnostics.describe_team()
         self.assertEqual((told["kind"], told["unprotected"]), ("open", OPEN_TEAM_WARNING))
 
     def test_tell_what_is_stored(self) -> None:
         """The inventory of another node and of the own node counts records by kind and lists the newest."""
         self.done(self.team, self.team.nodes[1].entangled.put(hash_key("a"), "note", b"\xa1x", "team"), 1)
         for uuid in self.dogs[:2]:
-            told: Any = self.done(self.team, self.survey.query_inventory(uuid), 1)
+            told: Any = self.done(self.team, self.diagnostics.query_inventory(uuid), 1)
             self.assertEqual(told["kinds"], {"devices": 3, "other": 1})
             self.assertEqual((told["records"], told["deleted"]), (4, 0))
             kind, name, size, lifetime = told["newest"][0]
@@ -173,13 +173,13 @@ class SurveyTests(FleetCase):
 
     def test_say_who_did_not_answer(self) -> None:
         """A silent device is answered with 504, a device without the method and a missing device with 409."""
-        self.assertEqual(self.assertRaises(Refusal, self.survey.query_inventory, "ff").status, 409)
+        self.assertEqual(self.assertRaises(Refusal, self.diagnostics.query_inventory, "ff").status, 409)
         self.team.nodes[1].entangled.endpoint.expose("device.inventory", _refuse)
-        waiting = self.survey.query_inventory(self.dogs[1])
+        waiting = self.diagnostics.query_inventory(self.dogs[1])
         self.team.run(1)
         self.assertEqual(self.failureResultOf(waiting, Refusal).value.status, 409)
         self.team.nodes[2].stop_silently()
-        waiting = self.survey.query_inventory(self.dogs[2])
+        waiting = self.diagnostics.query_inventory(self.dogs[2])
         self.team.run(ANSWER_LIMIT_S + 0.3)
         refusal = self.failureResultOf(waiting, Refusal).value
         self.assertEqual((refusal.status, refusal.problem), (504, "dog2 did not answer"))
@@ -196,23 +196,23 @@ class SurveyTests(FleetCase):
             self.assertTrue(1 <= each["hops"] <= each["asked"] and each["found"] == 8 and each["ms"] > 0, each)
 
     def test_ask_by_http(self) -> None:
-        """Viewers read the surveys; an unknown device gives 404, a silent one 504, a node without surveys 409."""
+        """Viewers read the diagnostics; an unknown device gives 404, a silent one 504, a node without them 409."""
         state = format_state([{"uuid": "01", "name": "dog1"}, {"uuid": "02", "name": "dog2"}], [], {})
         others: Any = ({"here": "01", "devices": {}, "silent": []}, {"kind": "open", "unprotected": "much"})
-        survey = MemorySurvey({"devices": {}, "silent": ["02"]}, {"01": {"records": 4}}, *others)
+        diagnostics = MemoryDiagnostics({"devices": {}, "silent": ["02"]}, {"01": {"records": 4}}, *others)
 
-        def asked(board: Services, path: str) -> tuple[int, Any]:
-            client = create_app(lambda: state, board).test_client()
+        def asked(services: Services, path: str) -> tuple[int, Any]:
+            client = create_app(lambda: state, services).test_client()
             answer = client.get(f"/api/v1/{path}?ticket=viewer", headers={"Host": "localhost"})
             return answer.status_code, answer.get_json()
 
-        board = Services(MemoryDesk(), Guests(), diagnostics=survey)
-        self.assertEqual(asked(board, "network"), (200, {"devices": {}, "silent": ["02"]}))
-        self.assertEqual((asked(board, "links"), asked(board, "team")), ((200, others[0]), (200, others[1])))
-        self.assertEqual(asked(board, "devices/01/inventory"), (200, {"records": 4}))
-        self.assertEqual([asked(board, f"devices/{uuid}/inventory")[0] for uuid in ("02", "03")], [504, 404])
+        services = Services(MemoryTeamControl(), Guests(), diagnostics=diagnostics)
+        self.assertEqual(asked(services, "network"), (200, {"devices": {}, "silent": ["02"]}))
+        self.assertEqual((asked(services, "links"), asked(services, "team")), ((200, others[0]), (200, others[1])))
+        self.assertEqual(asked(services, "devices/01/inventory"), (200, {"records": 4}))
+        self.assertEqual([asked(services, f"devices/{uuid}/inventory")[0] for uuid in ("02", "03")], [504, 404])
         for path in ("network", "links", "team"):
-            self.assertEqual(asked(Services(MemoryDesk(), Guests()), path)[0], 409)
+            self.assertEqual(asked(Services(MemoryTeamControl(), Guests()), path)[0], 409)
 
 
 def _refuse(peer: object, too: int, many: int) -> None:

@@ -7,7 +7,7 @@ from typing import Any
 from twisted.trial.unittest import SynchronousTestCase
 
 from tests.webnode.guests import Guests
-from tests.webnode.memory import MemoryDesk
+from tests.webnode.memory import MemoryTeamControl
 from webnode.app import create_app
 from webnode.event_log import EventLog
 from webnode.services import Services
@@ -26,9 +26,9 @@ def job(status: str, **more: Any) -> dict[str, Any]:
     return {"id": "t1", "title": "Find it", "created": 1.0, "status": status, **more}
 
 
-class ChronicleTests(SynchronousTestCase):
+class EventLogTests(SynchronousTestCase):
     def setUp(self) -> None:
-        self.chronicle = EventLog()
+        self.event_log = EventLog()
         self.departed = DepartedDevices()
         self.heard = 0
 
@@ -36,16 +36,16 @@ class ChronicleTests(SynchronousTestCase):
         """Return the new entries for a team of these devices; ``more`` is added to the state."""
         gone = self.departed.update(devices, now)
         state: State = {**format_state(devices, tasks, groups or {}, departed=gone, node="vaio"), **more}
-        self.chronicle.record_state(state, now)
+        self.event_log.record_state(state, now)
         return self.told()
 
     def told(self) -> list[str]:
-        entries = self.chronicle.list_since(self.heard)
+        entries = self.event_log.list_since(self.heard)
         self.heard = entries[-1].n if entries else self.heard
         return [entry.text for entry in entries]
 
     def test_begin_with_who_is_here(self) -> None:
-        """The chronicle begins with its start and the present devices; an equal state adds nothing."""
+        """The event log begins with its start and the present devices; an equal state adds nothing."""
         self.assertEqual(
             self.saw(1.0, dog(1), dog(2)),
             ["vaio starts to observe", "dog1 is here, number 1: idle", "dog2 is here, number 2: idle"],
@@ -70,7 +70,7 @@ class ChronicleTests(SynchronousTestCase):
         self.assertEqual(self.saw(3.6, tasks=[job("OPEN", note="nobody can")]), ["Find it: nobody can"])
         done = job("COMPLETED", result={"by": "dog2", "took": 13.24})
         self.assertEqual(self.saw(4.0, tasks=[done]), ["Find it: open → completed by dog2 in 13.2 s"])
-        self.assertEqual(self.chronicle.list_since(0)[-1].seconds, 13.24)
+        self.assertEqual(self.event_log.list_since(0)[-1].seconds, 13.24)
 
     def test_tell_of_consensus(self) -> None:
         """An agreement of all members is described once with the bids, and not before all have decided."""
@@ -100,7 +100,7 @@ class ChronicleTests(SynchronousTestCase):
     def takeover(self) -> list[tuple[str, str, float | None]]:
         kinds = ("takeover", "handover")
         return [
-            (entry.kind, entry.uuid, entry.seconds) for entry in self.chronicle.list_since(0) if entry.kind in kinds
+            (entry.kind, entry.uuid, entry.seconds) for entry in self.event_log.list_since(0) if entry.kind in kinds
         ]
 
     def test_time_a_takeover(self) -> None:
@@ -121,7 +121,7 @@ class ChronicleTests(SynchronousTestCase):
         tasks = [job("EXECUTING")]
         both = dog(1, "EXECUTING", "t1"), dog(2, "WAITING", "t1")
         self.saw(1.0, *both, tasks=tasks)
-        self.chronicle.record_fault(uuid(1), "radio", 9.0)
+        self.event_log.record_fault(uuid(1), "radio", 9.0)
         self.assertEqual(self.told(), ["dog1: radio (injected fault)"])
         self.saw(10.0, both[1], tasks=tasks)
         self.saw(10.5, dog(2, "EXECUTING", "t1"), tasks=tasks)
@@ -131,7 +131,7 @@ class ChronicleTests(SynchronousTestCase):
         """A change from a present device, or long after a fault, is a handover without a time."""
         tasks = [job("EXECUTING")]
         self.saw(1.0, dog(1, "EXECUTING", "t1"), dog(2, "WAITING", "t1"), tasks=tasks)
-        self.chronicle.record_fault(uuid(1), "skew", 2.0)
+        self.event_log.record_fault(uuid(1), "skew", 2.0)
         self.saw(70.0, dog(1, "EXECUTING", "t1"), dog(2, "WAITING", "t1"), tasks=tasks)
         self.saw(71.0, dog(1, "WAITING", "t1"), dog(2, "EXECUTING", "t1"), tasks=tasks)
         self.assertEqual(self.takeover(), [("handover", uuid(2), None)])
@@ -150,17 +150,19 @@ class ChronicleTests(SynchronousTestCase):
 
     def test_keep_so_many(self) -> None:
         """Only the newest entries are kept, with increasing numbers; they can be filtered by device or task."""
-        self.chronicle = EventLog(max_entries=3)
+        self.event_log = EventLog(max_entries=3)
         self.saw(1.0, dog(1), dog(2), tasks=[job("OPEN")])
-        self.assertEqual([entry.n for entry in self.chronicle.list_since(0)], [2, 3, 4])
-        self.assertEqual([entry.n for entry in self.chronicle.list_since(3)], [4])
-        self.assertEqual([entry.n for entry in self.chronicle.list_since(0, uuid(2))], [3])
-        self.assertEqual([entry.n for entry in self.chronicle.list_since(0, "t1")], [4])
+        self.assertEqual([entry.n for entry in self.event_log.list_since(0)], [2, 3, 4])
+        self.assertEqual([entry.n for entry in self.event_log.list_since(3)], [4])
+        self.assertEqual([entry.n for entry in self.event_log.list_since(0, uuid(2))], [3])
+        self.assertEqual([entry.n for entry in self.event_log.list_since(0, "t1")], [4])
 
     def test_ask_by_http(self) -> None:
         """A viewer reads all entries, entries after a number, or entries of one device; a wrong number is rejected."""
         self.saw(1.0, dog(1), dog(2))
-        app = create_app(lambda: format_state([], [], {}), Services(MemoryDesk(), Guests(), event_log=self.chronicle))
+        app = create_app(
+            lambda: format_state([], [], {}), Services(MemoryTeamControl(), Guests(), event_log=self.event_log)
+        )
         client = app.test_client()
 
         def asked(query: str) -> Any:

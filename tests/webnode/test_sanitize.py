@@ -11,7 +11,7 @@ from twisted.trial.unittest import SynchronousTestCase
 from webnode.sanitize import clean_count, clean_distance, clean_number, clean_properties, clean_text, clean_texts
 
 
-class FieldTests(SynchronousTestCase):
+class SanitizeTests(SynchronousTestCase):
     def test_take_lawful_values(self) -> None:
         """Valid values are returned unchanged."""
         self.assertEqual(clean_text("dog1"), "dog1")

@@ -7,7 +7,7 @@ from twisted.trial.unittest import SynchronousTestCase
 from webnode.sign_in_delay import FORGET_S, LONGEST_S, MAX_SOURCES, SignInDelays
 
 
-class DelaysTests(SynchronousTestCase):
+class SignInDelaysTests(SynchronousTestCase):
     def setUp(self) -> None:
         self.delays = SignInDelays()
 
@@ -64,7 +64,7 @@ class DelaysTests(SynchronousTestCase):
         self.assertLessEqual(self.delays.get_wait("a", 0.0), LONGEST_S)
 
     def test_take_a_try_back(self) -> None:
-        """``undo`` removes a successful try, wrong tries count; the limits are configurable."""
+        """``uncount_attempt`` removes a successful try, wrong tries count; the limits are configurable."""
         delays = SignInDelays(free=3, longest_s=10.0, forgotten_s=100.0)
         for _ in range(20):
             delays.count_attempt("everywhere", 0.0)
