@@ -1,176 +1,147 @@
-"""Tests of discovery on a simulated LAN."""
+"""Tests of the exchange before the handshake: cookies under load, and probes."""
 
 from __future__ import annotations
 
 import random
 
-from middleware.entangled.kademlia.lan_discovery import LISTEN_S, TARGET_REPLIES
-from middleware.entangled.network.multicast import SimulatedLan, SimulatedMulticast
+from middleware.entangled.errors import Malformed, NoAnswer, NotRunning
+from middleware.entangled.identity import Identity, derive_exchange_key
 from middleware.entangled.network.network import Address
-from middleware.entangled.node import EntangledNode
-from middleware.entangled.wire.discovery import DISCOVERY, DISCOVERY_REPLY
-from middleware.entangled.wire.probe import PROBE
-from middleware.entangled.wire.session import INIT
-from tests.fleet import TEAM_KEY, EntangledTeam, FleetCase
+from middleware.entangled.wire.discovery import (
+    COOKIE,
+    COOKIE_BYTES,
+    MAX_COOKIE_HANDSHAKES_PER_S,
+    MAX_HANDSHAKES_PER_S,
+    CookieCheck,
+)
+from middleware.entangled.wire.probe import (
+    PROBE,
+    PROBE_REPLY,
+    VERSION,
+    Prober,
+    ProbeReply,
+    pack_probe,
+    pack_reply,
+    parse_reply,
+)
+from middleware.entangled.wire.session import MIN_INIT_BYTES, RESP, Credentials, InitiatorHandshake
+from tests.middleware.gate import Gate
+from tests.middleware.test_endpoint import DELAY, TEAM, EndpointCase
+
+HOME, ELSEWHERE = Address("10.0.0.1", 1), Address("10.0.0.1", 2)
 
 
-class Lan(EntangledTeam):
-    """Nodes without known addresses on one LAN segment."""
+class CookieTests(EndpointCase):
+    """Tests of ``Cookies`` and of endpoints under a flood."""
 
-    def __init__(self) -> None:
-        super().__init__(0)
-        self.segment = SimulatedLan(self.switchboard)
-        self.groups: list[SimulatedMulticast] = []
+    def invitation(self, number: int, cookie: bytes = b"") -> bytes:
+        """Return an INIT datagram of a member."""
+        own = Credentials.derive(Identity(b"m" * 32), TEAM)
+        ephemeral = (number << 64).to_bytes(32, "big")
+        return InitiatorHandshake(own, derive_exchange_key(self.to_b.public), ephemeral, number, b"").make_init(cookie)
 
-    def on(
-        self, place: int, *known: Address, segment: SimulatedLan | None = None, team: bytes = TEAM_KEY
-    ) -> EntangledNode:
-        """Create and start the node of this number on ``segment``."""
-        group = (segment or self.segment).join()
-        network = self.switchboard.make_network(*self.address(place))
-        identity, store, rng = self.identity(place), self.store(place), self.make_life_rng(place)
-        node = EntangledNode(identity, team, network, store, self.clock, rng, lan=group)
-        self.groups.append(group)
-        self.nodes.append(node)
-        self.start_node(node, list(known))
-        return node
+    def flood(self, count: int) -> list[bytes]:
+        """Send ``count`` INITs to ``b`` from one address and return its replies."""
+        answers: list[bytes] = []
+        deaf = self.board.make_network("10.0.0.1", 1)
+        deaf.listen(lambda datagram, source: answers.append(datagram))
+        for number in range(count):
+            self.taps[self.to_b.address].receiver(self.invitation(number), HOME)
+        self.clock.advance(DELAY)
+        deaf.close()
+        return answers
 
-    def traffic(self) -> dict[str, int]:
-        """Return the sum of the counters of all nodes."""
-        counted = [node.discovery.counters for node in self.nodes if node.discovery is not None]
-        return {name: sum(each[name] for each in counted) for name in ("calls", "answered", "left", "greeted")}
+    def test_above_the_rate_comes_a_cookie(self) -> None:
+        """Up to the rate limit INITs get a RESP, above it a cookie that creates no session."""
+        answers = self.flood(300)
+        kinds = [answer[0] for answer in answers]
+        self.assertEqual(kinds, [RESP] * int(MAX_HANDSHAKES_PER_S) + [COOKIE] * (300 - int(MAX_HANDSHAKES_PER_S)))
+        self.assertEqual(len(self.b._sessions), int(MAX_HANDSHAKES_PER_S))
+        self.assertTrue(all(len(answer) <= MIN_INIT_BYTES for answer in answers))
+        self.assertEqual({len(answer) for answer in answers if answer[0] == COOKIE}, {COOKIE_BYTES})
+
+    def test_a_cookie_is_bound_to_its_address_and_time(self) -> None:
+        """A cookie is valid from its address for at most four minutes, and at a limited rate of handshakes."""
+        cookies = CookieCheck(b"c" * 32, random.Random(1))
+        cookie = cookies._make_cookie(HOME, int(1000 / 120))
+        paid = self.invitation(1, cookie)
+        self.assertTrue(cookies.is_valid(paid, HOME, 1000.0))
+        self.assertTrue(cookies.is_valid(paid, HOME, 1100.0))
+        self.assertFalse(cookies.is_valid(paid, HOME, 1400.0))
+        self.assertFalse(cookies.is_valid(paid, ELSEWHERE, 1000.0))
+        self.assertTrue(cookies.is_valid(self.invitation(1), ELSEWHERE, 1000.0))
+        admitted = sum(cookies.admits(paid, HOME, 1000.0) for _ in range(2 * int(MAX_COOKIE_HANDSHAKES_PER_S)))
+        self.assertEqual(admitted, int(MAX_COOKIE_HANDSHAKES_PER_S))
+
+    def test_forged_cookies(self) -> None:
+        """A COOKIE from another address, for an unknown INIT or with a wrong tag is counted and has no effect."""
+        self.b._cookies._limit._tokens = -1e6
+        self.a.ask(self.to_b, "echo", 7).addErrback(lambda failure: None)
+        self.clock.advance(1.5 * DELAY)
+        tap = self.taps[self.to_a.address]
+        genuine, tap.receiver = tap.receiver, lambda datagram, source: None
+        self.clock.advance(DELAY)
+        cookie, source = self.kept(self.to_a, COOKIE)[0]
+        genuine(cookie, ELSEWHERE)
+        genuine(cookie[:-1] + bytes([cookie[-1] ^ 1]), source)
+        genuine(cookie[:-1], source)
+        genuine(cookie[:1] + bytes(16) + cookie[17:], source)
+        counted = [self.a.counters[name] for name in ("misdirected", "forged", "stale")]
+        self.assertEqual(counted, [1, 2, 1])
+        self.assertEqual(next(iter(self.a._peers._handshakes.values())).cookies, {self.to_b.address: b""})
 
 
-class DiscoveryTests(FleetCase):
-    """Tests of ``Discovery``."""
+TOKEN = b"0123456789abcdef"
 
-    def lan(self) -> Lan:
-        """Return a LAN that is stopped after the test."""
-        lan = Lan()
-        self.worlds.append(lan)
-        return lan
 
-    def test_two_find_each_other(self) -> None:
-        """Two nodes without known nodes join within 0.5 s; a node that lost all peers soon searches again."""
-        lan = self.lan()
-        a, b = lan.on(0), lan.on(1)
-        lan.run(0.5)
-        self.assertEqual(a.overlay.contacts(), [b.contact])
-        self.assertEqual(b.overlay.contacts(), [a.contact])
-        b.stop_silently()
-        lan.run(30.0)
-        c = lan.on(2)
-        lan.run(1.0)
-        self.assertIn(c.contact, a.overlay.contacts())
+class HailTests(EndpointCase):
+    """Tests of ``Endpoint.hail`` and of its replies."""
 
-    def test_newcomer_is_not_whole_before_it_met_all(self) -> None:
-        """The roster of a node that joins through the LAN is whole only after the node met all members."""
-        lan = self.lan()
-        for place in range(6):
-            lan.on(place)
-            lan.run(1.0)
-        newcomer = lan.on(6)
-        while not newcomer.overlay.contacts():
-            lan.run(0.001)
-        self.assertFalse(newcomer.overlay.has_all_members)
-        while not newcomer.overlay.has_all_members:
-            lan.run(0.001)
-        self.assertEqual(len(newcomer.overlay.contacts()), 6)
+    def test_who_is_there(self) -> None:
+        """A reply, also of another team, contains fingerprint, version and clock, and the address of the prober."""
+        self.b.probe_responder.unix_time = lambda: 1_700_000_000.25
+        self.b.probe_responder._fingerprint = lambda: Gate.fingerprint
+        found = self.got(self.a.probe(self.to_b.address), 2 * DELAY)
+        self.assertEqual(found[1:], ProbeReply(b"", VERSION, b"the team", 1_700_000_000.25, self.to_a.address)[1:])
 
-    def test_first_of_a_network_waits_a_moment(self) -> None:
-        """A node without replies starts a team as its first node after ``LISTEN`` seconds, not before."""
-        lan = self.lan()
-        lan.nodes.append(node := lan.make_node(0))
-        node.stop()
-        alone = lan.on(1)
-        joined = alone.join([])
-        lan.run(LISTEN_S - 0.05)
-        self.assertFalse(joined.called)
-        self.done(lan, joined, 0.1)
-        self.assertTrue(alone.overlay.has_all_members)
+        _, to_other = self.endpoint(3, team=b"o" * 32)
 
-    def test_storm_of_a_hundred_stays_small(self) -> None:
-        """A hundred nodes that start at the same time form one network, with few replies to each query."""
-        lan = self.lan()
-        for place in range(100):
-            lan.on(place)
-        lan.run(20.0)
-        self.assertGreaterEqual(min(len(node.overlay.contacts()) for node in lan.nodes), 8)
-        self.assertEqual({(node.overlay.has_all_members, node.overlay.is_large) for node in lan.nodes}, {(False, True)})
-        last, first = lan.nodes[-1], lan.nodes[0]
-        self.assertEqual(self.done(lan, last.find_node(first.identity.node_id))[0], first.contact)
-        traffic = lan.traffic()
-        self.assertLess(traffic["calls"], 120)
-        self.assertLess(traffic["answered"], 2 * TARGET_REPLIES * traffic["calls"])
-        self.assertLess(traffic["greeted"], 350)
+        found = self.got(self.a.probe(to_other.address))
+        self.assertEqual((found.fingerprint, found.unix_time_s), (bytes(8), 0.0))
 
-    def test_team_in_company_is_quiet(self) -> None:
-        """Ten connected nodes together send about two discovery queries per minute."""
-        lan = self.lan()
-        for place in range(10):
-            lan.on(place)
-        lan.run(30.0)
-        before = lan.traffic()["calls"]
-        lan.run(600.0)
-        self.assertLess(lan.traffic()["calls"] - before, 30)
+    def test_nobody_is_there(self) -> None:
+        """A probe without a reply fails after its timeout, and a cancelled probe leaves no state."""
+        self.failed(self.a.probe(HOME, 1.0), NoAnswer, 1.0)
+        self.a.probe(HOME, 1.0).addErrback(lambda failure: None).cancel()
+        self.assertEqual(self.a.prober._pending, {})
+        pending = self.a.probe(HOME)
+        self.a.stop()
+        self.failureResultOf(pending, NotRunning)
+        self.failureResultOf(self.a.probe(HOME), NotRunning)
 
-    def test_two_halves_become_one(self) -> None:
-        """Two separate networks of one team merge soon after their LANs are connected."""
-        lan = self.lan()
-        other = SimulatedLan(lan.switchboard)
-        for place in range(3):
-            lan.on(place)
-            lan.on(place + 3, segment=other)
-        lan.run(5.0)
-        self.assertEqual({len(node.overlay.contacts()) for node in lan.nodes}, {2})
-        lan.segment.groups += other.groups
-        other.groups = lan.segment.groups
-        lan.run(150.0)
-        self.assertEqual({len(node.overlay.contacts()) for node in lan.nodes}, {5})
+    def test_what_is_none(self) -> None:
+        """Probes and replies of wrong length, and replies without a probe, are counted and not answered."""
+        receiver = self.taps[self.to_b.address].receiver
+        before = self.board.counters["sent"]
+        for datagram in (
+            pack_probe(TOKEN)[:-1],
+            pack_probe(TOKEN) + b"x",
+            bytes([PROBE]),
+            bytes([PROBE_REPLY]) + bytes(7),
+        ):
+            receiver(datagram, HOME)
+        receiver(pack_reply(pack_probe(TOKEN), bytes(8), 0.0, HOME), HOME)
+        self.assertEqual(self.b.counters, {"malformed": 4, "unasked": 1})
+        self.assertEqual(self.board.counters["sent"], before)
+        self.assertRaises(Malformed, pack_reply, b"", bytes(8), 0.0, HOME)
+        self.assertRaises(Malformed, parse_reply, pack_probe(TOKEN))
 
-    def test_new_interface_is_called_at_once(self) -> None:
-        """A node that is connected to another LAN sends a discovery query there at once."""
-        lan = self.lan()
-        lan.segment.is_blocked = True
-        a, b = lan.on(0), lan.on(1)
-        lan.run(60.0)
-        self.assertEqual(a.overlay.contacts(), [])
-        lan.segment.is_blocked = False
-        lan.groups[0].on_moved()
-        lan.run(0.3)
-        self.assertEqual(a.overlay.contacts(), [b.contact])
-
-    def test_strangers_change_nothing(self) -> None:
-        """Other teams are ignored, a replayed query gets one reply, and forged replies cause few handshakes."""
-        lan = self.lan()
-        a, b = lan.on(0), lan.on(1, team=b"o" * 32)
-        lan.run(5.0)
-        assert a.discovery is not None
-        self.assertEqual([*a.overlay.contacts(), *b.overlay.contacts()], [])
-        self.assertGreater(a.discovery.counters["foreign"], 0)
-        self.assertEqual(a.discovery.counters["answered"], 0)
-        call, noise = a.endpoint.discoverer.make_multicast(), random.Random(5)
-        thief = lan.segment.join()
-        got: list[bytes] = []
-        thief.listen(lambda datagram, source: got.append(datagram), lambda: None)
-        for _ in range(50):
-            thief.send(call)
-            lan.run(0.2)
-        self.assertEqual(len([datagram for datagram in got if datagram[0] == DISCOVERY_REPLY]), 1)
-        a.discovery.counters.clear()
-        for kind in (0, INIT, DISCOVERY, DISCOVERY_REPLY, PROBE):
-            for size in (0, 1, 88, 89, 400):
-                thief.send((bytes([kind]) + noise.randbytes(size))[:size])
-        lan.run(5.0)
-        thief.close()
-        self.assertEqual(a.overlay.contacts(), [])
-        self.assertLessEqual(a.discovery.counters["greeted"], 2)
-
-    def test_known_node_that_is_gone_is_no_bar(self) -> None:
-        """If the known node of a node is dead, the node joins through another one on the LAN."""
-        lan = self.lan()
-        first = lan.on(0)
-        lan.run(1.0)
-        node = lan.on(1, Address("10.0.0.99", 7000))
-        lan.run(2.0)
-        self.assertEqual(node.overlay.contacts(), [first.contact])
+    def test_an_echo_from_elsewhere(self) -> None:
+        """A reply from another address than the probed one is ignored."""
+        sent: list[bytes] = []
+        hailer = Prober(lambda datagram, to: sent.append(datagram), self.clock, random.Random(1))
+        asked = hailer.probe(HOME)
+        hailer.on_reply(pack_reply(sent[0], bytes(8), 0.0, ELSEWHERE), ELSEWHERE)
+        self.assertNoResult(asked)
+        hailer.on_reply(pack_reply(sent[0], bytes(8), 0.0, ELSEWHERE), HOME)
+        self.assertEqual(self.successResultOf(asked).observed_address, ELSEWHERE)

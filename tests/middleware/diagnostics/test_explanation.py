@@ -9,7 +9,7 @@ from twisted.trial.unittest import SynchronousTestCase
 
 from middleware.consensus.decision_record import MAX_BEST_REPORTS, MAX_REPORTS
 from middleware.diagnostics.explanation import explain_decisions, format_explanation
-from tests.middleware.consensus.test_verdict import THREE, decided, member
+from tests.middleware.consensus.test_decision_record import THREE, decided, member
 
 OWN = [decided(n, THREE) for n in (1, 2, 3)]
 

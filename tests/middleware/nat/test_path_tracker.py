@@ -16,7 +16,7 @@ from middleware.entangled.node import EntangledNode
 from middleware.entangled.wire.noise import TransportKeys
 from middleware.entangled.wire.peer import Peer
 from middleware.entangled.wire.session import Session
-from tests.middleware.reach.ground import Ground, GroundCase
+from tests.middleware.nat.sites import Ground, GroundCase
 
 KINDS = ("none", "full", "addr", "port", "sym")
 UNPUNCHABLE = {frozenset({"port", "sym"}), frozenset({"sym"})}

@@ -14,7 +14,7 @@ from middleware.entangled.nat.candidate import MAX_CANDIDATES, is_loopback, is_n
 from middleware.entangled.nat.introducer import ATTEMPT_BURST, ATTEMPTS_PER_S, INTRODUCTIONS_PER_S, IntroductionLimits
 from middleware.entangled.network.network import Address, relayed_address
 from middleware.entangled.network.switchboard import LinkConditions
-from tests.middleware.reach.ground import GroundCase
+from tests.middleware.nat.sites import GroundCase
 
 INTRODUCE, MEET = "reach.introduce", "reach.meet"
 
