@@ -1,7 +1,7 @@
 """Measurements for ``swarm doctor``, taken from this machine with separate sockets.
 
-A node replies to a discovery probe (HAIL) of any sender, and to a team probe (WHO) of a member.  All measurements take
-about two seconds.
+A node replies to a discovery probe (PROBE) of any sender, and to a team probe (DISCOVERY) of a member.  All
+measurements take about two seconds.
 """
 
 from __future__ import annotations

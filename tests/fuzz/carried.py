@@ -1,8 +1,8 @@
 """Fuzz the relayed and path messages of a member in a session.
 
-Each input consists of several plaintexts, as in ``envelope``; the first byte of each selects the kind: CARRY to a
-known or unknown node, CARRIED as if from a node, MIRROR, IMAGE. No input raises or is logged, a message for a node
-without a session changes nothing, and the target sends no more than it received.
+Each input consists of several plaintexts, as in ``envelope``; the first byte of each selects the kind: RELAY_REQUEST to
+a known or unknown node, RELAYED_DATAGRAM as if from a node, ADDRESS_REQUEST, ADDRESS_REPLY. No input raises or is
+logged, a message for a node without a session changes nothing, and the target sends no more than it received.
 """
 
 from __future__ import annotations

@@ -19,8 +19,8 @@ from middleware.entangled.wire.session import Session
 from tests.middleware.gate import Gate
 
 VECTORS = Path(__file__).with_name("vectors") / "exchange.json"
-NAMES = {0x11: "INIT", 0x12: "RESP", 0x13: "DATA", 0x14: "WHO", 0x15: "HERE", 0x16: "COOKIE"}
-NAMES |= {0x19: "HAIL", 0x1A: "ECHO"}
+NAMES = {0x11: "INIT", 0x12: "RESP", 0x13: "DATA", 0x14: "DISCOVERY", 0x15: "DISCOVERY_REPLY", 0x16: "COOKIE"}
+NAMES |= {0x19: "PROBE", 0x1A: "PROBE_REPLY"}
 LARGE = bytes(range(256)) * 6
 
 
@@ -46,7 +46,7 @@ class Dice(random.Random):
         return number
 
 
-class Doorway(Gate):
+class ShortPassGate(Gate):
     """An admission check with a short pass."""
 
     def __init__(self, name: str, seed: int) -> None:
@@ -57,7 +57,7 @@ class Doorway(Gate):
 def exchange() -> dict[str, Any]:
     """Run ``alice`` and ``bob`` through a probe, a handshake and four calls, one of them under load."""
     clock = HeapClock()
-    board = Switchboard(clock, random.Random(0), LinkConditions(0.01))
+    switchboard = Switchboard(clock, random.Random(0), LinkConditions(0.01))
     team = bytes(range(32))
     said: list[dict[str, str]] = []
     plains: list[tuple[bytes, bytes]] = []
@@ -70,7 +70,7 @@ def exchange() -> dict[str, Any]:
 
     ends, dice = {}, {}
     for name, seed, port in (("alice", 0x11, 1), ("bob", 0x22, 2)):
-        network = board.make_network("10.0.0.1", port)
+        network = switchboard.make_network("10.0.0.1", port)
         identity = Identity(bytes([seed]) * 32)
         send = network.send
 
@@ -80,7 +80,7 @@ def exchange() -> dict[str, Any]:
 
         dice[name] = Dice(seed)
         network.send = heard  # type: ignore[method-assign]
-        end = Endpoint(identity, team, network, clock, dice[name], Doorway(name, seed))
+        end = Endpoint(identity, team, network, clock, dice[name], ShortPassGate(name, seed))
         ends[name] = end, Contact(identity.public, network.address)
         ends[name][0].start()
     (alice, _), (bob, to_bob) = ends["alice"], ends["bob"]
@@ -131,5 +131,5 @@ class ProtocolTests(SynchronousTestCase):
         """The vectors contain every kind of datagram, and fragments and acknowledgements in both directions."""
         said = json.loads(VECTORS.read_text(encoding="utf-8"))["datagrams"]
         self.assertEqual({one["kind"] for one in said}, set(NAMES.values()))
-        parcels = {(one["from"], one["inside"][:2]) for one in said if one["kind"] == "DATA"}
-        self.assertLessEqual({("alice", "01"), ("alice", "02"), ("bob", "01"), ("bob", "02")}, parcels)
+        messages = {(one["from"], one["inside"][:2]) for one in said if one["kind"] == "DATA"}
+        self.assertLessEqual({("alice", "01"), ("alice", "02"), ("bob", "01"), ("bob", "02")}, messages)

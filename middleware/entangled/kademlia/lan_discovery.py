@@ -1,9 +1,10 @@
 """Discover nodes of the team on the LAN without a configured address, and merge separate parts of a team.
 
-A node multicasts WHO to the LAN, often while it has no contacts and rarely afterwards; some receivers reply from their
-own port after a random delay, and the node then sends a discovery request to each reply's address, which proves its
-membership.  A receiver replies with a probability that decreases with the number of members and senders that it knows,
-so that about ``TARGET_REPLIES`` replies are sent in a team of any size, even if all nodes start at the same moment.
+A node multicasts DISCOVERY to the LAN, often while it has no contacts and rarely afterwards; some receivers reply from
+their own port after a random delay, and the node then sends a discovery request to each reply's address, which proves
+its membership.  A receiver replies with a probability that decreases with the number of members and senders that it
+knows, so that about ``TARGET_REPLIES`` replies are sent in a team of any size, even if all nodes start at the same
+moment.
 """
 
 from __future__ import annotations
@@ -27,9 +28,9 @@ from middleware.entangled.wire.endpoint import Endpoint
 from middleware.entangled.wire.probe import PROBE
 
 TARGET_REPLIES = 4
-"""The mean number of replies to one WHO, if more nodes could reply."""
+"""The mean number of replies to one DISCOVERY, if more nodes could reply."""
 MAX_REPLY_DELAY_S = 0.1
-"""The maximum delay of a reply in seconds; the first WHO of a node is delayed by up to a fifth of it."""
+"""The maximum delay of a reply in seconds; the first DISCOVERY of a node is delayed by up to a fifth of it."""
 ALONE_INTERVALS_S = (0.2, 0.3, 0.5, 1.0, 2.0, 5.0)
 """The seconds between the multicasts of a node without contacts; the last one repeats."""
 SHARED_INTERVAL_S = 30.0
@@ -85,7 +86,7 @@ class LanDiscovery:
         self._waiting: list[Deferred[None]] = []
 
     def start(self) -> None:
-        """Join the multicast group and send the first WHO."""
+        """Join the multicast group and send the first DISCOVERY."""
         self._group.listen(self._on_datagram, self._on_moved)
         # The nodes of a team that are switched on together do not multicast at the same moment.
         self._cancel_multicast = self._background.later(
@@ -199,7 +200,7 @@ class LanDiscovery:
         self._background.later(self._rng.random() * MAX_REPLY_DELAY_S, self._answer, datagram, source)
 
     def _answer(self, datagram: bytes, source: Address) -> None:
-        """Reply to a WHO, or leave it to other nodes; simultaneous senders are counted by now."""
+        """Reply to a DISCOVERY, or leave it to other nodes; simultaneous senders are counted by now."""
         self._pending -= 1
         since = self._clock.seconds() - RECENT_S
         callers = sum(1 for moment in self._multicast_times if moment > since)

@@ -1,7 +1,7 @@
 """Learn the external address of each local port from peers.
 
-MIRROR ``0x06 | token 8 | zero 18`` is answered by IMAGE ``0x07 | token 8 | address 16, port 2``, sent to its source
-address; both are sent in a session.
+ADDRESS_REQUEST ``0x06 | token 8 | zero 18`` is answered by ADDRESS_REPLY ``0x07 | token 8 | address 16, port 2``, sent
+to its source address; both are sent in a session.
 """
 
 from __future__ import annotations
@@ -84,7 +84,7 @@ class AddressQuery:
         self._send(session, bytes([ADDRESS_REPLY]) + plain[1 : 1 + _TOKEN_BYTES] + pack_address(source), source)
 
     def on_reply(self, session: Session, plain: bytes, source: Address) -> None:
-        """Process the answer to a MIRROR."""
+        """Process the answer to an ADDRESS_REQUEST."""
         done = self._pending.get(plain[1 : 1 + _TOKEN_BYTES])
         if len(plain) == _MESSAGE_BYTES and done is not None:
             done(parse_address(plain[1 + _TOKEN_BYTES :]))

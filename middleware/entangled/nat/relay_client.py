@@ -1,6 +1,7 @@
 """Send datagrams through relays to nodes that this one cannot reach directly.
 
-CARRY asks a relay to forward a datagram (``relay`` is the other side), and CARRIED delivers a forwarded datagram.
+RELAY_REQUEST asks a relay to forward a datagram (``relay`` is the other side), and RELAYED_DATAGRAM delivers a
+forwarded datagram.
 """
 
 from __future__ import annotations

@@ -1,7 +1,8 @@
-"""Exchange datagrams without a session: discovery (WHO, HERE) and proof of address (COOKIE).
+"""Exchange datagrams without a session: discovery (DISCOVERY, DISCOVERY_REPLY) and proof of address (COOKIE).
 
-With WHO and HERE a node learns the public key of the node at an address.  Both are sealed under the team's key alone,
-so they prove membership and nothing else; the session that follows proves the key.  HERE and WHO have the same length.
+With DISCOVERY and DISCOVERY_REPLY a node learns the public key of the node at an address.  Both are sealed under the
+team's key alone, so they prove membership and nothing else; the session that follows proves the key.  DISCOVERY_REPLY
+and DISCOVERY have the same length.
 
 A node under load answers INIT with COOKIE: the initiator must prove that it receives at its source address before the
 responder exchanges keys or keeps state (after WireGuard, Donenfeld 2017, section 5.4.7).
@@ -43,24 +44,24 @@ COOKIE_S = 120.0
 
 
 def pack_discovery(key: bytes, token: bytes, rng: random.Random) -> bytes:
-    """Return a WHO datagram; ``token`` identifies the request and must not be guessable."""
+    """Return a DISCOVERY datagram; ``token`` identifies the request and must not be guessable."""
     return _seal_discovery(DISCOVERY, key, token + bytes(32), rng)
 
 
 def pack_discovery_reply(key: bytes, token: bytes, public: bytes, rng: random.Random) -> bytes:
-    """Return the HERE that answers the WHO with ``token``: this node's public key."""
+    """Return the DISCOVERY_REPLY that answers the DISCOVERY with ``token``: this node's public key."""
     return _seal_discovery(DISCOVERY_REPLY, key, token + public, rng)
 
 
 def open_discovery(key: bytes, datagram: bytes) -> tuple[bytes, bytes]:
-    """Decrypt a WHO or HERE; return its token and its public key (32 zero bytes in WHO).  Raises ``Forged``."""
+    """Decrypt a DISCOVERY or DISCOVERY_REPLY; return its token and key (zero in DISCOVERY), or raise ``Forged``."""
     if len(datagram) != DISCOVERY_BYTES:
-        raise Forged("the WHO or HERE has the wrong length")
+        raise Forged("the DISCOVERY or DISCOVERY_REPLY has the wrong length")
     nonce, ciphertext = datagram[1 : 1 + _NONCE_BYTES], datagram[1 + _NONCE_BYTES :]
     try:
         body = bindings.crypto_aead_xchacha20poly1305_ietf_decrypt(ciphertext, datagram[:1], nonce, key)
     except (CryptoError, ValueError) as error:
-        raise Forged("the WHO or HERE is not sealed under this key") from error
+        raise Forged("the DISCOVERY or DISCOVERY_REPLY is not sealed under this key") from error
     return body[:TOKEN_BYTES], body[TOKEN_BYTES:]
 
 
@@ -157,22 +158,22 @@ class Discoverer(ProbeSender[Contact]):
         return self._start(token, address, datagrams, timeout)
 
     def make_multicast(self) -> bytes:
-        """Return a WHO for many receivers, such as all nodes of a LAN; probe each sender of a HERE directly then."""
+        """Return a DISCOVERY for many receivers, such as a LAN; then probe each sender of a reply directly."""
         return pack_discovery(self._peers.ring[0].discovery_key, self._rng.randbytes(TOKEN_BYTES), self._rng)
 
     def is_of_team(self, datagram: bytes) -> bool:
-        """Return whether ``datagram`` is a WHO or HERE of this team."""
+        """Return whether ``datagram`` is a DISCOVERY or DISCOVERY_REPLY of this team."""
         return self._open_discovery(datagram) is not None
 
     def on_discovery(self, datagram: bytes, source: Address) -> None:
-        """Answer a WHO of this team."""
+        """Answer a DISCOVERY of this team."""
         found = self._open_discovery(datagram)
         if found is not None:
             own, token, _ = found
             self._send(pack_discovery_reply(own.discovery_key, token, self._public, self._rng), source)
 
     def on_discovery_reply(self, datagram: bytes, source: Address) -> None:
-        """Process the answer to a WHO of this node."""
+        """Process the answer to a DISCOVERY of this node."""
         found = self._open_discovery(datagram)
         if found is None:
             return
@@ -186,7 +187,7 @@ class Discoverer(ProbeSender[Contact]):
             self._forget(token)
             contact = Contact(public, source)
             self._peers.record_credentials(contact, own)
-            if not self._peers.overall_round_trip.is_measured:  # an estimate: the HERE may answer a later try
+            if not self._peers.overall_round_trip.is_measured:  # an estimate: the reply may answer a later try
                 self._peers.overall_round_trip.add_sample(self._clock.seconds() - pending.started_at)
             pending.deferred.callback(contact)
 
@@ -206,7 +207,7 @@ class Discoverer(ProbeSender[Contact]):
             self._peers.resend_with_cookie(opening, cookie, source)
 
     def _open_discovery(self, datagram: bytes) -> tuple[Credentials, bytes, bytes] | None:
-        """Decrypt a WHO or HERE; return its credentials, token and key, or count it as forged and return None."""
+        """Decrypt a datagram of this module; return its credentials, token and key, or count it as forged: None."""
         for own in self._peers.ring:
             try:
                 return own, *open_discovery(own.discovery_key, datagram)

@@ -1,8 +1,8 @@
-"""Probe an address for a node of any team, with HAIL and ECHO; neither is encrypted or contains a secret.
+"""Probe an address for a node of any team, with PROBE and PROBE_REPLY; neither is encrypted or contains a secret.
 
 A node that finds no team, or not its own, learns from it whether an address is reachable, which team is there, the
-protocol version, the clock difference, and its own external address.  HAIL and ECHO have the same length, and ECHOs are
-rate-limited.
+protocol version, the clock difference, and its own external address.  PROBE and PROBE_REPLY have the same length, and
+replies are rate-limited.
 """
 
 from __future__ import annotations
@@ -33,10 +33,10 @@ PROBE_BYTES = _HEADER_BYTES + 1 + FINGERPRINT_BYTES + 8 + ADDRESS_BYTES
 
 
 class ProbeReply(NamedTuple):
-    """The content of an ECHO.
+    """The content of a PROBE_REPLY.
 
     ``fingerprint`` identifies the team (zero: an open team), ``wall`` is the clock of its node in Unix seconds (0:
-    unknown), ``observed_address`` is the source address of the HAIL.
+    unknown), ``observed_address`` is the source address of the PROBE.
     """
 
     token: bytes
@@ -47,14 +47,14 @@ class ProbeReply(NamedTuple):
 
 
 def pack_probe(token: bytes) -> bytes:
-    """Return a HAIL; ``token`` (16 bytes) is returned in the ECHO."""
+    """Return a PROBE; ``token`` (16 bytes) is returned in the PROBE_REPLY."""
     return (bytes([PROBE]) + token).ljust(PROBE_BYTES, b"\0")
 
 
 def pack_reply(probe: bytes, fingerprint: bytes, wall: float, source: Address) -> bytes:
-    """Return the ECHO for the HAIL ``probe`` from ``source``; raise ``Malformed`` if it is no HAIL."""
+    """Return the PROBE_REPLY for the PROBE ``probe`` from ``source``; raise ``Malformed`` if it is no PROBE."""
     if len(probe) != PROBE_BYTES or probe[0] != PROBE:
-        raise Malformed("the HAIL has the wrong length")
+        raise Malformed("the PROBE has the wrong length")
     moment = max(0, int(1000 * wall)).to_bytes(8, "little")
     return (
         bytes([PROBE_REPLY]) + probe[1:_HEADER_BYTES] + bytes([VERSION]) + fingerprint + moment + pack_address(source)
@@ -62,9 +62,9 @@ def pack_reply(probe: bytes, fingerprint: bytes, wall: float, source: Address) -
 
 
 def parse_reply(datagram: bytes) -> ProbeReply:
-    """Decode an ECHO; raise ``Malformed``."""
+    """Decode a PROBE_REPLY; raise ``Malformed``."""
     if len(datagram) != PROBE_BYTES or datagram[0] != PROBE_REPLY:
-        raise Malformed("the ECHO has the wrong length")
+        raise Malformed("the PROBE_REPLY has the wrong length")
     rest = datagram[_HEADER_BYTES:]
     fingerprint, moment = rest[1 : 1 + FINGERPRINT_BYTES], rest[1 + FINGERPRINT_BYTES : -ADDRESS_BYTES]
     wall = int.from_bytes(moment, "little") / 1000
@@ -84,7 +84,7 @@ class ProbeResponder:
         self._bucket = TokenBucket(REPLIES_PER_S)
 
     def on_probe(self, datagram: bytes, source: Address) -> str:
-        """Answer a HAIL; return the reason in one word if it was dropped."""
+        """Answer a PROBE; return the reason in one word if it was dropped."""
         try:
             answer = pack_reply(datagram, self._fingerprint(), self.unix_time(), source)
         except Malformed:
@@ -166,7 +166,7 @@ class Prober(ProbeSender[ProbeReply]):
         return self._start(token, address, [pack_probe(token)], timeout)
 
     def on_reply(self, datagram: bytes, source: Address) -> str:
-        """Process an ECHO; return the reason in one word if it was dropped."""
+        """Process a PROBE_REPLY; return the reason in one word if it was dropped."""
         try:
             answer = parse_reply(datagram)
         except Malformed:
