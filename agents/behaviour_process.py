@@ -75,7 +75,7 @@ class _HostedBehaviour:
 
 
 def read_attributes(thing: object) -> list[Any]:
-    """Return the cost and the optional attributes of a behaviour, in the order of ``OPTIONAL``."""
+    """Return the cost and the optional attributes of a behaviour, in the order of ``OPTIONAL_ATTRIBUTES``."""
     return [
         getattr(thing, "cost", None),
         *(getattr(thing, name, default) for name, default in OPTIONAL_ATTRIBUTES.items()),

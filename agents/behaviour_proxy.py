@@ -36,7 +36,7 @@ ACT = "act"
 
 
 class BehaviourConnection(Protocol):
-    """The connection to the behaviour's process, as in ``middleware.deployment.runner.Instance``."""
+    """The connection to the behaviour's process, as in ``middleware.deployment.runner.BehaviourInstance``."""
 
     fault: str
     facts: dict[str, Any]

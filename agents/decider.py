@@ -159,8 +159,8 @@ class DecisionRecorder:
 class Decider:
     """One agent's view of ``task``.
 
-    ``uuid`` is the agent's own, ``division`` the task's group or None.  ``reporters`` are the reporters of a large team; an
-    agent that is not one of them decides from their reports without its own.
+    ``uuid`` is the agent's own, ``task_group`` the task's group or None.  ``reporters`` are the reporters of a large
+    team; an agent that is not one of them decides from their reports without its own.
     """
 
     def __init__(self, task: Task, uuid: str, strategy: ConsensusAlgorithm, reporters: Reporters) -> None:

@@ -24,7 +24,7 @@ def run_now(function: Callable[[], Any]) -> Deferred[Any]:
 
 
 def run_in_thread(clock: object) -> Executor:
-    """Return a ``Run`` with the thread pool of ``clock``, or ``run_now`` if the clock has no threads."""
+    """Return an ``Executor`` with the thread pool of ``clock``, or ``run_now`` if the clock has no threads."""
     if not IReactorThreads.providedBy(clock):
         return run_now
     reactor: Any = clock

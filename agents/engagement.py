@@ -200,7 +200,7 @@ class Engagement:
     # -- the robot --------------------------------------------------------------------------------------------------
 
     def take_robot(self, lease_client: LeaseClient, token: int) -> None:
-        """Assign the robot to this task; it has obeyed ``token``, and ``lease_client`` is the client of the task's lease."""
+        """Assign the robot to this task; it has obeyed ``token``, ``lease_client`` is the client of its lease."""
         self.task_lease.lease_client, self.task_lease.token = lease_client, token
 
     def set_robot_lent(self, is_lent: bool, now: float) -> None:

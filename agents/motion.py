@@ -19,7 +19,7 @@ WALK_SPEED_MPS = 0.16
 FAST_WALK_SPEED_MPS = 0.3
 """Walking speed in m/s of a robot that ranges what lies ahead.
 
-``WALK`` is for robots that detect obstacles by touch.
+``WALK_SPEED_MPS`` is for robots that detect obstacles by touch.
 """
 LOOKAHEAD_S = 3.0
 """Seconds of walking that the ranger must cover, so that the robot can stop in time."""

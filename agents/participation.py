@@ -1,7 +1,7 @@
 """One agent's engagement in one task, connected to the task's group: its reports are sent through it.
 
-The caretaker replaces lost members of the task's quorum.  This is the duty of the acting agent or, while no agent acts,
-of the first present agent (consensus rules 1 and 2).
+The council maintainer replaces lost members of the task's quorum.  This is the duty of the acting agent or, while no
+agent acts, of the first present agent (consensus rules 1 and 2).
 """
 
 from __future__ import annotations
@@ -79,7 +79,7 @@ class CouncilMaintainer:
 
 
 def _ignore_unreachable(failure: Any) -> None:
-    """Ignore that too few members answer or that the lease is claimed: the caretaker tries again."""
+    """Ignore that too few members answer or that the lease is claimed: the council maintainer tries again."""
     failure.trap(EntangledError)
 
 

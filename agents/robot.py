@@ -63,7 +63,7 @@ class AgentRobot:
 
     @property
     def is_battery_empty(self) -> bool:
-        """Whether the robot reports a battery charge below ``EMPTY``; False if it reports none."""
+        """Whether the robot reports a battery charge below ``EMPTY_BATTERY_LEVEL``; False if it reports none."""
         seen = self.driver.observe()
         charge = None if seen is None else seen.values.get("power.level")
         return isinstance(charge, float | int) and charge < EMPTY_BATTERY_LEVEL
@@ -76,7 +76,7 @@ class AgentRobot:
 
     @property
     def is_responding(self) -> bool:
-        """Whether the robot responds, or did within ``PATIENCE``, with its motors enabled and enough charge."""
+        """Whether the robot responded within ``RESPONSE_TIMEOUT_S``, with its motors enabled and enough charge."""
         if self.is_battery_empty:
             return False
         has_motors = not self.is_estop_engaged

@@ -220,33 +220,33 @@ class SearchAndApproach:
             return self.search(now)
         self._detect_stuck(now)
         bearing, gap = self._bearing, self._gap
-        means = self._motion
-        turn = clip(TURN_GAIN * bearing, means.look_turn)
+        motion = self._motion
+        turn = clip(TURN_GAIN * bearing, motion.look_turn)
         is_facing = abs(bearing) < ARRIVAL_BEARING_RAD
         self._has_arrived = is_facing and gap <= TOUCH_DISTANCE_M and (self._is_bumped or self._has_arrived)
-        if self._has_arrived or (gap <= means.stop_distance and is_facing):
+        if self._has_arrived or (gap <= motion.stop_distance and is_facing):
             # The target must be in view on arrival; otherwise the robot waits until its remembered position expires.
             self._arrival_count = self._arrival_count + 1 if self.is_in_view(now) else 0
             self._detour.cancel()
-            is_enough = self._has_arrived or (means.is_coarse and abs(bearing) < means.facing_tolerance)
-            return None if self._arrival_count >= MIN_DETECTIONS else STAND if is_enough else means.spin(turn)
+            is_enough = self._has_arrived or (motion.is_coarse and abs(bearing) < motion.facing_tolerance)
+            return None if self._arrival_count >= MIN_DETECTIONS else STAND if is_enough else motion.spin(turn)
         self._arrival_count = 0
         detour = self._step_detour(now)
         if detour is not None:
             return detour
         if abs(bearing) > MAX_WALK_BEARING_RAD:
-            if math.dist(self._pose[:2], self._target) < TIGHT_TURN_RADII * means.circle:
-                return means.go(-CREEP_SPEED_MPS)  # nearer than the robot's turning circle
-            return means.spin(turn)
+            if math.dist(self._pose[:2], self._target) < TIGHT_TURN_RADII * motion.circle:
+                return motion.go(-CREEP_SPEED_MPS)  # nearer than the robot's turning circle
+            return motion.spin(turn)
         if self._ahead < OBSTACLE_RANGE_M and self._is_hidden:
             # An obstacle is in between: step aside while facing the target, or take a detour.
-            if not means.strafes:
+            if not motion.strafes:
                 self._detour.start(self._pose, self._side, now, has_touched=False)
                 return self._step_detour(now) or STAND
             self._blocked_at = self._pose[:2]
-        if math.dist(self._pose[:2], self._blocked_at) < SIDESTEP_RADII * means.radius:
+        if math.dist(self._pose[:2], self._blocked_at) < SIDESTEP_RADII * motion.radius:
             return {**STAND, "base.vy": self._side * SIDESTEP_SPEED_MPS, "base.wz": turn}
-        return means.go(clip(max(CREEP_SPEED_MPS, gap - means.stop_distance), means.walk), turn)
+        return motion.go(clip(max(CREEP_SPEED_MPS, gap - motion.stop_distance), motion.walk), turn)
 
     @property
     def _gap(self) -> float:
@@ -277,9 +277,9 @@ class SearchAndApproach:
         return self._detour.step(self._pose, self._ahead, now)
 
     def _face_target(self) -> Action:
-        bearing, means = self._bearing, self._motion
-        is_facing = abs(bearing) < means.facing_tolerance * 0.7
-        return STAND if is_facing else means.spin(clip(TURN_GAIN * bearing, means.look_turn))
+        bearing, motion = self._bearing, self._motion
+        is_facing = abs(bearing) < motion.facing_tolerance * 0.7
+        return STAND if is_facing else motion.spin(clip(TURN_GAIN * bearing, motion.look_turn))
 
     @property
     def _ahead(self) -> float:

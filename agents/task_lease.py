@@ -17,13 +17,13 @@ REPORT_AGAIN_S = 1.0
 
 
 class TaskLease:
-    """One agent's claim; without a ``lessee`` the agent has no robot for the task and claims nothing.
+    """One agent's claim; without a ``lease_client`` the agent has no robot for the task and claims nothing.
 
     - ``is_lent``: another task of the group uses the robot; the agent still reports and decides
     - ``token``: the highest fencing token that the robot has obeyed
     - ``standbys``: the uuids of the standbys, the best first
-    - ``successors``: the members of the next quorum
-    - ``released``: fires when the quorum members know that the lease was handed over
+    - ``next_members``: the members of the next quorum
+    - ``when_released``: fires when the quorum members know that the lease was handed over
     """
 
     def __init__(self, token: int) -> None:
@@ -58,7 +58,7 @@ class TaskLease:
             self.lease_client.claim()
 
     def start_request(self, now: float) -> None:
-        """Claim the lease and start the timer of ``insist``."""
+        """Claim the lease and start the timer of ``retry_request``."""
         if self.lease_client is not None:
             self.lease_client.claim()
             self._report_again_at = now + REPORT_AGAIN_S
@@ -89,7 +89,7 @@ class TaskLease:
         return self.lease_client.release(standbys, max(0.0, self._stands_still_at - now))
 
     def change_council(self, now: float, ttl: float) -> None:
-        """Change the quorum to ``successors``; the lease is granted again within ``ttl`` seconds, or is lost."""
+        """Change the quorum to ``next_members``; the lease is granted again within ``ttl`` seconds, or is lost."""
         members, self.next_members = self.next_members, ()
         self._council_change_ends_at = now + ttl
         if self.lease_client is not None:

@@ -138,7 +138,7 @@ class ReportedTarget:
             self._seen_at = now
 
     def is_in_view(self, now: float) -> bool:
-        """Return whether the device reported the target within ``FRESH``."""
+        """Return whether the device reported the target within ``DETECTION_TTL_S``."""
         return now - self._seen_at <= DETECTION_TTL_S
 
     def search(self, now: float) -> Action:

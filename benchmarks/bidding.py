@@ -76,7 +76,7 @@ class Ring:
 
 @dataclass
 class LinkFaults:
-    """Faults of the links: the shares ``loss``, ``dead`` (failed agents) and ``twice`` (duplicates)."""
+    """Faults of the links: the shares ``loss``, ``dead`` (failed agents) and ``duplicate`` (duplicates)."""
 
     loss: float = 0.0
     dead: float = 0.0

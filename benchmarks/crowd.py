@@ -131,7 +131,7 @@ def _measure_agents(agents: int) -> dict[str, float]:
     team.clock.advance(SETTLE_S)
     figures = {"agents": float(agents), "joining": time.process_time() - started_at}
     _print_line(
-        f"\n{agents} agents attached to {team.simulator.crowd.scene.robots:,} robots, without a task; ms a virtual second"
+        f"\n{agents} agents attached to {team.simulator.crowd.scene.robots:,} robots, no task; ms a virtual second"
     )
     _print_line(f"{'':24}{'moves, rays':>12}{'telling':>9}{'agents':>9}{'yard alone':>13}{'all':>9}{'datagrams':>11}")
     for part, fps in ((f"{CAMERA_FPS:g} pictures a second", CAMERA_FPS), ("no camera", 0.0)):

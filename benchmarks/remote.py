@@ -38,7 +38,7 @@ class RemoteProcess:
         await self._await_answer(0, "come up", limit_s)
 
     async def run_order(self, do: str, patience_s: float, /, **fields: Any) -> dict[str, Any]:
-        """Execute an order and return its answer; raises ``Lost``."""
+        """Execute an order and return its answer; raises ``OrderFailed``."""
         self._number += 1
         self._waiting[self._number] = asyncio.get_running_loop().create_future()
         assert self._process.stdin is not None

@@ -87,7 +87,7 @@ def _emulate(ports: list[dict[str, int]]) -> int:
 
 
 class DriverProcess:
-    """One driver process: it sends a command each ``COMMAND_S``, and records the times of all received data."""
+    """A driver process that sends a command each ``COMMAND_INTERVAL_S`` and records the times of received data."""
 
     def __init__(self, reactor: Any, options: dict[str, Any], seconds: float) -> None:
         from drivers.registry import create_driver

@@ -2,8 +2,8 @@
 
 Each agent states its own bids, with version numbers; a newer statement of an agent about a task replaces its older
 ones, and the highest valid bid for a task wins. Statements are values: the caller sends the result of ``drain`` to the
-neighbours and passes received statements to ``hear``. Only changes are sent. Silence proves nothing: the lease decides
-which agent may act.
+neighbours and passes received statements to ``receive``. Only changes are sent. Silence proves nothing: the lease
+decides which agent may act.
 """
 
 from __future__ import annotations

@@ -11,7 +11,7 @@ from benchmarks.consensus.mission import Mission
 
 MAX_FULL_BIDDERS = 100
 FEW_BIDS = 40
-"""Bids of each agent in missions of more than ``ALL`` agents, because all bids would be a million."""
+"""Bids of each agent in missions of more than ``MAX_FULL_BIDDERS`` agents, because all bids would be a million."""
 BID_KB = 0.012
 """An encoded bid: its task, its cost, and its share of the message overhead."""
 MEETING_KB = 0.03

@@ -10,7 +10,7 @@ from benchmarks.dht.library import Cancel, OnDone, OnValue
 
 
 class AsyncioPeer:
-    """The loop of a contestant; a library's own threads use ``soon``."""
+    """The loop of a contestant; a library's own threads use ``call_soon``."""
 
     def __init__(self, folder: str) -> None:
         self._tasks: set[asyncio.Task[Any]] = set()

@@ -57,9 +57,9 @@ class LibraryNode(Protocol):
 class Library:
     """One column of the comparison.
 
-    ``package`` is the module that must be importable; ``promise`` is the guarantee of a finished put; ``largest`` is
+    ``package`` is the module that must be importable; ``guarantee`` is the guarantee of a finished put; ``largest`` is
     the documented maximum length of a value in bytes; ``survives`` names the failures that a store on disk survives, if
-    it does not survive a loss of power; ``can`` names its features in addition to put and get.
+    it does not survive a loss of power; ``features`` names its features in addition to put and get.
     """
 
     name: str

@@ -26,7 +26,7 @@ class Node(RemoteProcess):
         self.port = port
 
     async def run_order(self, do: str, patience_s: float = ORDER_LIMIT_S, /, **fields: Any) -> dict[str, Any]:
-        """Execute an order; raises ``Lost``."""
+        """Execute an order; raises ``OrderFailed``."""
         return await super().run_order(do, patience_s, **fields)
 
 

@@ -92,7 +92,7 @@ class Workload:
             await self.store_until_found(node, nodes[number - 1], f"ready {number}")
 
     async def store_until_found(self, writer: Node, reader: Node, key: str) -> tuple[str, str]:
-        """Store a new value, with retries, until another node finds it; return its key and value; raises ``Lost``."""
+        """Store a new value, with retries, until another node finds it; return both; raises ``OrderFailed``."""
         for number in range(MAX_TRIES):
             value = self.make_value()
             put = await self.run_operation(writer, "put", f"{key} try {number}", value)

@@ -22,7 +22,7 @@ class HostProcess(RemoteProcess):
     """The child process of one host, with orders that may take some time."""
 
     async def run_order(self, do: str, limit_s: float = 0.0, /, **fields: Any) -> dict[str, Any]:
-        """Execute an order that may take ``limit_s``; raises ``Lost``."""
+        """Execute an order that may take ``limit_s``; raises ``OrderFailed``."""
         try:
             return await super().run_order(do, limit_s + MARGIN_S, limit_s=limit_s, **fields)
         except OrderImpossible as error:
@@ -60,8 +60,8 @@ class Hosts:
         with said.open("wb") as errors:
             # In a separate session, so that signals from the terminal reach only the parent.
             process = await asyncio.create_subprocess_exec(
-                *command, stdin=pipe, stdout=pipe, stderr=errors, cwd=ROOT, env=make_environment(), limit=MAX_LINE_BYTES,
-                start_new_session=True,
+                *command, stdin=pipe, stdout=pipe, stderr=errors, cwd=ROOT, env=make_environment(),
+                limit=MAX_LINE_BYTES, start_new_session=True,
             )  # fmt: skip
         return HostProcess(host, process, said)
 

@@ -98,7 +98,8 @@ def check_requirements(outcomes: Iterable[Outcome]) -> list[Requirement]:
         if some:
             held = [one for one in some if kept(one)]
             times = [one.seconds for one in some]
-            seen = f"{len(held)} of {len(some)}; p50 {_format_seconds(percentile(times, 0.5))}, worst {_format_seconds(max(times))}"
+            p50, worst = _format_seconds(percentile(times, 0.5)), _format_seconds(max(times))
+            seen = f"{len(held)} of {len(some)}; p50 {p50}, worst {worst}"
             wanted.append(Requirement(what, seen, len(held) >= share * len(some)))
 
     want(

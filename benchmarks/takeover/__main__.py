@@ -42,7 +42,7 @@ def run_virtual(causes: Sequence[Cause], count: int, seed: int, loss: float, job
 
 
 def run_real(causes: Sequence[Cause], count: int, seed: int) -> list[Trial]:
-    """Run ``count`` trials of each cause with processes; call it inside of ``lan.within``."""
+    """Run ``count`` trials of each cause with processes; call it inside of ``lan.run_in_network``."""
     from benchmarks.takeover.real import run_trial as real_trial
 
     trials = []

@@ -25,7 +25,7 @@ def run_in_network(arguments: Sequence[str]) -> int:
 
 
 class Lan:
-    """Nodes by name, each in a separate namespace; create it inside of ``within``."""
+    """Nodes by name, each in a separate namespace; create it inside of ``run_in_network``."""
 
     def __init__(self, names: Sequence[str]) -> None:
         self._numbers = {name: number for number, name in enumerate(names, start=1)}

@@ -278,7 +278,8 @@ def _print_addresses(demonstration: Demonstration, plan: Plan) -> None:
     print_line(f"The page: {demonstration.address}   (logs: {plan.run_dir}; end with Ctrl-C)")
     if demonstration.secure_address:
         print_line(
-            f"Over TLS: {demonstration.secure_address}   (a browser warns until it trusts the team: docs/how-to/https.md)"
+            f"Over TLS: {demonstration.secure_address}"
+            "   (a browser warns until it trusts the team: docs/how-to/https.md)"
         )
     print_line("If its node fails, the page switches to another: end the process of vaio to see it.")
     if plan.web_host == LOOPBACK:
@@ -296,7 +297,7 @@ def _print_addresses(demonstration: Demonstration, plan: Plan) -> None:
 
 def main(arguments: Sequence[str] = tuple(sys.argv[1:])) -> None:
     """Run the demonstration according to the command line."""
-    given = _parse_arguments(arguments)
+    args = _parse_arguments(arguments)
     # Twisted's timers use the wall clock; a step of that clock would delay or fire all of them.
     ReactorBase.seconds = staticmethod(time.monotonic)
-    react(lambda reactor: Deferred.fromCoroutine(_run(reactor, given)))
+    react(lambda reactor: Deferred.fromCoroutine(_run(reactor, args)))

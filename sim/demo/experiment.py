@@ -37,7 +37,7 @@ class Experiment:
     """One task from its assignment to its end.
 
     :param kills: whether the approaching dog fails on its way
-    :param started: the time of assignment, in seconds of the clock of ``look``
+    :param started: the time of assignment, in seconds of the clock of ``update``
     """
 
     def __init__(self, title: str, task: str, kills: bool, started: float) -> None:

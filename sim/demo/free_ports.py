@@ -34,7 +34,7 @@ def choose_port(kind: Transport, host: str, wanted: int, spare: Iterator[int]) -
 
 
 def find_free_ports(kind: Transport | tuple[Transport, ...], host: str, count: int) -> list[int]:
-    """Return ``count`` different ``QUIET`` ports that are free now for every ``kind``.
+    """Return ``count`` different ``PORT_RANGE`` ports that are free now for every ``kind``.
 
     All are bound at the same time, so none is returned twice, and drawn at random, so that concurrent callers get
     different ones.  Raises ``OSError`` if ``host`` is not an address of this machine, or too few ports are free.

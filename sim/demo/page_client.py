@@ -83,7 +83,7 @@ class PageClient:
         self._following = False
 
     def follow(self) -> None:
-        """Follow the live states until ``leave``; a lost stream is reopened."""
+        """Follow the live states until ``stop``; a lost stream is reopened."""
         self._following = True
         self._open()
 

@@ -1,8 +1,8 @@
 """Run a program that ends when its parent ends, also if the parent is killed.
 
-``python -m sim.demo.parent_monitor FILE|-m MODULE [ARGUMENTS]`` runs the program in this process, so the process id stays the
-same.  The parent holds the other end of standard input and never writes; end of file means that the parent has ended.
-The kernel closes the pipe however the parent ends, which a signal handler cannot guarantee.
+``python -m sim.demo.parent_monitor FILE|-m MODULE [ARGUMENTS]`` runs the program in this process, so the process id
+stays the same.  The parent holds the other end of standard input and never writes; end of file means that the parent
+has ended. The kernel closes the pipe however the parent ends, which a signal handler cannot guarantee.
 """
 
 from __future__ import annotations

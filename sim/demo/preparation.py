@@ -80,7 +80,7 @@ def make_plan(
 
     ``usual``: try the usual ports first, for interactive use; otherwise all ports are arbitrary, so that several
     demonstrations can start at the same time.  ``with_tls``: also serve the pages over TLS.  ``robot``: a key of
-    ``sim.demo.robots.CASTS``.
+    ``sim.demo.robots.ROBOT_SETS``.
     """
     try:
         free_ports.check_host("tcp", web_host)

@@ -129,5 +129,5 @@ class ProcessGroup:
 
 
 def make_child_command(arguments: Sequence[str]) -> list[str]:
-    """Return the command line that runs Python ``arguments`` and ends with this process (see ``sim.demo.parent_monitor``)."""
+    """Return the command line that runs Python ``arguments``, and that ends with this process (``parent_monitor``)."""
     return [sys.executable, "-m", "sim.demo.parent_monitor", *arguments]

@@ -48,7 +48,7 @@ class Robot:
 def make_robots(
     robot_set: str, names: tuple[str, ...], folder: Path, ports: Iterator[int], yard_port: int
 ) -> dict[str, Robot]:
-    """Return the robots of the cast ``robot_set`` by name; they take ports from ``ports`` and put cables into ``folder``."""
+    """Return the robots of ``robot_set`` by name; they take ports from ``ports`` and put cables into ``folder``."""
     makers: dict[str, Callable[[str], Robot]] = {
         "aibo": lambda name: _make_aibo(name, ports),
         "bittle": lambda name: _make_bittle(name, folder, ports),

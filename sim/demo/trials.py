@@ -31,7 +31,7 @@ SETTLE_S = 1.0
 
 
 class DemoTeam(Protocol):
-    """A team in virtual time (``VirtualTeam`` of package ``swarmnode``)."""
+    """A team in virtual time (``SimulatedTeam`` of package ``swarmnode``)."""
 
     clock: Any
     switchboard: Any

@@ -43,7 +43,7 @@ class Impairments:
 
 
 class LinkDirection:
-    """One direction of a link; ``passed`` and ``lost`` count frames, ``carried`` counts the bytes of passed frames."""
+    """One direction of a link; ``passed`` and ``lost`` count frames, ``passed_bytes`` the bytes of passed frames."""
 
     def __init__(self, rng: Random) -> None:
         self.passed = self.lost = self.passed_bytes = 0

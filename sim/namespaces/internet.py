@@ -42,7 +42,7 @@ class Site:
 
 
 class Internet:
-    """The sites within a ``with`` block; ``seed`` is the seed of losses.  Raises ``Refused``."""
+    """The sites within a ``with`` block; ``seed`` is the seed of losses.  Raises ``NamespacesUnavailable``."""
 
     def __init__(self, sites: Sequence[Site], seed: int = 1) -> None:
         if len(sites) > MAX_SITES or len({site.name for site in sites}) < len(sites):
@@ -133,7 +133,7 @@ class Internet:
     # -- links ------------------------------------------------------------------------------------------------------
 
     def impair(self, site: str, way: Direction = "both", to: str = "", **figures: float) -> None:
-        """Impair the link of a site (or of ``pub``) according to ``figures`` (see ``Weather``).
+        """Impair the link of a site (or of ``pub``) according to ``figures`` (see ``Impairments``).
 
         ``way`` is relative to the site.  With ``to`` only the direction from this site to that one is impaired.
         """

@@ -33,7 +33,10 @@ class NamespacesUnavailable(Exception):
 
 
 class Namespace:
-    """One namespace; ``inside`` is a room of the same user namespace (None: the first room).  Raises ``Refused``."""
+    """A network namespace; ``inside`` is one of the same user namespace, or None for the first.
+
+    Raises ``NamespacesUnavailable``.
+    """
 
     def __init__(self, inside: Namespace | None = None) -> None:
         self._is_own_user: bool = inside is not None and inside._is_own_user

@@ -77,7 +77,7 @@ class World:
         return [(*corners[i], *corners[(i + 1) % 4]) for i in range(4)]
 
     def step(self) -> None:
-        """Simulate ``SUBSTEP`` seconds."""
+        """Simulate ``SUBSTEP_S`` seconds."""
         if self.t >= self._place_target_at:
             self._place_target_at = math.inf
             with suppress(NotPossible):  # no place is free, and no caller waits for an answer
@@ -120,10 +120,10 @@ class World:
         self._space.add(shape)
 
     def place_target_at_random(self) -> None:
-        """Move the target to a free place, ``CLEARANCE`` from every dog, so that one dog is clearly the nearest.
+        """Move the target to a free place, ``CLEARANCE_M`` from every dog, so that one dog is clearly the nearest.
 
-        The distances to the dogs differ pairwise by ``APART``.  If no place satisfies both, the best one is used;
-        raises ``NotPossible`` if no place is free.
+        The distances to the dogs differ pairwise by ``DISTANCE_GAP_M``.  If no place satisfies both, the best one is
+        used; raises ``NotPossible`` if no place is free.
         """
         best, best_fit = None, -math.inf
         for _ in range(MAX_TRIES):

@@ -1,7 +1,8 @@
 """Check the invariants of a history of events.
 
 Some workloads compare their observations with the true state of the team (lookups, values, takeovers, tasks), which no
-history contains.  They check it themselves (``Workload.verdict``), under the same letters if the invariant is the same.
+history contains.  They check it themselves (``Workload.find_violations``), under the same letters if the invariant is
+the same.
 
 Invariants have the letters and numbers of the documentation: E for execution, D for durability, T for tuples, R for the
 wire.  Each is a function of the events; a request without an answer counts as "maybe".

@@ -40,7 +40,7 @@ def record_outcome(
 
 
 class Clients:
-    """The clients of one run; ``asked`` and ``answered`` count operations."""
+    """The clients of one run; ``request_counts`` and ``answer_counts`` count operations."""
 
     def __init__(self, history: History) -> None:
         self.request_counts: Counter[str] = Counter()

@@ -29,7 +29,7 @@ class Environment:
     """The environment of a command; tests replace it.
 
     ``wall`` and ``cpu`` return seconds; ``columns`` is the width of the terminal, 0 without one; ``is_stopped`` returns
-    whether the user has asked to stop; ``grown`` is called when most of a run's memory is allocated.
+    whether the user has asked to stop; ``on_allocated`` is called when most of a run's memory is allocated.
     """
 
     out: TextIO
@@ -44,11 +44,11 @@ class Environment:
 
 def run(arguments: Sequence[str], world: Environment, kinds: WorkloadKinds = KINDS) -> int:
     """Run the scenario of the arguments; returns 1 if a target or invariant is missed.  Raises ``BadSetting``."""
-    wanted = _parse_arguments(arguments)
-    changes = {} if wanted.nodes is None else {"nodes": wanted.nodes}
-    scenario = load_scenario(wanted.scenario, {name: kind.settings for name, kind in kinds.items()}, changes)
+    args = _parse_arguments(arguments)
+    changes = {} if args.nodes is None else {"nodes": args.nodes}
+    scenario = load_scenario(args.scenario, {name: kind.settings for name, kind in kinds.items()}, changes)
     check_memory(scenario, world.read)
-    line = make_repeat_command(wanted.scenario, wanted.seed, wanted.nodes)
+    line = make_repeat_command(args.scenario, args.seed, args.nodes)
     began, cpu = world.wall(), world.cpu()
     memory = lambda: measure_resident_bytes(world.read)  # noqa: E731
     progress, samples = Progress(world.err, world.columns, world.wall, memory), Samples()
@@ -61,20 +61,20 @@ def run(arguments: Sequence[str], world: Environment, kinds: WorkloadKinds = KIN
         progress.update(run)
         return world.is_stopped()
 
-    scenario_run = Run(scenario, wanted.seed, kinds, looked, world.on_allocated, watched, world.wall)
-    check_targets(scenario, [metric.name for metric in scenario_run.collect_metrics()], wanted.scenario)
+    scenario_run = Run(scenario, args.seed, kinds, looked, world.on_allocated, watched, world.wall)
+    check_targets(scenario, [metric.name for metric in scenario_run.collect_metrics()], args.scenario)
     faults: list[tuple[float, str]] = []
     with ExitStack() as files:
         # Opened before the run, so that a missing folder is reported at once and not after an hour.
-        json_out = _open_file(wanted.json, "--json", files)
-        trace_out = _open_file(wanted.trace, "--trace", files)
-        picture_out = _open_file(wanted.picture, "--picture", files)
+        json_out = _open_file(args.json, "--json", files)
+        trace_out = _open_file(args.trace, "--trace", files)
+        picture_out = _open_file(args.picture, "--picture", files)
         scenario_run.team.event_listeners.append(
             lambda now, what, _, more: faults.append((now, more)) if what == "fault" else None
         )
         trace = None if trace_out is None else Trace(trace_out)
         if trace is not None:
-            trace.begin(scenario=scenario.name, seed=wanted.seed, nodes=scenario.nodes, again=line)
+            trace.begin(scenario=scenario.name, seed=args.seed, nodes=scenario.nodes, again=line)
             scenario_run.team.event_listeners.append(trace.write_event)
         outcome = scenario_run.run()
         progress.close()
@@ -84,7 +84,7 @@ def run(arguments: Sequence[str], world: Environment, kinds: WorkloadKinds = KIN
         if json_out is not None:
             json_out.write(format_json(scenario, outcome, cost, line, samples.series))
         if picture_out is not None:
-            title = f"{scenario.name}, {scenario.nodes:,} nodes, seed {wanted.seed}"
+            title = f"{scenario.name}, {scenario.nodes:,} nodes, seed {args.seed}"
             picture_out.write(draw_svg(title + (" (partial)" if outcome.is_partial else ""), samples.series, faults))
         world.out.write(format_text(scenario, outcome, cost, line))
     if outcome.is_partial:

@@ -1,8 +1,8 @@
 """Draw durations of sessions and absences from distributions with a given median.
 
 When an observation starts, sessions are already in progress: their remaining durations are not fresh draws, as long
-sessions are more likely to be observed (the inspection paradox).  ``left`` draws these, so that the churn rate is the
-same from the first second on.
+sessions are more likely to be observed (the inspection paradox).  ``draw_remaining`` draws these, so that the churn
+rate is the same from the first second on.
 """
 
 from __future__ import annotations

@@ -115,7 +115,7 @@ class LeaseHeld(Event):
 class CommandSent(Event):
     """An agent sent a command.
 
-    Its lease ends at ``ends`` by its own clock, and at ``truly`` by an equal clock that was never suspended.
+    Its lease ends at ``ends_at`` by its own clock, and at ``true_end`` by an equal clock that was never suspended.
     """
 
     task: str
@@ -138,7 +138,7 @@ class CommandReceived(Event):
 
 @dataclass(frozen=True, slots=True)
 class RobotStopped(Event):
-    """An agent stopped its robot, which stands still from ``still`` on."""
+    """An agent stopped its robot, which stands still from ``still_at`` on."""
 
     task: str
     place: int
@@ -325,7 +325,7 @@ class InvalidDatagram(Event):
 
 @dataclass(frozen=True, slots=True)
 class RequestExecuted(Event):
-    """A node executed the request ``question``, which may happen once per life."""
+    """A node executed the request ``request``, which may happen once per life."""
 
     place: int
     life: int

@@ -61,7 +61,7 @@ class LinkSettings:
 
 
 class TeamLink:
-    """The link model of a switchboard (``switchboard.Link``); ``seed`` determines the positions of nodes."""
+    """The link model of a switchboard (``switchboard.LinkModel``); ``seed`` determines the positions of nodes."""
 
     def __init__(self, settings: LinkSettings, seed: str) -> None:
         self.settings = settings

@@ -146,7 +146,7 @@ class Machine:
             receive(*arguments)
 
     def deliver_datagram(self, receive: Callable[..., object], *arguments: Any) -> None:
-        """Deliver a datagram; a frozen machine queues at most ``MOST_WAITING``."""
+        """Deliver a datagram; a frozen machine queues at most ``MAX_QUEUED_DATAGRAMS``."""
         if not self.is_frozen or len(self._pending_input) < MAX_QUEUED_DATAGRAMS:
             self.deliver(receive, *arguments)
 

@@ -52,7 +52,8 @@ def check_memory(scenario: Scenario, read: Read) -> None:
     if needed <= left * USABLE_SHARE:
         return
     fit = max(0, int((left * USABLE_SHARE - BASE_BYTES) / (KIB_PER_NODE[scenario.kind] * 1024)))
-    problem = f"{scenario.nodes:,} nodes need {_format_size(needed)} of memory, but {_format_size(int(left * USABLE_SHARE))} are available"
+    available = _format_size(int(left * USABLE_SHARE))
+    problem = f"{scenario.nodes:,} nodes need {_format_size(needed)} of memory, but {available} are available"
     raise BadSetting("command line", "--nodes", problem, f"use at most {fit:,}, or a machine with more memory")
 
 

@@ -17,7 +17,7 @@ _BOUND = re.compile(r"\s*(<=|>=)\s*(\S+)\s*")
 
 @dataclass(frozen=True)
 class Bound:
-    """A bound of a figure: a maximum if ``most``, else a minimum."""
+    """A bound of a figure: a maximum if ``is_maximum``, else a minimum."""
 
     value: float
     is_maximum: bool = True
@@ -117,7 +117,8 @@ def format_number(value: float | None) -> str:
 def format_trials(figure: Metric) -> str:
     """Return the number of trials as text, with the bound that it implies for a share of 0 or 1."""
     if figure.unit == "share" and figure.n and figure.value in (0.0, 1.0):
-        return f"n {figure.n:,}, < {format_number(ZERO_EVENTS_FACTOR / figure.n)} {'else' if figure.value else ''}".rstrip()
+        limit = format_number(ZERO_EVENTS_FACTOR / figure.n)
+        return f"n {figure.n:,}, < {limit} {'else' if figure.value else ''}".rstrip()
     return f"n {figure.n:,}" if figure.n else ""
 
 

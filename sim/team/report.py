@@ -136,7 +136,7 @@ MAX_LINES = 200_000
 
 
 class Trace:
-    """Writes the events of a team to ``out`` (``Team.told``)."""
+    """Writes the events of a team to ``out`` (``Team.write_event``)."""
 
     def __init__(self, out: TextIO, most: int = MAX_LINES) -> None:
         self._out = out

@@ -25,8 +25,8 @@ MAX_VIOLATIONS = 1000
 EPSILON_S = 1e-9
 """Tolerance in seconds for rounding errors of summed steps."""
 LONG_S, SHORT_S, MIN_GRAIN_S = 0.5, 0.1, 1e-4
-"""Real seconds for one grain: above ``LONG`` the grain becomes finer, so that a user can stop the run soon, and below
-``SHORT`` coarser.  ``LEAST_GRAIN`` is the finest one in seconds of the team's time."""
+"""Real seconds for one grain: above ``LONG_S`` the grain becomes finer, so that a user can stop the run soon, and below
+``SHORT_S`` coarser.  ``MIN_GRAIN_S`` is the finest one in seconds of the team's time."""
 
 Phase = str
 JOINING, SETTLING, RUNNING, REPAIRING, ASKING, DONE = "joining", "settling", "running", "repairing", "asking", "done"

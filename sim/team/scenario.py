@@ -105,7 +105,7 @@ class Nats:
     """Share of nodes that are each behind a router; the first ones never are."""
 
     kinds: Annotated[tuple[str, ...], some_of(NAT_KINDS)] = ("port",)
-    """The kinds of routers, assigned in turn (``network.nat``)."""
+    """The kinds of routers, assigned in turn (``network.nat_router``)."""
 
 
 @dataclass(frozen=True)

@@ -1,7 +1,7 @@
 """Nodes of one process in virtual time: clock, switchboard, the nodes' lives, and state that survives a node.
 
-``World`` is the base of every simulated team; ``Fleet`` has nodes of the library, ``SwarmFleet`` whole device nodes.
-A team with a scenario is ``sim.team.team.Team``.
+``Simulation`` is the base of every simulated team; ``EntangledTeam`` has nodes of the library, ``SwarmTeam`` whole
+device nodes.  A team with a scenario is ``sim.team.team.Team``.
 """
 
 from __future__ import annotations

@@ -91,7 +91,7 @@ class ClockedWriter(Writer):
 
 
 class CheckedStore(SqliteStore):
-    """A store that records acknowledged writes in ``promised``, and later changes in ``fresh``."""
+    """A store that records acknowledged writes in ``acknowledged``, and later changes in ``unacknowledged``."""
 
     def __init__(self, *arguments: Any) -> None:
         super().__init__(*arguments)
@@ -150,8 +150,8 @@ class CheckedStore(SqliteStore):
 class SqliteTeam(EntangledTeam):
     """Nodes with stores in files of a temporary folder.
 
-    ``decay`` maps places to the kind of corruption ("row" or "file") at their next kill; ``lost`` lists acknowledged
-    writes that were missing in the next life, ``overlooked`` corruption that was not detected.
+    ``planned_corruption`` maps places to the kind of corruption ("row" or "file") at their next kill; ``lost`` lists
+    acknowledged writes that were missing in the next life, ``undetected`` corruption that was not detected.
     """
 
     def __init__(self, n: int, seed: int = 1, conditions: LinkConditions = PERFECT) -> None:

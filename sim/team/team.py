@@ -40,7 +40,7 @@ def get_entangled(node: Node) -> EntangledNode:
 
 
 class PlaceState:
-    """The state of a place that is kept from life to life; ``step`` is the error of its wall clock."""
+    """The state of a place that is kept from life to life; ``wall_error`` is the error of its wall clock."""
 
     __slots__ = ("address", "identity", "store", "traffic", "wall_error", "rate", "nat", "machine", "join_waiters")
 
@@ -58,7 +58,7 @@ class PlaceState:
 
 
 class Team(Simulation):
-    """The team of a ``scenario``; no node exists before ``stand`` or ``come``."""
+    """The team of a ``scenario``; no node exists before ``form`` or ``start_all``."""
 
     seed: int
     living: dict[int, Node]

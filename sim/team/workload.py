@@ -11,7 +11,7 @@ from sim.team.team import Team
 
 
 class Workload:
-    """A workload, created before the first node joins; it observes births and deaths through ``World.attend``.
+    """A workload, created before the first node joins; ``Simulation.watch_lives`` tells it of births and deaths.
 
     It records requests and answers in the history, which the checker judges.
     """

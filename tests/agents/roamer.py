@@ -83,9 +83,9 @@ class Roamer:
         self.dog = self.world.dogs["dog1"]
         self.dog.shape.unsafe_set_radius(self.description.radius)
         self.senses = Sensors(Random(seed + 2), self.world, self.dog)
-        self.means = MotionCapabilities(self.description)
+        self.motion = MotionCapabilities(self.description)
         self.behaviour = SearchAndApproach({}, Random(seed + 3))
-        self.behaviour.embody(self.means)
+        self.behaviour.embody(self.motion)
         self.now = 0.0
         self.hardest = 0.0
         """The highest speed in m/s at a contact with an object."""
@@ -109,22 +109,22 @@ class Roamer:
 
     def sense(self) -> Mapping[str, Value]:
         """Return the values of the sensors that a robot of this kind has."""
-        told: dict[str, Value] = dict(self.senses.values())
+        values: dict[str, Value] = dict(self.senses.values())
         if self._kind != "sim":
-            told.pop("compass.heading")
+            values.pop("compass.heading")
         if self._kind == "bittle":
-            told |= {f"odom.{axis}": value for axis, value in zip(("x", "y", "yaw"), self._reckoned, strict=True)}
-        near, far = float(told["range.near"]), float(told["range.far"])
+            values |= {f"odom.{axis}": value for axis, value in zip(("x", "y", "yaw"), self._reckoned, strict=True)}
+        near, far = float(values["range.near"]), float(values["range.far"])
         if self._kind == "sim":
-            return told
-        told = {key: value for key, value in told.items() if not key.startswith("range.")}
+            return values
+        values = {key: value for key, value in values.items() if not key.startswith("range.")}
         if self._kind == "create2":
             side = self.touched()
-            told |= {"bump.left": side is not None and side >= 0.0, "bump.right": side is not None and side <= 0.0}
-            told |= {f"lightbump.{name}.hit": near < LIT for name in ("center_left", "center_right")}
+            values |= {"bump.left": side is not None and side >= 0.0, "bump.right": side is not None and side <= 0.0}
+            values |= {f"lightbump.{name}.hit": near < LIT for name in ("center_left", "center_right")}
         elif "ranger" in self.description.capabilities:
-            told["range.front"] = min((one for one in (near, far) if not math.isnan(one)), default=math.nan)
-        return told
+            values["range.front"] = min((one for one in (near, far) if not math.isnan(one)), default=math.nan)
+        return values
 
     def touched(self) -> float | None:
         """Return the bearing in radians (left is positive) of an object that the front half touches, or None."""
@@ -155,11 +155,11 @@ class Roamer:
             frame = Frame(self._frames, 208, 160, self.camera.render_jpeg(self.dog), self.now)
         self.behaviour.look(Observation(self.now, self.now, self.sense(), frame=frame), self.now)
         action = act(self.now)
-        wished = self.means.remove_missing_axes(action or {"base.vx": 0.0, "base.vy": 0.0, "base.wz": 0.0})
+        wished = self.motion.remove_missing_axes(action or {"base.vx": 0.0, "base.vy": 0.0, "base.wz": 0.0})
         unknown = set(wished) - set(self.description.limits)
         assert not unknown, f"{self._kind} has no {unknown}"
         before, self.done = self.done, self.does(wished)
-        self.means.learn(wished, self.done)
+        self.motion.learn(wished, self.done)
         self.reversals += self.done.get("base.wz", 0.0) * before.get("base.wz", 0.0) < 0.0
         self._lag.append(Motion(*(self.done.get(key, 0.0) for key in ("base.vx", "base.vy", "base.wz"))))
         self._reckon()
@@ -170,9 +170,9 @@ class Roamer:
     def _reckon(self) -> None:
         """Integrate the executed actions into a pose estimate, as a dog without encoders does."""
         x, y, yaw = self._reckoned
-        way = self.done.get("base.vx", 0.0) * TICK
+        distance = self.done.get("base.vx", 0.0) * TICK
         turned = math.remainder(yaw + self.done.get("base.wz", 0.0) * TICK, math.tau)
-        self._reckoned = [x + way * math.cos(yaw), y + way * math.sin(yaw), turned]
+        self._reckoned = [x + distance * math.cos(yaw), y + distance * math.sin(yaw), turned]
 
     def find(self, limit: float) -> float | None:
         """Search until the behaviour has a cost, or until ``limit``; return the cost."""

@@ -137,7 +137,7 @@ class DecisionTests(SynchronousTestCase):
         self.assertTrue(chosen == min(costs.values()) or min(costs.values()) >= chosen * 0.9)
 
 
-class PanelTests(SynchronousTestCase):
+class ReportersTests(SynchronousTestCase):
     """Decisions from the reports of a subset of the agents (the reporters)."""
 
     def panelled(self, since: float, has_word: bool, *members: Member) -> str | None:

@@ -71,19 +71,19 @@ class DogBody:
             self._senses.sample()
 
 
-def driven(kind: str, body: DogBody, clock: Clock) -> Driver:
+def driven(kind: str, robot: DogBody, clock: Clock) -> Driver:
     """Return a driver of this kind that is connected in memory to the emulator of this robot."""
     emulator: Any
     if kind == "aibo":
-        emulator = AiboEmulator(clock, body, Random(1))
+        emulator = AiboEmulator(clock, robot, Random(1))
         emulator.start()
         return create_driver(kind, {"host": "dog"}, "robot", clock, emulator.connector())
     if kind == "rosbridge":
-        emulator = RosbridgeRobot(clock, body, Random(1))
+        emulator = RosbridgeRobot(clock, robot, Random(1))
         emulator.start()
         options = {"image_topic": "/camera/image_raw/compressed", "camera_lens": 56.9}
         return create_driver(kind, options, "robot", clock, MemoryConnector(clock, emulator.accept))
-    emulator = (Create2 if kind == "create2" else Bittle)(body, clock, Random(1))
+    emulator = (Create2 if kind == "create2" else Bittle)(robot, clock, Random(1))
     return create_driver(kind, {"port": "memory"}, "robot", clock, MemoryConnector(clock, emulator.accept))
 
 
@@ -91,8 +91,8 @@ class DriverTests(SynchronousTestCase):
     def reached(self, kind: str, seed: int) -> tuple[DogBody, float]:
         """Return the world after a robot of this kind has reached the target, and the seconds that it needed."""
         clock = Clock()
-        body = DogBody(clock, seed)
-        driver = driven(kind, body, clock)
+        robot = DogBody(clock, seed)
+        driver = driven(kind, robot, clock)
         fps = FPS.get(kind, 15.0)
         has_camera = "camera" in driver.description.capabilities
         motion = MotionCapabilities(driver.description if has_camera else filming(driver.description, fps))
@@ -100,16 +100,16 @@ class DriverTests(SynchronousTestCase):
         behaviour.embody(motion)
         enabled: list[bool] = []
         driver.connect().addCallback(lambda _: driver.enable()).addCallback(enabled.append)
-        frame, seen_at, began = Frame(0, 208, 160, b"", 0.0), 0.0, math.inf
+        frame, seen_at, started_at = Frame(0, 208, 160, b"", 0.0), 0.0, math.inf
         for _ in range(round(120.0 / TICK_S)):
             for _ in range(12):
                 clock.advance(TICK_S / 12)
             now = clock.seconds()
             if not enabled:
                 continue
-            began = min(began, now)
+            started_at = min(started_at, now)
             if now - seen_at >= 1.0 / fps:
-                frame, seen_at = Frame(frame.seq + 1, 208, 160, body.picture() or b"", now), now
+                frame, seen_at = Frame(frame.seq + 1, 208, 160, robot.picture() or b"", now), now
             seen = driver.observe()
             assert isinstance(seen, Observation)
             behaviour.look(seen if has_camera else replace(seen, frame=frame), now)
@@ -118,7 +118,7 @@ class DriverTests(SynchronousTestCase):
                 driver.disconnect()
                 for _ in range(100):
                     clock.advance(0.01)
-                return body, now - began
+                return robot, now - started_at
             action = motion.remove_missing_axes(action)
             motion.learn(action, driver.act(action, Permit(1, now + 0.5)))
         self.fail(f"{kind} never reached the target")
@@ -128,10 +128,10 @@ class DriverTests(SynchronousTestCase):
         for kind in ("aibo", "create2", "bittle", "rosbridge"):
             for seed in (1, 4):
                 with self.subTest(kind=kind, seed=seed):
-                    body, took = self.reached(kind, seed)
-                    target = body.world.target
+                    robot, took = self.reached(kind, seed)
+                    target = robot.world.target
                     assert target is not None
-                    away = math.dist((target.x, target.y), (body.dog.x, body.dog.y))
+                    away = math.dist((target.x, target.y), (robot.dog.x, robot.dog.y))
                     self.assertLess(away - target.radius - FOOTPRINT_RADIUS_M, TOUCH)
-                    self.assertEqual(body.world.collisions, 0)
+                    self.assertEqual(robot.world.collisions, 0)
                     self.assertLess(took, 60.0)

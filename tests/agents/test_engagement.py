@@ -66,12 +66,12 @@ class Dog:
         return None if self.executed > self.steps else GO
 
 
-class Council:
+class LeaseClientStub:
     """A lease client that gets the lease when the test grants it, and records events."""
 
     def __init__(self, clock: HeapClock, events: list[str]) -> None:
         self.is_wanted = False
-        self.heirs: Sequence[Contact] = ()
+        self.standbys: Sequence[Contact] = ()
         self.rest = 0.0
         self.places: list[int] = []
         self.token = 0
@@ -90,7 +90,7 @@ class Council:
         self.is_wanted = True
 
     def learn(self, packed: bytes) -> None:
-        """Ignore the council's message."""
+        """Ignore the charter."""
 
     def stand_by(self, rank: int = 1) -> None:
         """Record the rank among the standbys."""
@@ -98,7 +98,7 @@ class Council:
 
     def release(self, standbys: Sequence[Contact] = (), rest: float = 0.0) -> Deferred[object]:
         """Return the lease."""
-        self.heirs = standbys
+        self.standbys = standbys
         if self.token:
             self.rest = rest
             self._events.append("released")
@@ -122,20 +122,20 @@ class Council:
 
 
 class Recorder:
-    """The output ports of an engagement, which record all output."""
+    """The outputs of an engagement, which record all output."""
 
     def __init__(self, events: list[str]) -> None:
-        self.told: list[Member] = []
+        self.reports: list[Member] = []
         self.results: list[Result] = []
-        self.said: list[str] = []
-        self.accounts: list[DecisionRecord] = []
+        self.log_lines: list[str] = []
+        self.decision_records: list[DecisionRecord] = []
         self.known: dict[str, Contact] = {}
         self.moves_for = 0.0
         self._events = events
 
     def publish_report(self, member: Member) -> None:
         """Record a report."""
-        self.told.append(member)
+        self.reports.append(member)
 
     def record_outcome(self, result: Result) -> None:
         """Record an outcome."""
@@ -143,11 +143,11 @@ class Recorder:
 
     def log_event(self, text: str) -> None:
         """Record a log line."""
-        self.said.append(text)
+        self.log_lines.append(text)
 
     def publish_decision_record(self, record: DecisionRecord) -> None:
         """Record a decision record."""
-        self.accounts.append(record)
+        self.decision_records.append(record)
 
     def stop_robot(self) -> float:
         """Stop the robot, which may not receive the message."""
@@ -163,10 +163,10 @@ class EngagementTests(SynchronousTestCase):
     def setUp(self) -> None:
         self.clock = HeapClock()
         self.events: list[str] = []
-        self.ports = Recorder(self.events)
-        self.told, self.results, self.said = self.ports.told, self.ports.results, self.ports.said
+        self.outputs = Recorder(self.events)
+        self.reports, self.results, self.log_lines = self.outputs.reports, self.outputs.results, self.outputs.log_lines
         self.dog = Dog()
-        self.council = Council(self.clock, self.events)
+        self.lease_client = LeaseClientStub(self.clock, self.events)
         self.others = {n: Identity(bytes([n]) * 32) for n in (2, 3)}
         self.begin(TASK)
 
@@ -174,8 +174,8 @@ class EngagementTests(SynchronousTestCase):
         """Take part in ``task`` with the robot."""
         uuid = ME.node_id.hex()
         me, reporters, now = Member(uuid, "dog1", ""), Reporters(uuid), self.clock.seconds()
-        self.engagement = Engagement(task, me, self.dog, strategy or Nearest(), self.ports, reporters, 4, now)
-        self.engagement.take_robot(self.council, 4)  # type: ignore[arg-type]
+        self.engagement = Engagement(task, me, self.dog, strategy or Nearest(), self.outputs, reporters, 4, now)
+        self.engagement.take_robot(self.lease_client, 4)  # type: ignore[arg-type]
 
     def report(self, number: int, cost: float | None, status: str = WAITING) -> Member:
         """Return a report of another dog."""
@@ -205,7 +205,7 @@ class EngagementTests(SynchronousTestCase):
         self.hear(self.report(2, 2.0))
         self.see(1.0)
         self.step()
-        self.council.grant(token)
+        self.lease_client.grant(token)
         self.assertEqual(self.step().action, GO)
 
     def test_states_follow_the_thesis(self) -> None:
@@ -217,25 +217,25 @@ class EngagementTests(SynchronousTestCase):
         self.assertEqual(self.step().action, HOLD)
         self.hear(self.report(2, 2.0))
         self.step()
-        self.council.grant(5)
+        self.lease_client.grant(5)
         self.assertEqual(self.step().action, GO)
         self.end(COMPLETED, "dog1")
-        statuses = list(dict.fromkeys(member.status for member in self.told))
+        statuses = list(dict.fromkeys(member.status for member in self.reports))
         self.assertEqual(statuses, [SEARCHING, WAITING, EXECUTING, DONE])
 
     def test_nothing_is_executed_without_a_lease(self) -> None:
-        """The assigned agent holds its position until the council grants the lease, and again when it expires."""
+        """The assigned agent holds its position until the quorum grants the lease, and again when it expires."""
         self.hear(self.report(2, 2.0))
         self.see(1.0)
         for _ in range(5):
             self.assertEqual(self.step().action, HOLD)
             self.clock.advance(0.05)
-        self.assertTrue(self.council.is_wanted)
+        self.assertTrue(self.lease_client.is_wanted)
         self.assertEqual(self.dog.executed, 0)
-        self.council.grant(5)
+        self.lease_client.grant(5)
         command = self.step()
         self.assertEqual(
-            (command.action, command.permit.token, command.permit.deadline), (GO, 5, self.council.deadline)
+            (command.action, command.permit.token, command.permit.deadline), (GO, 5, self.lease_client.deadline)
         )
         self.clock.advance(1.6)
         self.assertEqual(self.step().action, HOLD)
@@ -252,7 +252,7 @@ class EngagementTests(SynchronousTestCase):
         self.hear(self.report(2, 0.5))
         self.assertEqual(self.step().action, HOLD)
         self.assertEqual(self.events, ["halted", "released"])
-        self.assertIn("releases the task", self.said)
+        self.assertIn("releases the task", self.log_lines)
 
     def test_who_stands_by_keeps_its_place(self) -> None:
         """A standby keeps its place in the order of standbys from its first step on."""
@@ -261,28 +261,28 @@ class EngagementTests(SynchronousTestCase):
         for _ in range(5):
             self.assertEqual(self.step().action, HOLD)
             self.clock.advance(0.05)
-        self.assertEqual(self.council.places, [1] * 5)
+        self.assertEqual(self.lease_client.places, [1] * 5)
 
     def test_who_is_to_act_and_does_not_yet_is_in_the_line(self) -> None:
         """An assigned agent that does not act yet counts as the first standby, so two agents never claim at once."""
         self.hear(self.report(2, 0.5))
         self.see(1.0)
         self.step()
-        self.assertEqual(self.council.places, [2])
+        self.assertEqual(self.lease_client.places, [2])
         self.hear(self.report(2, 0.5, EXECUTING))
         self.step()
-        self.assertEqual(self.council.places, [2, 1])
+        self.assertEqual(self.lease_client.places, [2, 1])
 
     def test_who_is_not_let_insists(self) -> None:
         """An assigned agent without a lease repeats its report each second, so that others do not treat it as gone."""
         self.hear(self.report(2, 2.0))
         self.see(1.0)
         self.step()
-        told = len(self.told)
+        told = len(self.reports)
         for _ in range(50):
             self.clock.advance(0.05)
             self.step()
-        again = self.told[told - 1 :]
+        again = self.reports[told - 1 :]
         self.assertEqual([member.serial - again[0].serial for member in again], [0, 1, 2])
         self.assertEqual({(member.cost, member.assigned) for member in again}, {(1.0, ME.node_id.hex())})
 
@@ -292,7 +292,7 @@ class EngagementTests(SynchronousTestCase):
         self.hear(better)
         self.see(1.0)
         self.step()
-        self.council.grant(5)
+        self.lease_client.grant(5)
         self.assertEqual(self.step().action, GO)
         for _ in range(5):
             self.clock.advance(0.05)
@@ -306,11 +306,11 @@ class EngagementTests(SynchronousTestCase):
         self.hear(self.report(2, 0.5, EXECUTING), self.report(3, 3.0))
         self.see(1.0)
         self.step()
-        self.assertEqual((self.council.is_wanted, self.events), (False, []))
+        self.assertEqual((self.lease_client.is_wanted, self.events), (False, []))
         self.hear(self.report(3, 3.0))
         self.assertEqual(self.events, ["suspected"])
         self.step()
-        self.assertTrue(self.council.is_wanted)
+        self.assertTrue(self.lease_client.is_wanted)
 
     def test_council_changes_under_who_acts(self) -> None:
         """At a safe point the agent stops, the council changes, and the agent resumes with a new lease."""
@@ -323,22 +323,22 @@ class EngagementTests(SynchronousTestCase):
         self.assertEqual(self.events, ["halted", "moved to 3"])
         self.clock.advance(0.2)
         self.assertIsNone(self.engagement.step(self.clock.seconds()))
-        self.assertEqual(self.told[-1].status, EXECUTING)
-        self.council.grant(9)
-        self.assertEqual(self.step(), RobotCommand(GO, Permit(9, self.council.deadline)))
+        self.assertEqual(self.reports[-1].status, EXECUTING)
+        self.lease_client.grant(9)
+        self.assertEqual(self.step(), RobotCommand(GO, Permit(9, self.lease_client.deadline)))
         self.assertEqual(self.events, ["halted", "moved to 3"])
 
     def test_moved_target_is_reported_again(self) -> None:
         """A larger cost is reported again in each state; a smaller one only by an agent that does not act."""
         self.see(1.0)
         self.see(1.1)
-        self.assertEqual([m.cost for m in self.told], [1.0])
+        self.assertEqual([m.cost for m in self.reports], [1.0])
         self.see(1.5)
         self.see(0.6)
-        self.assertEqual([m.cost for m in self.told], [1.0, 1.5, 0.6])
+        self.assertEqual([m.cost for m in self.reports], [1.0, 1.5, 0.6])
         self.hear(self.report(2, 2.0))
         self.step()
-        self.council.grant(5)
+        self.lease_client.grant(5)
         self.step()
         self.see(0.1)
         self.assertEqual(self.engagement.me.cost, 0.6)
@@ -350,19 +350,19 @@ class EngagementTests(SynchronousTestCase):
         for leave in (lambda: self.engagement.on_robot_lost(), lambda: self.engagement.leave(self.clock.seconds())):
             self.setUp()
             self.acting()
-            self.ports.moves_for = 0.8
+            self.outputs.moves_for = 0.8
             leave()
             self.engagement.step(self.clock.seconds())
-            self.assertEqual(self.council.rest, 0.8)
+            self.assertEqual(self.lease_client.rest, 0.8)
 
     def test_lost_body_is_not_waited_for(self) -> None:
         """An agent without a connection to its robot is unavailable until the next observation."""
         for cost in (None, 1.0):
             self.see(cost)
             self.engagement.on_robot_lost()
-            self.assertEqual((self.told[-1].cost, self.told[-1].available), (None, False), str(cost))
+            self.assertEqual((self.reports[-1].cost, self.reports[-1].available), (None, False), str(cost))
             self.see(cost)
-            self.assertEqual((self.told[-1].cost, self.told[-1].available), (cost, True), str(cost))
+            self.assertEqual((self.reports[-1].cost, self.reports[-1].available), (cost, True), str(cost))
 
     def test_done_is_recorded_and_the_lease_kept_until_it_is_known(self) -> None:
         """The agent stops, records the outcome once, and returns the lease when the outcome is confirmed."""
@@ -401,9 +401,9 @@ class EngagementTests(SynchronousTestCase):
         self.see(0.9)
         self.hear(self.report(2, 2.0))
         self.step()
-        self.council.grant(6)
+        self.lease_client.grant(6)
         self.assertEqual(self.step().action, GO)
-        self.assertEqual(self.said[-3:], ["resumed by vaio", "reports 0.90 m", "acts: dog1, 0.90, best of 2"])
+        self.assertEqual(self.log_lines[-3:], ["resumed by vaio", "reports 0.90 m", "acts: dog1, 0.90, best of 2"])
 
     def test_lease_is_kept_while_the_outcome_is_on_its_way(self) -> None:
         """Another task that arrives between completion and the outcome's record does not release the lease."""
@@ -422,7 +422,7 @@ class EngagementTests(SynchronousTestCase):
         self.begin(replace(TASK, deadline=5.0))
         self.acting()
         self.clock.advance(5.1)
-        self.council.grant(5)
+        self.lease_client.grant(5)
         self.assertIsNone(self.engagement.step(self.clock.seconds()))
         self.assertIsNone(self.engagement.step(self.clock.seconds()))
         self.assertEqual([(r.outcome, r.why) for r in self.results], [(FAILED, "past its deadline of 5 s")])
@@ -447,8 +447,8 @@ class EngagementTests(SynchronousTestCase):
         self.clock.advance(5.1)
         for _ in range(2):
             self.assertIsNone(self.engagement.step(self.clock.seconds()))
-            self.assertEqual((self.results, self.council.is_wanted), ([], True))
-        self.council.grant(6)
+            self.assertEqual((self.results, self.lease_client.is_wanted), ([], True))
+        self.lease_client.grant(6)
         self.assertIsNone(self.engagement.step(self.clock.seconds()))
         self.assertEqual([result.token for result in self.results], [6])
 
@@ -469,10 +469,10 @@ class EngagementTests(SynchronousTestCase):
         self.acting()
         for _ in range(22):
             self.clock.advance(0.05)
-            self.council.grant(5)
+            self.lease_client.grant(5)
             self.step()
         self.assertEqual(self.events[:2], ["halted", "released"])
-        self.assertIn("makes no progress", self.said)
+        self.assertIn("makes no progress", self.log_lines)
         self.see(0.5)
         self.assertIsNone(self.engagement.me.cost)
         self.clock.advance(1.2)
@@ -491,7 +491,7 @@ class EngagementTests(SynchronousTestCase):
         self.see(1.0)
         self.clock.advance(1.1)
         self.see(1.0)
-        self.assertEqual([(m.cost, m.serial, m.valid_for) for m in self.told], [(1.0, 1, 2.0), (1.0, 2, 2.0)])
+        self.assertEqual([(m.cost, m.serial, m.valid_for) for m in self.reports], [(1.0, 1, 2.0), (1.0, 2, 2.0)])
 
     def test_failing_strategy_falls_back_to_nearest(self) -> None:
         """The error of a failing strategy is logged once, and the nearest agent is assigned."""
@@ -508,7 +508,7 @@ class EngagementTests(SynchronousTestCase):
         self.see(1.0)
         self.step()
         self.step()
-        faults = [line for line in self.said if "broken" in line and not line.startswith("standby")]
+        faults = [line for line in self.log_lines if "broken" in line and not line.startswith("standby")]
         self.assertEqual(faults, ["broken has no opinion (ZeroDivisionError: no luck); nearest: 0.50, least of 2"])
         self.assertEqual(self.engagement.me.assigned, self.others[2].node_id.hex())
         self.assertEqual(len(self.flushLoggedErrors(ZeroDivisionError)), 1)
@@ -529,38 +529,38 @@ class EngagementTests(SynchronousTestCase):
         """After a restart the agent continues the round and serial numbers that the others have seen."""
         self.hear(Member(ME.node_id.hex(), "dog1", WAITING, 9.0, epoch=4, serial=3))
         self.see(1.0)
-        self.assertGreater((self.told[-1].epoch, self.told[-1].serial), (4, 3))
+        self.assertGreater((self.reports[-1].epoch, self.reports[-1].serial), (4, 3))
 
     def test_heirs_hear_of_a_leave_from_the_one_that_leaves(self) -> None:
         """An agent that leaves a task names its standbys in order, without itself."""
         contacts = {n: Contact(each.public, Address("10.0.0.1", n)) for n, each in self.others.items()}
-        self.ports.known = {contact.node_id.hex(): contact for contact in contacts.values()}
+        self.outputs.known = {contact.node_id.hex(): contact for contact in contacts.values()}
         self.hear(self.report(2, 3.0), self.report(3, 2.0))
         self.see(1.0)
         self.step()
-        self.council.grant(1)
+        self.lease_client.grant(1)
         self.step()
         self.engagement.leave(self.clock.seconds())
-        self.assertEqual(self.council.heirs, [contacts[3], contacts[2]])
+        self.assertEqual(self.lease_client.standbys, [contacts[3], contacts[2]])
 
     def test_each_decision_is_accounted_for_once(self) -> None:
         """A new decision is recorded at once, changed reports at most once a second, an unchanged decision never."""
-        accounts = self.ports.accounts
+        records = self.outputs.decision_records
         self.step()
-        self.assertEqual(accounts, [])
+        self.assertEqual(records, [])
         self.hear(self.report(2, 2.0))
         self.see(1.0)
         self.step()
-        self.assertEqual([(v.winner, v.epoch, v.token) for v in accounts], [(ME.node_id.hex(), 1, 0)])
-        self.assertEqual([(r.name, r.cost) for r in accounts[0].reports], [("dog1", 1.0), ("dog2", 2.0)])
+        self.assertEqual([(v.winner, v.epoch, v.token) for v in records], [(ME.node_id.hex(), 1, 0)])
+        self.assertEqual([(r.name, r.cost) for r in records[0].reports], [("dog1", 1.0), ("dog2", 2.0)])
         for cost in (2.1, 2.2, 2.3, 2.4):
             self.hear(self.report(2, cost))
             self.clock.advance(0.1)
             self.step()
-        self.assertEqual(len(accounts), 1)
+        self.assertEqual(len(records), 1)
         self.clock.advance(1.0)
         self.step()
-        self.assertEqual(accounts[1].reports[1].cost, 2.4)
+        self.assertEqual(records[1].reports[1].cost, 2.4)
         self.clock.advance(5.0)
         self.step()
-        self.assertEqual(len(accounts), 2)
+        self.assertEqual(len(records), 2)

@@ -81,7 +81,7 @@ class ExplorationTests(SynchronousTestCase):
                 self.assertTrue(0.0 < x < 3.0 and 0.0 < y < 3.0, (seed, walker.pose))
 
     def test_leg_ends_and_the_robot_looks_around_again(self) -> None:
-        """After a leg of at most ``LEG`` metres the robot stops and turns."""
+        """After a leg of at most ``LEG_M`` metres the robot stops and turns."""
         walker = Walker(1, side=50.0)
         while walker.live() == 0.0:
             pass
@@ -164,7 +164,7 @@ class DetourTests(SynchronousTestCase):
         self.assertFalse(detour.is_active(took))
 
     def test_detour_that_nobody_walks_is_none(self) -> None:
-        """A detour without calls expires after its timeout, and ``end`` ends it at any time."""
+        """A detour without calls expires after its timeout, and ``cancel`` ends it at any time."""
         detour = Detour(MotionCapabilities())
         detour.start((0.0, 0.0, 0.0), 1.0, 0.0, has_touched=True)
         self.assertTrue(detour.is_active(1.0))

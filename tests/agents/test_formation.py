@@ -105,7 +105,7 @@ class FormationTests(SynchronousTestCase):
         self.assertNotEqual(self.formation.assign_post(self.me, far, "b"), first)
 
 
-class CirclingTests(SynchronousTestCase):
+class PostPathTests(SynchronousTestCase):
     def walk(self, radius: float, post: float, ahead: float = math.nan, seconds: float = 60.0) -> tuple[float, float]:
         """Move a robot to its post around a target at (0, 0); return its final angle and distance."""
         x, y, yaw = radius, 0.0, math.pi

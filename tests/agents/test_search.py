@@ -155,7 +155,7 @@ class MemoryTests(SynchronousTestCase):
         return walk
 
     def test_target_out_of_sight_is_remembered_for_a_while(self) -> None:
-        """A hidden target keeps its cost for ``MEMORY`` seconds, then the cost is removed."""
+        """A hidden target keeps its cost for ``TARGET_MEMORY_S`` seconds, then the cost is removed."""
         walk = self.found()
         walk.turned_off.add("camera")
         hidden = walk.now
@@ -188,13 +188,13 @@ class HiddenTests(SynchronousTestCase):
         return walk
 
     def test_report_stays_for_a_while(self) -> None:
-        """A target hidden by another robot keeps its cost for ``HIDDEN`` seconds, then the cost is removed."""
+        """A target hidden by another robot keeps its cost for ``HIDDEN_TARGET_MEMORY_S`` seconds, and then loses it."""
         walk = self.hidden()
-        began = walk.now
-        while walk.now - began < HIDDEN_TARGET_MEMORY_S - 0.5:
+        started_at = walk.now
+        while walk.now - started_at < HIDDEN_TARGET_MEMORY_S - 0.5:
             walk.live(walk.behaviour.hold)
             self.assertIsNotNone(walk.behaviour.cost)
-        while walk.now - began < HIDDEN_TARGET_MEMORY_S + 0.5:
+        while walk.now - started_at < HIDDEN_TARGET_MEMORY_S + 0.5:
             walk.live(walk.behaviour.hold)
         self.assertIsNone(walk.behaviour.cost)
 

@@ -19,7 +19,7 @@ from middleware.entangled.clock import HeapClock
 from middleware.tasks.order import PAUSE, RESUME, Order
 from middleware.tasks.task import COMPLETED, Member, Result, Task
 from tests.agents.state_table import PAGE, write_states
-from tests.agents.test_engagement import CONTACT, GO, Council, Dog, Recorder
+from tests.agents.test_engagement import CONTACT, GO, Dog, LeaseClientStub, Recorder
 
 S = State
 ME, OTHER = "1" * 40, "2" * 40
@@ -78,48 +78,54 @@ class TableTests(SynchronousTestCase):
 
 
 class Rig:
-    """An agent in a task with fakes of robot, council, other agent and clock; each input checks the invariants."""
+    """An agent in a task with stubs of robot, lease client, other agent and clock; each input checks the invariants."""
 
     def __init__(self) -> None:
         self.clock = HeapClock()
         self.events: list[str] = []
         self.dog = Dog()
-        self.ports = Recorder(self.events)
-        self.council = Council(self.clock, self.events)
-        self.lessee: Any = self.council
+        self.outputs = Recorder(self.events)
+        self.lease_client = LeaseClientStub(self.clock, self.events)
+        self.client: Any = self.lease_client
         self.others: list[Member] = []
         self.is_moving = self.is_late = self.has_left = False
         task = Task("t1", "find-target", "Find it", waiting_period=DEADLINE, deadline=DEADLINE, preemptible=True)
         me = Member(ME, "dog1", "")
-        self.engagement = Engagement(task, me, self.dog, Nearest(), self.ports, Reporters(ME), 0, 0.0)
+        self.engagement = Engagement(task, me, self.dog, Nearest(), self.outputs, Reporters(ME), 0, 0.0)
 
     @property
     def key(self) -> tuple[object, ...]:
         """The part of the state that determines the event of an input."""
-        one, council = self.engagement, self.council
+        one, client = self.engagement, self.lease_client
         held = (
             one.state_machine.state,
             one.lease_client is not None,
-            council.lease is not None,
+            client.lease is not None,
             self.has_left,
             self.is_moving,
         )
         if one.is_over or self.has_left:
             return held
-        asked = council.is_wanted, council.places[-1:] > [0], one.task_lease.is_lent, one.is_paused, self.is_late
+        asked = client.is_wanted, client.places[-1:] > [0], one.task_lease.is_lent, one.is_paused, self.is_late
         moves = one.state_machine.state is S.EXECUTING and (self.dog.is_safe, bool(one.task_lease.next_members))
         return (*held, *asked, moves, one.me.cost, *(other.cost for other in self.others))
 
     def feed(self, name: str) -> list[str]:
         """Apply one input, run a step, and return the faults that the invariants find."""
-        for past in (self.events, self.ports.told, self.ports.said, self.ports.accounts, self.dog.contexts):
+        for past in (
+            self.events,
+            self.outputs.reports,
+            self.outputs.log_lines,
+            self.outputs.decision_records,
+            self.dog.contexts,
+        ):
             past.clear()
         was_over = self.engagement.is_over
         now = self.clock.seconds()
         INPUTS[name](self, self.engagement, now)
         command = None if self.has_left else self.engagement.step(now)
         faults = self.faults(command)
-        if was_over and (command or self.events not in ([], ["released"]) or self.ports.told):
+        if was_over and (command or self.events not in ([], ["released"]) or self.outputs.reports):
             faults.append("something follows the outcome")
         if was_over and self.engagement.state_machine.state is not S.DONE:
             faults.append("the outcome does not stay")
@@ -132,16 +138,16 @@ class Rig:
             if event == "halted":
                 self.is_moving = False
             elif self.is_moving and (event == "released" or event.startswith("moved")):
-                faults.append("the lease is given back while the body moves")
-        lease = self.council.lease
+                faults.append("the lease is given back while the robot moves")
+        lease = self.lease_client.lease
         if command is not None and command.action == GO:
             self.is_moving = True
             if lease is None or (command.permit.token, command.permit.deadline) != (lease.token, lease.deadline):
-                faults.append("the body acts without a lease")
+                faults.append("the robot acts without a lease")
         elif self.is_moving and command is not None:
-            faults.append("the body is not stopped before it does something else")
+            faults.append("the robot is not stopped before it does something else")
         if self.is_moving and (lease is None or self.engagement.lease_client is None):
-            faults.append("the body moves on without a lease")
+            faults.append("the robot moves on without a lease")
         return faults
 
 
@@ -154,7 +160,7 @@ def hear(rig: Rig, one: Engagement, now: float, *others: Member) -> None:
 def take(rig: Rig, one: Engagement, now: float) -> None:
     """The agent gives its robot to the task."""
     if one.lease_client is None and not rig.has_left:
-        one.take_robot(rig.lessee, one.task_lease.token)
+        one.take_robot(rig.client, one.task_lease.token)
 
 
 def lend(rig: Rig, one: Engagement, now: float) -> None:
@@ -170,14 +176,14 @@ def finish(rig: Rig, one: Engagement, now: float) -> None:
 
 
 def grant(rig: Rig, one: Engagement, now: float) -> None:
-    """The council grants the lease if the agent wants it."""
-    if one.lease_client is not None and (rig.council.is_wanted or rig.council.places[-1:] > [0]):
-        rig.council.grant(one.task_lease.token + 1)
+    """The quorum grants the lease if the agent wants it."""
+    if one.lease_client is not None and (rig.lease_client.is_wanted or rig.lease_client.places[-1:] > [0]):
+        rig.lease_client.grant(one.task_lease.token + 1)
 
 
 def lose(rig: Rig, one: Engagement, now: float) -> None:
     """The lease expires, and the robot stops at its deadline."""
-    rig.council.token, rig.is_moving = 0, False
+    rig.lease_client.token, rig.is_moving = 0, False
 
 
 def leave(rig: Rig, one: Engagement, now: float) -> None:
@@ -189,7 +195,7 @@ def leave(rig: Rig, one: Engagement, now: float) -> None:
 def expire(rig: Rig, one: Engagement, now: float) -> None:
     """The task passes its deadline; a held lease is renewed."""
     rig.is_late = True
-    rig.council.deadline += DEADLINE
+    rig.lease_client.deadline += DEADLINE
     rig.clock.advance(DEADLINE + 1.0)
 
 

@@ -88,7 +88,7 @@ class Session:
     """One call of the command: runs the schedules, prints failures, and writes the logbook."""
 
     def __init__(self, args: argparse.Namespace, trim: Reduction) -> None:
-        self._wanted = args
+        self._args = args
         self._trim = trim
         self._began = time.monotonic()
         self._is_interrupted = False
@@ -96,20 +96,20 @@ class Session:
 
     def run(self, seeds: range) -> int:
         """Run all seeds; return 1 if one failed, or if none detected the seeded bug."""
-        wanted = self._wanted
+        args = self._args
         signal.signal(signal.SIGINT, self._interrupt)
-        if not wanted.log:
+        if not args.log:
             for _ in self._outcomes(seeds):
-                if wanted.bug and self._failed:
+                if args.bug and self._failed:
                     break
         else:
             self._log(seeds)
         say(f"{self._failed} of {self._ran} schedules failed, {time.monotonic() - self._began:.0f} s")
-        return int(bool(self._failed) != bool(wanted.bug))
+        return int(bool(self._failed) != bool(args.bug))
 
     def _outcomes(self, seeds: Sequence[int]) -> Iterator[Outcome]:
-        wanted = self._wanted
-        for outcome in run_all(seeds, wanted.jobs, (), wanted.bug, self._trim, wanted.scheduler):
+        args = self._args
+        for outcome in run_all(seeds, args.jobs, (), args.bug, self._trim, args.scheduler):
             self._ran += 1
             if outcome.found:
                 self._failed += 1
@@ -125,26 +125,26 @@ class Session:
 
     def _tell(self, outcome: Outcome) -> None:
         """Print the failure, and the line that replays its smallest variant."""
-        say(f"FAILED  {line(outcome.seed, self._trim, self._wanted.bug)}")
+        say(f"FAILED  {line(outcome.seed, self._trim, self._args.bug)}")
         say(f"        {outcome.title}")
         for violation in outcome.found[:6]:
             say(f"        {violation}")
-        if self._wanted.shrink > 0.0 and self._failed <= MOST_SHRUNK:
-            until = time.monotonic() + self._wanted.shrink
-            self._tell_least(outcome, least(outcome, self._wanted.bug, until_then(until), self._trim))
+        if self._args.shrink > 0.0 and self._failed <= MOST_SHRUNK:
+            until = time.monotonic() + self._args.shrink
+            self._tell_least(outcome, least(outcome, self._args.bug, until_then(until), self._trim))
 
     def _tell_least(self, whole: Outcome, left: Least) -> None:
-        say(f"LEAST   {line(whole.seed, left.trim, self._wanted.bug)}")
+        say(f"LEAST   {line(whole.seed, left.trim, self._args.bug)}")
         kept = whole.faults if left.trim.keep is None else len(left.trim.keep)
         say(f"        {kept} of {whole.faults} faults are left, after {left.runs} runs: {left.outcome.found[0]}")
 
     def _log(self, seeds: range) -> None:
         """Run the seeds in stretches, and log each one, also if it is interrupted."""
-        wanted, what = self._wanted, "+".join(self._trim.only)
-        text = Path(wanted.log).read_text(encoding="utf-8") if os.path.exists(wanted.log) else ""
-        logged = seed_log.parse_entries(text, wanted.log)
-        left = seed_log.find_missing(seeds, logged, what) if wanted.resume else list(seeds)
-        Path(wanted.log).open("ab").close()
+        args, what = self._args, "+".join(self._trim.only)
+        text = Path(args.log).read_text(encoding="utf-8") if os.path.exists(args.log) else ""
+        logged = seed_log.parse_entries(text, args.log)
+        left = seed_log.find_missing(seeds, logged, what) if args.resume else list(seeds)
+        Path(args.log).open("ab").close()
         say(f"{len(left)} of {len(seeds)} schedules, from seed {left[0]}" if left else "all are in the logbook")
         commit, outcomes = commit_of(Path(__file__).resolve().parents[2]), self._outcomes(left)
         for stretch in seed_log.split_ranges(left, STRETCH):
@@ -160,7 +160,7 @@ class Session:
                     date = time.strftime("%Y-%m-%dT%H:%M:%SZ", time.gmtime())
                     seconds = round(time.monotonic() - started_at, 1)
                     entry = seed_log.SeedRun(date, commit, what, stretch[0], ran, tuple(failures), seconds)
-                    seed_log.append_entry(wanted.log, entry)
+                    seed_log.append_entry(args.log, entry)
                     say(f"{self._ran} of {len(left)} schedules, {self._failed} failed; up to seed {stretch[ran - 1]}")
 
 

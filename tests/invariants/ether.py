@@ -31,7 +31,7 @@ OPERATOR = 0
 
 
 @dataclass
-class Weather:
+class NetworkConditions:
     """The delay of messages in seconds, and their rates of loss and duplication."""
 
     delay: float = 0.02
@@ -55,7 +55,7 @@ class Ether:
     def __init__(self, clock: HeapClock, rng: random.Random, n: int) -> None:
         self.clock = clock
         self.rng = rng
-        self.weather = Weather()
+        self.conditions = NetworkConditions()
         self.side: dict[int, int] = {}
         """Nodes with different numbers cannot reach each other."""
         self.replicas = [Replica() for _ in range(n + 1)]
@@ -70,11 +70,11 @@ class Ether:
         return self.side.get(one, 0) == self.side.get(other, 0)
 
     def send(self, source: int, target: int, deliver: Callable[[], None]) -> None:
-        """Send a message through the present weather."""
-        for _ in range(1 + (self.rng.random() < self.weather.duplicate)):
-            lost = self.rng.random() < self.weather.loss or not self.reaches(source, target)
+        """Send a message through the present conditions."""
+        for _ in range(1 + (self.rng.random() < self.conditions.duplicate)):
+            lost = self.rng.random() < self.conditions.loss or not self.reaches(source, target)
             if not lost:
-                self.clock.callLater(self.weather.delay * self.rng.uniform(0.2, 3.0), deliver)
+                self.clock.callLater(self.conditions.delay * self.rng.uniform(0.2, 3.0), deliver)
 
     def everywhere(self, source: int, change: Callable[[int], None]) -> None:
         """Apply a change at ``source`` at once, and at the others when the message arrives."""
@@ -211,7 +211,7 @@ class Ether:
             self._order(target, task_id, order)
 
 
-class Council:
+class ProposerStub:
     """A council of the operator's node alone, without changes."""
 
     def learn_charter(self, packed: bytes) -> None:
@@ -221,11 +221,11 @@ class Council:
         """Do nothing, as the member is always present."""
 
 
-class Lessee:
+class LeaseClientStub:
     """The lease client for a council at the operator's node."""
 
     TTL = 1.5
-    proposer = Council()
+    proposer = ProposerStub()
 
     def __init__(self, ether: Ether, place: int, task_id: str, changed: Callable[[], None], floor: int) -> None:
         self._ether, self._place, self._task_id, self._changed, self._floor = ether, place, task_id, changed, floor
@@ -283,7 +283,7 @@ class Lessee:
         is_mine = holder is not None and holder[1] == self.token and self.lease is not None
         if (
             self._reached()
-            and ether.rng.random() >= ether.weather.loss
+            and ether.rng.random() >= ether.conditions.loss
             and (holder is None or is_mine or holder[2] <= now)
         ):
             if not is_mine:
@@ -310,7 +310,7 @@ class Node:
         self.entangled = SimpleNamespace(get=self._get)
         self.find_contacts = lambda uuids: ()
         self.council_manager = SimpleNamespace(
-            make_proposer=lambda task: Council(), has_vacancy=lambda task, council: False
+            make_proposer=lambda task: ProposerStub(), has_vacancy=lambda task, council: False
         )
         self.stop_state = SimpleNamespace(
             subscribe=lambda listener: None, request_stops=lambda: None, is_motion_forbidden=False, is_known=True
@@ -356,14 +356,14 @@ class Node:
             conclude=lambda result, proof: ether.conclude(place, task_id, result),
         )
 
-    def make_lease_client(self, task: Task, changed: Callable[[], None], floor: int) -> Lessee:
+    def make_lease_client(self, task: Task, changed: Callable[[], None], floor: int) -> LeaseClientStub:
         """Return the lease client of a task."""
-        return Lessee(self.ether, self.place, task.task_id, changed, floor)
+        return LeaseClientStub(self.ether, self.place, task.task_id, changed, floor)
 
     def _get(self, key: bytes) -> Deferred[list[Record]]:
         """Return the records that the reachable nodes know, if these are a majority."""
         reached = [place for place in range(len(self.ether.replicas)) if self.ether.reaches(self.place, place)]
-        if 2 * len(reached) <= len(self.ether.replicas) or self.ether.rng.random() < self.ether.weather.loss:
+        if 2 * len(reached) <= len(self.ether.replicas) or self.ether.rng.random() < self.ether.conditions.loss:
             return fail(Unavailable(len(reached), len(self.ether.replicas)))
         tasks = self.ether.replicas[self.place].tasks
         task_id = next(name for name in tasks if group_key(name) == key)

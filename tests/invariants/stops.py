@@ -1,4 +1,4 @@
-"""Run random sequences of stops, releases, partitions, restarts and hostile messages on the halts of a small team.
+"""Run random sequences of stops, releases, partitions, restarts and hostile messages on the stops of a small team.
 
 The halts are the product's.  The network below them delays, repeats and loses messages, disks lose unwritten data, and
 replicas forget records and return old ones.  Checked after each step: once a robot's node has acknowledged a stop by an

@@ -25,7 +25,7 @@ from sim.team.checker import find_violations
 from sim.team.event import ActiveTasks, Born, Decided, Died, FaultFree, OpenTask, OutcomeExpired, OutcomeStored, Report
 from sim.team.history import History
 from sim.team.reduction import NO_REDUCTION, Reduction
-from tests.invariants.ether import OPERATOR, Ether, Lessee, Node, Weather
+from tests.invariants.ether import OPERATOR, Ether, LeaseClientStub, NetworkConditions, Node
 from tests.invariants.walk import Robot, restarted
 
 STEP = 0.25
@@ -55,7 +55,7 @@ class Tasks:
         self._acting: dict[str, tuple[int, int]] = {}
         self._acknowledged: dict[str, tuple[Result, float]] = {}
         if self.is_calm:
-            self.history.record(FaultFree, HEARD + Lessee.TTL)
+            self.history.record(FaultFree, HEARD + LeaseClientStub.TTL)
         for place in range(1, self.n + 1):
             self.birth(place)
 
@@ -66,7 +66,9 @@ class Tasks:
                 delay, loss, double = (
                     self.rng.choice(some) for some in ([0.005, 0.05, 0.15], [0.0, 0.1, 0.3], [0.0, 0.2])
                 )
-                self.ether.weather = Weather(delay) if self._trim.calm else Weather(delay, loss, double)
+                self.ether.conditions = (
+                    NetworkConditions(delay) if self._trim.calm else NetworkConditions(delay, loss, double)
+                )
             while self.clock.seconds() < self.seconds:
                 self.step()
                 self.live(STEP)
@@ -173,7 +175,7 @@ class Tasks:
 
     def heal(self) -> None:
         """End all faults and restart absent agents."""
-        self.ether.weather, self.ether.side = Weather(), {}
+        self.ether.conditions, self.ether.side = NetworkConditions(), {}
         for place in range(1, self.n + 1):
             if place not in self.agents:
                 self.birth(place)

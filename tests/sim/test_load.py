@@ -29,9 +29,9 @@ def played(text: str, seed: int = 1) -> tuple[Outcome, dict[str, Metric]]:
     return outcome, {metric.name: metric for metric in outcome.metrics}
 
 
-class CensusTests(SynchronousTestCase):
+class NodeIdIndexTests(SynchronousTestCase):
     def test_closest(self) -> None:
-        """``closest`` matches a search of all living nodes after random joins and deaths."""
+        """``find_closest`` matches a search of all living nodes after random joins and deaths."""
         rng, census, living = random.Random(1), NodeIdIndex(), set()
         for _ in range(300):
             born = rng.randbytes(20)
@@ -49,7 +49,7 @@ class CensusTests(SynchronousTestCase):
         self.assertEqual(len(census), len(living))
 
 
-class PaceTests(SynchronousTestCase):
+class PacerTests(SynchronousTestCase):
     def test_due(self) -> None:
         """The due count follows the rate at any polling interval, up to the total count."""
         clock = HeapClock()

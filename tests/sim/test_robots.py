@@ -26,7 +26,7 @@ from sim.robots.simulator import RobotSimulator
 from sim.robots.world import TICK_S
 
 
-class YardCase(SynchronousTestCase):
+class SimulatorCase(SynchronousTestCase):
     """A running simulator in virtual time."""
 
     def setUp(self) -> None:
@@ -40,11 +40,11 @@ class YardCase(SynchronousTestCase):
             self.clock.advance(TICK_S)
 
 
-class DogBodyTests(YardCase):
-    """``DogBody`` moves a lent dog and reads its sensors."""
+class SimulatedDogTests(SimulatorCase):
+    """``SimulatedDog`` moves a lent dog and reads its sensors."""
 
     def lent(self, limits: Any = LIMITS) -> SimulatedDog:
-        """Return the body of dog1, which faces the middle of the map."""
+        """Return the emulated robot of dog1, which faces the middle of the map."""
         return self.yard.reserve_for_emulator("dog1", limits)
 
     def test_moves_as_fast_as_its_kind(self) -> None:
@@ -88,7 +88,7 @@ class DogBodyTests(YardCase):
         self.assertEqual(read_size(body.picture(True) or b""), (104, 80))
 
 
-class RobotsTests(YardCase):
+class RobotsTests(SimulatorCase):
     """The table of robots is validated, and each dog accepts one kind of connection only."""
 
     def test_lent_dog_has_no_other_driver(self) -> None:

@@ -50,7 +50,7 @@ class TheoryTests(SynchronousTestCase):
         self.assertTrue(theory.agreement(100) < theory.agreement(200) < theory.agreement(300))
 
 
-class RecordTests(SynchronousTestCase):
+class MeasurementFileTests(SynchronousTestCase):
     def test_resumed(self) -> None:
         """A size that is in the file is not measured again; a file with other settings is not overwritten."""
         out = self.mktemp()
@@ -143,7 +143,7 @@ class PageTests(SynchronousTestCase):
         self.assertIn("| 0.7 | **0.7** | 0.7 | 0.7 | <= 1; <= 0.6 at 100, <= 0.8 at 1,000 |", shown)
 
 
-class SurveyTests(SynchronousTestCase):
+class MeasurementTests(SynchronousTestCase):
     def test_ends_soon(self) -> None:
         """A survey that is interrupted ends at the next check, within 0.25 s of simulated time."""
         looks: list[int] = []

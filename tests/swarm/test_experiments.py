@@ -300,7 +300,7 @@ class MembershipTests(TeamCase):
         self.assertTrue(killed)
 
 
-class WeatherTests(TeamCase):
+class LinkConditionTests(TeamCase):
     def test_loss_of_a_fifth_still_completes(self) -> None:
         """With 20 % packet loss the team finds the target, and one dog reaches it."""
         team = self.start_team(2, loss=0.2)

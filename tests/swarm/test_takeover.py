@@ -61,7 +61,7 @@ class TakeoverTests(TeamCase):
         return going()[0]
 
 
-class JudgeTests(SynchronousTestCase):
+class TakeoverObserverTests(SynchronousTestCase):
     def judge(self, cause: Cause = Cause.CRASH) -> TakeoverObserver:
         """Return a judge for the loss of dog1 at 100 s, with a limit of 25 s and 1 s of observation after the end."""
         return TakeoverObserver(cause, 1, "dog1", 100.0, random.Random(1), 25.0, 1.0)

@@ -43,7 +43,7 @@ class Readings:
 
     @property
     def ranges(self) -> Floats:
-        """Metres from the centre along each ray, counter-clockwise from straight ahead; ``REACH`` for nothing."""
+        """Metres from the centre along each ray, counter-clockwise from ahead; ``RAY_LENGTH_M`` if nothing is hit."""
         return self._crowd.ranges[self._own]
 
     def read_scent(self) -> tuple[Floats, Floats]:
@@ -66,7 +66,7 @@ class Readings:
         distance = bearing.copy()
         if target is not None:
             dx, dy = target.x - crowd.x, target.y - crowd.y
-            # A robot that hides the target from one within ``SIGHT`` is nearer, so it is in this set as well.
+            # A robot that hides the target from one within ``SIGHT_M`` is nearer, so it is in this set as well.
             near = np.flatnonzero(dx * dx + dy * dy < SIGHT_M * SIGHT_M)
             dx, dy = dx[near], dy[near]
             far, towards = np.hypot(dx, dy), np.arctan2(dy, dx)

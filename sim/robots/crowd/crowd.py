@@ -38,7 +38,7 @@ class Crowd:
     """The robots of ``scene``, numbered from 0; ``seed`` determines their initial positions.
 
     ``x y heading`` are their poses, ``vx vy wz`` their velocities in the world's frame, ``ax ay`` their accelerations
-    in the last step, ``wish`` their commanded velocities (forward, left, turn), ``ranges`` the length of each ray.
+    in the last step, ``commands`` their commanded velocities (forward, left, turn), ``ranges`` the length of each ray.
     """
 
     def __init__(self, seed: int, scene: CrowdScene) -> None:
@@ -61,7 +61,7 @@ class Crowd:
         return self.ticks * TICK_S
 
     def step(self) -> None:
-        """Simulate ``TICK`` seconds."""
+        """Simulate ``TICK_S`` seconds."""
         before_x, before_y, before_vx, before_vy = self.x, self.y, self.vx, self.vy
         self._accelerate()
         self.x, self.y = self.x + self.vx * TICK_S, self.y + self.vy * TICK_S
@@ -133,7 +133,7 @@ class Crowd:
         return max(0.0, 2 * FOOTPRINT_RADIUS_M - float(gaps.min(initial=math.inf)))
 
     def _accelerate(self) -> None:
-        """Accelerate all robots towards their commands for one step, as ``Dog.strive`` does for one robot."""
+        """Accelerate all robots towards their commands for one step, as ``Dog.accelerate`` does for one robot."""
         forward, left, turn = (np.clip(self.commands[:, n], low, high) for n, (low, high) in enumerate(_SPANS))
         cos, sin = np.cos(self.heading), np.sin(self.heading)
         error_x, error_y = cos * forward - sin * left - self.vx, sin * forward + cos * left - self.vy

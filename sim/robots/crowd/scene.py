@@ -52,7 +52,8 @@ class CrowdScene:
         if places < self.robots:
             side = math.ceil(10 * CELL_M * math.ceil(math.sqrt(self.robots))) / 10
             raise SceneError(
-                f"{self.robots} robots of {200 * FOOTPRINT_RADIUS_M:.0f} cm do not fit into {self.width:g} x {self.height:g} m: "
+                f"{self.robots} robots of {200 * FOOTPRINT_RADIUS_M:.0f} cm do not fit into"
+                f" {self.width:g} x {self.height:g} m: "
                 f"there is room for {places}; use at most {places} robots, or {side:g} x {side:g} m"
             )
 

@@ -52,7 +52,7 @@ class CrowdSensors:
         self._moving: list[bool] = [False] * count
 
     def sample(self) -> None:
-        """Take a sample, ``TICK`` seconds after the previous one."""
+        """Take a sample, ``TICK_S`` seconds after the previous one."""
         crowd, first = self._crowd, slice(0, len(self._power))
         heading, wz = crowd.heading[first], crowd.wz[first]
         cos, sin = np.cos(heading), np.sin(heading)

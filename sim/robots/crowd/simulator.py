@@ -30,8 +30,8 @@ class CrowdSimulator(PacedSimulator):
     """A simulator of many robots, on ``scene``.
 
     The first ``driven`` robots, ``robot1`` and so on, obey drivers and stand still without one; ``controller`` moves
-    the others.  ``stopwatch`` measures the time spent in ``moving`` robots and in ``telling`` drivers the sensor
-    values.
+    the others.  ``stopwatch`` measures the time spent in moving robots (``moving_s``) and in sending drivers
+    (``reporting_s``) the sensor values.
     """
 
     def __init__(

@@ -102,6 +102,6 @@ class _Camera(DatagramProtocol):
 
 def serve(reactor: Any, body: SimulatedRobot, rng: random.Random, options: Table, dialect: str) -> EmulatorServer:
     """Return the server of an AIBO; ``dialect`` is its version of Tekkotsu, "T4" or "T2"."""
-    chosen = parse_options(options)
-    dog = AiboEmulator(reactor, body, rng, dialect, dict(chosen.ports) | {"gains": 0})
-    return AiboServer(reactor, dog, chosen.host)
+    args = parse_options(options)
+    dog = AiboEmulator(reactor, body, rng, dialect, dict(args.ports) | {"gains": 0})
+    return AiboServer(reactor, dog, args.host)

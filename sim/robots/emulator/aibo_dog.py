@@ -35,7 +35,7 @@ EMULATED_PORTS = {**PORTS, "gains": 10032}
 
 
 class AiboEmulator:
-    """One emulated dog; ``accept`` takes its TCP links, ``datagram`` its UDP datagrams.
+    """One emulated dog; ``accept`` takes its TCP links, ``on_datagram`` its UDP datagrams.
 
     ``on_ports`` is notified when the listening ports may have changed, for a server on real sockets.
     """
@@ -309,7 +309,7 @@ class MemoryPorts:
         self._ports: dict[int, _MemoryPort] = {}
 
     def connect(self, host: str, port: int, caller: Any) -> Any:
-        """Keep ``caller`` connected, with back-off, until ``hang_up``."""
+        """Keep ``caller`` connected, with back-off, until ``disconnect``."""
         if port not in self._ports:
             self._ports[port] = _MemoryPort(self._clock, self, port, self._delay)
         return self._ports[port].connect(host, port, caller)

@@ -42,8 +42,8 @@ UNSUPPORTED_TOKENS = frozenset("csa!")
 class Bittle:
     """One dog; ``accept`` is its serial port, ``accept_http`` its web server.
 
-    ``faults`` corrupts its output; with ``resets`` opening the port restarts the board, as with most boards.  ``heard``
-    are the received commands in order.
+    ``faults`` corrupts its output; with ``resets`` opening the port restarts the board, as with most boards.
+    ``received_commands`` are the received commands in order.
     """
 
     def __init__(
@@ -312,9 +312,9 @@ class BittlePage:
 
 def serve(reactor: Any, body: SimulatedRobot, rng: random.Random, options: Table, dialect: str) -> EmulatorServer:
     """Return the server of a Bittle: a pseudo-terminal, or HTTP."""
-    chosen = parse_options(options)
-    board = "biboard" if chosen.board == "auto" else chosen.board
-    dog = Bittle(body, reactor, rng, board=board, gaits=dict(chosen.gaits))
-    if chosen.port:
-        return PtyEmulatorServer(reactor, dog, chosen.port)
-    return TcpEmulatorServer(reactor, dog, dog.accept_http, chosen.host, chosen.http_port)
+    args = parse_options(options)
+    board = "biboard" if args.board == "auto" else args.board
+    dog = Bittle(body, reactor, rng, board=board, gaits=dict(args.gaits))
+    if args.port:
+        return PtyEmulatorServer(reactor, dog, args.port)
+    return TcpEmulatorServer(reactor, dog, dog.accept_http, args.host, args.http_port)

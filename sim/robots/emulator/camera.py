@@ -83,9 +83,9 @@ class MjpegCamera(Broadcast[_Client]):
 
 def serve(reactor: Any, body: SimulatedRobot, rng: random.Random, options: Table, dialect: str) -> EmulatorServer:
     """Return the server of a camera; raise ``UsageError`` if ``options`` have no url."""
-    chosen = parse_options(options)
-    if not chosen.url:
+    args = parse_options(options)
+    if not args.url:
         raise UsageError('an emulated camera needs the option url, as in url = "http://127.0.0.1:8081/"')
-    place = parse_url(chosen.url)
+    place = parse_url(args.url)
     camera = MjpegCamera(reactor, body, float(options.get("fps", 15.0)))
     return TcpEmulatorServer(reactor, camera, camera.accept, place.host, place.port)

@@ -50,8 +50,8 @@ class NmeaCompass(Broadcast[Client]):
 
 def serve(reactor: Any, body: SimulatedRobot, rng: random.Random, options: Table, dialect: str) -> EmulatorServer:
     """Return the server of a compass: a pseudo-terminal, or TCP."""
-    chosen = parse_options(options)
+    args = parse_options(options)
     compass = NmeaCompass(reactor, body)
-    if chosen.device:
-        return PtyEmulatorServer(reactor, compass, chosen.device)
-    return TcpEmulatorServer(reactor, compass, compass.accept, chosen.host, chosen.port)
+    if args.device:
+        return PtyEmulatorServer(reactor, compass, args.device)
+    return TcpEmulatorServer(reactor, compass, compass.accept, args.host, args.port)

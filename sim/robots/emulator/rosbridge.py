@@ -46,7 +46,7 @@ class RosbridgeRobot:
     """One robot; ``accept`` is called by a listening port or a ``MemoryConnector``.
 
     ``velocity_type`` is the type of ``/cmd_vel``; messages of another type are silently ignored, as in ROS.
-    ``has_rosapi`` enables the query of that type, which takes ``rosapi_s`` seconds; ``ignored`` counts ignored
+    ``has_rosapi`` enables the query of that type, which takes ``rosapi_s`` seconds; ``ignored_count`` counts ignored
     messages.
     """
 
@@ -321,6 +321,6 @@ def _read_number(value: object, default: float = 0.0) -> float:
 
 def serve(reactor: Any, body: SimulatedRobot, rng: random.Random, options: Table, dialect: str) -> EmulatorServer:
     """Return the server of a rosbridge."""
-    chosen = parse_options(options)
+    args = parse_options(options)
     robot = RosbridgeRobot(reactor, body, rng)
-    return TcpEmulatorServer(reactor, robot, robot.accept, chosen.host, chosen.port)
+    return TcpEmulatorServer(reactor, robot, robot.accept, args.host, args.port)

@@ -1,4 +1,4 @@
-"""The interface through which emulators move and sense, for simulated dogs, and ``MemoryBody`` for tests."""
+"""The interface through which emulators move and sense, for simulated dogs, and ``MemoryRobot`` for tests."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ class SimulatedRobot(Protocol):
 
 @dataclass
 class MemoryRobot:
-    """A simulated robot on an endless floor; ``pass_time`` moves it exactly as commanded."""
+    """A simulated robot on an endless floor; ``advance`` moves it exactly as commanded."""
 
     x: float = 0.0
     y: float = 0.0

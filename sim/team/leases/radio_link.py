@@ -1,4 +1,4 @@
-"""A radio link with losses, delays, duplicates and reordering (``switchboard.Link``)."""
+"""A radio link with losses, delays, duplicates and reordering (``switchboard.LinkModel``)."""
 
 from __future__ import annotations
 

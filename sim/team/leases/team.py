@@ -1,6 +1,7 @@
 """Places with machines, acceptors, agents and devices on a simulated link, for schedules and trials of leases.
 
-``Bidder`` is one life of a place, ``LeaseTeam`` all places, ``Referee`` records the events for the checker (E1 to E9).
+``LeaseNode`` is one life of a place, ``LeaseTeam`` all places, ``LeaseRecorder`` records the events for the checker (E1
+to E9).
 """
 
 from __future__ import annotations

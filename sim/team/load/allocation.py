@@ -45,7 +45,8 @@ class TaskAllocation:
 
     All bid within ``spread`` seconds; with ``claims`` they also claim the lease, otherwise the contest ends with the
     decision.  ``began_at`` is the time of the first bid, ``held_at`` the time at which the lease was first held;
-    ``overlaps`` counts leases won while another agent held the lease; ``trouble`` says why the contest did not start.
+    ``overlaps`` counts leases won while another agent held the lease; ``start_failure`` says why the contest did not
+    start.
     """
 
     def __init__(

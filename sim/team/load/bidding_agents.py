@@ -36,7 +36,7 @@ BID_PREFIX, SEARCHED_BYTES = b"bid.", 64
 
 
 class CountingEndpoint:
-    """An ``auctions.Wire`` over ``endpoint`` that counts the datagrams of bidding, ``sent`` and ``received``.
+    """A ``RequestSender`` over ``endpoint`` that counts the datagrams of bidding, ``sent`` and ``received``.
 
     Nodes also send heartbeats, pings and answers, often in step, so the total traffic does not show the cost of an
     auction.
@@ -104,13 +104,13 @@ class BiddingServices:
 
     @cached_property
     def council_manager(self) -> CouncilManager:
-        """The councils of tasks, as ``SwarmNode.councils``; a reconfiguration is not recorded."""
+        """The councils of tasks, as ``SwarmNode.council_manager``; a reconfiguration is not recorded."""
         seen = self._node.store, self._clock, self._rng, self._born_at
         return CouncilManager(self._node, *seen, moved=lambda task: None, may_sit=lambda public: True)
 
     @cached_property
     def auction_service(self) -> AuctionService:
-        """The dissemination of bids, as ``SwarmNode.dissemination``."""
+        """The auctions of the node, as ``SwarmNode.auction_service``."""
         node = self._node
 
         def size() -> int:
@@ -131,7 +131,7 @@ class BiddingServices:
 
 
 class BiddingAgent:
-    """The bidding and claiming part of the agent of one place, for one life of its ``node``; ``tally`` counts."""
+    """The bidding and claiming part of the agent of one place, for one life of its ``node``; ``counter`` counts."""
 
     def __init__(self, place: int, node: Node, clock: IReactorTime, rng: random.Random) -> None:
         self.place = place
@@ -187,7 +187,7 @@ class BiddingAgent:
 
 
 class BiddingAgents:
-    """The deputies of a team (``deputies_of``), made as nodes are born."""
+    """The agents of a team (``get_bidding_agents``), made as nodes are born."""
 
     def __init__(self, team: Team) -> None:
         self._clock = team.clock

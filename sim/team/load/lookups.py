@@ -4,8 +4,8 @@ As in the studies with which results are compared (Li et al., INFOCOM 2005), the
 lives and has joined, and a lookup succeeds if that node is the first of the result within the time limit.  If the
 searching node or the target dies meanwhile, the trial is void.
 
-``seconds`` count until the whole result is available, the k closest; ``reached`` until the target itself has answered,
-as in those studies.
+``seconds`` count until the whole result is available, the k closest; ``reach_times`` until the target itself has
+answered, as in those studies.
 
 In a quiet network, random keys are looked up in addition: the result is exact if it has the k closest of all living
 nodes in their order (invariant D6).
@@ -146,7 +146,7 @@ class Lookups(ClientWorkload):
         else:
             self.found += 1
             self.seconds.append(took)
-            # The target answered this lookup, or was heard up to a tenth of a second before (``overlay.FRESH``).
+            # The target answered this lookup, or sent a datagram up to ``overlay.RECORD_INTERVAL_S`` before.
             self.reach_times.append(took - min(took, trial.life.overlay.silence(contacts[0])))
             looked = next((one for one in reversed(trial.life.overlay.lookups) if one.key == trial.target), None)
             if looked is not None:

@@ -81,7 +81,8 @@ class Tasks(ClientWorkload):
         """Return tasks without a holder, and tasks held by two agents at once (E2)."""
         found = [f"E2: two held {c.task.task_id} at once" for c in self._allocations if c.overlaps]
         found += [
-            f"{allocation.task.task_id} is held by {held} agents{': ' if allocation.start_failure else ''}{allocation.start_failure}"
+            f"{allocation.task.task_id} is held by {held} agents"
+            + (f": {allocation.start_failure}" if allocation.start_failure else "")
             for allocation, held in zip(self._allocations, self._counted, strict=False)
             if held != 1 and allocation.list_present()
         ]

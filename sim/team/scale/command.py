@@ -28,7 +28,7 @@ Measure = Callable[[int, SurveySettings, ProgressCallbacks], SizeResult]
 
 
 def measure_in_fork(nodes: int, settings: SurveySettings, watcher: ProgressCallbacks) -> SizeResult:
-    """Measure a team of that size in a separate process; raises ``Ended``.
+    """Measure a team of that size in a separate process; raises ``MeasurementStopped``.
 
     Memory freed by one team would otherwise be reused for the next one, which would then seem to need less.
     """
@@ -42,13 +42,13 @@ def run_scale(arguments: Sequence[str], world: Environment, measure: Measure = m
 
     Raises ``BadSetting``.
     """
-    wanted = _parse_arguments(arguments)
-    sizes = _parse_sizes(wanted.nodes)
-    out = Path(wanted.out)
-    for key, value in (("--takeovers", wanted.takeovers), ("--swarm-most", wanted.swarm_most)):
+    args = _parse_arguments(arguments)
+    sizes = _parse_sizes(args.nodes)
+    out = Path(args.out)
+    for key, value in (("--takeovers", args.takeovers), ("--swarm-most", args.swarm_most)):
         if value < 0:
             raise BadSetting("command line", key, f"must be 0 or more, is {value}", f"write {key} 100")
-    settings = SurveySettings(seed=wanted.seed, takeovers=wanted.takeovers, swarm_most=wanted.swarm_most)
+    settings = SurveySettings(seed=args.seed, takeovers=args.takeovers, swarm_most=args.swarm_most)
     record = MeasurementFile(out / "scale.json", settings)
     record.prepare()
     record.read()

@@ -12,7 +12,7 @@ from sim.team.scale.theory import Published, Theory
 
 @dataclass(frozen=True)
 class Curve:
-    """``figure`` under ``title`` in ``unit``; ``bound`` is its target, and ``at`` has other targets for some sizes."""
+    """``metric`` under ``title`` in ``unit``; ``bound`` is its target, ``bounds_by_size`` has other ones."""
 
     metric: str
     title: str

@@ -82,9 +82,10 @@ def _draw_plot(curve: Curve, points: Points) -> str:
         path = " ".join(f"{across.to_pixel(n):.1f},{up.to_pixel(value):.1f}" for n, value in some)
         return f'<polyline points="{path}" fill="none" stroke="{colour}" stroke-width="1.6"{dash}/>'
 
+    unit = f"{curve.unit} · {curve.theory_label}" if curve.theory_label else curve.unit
     parts = [
         f'<text x="8" y="14" font-weight="bold">{escape(curve.title)}</text>',
-        f'<text x="8" y="28" fill="#444">{escape(curve.unit)}{escape(" · " + curve.theory_label if curve.theory_label else "")}</text>',
+        f'<text x="8" y="28" fill="#444">{escape(unit)}</text>',
         f'<path d="M{LEFT} {TOP}V{HIGH - BOTTOM}H{WIDE - RIGHT}" fill="none" stroke="#333"/>',
     ]
     for n in (3, 10, 30, 100, 300, 1000, 3000, 10_000):
@@ -101,14 +102,16 @@ def _draw_plot(curve: Curve, points: Points) -> str:
     for n, value in points:
         y = up.to_pixel(value)
         parts.append(
-            f'<circle cx="{across.to_pixel(n):.1f}" cy="{y:.1f}" r="3" fill="{OURS}"><title>{format_number(value)}</title></circle>'
+            f'<circle cx="{across.to_pixel(n):.1f}" cy="{y:.1f}" r="3" fill="{OURS}">'
+            f"<title>{format_number(value)}</title></circle>"
         )
     for number, one in enumerate(curve.published):
         x, y = across.to_pixel(one.nodes), up.to_pixel(one.value)
         parts.append(f'<circle cx="{x:.1f}" cy="{y:.1f}" r="3.5" fill="{OTHERS}"/>')
         at = HIGH - 18 + 12 * number
         parts.append(
-            f'<text x="8" y="{at}" fill="{OTHERS}">{format_number(one.value)} at {one.nodes:,}: {escape(one.source)}</text>'
+            f'<text x="8" y="{at}" fill="{OTHERS}">'
+            f"{format_number(one.value)} at {one.nodes:,}: {escape(one.source)}</text>"
         )
     return "\n".join(parts)
 

@@ -89,7 +89,7 @@ class ProgressCallbacks:
 
 
 def measure_size(nodes: int, settings: SurveySettings, watcher: ProgressCallbacks = ProgressCallbacks()) -> SizeResult:  # noqa: B008  (never changed)
-    """Measure a team of that size; raises ``Ended``."""
+    """Measure a team of that size; raises ``MeasurementStopped``."""
     return SizeMeasurement(nodes, settings, watcher).run()
 
 
@@ -105,7 +105,7 @@ class SizeMeasurement:
         self._scenario = Scenario(nodes=nodes, join=join, link=LinkSettings("internet"), step=STEP_S)
 
     def run(self) -> SizeResult:
-        """Measure all figures; raises ``Ended``."""
+        """Measure all figures; raises ``MeasurementStopped``."""
         started_at, sized = time.process_time(), self._result
         hashes = [self._measure_lookups(), self._measure_auctions()]
         if self._nodes <= self._settings.swarm_most:

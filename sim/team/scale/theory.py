@@ -15,7 +15,7 @@ Theory = Callable[[float], float]
 
 
 class Published(NamedTuple):
-    """A published value: ``value`` at ``nodes`` nodes, by ``who``."""
+    """A published value: ``value`` at ``nodes`` nodes, by ``source``."""
 
     nodes: int
     value: float

@@ -1,4 +1,4 @@
-"""Tests of ``sim.robots.crowd.crowd`` and ``ground``: collisions, placement, controllers and reproducibility."""
+"""Tests of ``sim.robots.crowd.crowd`` and ``scene``: collisions, placement, controllers and reproducibility."""
 
 from __future__ import annotations
 
@@ -96,7 +96,7 @@ class CrowdTests(SynchronousTestCase):
         self.assertRaises(NotPossible, full.place_target_at_random)
 
 
-class GroundTests(SynchronousTestCase):
+class CrowdSceneTests(SynchronousTestCase):
     def test_too_small_is_refused_with_the_remedy(self) -> None:
         """The error for a map that is too small names the number of robots that fit and a size that is large enough."""
         error = self.assertRaises(SceneError, CrowdScene, 1000, 5.0, 5.0)

@@ -73,7 +73,7 @@ class ExperimentTests(SynchronousTestCase):
             self.assertEqual(list(row["checks"].values()), [check.is_met for check in run.list_checks()])
 
     def test_who_is_killed(self) -> None:
-        """``look`` names the moving dog once, 0.1 m nearer or half way; never in experiment 1 or if it is gone."""
+        """``update`` names the moving dog once, 0.1 m nearer or half way; never in experiment 1 or if it is gone."""
         gone = state("EXECUTING", gone=1.0, dog1="EXECUTING")
         for kills, seen, ways, named in (
             (True, RUNS, (1.05, 1.0, 0.94, 0.85), ["", "", "dog1", ""]),
@@ -114,7 +114,7 @@ class ExperimentTests(SynchronousTestCase):
         self.assertEqual(measure_distances(snapshot(-2.0)), {"dog1": 2.0})
 
 
-class StoryTests(SynchronousTestCase):
+class StateChangesTests(SynchronousTestCase):
     """Log lines describe the changes between two states of the page."""
 
     def test_told(self) -> None:
@@ -207,7 +207,7 @@ class ConfigurationTests(SynchronousTestCase):
 
 
 class EventStreamTests(SynchronousTestCase):
-    """``EventStream`` parses server-sent events."""
+    """``EventParser`` parses server-sent events."""
 
     WIRE = b'event: state\r\ndata: {"a":\r\ndata: 1}\r\n\r\n: heartbeat\n\nevent: other\ndata:x\n\ndata: y\n\n'
 
@@ -226,7 +226,7 @@ class EventStreamTests(SynchronousTestCase):
         self.assertEqual(stream.feed(b"\n\ndata: y\n\n"), [("message", b"y")])
 
 
-class StageTests(SynchronousTestCase):
+class PreparationTests(SynchronousTestCase):
     """Ports are free, and only run folders of the demonstration are emptied."""
 
     def setUp(self) -> None:

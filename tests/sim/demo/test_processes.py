@@ -60,7 +60,7 @@ class MemoryProcesses(Clock):
 
 
 class TeamTests(SynchronousTestCase):
-    """``Team`` starts, logs, kills, restarts and ends processes."""
+    """``ProcessGroup`` starts, logs, kills, restarts and ends processes."""
 
     def setUp(self) -> None:
         self.folder = Path(self.mktemp())

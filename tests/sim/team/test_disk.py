@@ -20,7 +20,7 @@ def _record(name: str, sequence: int = 1, lifetime: Lifetime = "team") -> Record
 
 
 class DiskTests(SynchronousTestCase):
-    """Tests of ``Disk``."""
+    """Tests of ``SimulatedDisk``."""
 
     def setUp(self) -> None:
         """Create an empty disk."""
@@ -34,7 +34,7 @@ class DiskTests(SynchronousTestCase):
         return restore_store(self.disk, SimulatedDisk(self.clock, random.Random(2)), self.clock.seconds())
 
     def test_last_moment_goes_with_the_power(self) -> None:
-        """Records that ``written`` confirmed survive a power loss; unconfirmed records and leases do not."""
+        """Records that ``wait_for_write`` confirmed survive a power loss; unconfirmed records and leases do not."""
         self.disk.put(_record("safe"), 60.0)
         self.disk.put(_record("lease", lifetime="leased"), 60.0)
         self.disk.set_note("fact", b"1")

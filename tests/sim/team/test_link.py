@@ -80,7 +80,7 @@ class TeamLinkTests(SynchronousTestCase):
         self.assertApproximates(link.draw_delays(A, B, 100, 10.0, random.Random(1))[0], 0.1, 1e-9)
 
     def test_bad_weather_is_lost_besides(self) -> None:
-        """``worse`` adds loss while it is set."""
+        """``extra_loss`` adds loss while it is set."""
         link = TeamLink(LinkSettings("lan"), "1")
         link.extra_loss = 0.5
         self.assertApproximates(sum(not delays for delays in _sent(link, 4000)) / 4000, 0.5, 0.03)
@@ -92,7 +92,7 @@ class BarrierTests(SynchronousTestCase):
     """Barriers block datagrams between nodes."""
 
     def test_each_kind_stops_what_it_should(self) -> None:
-        """``cut`` blocks both directions at the edge of a group, ``deaf`` and ``mute`` one, ``clog`` one host."""
+        """``isolate`` blocks both directions of a group, ``block_incoming``/``outgoing`` one, ``block_host`` a host."""
         table = {
             isolate([A.host, B.host]): {(A, C), (C, A), (B, C), (C, B)},
             block_incoming([A.host, B.host]): {(C, A), (C, B)},

@@ -98,7 +98,7 @@ class MachineTests(SynchronousTestCase):
             self.assertEqual(machine.to_unsuspended_time(shown), shown / 2.0)
 
     def test_buffer_holds_so_many_datagrams(self) -> None:
-        """A frozen machine buffers the first ``MOST_WAITING`` datagrams and drops the rest."""
+        """A frozen machine buffers the first ``MAX_QUEUED_DATAGRAMS`` datagrams and drops the rest."""
         machine = Machine(self.world)
         machine.freeze()
         for number in range(MAX_QUEUED_DATAGRAMS + 50):

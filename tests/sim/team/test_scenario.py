@@ -184,8 +184,8 @@ class ScenarioTests(SynchronousTestCase):
         self.assertIn("cannot be read", self.assertRaises(BadSetting, load_scenario, "/nowhere/x.toml", {}).problem)
 
 
-class SessionTests(SynchronousTestCase):
-    """Tests of ``Session``."""
+class DurationDistributionTests(SynchronousTestCase):
+    """Tests of ``DurationDistribution``."""
 
     def test_half_of_them_are_shorter_than_the_median(self) -> None:
         """Random durations have the expected median and mean."""
