@@ -131,17 +131,17 @@ def packed(picture: Picture) -> bytes:
 
 def quiet(photographer: Photographer, demo: Demonstration) -> None:
     """Take pictures before the first task."""
-    desk, phone = photographer.opened(DESK), photographer.opened(PHONE)
-    desk.locator("figure[data-camera=live]").nth(2).wait_for()
-    photographer.take(desk, "devices")
+    desktop, phone = photographer.opened(DESK), photographer.opened(PHONE)
+    desktop.locator("figure[data-camera=live]").nth(2).wait_for()
+    photographer.take(desktop, "devices")
     photographer.view(phone, "tasks")
     phone.locator("#group").fill("yard")
     phone.locator("[data-can=with]").wait_for()
     phone.locator("#h-tasks").click()
     photographer.take(phone, "assign-phone")
-    door = photographer.opened(PHONE, address=demo.url)
-    door.locator("#signin-code").wait_for()
-    photographer.take(door, "signin-phone")
+    signin = photographer.opened(PHONE, address=demo.url)
+    signin.locator("#signin-code").wait_for()
+    photographer.take(signin, "signin-phone")
 
 
 def running(photographer: Photographer) -> None:
@@ -168,21 +168,21 @@ def running(photographer: Photographer) -> None:
 
 def lost(photographer: Photographer, demo: Demonstration) -> None:
     """Take pictures of all views after the acting dog has lost its network and another has taken over."""
-    desk = photographer.opened(DESK)
+    desktop = photographer.opened(DESK)
     phones = {scheme: photographer.opened(PHONE, scheme) for scheme in ("light", "dark")}
     photographer.view(phones["dark"], "groups")
-    name = photographer.executing(desk)
+    name = photographer.executing(desktop)
     phones["dark"].locator(".point[data-agree=true]").wait_for()
     groups = photographer.seen(phones["dark"])
     uuid = next(device["uuid"] for device in demo.api("devices") if device["name"] == name)
-    desk.evaluate(f"location.hash = 'device/{uuid}'")
-    desk.locator(".fault-buttons button").first.wait_for()
-    desk.get_by_role("button", name="Cut radio").click()
-    desk.locator("#place-device .fault", has_text="took over after").wait_for()
-    desk.locator("#place-device .fault").evaluate("e => e.scrollIntoView({ block: 'end' })")
-    photographer.take(desk, "faults-desktop")
-    desk.get_by_role("button", name="Close").click()
-    photographer.finished(desk)
+    desktop.evaluate(f"location.hash = 'device/{uuid}'")
+    desktop.locator(".fault-buttons button").first.wait_for()
+    desktop.get_by_role("button", name="Cut radio").click()
+    desktop.locator("#place-device .fault", has_text="took over after").wait_for()
+    desktop.locator("#place-device .fault").evaluate("e => e.scrollIntoView({ block: 'end' })")
+    photographer.take(desktop, "faults-desktop")
+    desktop.get_by_role("button", name="Close").click()
+    photographer.finished(desktop)
     sheets = {"light": ["devices", "tasks", "cameras", "map"], "dark": ["network", "events", "more"]}
     assert sorted([*sheets["light"], *sheets["dark"], "groups"]) == sorted(VIEWS)
     taken: dict[str, list[Picture]] = {"light": [], "dark": [groups]}
@@ -193,13 +193,13 @@ def lost(photographer: Photographer, demo: Demonstration) -> None:
             taken[scheme].append(photographer.seen(phones[scheme]))
     keep("views-phone", beside(taken["light"]))
     keep("views-phone-dark", beside(taken["dark"]))
-    for page in (desk, *phones.values()):
+    for page in (desktop, *phones.values()):
         page.context.close()
 
 
 def takeover(photographer: Photographer, demo: Demonstration) -> None:
     """Record a takeover as animation: the node of the acting dog is killed, and another dog gets the task."""
-    desk = photographer.opened(DESK)
+    desktop = photographer.opened(DESK)
     frames: list[Picture] = []
     times: list[float] = []
 
@@ -207,9 +207,9 @@ def takeover(photographer: Photographer, demo: Demonstration) -> None:
         end = time.monotonic() + seconds
         while (now := time.monotonic()) < end:
             times.append(now)
-            frames.append(cv2.resize(photographer.seen(desk), FILM_SIZE, interpolation=cv2.INTER_AREA))  # type: ignore[arg-type]
+            frames.append(cv2.resize(photographer.seen(desktop), FILM_SIZE, interpolation=cv2.INTER_AREA))  # type: ignore[arg-type]
 
-    name = photographer.executing(desk)
+    name = photographer.executing(desktop)
     film(2.0)
     demo.send_signal(name, signal.SIGKILL)
     film(7.0)
@@ -220,8 +220,8 @@ def takeover(photographer: Photographer, demo: Demonstration) -> None:
     path = IMAGES / "takeover.webp"
     cv2.imwriteanimation(str(path), animation, [cv2.IMWRITE_WEBP_QUALITY, FILM_QUALITY])
     sys.stdout.write(f"{path.name} {path.stat().st_size // 1000} kB, {len(frames)} frames\n")
-    photographer.finished(desk)
-    desk.context.close()
+    photographer.finished(desktop)
+    desktop.context.close()
 
 
 def opened(photographer: Photographer, demo: Demonstration) -> None:

@@ -48,7 +48,7 @@ class PageTests(PageCase):
         """On a phone each view is shown alone after at most two taps; keys, back and links open it as well."""
         page = self.opened(PHONE)
         shown = "[...document.querySelectorAll('main section, footer')].filter(e => e.checkVisibility()).map(e => e.id)"
-        for name, ways in {
+        for name, names in {
             "devices": ["Devices"],
             "tasks": ["Tasks"],
             "cameras": ["Cameras"],
@@ -58,12 +58,12 @@ class PageTests(PageCase):
             "events": ["More", "Events"],
             "more": ["More"],
         }.items():
-            for way in ways:
-                page.get_by_role("link", name=way, exact=True).tap()
+            for link in names:
+                page.get_by_role("link", name=link, exact=True).tap()
             page.locator(f"body[data-view={name}]").wait_for()
             beside = ["place-groups"] if name == "tasks" else []
             self.assertEqual(sorted(page.evaluate(shown)), sorted([f"place-{name}", *beside]))
-            self.assertEqual(page.locator("#views [aria-current=page]").count(), len(ways) == 1)
+            self.assertEqual(page.locator("#views [aria-current=page]").count(), len(names) == 1)
             page.wait_for_function("() => scrollY === 0")
         page.go_back()
         page.locator("body[data-view=events]").wait_for()

@@ -63,8 +63,8 @@ class WebServiceTests(TestCase):
         self.gate = threading.Event()
         self.gate.set()
         self.held = threading.Event()
-        self.desk = MemoryTeamControl()
-        self.frames = self.desk.frames
+        self.control = MemoryTeamControl()
+        self.frames = self.control.frames
         self.web = self.service(0)
         self.web.startService()
         self.pool = HTTPConnectionPool(reactor, persistent=False)
@@ -78,8 +78,8 @@ class WebServiceTests(TestCase):
         await deferLater(reactor, 0.05)
 
     def service(self, port: int) -> WebService:
-        board = Services(self.desk, OpenSessions())
-        return WebService(reactor, "127.0.0.1", port, self.read, board, lambda: 1e9)
+        services = Services(self.control, OpenSessions())
+        return WebService(reactor, "127.0.0.1", port, self.read, services, lambda: 1e9)
 
     def read(self) -> State:
         if threading.current_thread() is not threading.main_thread():
@@ -154,16 +154,16 @@ class WebServiceTests(TestCase):
         self.assertLess(len(held), 200_000)
         self.assertLess(len(taken), 400_000)
 
-    async def test_serve_at_further_doors(self) -> None:
+    async def test_serve_at_further_ports(self) -> None:
         """An additional port serves the same page, and is closed with the first one."""
         opened: list[Any] = []
 
-        def door(site: Any) -> Any:
+        def open_second_port(site: Any) -> Any:
             opened.append(reactor.listenTCP(0, site, interface="127.0.0.1"))
             return opened[0]
 
-        board = Services(self.desk, OpenSessions())
-        web = WebService(reactor, "127.0.0.1", 0, self.read, board, lambda: 1e9, port_openers=[door])
+        services = Services(self.control, OpenSessions())
+        web = WebService(reactor, "127.0.0.1", 0, self.read, services, lambda: 1e9, port_openers=[open_second_port])
         web.startService()
         url = f"http://127.0.0.1:{opened[0].getHost().port}".encode()
         for path, words in ((b"/", b"vaio"), (b"/sw.js", b"caches"), (b"/api/v1/state", b"dog1")):
