@@ -203,15 +203,15 @@ def run_plain_node(run_dir: Path) -> Iterator[int]:
 def measure_task(page: PageClient, least_s: float) -> float:
     """Press Run Demo and return the seconds until the task is completed; wait at least ``least_s``."""
     task = json.loads(page.request("/api/v1/demo", "POST")[1])["id"]
-    started_at, took = time.monotonic(), 0.0
-    while not took or time.monotonic() - started_at < least_s:
+    started_at, elapsed = time.monotonic(), 0.0
+    while not elapsed or time.monotonic() - started_at < least_s:
         if time.monotonic() - started_at > TASK_LIMIT_S:
             raise SystemExit(f"bench-demo: the task was not completed within {TASK_LIMIT_S:g} s")
         done = [row["id"] for row in page.read_state()["tasks"] if row["status"] == "COMPLETED"]
-        if not took and task in done:
-            took = time.monotonic() - started_at
+        if not elapsed and task in done:
+            elapsed = time.monotonic() - started_at
         time.sleep(0.5)
-    return took
+    return elapsed
 
 
 def _format_line(what: str, value: float, unit: str, target: str, note: str = "") -> str:

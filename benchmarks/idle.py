@@ -42,10 +42,10 @@ class Team(EntangledTeam):
         """Return the datagrams and bytes that an idle node sends per second, and its share of a core."""
         before, started_at = self.count_sent(), time.process_time()
         self.clock.advance(seconds)
-        took = time.process_time() - started_at
+        elapsed = time.process_time() - started_at
         each = seconds * len(self.nodes)
         datagrams, octets = self.count_sent()
-        return (datagrams - before[0]) / each, (octets - before[1]) / each, took / each
+        return (datagrams - before[0]) / each, (octets - before[1]) / each, elapsed / each
 
     def measure_operations(
         self, work: Callable[[EntangledNode], Deferred[Any]], times: int

@@ -134,12 +134,12 @@ class DriverProcess:
 
     def _write_report(self) -> None:
         began, spent = self._before
-        took = time.monotonic() - began
+        elapsed = time.monotonic() - began
         told = {
             "frames": self._frames,
-            "pictures": len(self._pictures) / took,
+            "pictures": len(self._pictures) / elapsed,
             "commands": self._commands,
-            "core": (read_cpu_s(os.getpid()) - spent) / took,
+            "core": (read_cpu_s(os.getpid()) - spent) / elapsed,
             "rss_mib": read_memory_bytes() / MIB,
             "bad": self._driver.diagnostics()["bad_frames"],
         }

@@ -61,13 +61,13 @@ class Bidder:
         corrections = []
         is_moved = False
         heard = self._received_statements.setdefault(neighbour, {})
-        for said in statements:
-            task, agent, version, bid = said
+        for statement in statements:
+            task, agent, version, bid = statement
             bids = self._known.get(task)
             if bids is None or not 0.0 <= bid <= MAX_NUMBER:
                 continue
             if agent == self.agent:
-                is_moved |= self._adopt_previous_run(said)
+                is_moved |= self._adopt_previous_run(statement)
                 continue
             known = bids.get(agent)
             if known is not None and known.version > version:
@@ -76,10 +76,10 @@ class Bidder:
             heard[task, agent] = version
             if known is not None and known.version == version:
                 continue
-            bids[agent] = said
+            bids[agent] = statement
             if known is not None and known.bid > 0.0:
-                self._outgoing[task, agent] = said  # it replaces the forwarded statement
-            is_moved |= self._update_rival(said)
+                self._outgoing[task, agent] = statement  # it replaces the forwarded statement
+            is_moved |= self._update_rival(statement)
         if is_moved:
             self._rebuild_bundle()
         return corrections
@@ -109,23 +109,23 @@ class Bidder:
         """Whether there is nothing to send."""
         return not self._outgoing and not self._touched
 
-    def _adopt_previous_run(self, said: Statement) -> bool:
+    def _adopt_previous_run(self, statement: Statement) -> bool:
         """Number new statements above the statements of a previous run of this agent, which others remember."""
-        own = self._known[said.task].get(self.agent)
-        if said.version <= (own.version if own is not None else 0):
+        own = self._known[statement.task].get(self.agent)
+        if statement.version <= (own.version if own is not None else 0):
             return False
-        self._count = max(self._count, said.version)
-        self._known[said.task][self.agent] = said._replace(bid=-1.0)
-        self._disowned.add(said.task)
+        self._count = max(self._count, statement.version)
+        self._known[statement.task][self.agent] = statement._replace(bid=-1.0)
+        self._disowned.add(statement.task)
         return True
 
-    def _update_rival(self, said: Statement) -> bool:
+    def _update_rival(self, statement: Statement) -> bool:
         """Recompute the best bid of the others for that task; return whether the own bundle can change."""
-        task, before = said.task, self._rival[said.task]
+        task, before = statement.task, self._rival[statement.task]
         self._touched.add(task)
-        if said.bid > 0.0 and (before is None or _beats(said.bid, said.agent, before)):
-            after: Statement | None = said
-        elif before is None or before.agent != said.agent:
+        if statement.bid > 0.0 and (before is None or _beats(statement.bid, statement.agent, before)):
+            after: Statement | None = statement
+        elif before is None or before.agent != statement.agent:
             return False  # the best bidder is unchanged
         else:
             others = [s for s in self._known[task].values() if s.agent != self.agent and s.bid > 0.0]

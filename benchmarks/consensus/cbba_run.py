@@ -151,6 +151,6 @@ def run_cbba(mission: Mission, pause: int = PAUSE_ROUNDS, loss: float = 0.0, qui
     return CbbaRun(owners, last, messages / each, octets / each, time.process_time() - started_at - measured)
 
 
-def encode_message(said: tuple[Statement, ...]) -> bytes:
+def encode_message(statement: tuple[Statement, ...]) -> bytes:
     """Encode a message: tasks and agents by their number in the epoch."""
-    return bytes(msgpack.packb([(int(s.task[1:]), int(s.agent[1:]), s.version, s.bid) for s in said]))
+    return bytes(msgpack.packb([(int(s.task[1:]), int(s.agent[1:]), s.version, s.bid) for s in statement]))

@@ -46,8 +46,8 @@ def draw_svg(rows: Sequence[dict[str, Any]]) -> str:
                 bar(NAME, y - up, max(1.0, BAR * (row[key] - 1.0) / (STEP * steps)), colour)
             text(WIDTH - 62, f"{row['ratio']:.3f}", f'{END} fill="{CALM}"')
             text(WIDTH - 8, f"{row['ratio_failed']:.3f}", f'{END} fill="{AFTER}"')
-    body = "\n".join(parts)
+    content = "\n".join(parts)
     return (
         f'<svg xmlns="http://www.w3.org/2000/svg" width="{WIDTH}" height="{y + 20}" font-family="sans-serif"'
-        f' font-size="12">\n<rect width="100%" height="100%" fill="white"/>\n{body}\n</svg>\n'
+        f' font-size="12">\n<rect width="100%" height="100%" fill="white"/>\n{content}\n</svg>\n'
     )

@@ -119,10 +119,10 @@ def draw_svg(outcomes: Sequence[Outcome], title: str) -> str:
         x = LEFT + number * 130
         parts.append(f'<rect x="{x}" y="{y - 11}" width="14" height="14" fill="{colour}"/>')
         parts.append(f'<text x="{x + 20}" y="{y}">{path or "no answer"}</text>')
-    body = "\n".join(parts)
+    content = "\n".join(parts)
     return (
         f'<svg xmlns="http://www.w3.org/2000/svg" width="{width}" height="{height}" font-family="sans-serif"'
-        f' font-size="12" fill="{INK}">\n<rect width="100%" height="100%" fill="white"/>\n{body}\n</svg>\n'
+        f' font-size="12" fill="{INK}">\n<rect width="100%" height="100%" fill="white"/>\n{content}\n</svg>\n'
     )
 
 

@@ -103,8 +103,8 @@ class Plan:
         }
 
     def _make_web_config(self, name: str, node: Table, port: int, tls_port: int) -> str:
-        yard = f"{self.get_location(name).yard}:{self.simulator_port}"
-        web = {"host": self.web_host, "port": port, "yard": yard, "code": self.code}
+        simulator = f"{self.get_location(name).yard}:{self.simulator_port}"
+        web = {"host": self.web_host, "port": port, "yard": simulator, "code": self.code}
         tls = {"tls": "auto", "tls_port": tls_port} if tls_port else {}
         return encode_toml({"node": node, "web": {**web, **tls}, "faults": FAULTS})
 

@@ -66,7 +66,7 @@ class Demonstration:
         # Create the team while the simulator starts.
         founding = [sys.executable, "-m", "swarmnode.team.init", *self._plan.make_init_arguments()]
         founder = subprocess.Popen(founding, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True)
-        yard = [
+        arguments = [
             "--host",
             self._plan.get_location(SIMULATOR).host,
             "--port",
@@ -77,8 +77,10 @@ class Demonstration:
         if self._plan.emulated_robots:
             path = self._plan.run_dir / "robots.toml"
             path.write_text(self._plan.emulated_robots, encoding="utf-8")
-            yard += ["--robots", str(path)]
-        self._processes.add(SIMULATOR, ["-m", "sim.robots.server", *yard], self._plan.get_location(SIMULATOR).enter)
+            arguments += ["--robots", str(path)]
+        self._processes.add(
+            SIMULATOR, ["-m", "sim.robots.server", *arguments], self._plan.get_location(SIMULATOR).enter
+        )
         self._processes.start()
         _, trouble = founder.communicate()
         if founder.returncode != 0:

@@ -101,14 +101,14 @@ def make_plan(
         preferred_port = TLS_PORT if usual and not {TLS_PORT, TLS_PORT + 1} & {web, reserve} else 0
         first = free_ports.choose_port("tcp", web_host, preferred_port, spare)
         tls = (first, free_ports.choose_port("tcp", web_host, first + 1 if first == preferred_port else 0, spare))
-    yard = free_ports.choose_port("tcp", LOOPBACK, SIMULATOR_PORT if usual else 0, spare)
+    simulator_port = free_ports.choose_port("tcp", LOOPBACK, SIMULATOR_PORT if usual else 0, spare)
     quiet = iter(free_ports.find_free_ports("udp", LOOPBACK, 2 + len(DOGS)))
     node = free_ports.choose_port("udp", LOOPBACK, NODE_PORT if usual else 0, quiet)
     others = [next(quiet) for _ in (RESERVE, *DOGS)]
     if usual:
         wanted = [
             ("the page", web_port or WEB_PORT, web),
-            ("the yard", SIMULATOR_PORT, yard),
+            ("the yard", SIMULATOR_PORT, simulator_port),
             ("vaio", NODE_PORT, node),
         ]
         wanted += [("the page over TLS", TLS_PORT, tls[0])] if with_tls else []
@@ -117,5 +117,5 @@ def make_plan(
                 say(f"port {preferred_port} is busy; {what} uses {got}")
     nodes = {BOOTSTRAP: node, **dict(zip((RESERVE, *DOGS), others, strict=True))}
     code = "".join(secrets.choice(CODE_LETTERS) for _ in range(8))
-    robots = make_robots(robot, DOGS, run_dir, spare, yard)
-    return Plan(run_dir, web_host, web, yard, nodes, f"{code[:4]}-{code[4:]}", reserve, tls, robots)
+    robots = make_robots(robot, DOGS, run_dir, spare, simulator_port)
+    return Plan(run_dir, web_host, web, simulator_port, nodes, f"{code[:4]}-{code[4:]}", reserve, tls, robots)

@@ -63,9 +63,9 @@ def make_namespace_plan(run_dir: Path, robot: str, places: dict[str, Location], 
     return Plan(run_dir, "0.0.0.0", WEB_PORT, YARD_PORT, nodes, code, WEB_PORT, robots=robots, locations=places)
 
 
-def _with_cable_address(robot: Robot, yard: str) -> Robot:
+def _with_cable_address(robot: Robot, simulator_host: str) -> Robot:
     """Return ``robot`` with the address of the simulator's end of its cable."""
-    there = json.loads(json.dumps({"options": robot.options, "parts": robot.parts}).replace(LOOPBACK, yard))
+    there = json.loads(json.dumps({"options": robot.options, "parts": robot.parts}).replace(LOOPBACK, simulator_host))
     return replace(robot, options=there["options"], parts=tuple(there["parts"]))
 
 

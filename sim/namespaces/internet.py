@@ -2,7 +2,7 @@
 
     with Internet([Site("a", Kind.PORT), Site("b", Kind.SYM, hosts=2)]) as net:
         process = net.start("a1", ["ping", net.address("pub")])
-        net.weather("b", loss=30)
+        net.impair("b", loss=30)
 
 Hosts are named after their site: ``a1``, ``b1``, ``b2``; ``pub`` is the public host, ``a-gw`` the router of ``a``.  No
 address is routed out of the namespaces (198.18.0.0/15, RFC 2544), and leaving the block ends every process that was

@@ -42,10 +42,12 @@ class EmulatedRobots:
         for name, robot in table.items():
             (kind, options), *parts = _check_robot(name, robot)
             try:
-                body = simulator.reserve_for_emulator(name, describe(kind, options, name, parts).limits)
+                simulated_robot = simulator.reserve_for_emulator(name, describe(kind, options, name, parts).limits)
                 own = random.Random(rng.getrandbits(64))
-                self._servers[name] = [_make_server(reactor, body, own, kind, options, str(robot.get("dialect", "T4")))]
-                self._servers[name] += [_make_server(reactor, body, own, *part) for part in parts]
+                self._servers[name] = [
+                    _make_server(reactor, simulated_robot, own, kind, options, str(robot.get("dialect", "T4")))
+                ]
+                self._servers[name] += [_make_server(reactor, simulated_robot, own, *part) for part in parts]
             except UsageError as error:
                 raise UsageError(f"[{name}] {error}") from None
         simulator.add_order("unplug", self.unplug, (str,))
@@ -104,7 +106,7 @@ def _check_robot(name: str, robot: Any) -> list[tuple[str, Table]]:
 
 
 def _make_server(
-    reactor: Any, body: SimulatedRobot, rng: random.Random, kind: str, options: Table, dialect: str = "T4"
+    reactor: Any, simulated_robot: SimulatedRobot, rng: random.Random, kind: str, options: Table, dialect: str = "T4"
 ) -> EmulatorServer:
     if kind not in emulated_kinds():
         raise UsageError(f"the simulator has no robot of kind {kind!r}; it has {', '.join(emulated_kinds())}")
@@ -112,4 +114,4 @@ def _make_server(
         raise UsageError(f"dialect is {dialect!r}, but must be one of {', '.join(DIALECTS)}")
     # Import only the emulators that are used.
     serve: ServeFunction = import_module(f"sim.robots.emulator.{kind}").serve
-    return serve(reactor, body, rng, options, dialect)
+    return serve(reactor, simulated_robot, rng, options, dialect)

@@ -103,7 +103,7 @@ class PacedSimulator:
         return session
 
     def connector(self, delay: float = 0.0005) -> MemoryConnector:
-        """Return a connector for drivers in this process: ``SimDriver(options, yard.connector(), clock)``."""
+        """Return a connector for drivers in this process: ``SimDriver(options, simulator.connector(), clock)``."""
         return MemoryConnector(self._clock, self.attach, delay)
 
     # -- for subclasses ---------------------------------------------------------------------------------------------

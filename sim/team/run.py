@@ -217,8 +217,8 @@ class Run:
             except Exception:  # a reactor would continue as well
                 self._log.failure("a scheduled call of the team failed")
             self._is_ended = self._on_grain(self)
-            took = self._real_time() - began
-            if took > LONG_S:
+            elapsed = self._real_time() - began
+            if elapsed > LONG_S:
                 self._grain = max(MIN_GRAIN_S, self._grain / 4)
-            elif took < SHORT_S:
+            elif elapsed < SHORT_S:
                 self._grain = min(SLICE_S, self._grain * 2)

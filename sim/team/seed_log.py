@@ -1,4 +1,4 @@
-"""Keep a logbook: a file with one line of JSON per range of seeds, to which lines are only appended.
+"""Keep a seed log: a file with one line of JSON per range of seeds, to which lines are only appended.
 
 The file is valid after every line, however the run ended: an incomplete last line (after a loss of power) is skipped
 when reading, and removed when appending.
@@ -36,14 +36,14 @@ class SeedRun:
 
 
 def parse_entries(text: str, file: str) -> list[SeedRun]:
-    """Parse a logbook; raises ``BadSetting`` for an invalid line (except an incomplete last one)."""
+    """Parse a seed log; raises ``BadSetting`` for an invalid line (except an incomplete last one)."""
     found = []
     for number, line in enumerate(text.splitlines(), start=1):
         try:
             found.append(_parse_entry(json.loads(line)))
         except (ValueError, TypeError, KeyError) as error:
             if line and number <= text.count("\n"):
-                problem = f"line {number} is not a logbook entry ({error})"
+                problem = f"line {number} is not a seed log entry ({error})"
                 raise BadSetting(file, "--log", problem, "name another file, or remove the line") from None
     return found
 
@@ -67,7 +67,7 @@ def split_ranges(seeds: Sequence[int], most: int) -> list[Sequence[int]]:
 
 
 def append_entry(file: str, entry: SeedRun) -> None:
-    """Append a line to a logbook and flush it to disk."""
+    """Append a line to a seed log and flush it to disk."""
     with open(file, "a+b") as book:
         book.seek(0, os.SEEK_END)
         is_torn = False

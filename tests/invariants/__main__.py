@@ -20,7 +20,7 @@ from tests.invariants.run import ALONE, WORKLOADS, Least, Outcome, hunt_all, lea
 BOUND = 400
 """The number of schedules that must detect each bug, unless fewer are requested."""
 STRETCH = 1000
-"""The maximum number of seeds in one line of a logbook."""
+"""The maximum number of seeds in one line of a seed log."""
 MOST_SHRUNK = 3
 """The maximum number of failures that are shrunk."""
 INTERRUPTED = 130
@@ -42,8 +42,8 @@ def main() -> int:
     parser.add_argument(
         "--shrink", type=float, default=60.0, help="seconds in which a failed one is shrunk (default 60)"
     )
-    parser.add_argument("--log", default="", metavar="FILE", help="add what came of it to a logbook")
-    parser.add_argument("--resume", action="store_true", help="leave out the seeds that the logbook has")
+    parser.add_argument("--log", default="", metavar="FILE", help="add what came of it to a seed log")
+    parser.add_argument("--resume", action="store_true", help="leave out the seeds that the seed log has")
     parser.add_argument("--bug", choices=sorted(BUGS), metavar="NAME", help="run with a bug put in, until it shows")
     parser.add_argument("--bugs", action="store_true", help="run with each bug in turn, and say when it showed")
     args = parser.parse_args()
@@ -56,7 +56,7 @@ def main() -> int:
     if args.seconds is not None and not args.seconds > 0.0:
         parser.error("--seconds: more than 0")
     if args.resume and not args.log:
-        parser.error("--resume: name the logbook with --log FILE")
+        parser.error("--resume: name the seed log with --log FILE")
     if args.log and (args.bug or args.bugs):
         parser.error("--log: runs with a bug put in are not logged")
     if args.bug:
@@ -85,7 +85,7 @@ def numbers(told: str | None) -> tuple[int, ...] | None:
 
 
 class Session:
-    """One call of the command: runs the schedules, prints failures, and writes the logbook."""
+    """One call of the command: runs the schedules, prints failures, and writes the seed log."""
 
     def __init__(self, args: argparse.Namespace, trim: Reduction) -> None:
         self._args = args
@@ -145,7 +145,7 @@ class Session:
         logged = seed_log.parse_entries(text, args.log)
         left = seed_log.find_missing(seeds, logged, what) if args.resume else list(seeds)
         Path(args.log).open("ab").close()
-        say(f"{len(left)} of {len(seeds)} schedules, from seed {left[0]}" if left else "all are in the logbook")
+        say(f"{len(left)} of {len(seeds)} schedules, from seed {left[0]}" if left else "all are in the seed log")
         commit, outcomes = commit_of(Path(__file__).resolve().parents[2]), self._outcomes(left)
         for stretch in seed_log.split_ranges(left, STRETCH):
             started_at, failures, ran = time.monotonic(), [], 0

@@ -24,18 +24,18 @@ class Deciders(Workload):
     """Reports of random teams, and bidders in a line, in addition to the schedule of ``schedule.seed``."""
 
     def __init__(self, schedule: Schedule) -> None:
-        self._dice = random.Random(f"deciders/{schedule.seed}")
+        self._rng = random.Random(f"deciders/{schedule.seed}")
         self._found: list[str] = []
 
     def step(self) -> None:
         """Let a small team decide."""
-        contacts = [Report(f"agent-{n:03d}", self._dice.choice([1.0, 1.0, 2.0])) for n in range(4)]
-        views = [self._dice.sample(contacts, len(contacts)) for _ in contacts]
+        contacts = [Report(f"agent-{n:03d}", self._rng.choice([1.0, 1.0, 2.0])) for n in range(4)]
+        views = [self._rng.sample(contacts, len(contacts)) for _ in contacts]
         assigned = sorted({str(Nearest().find(view).assigned_agent) for view in views})
         if len(assigned) > 1:
             self._found.append(f"C1: {' and '.join(assigned)} are assigned by equal reports")
-        bad = Report("agent-bad", self._dice.choice([math.nan, math.inf, -math.inf, -1.0]))
-        view = self._dice.sample([*contacts, bad], len(contacts) + 1)
+        bad = Report("agent-bad", self._rng.choice([math.nan, math.inf, -math.inf, -1.0]))
+        view = self._rng.sample([*contacts, bad], len(contacts) + 1)
         if str(Nearest().find(view).assigned_agent) not in assigned:
             self._found.append(f"C2: a cost of {bad.cost} makes {Nearest().find(view).assigned_agent} win")
 
@@ -45,7 +45,7 @@ class Deciders(Workload):
         found = Nearest().find(far).assigned_agent
         if found != "agent-299":
             self._found.append(f"C3: of 300 agents {found} is assigned, not agent-299")
-        mission = Mission(LINE, LINE, self._dice.randrange(10**6))
+        mission = Mission(LINE, LINE, self._rng.randrange(10**6))
         self._found += [f"C4: {' and '.join(o)} own {t}" for t, o in stopped(mission).items() if len(o) > 1]
 
     def find_violations(self) -> list[str]:

@@ -58,7 +58,7 @@ class Leases(LeaseTeam):
     """The run of ``seed``, which determines everything."""
 
     def __init__(self, seed: int, trim: Reduction = NO_REDUCTION, ttl: float = TTL) -> None:
-        rng = self._dice = random.Random(f"leases/{seed}")
+        rng = self._schedule_rng = random.Random(f"leases/{seed}")
         n = rng.choice([4, 5, 5, 6, 7])
         agents = rng.choice([2, 3, 3, 4])
         stop_time = rng.choice([0.0, 0.0, 0.3])
@@ -105,7 +105,7 @@ class Leases(LeaseTeam):
         self.radio.quality = self.air
         self.recorder.record_assumptions()
         timeline = Timeline(self.faults, self._trim)
-        self.seconds = end = self._trim.limit_duration(self._dice.choice([8.0, 12.0, 16.0]))
+        self.seconds = end = self._trim.limit_duration(self._schedule_rng.choice([8.0, 12.0, 16.0]))
         started_at = self.clock.seconds()
         while self.clock.seconds() - started_at < end:
             for fault, is_end in timeline.pop_due(self.clock.seconds() - started_at):
@@ -122,13 +122,13 @@ class Leases(LeaseTeam):
         for task_id in self.charters:
             for place in self.agents:
                 bidder = self.nodes[place]
-                if bidder.machine.is_frozen or not bidder.machine.is_alive or self._dice.random() > 0.25:
+                if bidder.machine.is_frozen or not bidder.machine.is_alive or self._schedule_rng.random() > 0.25:
                     continue
-                fate = self._dice.random()
+                fate = self._schedule_rng.random()
                 if fate < 0.35:
                     bidder.get_lease_client(task_id).claim()
                 elif fate < 0.75:
-                    bidder.get_lease_client(task_id).stand_by(self._dice.choice([1, 1, 2, 3]))
+                    bidder.get_lease_client(task_id).stand_by(self._schedule_rng.choice([1, 1, 2, 3]))
                 elif fate < 0.85:
                     bidder.leave(task_id)
                 elif fate < 0.9:
@@ -150,7 +150,7 @@ class Leases(LeaseTeam):
         if not self.has_stores:
             # A lease that no member remembers must end first, as the next one may have its token.
             self.clock.advance(self.ttl)
-        for rank, place in enumerate(self._dice.sample(self.agents, len(self.agents))):
+        for rank, place in enumerate(self._schedule_rng.sample(self.agents, len(self.agents))):
             lease_client = self.nodes[place].get_lease_client(task_id)
             if rank:
                 lease_client.stand_by(rank)
@@ -160,10 +160,10 @@ class Leases(LeaseTeam):
         since, most = self.clock.seconds(), 2 * self.ttl + SLACK + 1.0
         if not self._wait_for_command(task_id, f"all is well with {task_id}", 0, since, most, most):
             return
-        self.clock.advance(self._dice.uniform(0.7, 1.3) * self.ttl)
+        self.clock.advance(self._schedule_rng.uniform(0.7, 1.3) * self.ttl)
         _, token, holder = self.recorder.accepted[task_id][-1]
         self._depart_politely(task_id, token, holder)
-        self.clock.advance(self._dice.uniform(0.7, 1.3) * self.ttl)
+        self.clock.advance(self._schedule_rng.uniform(0.7, 1.3) * self.ttl)
         _, token, holder = self.recorder.accepted[task_id][-1]
         self._depart_suddenly(task_id, token, holder)
         self._conclude(task_id)
@@ -177,7 +177,7 @@ class Leases(LeaseTeam):
 
     def _depart_suddenly(self, task_id: str, token: int, holder: int) -> None:
         """Kill, freeze or disconnect the executor, with one member of the council."""
-        gone_at, rng = self.clock.seconds(), self._dice
+        gone_at, rng = self.clock.seconds(), self._schedule_rng
         members = [self.get_place(member) for member in self.charters[task_id].members]
         spare = [place for place in members if place not in self.agents]
         also = [rng.choice(spare)] if spare and holder not in members else []
@@ -205,7 +205,7 @@ class Leases(LeaseTeam):
     def _conclude(self, task_id: str) -> None:
         """Complete the task by its executor, or cancel it: after the acknowledgement no robot moves."""
         _, token, holder = self.recorder.accepted[task_id][-1]
-        place = self._dice.choice([holder, self.n - 1])
+        place = self._schedule_rng.choice([holder, self.n - 1])
         if place == holder:
             self.recorder.stop_robot(holder, task_id)
         history = self.recorder.history
@@ -242,7 +242,7 @@ class Leases(LeaseTeam):
             case "one way":
                 self.radio.cut |= {(a, b) for a in fault.places for b in set(range(self.n)).difference(fault.places)}
             case "swizzle":
-                order = self._dice.sample(range(self.n), self.n // 2)
+                order = self._schedule_rng.sample(range(self.n), self.n // 2)
                 for number, place in enumerate(order):
                     self.clock.callLater(0.2 * number, self._clog, place)
             case "kill" | "wipe":
@@ -298,11 +298,11 @@ class Leases(LeaseTeam):
         if not self.is_up(place) or not self.has_stores:
             return
         for task_id in self.charters:
-            if self._dice.random() < 0.7:
+            if self._schedule_rng.random() < 0.7:
                 for agent in self.agents:
-                    if self.is_up(agent) and self._dice.random() < 0.9:
+                    if self.is_up(agent) and self._schedule_rng.random() < 0.9:
                         self.nodes[agent].leave(task_id)
-            chosen = sorted(self._dice.sample(range(self.n), 3))
+            chosen = sorted(self._schedule_rng.sample(range(self.n), 3))
             if is_torn:
                 sitting = [self.get_place(member) for member in self.charters[task_id].members]
                 chosen = sorted(range(self.n), key=lambda n: n in sitting)[:3]

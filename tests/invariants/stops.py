@@ -1,9 +1,9 @@
 """Run random sequences of stops, releases, partitions, restarts and hostile messages on the stops of a small team.
 
-The halts are the product's.  The network below them delays, repeats and loses messages, disks lose unwritten data, and
-replicas forget records and return old ones.  Checked after each step: once a robot's node has acknowledged a stop by an
-honest operator, the robot stands until it receives a release that names this stop, from a member with the right to
-order.  Checked at the end, with a healthy network: an operator can release the whole team.
+The stop states are the product's.  The network below them delays, repeats and loses messages, disks lose unwritten
+data, and replicas forget records and return old ones.  Checked after each step: once a robot's node has acknowledged a
+stop by an honest operator, the robot stands until it receives a release that names this stop, from a member with the
+right to order.  Checked at the end, with a healthy network: an operator can release the whole team.
 
 ``python -m tests.invariants.stops --sequences 10000 --seed 1`` runs 10,000 sequences and prints the counts of events.
 """
@@ -96,11 +96,11 @@ class Disk(MemoryStore):
 
 @dataclass
 class Life:
-    """One run of a node, with the parts of the library that its halt uses."""
+    """One run of a node, with the parts of the library that its stop state uses."""
 
     net: Net
     name: str
-    halt: StopState = field(init=False)
+    stop_state: StopState = field(init=False)
     is_over: bool = False
     changed: Callable[[list[Record]], None] | None = None
     answer: Callable[..., Any] = field(init=False)
@@ -110,15 +110,15 @@ class Life:
         self.store = self.net.disks[self.name]
         self.endpoint = self.replica = self.admission = self
         self.records: list[Record] = []
-        self.halt = expose_stops(self, self.net.dice, self.later, lambda stops, words: None)  # type: ignore[arg-type]
+        self.stop_state = expose_stops(self, self.net.rng, self.later, lambda stops, words: None)  # type: ignore[arg-type]
         if self.name in ROBOTS:
-            self.halt.subscribe(self.obey)
+            self.stop_state.subscribe(self.obey)
 
     def obey(self) -> str:
-        """Obey the halt as an agent does."""
-        if not self.halt.is_known:
-            self.halt.request_stops()
-        return STANDS_STILL if self.halt.is_motion_forbidden else "goes on"
+        """Obey the stop as an agent does."""
+        if not self.stop_state.is_known:
+            self.stop_state.request_stops()
+        return STANDS_STILL if self.stop_state.is_motion_forbidden else "goes on"
 
     def expose(self, name: str, answer: Callable[..., Any], changes: bool, idempotent: bool) -> None:
         """Store the handler of the calls."""
@@ -177,10 +177,10 @@ class Net:
     """A team, its messages in transit, and the stops that each robot must obey."""
 
     def __init__(self, seed: int, counts: Counter[str]) -> None:
-        self.dice = random.Random(seed)
+        self.rng = random.Random(seed)
         self.counts = counts
         self.clock = Clock()
-        self.identities = {name: Identity(self.dice.randbytes(32)) for name in (*TEAM, OUTSIDE)}
+        self.identities = {name: Identity(self.rng.randbytes(32)) for name in (*TEAM, OUTSIDE)}
         self.names = {self.identities[name].public: name for name in TEAM}
         self.revoked: set[str] = set()
         self.disks = {name: Disk() for name in NODES}
@@ -218,9 +218,9 @@ class Net:
         """Write a new record of an owner to its replica, or to a random one if the owner is no node."""
         own = self.identities[name].public
         known = [r.sequence for r in (*self.old, *self.newest(list(NODES))) if r.owner == own]
-        record = Record(STOPS_KEY, SLOT, own, max(known, default=0) + 1, "team", 600.0, value, self.dice.randbytes(64))
+        record = Record(STOPS_KEY, SLOT, own, max(known, default=0) + 1, "team", 600.0, value, self.rng.randbytes(64))
         self.old.append(record)
-        self.hold(name if name in NODES else self.dice.choice(NODES), record)
+        self.hold(name if name in NODES else self.rng.choice(NODES), record)
 
     def hold(self, name: str, record: Record) -> None:
         """Store a record at a replica if it beats the present one and its owner may write it."""
@@ -247,10 +247,10 @@ class Net:
     def send(self, sender: str, to: str, arguments: tuple[Any, ...]) -> Deferred[Any]:
         """Send a call; the request or its answer may be lost."""
         self.sent.append((sender, to, arguments))
-        if not self.reaches(sender, to) or self.dice.random() < 0.1:
+        if not self.reaches(sender, to) or self.rng.random() < 0.1:
             return fail(NoAnswer("lost"))
         answered = self.deliver(sender, to, arguments)
-        return fail(NoAnswer("lost")) if self.dice.random() < 0.1 else answered
+        return fail(NoAnswer("lost")) if self.rng.random() < 0.1 else answered
 
     def deliver(self, sender: str, to: str, arguments: tuple[Any, ...]) -> Deferred[Any]:
         """Process a call as the endpoint of ``to`` does: check the role, the types, then call the method."""
@@ -275,7 +275,7 @@ class Net:
             if to in ROBOTS and life is self.lives.get(to) and not said.endswith(NOT_SAVED):
                 ids = {stop for stop, _ in obeyed} & self.tracked
                 # A release may have arrived between the order and the end of the write.
-                fresh = {stop for stop, _ in arguments[0]} & ids & set(life.halt.stops)
+                fresh = {stop for stop, _ in arguments[0]} & ids & set(life.stop_state.stops)
                 self.owed[to] |= fresh
                 self.counts["acknowledged"] += len(fresh)
             return answer
@@ -287,7 +287,7 @@ class Net:
     def begin(self, name: str) -> None:
         """Start a node."""
         life = self.lives[name] = Life(self, name)
-        life.halt.request_stops() if name in ROBOTS else life.halt.follow()
+        life.stop_state.request_stops() if name in ROBOTS else life.stop_state.follow()
 
     def contacts(self) -> list[Contact]:
         """Return the contacts of all nodes."""
@@ -297,47 +297,47 @@ class Net:
         """Let an honest operator stop the team."""
         name = self.orderer()
         if name:
-            before = set(self.lives[name].halt.stops)
-            asked = self.lives[name].halt.stop
+            before = set(self.lives[name].stop_state.stops)
+            asked = self.lives[name].stop_state.stop
             # The id must be known before the first answer arrives.
-            state = self.dice.getstate()
-            self.tracked.add(self.dice.randbytes(ID_BYTES))
-            self.dice.setstate(state)
+            state = self.rng.getstate()
+            self.tracked.add(self.rng.randbytes(ID_BYTES))
+            self.rng.setstate(state)
             asked(name, self.contacts()).addErrback(_expected)
-            self.counts["stops"] += bool(set(self.lives[name].halt.stops) - before)
+            self.counts["stops"] += bool(set(self.lives[name].stop_state.stops) - before)
 
     def release(self) -> None:
         """Let an honest operator release some or all stops that it knows."""
         name = self.orderer()
         if name:
-            known = list(self.lives[name].halt.stops)
-            named = known if self.dice.random() < 0.6 else self.dice.sample(known, len(known) // 2)
-            self.lives[name].halt.release(named, name, self.contacts()).addErrback(_expected)
+            known = list(self.lives[name].stop_state.stops)
+            named = known if self.rng.random() < 0.6 else self.rng.sample(known, len(known) // 2)
+            self.lives[name].stop_state.release(named, name, self.contacts()).addErrback(_expected)
             self.counts["releases"] += 1
 
     def orderer(self) -> str:
         """Return an honest operator that is online and not revoked, or an empty string."""
         up = [name for name in HONEST if name in self.lives and name not in self.revoked]
-        return self.dice.choice(up) if up else ""
+        return self.rng.choice(up) if up else ""
 
     def partition(self) -> None:
         """Divide the network in two, or heal it."""
-        is_whole = self.dice.random() < 0.5
-        self.sides = {name: 0 if is_whole else self.dice.randrange(2) for name in TEAM}
+        is_whole = self.rng.random() < 0.5
+        self.sides = {name: 0 if is_whole else self.rng.randrange(2) for name in TEAM}
         self.counts["partitions"] += 1
 
     def restart(self) -> None:
         """Crash one node or all, and restart them later."""
-        for name in NODES if self.dice.random() < 0.1 else [self.dice.choice(NODES)]:
+        for name in NODES if self.rng.random() < 0.1 else [self.rng.choice(NODES)]:
             life = self.lives.pop(name, None)
             if life is None:
                 continue
             life.is_over = True
             self.disks[name].crash()
             self.counts["restarts"] += 1
-            if self.dice.random() < 0.3:
+            if self.rng.random() < 0.3:
                 self.replicas[name].clear()
-            self.clock.callLater(self.dice.random() * 20.0, self.come_back, name)
+            self.clock.callLater(self.rng.random() * 20.0, self.come_back, name)
 
     def come_back(self, name: str) -> None:
         """Start a node if it is not running."""
@@ -346,9 +346,9 @@ class Net:
 
     def forget(self) -> None:
         """Let a replica lose a record, as at its expiry."""
-        name = self.dice.choice(NODES)
+        name = self.rng.choice(NODES)
         if self.replicas[name]:
-            del self.replicas[name][self.dice.choice(list(self.replicas[name]))]
+            del self.replicas[name][self.rng.choice(list(self.replicas[name]))]
             if name in self.lives:
                 self.lives[name].look()
             self.counts["records lost"] += 1
@@ -356,7 +356,7 @@ class Net:
     def gossip(self) -> None:
         """Let pairs of replicas exchange records."""
         for _ in range(6):
-            one, other = self.dice.sample(NODES, 2)
+            one, other = self.rng.sample(NODES, 2)
             if one in self.lives and self.reaches(one, other):
                 for record in self.newest([one, other]):
                     self.hold(one, record)
@@ -365,17 +365,17 @@ class Net:
     def repeat(self) -> None:
         """Repeat an earlier call of a present member, or let a replica return an old record."""
         self.counts["repeated"] += 1
-        if self.sent and self.dice.random() < 0.6:
-            sender, to, arguments = self.dice.choice(self.sent)
+        if self.sent and self.rng.random() < 0.6:
+            sender, to, arguments = self.rng.choice(self.sent)
             if to in self.lives:
                 self.deliver(sender, to, arguments).addErrback(_expected)
         elif self.old:
-            self.hold(self.dice.choice(NODES), self.dice.choice(self.old))
+            self.hold(self.rng.choice(NODES), self.rng.choice(self.old))
 
     def revoke(self) -> None:
         """Revoke an operator; one honest operator remains."""
-        name = self.dice.choice(("bob", "web", "thief"))
-        if name not in self.revoked and self.dice.random() < 0.3:
+        name = self.rng.choice(("bob", "web", "thief"))
+        if name not in self.revoked and self.rng.random() < 0.3:
             self.revoked.add(name)
             public = self.identities[name].public
             for replica in NODES:
@@ -387,29 +387,29 @@ class Net:
     def attack(self) -> None:
         """Send a hostile message from a member without the right to order, an invented key or a stolen operator key."""
         self.counts["hostile"] += 1
-        sender = self.dice.choice(("eye", "boot", "dog1", "thief", OUTSIDE))
+        sender = self.rng.choice(("eye", "boot", "dog1", "thief", OUTSIDE))
         known = list(self.tracked)
-        if sender == "thief" and self.dice.random() < 0.9:
+        if sender == "thief" and self.rng.random() < 0.9:
             known = []  # it may release known stops; the attack is invented ones
-        arguments = self.dice.choice(
+        arguments = self.rng.choice(
             [
-                lambda: (2 ** self.dice.choice((31, 53, 63)), self.dice.random() < 0.5, sender),
+                lambda: (2 ** self.rng.choice((31, 53, 63)), self.rng.random() < 0.5, sender),
                 lambda: (
                     [],
-                    [self.dice.randbytes(ID_BYTES) for _ in range(self.dice.choice((1, MAX_RELEASED)))],
+                    [self.rng.randbytes(ID_BYTES) for _ in range(self.rng.choice((1, MAX_RELEASED)))],
                     sender,
                 ),
-                lambda: ([[self.dice.randbytes(ID_BYTES), sender] for _ in range(MAX_STOPS)], [], sender),
+                lambda: ([[self.rng.randbytes(ID_BYTES), sender] for _ in range(MAX_STOPS)], [], sender),
                 lambda: ([], known[:MAX_RELEASED], sender),
                 lambda: ([[stop, sender] for stop in known[:MAX_STOPS]], [], sender),
                 lambda: ([[b"", 0]], [2**53, [], {}], "x" * 100),
                 lambda: ([], [b"x" * 16] * (MAX_RELEASED + 1), sender),
             ]
         )()
-        if self.dice.random() < 0.5 or sender == OUTSIDE:
-            self.write(sender, self.dice.choice((msgpack.packb(list(arguments)), b"\xc1", self.dice.randbytes(20))))
+        if self.rng.random() < 0.5 or sender == OUTSIDE:
+            self.write(sender, self.rng.choice((msgpack.packb(list(arguments)), b"\xc1", self.rng.randbytes(20))))
         else:
-            to = self.dice.choice(NODES)
+            to = self.rng.choice(NODES)
             if to in self.lives:
                 self.deliver(sender, to, arguments).addErrback(_expected)
 
@@ -419,7 +419,7 @@ class Net:
         """Check that no robot with an unreleased stop may move."""
         for name in ROBOTS:
             life = self.lives.get(name)
-            if life is not None and self.owed[name] and not life.halt.is_motion_forbidden:
+            if life is not None and self.owed[name] and not life.stop_state.is_motion_forbidden:
                 raise Violation(f"after {what} {name} may move, though {len(self.owed[name])} stops are not released")
 
     def step(self) -> None:
@@ -435,21 +435,21 @@ class Net:
             (self.attack, 5),
             (self.revoke, 1),
         )
-        [event] = self.dice.choices([each for each, _ in events], [weight for _, weight in events])
+        [event] = self.rng.choices([each for each, _ in events], [weight for _, weight in events])
         event()
         self.check(event.__name__)
         for name in NODES:
-            if self.dice.random() < 0.4:
+            if self.rng.random() < 0.4:
                 self.disks[name].commit()
-        self.tick(self.dice.random() * 5.0)
+        self.tick(self.rng.random() * 5.0)
         self.check("a while")
 
     def tick(self, seconds: float) -> None:
-        """Let time pass, and let the agents refresh their halts."""
+        """Let time pass, and let the agents refresh their stop states."""
         self.clock.advance(seconds)
         for name in ROBOTS:
-            if name in self.lives and self.lives[name].halt.is_motion_forbidden:
-                self.lives[name].halt.recheck()
+            if name in self.lives and self.lives[name].stop_state.is_motion_forbidden:
+                self.lives[name].stop_state.recheck()
 
     def end(self) -> None:
         """Restart all nodes, end the attacks, and let an operator release all stops that the devices name."""
@@ -465,11 +465,11 @@ class Net:
             for _ in range(8):
                 self.gossip()
             operator = self.orderer()
-            named = {stop for name in NODES if name in self.lives for stop in self.lives[name].halt.stops}
+            named = {stop for name in NODES if name in self.lives for stop in self.lives[name].stop_state.stops}
             if operator and named:
-                self.lives[operator].halt.release(sorted(named), operator, self.contacts()).addErrback(_expected)
+                self.lives[operator].stop_state.release(sorted(named), operator, self.contacts()).addErrback(_expected)
             self.check("the end")
-        standing = [name for name in ROBOTS if self.lives[name].halt.is_motion_forbidden]
+        standing = [name for name in ROBOTS if self.lives[name].stop_state.is_motion_forbidden]
         if standing:
             raise Violation(f"no release lets {', '.join(standing)} go on")
 

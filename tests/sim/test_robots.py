@@ -31,8 +31,8 @@ class SimulatorCase(SynchronousTestCase):
 
     def setUp(self) -> None:
         self.clock = Clock()
-        self.yard = RobotSimulator(self.clock, Random(1), load_scene("three-dogs"))
-        self.yard.start()
+        self.simulator = RobotSimulator(self.clock, Random(1), load_scene("three-dogs"))
+        self.simulator.start()
 
     def pass_time(self, seconds: float) -> None:
         """Advance the clock, one tick of the simulator at a time."""
@@ -45,7 +45,7 @@ class SimulatedDogTests(SimulatorCase):
 
     def lent(self, limits: Any = LIMITS) -> SimulatedDog:
         """Return the emulated robot of dog1, which faces the middle of the map."""
-        return self.yard.reserve_for_emulator("dog1", limits)
+        return self.simulator.reserve_for_emulator("dog1", limits)
 
     def test_moves_as_fast_as_its_kind(self) -> None:
         """The body obeys the limits with which it is lent, and stops when it is halted."""
@@ -68,7 +68,7 @@ class SimulatedDogTests(SimulatorCase):
             body.drive(*motion)
             self.pass_time(1.0)
             self.assertFalse(body.sense()["base.moving"])
-            self.assertTrue(math.isfinite(self.yard.world.dogs["dog1"].x))
+            self.assertTrue(math.isfinite(self.simulator.world.dogs["dog1"].x))
 
     def test_senses(self) -> None:
         """Sensors are always readable, bumpers detect walls ahead and at the side, and pictures have two sizes."""
@@ -79,7 +79,7 @@ class SimulatedDogTests(SimulatorCase):
             self.assertTrue(math.isfinite(float(sensed[key])), key)
         self.assertEqual((sensed["bump.left"], sensed["bump.right"]), (False, False))
         for heading, wanted in ((180.0, (True, True)), (135.0, (True, False)), (-135.0, (False, True))):
-            self.yard.world.move_dog("dog1", 0.2, 1.2, math.radians(heading))
+            self.simulator.world.move_dog("dog1", 0.2, 1.2, math.radians(heading))
             body.drive(0.16, 0.0, 0.0)
             self.pass_time(1.5)
             sensed = body.sense()
@@ -95,8 +95,8 @@ class RobotsTests(SimulatorCase):
         """A driver of simulated dogs is rejected by a dog that is lent to an emulator."""
         from drivers.sim.driver import SimDriver
 
-        self.yard.reserve_for_emulator("dog1", describe("create2", {"port": "x"}).limits)
-        driver = SimDriver({"robot": "dog1"}, self.yard.connector(), self.clock)
+        self.simulator.reserve_for_emulator("dog1", describe("create2", {"port": "x"}).limits)
+        driver = SimDriver({"robot": "dog1"}, self.simulator.connector(), self.clock)
         failed = driver.connect()
         self.pass_time(0.5)
         self.assertIn("reached as a robot of another kind", self.failureResultOf(failed).getErrorMessage())
@@ -119,7 +119,7 @@ class RobotsTests(SimulatorCase):
         ]
         for table, problem in cases:
             with self.assertRaisesRegex(UsageError, problem):
-                EmulatedRobots(self.clock, Random(1), self.yard, table)
+                EmulatedRobots(self.clock, Random(1), self.simulator, table)
 
     def test_replaces_no_file(self) -> None:
         """A file at the path of the serial port is kept and reported; only a leftover link is replaced."""
@@ -128,7 +128,7 @@ class RobotsTests(SimulatorCase):
         path = folder / "ttyUSB0"
         table = {"dog1": {"kind": "create2", "options": {"port": str(path)}}}
         path.write_text("a device, or somebody's notes")
-        robots = EmulatedRobots(MemoryReactorClock(), Random(1), self.yard, table)
+        robots = EmulatedRobots(MemoryReactorClock(), Random(1), self.simulator, table)
         with self.assertRaisesRegex(UsageError, r"\[dog1\] .*ttyUSB0 is there already"):
             robots.start()
         robots.stop()
@@ -147,7 +147,7 @@ class RobotsTests(SimulatorCase):
         """A robot that cannot be served is reported with the reason, and no file stays open."""
         before = len(os.listdir("/dev/fd"))
         table = {"dog2": {"kind": "create2", "options": {"port": "/nowhere/at/all"}}}
-        robots = EmulatedRobots(MemoryReactorClock(), Random(1), self.yard, table)
+        robots = EmulatedRobots(MemoryReactorClock(), Random(1), self.simulator, table)
         with self.assertRaisesRegex(UsageError, r"\[dog2\] it cannot be served: .*/nowhere/at/all"):
             robots.start()
         robots.stop()

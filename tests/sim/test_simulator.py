@@ -70,9 +70,9 @@ class SimulatorTests(SynchronousTestCase):
     def setUp(self) -> None:
         """Start a simulator in virtual time, with a driver for dog1."""
         self.clock = Clock()
-        self.yard = RobotSimulator(self.clock, Random(1), load_scene("three-dogs"))
-        self.yard.start()
-        self.client = Client(self.yard)
+        self.simulator = RobotSimulator(self.clock, Random(1), load_scene("three-dogs"))
+        self.simulator.start()
+        self.client = Client(self.simulator)
         self.client.say(Hello(VERSION, "dog1", 0.0), Motors(True))
 
     def ticks(self, count: int) -> None:
@@ -86,7 +86,7 @@ class SimulatorTests(SynchronousTestCase):
 
     def is_moving(self) -> bool:
         """Return whether dog1 moves."""
-        return self.yard.world.dogs["dog1"].is_moving
+        return self.simulator.world.dogs["dog1"].is_moving
 
     def test_sends_a_sensor_frame_each_32_ms(self) -> None:
         """After ten seconds 312 frames have arrived, with timestamps 32 ms apart and without drift."""
@@ -157,7 +157,7 @@ class SimulatorTests(SynchronousTestCase):
         self.client.close()
         self.ticks(4)
         self.assertFalse(self.is_moving())
-        self.client = Client(self.yard)
+        self.client = Client(self.simulator)
         self.client.say(Hello(VERSION, "dog1", 0.0), Motors(True))
         self.ticks(1)
         self.assertEqual([m.token for m in self.client.of(Sensors) if isinstance(m, Sensors)], [9])
@@ -175,7 +175,7 @@ class SimulatorTests(SynchronousTestCase):
         self.clock.advance(60.0)
         self.ticks(5)
         self.assertFalse(self.is_moving())
-        self.assertLess(self.yard.world.t, 2.0)
+        self.assertLess(self.simulator.world.t, 2.0)
 
     def test_tells_what_the_gates_did(self) -> None:
         """Lower tokens and expired commands have no effect; each gate counts accepted and rejected commands."""
@@ -184,34 +184,34 @@ class SimulatorTests(SynchronousTestCase):
         self.drive(token=6, vx=-0.1)
         self.drive(token=8, ttl=0.0)
         self.ticks(10)
-        self.assertGreater(self.yard.world.dogs["dog1"].motion.vx, 0.1)
-        dogs: Any = self.yard.get_true_state()["dogs"]
+        self.assertGreater(self.simulator.world.dogs["dog1"].motion.vx, 0.1)
+        dogs: Any = self.simulator.get_true_state()["dogs"]
         told = [(dog["name"], dog["token"], dog["accepted"], dog["refused"]) for dog in dogs]
         self.assertEqual(told, [("dog1", 7, 2, 2), ("dog2", 0, 0, 0), ("dog3", 0, 0, 0)])
 
     def test_gives_up_a_silent_client(self) -> None:
         """A driver that falls silent and a client that never sends hello are disconnected after ``SILENCE_LIMIT_S``."""
-        stranger = Client(self.yard)
-        lively = Client(self.yard)
+        stranger = Client(self.simulator)
+        lively = Client(self.simulator)
         for _ in range(round(SILENCE_LIMIT_S / TICK_S) + 3):
             lively.say(KeepAlive())
             self.ticks(1)
         self.assertEqual((self.client.is_open, stranger.is_open, lively.is_open), (False, False, True))
-        self.assertEqual(self.yard.driven_robots, [])
+        self.assertEqual(self.simulator.driven_robots, [])
 
     def test_refuses_drivers(self) -> None:
         """A taken robot is refused temporarily; an unknown robot, another version or a second robot permanently."""
         cases = [("dog1", VERSION, False), ("cat", VERSION, True), ("dog2", VERSION + 1, True)]
         for robot, version, is_lasting in cases:
-            client = Client(self.yard)
+            client = Client(self.simulator)
             client.say(Hello(version, robot, 0.0))
             (refusal,) = client.heard
             assert isinstance(refusal, Refused)
             self.assertEqual((refusal.lasting, client.is_open), (is_lasting, False))
-        self.assertEqual(self.yard.driven_robots, ["dog1"])
+        self.assertEqual(self.simulator.driven_robots, ["dog1"])
         self.client.say(Hello(VERSION, "dog2", 0.0))
         self.assertEqual(self.client.heard[-1], Refused("this connection holds dog1 already", True))
-        self.assertEqual(self.yard.driven_robots, [])
+        self.assertEqual(self.simulator.driven_robots, [])
 
     def test_drops_for_a_client_that_does_not_read(self) -> None:
         """A busy client gets nothing until it is free again, and then the newest frame, not the oldest."""
@@ -227,16 +227,16 @@ class SimulatorTests(SynchronousTestCase):
 
     def test_lives_on_after_rubbish(self) -> None:
         """Invalid bytes, orders without operator rights and commands without a dog have no effect."""
-        before = self.yard.world.snapshot()
-        stranger = Client(self.yard)
+        before = self.simulator.world.snapshot()
+        stranger = Client(self.simulator)
         assert stranger.session is not None
         stranger.session.data_received(b"\x00\xff" * 500)
         stranger.say(WorldCommand(1, "scatter", (1,)), Drive(0.1, 0.0, 0.0, 1, 1.0, 0.0), Halt())
-        self.assertEqual((stranger.heard, self.yard.world.snapshot()), ([], before))
+        self.assertEqual((stranger.heard, self.simulator.world.snapshot()), ([], before))
 
     def test_shows_the_operator_everything(self) -> None:
         """An operator receives the truth at the requested rate, and an answer to every order, valid or not."""
-        operator = Client(self.yard)
+        operator = Client(self.simulator)
         operator.say(SubscribeWorld(VERSION, 5.0))
         self.ticks(31)
         self.assertIn(len(operator.of(WorldSnapshot)), (5, 6))
@@ -249,14 +249,14 @@ class SimulatorTests(SynchronousTestCase):
         )
         done = [message for message in operator.heard if isinstance(message, CommandResult)]
         self.assertEqual([(one.number, bool(one.problem)) for one in done], [(n, n > 1) for n in range(1, 6)])
-        self.assertIsNotNone(self.yard.world.target)
+        self.assertIsNotNone(self.simulator.world.target)
 
     def test_turns_away_the_crowd(self) -> None:
         """The sixty-fifth connection is rejected; ``stop`` closes all connections and leaves no timer."""
-        crowd = [Client(self.yard) for _ in range(65)]
+        crowd = [Client(self.simulator) for _ in range(65)]
         self.assertEqual(sum(not client.is_open for client in crowd), 2)
         self.assertTrue(self.client.is_open)
-        self.yard.stop()
+        self.simulator.stop()
         self.assertFalse(self.client.is_open)
         self.assertEqual(self.clock.getDelayedCalls(), [])
 

@@ -44,14 +44,14 @@ class CrowdCameras:
         self._crowd = crowd
         self._room = Room(rng, crowd.scene.width, crowd.scene.height, crowd.scene.wall_height)
 
-    def render_jpeg(self, body: int, is_halved: bool = False) -> bytes:
-        """Return the picture of the robot ``body`` as a JPEG, 208x160 pixels, or 104x80 if ``is_halved``."""
-        return encode_jpeg(self.render_image(body), is_halved)
+    def render_jpeg(self, number: int, is_halved: bool = False) -> bytes:
+        """Return the picture of the robot ``number`` as a JPEG, 208x160 pixels, or 104x80 if ``is_halved``."""
+        return encode_jpeg(self.render_image(number), is_halved)
 
-    def render_image(self, body: int) -> Image:
+    def render_image(self, number: int) -> Image:
         """Return the picture as blue, green and red bytes."""
         crowd = self._crowd
-        view = CameraFrame(float(crowd.x[body]), float(crowd.y[body]), float(crowd.heading[body]))
+        view = CameraFrame(float(crowd.x[number]), float(crowd.y[number]), float(crowd.heading[number]))
         image = self._room.draw_floor()
         self._room.draw_walls(image, view)
         target, target_at, far = crowd.target, math.inf, CLEAR_M
@@ -60,7 +60,7 @@ class CrowdCameras:
             target_at = math.hypot(ahead, left)
             if ahead > 0.0 and abs(left) < WEDGE * ahead + SIDE:
                 far = min(max(CLEAR_M, target_at), FARTHEST_M)
-        others, cylinders = self._find_visible(body, view, far)
+        others, cylinders = self._find_visible(number, view, far)
         behind = int((others > target_at).sum())
         _draw(image, cylinders[:behind])
         if target is not None:
@@ -68,7 +68,7 @@ class CrowdCameras:
         _draw(image, cylinders[behind:])
         return self._room.add_noise(image)
 
-    def _find_visible(self, body: int, view: CameraFrame, far: float) -> tuple[Floats, list[list[int]]]:
+    def _find_visible(self, number: int, view: CameraFrame, far: float) -> tuple[Floats, list[list[int]]]:
         """Return the distances of the robots in view, farthest first, with the columns and lowest row of their strips.
 
         The cylinders are as high as the lens, so their tops are never visible.
@@ -77,7 +77,7 @@ class CrowdCameras:
         dx, dy = crowd.x - view.x, crowd.y - view.y
         ahead, left = view.cos * dx + view.sin * dy, view.cos * dy - view.sin * dx
         is_seen = (ahead > 0.0) & (ahead < far) & (np.abs(left) < WEDGE * ahead + SIDE)
-        is_seen[body] = False
+        is_seen[number] = False
         seen = np.flatnonzero(is_seen)
         ahead, left = ahead[seen], left[seen]
         distance = np.hypot(ahead, left)

@@ -51,10 +51,10 @@ def main(arguments: Sequence[str], make_team: MakeTeam | None = None) -> int:
         if path is not None and not path.parent.is_dir():
             parser.error(f"{path} cannot be written: there is no folder {path.parent}; create it")
     try:
-        ground = make_square_scene(args.bodies, args.room)
+        scene = make_square_scene(args.bodies, args.room)
         if args.agents and make_team is not None:
-            return _run_search(args, ground, make_team)
-        return _run_without_agents(args, ground)
+            return _run_search(args, scene, make_team)
+        return _run_without_agents(args, scene)
     except (SceneError, NotPossible) as error:
         parser.error(str(error))
 

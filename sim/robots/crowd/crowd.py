@@ -102,7 +102,7 @@ class Crowd:
                 return self.place_target(x, y)
         raise NotPossible("no place is free near the centre; give the robots more room")
 
-    def move(self, body: int, x: float, y: float, heading: float) -> None:
+    def move(self, number: int, x: float, y: float, heading: float) -> None:
         """Move a robot to this place, at rest; raise ``NotPossible`` if another robot or a wall is in the way."""
         scene = self.scene
         inside = (
@@ -110,13 +110,13 @@ class Crowd:
             and FOOTPRINT_RADIUS_M <= y <= scene.height - FOOTPRINT_RADIUS_M
         )
         gap = np.hypot(self.x - x, self.y - y)
-        gap[body] = math.inf
+        gap[number] = math.inf
         if not (inside and gap.min() >= 2 * FOOTPRINT_RADIUS_M and math.isfinite(heading)):
-            raise NotPossible(f"robot {body} does not fit at ({x:.2f}, {y:.2f}); choose a free place")
+            raise NotPossible(f"robot {number} does not fit at ({x:.2f}, {y:.2f}); choose a free place")
         for row, value in ((self.x, x), (self.y, y), (self.heading, math.remainder(heading, math.tau))):
-            row[body] = value
+            row[number] = value
         for row in (self.vx, self.vy, self.wz, self.ax, self.ay):
-            row[body] = 0.0
+            row[number] = 0.0
         self.ranges = self.cast_rays()
 
     def digest(self) -> str:

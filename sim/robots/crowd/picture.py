@@ -49,13 +49,13 @@ def draw_svg(
     rows = list(zip(crowd.x.tolist(), crowd.y.tolist(), crowd.heading.tolist(), strict=True))
     for kind in present_kinds:
         # One path per kind: a disc is a stroke of zero length with round ends, its nose a short line.
-        bodies = [rows[body] for body in range(scene.robots) if kinds.get(body, OTHER) == kind]
-        discs = "".join(f"M{at(x, y)}h0" for x, y, _ in bodies)
+        poses = [rows[body] for body in range(scene.robots) if kinds.get(body, OTHER) == kind]
+        discs = "".join(f"M{at(x, y)}h0" for x, y, _ in poses)
         wide = f'stroke-width="{2 * FOOTPRINT_RADIUS_M * scale:.2f}" stroke-linecap="round"'
         parts.append(f'<path d="{discs}" stroke="{INK[kind]}" {wide}/>')
         noses = "".join(
             f"M{at(x, y)}L{at(x + FOOTPRINT_RADIUS_M * math.cos(turn), y + FOOTPRINT_RADIUS_M * math.sin(turn))}"
-            for x, y, turn in bodies
+            for x, y, turn in poses
         )
         parts.append(f'<path d="{noses}" stroke="white" stroke-width="{0.3 * FOOTPRINT_RADIUS_M * scale:.2f}"/>')
     if crowd.target is not None:

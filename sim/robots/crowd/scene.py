@@ -23,7 +23,7 @@ AREA_M2 = 4.0
 
 @dataclass(frozen=True)
 class CrowdScene:
-    """A walled rectangle of ``width`` by ``height`` metres with ``bodies`` round robots of an ERS-7's footprint.
+    """A walled rectangle of ``width`` by ``height`` metres with ``robots`` round robots of an ERS-7's footprint.
 
     Raises ``SceneError`` with the remedy for invalid values.
     """
@@ -70,11 +70,11 @@ class CrowdScene:
         return (cells % columns + 0.5) * across + loose_x, (cells // columns + 0.5) * up + loose_y, heading
 
 
-def make_square_scene(bodies: int, room: float = AREA_M2) -> CrowdScene:
+def make_square_scene(robots: int, room: float = AREA_M2) -> CrowdScene:
     """Return a square ground with ``room`` square metres per robot; raise ``SceneError`` if that is too little."""
-    if type(bodies) is not int or not 1 <= bodies <= MAX_ROBOTS:
-        raise SceneError(f"bodies must be a whole number from 1 to {MAX_ROBOTS}, not {bodies!r}")
+    if type(robots) is not int or not 1 <= robots <= MAX_ROBOTS:
+        raise SceneError(f"bodies must be a whole number from 1 to {MAX_ROBOTS}, not {robots!r}")
     if not (isinstance(room, int | float) and CELL_M**2 <= room <= 1000.0):
         raise SceneError(f"room must be a number from {CELL_M**2:.2f} to 1000 square metres per robot, not {room!r}")
-    side = round(max(3.0, math.sqrt(bodies * room)), 2)
-    return CrowdScene(bodies, side, side)
+    side = round(max(3.0, math.sqrt(robots * room)), 2)
+    return CrowdScene(robots, side, side)

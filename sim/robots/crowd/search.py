@@ -90,10 +90,10 @@ def run_search(
 
     ``show`` is called after each measurement; when ``is_over`` returns True, the search ends with the results so far.
     """
-    yard = team.simulator
-    outcome = Outcome(seed, len(yard.names), yard.crowd.scene.robots)
+    simulator = team.simulator
+    outcome = Outcome(seed, len(simulator.names), simulator.crowd.scene.robots)
     started_at, sent = team.clock.seconds(), team.switchboard.counters["sent"]
-    before = stopwatch(), yard.moving_s, yard.reporting_s
+    before = stopwatch(), simulator.moving_s, simulator.reporting_s
     team.assign()
     while outcome.seconds < limit and outcome.reach is None and not is_over():
         for _ in range(SLICES):
@@ -101,13 +101,13 @@ def run_search(
                 team.clock.advance(POLL_S / SLICES)
         outcome.seconds = round(team.clock.seconds() - started_at, 3)
         outcome.datagrams = team.switchboard.counters["sent"] - sent
-        if yard.crowd.target is None and outcome.seconds >= PLACE_TARGET_S:
-            yard.crowd.place_target_at_random()
+        if simulator.crowd.target is None and outcome.seconds >= PLACE_TARGET_S:
+            simulator.crowd.place_target_at_random()
         _measure(outcome, team)
         show(outcome)
-    spent, moving, telling = stopwatch() - before[0], yard.moving_s - before[1], yard.reporting_s - before[2]
+    spent, moving, telling = stopwatch() - before[0], simulator.moving_s - before[1], simulator.reporting_s - before[2]
     outcome.cost = {"moving": moving, "telling": telling, "agents": spent - moving - telling}
-    outcome.digest = f"{team.switchboard.digest()[:16]}-{yard.crowd.digest()[:16]}"
+    outcome.digest = f"{team.switchboard.digest()[:16]}-{simulator.crowd.digest()[:16]}"
     return outcome
 
 
@@ -132,17 +132,17 @@ def _measure(outcome: Outcome, team: SearchTeam) -> None:
     if outcome.by != before:
         outcome.trail.clear()  # another robot was selected
     if outcome.by:
-        body = team.simulator.names.index(outcome.by)
-        outcome.trail.append((float(team.simulator.crowd.x[body]), float(team.simulator.crowd.y[body])))
+        number = team.simulator.names.index(outcome.by)
+        outcome.trail.append((float(team.simulator.crowd.x[number]), float(team.simulator.crowd.y[number])))
 
 
-def _is_nearest(yard: CrowdSimulator, chosen: str, finders: list[str]) -> bool:
-    crowd, target = yard.crowd, yard.crowd.target
+def _is_nearest(simulator: CrowdSimulator, chosen: str, finders: list[str]) -> bool:
+    crowd, target = simulator.crowd, simulator.crowd.target
     if target is None:
         return False
     gaps = np.hypot(crowd.x - target.x, crowd.y - target.y)
-    least = min((float(gaps[yard.names.index(name)]) for name in finders), default=math.inf)
-    return bool(gaps[yard.names.index(chosen)] <= least * (1.0 + SLACK_M) + SLACK_M)
+    least = min((float(gaps[simulator.names.index(name)]) for name in finders), default=math.inf)
+    return bool(gaps[simulator.names.index(chosen)] <= least * (1.0 + SLACK_M) + SLACK_M)
 
 
 def format_table(outcome: Outcome) -> str:

@@ -82,9 +82,9 @@ class CrowdSensors:
         self._rows = np.stack(columns, axis=1).tolist()
         self._moving = moving.tolist()
 
-    def values(self, body: int) -> dict[str, Value]:
-        """Return the newest values of the robot ``body``, NaN for nothing in range."""
-        return {**dict(zip(_KEYS, self._rows[body], strict=True)), "base.moving": self._moving[body]}
+    def values(self, number: int) -> dict[str, Value]:
+        """Return the newest values of the robot ``number``, NaN for nothing in range."""
+        return {**dict(zip(_KEYS, self._rows[number], strict=True)), "base.moving": self._moving[number]}
 
     def _update_odometry(self, moving: Floats, vx: Floats, vy: Floats, wz: Floats, noise: Floats) -> None:
         x, y, yaw = self._odometry

@@ -100,8 +100,8 @@ class _Camera(DatagramProtocol):
             self.transport.write(data, addr)
 
 
-def serve(reactor: Any, body: SimulatedRobot, rng: random.Random, options: Table, dialect: str) -> EmulatorServer:
+def serve(reactor: Any, robot: SimulatedRobot, rng: random.Random, options: Table, dialect: str) -> EmulatorServer:
     """Return the server of an AIBO; ``dialect`` is its version of Tekkotsu, "T4" or "T2"."""
     args = parse_options(options)
-    dog = AiboEmulator(reactor, body, rng, dialect, dict(args.ports) | {"gains": 0})
+    dog = AiboEmulator(reactor, robot, rng, dialect, dict(args.ports) | {"gains": 0})
     return AiboServer(reactor, dog, args.host)

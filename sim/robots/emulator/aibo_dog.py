@@ -43,7 +43,7 @@ class AiboEmulator:
     def __init__(
         self,
         clock: IReactorTime,
-        body: SimulatedRobot,
+        robot: SimulatedRobot,
         rng: random.Random,
         dialect: str = T4,
         ports: dict[str, int] | None = None,
@@ -59,7 +59,7 @@ class AiboEmulator:
         """The newest walk commands, for tests."""
         self.start_ms = 0
         self._clock = clock
-        self._robot = body
+        self._robot = robot
         self._rng = rng
         self._dialect = dialect
         self._walk = {"f": 0.0, "s": 0.0, "r": 0.0}

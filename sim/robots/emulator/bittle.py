@@ -48,7 +48,7 @@ class Bittle:
 
     def __init__(
         self,
-        body: SimulatedRobot,
+        robot: SimulatedRobot,
         clock: IReactorTime,
         rng: random.Random,
         board: str = "biboard",
@@ -64,7 +64,7 @@ class Bittle:
         self.task_output: list[str] = []
         self.is_limp = True
         self.clock = clock
-        self._robot = body
+        self._robot = robot
         self._rng = rng
         self._resets = resets
         self._gaits = gaits
@@ -310,11 +310,11 @@ class BittlePage:
             self._link.send(piece)
 
 
-def serve(reactor: Any, body: SimulatedRobot, rng: random.Random, options: Table, dialect: str) -> EmulatorServer:
+def serve(reactor: Any, robot: SimulatedRobot, rng: random.Random, options: Table, dialect: str) -> EmulatorServer:
     """Return the server of a Bittle: a pseudo-terminal, or HTTP."""
     args = parse_options(options)
     board = "biboard" if args.board == "auto" else args.board
-    dog = Bittle(body, reactor, rng, board=board, gaits=dict(args.gaits))
+    dog = Bittle(robot, reactor, rng, board=board, gaits=dict(args.gaits))
     if args.port:
         return PtyEmulatorServer(reactor, dog, args.port)
     return TcpEmulatorServer(reactor, dog, dog.accept_http, args.host, args.http_port)

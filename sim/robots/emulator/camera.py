@@ -44,13 +44,13 @@ class MjpegCamera(Broadcast[_Client]):
 
     ``faults`` corrupts its data.  ``status`` other than ``200 OK`` refuses clients; without ``has_length`` only
     boundaries separate the pictures; ``is_chunked`` selects chunked encoding, as on an ESP32-CAM.  Pictures are dropped
-    for a client that does not read them, and omitted if the body has none.
+    for a client that does not read them, and omitted if the robot has none.
     """
 
     make_client = _Client
 
-    def __init__(self, clock: IReactorTime, body: SimulatedRobot, fps: float = 15.0) -> None:
-        super().__init__(clock, body, fps)
+    def __init__(self, clock: IReactorTime, robot: SimulatedRobot, fps: float = 15.0) -> None:
+        super().__init__(clock, robot, fps)
         self.status = "200 OK"
         self.kind = f"{codec.CONTENT_TYPE};boundary={codec.BOUNDARY}"
         self.has_length = True
@@ -81,11 +81,11 @@ class MjpegCamera(Broadcast[_Client]):
                 client.output.send(data)
 
 
-def serve(reactor: Any, body: SimulatedRobot, rng: random.Random, options: Table, dialect: str) -> EmulatorServer:
+def serve(reactor: Any, robot: SimulatedRobot, rng: random.Random, options: Table, dialect: str) -> EmulatorServer:
     """Return the server of a camera; raise ``UsageError`` if ``options`` have no url."""
     args = parse_options(options)
     if not args.url:
         raise UsageError('an emulated camera needs the option url, as in url = "http://127.0.0.1:8081/"')
     place = parse_url(args.url)
-    camera = MjpegCamera(reactor, body, float(options.get("fps", 15.0)))
+    camera = MjpegCamera(reactor, robot, float(options.get("fps", 15.0)))
     return TcpEmulatorServer(reactor, camera, camera.accept, place.host, place.port)

@@ -19,14 +19,14 @@ class NmeaCompass(Broadcast[Client]):
     """One compass, on a cable or on the network.  North is along the map's y axis.
 
     ``kinds`` are the sentences of each report.  The sensor is off by ``deviation``, magnetic north by ``variation``, in
-    degrees to the east; ``HDG`` contains both, ``HDM`` is corrected by the deviation.  For a body without
+    degrees to the east; ``HDG`` contains both, ``HDM`` is corrected by the deviation.  For a robot without
     ``compass.heading`` the field is empty.  ``faults`` corrupts the data.
     """
 
     make_client = Client
 
-    def __init__(self, clock: IReactorTime, body: SimulatedRobot, rate: float = 10.0) -> None:
-        super().__init__(clock, body, rate)
+    def __init__(self, clock: IReactorTime, robot: SimulatedRobot, rate: float = 10.0) -> None:
+        super().__init__(clock, robot, rate)
         self.kinds: tuple[str, ...] = ("HDG",)
         self.deviation = 0.0
         self.variation = 0.0
@@ -48,10 +48,10 @@ class NmeaCompass(Broadcast[Client]):
         return encode_sentence(f"HC{kind}", degrees, kind[2])
 
 
-def serve(reactor: Any, body: SimulatedRobot, rng: random.Random, options: Table, dialect: str) -> EmulatorServer:
+def serve(reactor: Any, robot: SimulatedRobot, rng: random.Random, options: Table, dialect: str) -> EmulatorServer:
     """Return the server of a compass: a pseudo-terminal, or TCP."""
     args = parse_options(options)
-    compass = NmeaCompass(reactor, body)
+    compass = NmeaCompass(reactor, robot)
     if args.device:
         return PtyEmulatorServer(reactor, compass, args.device)
     return TcpEmulatorServer(reactor, compass, compass.accept, args.host, args.port)

@@ -35,12 +35,12 @@ class Create2:
     ``faults`` corrupts its output; ``reboot`` is a power cut; ``left`` and ``right`` are its wheel encoders, in counts.
     """
 
-    def __init__(self, body: SimulatedRobot, clock: IReactorTime, rng: random.Random) -> None:
+    def __init__(self, robot: SimulatedRobot, clock: IReactorTime, rng: random.Random) -> None:
         self.faults = StreamFaults()
         self.mode = OFF
         self.left = self.right = 0.0
         self.played_songs: list[int] = []
-        self._robot = body
+        self._robot = robot
         self._output = FaultyOutput(clock, rng, self.faults)
         self._reader = codec.CommandReader()
         self._ids: tuple[int, ...] = ()
@@ -224,6 +224,6 @@ class Create2:
         return packets
 
 
-def serve(reactor: Any, body: SimulatedRobot, rng: random.Random, options: Table, dialect: str) -> EmulatorServer:
+def serve(reactor: Any, robot: SimulatedRobot, rng: random.Random, options: Table, dialect: str) -> EmulatorServer:
     """Return the server of a Create 2, a pseudo-terminal."""
-    return PtyEmulatorServer(reactor, Create2(body, reactor, rng), parse_options(options).port)
+    return PtyEmulatorServer(reactor, Create2(robot, reactor, rng), parse_options(options).port)

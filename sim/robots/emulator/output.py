@@ -64,11 +64,11 @@ class Broadcast(Generic[AnyClient]):
 
     make_client: type[AnyClient]
 
-    def __init__(self, clock: IReactorTime, body: SimulatedRobot, rate: float) -> None:
+    def __init__(self, clock: IReactorTime, robot: SimulatedRobot, rate: float) -> None:
         self.faults = StreamFaults()
         self.clients: list[AnyClient] = []
         self._clock = clock
-        self._robot = body
+        self._robot = robot
         self._interval = 1.0 / rate
         self._rng = random.Random(0)
         self._due = 0.0

@@ -53,7 +53,7 @@ class RosbridgeRobot:
     def __init__(
         self,
         clock: IReactorTime,
-        body: SimulatedRobot,
+        robot: SimulatedRobot,
         rng: Random,
         velocity_type: str = "geometry_msgs/msg/Twist",
     ) -> None:
@@ -65,7 +65,7 @@ class RosbridgeRobot:
         self.ignored_count = 0
         self.received_messages: list[dict[str, Any]] = []
         self._clock = clock
-        self._robot = body
+        self._robot = robot
         self._rng = rng
         self._clients: list[_Client] = []
         self._ticks = 0
@@ -319,8 +319,8 @@ def _read_number(value: object, default: float = 0.0) -> float:
     return float(value) if isinstance(value, (int, float)) and not isinstance(value, bool) else default
 
 
-def serve(reactor: Any, body: SimulatedRobot, rng: random.Random, options: Table, dialect: str) -> EmulatorServer:
+def serve(reactor: Any, simulated: SimulatedRobot, rng: random.Random, options: Table, dialect: str) -> EmulatorServer:
     """Return the server of a rosbridge."""
     args = parse_options(options)
-    robot = RosbridgeRobot(reactor, body, rng)
+    robot = RosbridgeRobot(reactor, simulated, rng)
     return TcpEmulatorServer(reactor, robot, robot.accept, args.host, args.port)

@@ -32,9 +32,9 @@ class ServeFunction(Protocol):
     """The function ``serve`` of an emulator's module."""
 
     def __call__(
-        self, reactor: Any, body: SimulatedRobot, rng: random.Random, options: Table, dialect: str
+        self, reactor: Any, robot: SimulatedRobot, rng: random.Random, options: Table, dialect: str
     ) -> EmulatorServer:
-        """Return the server of a robot that moves ``body``, at the address in its driver's ``options``.
+        """Return the server of a robot that moves ``robot``, at the address in its driver's ``options``.
 
         Raises ``UsageError`` if the options contain no address.
         """

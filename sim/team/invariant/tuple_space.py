@@ -78,7 +78,7 @@ def t1(events: Iterable[Event]) -> Iterator[str]:
 def t2(events: Iterable[Event]) -> Iterator[str]:
     """Durability: readers see acknowledged tuples that were not taken; after the repair interval requests succeed."""
     space = _TupleSpaceState()
-    asked: dict[int, Asked] = {}
+    requests: dict[int, Asked] = {}
     acknowledged: dict[Hashable, None] = {}
     wanted: dict[int, tuple[Hashable, ...]] = {}
     is_over, is_rung = False, True
@@ -88,19 +88,21 @@ def t2(events: Iterable[Event]) -> Iterator[str]:
             case Settled():
                 is_over = True
             case Asked(_, number, _, what):
-                asked[number] = event
+                requests[number] = event
                 is_rung = is_rung and what != RING
                 if what == SURVEY:
                     wanted[number] = tuple(acknowledged)
-            case Answered(_, number, result) if number in asked:
-                what, subject = asked[number].what, asked[number].subject
+            case Answered(_, number, result) if number in requests:
+                what, subject = requests[number].what, requests[number].subject
                 if what == PUT:
                     acknowledged[subject] = None
                 is_rung = is_rung or what == RING
                 if what == SURVEY and isinstance(result, tuple):
-                    yield from _find_unseen(space, wanted.pop(number), set(result), asked[number].client)
-            case Unanswered(_, number, why) if is_over and number in asked and asked[number].what in (SURVEY, RING):
-                what = "a put" if asked[number].what == RING else "a read of all tuples"
+                    yield from _find_unseen(space, wanted.pop(number), set(result), requests[number].client)
+            case Unanswered(_, number, why) if (
+                is_over and number in requests and requests[number].what in (SURVEY, RING)
+            ):
+                what = "a put" if requests[number].what == RING else "a read of all tuples"
                 yield f"{what} fails after everything healed: {why}"
     if not is_rung:
         yield "a put is not acknowledged after everything healed"
@@ -119,22 +121,22 @@ def _find_unseen(
 def t3(events: Iterable[Event]) -> Iterator[str]:
     """Finality: a confirmed take is visible in every survey that starts later."""
     space = _TupleSpaceState()
-    asked: dict[int, Asked] = {}
+    requests: dict[int, Asked] = {}
     confirmed: dict[Hashable, str] = {}
     over: dict[int, dict[Hashable, str]] = {}
     for event in events:
         space.apply(event)
         match event:
             case Asked(_, number, _, what):
-                asked[number] = event
+                requests[number] = event
                 if what == SURVEY:
                     over[number] = dict(confirmed)
-            case Answered(at, number, tuple() as result) if number in asked:
-                client = asked[number].client
-                if asked[number].what == TAKE:
+            case Answered(at, number, tuple() as result) if number in requests:
+                client = requests[number].client
+                if requests[number].what == TAKE:
                     for fields in result:
                         confirmed.setdefault(fields, f"node {client} at {at:.1f}")
-                elif asked[number].what == SURVEY:
+                elif requests[number].what == SURVEY:
                     before, known = (
                         over.pop(number),
                         {stored_tuple.fields: stored_tuple for stored_tuple in space.tuples.values()},

@@ -28,18 +28,18 @@ def r2(events: Iterable[Event]) -> Iterator[str]:
     """At most once: a request that changes something runs at most once, and an answer implies that it ran."""
     runs: Counter[tuple[int, int, int]] = Counter()
     lives: dict[int, int] = {}
-    asked: dict[int, Asked] = {}
+    requests: dict[int, Asked] = {}
     for event in events:
         match event:
             case RequestExecuted(_, place, life, question):
                 lives[place] = max(life, lives.get(place, 0))
                 runs[place, life, question] += 1
             case Asked(_, number, _, "run"):
-                asked[number] = event
-            case Answered(_, number, (answer, place, life, newest)) if number in asked:
-                ran = runs[place, life, asked[number].subject]  # type: ignore[index]
-                if answer != asked[number].subject or (ran != 1 and newest == life):
-                    yield f"question {asked[number].subject} was answered with {answer!r} and ran {ran} times"
+                requests[number] = event
+            case Answered(_, number, (answer, place, life, newest)) if number in requests:
+                ran = runs[place, life, requests[number].subject]  # type: ignore[index]
+                if answer != requests[number].subject or (ran != 1 and newest == life):
+                    yield f"question {requests[number].subject} was answered with {answer!r} and ran {ran} times"
     for (place, _, question), ran in runs.items():
         if ran > 1:
             yield f"node {place} ran question {question} {ran} times"

@@ -197,15 +197,15 @@ class BiddingAgents:
         team.watch_lives(self._on_birth, self._on_death)
 
     def get(self, place: int) -> BiddingAgent | None:
-        """Return the deputy of a place; None if its node does not live."""
+        """Return the agent of a place; None if its node does not live."""
         return self._present.get(place)
 
     def list_present(self) -> list[BiddingAgent]:
-        """Return the deputies of living nodes, by place."""
+        """Return the agents of living nodes, by place."""
         return [self._present[place] for place in sorted(self._present)]
 
     def is_alive(self, agent: BiddingAgent) -> bool:
-        """Return whether the deputy's node still lives."""
+        """Return whether the node of the agent still lives."""
         return self._present.get(agent.place) is agent
 
     def _on_birth(self, place: int, node: Node) -> None:
@@ -214,17 +214,17 @@ class BiddingAgents:
         self._present[place] = BiddingAgent(place, node, self._clock, rng)
 
     def _on_death(self, place: int, node: Node) -> None:
-        deputy = self._present.get(place)
-        if deputy is not None and deputy.node is node:
+        agent = self._present.get(place)
+        if agent is not None and agent.node is node:
             del self._present[place]
-            deputy.stop()
+            agent.stop()
 
 
 _AGENTS_BY_TEAM: WeakKeyDictionary[Team, BiddingAgents] = WeakKeyDictionary()
 
 
 def get_bidding_agents(team: Team) -> BiddingAgents:
-    """Return the deputies of ``team``, shared by all workloads, as a node has one handler for bids."""
+    """Return the agents of ``team``, shared by all workloads, as a node has one handler for bids."""
     known = _AGENTS_BY_TEAM.get(team)
     if known is None:
         known = _AGENTS_BY_TEAM[team] = BiddingAgents(team)

@@ -95,7 +95,7 @@ class Takeovers(ClientWorkload):
 
     def _start_trial(self) -> bool:
         free = [place for place in self._joined.any(self._rng, 4 * AGENTS_PER_TASK) if place not in self._busy]
-        agents = [deputy for place in free[:AGENTS_PER_TASK] if (deputy := self._agents.get(place)) is not None]
+        agents = [agent for place in free[:AGENTS_PER_TASK] if (agent := self._agents.get(place)) is not None]
         if len(agents) < AGENTS_PER_TASK:
             return False
         self._begun += 1

@@ -59,30 +59,30 @@ def run_scale(arguments: Sequence[str], world: Environment, measure: Measure = m
             world.err.write(f"{nodes:,} nodes: already measured\n")
             continue
         try:
-            sized = measure(nodes, settings, watcher)
+            result = measure(nodes, settings, watcher)
         except MeasurementStopped:
             break
-        record.add(sized)
+        record.add(result)
         world.out.write(
-            f"\n{nodes:,} nodes, {sized.cpu:,.0f} s of the processor\n{format_table(apply_targets(sized))}\n"
+            f"\n{nodes:,} nodes, {result.cpu:,.0f} s of the processor\n{format_table(apply_targets(result))}\n"
         )
-        for line in sized.violations:
+        for line in result.violations:
             world.out.write(f"violated  {line}\n")
         world.out.flush()
         _draw(out, record.sizes, settings)
     _draw(out, record.sizes, settings)
-    found = [figure for sized in record.sizes.values() for figure in apply_targets(sized)]
+    found = [figure for result in record.sizes.values() for figure in apply_targets(result)]
     missed = [figure for figure in found if figure.holds is False]
     world.out.write(f"\n{len(found)} figures, {len(missed)} missed; {out / 'scale.json'}, {out / 'scale.svg'}\n")
     if world.is_stopped():
         return EXIT_INTERRUPTED
-    return EXIT_MISSED if missed or any(sized.violations for sized in record.sizes.values()) else 0
+    return EXIT_MISSED if missed or any(result.violations for result in record.sizes.values()) else 0
 
 
-def apply_targets(sized: SizeResult) -> list[Metric]:
+def apply_targets(result: SizeResult) -> list[Metric]:
     """Return the figures of one size with the targets for that size."""
-    targets = {curve.metric: curve.get_target(sized.nodes) for curve in CURVES}
-    return [metric.with_target(targets.get(metric.name)) for metric in sized.metrics]
+    targets = {curve.metric: curve.get_target(result.nodes) for curve in CURVES}
+    return [metric.with_target(targets.get(metric.name)) for metric in result.metrics]
 
 
 def collect_points(sizes: Mapping[int, SizeResult]) -> dict[str, list[tuple[int, float]]]:

@@ -49,9 +49,9 @@ class MeasurementFile:
         except (TypeError, ValueError, KeyError) as error:
             raise self._make_error(f"it contains an invalid size: {error}") from error
 
-    def add(self, sized: SizeResult) -> None:
+    def add(self, result: SizeResult) -> None:
         """Add a size, and replace the file atomically."""
-        self.sizes[sized.nodes] = sized
+        self.sizes[result.nodes] = result
         content = {
             "digest": self._settings.digest(),
             "settings": asdict(self._settings),
@@ -64,12 +64,12 @@ class MeasurementFile:
         return BadSetting(str(self._path), "", f"cannot be used: {problem}", "move it away, or name another --out")
 
 
-def _encode_size(sized: SizeResult) -> dict[str, Any]:
+def _encode_size(result: SizeResult) -> dict[str, Any]:
     return {
-        "figures": [metric.to_json() for metric in sized.metrics],
-        "violations": sized.violations,
-        "hash": sized.hash,
-        "cpu": round(sized.cpu, 1),
+        "figures": [metric.to_json() for metric in result.metrics],
+        "violations": result.violations,
+        "hash": result.hash,
+        "cpu": round(result.cpu, 1),
     }
 
 

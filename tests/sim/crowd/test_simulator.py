@@ -32,15 +32,15 @@ class DrivenTests(SynchronousTestCase):
     def setUp(self) -> None:
         """Place the first robot at the left, facing right, and the others behind it."""
         self.clock = HeapClock()
-        self.yard = CrowdSimulator(self.clock, Random(1), CrowdScene(5, 6.0, 4.0), 2, stand)
-        self.crowd = self.yard.crowd
+        self.simulator = CrowdSimulator(self.clock, Random(1), CrowdScene(5, 6.0, 4.0), 2, stand)
+        self.crowd = self.simulator.crowd
         for body, (x, y) in enumerate(((1.0, 2.0), (0.3, 0.3), (0.3, 3.7), (0.3, 3.0), (0.3, 1.0))):
             self.crowd.move(body, x, y, 0.0)
-        self.yard.start()
+        self.simulator.start()
 
     def driver(self, name: str = "robot1", fps: float = 0.0) -> SimDriver:
         """Return a connected driver of the robot, enabled if possible."""
-        driver = SimDriver({"robot": name, "camera_fps": fps}, self.yard.connector(), self.clock)
+        driver = SimDriver({"robot": name, "camera_fps": fps}, self.simulator.connector(), self.clock)
         driver.connect().addCallback(lambda _: driver.enable()).addErrback(lambda why: why.trap(DriverError))
         self.clock.advance(0.5)
         return driver
@@ -72,8 +72,8 @@ class DrivenTests(SynchronousTestCase):
         before = driver.diagnostics()["frames"]
         self.clock.advance(100 * TICK_S)
         self.assertEqual(driver.diagnostics()["frames"] - before, 100)
-        for yard in (dogs, self.yard):
-            yard.stop()
+        for simulator in (dogs, self.simulator):
+            simulator.stop()
 
     def test_obeys_its_driver(self) -> None:
         """The robot and its odometry follow the commands until their time to live ends; other robots stay."""
@@ -91,7 +91,7 @@ class DrivenTests(SynchronousTestCase):
 
     def test_stands_when_nothing_is_heard(self) -> None:
         """A robot stops at the end of the time to live if its link falls silent without being closed."""
-        connector = self.yard.connector()
+        connector = self.simulator.connector()
         driver = SimDriver({"robot": "robot1", "camera_fps": 0.0}, connector, self.clock)
         driver.connect().addCallback(lambda _: driver.enable())
         self.clock.advance(0.5)
@@ -102,7 +102,7 @@ class DrivenTests(SynchronousTestCase):
         self.clock.advance(0.5)
         self.assertEqual(float(self.crowd.vx[0]), 0.0)
         self.clock.advance(4.0)
-        self.assertEqual(self.yard.driven_robots, [])
+        self.assertEqual(self.simulator.driven_robots, [])
 
     def test_ranges(self) -> None:
         """The near and far sensors measure from the nose to the obstacle, and return NaN beyond their range."""
@@ -164,25 +164,25 @@ class DrivenTests(SynchronousTestCase):
 
     def test_body_for_an_emulator(self) -> None:
         """A robot that is lent to an emulator moves, stops, senses and detects bumps, and rejects drivers."""
-        body = self.yard.reserve_for_emulator("robot2")
-        body.drive(0.16, 0.0, 0.0)
+        robot = self.simulator.reserve_for_emulator("robot2")
+        robot.drive(0.16, 0.0, 0.0)
         self.clock.advance(1.0)
         self.assertGreater(float(self.crowd.x[1]), 0.4)
-        body.drive(math.nan, 0.0, 0.0)
+        robot.drive(math.nan, 0.0, 0.0)
         self.clock.advance(0.5)
         self.assertEqual(float(self.crowd.vx[1]), 0.0)
-        self.assertEqual(self.bumps(body), (False, False))
+        self.assertEqual(self.bumps(robot), (False, False))
         self.crowd.move(2, float(self.crowd.x[1]) + 2 * FOOTPRINT_RADIUS_M, 0.3, 0.0)
-        self.assertEqual(self.bumps(body), (True, True))
+        self.assertEqual(self.bumps(robot), (True, True))
         self.crowd.move(1, 3.0, FOOTPRINT_RADIUS_M, math.radians(-60.0))
-        self.assertEqual(self.bumps(body), (False, True))
+        self.assertEqual(self.bumps(robot), (False, True))
         self.crowd.move(1, 3.0, 2.0, 0.0)
         self.crowd.place_target(3.0 + FOOTPRINT_RADIUS_M + 0.08, 2.0)
-        self.assertEqual(self.bumps(body), (True, True))
-        self.assertIn("odom.x", body.sense())
-        body.halt()
+        self.assertEqual(self.bumps(robot), (True, True))
+        self.assertIn("odom.x", robot.sense())
+        robot.halt()
         self.assertEqual(self.driver("robot2").state, "closed")
-        self.assertRaises(UsageError, self.yard.reserve_for_emulator, "robot3")
+        self.assertRaises(UsageError, self.simulator.reserve_for_emulator, "robot3")
 
     def bumps(self, body: CrowdRobot) -> tuple[Any, Any]:
         """Return the values of the left and right bump sensors."""
@@ -194,7 +194,7 @@ class DrivenTests(SynchronousTestCase):
         for driven in (-1, 6, 1.5, True):
             self.assertRaises(SceneError, CrowdSimulator, self.clock, Random(1), CrowdScene(5, 6.0, 4.0), driven)
         self.assertEqual(self.driver("robot3").state, "closed")
-        connector = self.yard.connector()
+        connector = self.simulator.connector()
         callers = [SimDriver({"robot": "robot1"}, connector, self.clock) for _ in range(2 + SPARE_CONNECTIONS + 1)]
         for caller in callers:
             caller.connect().addErrback(lambda why: None)

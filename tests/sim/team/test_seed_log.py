@@ -15,7 +15,7 @@ ENTRY = SeedRun("2026-11-22T10:00:00Z", "abc", "", 1, 3, (2,), 1.5)
 
 class SeedLogTests(SynchronousTestCase):
     def book(self) -> Path:
-        """Return the path of a new logbook."""
+        """Return the path of a new seed log."""
         return Path(self.mktemp())
 
     def test_what_is_added_is_read(self) -> None:
@@ -26,7 +26,7 @@ class SeedLogTests(SynchronousTestCase):
         self.assertEqual(parse_entries(book.read_text(), "book"), [ENTRY, second])
 
     def test_half_a_line(self) -> None:
-        """An incomplete last line is ignored when the logbook is read, and removed when an entry is appended."""
+        """An incomplete last line is ignored when the seed log is read, and removed when an entry is appended."""
         book = self.book()
         append_entry(str(book), ENTRY)
         with book.open("a") as torn:
@@ -35,14 +35,14 @@ class SeedLogTests(SynchronousTestCase):
         append_entry(str(book), ENTRY)
         self.assertEqual(parse_entries(book.read_text(), "book"), [ENTRY, ENTRY])
 
-    def test_no_logbook(self) -> None:
+    def test_no_seed_log(self) -> None:
         """A complete line that is no entry is rejected with its line number."""
         told = ENTRY.to_json() + "\nhello\n" + ENTRY.to_json() + "\n"
         error = self.assertRaises(BadSetting, parse_entries, told, "book")
         self.assertIn("line 2", str(error))
 
     def test_missing(self) -> None:
-        """Seeds in the logbook are not run again, except for seeds that ran with other workloads."""
+        """Seeds in the seed log are not run again, except for seeds that ran with other workloads."""
         logged = [ENTRY, replace(ENTRY, first=6), replace(ENTRY, first=4, what="wire")]
         self.assertEqual(find_missing(range(1, 11), logged, ""), [4, 5, 9, 10])
 
