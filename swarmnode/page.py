@@ -85,7 +85,7 @@ def make_page_service(
     if address.yard is not None:
         simulator = SimulatorClient(TcpConnector(), reactor, address.yard.host, address.yard.port)
     client = TeamClient(node)
-    desk = TeamControl(client, TASKS, DEMO_TASK, simulator)
+    control = TeamControl(client, TASKS, DEMO_TASK, simulator)
     tls = (
         None
         if make_tls_port is None
@@ -99,7 +99,7 @@ def make_page_service(
 
     authority, fingerprint = (b"", "") if tls is None else (tls.signer.pem, tls.signer.fingerprint)
     services = Services(
-        desk,
+        control,
         make_sessions(settings, node, reactor, dependencies.rng, team),
         AuditLog(None if store == IN_MEMORY else Path(f"{store}.audit"), wall),
         fallbacks=team,

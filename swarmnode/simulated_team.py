@@ -88,7 +88,7 @@ class SimulatedTeam(Simulation):
         self._simulator_client = SimulatorClient(self.simulator.connector(), self.clock)
         self._simulator_client.connect()
         self.client = TeamClient(self.services[self.BOOTSTRAP].assembly.node)
-        self.desk = TeamControl(self.client, TASKS, DEMO_TASK, self._simulator_client)
+        self.control = TeamControl(self.client, TASKS, DEMO_TASK, self._simulator_client)
         self._departed = DepartedDevices()
         self.clock.advance(self.JOIN_INTERVAL_S)
 
@@ -142,11 +142,11 @@ class SimulatedTeam(Simulation):
 
     def run_demo(self) -> str:
         """Press the Run Demo button; returns the task's id."""
-        return str(self.desk.run_demo())
+        return str(self.control.run_demo())
 
     def state(self) -> dict[str, Any]:
         """Return the state that the page shows now."""
-        return build_state(self.desk.read, self._departed, self.BOOTSTRAP, self.clock.seconds())
+        return build_state(self.control.read, self._departed, self.BOOTSTRAP, self.clock.seconds())
 
     def get_true_state(self) -> dict[str, Any]:
         """Return the true positions in the simulator."""

@@ -52,7 +52,7 @@ class LoopTests(SynchronousTestCase):
         assert isinstance(agent, Agent)
         ages: list[float] = []
         uuid = self.team.services["dog1"].assembly.node.uuid
-        self.team.desk.stream_camera(uuid, lambda seq, jpeg, age: ages.append(age) if jpeg == b"seen" else None)
+        self.team.control.stream_camera(uuid, lambda seq, jpeg, age: ages.append(age) if jpeg == b"seen" else None)
         self.team.clock.advance(0.2)
         frame = Frame(900, 1, 1, b"seen", 4.7)
         agent._on_observation(Observation(self.team.clock.seconds() - 0.2, 5.0, {}, {}, frame))
@@ -96,7 +96,7 @@ class LoopTests(SynchronousTestCase):
             self.team.clock.advance(0.0005)
         connector.cut()
         self.team.clock.advance(3.0)
-        self.team.desk.assign("turn-around")
+        self.team.control.assign("turn-around")
         self.team.clock.advance(1.0)
         self.assertTrue(self.agent_of("dog3")._robot.is_enabled)
         self.assertIsNot(self.agent_of("dog3").engagement, None)

@@ -85,13 +85,13 @@ class TeamCase(SynchronousTestCase):
 
     def members(self, team: SimulatedTeam, task_id: str) -> list[Member]:
         """Return the reports on a task."""
-        return [m for record in team.desk.read(group_key(task_id)) if (m := parse_member(record)) is not None]
+        return [m for record in team.control.read(group_key(task_id)) if (m := parse_member(record)) is not None]
 
     def verdicts(self, team: SimulatedTeam, task_id: str) -> list[DecisionRecord]:
         """Return the decision records of a task."""
         return [
             v
-            for record in team.desk.read(decision_records_key(task_id))
+            for record in team.control.read(decision_records_key(task_id))
             if (v := parse_decision_record(record)) is not None
         ]
 

@@ -40,7 +40,7 @@ class TaskTests(TeamCase):
     def test_task_that_nobody_can_do_stays_open_and_says_why(self) -> None:
         """A task with a requirement that no device meets stays open, and its note lists the missing capabilities."""
         team = self.start_team()
-        answer = team.desk.assign("fetch-the-ball")
+        answer = team.control.assign("fetch-the-ball")
         team.clock.advance(5.0)
         task = self.task(team)
         self.assertEqual((answer["able"], task["status"]), ([], "OPEN"))
@@ -51,7 +51,7 @@ class TaskTests(TeamCase):
     def test_device_is_done_or_idle_until_its_next_task(self) -> None:
         """After a task its dog is DONE and the others are IDLE until all of them take part in the next task."""
         team = self.start_team()
-        team.desk.assign("turn-around")
+        team.control.assign("turn-around")
         shown: list[dict[str, str]] = []
 
         def is_done() -> bool:
@@ -68,16 +68,16 @@ class TaskTests(TeamCase):
         for _ in range(100):
             self.assertEqual(self.statuses(team), wanted)
             team.clock.advance(LOOK_S)
-        team.desk.assign("turn-around")
+        team.control.assign("turn-around")
         self.until(team, lambda: self.statuses(team)[by] not in ("DONE", "IDLE"), 3.0)
         self.until(team, lambda: self.task(team)["status"] == "COMPLETED")
 
     def test_tasks_are_done_one_after_the_other(self) -> None:
         """A task that arrives while a dog is busy is done afterwards."""
         team = self.start_team()
-        team.desk.assign("turn-around")
+        team.control.assign("turn-around")
         team.clock.advance(0.2)
-        team.desk.assign("turn-around")
+        team.control.assign("turn-around")
         self.until(team, lambda: [t["status"] for t in team.state()["tasks"]] == ["COMPLETED", "COMPLETED"])
 
     def test_urgent_task_has_the_bodies_first(self) -> None:
@@ -107,7 +107,7 @@ class TaskTests(TeamCase):
         team.run_demo()
         self.until(team, lambda: bool(self.executing(team)))
         task_id = self.task(team)["id"]
-        team.desk.pause(task_id)
+        team.control.pause(task_id)
         team.clock.advance(1.0)
         self.assertEqual(self.moving(team), [])
         task = self.task(team)
@@ -115,7 +115,7 @@ class TaskTests(TeamCase):
         self.assertIn("paused by vaio", {*self.lines(team, "dog1")})
         team.clock.advance(5.0)
         self.assertEqual(self.task(team)["status"], "ASSIGNED")
-        team.desk.resume(task_id)
+        team.control.resume(task_id)
         self.until(team, lambda: self.task(team)["status"] == "COMPLETED")
 
     def test_deadline_fails_the_task_and_says_so(self) -> None:
@@ -135,7 +135,7 @@ class TaskTests(TeamCase):
         self.until(team, lambda: bool(self.executing(team)))
         team.clock.advance(1.0)
         self.assertTrue(self.moving(team))
-        team.desk.cancel(self.task(team)["id"])
+        team.control.cancel(self.task(team)["id"])
         team.clock.advance(0.5)
         self.assertEqual(self.moving(team), [])
         self.assertEqual(self.task(team)["status"], "CANCELLED")
@@ -267,7 +267,7 @@ class MembershipTests(TeamCase):
         self.until(team, lambda: bool(self.executing(team)))
         first = self.executing(team)[0]
         before = self.device(team, first)
-        team.desk.disconnect(before["uuid"], 5.0)
+        team.control.disconnect(before["uuid"], 5.0)
         self.until(team, lambda: self.device(team, first)["status"] == "GONE", 2.0)
         self.assertFalse(team.simulator.world.dogs[first].is_moving)
         self.until(team, lambda: self.executing(team) not in ([], [first]), 3.0)

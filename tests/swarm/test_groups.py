@@ -112,7 +112,7 @@ class GroupTests(TeamCase):
         """Predefined tasks in one group are done at once, one by each dog, and the page shows the group."""
         team = self.start_team(5)
         for _ in DOGS:
-            team.desk.assign("turn-around", group="yard")
+            team.control.assign("turn-around", group="yard")
         self.until(team, lambda: self.are_done(team))
         self.assertEqual(sorted(self.by(team).values()), list(DOGS))
         told = {(task["group"], task["strategy"]) for task in team.state()["tasks"]}

@@ -97,10 +97,10 @@ class DeployTests(SynchronousTestCase):
         submitted = Deferred.fromCoroutine(self.laptop.submit(task))
         self.team.simulator.world.scatter(3)
         self.team.clock.advance(3.0)
-        self.team.desk.move_target(1.5, 1.2)
+        self.team.control.move_target(1.5, 1.2)
         self.team.clock.advance(seconds)
         self.assertEqual(self.successResultOf(submitted).task_id, task.task_id)
-        records = self.team.desk.read(decision_records_key(task.task_id))
+        records = self.team.control.read(decision_records_key(task.task_id))
         return [verdict for each in records if (verdict := parse_decision_record(each)) is not None]
 
     def test_team_runs_what_is_pushed(self) -> None:

@@ -42,9 +42,9 @@ class SplitTests(FleetCase):
     def test_page(self) -> None:
         """The page of a web node shows every device of a split directory."""
         fleet = self.apart()
-        desk = TeamControl(TeamClient(fleet.nodes[2]), {}, "")
+        control = TeamControl(TeamClient(fleet.nodes[2]), {}, "")
         fleet.run(3.0)
-        state = build_state(desk.read, DepartedDevices(), "dog2", 0.0)
+        state = build_state(control.read, DepartedDevices(), "dog2", 0.0)
         self.assertEqual([device["name"] for device in state["devices"]], [f"dog{n}" for n in range(COUNT)])
 
     def test_shell(self) -> None:

@@ -41,7 +41,7 @@ class ChaosTests(SynchronousTestCase):
     def test_one_fault(self) -> None:
         """A fault in the acting device is reported with the successor and the takeover time, and exit code 0."""
         self.team()
-        self.virtual.desk.assign("turn-around")
+        self.virtual.control.assign("turn-around")
         code, output = self.chaos("executing radio --seconds 4")
         first, second = output.splitlines()
         self.assertRegex(first, r"^dog\d: radio for 4 s$")

@@ -70,9 +70,9 @@ class GatewayTests(SynchronousTestCase):
             clock = self.team.clock
             return Dependencies(clock, network, store, random.Random(self.port), clock.seconds)
 
-        desk = self.team.desk
+        control = self.team.control
         return Gateway(
-            service.settings, service.assembly.node, seams, lambda: [d for d, _ in parse_devices(desk.read(DEVICES))]
+            service.settings, service.assembly.node, seams, lambda: [d for d, _ in parse_devices(control.read(DEVICES))]
         )
 
     def live(self, seconds: float) -> None:
@@ -96,11 +96,11 @@ class GatewayTests(SynchronousTestCase):
         self.assertEqual((device["name"], device["kind"], device["status"]), ("anna", "phone", "IDLE"))
         self.assertEqual(sorted(device["capabilities"]), ["camera", "position"])  # type: ignore[call-overload]
         self.assertNotEqual(device["address"], self.device(self.team.services["vaio"].assembly.node.uuid)["address"])
-        told = next(d for d, _ in parse_devices(self.team.desk.read(DEVICES)) if d.uuid == phone.uuid)
+        told = next(d for d, _ in parse_devices(self.team.control.read(DEVICES)) if d.uuid == phone.uuid)
         self.assertEqual(told.position, {"lat": 52.12346, "lon": 13.0, "accuracy": 12.0})
         self.assertEqual((phone.said, phone.fps), ("Nothing to do at the moment.", 5.0))
         seen: list[bytes] = []
-        stop = self.team.desk.stream_camera(phone.uuid, lambda seq, picture, age: seen.append(picture))
+        stop = self.team.control.stream_camera(phone.uuid, lambda seq, picture, age: seen.append(picture))
         self.live(1.0)
         stop()
         self.assertGreater(len(seen), 4)
@@ -112,7 +112,7 @@ class GatewayTests(SynchronousTestCase):
         self.team.simulator.world.place_target(1.5, 1.2)
         self.sees = {"target.bearing": 0.0, "target.distance": 0.05}
         self.live(1.0)
-        self.team.desk.assign("watch-target")
+        self.team.control.assign("watch-target")
         self.until(lambda: self.device(phone.uuid)["status"] == "EXECUTING", 40.0)
         self.assertEqual((phone.said, phone.fps), ("You have the task: keep the target in view.", 10.0))
         self.sees = {}
@@ -132,7 +132,7 @@ class GatewayTests(SynchronousTestCase):
         phone = Phone(self, self.gateways["vaio"])
         self.team.simulator.world.place_target(1.5, 1.2)
         self.sees = {"target.bearing": 0.0, "target.distance": 0.05}
-        self.team.desk.assign("watch-target")
+        self.team.control.assign("watch-target")
         self.until(lambda: self.device(phone.uuid).get("status") == "EXECUTING" and self.dog_waits(), 40.0)
         phone.looks = False
         began = self.team.clock.seconds()
@@ -184,7 +184,7 @@ class GatewayTests(SynchronousTestCase):
         """A phone that joins again while it releases its task waits for that, and is listed once."""
         phone = Phone(self, self.gateways["vaio"])
         self.sees = {"target.bearing": 0.0, "target.distance": 0.05}
-        self.team.desk.assign("watch-target")
+        self.team.control.assign("watch-target")
         self.until(lambda: self.device(phone.uuid).get("status") == "EXECUTING", 40.0)
         phone.at.leave(phone.uuid)
         phone.at.leave(phone.uuid)
@@ -232,7 +232,7 @@ class GatewayTests(SynchronousTestCase):
         """A phone that an operator disconnects may not join again before the time is over."""
         phone = Phone(self, self.gateways["vaio"])
         self.live(1.0)
-        self.team.desk.disconnect(phone.uuid, 3.0)
+        self.team.control.disconnect(phone.uuid, 3.0)
         self.phones.clear()
         self.live(0.5)
         refusal = self.failureResultOf(phone.at.join(b"s" * 32, "anna", CAN), Refusal).value

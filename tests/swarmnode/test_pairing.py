@@ -81,8 +81,8 @@ class PairingTests(SynchronousTestCase):
             self.addCleanup(services[name].stopService)
             team.clock.advance(1.0)
         team.clock.advance(3.0)
-        desk = TeamControl(TeamClient(services["vaio"].assembly.node), TASKS, DEMO_TASK, None)
-        devices = build_state(desk.read, DepartedDevices(), "vaio", team.clock.seconds())["devices"]
+        control = TeamControl(TeamClient(services["vaio"].assembly.node), TASKS, DEMO_TASK, None)
+        devices = build_state(control.read, DepartedDevices(), "vaio", team.clock.seconds())["devices"]
         told = {device["name"]: (device["name"], device["laptop"], device["agent"]) for device in devices}
         self.assertEqual(told, {"vaio": ("vaio", "vaio", ""), **{row[0]: row for row in ROWS}})
         self.assertEqual({device["kind"] for device in devices}, {"laptop", "aibo-ers7"})

@@ -64,7 +64,7 @@ class FaultControlTests(SynchronousTestCase):
 
     def test_takeover_clock(self) -> None:
         """After a fault in the acting device the takeover time stops below two seconds, and names the successor."""
-        self.team.desk.assign("turn-around")
+        self.team.control.assign("turn-around")
         lost = self.acting()
         self.assertIsNone(self.cause(lost, "radio"))
         self.team.clock.advance(0.6)

@@ -24,19 +24,19 @@ class TunerTests(SynchronousTestCase):
 
     def told(self, name: str = "dog1") -> dict[str, Any]:
         """Return the settings that a device reports."""
-        asked = read_settings(self.team.desk, self.team.services[name].assembly.node.uuid)
+        asked = read_settings(self.team.control, self.team.services[name].assembly.node.uuid)
         self.team.clock.advance(0.1)
         return {str(row["key"]): row["value"] for row in self.successResultOf(asked)}
 
     def change(self, **changes: Any) -> dict[str, Any]:
         """Change settings of dog1 and return the settings that it reports."""
-        asked = change_settings(self.team.desk, self.node.uuid, changes)
+        asked = change_settings(self.team.control, self.node.uuid, changes)
         self.team.clock.advance(0.1)
         return {str(row["key"]): row["value"] for row in self.successResultOf(asked)}
 
     def refusal(self, **changes: Any) -> Refusal:
         """Return the error with which dog1 rejects the changes."""
-        asked = change_settings(self.team.desk, self.node.uuid, changes)
+        asked = change_settings(self.team.control, self.node.uuid, changes)
         self.team.clock.advance(0.1)
         refusal = self.failureResultOf(asked, Refusal).value
         assert isinstance(refusal, Refusal)
@@ -50,7 +50,7 @@ class TunerTests(SynchronousTestCase):
         """A robot with a camera has four settings, a laptop three, each with bounds and unit."""
         self.assertEqual(list(self.told()), KEYS)
         self.assertEqual(list(self.told("vaio")), KEYS[:3])
-        asked = read_settings(self.team.desk, self.node.uuid)
+        asked = read_settings(self.team.control, self.node.uuid)
         self.team.clock.advance(0.1)
         lease = self.successResultOf(asked)[1]
         self.assertEqual([lease[key] for key in ("value", "unit", "least", "most")], [1.0, "s", 0.1, 60.0])
@@ -117,7 +117,7 @@ class TunerTests(SynchronousTestCase):
     def test_device_that_is_gone_is_told(self) -> None:
         """The settings of a device that has just died are answered with 409."""
         self.team.kill("dog1")
-        asked = read_settings(self.team.desk, self.node.uuid)
+        asked = read_settings(self.team.control, self.node.uuid)
         self.team.clock.advance(2.0)
         self.assertEqual(self.failureResultOf(asked, Refusal).value.status, 409)
 

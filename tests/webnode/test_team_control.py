@@ -21,7 +21,7 @@ class TeamControlTests(SynchronousTestCase):
     def setUp(self) -> None:
         self.team = SimulatedTeam(3, dogs=("dog1", "dog2"))
         self.addCleanup(self.team.stop)
-        self.control = self.team.desk
+        self.control = self.team.control
 
     def uuid(self, name: str) -> str:
         """Return the uuid of a device."""
@@ -146,7 +146,7 @@ class RepeatedWishTests(SynchronousTestCase):
     def setUp(self) -> None:
         self.team = SimulatedTeam(3, dogs=("dog1", "dog2"), others=("pi",))
         self.addCleanup(self.team.stop)
-        self.control = self.team.desk
+        self.control = self.team.control
         self.reserve = TeamControl(TeamClient(self.team.services["pi"].assembly.node), TASKS, DEMO_TASK)
         self.team.clock.advance(1.0)
 
