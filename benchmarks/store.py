@@ -168,7 +168,7 @@ def check_restarts(folder: str, rows: int, times: int = 5) -> bool:
                 value, signature = rng.randbytes(200), rng.randbytes(64)
                 name, owner = str(number), rng.choice((OWNER, OWNER[::-1]))
                 store.put(Record(rng.randbytes(20), name, owner, 1, "team", TTL_S, value, signature), TTL_S)
-        took, said = [], [0, 0, 0]
+        took, numbers = [], [0, 0, 0]
         for _ in range(times):
             started = time.monotonic()
             child = subprocess.Popen(
@@ -176,14 +176,16 @@ def check_restarts(folder: str, rows: int, times: int = 5) -> bool:
             )
             assert child.stdout is not None
             with closing(child.stdout):
-                said = [int(word) for word in child.stdout.readline().split()]
+                numbers = [int(word) for word in child.stdout.readline().split()]
                 took.append(time.monotonic() - started)
                 child.terminate()
                 child.wait()
-        assert said and said[0] >= count
+        assert numbers and numbers[0] >= count
         size = os.path.getsize(path) / MIB
         median = sorted(took)[times // 2]
-        _print_line(f"{count:8} {size:9.1f} {median:16.2f} {max(took):8.2f} {said[1] / MIB:8.1f} {said[2] / MIB:9.1f}")
+        _print_line(
+            f"{count:8} {size:9.1f} {median:16.2f} {max(took):8.2f} {numbers[1] / MIB:8.1f} {numbers[2] / MIB:9.1f}"
+        )
         held = held and max(took) <= RESTART_LIMIT_S
     _print_line(f"target: at most {RESTART_LIMIT_S:g} s, the worst of {times}: {'held' if held else 'MISSED'}")
     return held

@@ -127,10 +127,10 @@ def run_cbba(mission: Mission, pause: int = PAUSE_ROUNDS, loss: float = 0.0, qui
     while quiet is None or silent < quiet:
         rounds += 1
         arriving, on_the_way = on_the_way, []
-        for sender, taker, said in arriving:
+        for sender, taker, statements in arriving:
             if loss and rng.random() < loss:
-                on_the_way.append((sender, taker, said))
-            elif corrections := bidders[taker].receive(sender, said):
+                on_the_way.append((sender, taker, statements))
+            elif corrections := bidders[taker].receive(sender, statements):
                 on_the_way.append((taker, sender, tuple(corrections)))
         for number, (name, bidder) in enumerate(bidders.items()):
             if (rounds + number) % pause == 0:
@@ -139,7 +139,7 @@ def run_cbba(mission: Mission, pause: int = PAUSE_ROUNDS, loss: float = 0.0, qui
         last = rounds if on_the_way else last
         counted = time.process_time()
         messages += len(on_the_way)
-        octets += sum(len(encode_message(said)) for _, _, said in on_the_way)
+        octets += sum(len(encode_message(statements)) for _, _, statements in on_the_way)
         measured += time.process_time() - counted
         if quiet is None and not on_the_way and all(bidder.is_quiet for bidder in bidders.values()):
             break

@@ -117,5 +117,5 @@ class SwarmPeer:
         self._network.loss_share = share
 
 
-def _report_result(outcome: Deferred[Any], tell: Callable[[Any], object]) -> None:
-    outcome.addErrback(lambda _: None).addCallback(tell)
+def _report_result(outcome: Deferred[Any], on_result: Callable[[Any], object]) -> None:
+    outcome.addErrback(lambda _: None).addCallback(on_result)

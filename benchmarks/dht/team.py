@@ -63,13 +63,13 @@ class Team:
 
     async def _spawn(self, port: int) -> Node:
         command = [sys.executable, "-m", "benchmarks.dht.child", self.library.name, str(self._folder)]
-        pipe, said = asyncio.subprocess.PIPE, self._folder / f"{port}.errors"
-        with said.open("wb") as errors:
+        pipe, error_path = asyncio.subprocess.PIPE, self._folder / f"{port}.errors"
+        with error_path.open("wb") as errors:
             # In a separate session, so that signals from the terminal reach only the parent.
             process = await asyncio.create_subprocess_exec(
                 *command, stdin=pipe, stdout=pipe, stderr=errors, cwd=ROOT, limit=MAX_LINE_BYTES, start_new_session=True
             )
-        node = Node(port, process, said)
+        node = Node(port, process, error_path)
         self.nodes.append(node)
         return node
 

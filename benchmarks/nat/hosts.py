@@ -55,15 +55,15 @@ class Hosts:
         await self._end()
 
     async def _spawn(self, host: str) -> HostProcess:
-        said, pipe = self._folder / f"{host}.errors", asyncio.subprocess.PIPE
+        error_path, pipe = self._folder / f"{host}.errors", asyncio.subprocess.PIPE
         command = self.net.command(host, [sys.executable, "-m", "benchmarks.nat.child"])
-        with said.open("wb") as errors:
+        with error_path.open("wb") as errors:
             # In a separate session, so that signals from the terminal reach only the parent.
             process = await asyncio.create_subprocess_exec(
                 *command, stdin=pipe, stdout=pipe, stderr=errors, cwd=ROOT, env=make_environment(),
                 limit=MAX_LINE_BYTES, start_new_session=True,
             )  # fmt: skip
-        return HostProcess(host, process, said)
+        return HostProcess(host, process, error_path)
 
     async def _end(self) -> None:
         await asyncio.gather(*(computer.kill() for computer in self._processes_by_host.values()))

@@ -30,15 +30,17 @@ class ProcessGroup:
 
     :param reactor: starts the processes and provides the time
     :param run_dir: an existing folder for the logs
-    :param said: called with the name of a process and each line of its output
+    :param on_line: called with the name of a process and each line of its output
     """
 
     log = Logger()
 
-    def __init__(self, reactor: Any, run_dir: Path, said: Callable[[str, str], None] = lambda name, line: None) -> None:
+    def __init__(
+        self, reactor: Any, run_dir: Path, on_line: Callable[[str, str], None] = lambda name, line: None
+    ) -> None:
         self._clock = IReactorTime(reactor)
         self._run_dir = run_dir
-        self._on_line = said
+        self._on_line = on_line
         self._logs: dict[str, TextIO] = {}
         self._tails: dict[str, deque[str]] = {}
         self._stopped: Deferred[None] | None = None

@@ -30,13 +30,13 @@ class BehaviourTests(SynchronousTestCase):
 
     def test_behaviour_is_told_what_its_body_can_do(self) -> None:
         """An installed or deployed behaviour receives the motion capabilities if it has the method ``embody``."""
-        told: list[MotionCapabilities] = []
+        received: list[MotionCapabilities] = []
 
         class Bodied:
             def __init__(self, parameters: object, rng: object) -> None: ...
 
             def embody(self, motion: MotionCapabilities) -> None:
-                told.append(motion)
+                received.append(motion)
 
         class Other:
             def __init__(self, parameters: object, rng: object) -> None: ...
@@ -45,7 +45,7 @@ class BehaviourTests(SynchronousTestCase):
         deployed = {("behaviour", "bodied"): Loopback.of(Bodied), ("behaviour", "other"): Loopback.of(Other)}
         for kind in ("deployed:bodied", "deployed:other"):
             create_behaviour(replace(TASK, kind=kind), random.Random(1), deployed, motion)
-        self.assertEqual([vars(each) for each in told], [vars(motion)])
+        self.assertEqual([vars(each) for each in received], [vars(motion)])
         turn: Any = create_behaviour(TASK, random.Random(1), None, motion)
         self.assertIs(turn._motion, motion)
 

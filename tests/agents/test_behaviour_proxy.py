@@ -141,16 +141,16 @@ class BehaviourProxyTests(SynchronousTestCase):
 
     def test_means_follow(self) -> None:
         """Changed motion capabilities reach the behaviour before the next observation."""
-        told: list[MotionCapabilities] = []
+        received: list[MotionCapabilities] = []
         spin = Spin()
-        spin.embody = told.append  # type: ignore[attr-defined]
+        spin.embody = received.append  # type: ignore[attr-defined]
         behaviour, connection = guarded(spin)
         motion = MotionCapabilities()
         behaviour.embody(motion)
         motion.circle = 0.25
         behaviour.look(SEEN, 0.0)
         behaviour.look(SEEN, 0.1)
-        self.assertEqual([each.circle for each in told], [0.25])
+        self.assertEqual([each.circle for each in received], [0.25])
         self.assertEqual(connection.asked, ["embody", "embody", "look", "look"])
 
     def test_cost_that_is_no_distance(self) -> None:

@@ -278,11 +278,11 @@ class EngagementTests(SynchronousTestCase):
         self.hear(self.report(2, 2.0))
         self.see(1.0)
         self.step()
-        told = len(self.reports)
+        count = len(self.reports)
         for _ in range(50):
             self.clock.advance(0.05)
             self.step()
-        again = self.reports[told - 1 :]
+        again = self.reports[count - 1 :]
         self.assertEqual([member.serial - again[0].serial for member in again], [0, 1, 2])
         self.assertEqual({(member.cost, member.assigned) for member in again}, {(1.0, ME.node_id.hex())})
 

@@ -36,10 +36,10 @@ class ExecutionTests(SynchronousTestCase):
         execution = self.execution(digger)
         for now, token in ((1.0, 5), (2.0, 5), (3.0, 6), (4.0, 6)):
             execution.step(now, token, now + 1.0)
-        told = [(c.now, c.token, c.deadline, c.began, c.is_resumed) for c in digger.contexts]
-        self.assertEqual(told[0], (1.0, 5, 2.0, 1.0, False))
-        self.assertEqual(told[1], (2.0, 5, 3.0, 1.0, True))
-        self.assertEqual([row[3:] for row in told[2:]], [(3.0, False), (3.0, True)])
+        called_with = [(c.now, c.token, c.deadline, c.began, c.is_resumed) for c in digger.contexts]
+        self.assertEqual(called_with[0], (1.0, 5, 2.0, 1.0, False))
+        self.assertEqual(called_with[1], (2.0, 5, 3.0, 1.0, True))
+        self.assertEqual([row[3:] for row in called_with[2:]], [(3.0, False), (3.0, True)])
 
     def test_agreement_is_told(self) -> None:
         """The agreed value reaches the behaviour, and stays under one token while no new value is agreed."""
@@ -47,13 +47,13 @@ class ExecutionTests(SynchronousTestCase):
         execution = self.execution(digger)
         for token, choice, value in ((5, "red", (1.0, 2.0)), (5, "", ()), (5, "blue", ()), (6, "", ())):
             execution.step(0.0, token, 9.0, Consensus("a", choice=choice, value=value))
-        told = [(context.choice, context.value) for context in digger.contexts]
-        self.assertEqual(told, [("red", (1.0, 2.0)), ("red", (1.0, 2.0)), ("blue", ()), ("", ())])
+        called_with = [(context.choice, context.value) for context in digger.contexts]
+        self.assertEqual(called_with, [("red", (1.0, 2.0)), ("red", (1.0, 2.0)), ("blue", ()), ("", ())])
 
     def test_progress_is_told_in_quarters(self) -> None:
         """Progress is rounded to quarters; an invalid value becomes None."""
-        for said, told in ((0.0, 0.0), (0.3, 0.25), (0.75, 0.75), (7.0, 1.0), (-1, 0.0), ("much", None)):
-            self.assertEqual(self.execution(Digger(said)).step(0.0, 1, 1.0).progress, told, said)
+        for value, expected in ((0.0, 0.0), (0.3, 0.25), (0.75, 0.75), (7.0, 1.0), (-1, 0.0), ("much", None)):
+            self.assertEqual(self.execution(Digger(value)).step(0.0, 1, 1.0).progress, expected, value)
         self.assertIsNone(self.execution(Digger(float("nan"))).step(0.0, 1, 1.0).progress)
 
     def test_who_is_kept_from_it_does_not_stall(self) -> None:

@@ -109,14 +109,14 @@ class LoopTests(SynchronousTestCase):
         assert driver is not None
         driver.disable()
         self.team.clock.advance(1.0)
-        said = self.agent.engagement
-        assert said is not None
+        engagement = self.agent.engagement
+        assert engagement is not None
         for _ in range(40):
-            self.assertEqual((said.me.available, said.me.cost), (False, None))
+            self.assertEqual((engagement.me.available, engagement.me.cost), (False, None))
             self.team.clock.advance(0.05)
         driver.enable()
         self.team.clock.advance(1.0)
-        self.assertTrue(said.me.available)
+        self.assertTrue(engagement.me.available)
 
     def test_every_motion_of_the_task_is_under_a_lease(self) -> None:
         """Each motion command of a task carries the token and deadline of the agent's valid lease."""

@@ -41,9 +41,9 @@ class ReporterTests(SynchronousTestCase):
         """Return the changed values, and store them as reported."""
         seen = Observation(0.0, 0.0, {"power.level": charge})
         self.reporter.load = load
-        told = self.reporter.find_changes(self.me, False, seen, self.clock.seconds()) or {}
-        self.me = replace(self.me, **told)
-        return told
+        changes = self.reporter.find_changes(self.me, False, seen, self.clock.seconds()) or {}
+        self.me = replace(self.me, **changes)
+        return changes
 
     def test_all_is_told_at_first(self) -> None:
         """The first report with a cost contains battery, load and the behaviour's values; later ones only changes."""

@@ -28,13 +28,13 @@ def roamer(kind: str, seed: int) -> Roamer:
 
 def with_gaits(gaits: dict[str, Velocity], seed: int) -> Roamer:
     """Return a robot dog with exactly these gaits."""
-    known = described("bittle")
+    description = described("bittle")
     limits = {
         "base.vx": (min(one.vx for one in gaits.values()), max(one.vx for one in gaits.values())),
         "base.wz": (min(one.wz for one in gaits.values()), max(one.wz for one in gaits.values())),
     }
-    known = replace(known, limits=limits)
-    return Roamer("bittle", seed, quantised(known, gaits), 0.3, known)
+    description = replace(description, limits=limits)
+    return Roamer("bittle", seed, quantised(description, gaits), 0.3, description)
 
 
 class RobotKindTests(SynchronousTestCase):
@@ -140,7 +140,7 @@ class BumpTests(SynchronousTestCase):
         self.assertTrue(backed)
 
 
-class Told:
+class StubRobot:
     """A behaviour on a robot of this kind that receives target positions instead of camera frames."""
 
     def __init__(self, kind: str) -> None:
@@ -165,10 +165,10 @@ class Told:
 class NearTests(SynchronousTestCase):
     def acts(self, distance: float, bearing: float) -> list[Action | None]:
         """Return five actions of a Create 2 with its bumper pressed and the target at this distance and bearing."""
-        told, acts = Told("create2"), []
+        stub, acts = StubRobot("create2"), []
         for _ in range(5):
-            told.see(distance, bearing, bump_left=True)
-            acts.append(told.execute())
+            stub.see(distance, bearing, bump_left=True)
+            acts.append(stub.execute())
         return acts
 
     def test_bump_counts_as_arrival_before_the_target_only(self) -> None:
@@ -180,11 +180,11 @@ class NearTests(SynchronousTestCase):
 
     def test_who_turns_on_a_circle_backs_off_from_what_is_in_it(self) -> None:
         """A robot backs off from a target inside its turning circle, and turns towards one that is farther away."""
-        told = Told("bittle")
-        told.motion.circle = 0.15
+        stub = StubRobot("bittle")
+        stub.motion.circle = 0.15
         for distance, sign in ((0.2, -1.0), (1.0, 1.0)):
-            told.see(distance, 0.7)
-            action = told.execute()
+            stub.see(distance, 0.7)
+            action = stub.execute()
             assert action is not None
             self.assertGreater(sign * action["base.vx"], 0.0, distance)
             self.assertEqual(action["base.wz"] > 0.0, sign > 0.0)

@@ -88,7 +88,7 @@ class SearchTests(SynchronousTestCase):
 
 
 class RangerTests(SynchronousTestCase):
-    def told(self, replaced: dict[str, float]) -> float:
+    def measure_cost(self, replaced: dict[str, float]) -> float:
         """Return the reported distance, relative to the true one, of a target at 0.9 m with these ranger values."""
         walk = Walk()
         walk.world.place_target(0.4 + NOSE_M + 0.9, 1.2)
@@ -99,12 +99,12 @@ class RangerTests(SynchronousTestCase):
 
     def test_ranger_is_believed_where_the_picture_agrees(self) -> None:
         """If range and camera agree, the cost is the range, which is more accurate."""
-        self.assertLess(abs(self.told({"range.near": math.nan, "range.far": 0.86}) * 0.9 - 0.94), 0.02)
+        self.assertLess(abs(self.measure_cost({"range.near": math.nan, "range.far": 0.86}) * 0.9 - 0.94), 0.02)
 
     def test_ranger_that_reads_something_else_is_not_believed(self) -> None:
         """If a dog in between, a wall behind or no echo disturbs the range, the cost is the camera's distance."""
         for wrong in (0.2, 0.45, 1.4, math.nan):
-            self.assertLess(abs(self.told({"range.near": math.nan, "range.far": wrong}) - 1), 0.08, wrong)
+            self.assertLess(abs(self.measure_cost({"range.near": math.nan, "range.far": wrong}) - 1), 0.08, wrong)
 
 
 class ApproachTests(SynchronousTestCase):

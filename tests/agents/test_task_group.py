@@ -160,10 +160,10 @@ class SelectParticipationTests(SynchronousTestCase):
 
     def test_else_what_it_cannot_tell_yet(self) -> None:
         """Without an assigned task the robot measures a task of unknown cost; if there is none, it keeps its task."""
-        told, blind, also = self.part(), self.part(None), self.part(None, assigned="b")
-        self.assertIs(select_participation([told, blind, also], told), blind)
-        self.assertIs(select_participation([told, blind, also], also), also)
-        self.assertIs(select_participation([told, blind], None), blind)
+        reported, unknown, also = self.part(), self.part(None), self.part(None, assigned="b")
+        self.assertIs(select_participation([reported, unknown, also], reported), unknown)
+        self.assertIs(select_participation([reported, unknown, also], also), also)
+        self.assertIs(select_participation([reported, unknown], None), unknown)
         last = self.part(assigned="b")
-        self.assertIs(select_participation([told, last], last), last)
-        self.assertIs(select_participation([told, last], None), told)
+        self.assertIs(select_participation([reported, last], last), last)
+        self.assertIs(select_participation([reported, last], None), reported)

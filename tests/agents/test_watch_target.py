@@ -74,10 +74,10 @@ class PhoneTests(SynchronousTestCase):
         self.assertFalse(phone.execute(0.5, 11, is_resumed=False))
         self.assertAlmostEqual(phone.behaviour.progress, 0.5)
         phone.execute(math.nan, 30)
-        told = phone.behaviour.progress
-        self.assertLessEqual(told, 0.5 + (DETECTION_TTL_S + TICK) / 2.0)
+        progress = phone.behaviour.progress
+        self.assertLessEqual(progress, 0.5 + (DETECTION_TTL_S + TICK) / 2.0)
         phone.execute(math.nan, 30)
-        self.assertEqual(phone.behaviour.progress, told)
+        self.assertEqual(phone.behaviour.progress, progress)
         self.assertTrue(phone.execute(0.5, 12))
         self.assertEqual(phone.behaviour.progress, 1.0)
 

@@ -113,7 +113,7 @@ class Session:
             self._ran += 1
             if outcome.found:
                 self._failed += 1
-                self._tell(outcome)
+                self._print_failure(outcome)
             yield outcome
             if self._is_interrupted:
                 raise KeyboardInterrupt
@@ -123,7 +123,7 @@ class Session:
         self._is_interrupted = True
         signal.signal(signal.SIGINT, signal.default_int_handler)
 
-    def _tell(self, outcome: Outcome) -> None:
+    def _print_failure(self, outcome: Outcome) -> None:
         """Print the failure, and the line that replays its smallest variant."""
         say(f"FAILED  {line(outcome.seed, self._trim, self._args.bug)}")
         say(f"        {outcome.title}")
@@ -131,9 +131,9 @@ class Session:
             say(f"        {violation}")
         if self._args.shrink > 0.0 and self._failed <= MOST_SHRUNK:
             until = time.monotonic() + self._args.shrink
-            self._tell_least(outcome, least(outcome, self._args.bug, until_then(until), self._trim))
+            self._print_least(outcome, least(outcome, self._args.bug, until_then(until), self._trim))
 
-    def _tell_least(self, whole: Outcome, left: Least) -> None:
+    def _print_least(self, whole: Outcome, left: Least) -> None:
         say(f"LEAST   {line(whole.seed, left.trim, self._args.bug)}")
         kept = whole.faults if left.trim.keep is None else len(left.trim.keep)
         say(f"        {kept} of {whole.faults} faults are left, after {left.runs} runs: {left.outcome.found[0]}")

@@ -66,10 +66,10 @@ def stopped(mission: Mission) -> dict[str, list[str]]:
     talking, rounds = list(names), 0
     while talking:
         rounds += 1
-        said = [(a, to, news) for a in talking for to, news in bidders[a].drain().items()]
+        messages = [(a, to, news) for a in talking for to, news in bidders[a].drain().items()]
         for name in talking:
             before = bidders[name].bundle
-            for a, to, news in said:
+            for a, to, news in messages:
                 if to == name:
                     bidders[name].receive(a, news)
             is_same = bidders[name].is_quiet and bidders[name].bundle == before

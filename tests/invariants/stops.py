@@ -271,8 +271,8 @@ class Net:
             return fail(Failure())
 
         def acknowledged(answer: list[Any]) -> list[Any]:
-            said, obeyed = answer
-            if to in ROBOTS and life is self.lives.get(to) and not said.endswith(NOT_SAVED):
+            status, obeyed = answer
+            if to in ROBOTS and life is self.lives.get(to) and not status.endswith(NOT_SAVED):
                 ids = {stop for stop, _ in obeyed} & self.tracked
                 # A release may have arrived between the order and the end of the write.
                 fresh = {stop for stop, _ in arguments[0]} & ids & set(life.stop_state.stops)

@@ -17,11 +17,11 @@ class AgreementTests(TeamCase):
         self.patch(Facing, "contexts", [])
         self.team = self.start_team(5)
         self.team.clock.advance(0.5)
-        self.told: dict[str, Member] = {}
+        self.members_seen: dict[str, Member] = {}
 
     def look(self, team: SimulatedTeam) -> None:
         """Record the latest report of each device."""
-        self.told.update({member.name: member for member in self.members(team, "t1")})
+        self.members_seen.update({member.name: member for member in self.members(team, "t1")})
 
     def run_task(self, strategy: str) -> dict[str, Any]:
         """Run a task to its end and return it as the page shows it."""
@@ -39,32 +39,32 @@ class AgreementTests(TeamCase):
         self.team.simulator._sensors["dog2"]._power = 0.1
         shown = self.run_task("capability_cost")
         self.assertNotEqual(shown["result"]["by"], "dog2")
-        told = self.why()
-        self.assertIn("3 of 3 agree", told)
-        self.assertIn("battery 10%", told)
-        self.assertNotIn("differs", told)
+        reasons = self.why()
+        self.assertIn("3 of 3 agree", reasons)
+        self.assertIn("battery 10%", reasons)
+        self.assertNotIn("differs", reasons)
 
     def test_nearest_does_not_mind_the_charge(self) -> None:
         """With ``nearest`` the same dog acts, and the explanation does not mention the battery."""
         self.team.simulator._sensors["dog2"]._power = 0.1
         self.assertEqual(self.run_task("nearest")["result"]["by"], "dog2")
         self.assertNotIn("battery", self.why())
-        self.assertEqual({member.battery for member in self.told.values()}, {1.0})
+        self.assertEqual({member.battery for member in self.members_seen.values()}, {1.0})
 
     def test_vote_reaches_who_acts(self) -> None:
         """The option of two of three dogs wins, and one of the two acts on it; the explanations agree."""
         shown = self.run_task("weighted_vote")
         self.assertIn(shown["result"]["by"], ("dog1", "dog2"))
         self.assertEqual({context.choice for context in Facing.contexts}, {"north"})
-        told = self.why()
-        self.assertIn("  agreed on north\n", told)
-        self.assertIn("3 of 3 agree", told)
+        reasons = self.why()
+        self.assertIn("  agreed on north\n", reasons)
+        self.assertIn("3 of 3 agree", reasons)
         self.assertEqual(shown["why"][0]["agreed"], "north")
 
     def test_mean_reaches_who_acts(self) -> None:
         """All dogs agree on the exact mean of their three values, and the assigned agent receives it."""
         self.run_task("average")
-        offered = [member.value[0] for member in self.told.values()]
+        offered = [member.value[0] for member in self.members_seen.values()]
         self.assertEqual((len(offered), len(set(offered))), (3, 3))
         self.assertEqual({len(context.value) for context in Facing.contexts}, {1})
         for context in Facing.contexts:

@@ -115,8 +115,8 @@ class GroupTests(TeamCase):
             team.control.assign("turn-around", group="yard")
         self.until(team, lambda: self.are_done(team))
         self.assertEqual(sorted(self.by(team).values()), list(DOGS))
-        told = {(task["group"], task["strategy"]) for task in team.state()["tasks"]}
-        self.assertEqual(told, {("yard", "group_optimal")})
+        groups = {(task["group"], task["strategy"]) for task in team.state()["tasks"]}
+        self.assertEqual(groups, {("yard", "group_optimal")})
         began = [task["created"] + task["result"]["took"] for task in team.state()["tasks"]]
         self.assertLess(max(began) - min(began), 3.0)
 

@@ -31,9 +31,11 @@ class StopTests(TeamCase):
             moved.update(self.moving(self.team))
         return moved
 
-    def told(self, asked: Deferred[dict[str, str]]) -> dict[str, str]:
+    def outcomes(self, asked: Deferred[dict[str, str]]) -> dict[str, str]:
         """Return the answer of each device by name."""
-        return {name: said for uuid, said in self.successResultOf(asked).items() if (name := self.name_of(uuid))}
+        return {
+            name: expected for uuid, expected in self.successResultOf(asked).items() if (name := self.name_of(uuid))
+        }
 
     def name_of(self, uuid: str) -> str:
         """Return the name of a node."""
@@ -52,8 +54,8 @@ class StopTests(TeamCase):
         asked = self.halts.stop("ann")
         self.team.clock.advance(BRAKING)
         self.assertEqual(self.moving(self.team), [])
-        said = {"vaio": "has no robot", "dog1": "stands", "dog2": "stands", "dog3": "stands"}
-        self.assertEqual(self.told(asked), said)
+        expected = {"vaio": "has no robot", "dog1": "stands", "dog2": "stands", "dog3": "stands"}
+        self.assertEqual(self.outcomes(asked), expected)
         self.assertEqual(self.moved_in(10.0), set())
         self.assertTrue(self.team.state()["halted"])
         self.assertEqual(self.executing(self.team), [acting])
@@ -101,7 +103,7 @@ class StopTests(TeamCase):
         self.team.block_datagrams("dog2")
         asked = self.halts.stop("ann")
         self.team.clock.advance(2.0)
-        self.assertEqual(self.told(asked)["dog2"], NO_ANSWER)
+        self.assertEqual(self.outcomes(asked)["dog2"], NO_ANSWER)
         self.team.switchboard.heal()
         self.team.clock.advance(15.0)
         self.assertTrue(self.node("dog2").stop_state.is_stopped)

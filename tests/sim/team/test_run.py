@@ -58,14 +58,14 @@ BASE = Scenario(nodes=6, seconds=10.0, join=JOIN, loads=(("steps", _Nothing()),)
 class RunTests(SynchronousTestCase):
     """Tests of ``Run``, its faults and its sessions."""
 
-    def told(self, scenario: Scenario, seed: int = 1) -> tuple[Run, list[tuple[float, str, int]]]:
+    def record_events(self, scenario: Scenario, seed: int = 1) -> tuple[Run, list[tuple[float, str, int]]]:
         """Run a scenario to its end; return the run and the events since the team was complete."""
         run = Run(scenario, seed, KINDS)
-        told: list[tuple[float, str, int]] = []
-        run.team.event_listeners.append(lambda now, event, place, more: told.append((now, event, place)))
+        events: list[tuple[float, str, int]] = []
+        run.team.event_listeners.append(lambda now, event, place, more: events.append((now, event, place)))
         run.run()
         began = run.began_at or 0.0
-        return run, [(round(now - began, 6), event, place) for now, event, place in told if now >= began]
+        return run, [(round(now - began, 6), event, place) for now, event, place in events if now >= began]
 
     def test_workloads_act_while_it_lasts(self) -> None:
         """Workloads step at the scenario's pace, learn the end of the repair, and are compared to the targets."""
@@ -147,9 +147,9 @@ class RunTests(SynchronousTestCase):
     def test_power_fails_and_comes_back(self) -> None:
         """Half of the nodes crash one after another at the planned times, and each restarts after the outage."""
         crash = Fault("crash", 2.0, lasts=3.0, share=0.5, over=1.5)
-        _, told = self.told(replace(BASE, faults=(crash,)))
-        killed = [(at, place) for at, event, place in told if event == "killed"]
-        born = [(at, place) for at, event, place in told if event == "born"]
+        _, events = self.record_events(replace(BASE, faults=(crash,)))
+        killed = [(at, place) for at, event, place in events if event == "killed"]
+        born = [(at, place) for at, event, place in events if event == "born"]
         self.assertEqual([at for at, _ in killed], [2.0, 2.5, 3.0])
         self.assertEqual(born, [(at + 3.0, place) for at, place in killed])
 
@@ -161,9 +161,9 @@ class RunTests(SynchronousTestCase):
         )
         faults += Fault("pairs", 1.0, lasts=99.0, share=0.2), Fault("weather", 1.0, lasts=99.0, amount=0.2)
         faults += Fault("step", 1.0, lasts=99.0, count=3, amount=-3600.0), Fault("crowd", 1.0, count=2)
-        run, told = self.told(replace(BASE, nodes=8, faults=faults, repair=60.0))
+        run, events = self.record_events(replace(BASE, nodes=8, faults=faults, repair=60.0))
         team = run.team
-        self.assertEqual(len([1 for _, event, _ in told if event == "fault"]), len(faults))
+        self.assertEqual(len([1 for _, event, _ in events if event == "fault"]), len(faults))
         self.assertEqual((team.alive(), sorted(team.get_joined())), (list(range(10)), list(range(10))))
         self.assertEqual(team.switchboard.barriers, [])
         self.assertAlmostEqual(team.link.extra_loss, 0.0)
@@ -206,22 +206,26 @@ class RunTests(SynchronousTestCase):
 
     def test_crowd_comes_and_goes(self) -> None:
         """New nodes join over the time that the fault gives, at new places, and leave after their time."""
-        run, told = self.told(replace(BASE, faults=(Fault("crowd", 1.0, lasts=4.0, count=4, over=2.0),)))
-        self.assertEqual([(at, p) for at, event, p in told if event == "born"], [(1 + n / 2, 6 + n) for n in range(4)])
-        self.assertEqual([(at, p) for at, event, p in told if event == "left"], [(5 + n / 2, 6 + n) for n in range(4)])
+        run, events = self.record_events(replace(BASE, faults=(Fault("crowd", 1.0, lasts=4.0, count=4, over=2.0),)))
+        self.assertEqual(
+            [(at, p) for at, event, p in events if event == "born"], [(1 + n / 2, 6 + n) for n in range(4)]
+        )
+        self.assertEqual(
+            [(at, p) for at, event, p in events if event == "left"], [(5 + n / 2, 6 + n) for n in range(4)]
+        )
         self.assertEqual(run.team.alive(), list(range(6)))
 
     def test_sessions_end_and_others_begin(self) -> None:
         """Nodes leave at the rate that follows from the mean, and return after their breaks; two always stay."""
         sessions = Sessions("exponential", 10.0, 2.0)
-        run, told = self.told(replace(BASE, nodes=12, seconds=60.0, sessions=sessions))
-        ended = [event for _, event, _ in told if event == "killed"]
+        run, events = self.record_events(replace(BASE, nodes=12, seconds=60.0, sessions=sessions))
+        ended = [event for _, event, _ in events if event == "killed"]
         stays = sessions.session_durations
         assert stays is not None
         expected = 12 * 60.0 / (stays.mean + sessions.absence_durations.mean)
         self.assertApproximates(len(ended) / expected, 1.0, 0.35)
         self.assertGreaterEqual(len(run.team.living), 2)
-        self.assertGreater(len([1 for _, event, _ in told if event == "born"]), 0.7 * len(ended))
+        self.assertGreater(len([1 for _, event, _ in events if event == "born"]), 0.7 * len(ended))
 
     def test_sessions_may_bring_others(self) -> None:
         """With ``same`` false another node takes the place of a node that left."""
