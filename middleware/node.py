@@ -71,11 +71,11 @@ REVIEW_INTERVAL_S = 10.0
 class SwarmNode(Service):
     """One node of a team.
 
-    ``device`` is the node's own description; ``wall`` returns seconds since the epoch, for display only; ``admission`` is
-    the admission check.  ``team`` is the closed team of that check, None in an open team; it starts and stops with the
-    node.  ``deployed`` holds the modules that operators pushed and the device's owner allowed; ``stop_deployed`` ends
-    their processes.  ``stop_state`` is the stop state of the whole team.  ``later(seconds, call, ...)`` is a timer that ends
-    with the node.
+    ``device`` is the node's own description; ``wall`` returns seconds since the epoch, for display only; ``admission``
+    is the admission check.  ``team`` is the closed team of that check, None in an open team; it starts and stops with
+    the node.  ``deployed`` holds the modules that operators pushed and the device's owner allowed; ``stop_deployed``
+    ends their processes.  ``stop_state`` is the stop state of the whole team.  ``later(seconds, call, ...)`` is a timer
+    that ends with the node.
     """
 
     _log = Logger()
@@ -294,7 +294,11 @@ class SwarmNode(Service):
         return self.entangled.watch(group_key(task_id), changed, keep)
 
     def join_group(
-        self, task: Task, on_members: OnMembers, ordered: OnChanged = lambda records: None, reporters: Reporters | None = None
+        self,
+        task: Task,
+        on_members: OnMembers,
+        ordered: OnChanged = lambda records: None,
+        reporters: Reporters | None = None,
     ) -> Group:
         """Take part in a task, and bid for it if it has a council.
 

@@ -13,8 +13,8 @@ A node shows its certificate (its *pass*) in the handshake of a session.  A pass
 * ``[3, content, not before, not after, signature, grant]``: a renewal of format 0 or 1.  ``content`` has the fields
   that the operator signed, ``[grant]`` or ``[invite, wish, proof, name, admitter]``; the bootstrap node adds its
   ``signature`` and its ``grant``.  Name and roles follow from ``content``, so a renewal changes only the dates.  Only
-  certificates that the operator issued for ``DEFAULT_LIFE_S`` or longer are renewed, and only by bootstrap nodes that have such
-  a certificate.
+  certificates that the operator issued for ``DEFAULT_LIFE_S`` or longer are renewed, and only by bootstrap nodes that
+  have such a certificate.
 """
 
 from __future__ import annotations
@@ -59,7 +59,7 @@ class Member:
 
     ``invitation`` is the public key of the invitation by which the member joined, valid for ``uses`` newcomers, and
     ``admitter`` is the public key of the bootstrap node; both are empty if the operator granted the certificate
-    directly.  ``voucher`` is the gateway that signed a guest's pass.
+    directly.  ``gateway`` is the gateway that signed a guest's pass.
 
     ``since`` is the moment from which the operator-signed content is valid, and ``life`` the number of seconds for
     which the certificate was issued.  ``renewer`` is the bootstrap node that renewed it, or empty.
@@ -249,8 +249,10 @@ def _verify_invited(operator: bytes, public: bytes, content: list[Any]) -> Membe
     return Member(public, name, invite.roles, 0, 0, *origin, uses=invite.uses, since=since, life=invite.life)
 
 
-def _verify_invitation(operator: bytes, public: bytes, packed: Any, requested_name: Any, signature: Any, name: Any) -> Invite:
-    """Return the invitation: its key signed ``public`` and ``requested_name``, and with this wish it allows ``name``."""
+def _verify_invitation(
+    operator: bytes, public: bytes, packed: Any, requested_name: Any, signature: Any, name: Any
+) -> Invite:
+    """Return the invitation, whose key signed ``public`` and ``requested_name``, and which allows ``name`` for it."""
     invite = open_statement(operator, packed)
     if not isinstance(invite, Invite):
         raise Malformed("the pass does not begin with an invitation")

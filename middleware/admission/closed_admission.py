@@ -66,7 +66,11 @@ class ClosedAdmission:
     max_pass_bytes = MAX_CERTIFICATE_BYTES
 
     def __init__(
-        self, membership_list: MembershipList, membership: Callable[[], Membership], wall: Callable[[], float], incarnation: Incarnation
+        self,
+        membership_list: MembershipList,
+        membership: Callable[[], Membership],
+        wall: Callable[[], float],
+        incarnation: Incarnation,
     ) -> None:
         self.incarnation = incarnation
         self.fingerprint = hashlib.blake2s(membership_list.operator, digest_size=8, person=b"team").digest()
@@ -77,7 +81,9 @@ class ClosedAdmission:
         self.publish_entry: Callable[[bytes], object] = lambda packed: membership_list.add(packed, wall())
         self._verified: OrderedDict[bytes, Member] = OrderedDict()
         self._session_members: OrderedDict[bytes, Member] = OrderedDict()
-        self._unlisted_certificates: dict[bytes, bytes] = {}  # passes of members in ``_session_members`` that are not on the list
+        self._unlisted_certificates: dict[
+            bytes, bytes
+        ] = {}  # passes of members in ``_session_members`` that are not on the list
         self._authorities: dict[bytes, Authority] = {}
         self._cached_at = (b"", 0.0)
 

@@ -32,7 +32,7 @@ MAX_ADDRESSES = 64
 
 
 class JoinClient:
-    """Join a team with a code; ``seed`` is the newcomer's lasting identity, ``requested_name`` the name that it asks for.
+    """Join a team with a code; ``seed`` is the node's lasting identity, ``requested_name`` the name that it asks for.
 
     The newcomer owns ``network`` while it joins, and closes it afterwards.
     """
@@ -64,7 +64,7 @@ class JoinClient:
         self._done: Deferred[Membership] | None = None
 
     def join(self, addresses: Iterable[Address], timeout: float = JOIN_TIMEOUT_S) -> Deferred[Membership]:
-        """Send requests to the addresses ``addresses`` until a bootstrap node admits the newcomer.
+        """Send requests to ``addresses`` until a bootstrap node admits the newcomer.
 
         Fails with ``NotWelcome``, or with ``NoAnswer`` if there is no reply within ``timeout`` seconds; raises
         ``PortInUse``.

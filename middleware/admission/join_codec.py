@@ -95,7 +95,9 @@ def derive_psk(invitation: bytes) -> bytes:
     return hashlib.blake2s(invitation, person=b"knock").digest()
 
 
-def make_request(invitation: Identity, public: bytes, ephemeral: bytes, requested_name: str, rng: random.Random) -> bytes:
+def make_request(
+    invitation: Identity, public: bytes, ephemeral: bytes, requested_name: str, rng: random.Random
+) -> bytes:
     """Return the KNOCK of the newcomer ``public`` that asks for the name ``requested_name`` (empty: any)."""
     signature = sign_join(invitation, public, requested_name)
     body = msgpack.packb([public, ephemeral, requested_name, signature]).ljust(_BODY_BYTES, b"\0")
@@ -205,7 +207,9 @@ def _parse_content(packed: bytes) -> JoinReply | str:
         (check_number(number), check_bytes(secret, SECRET_BYTES), check_number(until))
         for number, secret, until in secrets
     )
-    return JoinReply(certificate, found, tuple(contact for each in contacts if (contact := parse_contact(each)) is not None))
+    return JoinReply(
+        certificate, found, tuple(contact for each in contacts if (contact := parse_contact(each)) is not None)
+    )
 
 
 def _sign_body(invitation: bytes, request: JoinRequest, content: bytes, signer: Signer) -> bytes:

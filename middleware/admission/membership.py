@@ -101,7 +101,13 @@ def parse_membership(found: Mapping[str, Any]) -> Membership:
         )
         certificate = bytes.fromhex(found["pass"])
         membership = Membership(
-            check_name(found["team"]), seed, operator, certificate, tuple(secrets), tuple(known), dict(found["settings"])
+            check_name(found["team"]),
+            seed,
+            operator,
+            certificate,
+            tuple(secrets),
+            tuple(known),
+            dict(found["settings"]),
         )
     except (KeyError, ValueError, TypeError, RemoteError) as error:
         raise BadKeyFile(f"not a valid membership ({error}); join again, or restore it from a backup") from error

@@ -105,8 +105,8 @@ class Operator:
     ) -> bytes:
         """Revoke the key of a member or of an invitation.
 
-        ``members`` are the public keys of members admitted by a revoked bootstrap node that stay members; the others are
-        revoked with it.  ``renewals`` are its renewals that stay valid, as pairs of key and end.  Raises
+        ``members`` are the public keys of members admitted by a revoked bootstrap node that stay members; the others
+        are revoked with it.  ``renewals`` are its renewals that stay valid, as pairs of key and end.  Raises
         ``ValueError`` if there are too many.
         """
         ids = (*(member_id(each) for each in members), *(renewal_id(*each) for each in renewals))

@@ -78,7 +78,10 @@ class Renewer:
 
     def renew(self, member: Member, now: float) -> bool:
         """Sign a new end date for ``member`` and publish it; returns whether that succeeded."""
-        grant, certificate = self._membership_list.find_grant(self._identity.public), self._find_certificate(member.public)
+        grant, certificate = (
+            self._membership_list.find_grant(self._identity.public),
+            self._find_certificate(member.public),
+        )
         try:
             if grant is None or not certificate:
                 return False

@@ -104,8 +104,9 @@ remaining records."""
 class Namespace(NamedTuple):
     """A kind of record: roles whose members may write it, way to recognise it, and purpose.
 
-    ``example`` is a slot, as the text of its key and the slot's name.  Records of a namespace that ``is_lasting`` stay at
-    their replicas until they expire even if their owner is revoked, so a revocation does not change the team's state.
+    ``example`` is a slot, as the text of its key and the slot's name.  Records of a namespace that ``is_lasting`` stay
+    at their replicas until they expire even if their owner is revoked, so a revocation does not change the team's
+    state.
     """
 
     roles: frozenset[str]

@@ -53,7 +53,8 @@ _PUBLIC_BYTES, _SIGNATURE_BYTES, _FINGERPRINT_BYTES = 32, 64, 16
 class Entry:
     """An entry of the membership list.
 
-    Of two entries with the same ``slot`` the one with the higher ``rank`` wins.  An entry is kept ``kept_until`` a time.
+    Of two entries with the same ``slot`` the one with the higher ``rank`` wins.  An entry expires at
+    ``kept_until``.
     """
 
     kind: ClassVar[str]

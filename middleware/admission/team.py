@@ -49,7 +49,9 @@ class Team:
 
     _log = Logger()
 
-    def __init__(self, membership_store: MembershipStore, store: Store, wall: Callable[[], float], rng: random.Random) -> None:
+    def __init__(
+        self, membership_store: MembershipStore, store: Store, wall: Callable[[], float], rng: random.Random
+    ) -> None:
         self._membership_store = membership_store
         self._store = store
         self._wall = wall

@@ -33,7 +33,7 @@ class UseCounters:
         return gatherResults(puts, consumeErrors=True).addErrback(_unwrap_first_error)
 
     def take(self, invite: Invite) -> Deferred[bool]:
-        """Take one use of ``invite``; fires with whether one was left, fails with a ``TransientError`` if undecidable."""
+        """Take one use of ``invite``; fires with whether one was left, fails with ``TransientError`` if undecidable."""
         taken = self._space.get_if_exists((invitation_id(invite.public), int))
         return taken.addCallback(lambda found: found is not None)
 

@@ -26,7 +26,8 @@ SLOT = "verdict"
 MAX_EPOCHS = 4
 """Number of epochs of a task that an agent keeps; a new one replaces the slot of the epoch ``MAX_EPOCHS`` before it."""
 MAX_REPORTS, MAX_BEST_REPORTS = 30, 8
-"""Of more than ``MAX_REPORTS`` reports only the ``MAX_BEST_REPORTS`` are recorded, with the total count; ``MAX_BEST_REPORTS`` silent names at most."""
+"""Of more than ``MAX_REPORTS`` reports only the ``MAX_BEST_REPORTS`` are recorded, with the total count;
+``MAX_BEST_REPORTS`` silent names at most."""
 MAX_STANDBYS = 3
 MAX_RECORD_BYTES = 3300
 """Maximum size of a record's value in bytes: three datagrams, and one for a team of ten."""

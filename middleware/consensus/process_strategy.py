@@ -28,7 +28,7 @@ LENGTH_PREFIX = struct.Struct("!I")
 
 
 class ProcessStrategy(RemoteStrategy):
-    """The strategy at ``import_path`` (``module:Class``), called through pipes; each method raises the strategy's error.
+    """The strategy at ``import_path`` (``module:Class``), called through pipes; methods raise the strategy's error.
 
     ``deadline`` is the maximum time of a call in seconds; ``path`` precedes this process's import path.
     """

@@ -12,8 +12,8 @@ class StrategyRegistry:
     """The strategies of one node, by name.
 
     A third-party strategy runs in a process, so one instance is shared by all tasks and auctions until ``stop``.  Its
-    losses (``guarded_strategy.MAX_LOSSES``) therefore count across tasks: each loss blocks the whole node.  A strategy that reached
-    the limit is not called again until the node restarts.
+    losses (``guarded_strategy.MAX_LOSSES``) therefore count across tasks: each loss blocks the whole node.  A strategy
+    that reached the limit is not called again until the node restarts.
     """
 
     def __init__(self) -> None:

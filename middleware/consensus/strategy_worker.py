@@ -1,4 +1,4 @@
-"""The process in which a third-party strategy runs: the other end of ``worker``."""
+"""The process in which a third-party strategy runs: the other end of ``process_strategy``."""
 
 from __future__ import annotations
 

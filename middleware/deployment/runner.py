@@ -276,7 +276,7 @@ class BehaviourInstance:
         return self._runner.has_unsent
 
     def send_request(self, method: str, arguments: list[Any], take: Callable[[bool, Any], None]) -> bool:
-        """Send a request without waiting; returns whether that was possible.  ``take`` is as in ``Runner.send_request``."""
+        """Send a request without waiting (``take`` as in ``Runner.send_request``); return whether that was possible."""
         self.poll()
         if self.fault or not self._is_created:
             return False

@@ -33,7 +33,7 @@ class Listing:
         self.missed: list[Prefix] = []
 
     def take_next(self) -> Prefix | None:
-        """Return a place to read now, or None if none is known at present (call again after the next ``add_records``)."""
+        """Return a place to read now, or None if none is known (call again after the next ``add_records``)."""
         if not self._unread:
             return None
         if self.reads >= MAX_READS:

@@ -83,7 +83,8 @@ def compute_prefix(node_id: bytes, depth: int) -> Prefix:
 def compute_places(node_id: bytes, depth: int) -> list[bytes]:
     """Return the one to three keys under which a device with that id and depth is listed.
 
-    Up to ``ROOT_LISTED_DEPTH`` depth 0 is included: when a team becomes undivided, some nodes read only that place earlier.
+    Up to ``ROOT_LISTED_DEPTH`` depth 0 is included: when a team becomes undivided, some nodes read only that place
+    earlier.
     """
     depths = (depth, max(0, depth - 1), *((0,) if depth <= ROOT_LISTED_DEPTH else ()))
     return list(dict.fromkeys(compute_prefix(node_id, each).key for each in depths))

@@ -73,8 +73,9 @@ class EntangledNode:
 
     ``lease`` is the time in seconds that leased records outlive the node's last sign of life; more means fewer false
     failures, less means faster detection.  ``rng`` and ``clock`` are the only sources of randomness and time.  ``wall``
-    returns seconds that continue while the node is off, to measure its absence (None: assume a short one).  ``admission`` is
-    the admission check.  ``lan`` is the multicast group in which the node finds its team without known nodes.
+    returns seconds that continue while the node is off, to measure its absence (None: assume a short one).
+    ``admission`` is the admission check.  ``lan`` is the multicast group in which the node finds its team without known
+    nodes.
     """
 
     _log = Logger()

@@ -33,7 +33,7 @@ OnFrame = Callable[[int, bytes, float], None]
 
 @dataclass
 class _IncomingFrame:
-    """The parts of the newest frame of one channel; ``arrived_at`` is the arrival of its first part, ``age_s`` its age then."""
+    """The parts of a channel's newest frame; ``arrived_at`` is when its first part came, ``age_s`` its age then."""
 
     sequence: int = -1
     count: int = 0

@@ -2,6 +2,6 @@
 
 ``kinds``: the faults of a running node with their bounds.  ``network``, ``stream`` and ``process``: faults of
 datagrams, of a robot's link, and of the operating system process.  ``injector``: the active faults of one node.
-``takeover``: the time until another device continues a task.  ``scenario`` and ``scenario_runner``: faults in a fixed order from a
-file.
+``takeover``: the time until another device continues a task.  ``scenario`` and ``scenario_runner``: faults in a fixed
+order from a file.
 """

@@ -64,7 +64,7 @@ Later = Callable[[float, Callable[[], None]], object]
 
 
 class StopState:
-    """The stops as this node knows them; agents check ``is_motion_forbidden`` before they act, and report their activity.
+    """The stops as this node knows them; agents check ``is_motion_forbidden`` before they act, and report activity.
 
     ``later(seconds, call)`` is a timer that ends with the node, and ``report`` is called after each change.  Without a
     node, nothing is stopped.

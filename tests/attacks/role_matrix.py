@@ -36,7 +36,7 @@ from middleware.entangled.record import Record, Slot
 from middleware.entangled.wire.admission_check import ROLE
 from middleware.entangled.wire.endpoint import Endpoint
 from swarmnode.simulated_team import SimulatedTeam
-from tests.attacks.siege import PaperDoor
+from tests.attacks.siege import AnyAdmission
 
 REVOKED_OPERATOR = "revoked operator"
 SUBJECTS = (VIEWER, DEVICE, GATEWAY, REVOKED_OPERATOR)
@@ -95,7 +95,7 @@ class Insider:
         self.roles = tuple(roles)
         self.name = name
         network = team.switchboard.make_network("127.0.0.1", port)
-        self.endpoint = Endpoint(self.identity, secret, network, team.clock, rng, PaperDoor(paper.certificate))
+        self.endpoint = Endpoint(self.identity, secret, network, team.clock, rng, AnyAdmission(paper.certificate))
         self.endpoint.start()
 
 

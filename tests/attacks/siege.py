@@ -18,12 +18,12 @@ from tests.middleware.admission.village import Village, VillageCase
 SOURCE = Address("10.6.6.6", 666)
 
 
-class PaperDoor(OpenAdmission):
+class AnyAdmission(OpenAdmission):
     """The admission check of an attacker, which accepts every peer and presents any certificate."""
 
-    def __init__(self, shown: bytes, room: int = 640, life: int = 1) -> None:
-        self.own_pass = shown
-        self.max_pass_bytes = room
+    def __init__(self, certificate: bytes, max_pass_bytes: int = 640, life: int = 1) -> None:
+        self.own_pass = certificate
+        self.max_pass_bytes = max_pass_bytes
         self.incarnation = Incarnation(life, b"attacker")
         self.fingerprint = bytes(8)
 
@@ -38,12 +38,12 @@ class SiegeCase(VillageCase):
     """A test with a closed team and its attackers."""
 
     def attacker(
-        self, team: Village, identity: Identity, secret: bytes, shown: bytes, at: Address = SOURCE, life: int = 1
+        self, team: Village, identity: Identity, secret: bytes, certificate: bytes, at: Address = SOURCE, life: int = 1
     ) -> Endpoint:
         """Return an endpoint that presents an arbitrary certificate, stopped when the test ends."""
         network = team.switchboard.make_network(*at)
         dice = random.Random(f"attacker {at}")
-        endpoint = Endpoint(identity, secret, network, team.clock, dice, PaperDoor(shown, life=life))
+        endpoint = Endpoint(identity, secret, network, team.clock, dice, AnyAdmission(certificate, life=life))
         endpoint.start()
         self.addCleanup(endpoint.stop)
         return endpoint

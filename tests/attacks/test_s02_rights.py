@@ -74,10 +74,10 @@ class RecordTests(SiegeCase):
                     record = Record(hash_key(key), name, own.public, 1, "team", 600.0, b"x").sign(own)
                     kinds.add(classify_slot(record.slot))
                     asked = attacker.ask(team.contact(house), "store", [record.pack()], changes=True)
-                    [verdict] = self.outcome(team, asked, 0.1)
+                    [decision] = self.outcome(team, asked, 0.1)
                     held = house.node.replica.holds(record)
                     self.assertEqual(held, may_store((role,), record.slot, role), (role, key, name))
-                    self.assertEqual(verdict == Outcome.FORBIDDEN.value, not held, (role, key, name))
+                    self.assertEqual(decision == Outcome.FORBIDDEN.value, not held, (role, key, name))
         self.assertEqual(kinds, set(KINDS))
 
 
@@ -168,11 +168,11 @@ class OwnerTests(SiegeCase):
 
 
 class CertificateTests(SiegeCase):
-    def refused(self, number: int, shown: bytes, life: Identity, secret: bytes) -> str:
+    def refused(self, number: int, certificate: bytes, incarnation: Identity, secret: bytes) -> str:
         """Return the code with which a member with this certificate is refused."""
-        attacker = self.attacker(self.team, life, secret, shown, SOURCE._replace(port=700 + number))
+        attacker = self.attacker(self.team, incarnation, secret, certificate, SOURCE._replace(port=700 + number))
         code = self.refusal(self.team, attacker.ask, self.team.houses[0], 3.0)
-        self.assertNotIn(life.public, [each.public for each in self.team.houses[0].node.overlay.contacts()])
+        self.assertNotIn(incarnation.public, [each.public for each in self.team.houses[0].node.overlay.contacts()])
         return code
 
     def test_passes_that_do_not_hold(self) -> None:
@@ -194,5 +194,5 @@ class CertificateTests(SiegeCase):
             "none": (b"", "foreign"),
             "changed": (wrap_grant(good).replace(b"\xa1x", b"\xa1y"), "foreign"),
         }
-        for number, (name, (shown, code)) in enumerate(passes.items()):
-            self.assertEqual(self.refused(number, shown, own, secret), code, name)
+        for number, (name, (certificate, code)) in enumerate(passes.items()):
+            self.assertEqual(self.refused(number, certificate, own, secret), code, name)

@@ -87,8 +87,8 @@ class Spoofing(RuleBasedStateMachine):
             self.fire(bytes([RESP]) + index.to_bytes(4, "little") + self.dice.randbytes(size), source)
 
     @rule(source=st.sampled_from(PLACES), key=st.booleans())
-    def greeting(self, source: Address, key: bool) -> None:
-        """Send an unsolicited HERE under another key or under the team's key."""
+    def discovery(self, source: Address, key: bool) -> None:
+        """Send an unsolicited DISCOVERY_REPLY under another key or under the team's key."""
         secret = derive_key(TEAM, b"greet") if key else bytes(32)
         self.fire(pack_discovery_reply(secret, self.dice.randbytes(16), self.dice.randbytes(32), self.dice), source)
 
@@ -133,7 +133,7 @@ class ElsewhereTests(SynchronousTestCase):
         self.failureResultOf(asked, NoAnswer)
 
     def test_greeting_from_elsewhere(self) -> None:
-        """A HERE with the right token from another address than the probed one is dropped and counted."""
+        """A DISCOVERY_REPLY with the right token from another address than the probed one is dropped and counted."""
         ground = self.ground
         greeted = ground.target.discover(Address("10.0.0.8", 8))
         [token] = list(ground.target.discoverer._pending)
@@ -145,7 +145,7 @@ class ElsewhereTests(SynchronousTestCase):
         self.failureResultOf(greeted, NoAnswer)
 
     def test_greeting_with_a_guessed_token(self) -> None:
-        """A HERE from the right address with another token is dropped."""
+        """A DISCOVERY_REPLY from the right address with another token is dropped."""
         ground = self.ground
         at = Address("10.0.0.8", 8)
         greeted = ground.target.discover(at)
@@ -156,7 +156,7 @@ class ElsewhereTests(SynchronousTestCase):
         self.failureResultOf(greeted, NoAnswer)
 
     def test_who_of_a_stranger(self) -> None:
-        """A WHO without the team's key gets no answer."""
+        """A DISCOVERY without the team's key gets no answer."""
         datagram = pack_discovery(bytes(32), bytes(16), random.Random(1))
         self.assertEqual(self.ground.shoot(datagram), 0)
         self.assertEqual(self.counters["forged"], 1)

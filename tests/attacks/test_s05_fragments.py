@@ -27,7 +27,7 @@ def part(number: int, total: int, place: int, data: bytes, is_wanted: bool = Fal
     return head + total.to_bytes(4, "little") + place.to_bytes(2, "little") + data
 
 
-class CourierCase(SynchronousTestCase):
+class FragmenterCase(SynchronousTestCase):
     """A fragmenter, and members by number."""
 
     def setUp(self) -> None:
@@ -35,7 +35,7 @@ class CourierCase(SynchronousTestCase):
         self.counters: Counter[str] = Counter()
         self.delivered: list[tuple[bytes, int]] = []
         self.receipts: list[bytes] = []
-        self.courier = Fragmenter(
+        self.fragmenter = Fragmenter(
             self.clock,
             lambda public, plain: self.receipts.append(plain),
             lambda session, key, data: self.delivered.append((session.contact.public, len(data))),
@@ -44,15 +44,15 @@ class CourierCase(SynchronousTestCase):
             lambda number, public: None,
             self.counters,
         )
-        self.addCleanup(self.courier.stop)
+        self.addCleanup(self.fragmenter.stop)
 
     def take(self, member: int, plain: bytes) -> None:
         session: Any = OneSession(member.to_bytes(32, "little"))
-        self.courier.on_fragment(session, plain)
+        self.fragmenter.on_fragment(session, plain)
 
     def bytes_in(self) -> int:
         """Return the bytes reserved for incoming messages."""
-        return self.courier._bytes_in.total()
+        return self.fragmenter._bytes_in.total()
 
     def send_whole(self, member: int, number: int, size: int) -> None:
         """Send a valid message in fragments, in order."""
@@ -61,7 +61,7 @@ class CourierCase(SynchronousTestCase):
             self.take(member, part(number, size, place, bytes(here), True))
 
 
-class FragmentTests(CourierCase):
+class FragmentTests(FragmenterCase):
     def test_never_completed(self) -> None:
         """One member has at most its share of incomplete messages, and ten seconds later none."""
         for number in range(2000):
@@ -69,7 +69,7 @@ class FragmentTests(CourierCase):
         self.assertLessEqual(self.bytes_in(), MAX_IN_PER_PEER_BYTES)
         self.assertGreater(self.counters["crowded"], 1900)
         self.clock.advance(IDLE_TIMEOUT_S + 2.0)
-        self.assertEqual((self.bytes_in(), len(self.courier._incoming)), (0, 0))
+        self.assertEqual((self.bytes_in(), len(self.fragmenter._incoming)), (0, 0))
 
     def test_lies_about_its_size(self) -> None:
         """Fragments with invalid sizes or positions, or another total, are malformed and reserve nothing."""
@@ -137,7 +137,7 @@ class FragmentTests(CourierCase):
         self.clock.advance(1.5)
         for member in range(200, 300):
             self.take(member, part(1, 64 * KIB, 0, bytes(FRAGMENT_BYTES)))
-        self.assertTrue(((1).to_bytes(32, "little"), MessageKey(False, 1)) in self.courier._incoming)
+        self.assertTrue(((1).to_bytes(32, "little"), MessageKey(False, 1)) in self.fragmenter._incoming)
 
 
 class EndToEndTests(SynchronousTestCase):

@@ -61,7 +61,7 @@ class AmplificationTests(SiegeCase):
         secret = self.house.team.secret
         own = Credentials.derive(Identity(b"i" * 32), secret)
         remote = derive_exchange_key(self.house.public)
-        question = encode(Request(1, "find_node", (bytes(20),)))
+        request = encode(Request(1, "find_node", (bytes(20),)))
         paper = self.team.paper("ape")
         passes = {"no": b"", "good": paper.certificate, "long": paper.certificate.ljust(640, b"x")}
         code, packed, terms = self.team.signer.invite("cub", ("device",), 1, self.team.wall(), 900.0, self.dice)
@@ -77,12 +77,12 @@ class AmplificationTests(SiegeCase):
         }
         for name, shown in passes.items():
             member = Credentials.derive(paper.identity, secret) if shown == paper.certificate else own
-            for rider in (b"", question):
+            for early_message in (b"", request):
                 hello = HandshakeFields(self.house.team.admission.incarnation, shown, 640)
                 made = InitiatorHandshake(
-                    member, remote, self.dice.randbytes(32), self.dice.getrandbits(31), rider, hello
+                    member, remote, self.dice.randbytes(32), self.dice.getrandbits(31), early_message, hello
                 )
-                sent[f"init with {name} pass{', asks' * bool(rider)}"] = made.make_init()
+                sent[f"init with {name} pass{', asks' * bool(early_message)}"] = made.make_init()
         ratios = {name: self.back(datagram) / len(datagram) for name, datagram in sent.items()}
         answered = [name for name, ratio in ratios.items() if ratio]
         self.assertGreater(len(answered), 7, ratios)

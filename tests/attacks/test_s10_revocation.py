@@ -44,11 +44,11 @@ class RevocationCase(SiegeCase):
         """Return the refusals that an attacker with the stolen identity gets."""
         return {self.refusal(self.team, bare.ask, house, 0.5) for house in among}
 
-    def bare(self, at: int = 1, life: int = 2**62) -> Any:
+    def bare(self, at: int = 1, incarnation: int = 2**62) -> Any:
         """Return an endpoint with identity, certificate and secret of the stolen store, on another machine."""
         paper: Membership = self.bad.kept.membership
         where = SOURCE._replace(port=600 + at)
-        return self.attacker(self.team, paper.identity, paper.secrets[0][1], paper.certificate, where, life)
+        return self.attacker(self.team, paper.identity, paper.secrets[0][1], paper.certificate, where, incarnation)
 
 
 class TwentyTests(RevocationCase):
@@ -98,9 +98,11 @@ class RevocationTests(RevocationCase):
         """A copy of the member's store on another machine is refused, with an older or newer life number."""
         self.revoke()
         self.team.run(IN_FORCE)
-        for number, life in enumerate((1, 2**62)):  # with an older life number the refusal may also name the newer life
-            told = self.refusals(self.bare(number, life), self.others[:3])
-            self.assertLessEqual(told, {"revoked", "doubled"} if life == 1 else {"revoked"})
+        for number, incarnation in enumerate(
+            (1, 2**62)
+        ):  # with an older life number the refusal may also name the newer life
+            told = self.refusals(self.bare(number, incarnation), self.others[:3])
+            self.assertLessEqual(told, {"revoked", "doubled"} if incarnation == 1 else {"revoked"})
 
     def test_its_bootstrap_days_are_over(self) -> None:
         """A revoked bootstrap node admits no newcomer."""

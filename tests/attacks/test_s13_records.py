@@ -222,8 +222,8 @@ class RevokedKeyTests(RecordCase):
         bad, _ = self.insider(self.team, "bad", DEVICE)
         for house in self.others:
             asked = bad.ask(self.team.contact(house), "store", [self.later.pack()], [600.0], changes=True)
-            [verdict] = self.outcome(self.team, asked, 0.5)
-            self.assertLess(verdict, 0)
+            [decision] = self.outcome(self.team, asked, 0.5)
+            self.assertLess(decision, 0)
         accomplice = self.accomplice()
         accomplice.node.replica.store_locally(self.later)
         honest = [house for house in self.others if house is not accomplice]
@@ -260,8 +260,8 @@ class FloodTests(RecordCase):
         for house in team.houses:
             for begin in range(0, JUNK, PAGE):
                 asked = bad.ask(team.contact(house), "store", junk[begin : begin + PAGE], changes=True)
-                verdicts = self.outcome(team, asked, 0.05)
-                refused += not isinstance(verdicts, list) or any(verdicts)
+                decisions = self.outcome(team, asked, 0.05)
+                refused += not isinstance(decisions, list) or any(decisions)
             usage = house.node.store.usage
             self.assertLessEqual(usage.rows, usage.max_rows // 2)
         self.assertGreater(refused, 0)

@@ -85,25 +85,25 @@ class RoomTests(SiegeCase):
     def test_room_for_the_operator(self) -> None:
         """A membership list that a bootstrap node filled accepts the operator's revocation, which frees space."""
         signer = operator(1)
-        roll = MembershipList(signer.public)
+        membership_list = MembershipList(signer.public)
         grant = granted(signer, "boot", "bootstrap")
-        roll.add(grant, NOW)
+        membership_list.add(grant, NOW)
         rng = random.Random(1)
         with self.assertRaises(Full):
             for code in range(MAX_ENTRIES):
                 invitation = signer.invite(f"p{code}", ("device",), 100, NOW, 3600.0, rng)
-                invite = roll.add(invitation.invite, NOW)
+                invite = membership_list.add(invitation.invite, NOW)
                 assert isinstance(invite, Invite)
                 for number in range(invite.uses):
                     public = rng.randbytes(32)
                     came = (public, "", sign_join(invitation.code.key, public, ""))
                     shown = issue_certificate(BOOT, grant, (invitation.invite, invite), came, f"p{code}-{number}", NOW)
-                    roll.add(pack_admission(public, shown), NOW)
-        self.assertGreater(len(roll.list_admissions()), 400)
-        self.assertLessEqual(len(roll.list_admissions()), MAX_ENTRIES - RESERVED_ENTRIES)
-        roll.add(signer.revoke(BOOT.public, "boot", NOW), NOW)
-        self.assertIsNotNone(roll.find_revocation(BOOT.public))
-        self.assertEqual(roll.list_admissions(), [])
+                    membership_list.add(pack_admission(public, shown), NOW)
+        self.assertGreater(len(membership_list.list_admissions()), 400)
+        self.assertLessEqual(len(membership_list.list_admissions()), MAX_ENTRIES - RESERVED_ENTRIES)
+        membership_list.add(signer.revoke(BOOT.public, "boot", NOW), NOW)
+        self.assertIsNotNone(membership_list.find_revocation(BOOT.public))
+        self.assertEqual(membership_list.list_admissions(), [])
 
 
 class UnlistedTests(SiegeCase):

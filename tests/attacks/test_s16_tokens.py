@@ -103,10 +103,10 @@ class PageCase(SynchronousTestCase):
 
     def passes(self, web: Web, token: str) -> dict[str, Token]:
         """Return the visitor's tokens for the other web nodes, by the name of the node."""
-        who = web.sessions.authenticate(token, self.now())
+        user = web.sessions.authenticate(token, self.now())
         nodes = {each.node.uuid: name for name, each in self.webs.items()}
         pages = [page.node for page in web.fallbacks.list_pages() if not page.is_self]
-        return {nodes[uuid]: token for uuid, token in web.sessions.issue_peer_tokens(who, pages, self.now()).items()}
+        return {nodes[uuid]: token for uuid, token in web.sessions.issue_peer_tokens(user, pages, self.now()).items()}
 
     def tell(self, packed: bytes) -> None:
         """Publish a statement of the operator, and wait for its distribution."""
@@ -180,9 +180,9 @@ class MintTests(PageCase):
 
     def test_invite_beyond_oneself(self) -> None:
         """A guest cannot invite another guest for longer than the guest's own invitation."""
-        who = self.vaio.sessions.authenticate(self.token.text, self.now())
+        user = self.vaio.sessions.authenticate(self.token.text, self.now())
         invited = self.signed(
-            self.vaio, self.vaio.sessions.issue_guest_token(who, "guest", "operator", self.now(), 3600.0).text
+            self.vaio, self.vaio.sessions.issue_guest_token(user, "guest", "operator", self.now(), 3600.0).text
         )
         guest = self.vaio.sessions.authenticate(invited.text, self.now())
         further = self.vaio.sessions.issue_guest_token(guest, "friend", "operator", self.now(), 365 * 86_400.0)
@@ -195,9 +195,9 @@ class StandingTests(PageCase):
         signed = self.signed(self.pi)
         given = self.passes(self.pi, signed.text)
         self.assertEqual(self.role(self.vaio, given["vaio"].text), "operator")
-        who = self.vaio.sessions.authenticate(given["vaio"].text, self.now())
-        renewed = self.vaio.sessions.renew_token(who, self.now())
-        invited = self.vaio.sessions.issue_guest_token(who, "guest", "operator", self.now(), 60.0)
+        user = self.vaio.sessions.authenticate(given["vaio"].text, self.now())
+        renewed = self.vaio.sessions.renew_token(user, self.now())
+        invited = self.vaio.sessions.issue_guest_token(user, "guest", "operator", self.now(), 60.0)
         further = self.passes(self.vaio, renewed.text)["nuc"]
         made = (given["vaio"], renewed, invited)
         self.assertEqual([self.role(self.vaio, each.text) for each in made], ["operator"] * 3)
@@ -248,8 +248,8 @@ class FailoverTests(PageCase):
             self.assertNotIn(self.eve.node.uuid, [page.node for page in web.fallbacks.list_pages()])
             self.assertFalse(web.fallbacks.is_allowed_origin("http://127.0.0.1:8083"))
             self.assertNotIn("eve", self.passes(web, self.signed(web).text))
-        who = self.vaio.sessions.authenticate(self.token.text, self.now())
-        self.assertEqual(self.vaio.sessions.issue_peer_tokens(who, [], self.now()), {})
+        user = self.vaio.sessions.authenticate(self.token.text, self.now())
+        self.assertEqual(self.vaio.sessions.issue_peer_tokens(user, [], self.now()), {})
 
     def test_use_a_token_elsewhere(self) -> None:
         """A token for one web node is invalid at all others, and thus useless to them."""
@@ -274,8 +274,8 @@ class FailoverTests(PageCase):
         given = self.passes(self.vaio, self.token.text)["pi"]
         moved = self.pi.sessions.renew_token(self.pi.sessions.authenticate(given.text, self.now()), self.now())
         self.assertEqual(self.role(self.pi, moved.text), "operator")
-        who = self.vaio.sessions.authenticate(self.token.text, self.now())
-        self.vaio.sessions.revoke(who.token_id, who.limit)
+        user = self.vaio.sessions.authenticate(self.token.text, self.now())
+        self.vaio.sessions.revoke(user.token_id, user.limit)
         self.run_for(IN_FORCE)
         self.assertEqual([self.role(self.pi, each.text) for each in (given, moved)], ["anyone"] * 2)
 
@@ -294,12 +294,12 @@ class GuessTests(PageCase):
         for number in range(1000):
             self.refused(self.vaio, f"guess{number}", f"10.{number // 250}.{number % 250}.1")
         now = self.now()
-        who = self.vaio.sessions.authenticate(self.token.text, now)
-        self.assertEqual(self.vaio.sessions.renew_token(who, now).role, "operator")
+        user = self.vaio.sessions.authenticate(self.token.text, now)
+        self.assertEqual(self.vaio.sessions.renew_token(user, now).role, "operator")
         self.assertEqual(self.refused(self.vaio, CODE, "192.168.7.7"), 429)
         self.assertEqual(self.signed(self.vaio, CODE, "127.0.0.1").role, "operator")
         self.assertEqual(self.signed(self.vaio, CODE, HOME).role, "operator")
-        invited = self.vaio.sessions.issue_guest_token(who, "guest", "viewer", now, 60.0)
+        invited = self.vaio.sessions.issue_guest_token(user, "guest", "viewer", now, 60.0)
         self.assertEqual(self.signed(self.vaio, invited.text, "192.168.7.8").role, "viewer")
 
 
@@ -317,8 +317,8 @@ class LogTests(SynchronousTestCase):
 class RebindingTests(SynchronousTestCase):
     def test_rebind_a_local_name(self) -> None:
         """A Host header with an unknown local name is refused; the node's and the configured names are accepted."""
-        board, state = Services(MemoryTeamControl(), OpenSessions()), format_state([], [], {}, node="vaio")
-        client = create_app(lambda: state, board, hosts=("vaio", "vaio.local", "robots.lan")).test_client()
+        services, state = Services(MemoryTeamControl(), OpenSessions()), format_state([], [], {}, node="vaio")
+        client = create_app(lambda: state, services, hosts=("vaio", "vaio.local", "robots.lan")).test_client()
 
         def status(host: str) -> int:
             return client.get("/api/v1/node", headers={"Host": host}).status_code

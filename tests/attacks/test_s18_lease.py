@@ -70,29 +70,29 @@ class LeaseCase(SiegeCase):
         super().setUp()
         self.team = team = self.kept(LeaseTeam())
         self.task: Task = self.outcome(team, Deferred.fromCoroutine(team.nodes[0].submit(TASK)), 1.0)
-        self.lessees: list[LeaseClient] = []
+        self.clients: list[LeaseClient] = []
         self.bad, self.own = self.insider(team, "bad", "device")
 
-    def lessee(self, place: int) -> LeaseClient:
+    def make_client(self, place: int) -> LeaseClient:
         """Return the lease client of an honest node, released when the test ends."""
-        lessee = self.team.nodes[place].make_lease_client(self.task, lambda: None, 0)
-        self.lessees.append(lessee)
+        make_client = self.team.nodes[place].make_lease_client(self.task, lambda: None, 0)
+        self.clients.append(make_client)
         self.addCleanup(self.team.run, 2.0)
-        self.addCleanup(lessee.release)
-        return lessee
+        self.addCleanup(make_client.release)
+        return make_client
 
     def held_by(self, place: int, within: float = 1.0) -> LeaseClient:
         """Return the lease client of an honest node that gets the lease."""
-        lessee = self.lessee(place)
-        lessee.claim()
+        make_client = self.make_client(place)
+        make_client.claim()
         self.team.run(within)
-        self.assert_won(lessee)
-        return lessee
+        self.assert_won(make_client)
+        return make_client
 
-    def assert_won(self, lessee: LeaseClient) -> None:
+    def assert_won(self, make_client: LeaseClient) -> None:
         """Check that the client holds the lease, with a token far below the limit."""
-        self.assertIsNotNone(lessee.lease, "an honest node does not win the lease")
-        self.assertLess(lessee.token, 2**40)
+        self.assertIsNotNone(make_client.lease, "an honest node does not win the lease")
+        self.assertLess(make_client.token, 2**40)
 
     def attack(self, method: str, *arguments: object) -> list[Any]:
         """Send the same request to every node; return the answers or errors."""
@@ -123,7 +123,7 @@ class ReconfigurationTests(LeaseCase):
         packed = [contact.pack() for contact in (*others, own)][:3]
         self.attack("lease.install", TASK.task_id, 2, packed, 0, 0, 1.5)
         self.attack("lease.install", TASK.task_id, b"", False, 1.5)
-        second = self.lessee(self.outsiders()[0])
+        second = self.make_client(self.outsiders()[0])
         second.claim()
         self.team.run(1.0)
         self.assertIsNotNone(holder.lease)
@@ -135,9 +135,9 @@ class ReconfigurationTests(LeaseCase):
         holder = self.held_by(self.members()[0])
         liar, accomplices = self.members()[1], self.outsiders()
         forged = tuple(self.team.contact(self.team.houses[place]) for place in accomplices)
-        desk: Any = self.team.nodes[liar].council_manager.lease_service
-        desk._reply_after_write = lambda reply: ["moved", 0, "", 0, 0.0, 9, pack_members(forged)]
-        second = self.lessee(accomplices[0])
+        lease_service: Any = self.team.nodes[liar].council_manager.lease_service
+        lease_service._reply_after_write = lambda reply: ["moved", 0, "", 0, 0.0, 9, pack_members(forged)]
+        second = self.make_client(accomplices[0])
         second.claim()
         self.team.run(3.0)
         self.assertIsNotNone(holder.lease)
@@ -223,14 +223,14 @@ class NumberTests(LeaseCase):
     def test_false_news(self) -> None:
         """A device that notifies clients of the highest token blocks none of them."""
         place = self.outsiders()[0]
-        lessee = self.lessee(place)
-        lessee.stand_by(1)
+        make_client = self.make_client(place)
+        make_client.stand_by(1)
         self.attack("lease.freed", TASK.task_id, HUGE, 0.0)
-        lessee.release()
+        make_client.release()
         self.team.run(1.0)
-        lessee.claim()
+        make_client.claim()
         self.team.run(1.0)
-        self.assert_won(lessee)
+        self.assert_won(make_client)
 
     def test_member_that_lies_about_numbers(self) -> None:
         """One member that answers with the highest numbers blocks no client."""

@@ -106,12 +106,12 @@ class RecordedQuestionTests(SiegeCase):
     def recording(self, method: str) -> bytes:
         """Return a member's recorded INIT with a request in it."""
         self.numbers += 1
-        question = encode(Request(self.numbers, method, ARGUMENTS.get(method, ())))
+        request = encode(Request(self.numbers, method, ARGUMENTS.get(method, ())))
         own = Credentials.derive(self.member.identity, self.house.team.secret)
         hello = HandshakeFields(Incarnation(1, b"the life"), self.member.certificate, 640)
         secret = self.numbers.to_bytes(32, "little")
         remote = derive_exchange_key(self.house.public)
-        return InitiatorHandshake(own, remote, secret, self.numbers, question, hello, self.numbers).make_init()
+        return InitiatorHandshake(own, remote, secret, self.numbers, request, hello, self.numbers).make_init()
 
     def state(self) -> str:
         """Return the hash of the node's state without half-open sessions, which are limited and expire soon."""
@@ -120,12 +120,12 @@ class RecordedQuestionTests(SiegeCase):
         for session in list(half._unconfirmed.values()):
             half.forget(session)
         half.clear()
-        stamps, endpoint._timestamps = endpoint._timestamps, InitTimestamps()
+        timestamps, endpoint._timestamps = endpoint._timestamps, InitTimestamps()
         timers = sorted(call.getTime() for call in self.team.clock.getDelayedCalls())
         found = state_of(
             [self.house.node, self.house.node.store, self.house.team.membership_list, self.streams, timers]
         )
-        endpoint._timestamps = stamps
+        endpoint._timestamps = timestamps
         return found
 
     def play(self, datagram: bytes) -> None:
@@ -231,28 +231,35 @@ class TimestampTests(SiegeCase):
 
     def test_bounded(self) -> None:
         """The table of newest INITs is limited, and an unverified later life does not block an earlier one."""
-        stamps, first, later = InitTimestamps(), Incarnation(1, b"1" * 8), Incarnation(2, b"2" * 8)
-        answers = [stamps.accept(b"a", life, stamp) for life, stamp in ((first, 5), (first, 5), (first, 4), (first, 6))]
+        timestamps, first, later = InitTimestamps(), Incarnation(1, b"1" * 8), Incarnation(2, b"2" * 8)
+        answers = [
+            timestamps.accept(b"a", incarnation, timestamp)
+            for incarnation, timestamp in ((first, 5), (first, 5), (first, 4), (first, 6))
+        ]
         self.assertEqual(answers, [True, False, False, True])
-        answers = [stamps.accept(b"a", life, stamp) for life, stamp in ((later, 1), (first, 9), (later, 1), (later, 2))]
+        answers = [
+            timestamps.accept(b"a", incarnation, timestamp)
+            for incarnation, timestamp in ((later, 1), (first, 9), (later, 1), (later, 2))
+        ]
         self.assertEqual(answers, [True, False, False, True])
         self.assertEqual(
-            [stamps.accept(b"b", Incarnation(), 5), stamps.accept(b"b", first, 0), len(stamps)], [True, True, 1]
+            [timestamps.accept(b"b", Incarnation(), 5), timestamps.accept(b"b", first, 0), len(timestamps)],
+            [True, True, 1],
         )
         for number in range(MAX_IDENTITIES + 5):
-            stamps.accept(number.to_bytes(4, "big"), first, 1)
-        self.assertEqual(len(stamps), MAX_IDENTITIES)
+            timestamps.accept(number.to_bytes(4, "big"), first, 1)
+        self.assertEqual(len(timestamps), MAX_IDENTITIES)
 
 
 class RoundTripTests(EndpointCase):
     def asked(self, method: str, *arguments: object, changes: bool) -> float:
         """Return the round trips that the first request to a peer takes."""
         identity = Identity(self.rng.randbytes(32))
-        asker = Endpoint(identity, b"k" * 32, self.board.make_network("127.0.0.1", 0), self.clock, self.rng)
-        asker.start()
-        self.addCleanup(asker.stop)
+        requester = Endpoint(identity, b"k" * 32, self.switchboard.make_network("127.0.0.1", 0), self.clock, self.rng)
+        requester.start()
+        self.addCleanup(requester.stop)
         answered: list[object] = []
-        asker.ask(self.to_b, method, *arguments, changes=changes).addCallback(answered.append)
+        requester.ask(self.to_b, method, *arguments, changes=changes).addCallback(answered.append)
         trips = 0.0
         while not answered:
             self.clock.advance(DELAY)

@@ -50,7 +50,7 @@ class PushedCodeTests(SynchronousTestCase):
         self.team = SimulatedTeam(11, dogs=())
         self.team._names += ("author", "second")
         self.addCleanup(self.team.stop)
-        self.shelf = MemoryModuleStore()
+        self.module_store = MemoryModuleStore()
 
     def join(self, name: str, *roles: str) -> SwarmNode:
         """Add a member to which the operator granted these roles."""
@@ -66,7 +66,7 @@ class PushedCodeTests(SynchronousTestCase):
         """Start the dog with the keys of these authors in its settings."""
         keys = [author.entangled.identity.public.hex() for author in authors]
         allowed = {"allow": True, "operators": keys, "modules": ["best"]}
-        self.team.add_node("dog1", {"deployment": allowed}, self.shelf)
+        self.team.add_node("dog1", {"deployment": allowed}, self.module_store)
         self.team.clock.advance(1.0)
         return self.team.services["dog1"].assembly.node
 
@@ -144,7 +144,7 @@ class PushedCodeTests(SynchronousTestCase):
         author = self.join("author", "operator")
         dog = self.allow(author)
         self.push(author)
-        self.assertEqual(len(self.shelf.contents), 1)
+        self.assertEqual(len(self.module_store.contents), 1)
         sys.modules.pop(CANARY)
         self.revoke(author, "author")
         self.team.services["dog1"].leave_for(1.0)

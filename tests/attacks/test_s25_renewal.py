@@ -35,7 +35,7 @@ class RenewalCase(SiegeCase):
         super().setUp()
         self.port = 700
         self.team = self.village(bootstraps=2)
-        self.judge = self.team.enlist("cat")
+        self.admission = self.team.enlist("cat")
         self.honest, self.thief = (self.grant_of(house.public) for house in self.team.houses[:2])
         self.keys = [house.kept.membership.identity for house in self.team.houses[:2]]
         self.team.run(2.0)
@@ -65,13 +65,13 @@ class RenewalCase(SiegeCase):
 
     def end(self, own: Identity = DOG) -> int:
         """Return the expiry of a key's certificate in the list of a plain member."""
-        member = self.judge.team.admission.find_member(own.public)
+        member = self.admission.team.admission.find_member(own.public)
         assert member is not None
         return member.not_after
 
     def let_in(self, code: JoinCode, name: str, own: Identity = DOG) -> bytes:
         """Return the certificate of a key that the hostile node admits with a code."""
-        found = self.judge.team.membership_list.find_invitation(invitation_id(code.key.public))
+        found = self.admission.team.membership_list.find_invitation(invitation_id(code.key.public))
         assert found is not None
         came = (own.public, "", sign_join(code.key, own.public, ""))
         return issue_certificate(self.keys[1], self.thief, (found[1], found[0]), came, name, int(self.team.wall()))
@@ -82,10 +82,10 @@ class RenewalCase(SiegeCase):
 
     def enter(self, shown: bytes, own: Identity = DOG) -> str:
         """Return the code with which a node refuses the key with this certificate."""
-        secret = self.judge.kept.membership.secrets[0][1]
+        secret = self.admission.kept.membership.secrets[0][1]
         self.port += 1
         endpoint = self.attacker(self.team, own, secret, shown, SOURCE._replace(port=self.port))
-        return self.refusal(self.team, endpoint.ask, self.judge, 4.0)
+        return self.refusal(self.team, endpoint.ask, self.admission, 4.0)
 
 
 class RevokedBootstrapTests(RenewalCase):
@@ -195,7 +195,7 @@ class WideningTests(RenewalCase):
         self.team.days = 2
         again = self.renew(old)
         self.assertEqual(self.said(again), "")
-        self.assertEqual(self.judge.team.admission.roles_of(DOG.public), {"viewer"})
+        self.assertEqual(self.admission.team.admission.roles_of(DOG.public), {"viewer"})
 
     def test_when_the_narrower_grant_has_ended(self) -> None:
         """An expired grant still overrides the operator's earlier grants to the same key."""

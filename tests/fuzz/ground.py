@@ -29,7 +29,18 @@ from middleware.entangled.wire.fragmenter import MAX_IN_PER_PEER_BYTES
 
 TEAM = b"k" * 32
 STRANGER = Address("10.0.0.9", 999)
-LEFT_OUT = ("admission", "counters", "_counters", "_rng", "_network", "_clock", "_log", "_limit", "_cookie_limit", "_bucket")
+LEFT_OUT = (
+    "admission",
+    "counters",
+    "_counters",
+    "_rng",
+    "_network",
+    "_clock",
+    "_log",
+    "_limit",
+    "_cookie_limit",
+    "_bucket",
+)
 PLAIN = frozenset((bytes, str, int, float, bool, type(None)))
 APART = (FunctionType, MethodType, type, random.Random, HeapClock, Switchboard)
 """Types that are not part of a node's state."""
@@ -41,21 +52,21 @@ class Violation(AssertionError):
 
 @implementer(ILogObserver)
 class Ground:
-    """A node ``target`` and a member ``other`` with a session between them, both with the admission check ``door``.
+    """A node ``target`` and a member ``other`` with a session between them, and the same ``admission`` check.
 
     All datagrams to the target are recorded.
     """
 
-    def __init__(self, door: AdmissionCheck = OPEN_ADMISSION) -> None:
-        self.room = door.max_pass_bytes
+    def __init__(self, admission: AdmissionCheck = OPEN_ADMISSION) -> None:
+        self.room = admission.max_pass_bytes
         self.errors: list[str] = []
         self.known = ""  # the hash after the last input, for targets that let no time pass
         self._is_shooting = False
         self.clock = HeapClock()
-        self.board = Switchboard(self.clock, random.Random(1))
+        self.switchboard = Switchboard(self.clock, random.Random(1))
         self.recorded: list[bytes] = []
         self.sent: list[tuple[bytes, Address]] = []
-        self.network = self.board.make_network("10.0.0.1", 1)
+        self.network = self.switchboard.make_network("10.0.0.1", 1)
         self.store = MemoryStore(1000)
         self.node = EntangledNode(
             Identity(b"t" * 32),
@@ -66,7 +77,7 @@ class Ground:
             random.Random(2),
             1.0,
             None,
-            door,
+            admission,
         )
         self.target = self.node.endpoint
         self.node.start()
@@ -75,7 +86,7 @@ class Ground:
         self.contact = Contact(Identity(b"t" * 32).public, self.network.address)
         self.identity = Identity(b"o" * 32)
         self.other = Endpoint(
-            self.identity, TEAM, self.board.make_network("10.0.0.2", 2), self.clock, random.Random(3), door
+            self.identity, TEAM, self.switchboard.make_network("10.0.0.2", 2), self.clock, random.Random(3), admission
         )
         self.other.start()
         self.other.expose("ping", lambda peer: "pong", changes=True)
@@ -104,8 +115,8 @@ class Ground:
             self._is_shooting = False
         if self.errors:
             raise Violation(f"logged: {self.errors}")
-        courier = self.target._fragmenter
-        if courier._bytes_in.total() > MAX_IN_PER_PEER_BYTES:
+        fragmenter = self.target._fragmenter
+        if fragmenter._bytes_in.total() > MAX_IN_PER_PEER_BYTES:
             raise Violation("more is in assembly than one peer may have")
         return sum(len(datagram) for datagram, to in self.sent if to == source)
 

@@ -94,14 +94,14 @@ def _statement(whole: bytes) -> None:
         open_statement(SIGNER.public, whole)
         if whole not in GENUINE:
             raise Violation("a statement that nobody signed")
-    roll = MembershipList(SIGNER.public)
-    roll.add(LAWFUL["statement"][0], NOW)
-    before = (roll.digest, len(roll))
+    membership_list = MembershipList(SIGNER.public)
+    membership_list.add(LAWFUL["statement"][0], NOW)
+    before = (membership_list.digest, len(membership_list))
     try:
-        entry = roll.add(whole, NOW)
+        entry = membership_list.add(whole, NOW)
     except (RemoteError, Full):
         entry = None
-    if entry is None and (roll.digest, len(roll)) != before:
+    if entry is None and (membership_list.digest, len(membership_list)) != before:
         raise Violation("a refused statement changed the roll")
     if entry is not None and whole not in GENUINE:
         raise Violation("the roll believes what nobody signed")
@@ -117,9 +117,9 @@ def _pass(whole: bytes) -> None:
 def _knock(whole: bytes) -> None:
     sent: list[tuple[bytes, Address]] = []
     admissions: list[bytes] = []
-    roll = MembershipList(SIGNER.public)
+    membership_list = MembershipList(SIGNER.public)
     for each in (PACKED, INVITATION.terms, LAWFUL["statement"][1]):
-        roll.add(each, NOW)
+        membership_list.add(each, NOW)
 
     def take(invite: Invite) -> Deferred[bool]:
         return succeed(True)
@@ -134,7 +134,16 @@ def _knock(whole: bytes) -> None:
         pass
 
     bootstrap = AdmissionServer(
-        roll, identity("vaio"), take, admissions.append, given, send, lambda: 1.0, lambda: float(NOW), DICE, refused
+        membership_list,
+        identity("vaio"),
+        take,
+        admissions.append,
+        given,
+        send,
+        lambda: 1.0,
+        lambda: float(NOW),
+        DICE,
+        refused,
     )
     bootstrap.on_request(whole, STRANGER)
     if sum(len(datagram) for datagram, _ in sent) > len(whole):

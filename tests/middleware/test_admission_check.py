@@ -78,7 +78,7 @@ class ClosedCase(EndpointCase, LogCase):
         self, seed: int, team: bytes = TEAM, port: int = 0, identity: int | None = None, gate: Gate | None = None
     ) -> tuple[Endpoint, Contact]:
         own = Identity(bytes([identity or seed]) * 32)
-        tap = Tap(self.board.make_network("127.0.0.1", port))
+        tap = Tap(self.switchboard.make_network("127.0.0.1", port))
         self.gates.append(gate or Gate())
         endpoint = Endpoint(own, team, tap, self.clock, random.Random(seed), self.gates[-1])
         endpoint.start()
@@ -226,7 +226,7 @@ class EvictionTests(ClosedCase):
         self.assertEqual((self.b._sessions, self.runs), ({}, []))
 
 
-class LifeTests(ClosedCase):
+class IncarnationTests(ClosedCase):
     """Two nodes with one identity."""
 
     def life(self, number: int, nonce: int) -> tuple[Endpoint, Contact]:
@@ -293,28 +293,28 @@ class LifeTests(ClosedCase):
 
     def test_lives(self) -> None:
         """The latest incarnation is valid, the previous one superseded, others doubled; number 0 is always valid."""
-        lives, one, two = Incarnations(), Incarnation(1, b"1" * 8), Incarnation(2, b"2" * 8)
-        self.assertFalse(lives.record(b"a", one))
-        self.assertEqual(lives.find_refusal(b"a", two), "")
-        self.assertTrue(lives.record(b"a", two))
+        incarnations, one, two = Incarnations(), Incarnation(1, b"1" * 8), Incarnation(2, b"2" * 8)
+        self.assertFalse(incarnations.record(b"a", one))
+        self.assertEqual(incarnations.find_refusal(b"a", two), "")
+        self.assertTrue(incarnations.record(b"a", two))
         answers = [
-            lives.find_refusal(b"a", life)
+            incarnations.find_refusal(b"a", life)
             for life in (one, two, Incarnation(2, b"3" * 8), Incarnation(1, b"3" * 8), Incarnation())
         ]
         self.assertEqual(answers, [SUPERSEDED, "", DOUBLED, DOUBLED, ""])
-        self.assertEqual(lives.find_refusal(b"b", one), "")
-        lives.forget(b"a")
-        self.assertEqual(lives.find_refusal(b"a", one), "")
+        self.assertEqual(incarnations.find_refusal(b"b", one), "")
+        incarnations.forget(b"a")
+        self.assertEqual(incarnations.find_refusal(b"a", one), "")
 
     def test_tables_are_bounded(self) -> None:
         """The tables of incarnations and of logged rejections are bounded; the oldest entries are removed first."""
         self.patch(admission_check, "MAX_IDENTITIES", 3)
         self.patch(admission_check, "MAX_LOGGED", 3)
-        lives, noted = Incarnations(), LogLimiter()
+        incarnations, noted = Incarnations(), LogLimiter()
         for number in range(10):
-            lives.record(bytes([number]), Incarnation(1, b"1" * 8))
+            incarnations.record(bytes([number]), Incarnation(1, b"1" * 8))
             self.assertTrue(noted.should_log(0.0, bytes([number]), EXPIRED))
-        self.assertEqual(len(lives), 3)
+        self.assertEqual(len(incarnations), 3)
         self.assertFalse(noted.should_log(0.0, b"\x09", EXPIRED))
         self.assertTrue(noted.should_log(0.0, b"\x00", EXPIRED))
 
@@ -351,9 +351,9 @@ class SecretTests(ClosedCase):
         """Under load a member can read its cookie with only the old or only the new secret."""
         self.b.replace_secrets(self.NEW, TEAM)
         new, _ = self.endpoint(8, team=self.NEW)
-        for asker in (self.a, new):
+        for requester in (self.a, new):
             self.b._cookies._limit._tokens = -1e6
-            self.assertEqual(self.got(asker.ask(self.to_b, "echo", 1), 4 * DELAY), 1)
+            self.assertEqual(self.got(requester.ask(self.to_b, "echo", 1), 4 * DELAY), 1)
 
     def test_nobody_is_remembered_by_an_old_one(self) -> None:
         """A peer is contacted under the secret of its last handshake, and under the new one when only that is valid."""
@@ -402,7 +402,7 @@ class RouteTests(EndpointCase):
             self.assertRaises(ValueError, self.b.route, kind, print)
         self.a.stop()
         self.a.send_datagram(b"\x17 knock", self.to_b.address)
-        self.assertEqual(self.board.counters["sent"], 1)
+        self.assertEqual(self.switchboard.counters["sent"], 1)
 
 
 class AddressTests(SynchronousTestCase):
@@ -545,33 +545,33 @@ class MemberTests(FleetCase, LogCase):
         return [one for one in sent if one[1] == fleet.address(0)]
 
 
-class RebuffTests(SynchronousTestCase):
-    """Tests of ``Rebuffs``."""
+class RejectionTests(SynchronousTestCase):
+    """Tests of ``Rejections``."""
 
     def setUp(self) -> None:
-        self.rebuffs = Rejections()
+        self.rejections = Rejections()
 
     def met(self, who: bytes, now: float, code: str = "revoked") -> None:
         """Record a rejection."""
-        self.rebuffs.record(who, "10.0.0.1:7000", "we", code, "why; what to do", now)
+        self.rejections.record(who, "10.0.0.1:7000", "we", code, "why; what to do", now)
 
     def test_count_what_happens_again(self) -> None:
         """Equal rejections of one key are merged, with the first and last time; another code is a separate entry."""
         for now in (1.0, 2.0, 5.0):
             self.met(b"a", now)
         self.met(b"a", 6.0, "expired")
-        found = [(each.code, each.first_at, each.last_at, each.count) for each in self.rebuffs.list_recent(6.0)]
+        found = [(each.code, each.first_at, each.last_at, each.count) for each in self.rejections.list_recent(6.0)]
         self.assertEqual(found, [("expired", 6.0, 6.0, 1), ("revoked", 1.0, 5.0, 3)])
 
     def test_forget_after_an_hour(self) -> None:
         """A rejection older than an hour is not returned, and a later one starts at one again."""
         self.met(b"a", 0.0)
-        self.assertEqual(self.rebuffs.list_recent(HOUR_S + 1.0), [])
+        self.assertEqual(self.rejections.list_recent(HOUR_S + 1.0), [])
         self.met(b"a", HOUR_S + 1.0)
-        self.assertEqual([each.count for each in self.rebuffs.list_recent(HOUR_S + 1.0)], [1])
+        self.assertEqual([each.count for each in self.rejections.list_recent(HOUR_S + 1.0)], [1])
 
     def test_invented_keys_take_no_room(self) -> None:
         """Only the latest rejections are stored, for any number of invented keys."""
         for number in range(10 * MAX_REJECTIONS):
             self.met(number.to_bytes(32), float(number))
-        self.assertEqual((len(self.rebuffs), self.rebuffs.list_recent(700.0)[0].last_at), (MAX_REJECTIONS, 639.0))
+        self.assertEqual((len(self.rejections), self.rejections.list_recent(700.0)[0].last_at), (MAX_REJECTIONS, 639.0))

@@ -1,4 +1,4 @@
-"""Tests of ``middleware.entangled.kademlia.alternate_path``: nodes with blocked UDP join through tunnels, and return to UDP."""
+"""Tests of ``middleware.entangled.kademlia.alternate_path``: nodes with blocked UDP join through tunnels."""
 
 from __future__ import annotations
 
@@ -28,8 +28,8 @@ class Site:
         rng = world.make_life_rng(place)
         udp = world.switchboard.make_network(*world.address(place))
         self.udp = FaultyNetwork(udp, world.clock, random.Random(place))
-        carrier = world.pipes.make_transport(f"10.2.0.{place}", 443)
-        self.tunnel = TunnelNetwork(carrier, world.clock, rng, urls, is_served)
+        relay = world.pipes.make_transport(f"10.2.0.{place}", 443)
+        self.tunnel = TunnelNetwork(relay, world.clock, rng, urls, is_served)
         network = JointNetwork(self.udp, self.tunnel)
         identity, store = world.identity(place), world.store(place)
         self.node = EntangledNode(identity, TEAM_KEY, network, store, world.clock, rng, 1.0)
@@ -71,7 +71,7 @@ class TunnelWorld(Simulation):
             site.node.stop()
 
 
-class DetourTests(SynchronousTestCase):
+class AlternatePathsTests(SynchronousTestCase):
     def setUp(self) -> None:
         self.world = TunnelWorld()
         self.addCleanup(self.end)
@@ -84,10 +84,10 @@ class DetourTests(SynchronousTestCase):
         self.world.run(10.0)
         self.assertEqual(self.world.clock.getDelayedCalls(), [])
 
-    def call(self, asker: Site, asked: Site) -> object:
-        """Return the reply of ``asked`` to a call from ``asker``, which knows it by any address."""
-        (contact,) = (c for c in asker.node.overlay.contacts() if c.public == asked.node.identity.public)
-        answer = asker.node.call(contact, "who")
+    def call(self, requester: Site, asked: Site) -> object:
+        """Return the reply of ``asked`` to a call from ``requester``, which knows it by any address."""
+        (contact,) = (c for c in requester.node.overlay.contacts() if c.public == asked.node.identity.public)
+        answer = requester.node.call(contact, "who")
         self.world.run(2.0)
         return self.successResultOf(answer)
 
@@ -134,11 +134,11 @@ class DetourTests(SynchronousTestCase):
         for place, is_blocked in ((1, True), (2, False), (3, True), (4, False)):
             sites.append(self.world.add(place, is_blocked)[0])
             self.world.run(4.0)
-        for asker in sites:
-            self.assertEqual(len(asker.node.overlay.contacts()), 4)
+        for requester in sites:
+            self.assertEqual(len(requester.node.overlay.contacts()), 4)
             for asked in sites:
-                if asked is not asker:
-                    self.assertEqual(self.call(asker, asked), self.sites_place(asked))
+                if asked is not requester:
+                    self.assertEqual(self.call(requester, asked), self.sites_place(asked))
 
     def sites_place(self, site: Site) -> int:
         """Return the number of a site."""

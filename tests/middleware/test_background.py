@@ -17,13 +17,13 @@ async def wait(deferred: Deferred[int]) -> int:
 class BackgroundTests(SynchronousTestCase):
     def setUp(self) -> None:
         self.clock = HeapClock()
-        self.chores = Background(self.clock)
+        self.background = Background(self.clock)
         self.runs: list[object] = []
 
     def test_later_and_cancel(self) -> None:
         """A delayed call runs once with its arguments unless it is cancelled; a late cancel has no effect."""
-        prevent = self.chores.later(1.0, self.runs.append, "a")
-        self.chores.later(1.0, self.runs.append, "b")()
+        prevent = self.background.later(1.0, self.runs.append, "a")
+        self.background.later(1.0, self.runs.append, "b")()
         self.clock.advance(2.0)
         prevent()
         self.assertEqual(self.runs, ["a"])
@@ -36,23 +36,23 @@ class BackgroundTests(SynchronousTestCase):
             if len(self.runs) == 1:
                 raise ZeroDivisionError
 
-        self.chores.every(1.0, work)
+        self.background.every(1.0, work)
         self.assertRaises(ZeroDivisionError, self.clock.advance, 1.0)
         self.clock.advance(2.0)
         self.assertEqual(len(self.runs), 3)
 
     def test_stop_leaves_nothing(self) -> None:
         """``sleep`` ends on time; after ``stop`` no timer is left, no new call is scheduled and no sleep ends."""
-        self.chores.every(2.0, lambda: self.runs.append(1))
-        sleep = self.chores.sleep(1.0)
+        self.background.every(2.0, lambda: self.runs.append(1))
+        sleep = self.background.sleep(1.0)
         self.clock.advance(0.9)
         self.assertNoResult(sleep)
         self.clock.advance(0.2)
         self.successResultOf(sleep)
-        sleep = self.chores.sleep(1.0)
+        sleep = self.background.sleep(1.0)
 
-        self.chores.stop()
-        self.chores.later(1.0, self.runs.append, 1)
+        self.background.stop()
+        self.background.later(1.0, self.runs.append, 1)
         self.assertEqual(self.clock.getDelayedCalls(), [])
         self.clock.advance(3.0)
         self.assertNoResult(sleep)
@@ -61,7 +61,7 @@ class BackgroundTests(SynchronousTestCase):
     def test_fork_hears_only_accidents(self) -> None:
         """``fork`` ignores network errors and rejections, and logs any other error."""
         for error in (NoAnswer("x"), Refused("x"), ZeroDivisionError()):
-            self.chores.fork(wait(fail(error)))
+            self.background.fork(wait(fail(error)))
         self.assertEqual(len(self.flushLoggedErrors()), 1)
 
 

@@ -20,13 +20,13 @@ KEY = hash_key("flood")
 FLOOD = 40
 
 
-class ShipperTests(FleetCase):
+class RecordBatcherTests(FleetCase):
     def setUp(self) -> None:
         super().setUp()
         self.world: EntangledTeam = self.fleet(2)
         self.asked: list[int] = []
         writer = self.world.nodes[0]
-        self.shipper = RecordBatcher(writer.overlay, writer._background)
+        self.batcher = RecordBatcher(writer.overlay, writer._background)
         self.there: Contact = self.world.nodes[1].contact
 
     def record(self, number: int, size: int = 50) -> Record:
@@ -34,7 +34,7 @@ class ShipperTests(FleetCase):
         return Record(KEY, f"{number}", identity.public, number + 1, "team", TEAM_TTL_S, b"x" * size).sign(identity)
 
     def stored(self, *records: Record) -> list[Deferred[object]]:
-        return [Deferred.fromCoroutine(self.shipper.store(self.there, record)) for record in records]
+        return [Deferred.fromCoroutine(self.batcher.store(self.there, record)) for record in records]
 
     def count_questions(self) -> None:
         replica, answer = self.world.nodes[1].replica, Replica.answer_store
@@ -48,12 +48,12 @@ class ShipperTests(FleetCase):
     def test_a_flood_shares_questions(self) -> None:
         """The first of forty records is sent alone at once; the others share requests of one datagram each."""
         self.count_questions()
-        verdicts = self.stored(*[self.record(number) for number in range(FLOOD)])
+        replies = self.stored(*[self.record(number) for number in range(FLOOD)])
         self.world.run(0.1)
-        self.assertEqual([self.successResultOf(verdict) for verdict in verdicts], [0] * FLOOD)
+        self.assertEqual([self.successResultOf(reply) for reply in replies], [0] * FLOOD)
         self.assertEqual(self.asked, [1] + [MAX_LOAD_BYTES // self.record(1).message_bytes] * 6 + [3])
         self.assertEqual(len(self.world.nodes[1].store.get(KEY)), FLOOD)
-        self.assertEqual(self.shipper._waiting, {})
+        self.assertEqual(self.batcher._waiting, {})
 
     def test_what_is_handed_on_keeps_its_life(self) -> None:
         """A forwarded record keeps the remaining TTL of its sender; the node's own record gets the full TTL."""
@@ -61,7 +61,7 @@ class ShipperTests(FleetCase):
         replica, stranger = self.world.nodes[1].replica, Identity(bytes([9]) * 32)
         own, others = self.record(0), Record(KEY, "s", stranger.public, 1, "team", TEAM_TTL_S, b"x").sign(stranger)
         (first,) = self.stored(own)
-        handed = Deferred.fromCoroutine(self.shipper.store(self.there, others, 700.0))
+        handed = Deferred.fromCoroutine(self.batcher.store(self.there, others, 700.0))
         self.world.run(1.0)
         self.assertEqual([self.successResultOf(first), self.successResultOf(handed)], [0, 0])
         self.assertEqual(self.asked, [1, 1])
@@ -78,24 +78,24 @@ class ShipperTests(FleetCase):
             return keep(replica, record, left)
 
         self.patch(replica, "store_locally", picky)
-        verdicts = self.stored(*[self.record(number) for number in range(6)])
+        replies = self.stored(*[self.record(number) for number in range(6)])
         self.world.run(0.1)
-        self.failureResultOf(verdicts.pop(3), Refused)
-        self.assertEqual([self.successResultOf(verdict) for verdict in verdicts], [0] * 5)
+        self.failureResultOf(replies.pop(3), Refused)
+        self.assertEqual([self.successResultOf(reply) for reply in replies], [0] * 5)
 
     def test_a_silent_replica_is_not_asked_in_turn(self) -> None:
         """If the first request gets no reply, all waiting records are sent at once and fail at the same time."""
         self.world.kill(1)
-        verdicts = self.stored(*[self.record(number) for number in range(FLOOD)])
+        replies = self.stored(*[self.record(number) for number in range(FLOOD)])
         self.world.run(2 * TIMEOUT_S + 0.1)
-        for verdict in verdicts:
-            self.failureResultOf(verdict, EntangledError)
-        self.assertEqual(self.shipper._waiting, {})
+        for reply in replies:
+            self.failureResultOf(reply, EntangledError)
+        self.assertEqual(self.batcher._waiting, {})
 
     def test_a_long_record_holds_up_nobody(self) -> None:
         """A record that needs fragments is sent alone and does not delay a later short record."""
         self.count_questions()
-        verdicts = self.stored(self.record(0, size=50_000), self.record(1))
+        replies = self.stored(self.record(0, size=50_000), self.record(1))
         self.world.run(0.5)
-        self.assertEqual([self.successResultOf(verdict) for verdict in verdicts], [0, 0])
+        self.assertEqual([self.successResultOf(reply) for reply in replies], [0, 0])
         self.assertEqual(self.asked, [1, 1])

@@ -23,7 +23,7 @@ class PathCacheTests(SynchronousTestCase):
         self.key = hash_key("a")
 
     def test_a_copy_runs_out(self) -> None:
-        """A copy expires after its TTL, which is at most ``MAX_AGE``."""
+        """A copy expires after its TTL, which is at most ``MAX_AGE_S``."""
         for ttl, lives in ((5.0, 5.0), (1e9, MAX_AGE_S)):
             self.cache.put(self.key, copied(self.key), ttl, 0.0)
             self.assertEqual(self.cache.get(self.key, lives - 0.1), copied(self.key))
@@ -85,7 +85,7 @@ class ClosedStore(MemoryStore):
         raise NotRunning("closed")
 
 
-class KeepsakeTests(SynchronousTestCase):
+class WatchedCopiesTests(SynchronousTestCase):
     def setUp(self) -> None:
         self.store = MemoryStore(3)
         self.copies = WatchedCopies(self.store)

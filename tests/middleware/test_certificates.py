@@ -16,7 +16,7 @@ from middleware.entangled.replication.certificates import MAX_FAILED_PEERS, MAX_
 from middleware.entangled.wire.admission_check import FOREIGN, Authority, OpenAdmission
 
 
-class KnownDoor(OpenAdmission):
+class KnownOwnersAdmission(OpenAdmission):
     """An admission check that accepts learned owners; in these tests a valid certificate equals the owner's key."""
 
     def __init__(self) -> None:
@@ -36,7 +36,7 @@ class KnownDoor(OpenAdmission):
 
 class Endpoint:
     def __init__(self) -> None:
-        self.admission = KnownDoor()
+        self.admission = KnownOwnersAdmission()
         self.asked: list[list[bytes]] = []
         self.answer: Any = lambda owners: succeed(owners)
         self.exposed: Any = None

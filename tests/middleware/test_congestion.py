@@ -48,7 +48,7 @@ class LongWayTests(EndpointCase):
         """Set a long delay between the two endpoints."""
         super().setUp()
         self.equip(self.a)
-        self.board.conditions = LinkConditions(FAR)
+        self.switchboard.conditions = LinkConditions(FAR)
 
     def test_one_handshake_is_enough(self) -> None:
         """Concurrent requests in both directions wait for one handshake; no second one is started."""
@@ -62,9 +62,9 @@ class LongWayTests(EndpointCase):
         """The confirmation of a session gives its responder a round-trip time, and its next request is sent once."""
         self.got(self.a.ask(self.to_b, "echo", 1))
         self.assertEqual(self.b.round_trip(self.to_a), 2 * FAR)
-        sent = self.board.counters["sent"]
+        sent = self.switchboard.counters["sent"]
         self.got(self.b.ask(self.to_a, "echo", 2))
-        self.assertEqual(self.board.counters["sent"] - sent, 2)
+        self.assertEqual(self.switchboard.counters["sent"] - sent, 2)
 
 
 def heard(share: float, count: int, rng: random.Random) -> LossRate:
@@ -80,7 +80,7 @@ def heard(share: float, count: int, rng: random.Random) -> LossRate:
 
 
 class LossTests(SynchronousTestCase):
-    """Tests of ``Loss``."""
+    """Tests of ``LossRate``."""
 
     def test_the_share_is_what_gets_lost(self) -> None:
         """After 500 datagrams the mean estimate over 100 receivers is within 0.02 of the loss rate."""
@@ -89,7 +89,7 @@ class LossTests(SynchronousTestCase):
             self.assertLess(abs(sum(shares) / 100 - share), 0.02)
 
     def test_as_many_tries_as_it_takes(self) -> None:
-        """The number of tries limits the probability that all of them fail to ``RARE``."""
+        """The number of tries limits the probability that all of them fail to ``TOLERATED_FAILURES``."""
         for share in (0.02, 0.1, 0.2):
             loss = LossRate()
             loss.rate = share
@@ -113,7 +113,7 @@ class LossTests(SynchronousTestCase):
         self.assertLess(loss.rate, 0.06)
 
     def test_a_leap_counts_once(self) -> None:
-        """A long gap in the sequence numbers counts as at most ``MOST_AT_ONCE`` lost datagrams."""
+        """A long gap in the sequence numbers counts as at most ``MAX_GAP_LOSSES`` lost datagrams."""
         one, other = LossRate(), LossRate()
         one.record_arrival(2**40)
         other.record_arrival(MAX_GAP_LOSSES + 1)
@@ -136,7 +136,7 @@ class RoughWeatherTests(EndpointCase):
 
     def test_at_30_percent_lost_hardly_any_question_fails(self) -> None:
         """At 30 % loss a request gets more tries within its timeout than the usual four, and hardly any fails."""
-        self.board.conditions = LinkConditions(DELAY, loss=0.3)
+        self.switchboard.conditions = LinkConditions(DELAY, loss=0.3)
         self.answered(100, 1.0)
         self.assertGreater(self.a.peers.tries, MAX_TRIES)
         self.assertGreaterEqual(self.answered(500, 1.0), 498)  # with four tries about 466
@@ -146,7 +146,7 @@ class RoughWeatherTests(EndpointCase):
         strangers = [self.endpoint(seed) for seed in range(3, 103)]
         for stranger, _ in strangers:
             self.equip(stranger)
-        self.board.conditions = LinkConditions(DELAY, loss=0.3)
+        self.switchboard.conditions = LinkConditions(DELAY, loss=0.3)
         self.answered(100, 1.0)
         asked = [self.a.ask(to, "echo", 1) for _, to in strangers]
         self.clock.advance(3.0)

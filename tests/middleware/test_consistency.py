@@ -23,7 +23,7 @@ from tests.fleet import TEAM_KEY, EntangledTeam, FleetCase
 KEY = hash_key("task")
 
 
-class ConcernCase(FleetCase):
+class ConsistencyCase(FleetCase):
     """Helpers of these tests."""
 
     def cut(self, fleet: EntangledTeam, *places: int) -> None:
@@ -54,7 +54,7 @@ class ConcernCase(FleetCase):
             fleet.run(0.3)
 
 
-class WriteConcernTests(ConcernCase):
+class WriteConsistencyTests(ConsistencyCase):
     def test_how_many_have_it(self) -> None:
         """A write at each consistency level is acknowledged by at least the required number of replicas."""
         fleet = self.fleet(5)
@@ -82,7 +82,7 @@ class WriteConcernTests(ConcernCase):
         self.assertEqual(self.done(fleet, fleet.nodes[0].put(KEY, "a", b"x")), 2)
 
 
-class CompareAndSetTests(ConcernCase):
+class CompareAndSetTests(ConsistencyCase):
     def test_only_what_was_expected_is_replaced(self) -> None:
         """The first write expects sequence 0, the next one the last sequence; any other number is a conflict."""
         fleet = self.fleet(3)
@@ -117,7 +117,7 @@ class CompareAndSetTests(ConcernCase):
         self.assertEqual(self.values(fleet, 0), [b"old"])
 
 
-class ReadConcernTests(ConcernCase):
+class ReadConsistencyTests(ConsistencyCase):
     def setUp(self) -> None:
         super().setUp()
         self.world = self.fleet(14, seed=4)
@@ -173,7 +173,7 @@ class ReadConcernTests(ConcernCase):
         self.assertEqual((error.answered, error.needed), (3, 5))
 
 
-class NewcomerTests(ConcernCase):
+class NewcomerTests(ConsistencyCase):
     def test_second_node_reads_as_soon_as_it_has_joined(self) -> None:
         """In a team of two a node can read with certainty as soon as it has joined."""
 
@@ -189,7 +189,7 @@ class NewcomerTests(ConcernCase):
             self.assertEqual([record.value for record in self.done(fleet, read)], [b"red"])
 
 
-class AbsenceTests(ConcernCase):
+class AbsenceTests(ConsistencyCase):
     def test_a_delete_stays_one(self) -> None:
         """A node that was offline during a deletion does not restore the record."""
         fleet = self.fleet(5)
@@ -240,7 +240,7 @@ class AbsenceTests(ConcernCase):
         return node
 
 
-class WatchNumberTests(ConcernCase):
+class WatchNumberTests(ConsistencyCase):
     def test_a_gap_is_noticed_and_filled(self) -> None:
         """A watcher detects a missed push by the next push number and requests the records at once."""
         fleet = self.fleet(2)
@@ -259,7 +259,7 @@ class WatchNumberTests(ConcernCase):
         self.assertEqual(watch.push_numbers[fleet.nodes[0].identity.node_id], 2)
 
 
-class SecondHandTests(ConcernCase):
+class SecondHandTests(ConsistencyCase):
     def test_only_the_second_hand_is_verified(self) -> None:
         """A replica verifies the signature of a record from another node than its owner, not in the owner's session."""
         fleet = self.fleet(3)
@@ -274,7 +274,7 @@ class SecondHandTests(ConcernCase):
         self.assertEqual([len(fleet.stores[place].get(KEY)) for place in range(3)], [1, 0, 0])
 
 
-class WalkTests(ConcernCase):
+class WalkTests(ConsistencyCase):
     def test_copies_on_the_path(self) -> None:
         """A fast read in a large network leaves cached copies on its path, which never count as a replica."""
         fleet = self.fleet(30, seed=5)
@@ -313,7 +313,7 @@ class Replaced(MemoryStore):
         self._notes = dict(former._notes)
 
 
-class CutTests(ConcernCase):
+class CutTests(ConsistencyCase):
     """A minority behind a partition, with new nodes, against the majority."""
 
     def test_newcomers_make_no_majority_of_a_minority(self) -> None:
@@ -338,7 +338,7 @@ class CutTests(ConcernCase):
             self.assertEqual(sorted(self.values(fleet, len(fleet.nodes) - 1)), [b"x", b"y"])
 
     def test_a_lost_memory_was_a_vote(self) -> None:
-        """A node with a lost store is not ``SURE`` while only nodes answer that may have missed its records."""
+        """A node with a lost store is not ``SYNCED_REPLY`` while only nodes answer that may have missed its records."""
         fleet = self.fleet(3)
         self.cut(fleet, 2)
         self.outcome(fleet, fleet.nodes[0].put(KEY, "a", b"x"))
@@ -360,7 +360,9 @@ class CutTests(ConcernCase):
         self.assertEqual([self.values(fleet, place) for place in range(3)], [[b"x"]] * 3)
 
     def test_a_newcomer_and_a_lost_memory(self) -> None:
-        """A new node that joins through a node with a lost store learns the members from it and is not ``SURE``."""
+        """A new node that joins through a node with a lost store learns the members from it and is not
+        ``SYNCED_REPLY``.
+        """
         fleet = self.fleet(3)
         self.cut(fleet, 2, 3)
         fleet.nodes[2].stop_silently()
@@ -387,7 +389,8 @@ class CutTests(ConcernCase):
         self.assertEqual([node.replica.is_synced() for node in fleet.nodes], [True] * 4)
 
     def test_the_unsure_hold_without_a_vote(self) -> None:
-        """A replica that is not ``SURE`` stores records without a vote; the writer waits briefly for its vote."""
+        """A replica that is not ``SYNCED_REPLY`` stores records without a vote; the writer waits briefly for its vote.
+        """
         fleet = self.fleet(2)
         unsure = fleet.nodes[1].replica
         genuine, unsure.is_synced = unsure.is_synced, lambda: False
@@ -435,7 +438,7 @@ class CutTests(ConcernCase):
         self.assertIs(type(self.outcome(fleet, fleet.nodes[1].get(KEY, "fast"))), Unavailable)
 
 
-class StartTests(ConcernCase):
+class StartTests(ConsistencyCase):
     def test_a_liar_makes_no_members_up(self) -> None:
         """A new node counts a member as absent only if several of the nodes that it queries name it."""
         fleet = self.fleet(3)
@@ -447,7 +450,7 @@ class StartTests(ConcernCase):
         self.assertTrue(fleet.nodes[3].replica.is_synced())
 
     def test_a_new_team_all_at_once(self) -> None:
-        """Nodes that start at the same time and know all addresses are ``SURE`` within four seconds."""
+        """Nodes that start at the same time and know all addresses are ``SYNCED_REPLY`` within four seconds."""
         fleet = self.fleet(0)
         for place in range(5):
             fleet.nodes.append(fleet.make_node(place))
@@ -457,7 +460,7 @@ class StartTests(ConcernCase):
         self.assertEqual([node.replica.is_synced() for node in fleet.nodes], [True] * 5)
 
     def test_a_power_cut(self) -> None:
-        """After a restart from disk of all members but one the team is ``SURE`` and writes within seconds."""
+        """After a restart from disk of all members but one the team is ``SYNCED_REPLY`` and writes within seconds."""
         fleet = self.fleet(5)
         self.outcome(fleet, fleet.nodes[0].put(KEY, "a", b"x"))
         for node in fleet.nodes:

@@ -32,7 +32,7 @@ HOME, ELSEWHERE = Address("10.0.0.1", 1), Address("10.0.0.1", 2)
 
 
 class CookieTests(EndpointCase):
-    """Tests of ``Cookies`` and of endpoints under a flood."""
+    """Tests of ``CookieCheck`` and of endpoints under a flood."""
 
     def invitation(self, number: int, cookie: bytes = b"") -> bytes:
         """Return an INIT datagram of a member."""
@@ -43,7 +43,7 @@ class CookieTests(EndpointCase):
     def flood(self, count: int) -> list[bytes]:
         """Send ``count`` INITs to ``b`` from one address and return its replies."""
         answers: list[bytes] = []
-        deaf = self.board.make_network("10.0.0.1", 1)
+        deaf = self.switchboard.make_network("10.0.0.1", 1)
         deaf.listen(lambda datagram, source: answers.append(datagram))
         for number in range(count):
             self.taps[self.to_b.address].receiver(self.invitation(number), HOME)
@@ -94,8 +94,8 @@ class CookieTests(EndpointCase):
 TOKEN = b"0123456789abcdef"
 
 
-class HailTests(EndpointCase):
-    """Tests of ``Endpoint.hail`` and of its replies."""
+class ProbeTests(EndpointCase):
+    """Tests of ``Endpoint.probe`` and of its replies."""
 
     def test_who_is_there(self) -> None:
         """A reply, also of another team, contains fingerprint, version and clock, and the address of the prober."""
@@ -122,7 +122,7 @@ class HailTests(EndpointCase):
     def test_what_is_none(self) -> None:
         """Probes and replies of wrong length, and replies without a probe, are counted and not answered."""
         receiver = self.taps[self.to_b.address].receiver
-        before = self.board.counters["sent"]
+        before = self.switchboard.counters["sent"]
         for datagram in (
             pack_probe(TOKEN)[:-1],
             pack_probe(TOKEN) + b"x",
@@ -132,16 +132,16 @@ class HailTests(EndpointCase):
             receiver(datagram, HOME)
         receiver(pack_reply(pack_probe(TOKEN), bytes(8), 0.0, HOME), HOME)
         self.assertEqual(self.b.counters, {"malformed": 4, "unasked": 1})
-        self.assertEqual(self.board.counters["sent"], before)
+        self.assertEqual(self.switchboard.counters["sent"], before)
         self.assertRaises(Malformed, pack_reply, b"", bytes(8), 0.0, HOME)
         self.assertRaises(Malformed, parse_reply, pack_probe(TOKEN))
 
     def test_an_echo_from_elsewhere(self) -> None:
         """A reply from another address than the probed one is ignored."""
         sent: list[bytes] = []
-        hailer = Prober(lambda datagram, to: sent.append(datagram), self.clock, random.Random(1))
-        asked = hailer.probe(HOME)
-        hailer.on_reply(pack_reply(sent[0], bytes(8), 0.0, ELSEWHERE), ELSEWHERE)
+        prober = Prober(lambda datagram, to: sent.append(datagram), self.clock, random.Random(1))
+        asked = prober.probe(HOME)
+        prober.on_reply(pack_reply(sent[0], bytes(8), 0.0, ELSEWHERE), ELSEWHERE)
         self.assertNoResult(asked)
-        hailer.on_reply(pack_reply(sent[0], bytes(8), 0.0, ELSEWHERE), HOME)
+        prober.on_reply(pack_reply(sent[0], bytes(8), 0.0, ELSEWHERE), HOME)
         self.assertEqual(self.successResultOf(asked).observed_address, ELSEWHERE)

@@ -1,4 +1,4 @@
-"""Tests of the call features of ``Answerer``: deadline, cancellation, typed errors and checked types."""
+"""Tests of the call features of ``Dispatcher``: deadline, cancellation, typed errors and checked types."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from tests.middleware.test_endpoint import DELAY, EndpointCase
 
 
 class CallTests(EndpointCase):
-    """Tests of ``Answerer``."""
+    """Tests of ``Dispatcher``."""
 
     def setUp(self) -> None:
         """Open a session."""

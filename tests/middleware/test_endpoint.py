@@ -63,7 +63,7 @@ class EndpointCase(SynchronousTestCase):
         """Start both endpoints."""
         self.clock = HeapClock()
         self.rng = random.Random(11)
-        self.board = Switchboard(self.clock, self.rng, LinkConditions(DELAY))
+        self.switchboard = Switchboard(self.clock, self.rng, LinkConditions(DELAY))
         self.taps: dict[Address, Tap] = {}
         self.runs: list[object] = []
         self.a, self.to_a = self.endpoint(1)
@@ -95,7 +95,7 @@ class EndpointCase(SynchronousTestCase):
     ) -> tuple[Endpoint, Contact]:
         """Return a started endpoint and its contact."""
         own = Identity(bytes([identity or seed]) * 32)
-        tap = Tap(self.board.make_network("127.0.0.1", port))
+        tap = Tap(self.switchboard.make_network("127.0.0.1", port))
         endpoint = Endpoint(own, team, tap, self.clock, random.Random(seed))
         endpoint.start()
         self.taps[tap.address] = tap
@@ -123,7 +123,7 @@ class AskTests(EndpointCase):
         """A changing request takes two round trips for the first time, then one; it never runs from an INIT."""
         self.assertEqual(self.got(self.a.ask(self.to_b, "add", 1, changes=True), 4 * DELAY), 1)
         self.assertEqual(self.got(self.a.ask(self.to_b, "add", 2, changes=True), 2 * DELAY), 2)
-        self.assertEqual(self.board.counters["sent"], 6)
+        self.assertEqual(self.switchboard.counters["sent"], 6)
         other, _ = self.endpoint(3)
         asked = other.ask(self.to_b, "add", 5)
         self.clock.advance(2 * DELAY)
@@ -184,9 +184,9 @@ class AskTests(EndpointCase):
         self.clock.advance(1.4)
         self.assertNoResult(asked)
         self.failed(asked, NoAnswer, 0.2)
-        self.assertEqual(self.board.counters["unheard"], 4)
+        self.assertEqual(self.switchboard.counters["unheard"], 4)
         self.got(self.a.ask(self.to_b, "echo", 1))
-        self.board.kill(self.to_b.address)
+        self.switchboard.kill(self.to_b.address)
         self.failed(self.a.ask(self.to_b, "echo", 1), NoAnswer, 1.0)
         self.failed(self.a.ask(self.to_b, "echo", 1, timeout=0.1), NoAnswer, 0.11)
         self.assertIn(
@@ -224,12 +224,12 @@ class AskTests(EndpointCase):
         self.assertEqual([item for item in seen if item[1] == "b"], [(3 * DELAY, "b", self.to_a)])
 
 
-class TellTests(EndpointCase):
+class NotifyTests(EndpointCase):
     """One-way messages, key requests, start and stop."""
 
     def test_tells_open_a_session_and_arrive_once(self) -> None:
         """One-way messages sent before the session arrive in order after the handshake, each once."""
-        self.board.conditions = LinkConditions(DELAY, duplicate=1.0)
+        self.switchboard.conditions = LinkConditions(DELAY, duplicate=1.0)
         for number in range(5):
             self.a.notify(self.to_b, "add", number)
         self.clock.advance(1)
@@ -250,7 +250,7 @@ class TellTests(EndpointCase):
 
     def test_greeting(self) -> None:
         """``greet`` learns the key at an address, also under loss; the reply is no larger than the request."""
-        self.board.conditions = LinkConditions(DELAY, loss=0.3)
+        self.switchboard.conditions = LinkConditions(DELAY, loss=0.3)
         self.assertEqual(self.got(self.a.discover(self.to_b.address)), self.to_b)
         sizes = {len(datagram) for tap in self.taps.values() for datagram, _ in tap.kept}
         self.assertEqual(len(sizes), 1)
@@ -281,11 +281,11 @@ class WeatherTests(EndpointCase):
             (4, "add", self.to_b.address.port),
             (5, "add", 0),
         ):
-            self.board.kill(self.to_b.address)
+            self.switchboard.kill(self.to_b.address)
             self.b, self.to_b = self.endpoint(seed, port=port, identity=2)
             self.equip(self.b)
             self.assertEqual(self.got(self.a.ask(self.to_b, name, seed, changes=name == "add"), 0.5), seed)
-        self.board.kill(self.to_b.address)
+        self.switchboard.kill(self.to_b.address)
         self.b, self.to_b = self.endpoint(6, port=self.to_b.address.port, identity=2)
         self.equip(self.b)
         for number in range(10):  # one-way messages reveal a restart, too
@@ -297,7 +297,7 @@ class WeatherTests(EndpointCase):
         """Replies go to the source of a peer's newest datagram; a replayed datagram does not change the address."""
         self.got(self.a.ask(self.to_b, "echo", 1))
         old = self.taps[self.to_a.address]
-        moved = self.board.make_network("127.0.0.1", 40000)
+        moved = self.switchboard.make_network("127.0.0.1", 40000)
         moved.listen(old.receiver)
         old.network = moved
         seen: list[Contact] = []
@@ -325,13 +325,13 @@ class WeatherTests(EndpointCase):
     def test_keys_of_an_idle_session_are_forgotten(self) -> None:
         """An idle session sends nothing; at its end both sides delete its keys, and a request opens a new session."""
         self.got(self.a.ask(self.to_b, "echo", 1))
-        sent = self.board.counters["sent"]
+        sent = self.switchboard.counters["sent"]
         self.clock.advance(SESSION_END_S - 4.0)
         self.assertTrue(self.a.has_session(self.to_b))
         self.clock.advance(2.0)
         self.assertEqual([len(end._sessions) for end in (self.a, self.b)], [0, 0])
         self.assertEqual(self.clock.getDelayedCalls(), [])
-        self.assertEqual(self.board.counters["sent"], sent)
+        self.assertEqual(self.switchboard.counters["sent"], sent)
         self.assertFalse(self.a.has_session(self.to_b))
         self.assertEqual(self.got(self.a.ask(self.to_b, "echo", 2), 2 * DELAY), 2)
         self.assertEqual(len(self.kept(self.to_b, INIT)), 2)
@@ -339,8 +339,8 @@ class WeatherTests(EndpointCase):
     def test_used_session_is_renewed(self) -> None:
         """A used session is renewed every 120 s by one handshake, and each reply still takes one round trip."""
         for seconds in range(600):
-            asker, to = (self.a, self.to_b) if seconds % 2 else (self.b, self.to_a)
-            asker.notify(to, "echo", seconds)
+            requester, to = (self.a, self.to_b) if seconds % 2 else (self.b, self.to_a)
+            requester.notify(to, "echo", seconds)
             asked = self.a.ask(self.to_b, "echo", seconds)
             self.clock.advance(2 * DELAY)
             self.assertEqual(self.successResultOf(asked), seconds)
@@ -356,13 +356,13 @@ class WeatherTests(EndpointCase):
         """Without a reply from the peer nothing is sent under keys that expired by age or by use."""
         for tells, seconds in ((200, 1.0), (30, 0.0)):
             self.got(self.a.ask(self.to_b, "echo", 1))
-            self.board.cut(self.to_a.address, self.to_b.address)
+            self.switchboard.cut(self.to_a.address, self.to_b.address)
             for _ in range(tells):
                 self.a.notify(self.to_b, "echo", 1)
                 self.clock.advance(seconds)
             self.assertEqual(self.a._peers.get(self.to_b.public).sessions, ())  # type: ignore[union-attr]
             self.patch(peer, "SESSION_DATAGRAMS", 5)
-            self.board.heal()
+            self.switchboard.heal()
             self.clock.advance(10.0)
 
     def test_worn_session_is_renewed(self) -> None:
@@ -383,10 +383,10 @@ class AttackTests(EndpointCase):
 
     def send_raw(self, datagram: bytes, source: Address = Address("127.0.0.1", 666)) -> int:  # noqa: B008
         """Deliver a datagram to ``b`` and return the number of datagrams that ``b`` sends in response."""
-        before = self.board.counters["sent"]
+        before = self.switchboard.counters["sent"]
         self.taps[self.to_b.address].receiver(datagram, source)
         self.clock.advance(2 * DELAY)
-        return self.board.counters["sent"] - before
+        return self.switchboard.counters["sent"] - before
 
     def test_response_counts_only_from_where_it_was_asked(self) -> None:
         """A RESP from another address, or a repeated one, opens no session."""

@@ -32,7 +32,7 @@ MIB = 2**20
 LARGE = random.Random(5).randbytes(MIB)
 
 
-class ParcelCase(EndpointCase):
+class FragmenterCase(EndpointCase):
     """``b`` accepts and returns large values."""
 
     def equip(self, endpoint: Any) -> None:
@@ -73,13 +73,13 @@ class ParcelCase(EndpointCase):
         return got
 
 
-class ParcelTests(ParcelCase):
+class FragmenterTests(FragmenterCase):
     """Large requests and replies."""
 
     def test_every_size(self) -> None:
         """A value of up to 1 MiB arrives unchanged in both directions; one above the limit fails before it is sent."""
         self.failureResultOf(self.a.ask(self.to_b, "size", bytes(MAX_MESSAGE_BYTES)), TooLarge)
-        self.assertEqual(self.board.counters["sent"], 0)
+        self.assertEqual(self.switchboard.counters["sent"], 0)
         self.assertEqual(self.got(self.a.ask(self.to_b, "size", bytes(MIB + 4000), changes=True), 9), MIB + 4000)
         around = [n * FRAGMENT_BYTES + d for n in (1, 2, 10) for d in (-60, -40, -32, -31, -30, -20, -1, 0, 1)]
         for size in (0, 1, MAX_PLAIN_BYTES - 40, *around, 65536, MIB):
@@ -88,13 +88,13 @@ class ParcelTests(ParcelCase):
     def test_loss(self) -> None:
         """1 MiB in each direction arrives unchanged under 5 % loss within 2 s, and under 30 % loss within 22 s."""
         for loss, longest in ((0.05, 2.0), (0.3, 22.0)):
-            self.board.conditions = LinkConditions(DELAY, DELAY / 4, loss=loss, duplicate=0.02, reorder=0.05)
+            self.switchboard.conditions = LinkConditions(DELAY, DELAY / 4, loss=loss, duplicate=0.02, reorder=0.05)
             asked = self.a.ask(self.to_b, "echo", LARGE)
             self.assertEqual(self.got(asked, longest), LARGE, loss)
 
     def test_large_changes_run_once(self) -> None:
         """A large request that changes state runs once under loss and duplication."""
-        self.board.conditions = LinkConditions(DELAY, DELAY / 2, loss=0.2, duplicate=0.3, reorder=0.3)
+        self.switchboard.conditions = LinkConditions(DELAY, DELAY / 2, loss=0.2, duplicate=0.3, reorder=0.3)
         for number in range(30):
             asked = self.a.ask(self.to_b, "size", bytes(3000 + number), changes=True)
             self.assertEqual(self.got(asked, 10.0), 3000 + number)
@@ -106,7 +106,7 @@ class ParcelTests(ParcelCase):
         self.clock.advance(1.5 * DELAY)
         self.assertEqual([len(d) for d, _ in self.kept(self.to_b, INIT)], [MIN_INIT_BYTES])
         self.clock.advance(10 * DELAY)
-        self.board.cut(self.to_a.address, self.to_b.address)
+        self.switchboard.cut(self.to_a.address, self.to_b.address)
         self.failed(asked, NoAnswer, 4.0)
         self.clock.advance(IDLE_TIMEOUT_S + 2)
         self.assertEqual((self.b._fragmenter._incoming, dict(self.b._fragmenter._bytes_in)), ({}, {}))
@@ -120,13 +120,13 @@ class ParcelTests(ParcelCase):
         self.got(self.a.ask(self.to_b, "echo", 1))
         asked = self.a.ask(self.to_b, "size", LARGE, changes=True)
         self.clock.advance(4 * DELAY)
-        self.board.cut(self.to_a.address, self.to_b.address)
+        self.switchboard.cut(self.to_a.address, self.to_b.address)
         self.clock.advance(1.0)
-        self.board.heal()
+        self.switchboard.heal()
         self.assertEqual(self.got(asked, 8.0), MIB)
         asked = self.a.ask(self.to_b, "size", LARGE, changes=True)
         self.clock.advance(4 * DELAY)
-        self.board.kill(self.to_b.address)
+        self.switchboard.kill(self.to_b.address)
         self.b, self.to_b = self.endpoint(7, port=self.to_b.address.port, identity=2)
         self.equip(self.b)
         self.assertEqual(self.got(asked, 8.0), MIB)
@@ -164,7 +164,7 @@ class ParcelTests(ParcelCase):
     def test_parcels_side_by_side(self) -> None:
         """Several messages to one peer share the path fairly; without loss no fragment is retransmitted."""
         for delay in (DELAY, 0.0):
-            self.board.conditions = LinkConditions(delay)
+            self.switchboard.conditions = LinkConditions(delay)
             self.got(self.a.ask(self.to_b, "echo", 1))
             self.taps[self.to_b.address].kept.clear()
             asked = [self.a.ask(self.to_b, "size", LARGE[: 300_000 + n], changes=True) for n in range(3)]
@@ -174,7 +174,7 @@ class ParcelTests(ParcelCase):
             self.assertLessEqual(len(parts), 3 * count_fragments(300_060) + 3, delay)
 
 
-class HostileTests(ParcelCase):
+class HostileTests(FragmenterCase):
     """Fragments that a malicious member creates."""
 
     def setUp(self) -> None:

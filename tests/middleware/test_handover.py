@@ -214,7 +214,7 @@ class ManyTests(FleetCase):
 COUNT = 40
 
 
-class OverlapTests(FleetCase):
+class ComparisonTests(FleetCase):
     def setUp(self) -> None:
         super().setUp()
         self.whole: EntangledTeam = self.fleet(3)
@@ -273,7 +273,7 @@ class OverlapTests(FleetCase):
 
     def test_wrong_questions(self) -> None:
         """Invalid groups, cursors and slots are rejected."""
-        to, asker = self.whole.nodes[2].contact, self.whole.nodes[1].endpoint
+        to, requester = self.whole.nodes[2].contact, self.whole.nodes[1].endpoint
         wrong: list[tuple[object, ...]] = [
             ("digests", SIGNATURE_BITS, 2),
             ("places", GROUPS, []),
@@ -285,7 +285,7 @@ class OverlapTests(FleetCase):
             ("lacking", [[b"", b"", "", 1]]),
         ]
         for method, *arguments in wrong:
-            asked = asker.ask(to, str(method), *arguments)
+            asked = requester.ask(to, str(method), *arguments)
             self.whole.run(0.1)
             self.failureResultOf(asked, Refused)
 
@@ -313,7 +313,7 @@ class JoinTests(FleetCase):
             fleet.run(3.0)
 
     def test_a_newcomer_takes_over(self) -> None:
-        """Within a second a new node knows all members, is ``SURE`` and holds its records."""
+        """Within a second a new node knows all members, is ``SYNCED_REPLY`` and holds its records."""
         fleet = self.fleet(10)
         keys = [hash_key(str(number)) for number in range(60)]
         for key in keys:

@@ -42,7 +42,7 @@ class Lan(EntangledTeam):
 
 
 class DiscoveryTests(FleetCase):
-    """Tests of ``Discovery``."""
+    """Tests of ``LanDiscovery``."""
 
     def lan(self) -> Lan:
         """Return a LAN that is stopped after the test."""
@@ -64,7 +64,7 @@ class DiscoveryTests(FleetCase):
         self.assertIn(c.contact, a.overlay.contacts())
 
     def test_newcomer_is_not_whole_before_it_met_all(self) -> None:
-        """The roster of a node that joins through the LAN is whole only after the node met all members."""
+        """The member table of a node that joins through the LAN is whole only after the node met all members."""
         lan = self.lan()
         for place in range(6):
             lan.on(place)
@@ -78,7 +78,7 @@ class DiscoveryTests(FleetCase):
         self.assertEqual(len(newcomer.overlay.contacts()), 6)
 
     def test_first_of_a_network_waits_a_moment(self) -> None:
-        """A node without replies starts a team as its first node after ``LISTEN`` seconds, not before."""
+        """A node without replies starts a team as its first node after ``LISTEN_S`` seconds, not before."""
         lan = self.lan()
         lan.nodes.append(node := lan.make_node(0))
         node.stop()

@@ -1,4 +1,4 @@
-"""Tests of networks that are too large for a roster, with a limit of twelve members."""
+"""Tests of networks that are too large for a member table, with a limit of twelve members."""
 
 from __future__ import annotations
 
@@ -285,7 +285,7 @@ class LargeTests(FleetCase):
         self.assertIsInstance(fleet.nodes[6].find_node(key), Deferred)
 
 
-class PaceTests(SynchronousTestCase):
+class ProbeIntervalTests(SynchronousTestCase):
     def setUp(self) -> None:
         self.pace = ProbeInterval()
 

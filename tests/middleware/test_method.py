@@ -1,4 +1,4 @@
-"""Tests of the ledger, which stores the replies to requests that must run at most once."""
+"""Tests of the request history, which stores the replies to requests that must run at most once."""
 
 from __future__ import annotations
 
@@ -46,18 +46,18 @@ class KindTests(SynchronousTestCase):
                 self.assertRaises(BadArguments, method.run, PEER, (value,))
 
 
-class LedgerTests(SynchronousTestCase):
-    """Tests of ``Ledger``."""
+class RequestHistoryTests(SynchronousTestCase):
+    """Tests of ``RequestHistory``."""
 
     def setUp(self) -> None:
-        """Create an empty ledger."""
-        self.ledger = RequestHistory()
+        """Create an empty request history."""
+        self.history = RequestHistory()
 
     def run_one(self, public: bytes, number: int, oldest: int, now: float) -> None:
         """Begin and end a request at once."""
-        self.ledger.forget_before(public, oldest, now)
-        self.assertIsNotNone(self.ledger.begin(public, number, None, now, False))
-        self.ledger.finish(public, number, b"done", now)
+        self.history.forget_before(public, oldest, now)
+        self.assertIsNotNone(self.history.begin(public, number, None, now, False))
+        self.history.finish(public, number, b"done", now)
 
     def test_what_the_asker_has_is_forgotten(self) -> None:
         """Finished requests older than the caller's oldest open one are removed at once; later ones stay."""
@@ -65,38 +65,38 @@ class LedgerTests(SynchronousTestCase):
             self.run_one(ANN, number, 0, 1.0)
         self.run_one(BOB, 3, 3, 1.0)
         self.run_one(ANN, 10, 7, 1.0)
-        self.assertEqual([n for n in range(12) if self.ledger.get(ANN, n)], [7, 8, 9, 10])
-        self.assertEqual([n for n in range(12) if self.ledger.is_settled(ANN, n)], [0, 1, 2, 3, 4, 5, 6])
-        self.assertIsNotNone(self.ledger.get(BOB, 3))
-        self.assertEqual(len(self.ledger), 5)
+        self.assertEqual([n for n in range(12) if self.history.get(ANN, n)], [7, 8, 9, 10])
+        self.assertEqual([n for n in range(12) if self.history.is_settled(ANN, n)], [0, 1, 2, 3, 4, 5, 6])
+        self.assertIsNotNone(self.history.get(BOB, 3))
+        self.assertEqual(len(self.history), 5)
 
     def test_word_that_was_overtaken(self) -> None:
         """A late message with a lower number of the oldest open request does not reopen settled requests."""
-        self.ledger.forget_before(ANN, 7, 1.0)
-        self.ledger.forget_before(ANN, 4, 1.0)
-        self.assertTrue(self.ledger.is_settled(ANN, 5))
+        self.history.forget_before(ANN, 7, 1.0)
+        self.history.forget_before(ANN, 4, 1.0)
+        self.assertTrue(self.history.is_settled(ANN, 5))
 
     def test_runs_on_though_given_up(self) -> None:
         """A running request that its caller gave up is removed when it ends."""
-        self.ledger.begin(ANN, 1, None, 1.0, False)
-        self.ledger.forget_before(ANN, 5, 1.0)
-        self.assertIsNotNone(self.ledger.get(ANN, 1))
-        self.ledger.finish(ANN, 1, b"late", 2.0)
-        self.assertEqual((self.ledger.get(ANN, 1), len(self.ledger)), (None, 0))
+        self.history.begin(ANN, 1, None, 1.0, False)
+        self.history.forget_before(ANN, 5, 1.0)
+        self.assertIsNotNone(self.history.get(ANN, 1))
+        self.history.finish(ANN, 1, b"late", 2.0)
+        self.assertEqual((self.history.get(ANN, 1), len(self.history)), (None, 0))
 
     def test_another_life(self) -> None:
         """A restarted caller may use lower request numbers; its earlier settled requests stay settled."""
         self.run_one(ANN, 9 * LIFE + 5, 9 * LIFE + 5, 1.0)
         self.run_one(ANN, 2 * LIFE + 1, 2 * LIFE, 2.0)
-        self.assertFalse(self.ledger.is_settled(ANN, 2 * LIFE + 1))
-        self.assertTrue(self.ledger.is_settled(ANN, 9 * LIFE + 4))
-        self.assertIsNotNone(self.ledger.get(ANN, 9 * LIFE + 5))
+        self.assertFalse(self.history.is_settled(ANN, 2 * LIFE + 1))
+        self.assertTrue(self.history.is_settled(ANN, 9 * LIFE + 4))
+        self.assertIsNotNone(self.history.get(ANN, 9 * LIFE + 5))
 
     def test_lives_are_bounded(self) -> None:
-        """The ledger remembers a bounded number of restarts per caller."""
+        """The request history remembers a bounded number of restarts per caller."""
         for life in range(100):
-            self.ledger.forget_before(ANN, life * LIFE + 7, 1.0)
-        known = [life for life in range(100) if self.ledger.is_settled(ANN, life * LIFE)]
+            self.history.forget_before(ANN, life * LIFE + 7, 1.0)
+        known = [life for life in range(100) if self.history.is_settled(ANN, life * LIFE)]
         self.assertEqual(known, list(range(100 - MAX_INCARNATIONS, 100)))
 
     def test_nothing_is_kept_for_ever(self) -> None:
@@ -104,11 +104,11 @@ class LedgerTests(SynchronousTestCase):
         rng = random.Random(3)
         for _ in range(50):
             self.run_one(rng.randbytes(32), 1, 1, 1.0)
-        self.ledger.begin(BOB, 1, None, 1.0, False)
+        self.history.begin(BOB, 1, None, 1.0, False)
         for number in range(120):
             self.run_one(ANN, number, number, 2.0 + KEEP_ANSWER_S)
-        self.assertEqual((len(self.ledger), len(self.ledger._peers)), (2, 2))
-        self.assertIsNotNone(self.ledger.get(BOB, 1))
+        self.assertEqual((len(self.history), len(self.history._peers)), (2, 2))
+        self.assertIsNotNone(self.history.get(BOB, 1))
 
 
 class OnceTests(EndpointCase):
@@ -132,17 +132,17 @@ class OnceTests(EndpointCase):
         return len(answered)
 
     def test_honest_traffic_is_never_busy(self) -> None:
-        """Thousands of changes within seconds are all answered, and the ledger stays small."""
+        """Thousands of changes within seconds are all answered, and the request history stays small."""
         self.patch(method, "MAX_PER_PEER", 100)
-        self.board.conditions = LinkConditions(DELAY / 4)
+        self.switchboard.conditions = LinkConditions(DELAY / 4)
         self.assertEqual(self.flood("add", 3000), 3000)
         self.assertEqual(self.b.counters["busy"], 0)
         self.assertLess(len(self.b._dispatcher._history), 20)
         self.assertEqual(sorted(self.runs), list(range(3000)))
 
     def test_what_may_run_again_is_not_kept(self) -> None:
-        """An idempotent change needs no ledger entry, and may run again after a retransmission."""
-        self.board.conditions = LinkConditions(DELAY / 4, loss=0.3)
+        """An idempotent change needs no entry in the request history, and may run again after a retransmission."""
+        self.switchboard.conditions = LinkConditions(DELAY / 4, loss=0.3)
         answered = self.flood("note", 500)
         self.assertGreater(answered, 450)
         self.assertEqual(len(self.b._dispatcher._history), 0)
@@ -161,6 +161,6 @@ class OnceTests(EndpointCase):
 
     def test_in_rough_weather_still_once(self) -> None:
         """Under loss, duplication and reordering no change runs twice."""
-        self.board.conditions = LinkConditions(DELAY, DELAY, loss=0.2, duplicate=0.3, reorder=0.4)
+        self.switchboard.conditions = LinkConditions(DELAY, DELAY, loss=0.2, duplicate=0.3, reorder=0.4)
         self.assertGreater(self.flood("add", 800), 700)
         self.assertEqual(len(self.runs), len(set(self.runs)))

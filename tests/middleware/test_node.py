@@ -185,7 +185,7 @@ class TeamRecordTests(NodeCase):
             fleet.start_node(fleet.nodes[-1], [fleet.address(place)])
             fleet.run(2.0)
             fleet.nodes[place].stop_silently()
-            fleet.run(40.0)  # until the other nodes remove it from the roster
+            fleet.run(40.0)  # until the other nodes remove it from the member table
         self.assertEqual(self.values(fleet, 5), [b"do it"])
         self.assertEqual(len(fleet.stores[5].get(KEY, tombstones=True)), 2)
 

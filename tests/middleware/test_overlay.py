@@ -115,17 +115,17 @@ class NewcomerTests(SynchronousTestCase):
 
     def setUp(self) -> None:
         self.clock = HeapClock()
-        self.chores = Background(self.clock)
+        self.background = Background(self.clock)
         identity, address = Identity(bytes([1]) * 32), Address("10.0.0.1", 1)
         network = Switchboard(self.clock, random.Random(1)).make_network(*address)
         self.me = Contact(identity.public, address)
         endpoint = Endpoint(identity, TEAM_KEY, network, self.clock, random.Random(1))
-        self.overlay = Overlay(lambda: self.me, endpoint, self.clock, self.chores)
+        self.overlay = Overlay(lambda: self.me, endpoint, self.clock, self.background)
         self.overlay.has_found_neighbours = True
-        self.addCleanup(self.chores.stop)
+        self.addCleanup(self.background.stop)
 
     def meet(self) -> None:
-        """Add one member of the team to the roster."""
+        """Add one member of the team to the member table."""
         self.overlay.members.mark_alive(Contact(Identity(bytes([2]) * 32).public, Address("10.0.0.2", 2)), 0.0)
 
     def forget(self) -> None:
@@ -134,11 +134,11 @@ class NewcomerTests(SynchronousTestCase):
         self.overlay.has_all_members = self.overlay.is_large = False
 
     def knows_all(self) -> None:
-        """Mark the roster as complete."""
+        """Mark the member table as complete."""
         self.overlay.has_all_members = True
 
     def knows_many(self) -> None:
-        """Mark the team as too large for a roster."""
+        """Mark the team as too large for a member table."""
         self.overlay.is_large = True
 
     def holders(self) -> Deferred[list[Contact]]:

@@ -19,7 +19,7 @@ from middleware.entangled.data.sqlite import SqliteStore
 from tests.middleware.test_store import DOG, FOREVER, KEY, record
 
 
-class RottenFileTest(SynchronousTestCase):
+class CorruptFileTest(SynchronousTestCase):
     def setUp(self) -> None:
         self.lines: list[str] = []
 
@@ -48,13 +48,13 @@ class RottenFileTest(SynchronousTestCase):
 
     def opened_anew(self, number: int = 1) -> SqliteStore:
         """Open the new store that replaces the corrupted one, which must be kept unchanged under another name."""
-        rotten = Path(self.path).read_bytes()
+        corrupt = Path(self.path).read_bytes()
         store = SqliteStore.open(self.path, 0.0)
         self.addCleanup(store.close)
         self.assertEqual((len(store), store.origin), (0, "replaced"))
         self.assertNotEqual(store.epoch, self.epoch)
         aside = f"{self.path}.rotten-{number}"
-        self.assertEqual(Path(aside).read_bytes(), rotten)
+        self.assertEqual(Path(aside).read_bytes(), corrupt)
         lines = [line for line in self.lines if "rotten" in line]
         self.assertEqual(len(lines), number)
         self.assertIn(aside, lines[-1])

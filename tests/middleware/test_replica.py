@@ -51,12 +51,12 @@ class Alone:
 class ReplicaTests(SynchronousTestCase):
     def setUp(self) -> None:
         self.clock = HeapClock()
-        self.board = Switchboard(self.clock, random.Random(1))
+        self.switchboard = Switchboard(self.clock, random.Random(1))
         self.store = MemoryStore(50)
-        self.chores = Background(self.clock)
+        self.background = Background(self.clock)
         self.endpoint = self.opened(ME, 1)
         overlay: Any = Alone()
-        self.replica = Replica(self.store, self.endpoint, overlay, self.clock, self.chores)
+        self.replica = Replica(self.store, self.endpoint, overlay, self.clock, self.background)
         self.replica.start()
         self.told: list[tuple[object, ...]] = []
         self.replica.on_record.add(lambda r: self.told.append(("record", r.name)))
@@ -71,13 +71,13 @@ class ReplicaTests(SynchronousTestCase):
         self.owner.expose("missing", lambda peer, marks: self.heard.append(("missing", marks)))
 
     def opened(self, identity: Identity, port: int) -> Endpoint:
-        network = self.board.make_network("10.0.0.1", port)
+        network = self.switchboard.make_network("10.0.0.1", port)
         endpoint = Endpoint(identity, TEAM, network, self.clock, random.Random(port))
         endpoint.start()
         return endpoint
 
     def tearDown(self) -> None:
-        self.chores.stop()
+        self.background.stop()
         for endpoint in (self.endpoint, self.watcher, self.owner):
             endpoint.stop()
 

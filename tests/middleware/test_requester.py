@@ -20,7 +20,7 @@ SLOW_S = 0.2
 
 
 class TurnTests(EndpointCase):
-    """Tests of ``Asker`` with more requests than may be in flight."""
+    """Tests of ``Requester`` with more requests than may be in flight."""
 
     def setUp(self) -> None:
         """Open a session."""
@@ -45,9 +45,9 @@ class TurnTests(EndpointCase):
 
     def test_the_rest_waits_in_order(self) -> None:
         """At most ``MAX_IN_FLIGHT`` requests are sent at once; the others follow in order when replies arrive."""
-        sent = self.board.counters["sent"]
+        sent = self.switchboard.counters["sent"]
         asked = self.flood(12 * MAX_IN_FLIGHT)
-        self.assertEqual(self.board.counters["sent"] - sent, MAX_IN_FLIGHT)
+        self.assertEqual(self.switchboard.counters["sent"] - sent, MAX_IN_FLIGHT)
         self.clock.advance(DELAY)
         self.assertEqual(self.runs, list(range(MAX_IN_FLIGHT)))
         self.clock.advance(2.0)
@@ -59,7 +59,7 @@ class TurnTests(EndpointCase):
 
     def test_a_dead_peer(self) -> None:
         """For a dead peer sent requests fail with ``NoAnswer``, queued ones with ``Crowded``; no state remains."""
-        self.board.kill(self.to_b.address)
+        self.switchboard.kill(self.to_b.address)
         asked = self.flood(20 * MAX_IN_FLIGHT)
         self.clock.advance(30.0)
         kinds = [self.failureResultOf(one, NoAnswer, Crowded).type for one in asked]
@@ -107,10 +107,10 @@ class TurnTests(EndpointCase):
         """Requests that wait for a handshake keep their order and the limit."""
         third, to_third = self.endpoint(3)
         self.equip(third)
-        sent = self.board.counters["sent"]
+        sent = self.switchboard.counters["sent"]
         asked = [self.a.ask(to_third, "add", number, changes=True) for number in range(2 * MAX_IN_FLIGHT)]
         self.clock.advance(2 * DELAY)
-        self.assertEqual(self.board.counters["sent"] - sent, 2 + MAX_IN_FLIGHT)
+        self.assertEqual(self.switchboard.counters["sent"] - sent, 2 + MAX_IN_FLIGHT)
         self.clock.advance(1)
         self.assertEqual([self.successResultOf(one) for one in asked], self.runs)
 
@@ -118,7 +118,7 @@ class TurnTests(EndpointCase):
         """A peer that restarts during many requests answers all of them."""
         asked = self.flood(4 * MAX_IN_FLIGHT)
         self.clock.advance(0.05)
-        self.board.kill(self.to_b.address)
+        self.switchboard.kill(self.to_b.address)
         self.b, _ = self.endpoint(9, port=self.to_b.address.port, identity=2)
         self.equip(self.b)
         self.clock.advance(10)
@@ -144,33 +144,33 @@ class GivenUpTests(EndpointCase):
 
     def test_nothing_more_is_sent_for_nobody(self) -> None:
         """After all its requests ended, a handshake is not retransmitted, and is soon removed."""
-        self.board.kill(self.to_b.address)
-        sent = self.board.counters["sent"]
+        self.switchboard.kill(self.to_b.address)
+        sent = self.switchboard.counters["sent"]
         self.give_up(INITIAL_TIMEOUT_S / 2)
         self.clock.advance(5.0)
-        self.assertEqual(self.board.counters["sent"] - sent, 1)
+        self.assertEqual(self.switchboard.counters["sent"] - sent, 1)
         self.assertEqual(self.a.peers.get_or_create(self.to_b).handshake, None)
 
     def test_a_late_answer_opens_the_session(self) -> None:
         """A late handshake reply still opens the session for the next request."""
-        self.board.conditions = LinkConditions(0.3)
+        self.switchboard.conditions = LinkConditions(0.3)
         self.give_up(0.2)
         self.clock.advance(1.0)
         self.assertTrue(self.a.has_session(self.to_b))
 
     def test_who_asks_meanwhile_need_not_wait(self) -> None:
         """A new request during a paused handshake retransmits it at once."""
-        self.board.conditions = LinkConditions(DELAY, loss=1.0)
+        self.switchboard.conditions = LinkConditions(DELAY, loss=1.0)
         self.give_up(INITIAL_TIMEOUT_S / 2)
         self.clock.advance(INITIAL_TIMEOUT_S)
-        self.board.conditions = LinkConditions(DELAY)
+        self.switchboard.conditions = LinkConditions(DELAY)
         self.assertEqual(self.got(self.a.ask(self.to_b, "echo", 2), 5 * DELAY), 2)
         self.assertEqual(self.inits(), 1)
 
     def test_two_handshakes_in_doubt(self) -> None:
-        """A silent peer with a session gets at most ``DOUBTS`` INITs, for any number of requests."""
+        """A silent peer with a session gets at most ``MIN_CHECK_TRIES`` INITs, for any number of requests."""
         self.assertEqual(self.got(self.a.ask(self.to_b, "echo", 1), 5 * DELAY), 1)
-        self.board.conditions = LinkConditions(DELAY, loss=1.0)
+        self.switchboard.conditions = LinkConditions(DELAY, loss=1.0)
         sent: list[int] = []
         self.patch(self.a._network, "send", lambda datagram, to: sent.append(datagram[0]))
         asked = [self.a.ask(self.to_b, "echo", number) for number in range(3)]

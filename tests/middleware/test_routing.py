@@ -81,7 +81,7 @@ class RoutingTableTest(SynchronousTestCase):
         self.assertEqual(self.table.record_contact(self.new[0], 30.0), self.old[2])
 
     def test_no_flood_of_pings(self) -> None:
-        """For many new contacts the old contact is returned for a ping only once per ``PATIENCE``."""
+        """For many new contacts the old contact is returned for a ping only once per ``PING_INTERVAL_S``."""
         self.fill()
         asked = [self.table.record_contact(newcomer, 10.0) for newcomer in self.new]
         self.assertEqual(asked, [self.old[0]] + [None] * 7)
@@ -189,7 +189,11 @@ class RoutingTableTest(SynchronousTestCase):
         self.assertEqual(target, table.refresh_target(index, random.Random(seed)))
 
     @settings(max_examples=50)
-    @given(st.lists(st.tuples(st.sampled_from(["record_contact", "record_miss", "remove"]), st.integers(0, 40)), max_size=200))
+    @given(
+        st.lists(
+            st.tuples(st.sampled_from(["record_contact", "record_miss", "remove"]), st.integers(0, 40)), max_size=200
+        )
+    )
     def test_invariants(self, events: list[tuple[str, int]]) -> None:
         """In every state each bucket has at most k contacts, each contact occurs once, and the length is correct."""
         table = RoutingTable(OWN.node_id, k=3)

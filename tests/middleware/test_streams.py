@@ -81,9 +81,9 @@ class StreamsTests(EndpointCase):
         self.assertEqual(self.frames, [])
         stop()
         self.clock.advance(SUBSCRIPTION_TTL_S + 0.1)
-        sent = self.board.counters["sent"]
+        sent = self.switchboard.counters["sent"]
         self.publisher.publish(CAMERA, 1, b"x")
-        self.assertEqual(self.board.counters["sent"], sent)
+        self.assertEqual(self.switchboard.counters["sent"], sent)
 
     def test_lost_part_drops_the_frame(self) -> None:
         """A frame with a lost fragment is dropped, as is a late older frame; no frame is shown twice."""

@@ -105,8 +105,8 @@ class TunnelCase(SynchronousTestCase):
     def made(self, host: str = HOST, *urls: Url, port: int = 443, **options: Any) -> tuple[TunnelNetwork, Heard]:
         """Create an end, which is a server if it has no URL, and the list of datagrams that it receives."""
         heard: Heard = []
-        carrier = self.pipes.make_transport(host, port)
-        tunnel = TunnelNetwork(carrier, self.clock, random.Random(host), urls, not urls, **options)
+        stream = self.pipes.make_transport(host, port)
+        tunnel = TunnelNetwork(stream, self.clock, random.Random(host), urls, not urls, **options)
         tunnel.listen(lambda datagram, source: heard.append((datagram, source)))
         self.ends.append(tunnel)
         return tunnel, heard
@@ -223,8 +223,8 @@ class TunnelTests(TunnelCase):
     def test_port_in_use(self) -> None:
         """A port in use raises ``PortInUse``, and a joint network then opens neither of its networks."""
         self.made()
-        carrier = self.pipes.make_transport(HOST, 443)
-        other = TunnelNetwork(carrier, self.clock, random.Random(1), is_served=True)
+        stream = self.pipes.make_transport(HOST, 443)
+        other = TunnelNetwork(stream, self.clock, random.Random(1), is_served=True)
         self.assertRaises(PortInUse, other.listen, lambda datagram, source: None)
         udp = Switchboard(self.clock, random.Random(1)).make_network(HOST, 7000)
         self.assertRaises(PortInUse, JointNetwork(udp, other).listen, lambda datagram, source: None)
@@ -257,7 +257,7 @@ class TunnelTests(TunnelCase):
         self.assertEqual(layer.decode(b"HTTP/1.1 200 OK\r\n\r\nrest"), (b"rest", b""))
 
 
-class BurdenTests(TunnelCase):
+class QueueLimitTests(TunnelCase):
     """The load on a tunnel server by slow readers, incomplete handshakes and strangers."""
 
     def test_slow_reader(self) -> None:
@@ -411,13 +411,13 @@ class BurdenTests(TunnelCase):
 class JointTests(TunnelCase):
     def test_pick_by_address(self) -> None:
         """A joint network sends to tunnel addresses by tunnel and to others by UDP, with one receiver for both."""
-        board = Switchboard(self.clock, random.Random(1))
+        switchboard = Switchboard(self.clock, random.Random(1))
         server, served = self.made()
-        plain = board.make_network("10.0.0.9", 7000)
+        plain = switchboard.make_network("10.0.0.9", 7000)
         by_udp: Heard = []
         plain.listen(lambda datagram, source: by_udp.append((datagram, source)))
         tunnel = TunnelNetwork(self.pipes.make_transport("10.0.0.2"), self.clock, random.Random(2), [URL])
-        joint = JointNetwork(board.make_network("10.0.0.2", 7000), tunnel)
+        joint = JointNetwork(switchboard.make_network("10.0.0.2", 7000), tunnel)
         heard: Heard = []
         joint.listen(lambda datagram, source: heard.append((datagram, source)))
         self.addCleanup(joint.close)

@@ -24,7 +24,7 @@ STEP = 0.1
 WHOLE = GREETING.replace(b"\r\n\r\n", b"\r\n" + TOKEN_HEADER.encode() + b": %s\r\n\r\n")
 
 
-class BundleTests(TunnelCase):
+class TunnelConnectionsTests(TunnelCase):
     def talk(self, client: TunnelNetwork, served: Heard, seconds: float, size: int = 100) -> tuple[list[float], float]:
         """Send ten datagrams per second; return the copies per arrived datagram and the longest gap."""
         number, last, gap = 0, self.clock.seconds(), 0.0

@@ -115,7 +115,7 @@ class Environment:
 
 MAX_PARTICIPANTS = 256
 MAX_IDLE_S = 300.0
-"""Seconds after which an inactive party of another node's auction is removed."""
+"""Seconds after which an inactive participant of another node's auction is removed."""
 OWN_OPENER = b""
 
 
@@ -127,7 +127,7 @@ class _TableEntry:
 
 
 class ParticipantTable:
-    """Parties by the digest of their auction; parties in this node's own auctions are never evicted."""
+    """Participants by the digest of their auction; those in this node's own auctions are never evicted."""
 
     def __init__(self) -> None:
         self._entries: dict[bytes, _TableEntry] = {}
@@ -139,18 +139,18 @@ class ParticipantTable:
         return iter([entry.participant for entry in self._entries.values()])
 
     def get(self, digest: bytes) -> Participant | None:
-        """Return the party in the auction with this digest."""
+        """Return the participant in the auction with this digest."""
         entry = self._entries.get(digest)
         return entry.participant if entry is not None else None
 
     def touch(self, digest: bytes, now: float) -> None:
-        """Record activity in a party."""
+        """Record activity of a participant."""
         entry = self._entries.get(digest)
         if entry is not None:
             entry.touched_at = now
 
     def add(self, participant: Participant, opener: bytes, now: float) -> list[Participant]:
-        """Add ``participant``, which ``opener`` (a node id, or ``OWN_OPENER``) requested; returns the evicted parties."""
+        """Add ``participant``, requested by ``opener`` (a node id, or ``OWN_OPENER``); return the evicted ones."""
         idle = [
             d
             for d, entry in self._entries.items()
@@ -168,7 +168,7 @@ class ParticipantTable:
         return evicted
 
     def mark_own(self, digest: bytes, is_own: bool, opener: bytes = b"left") -> None:
-        """Mark a party as this node's own, or not."""
+        """Mark a participant as this node's own, or not."""
         entry = self._entries.get(digest)
         if entry is not None:
             entry.opener = OWN_OPENER if is_own else opener

@@ -210,7 +210,7 @@ class Group:
         return math.inf if self._reporters.is_partial(self._seconds()) else len(self._members)
 
     def _write_record(self) -> None:
-        """Write the record if the panel requires it, or set a timer for later."""
+        """Write the record if the reporters require it, or set a timer for later."""
         self._cancel()
         if self._me is None:
             return

@@ -1,7 +1,7 @@
 """Merge and evaluate the reports of one auction with its strategy, protected against faulty strategies; pure.
 
-If a third-party strategy raises, returns invalid reports, or has no ``merge``, the ``MAX_LEADING_REPORTS`` cheapest reports are
-used.  Reports that a strategy invents are dropped.
+If a third-party strategy raises, returns invalid reports, or has no ``merge``, the ``MAX_LEADING_REPORTS`` cheapest
+reports are used.  Reports that a strategy invents are dropped.
 """
 
 from __future__ import annotations

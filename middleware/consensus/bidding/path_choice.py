@@ -31,7 +31,7 @@ class PathChoice:
 
 
 MAX_WHOLE_TEAM = 50
-"""Up to this many contacts are assumed to be the whole team in a small network: a roster holds 64."""
+"""Up to this many contacts are assumed to be the whole team in a small network: a member table holds 64."""
 NEAREST_CONTACTS = 8
 """Number of nearest contacts by which the size of a large team is estimated: a node knows these reliably."""
 

@@ -37,7 +37,7 @@ ANNOUNCEMENT_TIMEOUT_S = 3.0
 
 
 class Reporters:
-    """The reporters of one task, as the participant ``uuid`` sees them; ``turn_share``, 0 to 1, is the order of its turn.
+    """The reporters of one task, as the participant ``uuid`` sees them; ``turn_share``, 0 to 1, orders their turns.
 
     ``compute_due`` returns when to write.  In a small team all participants are reporters.
     """

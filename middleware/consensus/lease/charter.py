@@ -101,7 +101,8 @@ class Charter:
     def packed(self) -> bytes:
         """The encoding for messages, records and notes."""
         changes = [
-            [pack_members(change.members), *change.ballot, [list(vote) for vote in change.votes]] for change in self.changes
+            [pack_members(change.members), *change.ballot, [list(vote) for vote in change.votes]]
+            for change in self.changes
         ]
         return bytes(msgpack.packb([self.owner, pack_members(self.first), self.signature, changes]))
 

@@ -1,8 +1,8 @@
 """The states of a lease client, and its transition table.  Pure.
 
-The client (``lease_client``) turns calls, timers and the results of rounds into events, looks up the transition, and performs
-its actions.  A claim runs through PREPARING, PROMISED if the previous lease has not ended, and PROPOSING to HOLDING;
-a standby alternates between WATCHING and LOOKING until the lease is about to end.
+The client (``lease_client``) turns calls, timers and the results of rounds into events, looks up the transition, and
+performs its actions.  A claim runs through PREPARING, PROMISED if the previous lease has not ended, and PROPOSING to
+HOLDING; a standby alternates between WATCHING and LOOKING until the lease is about to end.
 """
 
 from __future__ import annotations

@@ -41,8 +41,8 @@ SOON_PERIODS = 1.5
 RELEASE_SPREAD_S = 0.3
 """Seconds after a notification of release during which members may not know of it yet."""
 FIRST_STANDBY_SHARE = 0.8
-"""Share of the promise time before the end of a lease (``EARLY_PROMISE_SHARE``) at which the first standby asks for promises, so that
-a slightly late estimate is still in time."""
+"""Share of the promise time before the end of a lease (``EARLY_PROMISE_SHARE``) at which the first standby asks for
+promises, so that a slightly late estimate is still in time."""
 GRANT_LEAD_S = 0.1
 """Seconds before the end of a lease at which the next grant is requested: time for a retry; members delay the reply to
 an early request."""
@@ -426,7 +426,7 @@ class LeaseClient:
 
     @property
     def _is_recently_released(self) -> bool:
-        """Whether the lease was released within ``RELEASE_SPREAD_S`` seconds, so that some members may not know it yet."""
+        """Whether the lease was released within ``RELEASE_SPREAD_S`` seconds, so some members may not know it yet."""
         return self._clock.seconds() < self._standby.freed_at + RELEASE_SPREAD_S
 
     @property

@@ -185,9 +185,9 @@ class LeaseProposer:
     def change_members(self, members: Sequence[Contact], keep: bool = False) -> Deferred[None]:
         """Change the council to ``members``; fires when a majority of them has installed it.
 
-        With ``keep`` the own lease is released (``LeaseClient.change_council``) and reserved for this agent for one ttl.  Fails with
-        ``LeaseHeld`` while another agent holds a lease, ``NoMajority`` if the old council cannot decide, and
-        ``Superseded`` if another change was in progress, which is then completed instead.
+        With ``keep`` the own lease is released (``LeaseClient.change_council``) and reserved for this agent for one
+        ttl.  Fails with ``LeaseHeld`` while another agent holds a lease, ``NoMajority`` if the old council cannot
+        decide, and ``Superseded`` if another change was in progress, which is then completed instead.
         """
         wanted = tuple(members)
         if not 0 < len(wanted) <= MAX_COUNCIL:

@@ -39,7 +39,8 @@ class LeaseService:
     """The lease service of one node: its acceptor, and the lease clients to notify of releases.
 
     It may be created at the first request: ``born_at`` is the start of the node, from which the acceptor's silence
-    counts.  ``charter_verifier`` checks charters; ``may_sit`` returns whether the owner of a key may be a council member.
+    counts.  ``charter_verifier`` checks charters; ``may_sit`` returns whether the owner of a key may be a council
+    member.
     """
 
     def __init__(

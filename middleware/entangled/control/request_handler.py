@@ -105,7 +105,9 @@ class RequestHandler:
         return found.addCallback(lambda contacts: [_make_contact(contact) for contact in contacts])
 
     def _dht_watch(self, args: Arguments, send_event: SendEvent) -> object:
-        return _until_cancelled(self.node.watch(parse_key(args.text("key")), lambda records: send_event(make_rows(records))))
+        return _until_cancelled(
+            self.node.watch(parse_key(args.text("key")), lambda records: send_event(make_rows(records)))
+        )
 
     # -- keywords and tuples ----------------------------------------------------------------------------------------
 

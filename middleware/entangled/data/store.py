@@ -26,8 +26,8 @@ from middleware.entangled.errors import OWNER_FULL, Full
 from middleware.entangled.record import Record, Slot
 
 MAX_ROWS = 12_000
-"""Slots of a store.  More serve a larger network; each takes 1.2 KiB of memory in addition to its ``count_bytes``.  Together
-with ``MAX_BYTES`` a full store adds 22 MiB to a node of 40 MiB, the limit for a device with 64 MB."""
+"""Slots of a store.  More serve a larger network; each takes 1.2 KiB of memory in addition to its ``count_bytes``.
+Together with ``MAX_BYTES`` a full store adds 22 MiB to a node of 40 MiB, the limit for a device with 64 MB."""
 MAX_BYTES = 8 * 2**20
 """Bytes of a store by ``count_bytes``.  More hold more large values, at the cost of memory and flash."""
 TOMBSTONE_HOLD_S = 86_400.0

@@ -1,8 +1,8 @@
 """The thread that writes a SQLite file, with many changes to a commit.
 
 A single commit can stall for a quarter of a second on a busy flash card, so callers do not block on it: changes are
-queued, and ``wait_for_write`` fires when they are durable.  A change that a caller waits for is committed at once, together
-with all changes queued during the commit before; other changes share a later commit.
+queued, and ``wait_for_write`` fires when they are durable.  A change that a caller waits for is committed at once,
+together with all changes queued during the commit before; other changes share a later commit.
 """
 
 from __future__ import annotations
@@ -202,7 +202,9 @@ class Writer:
             self._condition.notify_all()
             lost_changes = len(self._pending)
             if self._is_closing and error:
-                self._log.error("store {path}: {left} changes are lost: {why}", path=self._path, left=lost_changes, why=error)
+                self._log.error(
+                    "store {path}: {left} changes are lost: {why}", path=self._path, left=lost_changes, why=error
+                )
             return self._is_closing and (bool(error) or not lost_changes)
 
     def _commit(self, batch: _Batch) -> str:

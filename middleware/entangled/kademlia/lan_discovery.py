@@ -53,7 +53,7 @@ class LanDiscovery:
 
     ``counters`` counts the multicasts sent (calls), received from the team (heard), answered and not answered (left);
     the datagrams of other teams (foreign), duplicates (repeated) and surplus ones (crowded); and the addresses that got
-    a discovery request (greeted).
+    a discovery request (contacted).
     """
 
     def __init__(

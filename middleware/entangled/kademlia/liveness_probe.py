@@ -22,7 +22,8 @@ DISCONNECTED_S = 3.0
 LOOKUP_INTERVALS_S = (3.0, 60.0)
 """The first and longest interval in seconds between a newcomer's lookups of its neighbours; it doubles each time."""
 NEIGHBOUR_SILENCE_S = 12.0
-"""The silence in seconds after which a neighbour, or a contact that ``needs_keep_alive``, is probed in a large network."""
+"""The silence in seconds after which a neighbour, or a contact that ``needs_keep_alive``, is probed in a large network.
+"""
 PROBES_PER_STEP = 2
 """The number of distant contacts that are probed per ``STEP_S``."""
 MAINTENANCE_S = 15.0
@@ -42,8 +43,8 @@ class ProbeInterval:
 
     In a stable network nearly every probe is unnecessary, in a changing one most contacts fail within a minute.
     Therefore the interval is halved for each lost contact and grows slightly with each answer: in equilibrium a share
-    of ``TARGET_FAILURES`` of the probed contacts has failed.  By the measurements of Kademlia and Bamboo this share does not slow
-    lookups.
+    of ``TARGET_FAILURES`` of the probed contacts has failed.  By the measurements of Kademlia and Bamboo this share
+    does not slow lookups.
     """
 
     __slots__ = ("silence_s",)
@@ -63,8 +64,8 @@ class ProbeInterval:
 class LivenessProber:
     """The probes of one node's contacts in a large network.
 
-    ``upkeep`` is called with the time at each run of infrequent maintenance.  ``needs_keep_alive`` returns whether the path to
-    a contact stays open only while it is used.
+    ``upkeep`` is called with the time at each run of infrequent maintenance.  ``needs_keep_alive`` returns whether the
+    path to a contact stays open only while it is used.
     """
 
     def __init__(

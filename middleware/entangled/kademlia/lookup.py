@@ -1,7 +1,8 @@
 """Track one iterative search for the k nodes closest to an id (Kademlia, section 2.3), without I/O.
 
-The caller asks the contacts that ``take_next`` returns and reports the results.  The lookup ends when the k closest known
-contacts that have not failed have answered, so in a stable connected network it finds exactly the k closest nodes.
+The caller asks the contacts that ``take_next`` returns and reports the results.  The lookup ends when the k closest
+known contacts that have not failed have answered, so in a stable connected network it finds exactly the k closest
+nodes.
 """
 
 from __future__ import annotations

@@ -2,9 +2,10 @@
 
 Records are stored at the closest *live* members; majorities are counted among the closest of all members, including
 absent ones, because a failed member is indistinguishable from a partitioned one.  Then two majorities share a member
-even if they were formed on different sides.  An absent member stops counting in two cases: after ``ABSENT_WITH_MAJORITY_S`` if a
-majority of all members is in touch without it (dynamic voting; Jajodia and Mutchler, 1990), so that members may leave
-one after the other; or after ``MAX_ABSENT_S`` in any case, which limits the tolerated duration of a partition.
+even if they were formed on different sides.  An absent member stops counting in two cases: after
+``ABSENT_WITH_MAJORITY_S`` if a majority of all members is in touch without it (dynamic voting; Jajodia and Mutchler,
+1990), so that members may leave one after the other; or after ``MAX_ABSENT_S`` in any case, which limits the tolerated
+duration of a partition.
 
 A newcomer is *settled* when it has synchronised with a majority of the members before it; until then it does not count
 in majorities, or a minority behind a partition could strike the majority with the help of newcomers.
@@ -58,7 +59,7 @@ class MemberTable:
 
     @property
     def is_full(self) -> bool:
-        """Whether there is no room for another member, so that the team may be larger than the roster."""
+        """Whether there is no room for another member, so that the team may be larger than the table."""
         return len(self._members) >= MAX_MEMBERS
 
     def get(self, node_id: bytes) -> Contact | None:
@@ -67,7 +68,7 @@ class MemberTable:
         return member.contact if member is not None and member.lost_at is None else None
 
     def mark_alive(self, contact: Contact, now: float) -> bool:
-        """Record that ``contact`` is alive; return whether it is new or was absent.  A full roster adds no member."""
+        """Record that ``contact`` is alive; return whether it is new or was absent.  A full table adds no member."""
         member = self._members.get(contact.node_id)
         if member is None:
             if self.is_full and not self._make_room():

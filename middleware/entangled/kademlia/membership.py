@@ -4,7 +4,8 @@ Every ping contains a digest of the live members; when two nodes differ, one req
 members that it does not know (no member is added without authentication).  So in a small team all nodes know each
 other, and after a partition the two sides merge through any pair of nodes, even without the original bootstrap node.
 
-A network of more than ``MAX_MEMBERS`` nodes is too large for that.  There a node probes its contacts (``liveness_probe``).
+A network of more than ``MAX_MEMBERS`` nodes is too large for that.  There a node probes its contacts
+(``liveness_probe``).
 """
 
 from __future__ import annotations
@@ -357,7 +358,7 @@ class Membership:
         return b"" if self._overlay.is_large else self._overlay.members.digest()
 
     def _answer_known(self, peer: Contact) -> list[object]:
-        """KNOWN: the settled members, and the seconds of their absence; a newcomer does not include itself."""
+        """KNOWN: the voters, and the seconds of their absence; a newcomer does not include itself."""
         members = self._overlay.members
         known = [(self._overlay.own_contact(), 0.0)] if members.is_voter else []
         return [[contact.pack(), int(away)] for contact, away in known + members.list_voters(self._clock.seconds())]

@@ -84,16 +84,18 @@ class Overlay:
     """The contacts of a node.
 
     ``max_silence`` is the silence in seconds up to which a contact is not pinged when a new one would take its place.
-    ``on_new_contact`` and ``on_lost`` are called with contacts that appear and disappear, ``on_named`` with each contact
-    in an answer and the contact that named it.
+    ``on_new_contact`` and ``on_lost`` are called with contacts that appear and disappear, ``on_named`` with each
+    contact in an answer and the contact that named it.
 
-    ``has_all_members``: all members of the team are known; ``is_large``: there are too many for that; ``has_found_neighbours``: this node
-    has looked up its neighbours, so if it knows few nodes there are few.  ``Membership`` and ``LivenessProber`` set them.  In
-    a large network the routing table is authoritative, and the roster has only contacts without a place in the table,
-    while few are known.
+    ``has_all_members``: all members of the team are known; ``is_large``: there are too many for that;
+    ``has_found_neighbours``: this node has looked up its neighbours, so if it knows few nodes there are few.
+    ``Membership`` and ``LivenessProber`` set them.  In a large network the routing table is authoritative, and the
+    member table has only contacts without a place in the table, while few are known.
     """
 
-    def __init__(self, me: Callable[[], Contact], endpoint: Endpoint, clock: IReactorTime, background: Background) -> None:
+    def __init__(
+        self, me: Callable[[], Contact], endpoint: Endpoint, clock: IReactorTime, background: Background
+    ) -> None:
         self.own_contact = me
         self.own_id = me().node_id
         self._endpoint = endpoint
@@ -209,7 +211,7 @@ class Overlay:
     def find_voters(self, key: bytes, targets: list[Contact]) -> Voters:
         """Return the voters for ``key`` with the replicas ``targets``.
 
-        In a team with a roster absent members are voters too; in a larger network the voters are the nodes found.
+        In a team with a member table absent members are voters too; in a larger network the voters are the nodes found.
         """
         if not (self.has_all_members or self.is_large):
             # It has not met its team yet: the few nodes that it knows must not count as all.

@@ -1,6 +1,7 @@
 """Introduce two peers: send each the other's addresses, so that both send INITs at the same time (hole punching).
 
-``IntroductionLimits`` limits the rate at which a peer may request introductions, and cause this node to send INITs to others.
+``IntroductionLimits`` limits the rate at which a peer may request introductions, and cause this node to send INITs to
+others.
 """
 
 from __future__ import annotations

@@ -24,8 +24,8 @@ MAX_NAMERS = 3
 class IntroducerSelector:
     """The peers that may introduce this node, and the ones that named each contact.
 
-    ``contacts`` returns the known contacts; ``bootstrap_addresses`` are addresses of nodes that are asked first.  ``rng``
-    returns the random generator when it is needed.
+    ``contacts`` returns the known contacts; ``bootstrap_addresses`` are the addresses of nodes that are asked first.
+    ``rng`` returns the random generator when it is needed.
     """
 
     def __init__(

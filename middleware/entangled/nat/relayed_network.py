@@ -1,7 +1,7 @@
 """Wrap a network so that nodes behind relays have addresses.
 
-Datagrams to such an address are passed to ``send_relayed``; relayed datagrams are passed to the receiver with such a source
-address.
+Datagrams to such an address are passed to ``send_relayed``; relayed datagrams are passed to the receiver with such a
+source address.
 """
 
 from __future__ import annotations

@@ -1,7 +1,8 @@
 """Join the multicast group of the LAN on every interface, with IPv4 and IPv6.
 
 Each family has two ports: a receiving port, shared with the other nodes of this machine, and a sending port, to which
-replies go.  Interfaces appear and disappear (a cable, another Wi-Fi), so they are listed again every ``LIST_INTERVAL_S`` seconds.
+replies go.  Interfaces appear and disappear (a cable, another Wi-Fi), so they are listed again every
+``LIST_INTERVAL_S`` seconds.
 """
 
 from __future__ import annotations

@@ -26,7 +26,7 @@ RETRANSMIT_S = 0.2
 
 
 class PipeNetwork:
-    """Connects the carriers of one process."""
+    """Connects the transports of one process."""
 
     def __init__(self, clock: IReactorTime, delay_s: float = 0.0, rate: float = float("inf")) -> None:
         self.delay_s = delay_s
@@ -40,7 +40,7 @@ class PipeNetwork:
         self._cut: set[str] = set()
 
     def make_transport(self, host: str, port: int = 0) -> PipeTransport:
-        """Return a carrier of the host ``host``, which listens at ``port``."""
+        """Return a transport of the host ``host``, which listens at ``port``."""
         return PipeTransport(self, Address(host, port))
 
     def cut(self, host: str) -> None:
@@ -121,8 +121,8 @@ class _Host:
 class Pipe:
     """One end of a stream, with the interface of a Twisted transport.
 
-    With ``is_reading`` False nothing more is read from it; ``is_stalled`` drops everything that this end sends; ``acknowledged`` is
-    the number of bytes that the other end has acknowledged.
+    With ``is_reading`` False nothing more is read from it; ``is_stalled`` drops everything that this end sends;
+    ``acknowledged`` is the number of bytes that the other end has acknowledged.
     """
 
     bufferSize = 65536  # noqa: N815

@@ -21,8 +21,8 @@ Accept = Callable[[str], IProtocol | None]
 class StreamState:
     """The state of the stream at one end.
 
-    ``unacked`` are the bytes that the other end has not acknowledged (each segment may count as a full one), ``acked`` the
-    bytes that it has acknowledged; ``retransmissions`` is the number of retransmissions.
+    ``unacked`` are the bytes that the other end has not acknowledged (each segment may count as a full one), ``acked``
+    the bytes that it has acknowledged; ``retransmissions`` counts the retransmissions.
     """
 
     unacked: int

@@ -259,7 +259,9 @@ class TunnelNetwork:
         if url.is_tls:
             layers.append(TlsLayer(self._client_context, url.host))
         socket = WebSocket(url, tunnel.token)
-        connection = self._register(TunnelConnection(self, self._clock, tunnel.address, url.host, layers, socket), tunnel)
+        connection = self._register(
+            TunnelConnection(self, self._clock, tunnel.address, url.host, layers, socket), tunnel
+        )
         self._transport.dial(where, connection, lambda why: connection.close(why, is_rude=True))
 
     def _accept(self, host: str) -> TunnelConnection | None:
@@ -271,11 +273,19 @@ class TunnelNetwork:
             return None
         served = [connection for connection in self._connections if connection.address not in self._targets]
         begun = [connection for connection in served if not connection.is_open]
-        unproved = [connection for connection in served if connection.is_open and not self._tunnels[connection.address].is_answered]
+        unproved = [
+            connection
+            for connection in served
+            if connection.is_open and not self._tunnels[connection.address].is_answered
+        ]
         if len(begun) >= MAX_HANDSHAKES:
             begun[0].close("replaced by a newer connection", is_rude=True)
         elif len(served) >= MAX_TOTAL_CONNECTIONS:
-            further = [connection for connection in served if connection is not self._tunnels[connection.address].connections[0]]
+            further = [
+                connection
+                for connection in served
+                if connection is not self._tunnels[connection.address].connections[0]
+            ]
             if not (begun or unproved or further):
                 self.counters["crowded"] += 1
                 return None

@@ -108,7 +108,10 @@ class TunnelConnections:
     def find_most_stalled(self, now: float) -> TunnelConnection:
         """Return the most stalled connection except the newest, or the oldest if none is stalled."""
         self.order_by_progress(now)
-        return max(self.connections[:-1], key=lambda connection: self._rank(self._progress.get(connection) or _Progress(now), now))
+        return max(
+            self.connections[:-1],
+            key=lambda connection: self._rank(self._progress.get(connection) or _Progress(now), now),
+        )
 
     def target_count(self, now: float) -> int:
         """Return the number of connections that the tunnel should have."""
@@ -125,7 +128,11 @@ class TunnelConnections:
             return [connection for connection in self.connections if connection is not connections[0]]
         if self._is_stalled(self._progress[connections[0]], now):
             return []
-        return [connection for connection in connections if self._stalled_s(self._progress[connection], now) > REPLACE_STALLED_S]
+        return [
+            connection
+            for connection in connections
+            if self._stalled_s(self._progress[connection], now) > REPLACE_STALLED_S
+        ]
 
     # -- private ----------------------------------------------------------------------------------------------------
 

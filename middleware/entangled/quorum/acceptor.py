@@ -134,8 +134,9 @@ TABLE = dict(_make_rows())
 class AcceptorSettings:
     """Parameters of one use of registers.
 
-    During the last ``early_share`` share of a lease the time after it may be promised.  Only its proposer may complete an
-    accepted value within ``completion_s`` seconds.  With ``must_prepare`` an unknown register has to be prepared first.
+    During the last ``early_share`` share of a lease the time after it may be promised.  Only its proposer may complete
+    an accepted value within ``completion_s`` seconds.  With ``must_prepare`` an unknown register has to be prepared
+    first.
     """
 
     early_share: float = 0.0

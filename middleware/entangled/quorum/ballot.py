@@ -11,8 +11,9 @@ FIRST_CONFIGURATION = 1
 """The first configuration of a register."""
 INITIAL_CEILING = 2**32
 CEILING_RATE_PER_S = 2**10
-"""An acceptor refuses tokens and attempts above ``INITIAL_CEILING``, or above its own at its start, plus ``CEILING_RATE_PER_S`` per second.  A
-proposer cannot exhaust them: the 2**42 attempts last for 136 years, and there are more tokens."""
+"""An acceptor refuses tokens and attempts above ``INITIAL_CEILING``, or above its own at its start, plus
+``CEILING_RATE_PER_S`` per second.  A proposer cannot exhaust them: the 2**42 attempts last for 136 years, and there are
+more tokens."""
 MAX_UNCONFIRMED = INITIAL_CEILING // 2
 """A proposer believes a higher number only from two acceptors: a single one may have invented it."""
 

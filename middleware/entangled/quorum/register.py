@@ -54,10 +54,10 @@ class Register:
     """The promises, the lease and the accepted value of one register at an acceptor.
 
     ``promised`` is the highest promised ballot, reserved for ``reserve`` seconds, until ``reserved_until``.  ``holder``
-    is the ballot of the lease, granted for ``ttl`` seconds, until ``lease_until``; ``released`` is the highest released ballot.
-    ``token`` is the fencing token, ``grantee`` the proposer to which it was granted here, empty if only reported by
-    others.  ``value`` was accepted under ``accepted``; if that is ``NO_BALLOT``, ``value`` is the newest configuration known
-    here and ``proof`` its certificate.  Times are on the clock of one process and are not stored.
+    is the ballot of the lease, granted for ``ttl`` seconds, until ``lease_until``; ``released`` is the highest released
+    ballot. ``token`` is the fencing token, ``grantee`` the proposer to which it was granted here, empty if only
+    reported by others.  ``value`` was accepted under ``accepted``; if that is ``NO_BALLOT``, ``value`` is the newest
+    configuration known here and ``proof`` its certificate.  Times are on the clock of one process and are not stored.
     """
 
     ceiling: Ceiling

@@ -87,8 +87,8 @@ class Round:
     ``ask`` sends the request to the member of a place.  If another proposer's lease at a member ends within ``short``
     seconds, the request is repeated then, or sooner if that is long.  ``outcome`` also fires, undecided, when all
     members have answered, after ``timeout_s`` seconds, and shortly after a majority has answered.  A silent member is
-    asked every ``RETRY_INTERVAL_S`` seconds until the round is decided, and at least ``MIN_TRIES`` times.  With ``single`` it is
-    asked once, the transport retransmits, and a failure counts as its answer.
+    asked every ``RETRY_INTERVAL_S`` seconds until the round is decided, and at least ``MIN_TRIES`` times.  With
+    ``single`` it is asked once, the transport retransmits, and a failure counts as its answer.
     """
 
     def __init__(
@@ -115,7 +115,9 @@ class Round:
         self._attempts = 0
         self._is_closed = False
         self._timer: IDelayedCall | None = None
-        self._end_timer: IDelayedCall | None = None if math.isinf(timeout_s) else clock.callLater(timeout_s, self._finish)
+        self._end_timer: IDelayedCall | None = (
+            None if math.isinf(timeout_s) else clock.callLater(timeout_s, self._finish)
+        )
         self._send_requests()
 
     @property

@@ -38,7 +38,8 @@ Mark = tuple[int, bytes]
 class Comparison:
     """The team records of one node as its peers see them.
 
-    ``requested_at`` maps peers to the time of their last request for digests; ``standing`` returns this node's sync state.
+    ``requested_at`` maps peers to the time of their last request for digests; ``standing`` returns this node's sync
+    state.
     """
 
     def __init__(self, replica: Replica, overlay: Overlay, endpoint: Endpoint, clock: IReactorTime) -> None:

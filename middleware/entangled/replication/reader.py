@@ -49,7 +49,8 @@ class Reader:
     async def read(self, key: bytes, concern: ReadConsistency) -> list[Record]:
         """Return the records of ``key``, without tombstones, in the order of (owner, name); raise ``Unavailable``.
 
-        A new node has no vote until it has caught up, so its reads wait up to ``CATCH_UP_TIMEOUT_S`` seconds until it has.
+        A new node has no vote until it has caught up, so its reads wait up to ``CATCH_UP_TIMEOUT_S`` seconds until it
+        has.
         """
         timed_out: list[bool] | None = None
         while True:

@@ -50,8 +50,8 @@ class Replica:
     a record in it may be kept and served, which differs for few slots.  ``is_synced`` returns whether this node is
     synced.
 
-    ``on_record`` is called with each accepted record, ``on_gone`` with each removed one, ``on_owner_expired`` with the public
-    key of each owner whose lease expired or that said goodbye.
+    ``on_record`` is called with each accepted record, ``on_gone`` with each removed one, ``on_owner_expired`` with the
+    public key of each owner whose lease expired or that said goodbye.
     """
 
     def __init__(
@@ -129,7 +129,7 @@ class Replica:
         return STORED
 
     def store(self, record: Record, left: float | None = None) -> StoreReply:
-        """Store ``record`` as ``store_locally`` does; return UNSYNCED instead of STORED if this replica is not synced."""
+        """Store ``record`` as ``store_locally`` does; return UNSYNCED, not STORED, if this replica is not synced."""
         reply = self.store_locally(record, left)
         return UNSYNCED if reply is STORED and not self.is_synced() else reply
 

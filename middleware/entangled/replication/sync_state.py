@@ -51,11 +51,11 @@ class SyncState:
     def is_enough(self, reached: list[int | None], away: int) -> bool:
         """Return whether the nodes in ``reached`` together have every record that a majority has.
 
-        ``reached`` lists the sync states of the nodes asked (None: failed); ``away`` more are absent.  A novice has no
-        records to give and counts in no majority.  If a synced node answered, only synced nodes count, because an
-        elder may stem from a time with other members.  A node that lost its records may have been one of the voters.
-        A new node is admitted by a majority of the nodes before it; otherwise each half of a partition could grow to a
-        majority.
+        ``reached`` lists the sync states of the nodes asked (None: failed); ``away`` more are absent.  A node that was
+        never synced has no records to give and counts in no majority.  If a synced node answered, only synced nodes
+        count, because the records of a stale node may stem from a time with other members.  A node that lost its
+        records may have been one of the voters.  A new node is admitted by a majority of the nodes before it; otherwise
+        each half of a partition could grow to a majority.
         """
         missing = reached.count(None) + away
         answered = reached.count(CURRENT) or reached.count(STALE)

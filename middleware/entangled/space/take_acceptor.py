@@ -52,8 +52,8 @@ class MethodRegistry(Protocol):
 class TakeAcceptor:
     """The acceptor of one node for all councils that it is a member of.
 
-    ``wait_for_write`` may be set to a function that returns a Deferred which fires when all notes are on disk; answers then
-    wait for it, so that even a power failure loses no vote that was sent.
+    ``wait_for_write`` may be set to a function that returns a Deferred which fires when all notes are on disk; answers
+    then wait for it, so that even a power failure loses no vote that was sent.
     """
 
     def __init__(self, endpoint: MethodRegistry, store: Store, clock: IReactorTime, rng: random.Random) -> None:
@@ -131,7 +131,9 @@ class TakeAcceptor:
         if not 0.0 < lease <= MAX_LEASE_S:
             raise Refused(f"a lease lasts more than 0 and at most {MAX_LEASE_S:.0f} seconds")
         now = self._clock.seconds()
-        return self._pack_answer(Event.PREPARE, [self._prepare(tuple_id, ballot, float(lease), now) for tuple_id in wanted])
+        return self._pack_answer(
+            Event.PREPARE, [self._prepare(tuple_id, ballot, float(lease), now) for tuple_id in wanted]
+        )
 
     def answer_confirm(
         self,
@@ -143,7 +145,7 @@ class TakeAcceptor:
         taker: bytes,
         value: bytes,
     ) -> Answers:
-        """CONFIRM: accept ``value`` as the taker of each of ``tuple_ids`` under the ballot, or reply with the reason."""
+        """CONFIRM: accept ``value`` as the taker of each of ``tuple_ids`` under the ballot, or reply with a reason."""
         wanted, ballot = self._parse_request(key, tuple_ids, incarnation, counter, taker)
         if not is_taker_name(value):
             raise Refused("decree.confirm needs the name of a taker")
@@ -173,7 +175,9 @@ class TakeAcceptor:
             raise Refused("this member has lost its votes since it joined that council")
         if len(key) != KEY_BYTES or not 0 < len(tuple_ids) <= MAX_TUPLES:
             raise Refused(f"a request names a key and 1 to {MAX_TUPLES} places")
-        wanted = [tuple_id for tuple_id in (parse_tuple_id(key, fields) for fields in tuple_ids) if tuple_id is not None]
+        wanted = [
+            tuple_id for tuple_id in (parse_tuple_id(key, fields) for fields in tuple_ids) if tuple_id is not None
+        ]
         if len(wanted) < len(tuple_ids) or len(set(wanted)) < len(wanted):
             raise Refused("a place is an owner, a name and a mark, and a request names each place once")
         if not (is_counter(counter) and is_taker_name(taker)):

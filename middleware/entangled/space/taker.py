@@ -285,7 +285,9 @@ class Taker:
             self._forget_taken(tuple_id, outcome.value)
             self._slots.check_taken_note(tuple_id, outcome.value)
         elif outcome.result is Result.HELD:
-            self._not_before[tuple_id] = now + min(outcome.remaining, LEASED_RETRY_S) + self._rng.uniform(*CONTEST_RETRY_S)
+            self._not_before[tuple_id] = (
+                now + min(outcome.remaining, LEASED_RETRY_S) + self._rng.uniform(*CONTEST_RETRY_S)
+            )
         elif outcome.result is Result.OUTBID:
             self._not_before[tuple_id] = now + self._rng.uniform(*CONTEST_RETRY_S)
         else:

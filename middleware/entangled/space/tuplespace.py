@@ -1,7 +1,7 @@
 """The tuple space: put, get, read and claim tuples by template; at most one taker gets each tuple.
 
-A tuple is a record of its publisher that names the council which decides about its taker; ``take_acceptor`` has the acceptors,
-``taker`` the proposers.  ``docs/reference/tuple-space.md`` describes the conditions that calls wait for.
+A tuple is a record of its publisher that names the council which decides about its taker; ``take_acceptor`` has the
+acceptors, ``taker`` the proposers.  ``docs/reference/tuple-space.md`` describes the conditions that calls wait for.
 """
 
 from __future__ import annotations

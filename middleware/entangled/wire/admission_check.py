@@ -1,12 +1,12 @@
 """Decide which nodes a team admits and which methods they may call, independently of the transport.
 
 An open team admits every node that holds its key.  In a closed team each side shows a *pass* in the handshake, and the
-admission check (``AdmissionCheck``) of the other side judges it.  The implementation of ``AdmissionCheck`` decides which passes are valid
-and which roles they grant; this module defines only the refusal codes, with a remedy for each.
+admission check (``AdmissionCheck``) of the other side judges it.  The implementation of ``AdmissionCheck`` decides
+which passes are valid and which roles they grant; this module defines only the refusal codes, with a remedy for each.
 
-A copied store makes two nodes with one identity.  Therefore each incarnation (``Incarnation``) of an identity has a number
-that grows from start to start, and eight random bytes: of two incarnations the later one is admitted, and the other is
-refused.
+A copied store makes two nodes with one identity.  Therefore each incarnation (``Incarnation``) of an identity has a
+number that grows from start to start, and eight random bytes: of two incarnations the later one is admitted, and the
+other is refused.
 
 Each INIT has a timestamp that grows within an incarnation.  A replayed INIT is older than the newest one of its sender,
 or equal to it, and is dropped (after WireGuard, Donenfeld 2017, section 5.1; the incarnation number replaces its wall
@@ -80,9 +80,9 @@ class Authority(NamedTuple):
 class AdmissionCheck(Protocol):
     """The admission check of a team; the endpoint repeats it at each handshake, so its results may change.
 
-    ``max_pass_bytes`` is the maximum length of a pass in this team, at most ``MAX_PASS_BYTES`` and equal for all members; 0 in an open
-    team.  ``shown`` is this node's pass, ``life`` its current incarnation.  ``fingerprint`` is the public identifier of
-    the team, 8 bytes (zero: none).  The default methods behave as in an open team.
+    ``max_pass_bytes`` is the maximum length of a pass in this team, at most ``MAX_PASS_BYTES`` and equal for all
+    members; 0 in an open team.  ``shown`` is this node's pass, ``life`` its current incarnation.  ``fingerprint`` is
+    the public identifier of the team, 8 bytes (zero: none).  The default methods behave as in an open team.
     """
 
     @property

@@ -89,10 +89,10 @@ class CongestionWindow:
 
     It grows in slow start, then slowly, and decreases multiplicatively. Radio links lose datagrams without congestion,
     and halving the window at each loss would leave a window of five at 5 % loss. Therefore a loss counts as congestion
-    only if a queue builds up, as in TCP Veno (Fu and Liew, 2003), or if more than one in six of at least ``MIN_LOSS_SAMPLES``
-    fragments is lost. A queue is detected as in HyStart (Ha and Rhee, 2008; RFC 9406): the minimum of ``ROUND_SAMPLES``
-    round trips exceeds the minimum of the last ``BASE_ROUND_TRIP_S`` seconds by an eighth of it, by 4 ms, and by twice the usual
-    difference between successive round trips, because jitter is not a queue.
+    only if a queue builds up, as in TCP Veno (Fu and Liew, 2003), or if more than one in six of at least
+    ``MIN_LOSS_SAMPLES`` fragments is lost. A queue is detected as in HyStart (Ha and Rhee, 2008; RFC 9406): the minimum
+    of ``ROUND_SAMPLES`` round trips exceeds the minimum of the last ``BASE_ROUND_TRIP_S`` seconds by an eighth of it,
+    by 4 ms, and by twice the usual difference between successive round trips, because jitter is not a queue.
     """
 
     __slots__ = (

@@ -85,8 +85,8 @@ class Endpoint:
 
     ``team_key`` (32 bytes) is the secret of the team: a node without it can neither decrypt nor cause an answer.
     ``rng`` generates the ephemeral keys, so outside of simulations it must be ``random.SystemRandom``; in simulations a
-    restarted node must not repeat the numbers of its earlier incarnations.  ``admission`` decides which nodes are admitted,
-    and which methods a peer may call.
+    restarted node must not repeat the numbers of its earlier incarnations.  ``admission`` decides which nodes are
+    admitted, and which methods a peer may call.
 
     ``on_contact`` is called when a peer has proved its key and its address, by an answer or by confirming a session
     that it opened; ``on_seen`` with a peer and this node's address as the peer sees it; ``on_rejected`` when a peer

@@ -1,15 +1,16 @@
 """Encode and decode the content of sealed datagrams: messages as strict msgpack, fragments, and receipts for fragments.
 
-``decode``, ``parse_fragment`` and ``parse_receipt`` accept any bytes: they return a value or raise ``Malformed``.  Absolute
-times are never transmitted.  A fragment (PART) and a receipt each fill one datagram::
+``decode``, ``parse_fragment`` and ``parse_receipt`` accept any bytes: they return a value or raise ``Malformed``.
+Absolute times are never transmitted.  A fragment (PART) and a receipt each fill one datagram::
 
     PART     0x01  flags 1  id 8  total bytes 4  number 2  the bytes of this fragment
     RECEIPT  0x02  flags 1  id 8  next 2  room 2  cause 2  bitmap
 
-All fragments but the last have ``FRAGMENT_BYTES``, so each fragment has one place and fragments never overlap.  ``next`` is
-the first missing fragment, bit n of the bitmap (least significant first) is set if fragment ``next + 1 + n`` has
-arrived, and ``room`` is the number of fragments from ``next`` on that the receiver accepts.  ``cause`` is the fragment
-that triggered the receipt: only its round trip is measured, because earlier receipts for the others may have been lost.
+All fragments but the last have ``FRAGMENT_BYTES``, so each fragment has one place and fragments never overlap.
+``next`` is the first missing fragment, bit n of the bitmap (least significant first) is set if fragment ``next + 1 +
+n`` has arrived, and ``room`` is the number of fragments from ``next`` on that the receiver accepts.  ``cause`` is the
+fragment that triggered the receipt: only its round trip is measured, because earlier receipts for the others may have
+been lost.
 """
 
 from __future__ import annotations
@@ -92,7 +93,7 @@ class Notification:
 
 @dataclass(frozen=True, slots=True)
 class Cancel:
-    """Tells the responder that the answer to the request ``id`` is no longer needed."""
+    """Notifies the responder that the answer to the request ``id`` is no longer needed."""
 
     id: int
 
@@ -278,7 +279,7 @@ def parse_receipt(plain: bytes) -> Receipt:
 
 
 def pack_receipt(key: MessageKey, is_done: bool, room: int, cause: int, received: int) -> bytes:
-    """Return the RECEIPT for a message of which the fragments in ``received`` have arrived, ``cause`` being the latest."""
+    """Return the RECEIPT for a message of which the fragments in ``received`` have arrived, ``cause`` the latest."""
     first = ((received + 1) & ~received).bit_length() - 1  # the lowest bit that is not set
     bitmap = received >> (first + 1)
     head = bytes([RECEIPT, key.is_answer * IS_ANSWER | is_done * DONE]) + key.id.to_bytes(8, "little")

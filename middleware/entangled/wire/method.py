@@ -1,7 +1,7 @@
 """Check arguments and run exposed methods, remember the calls that ran, and convert errors to failures and back.
 
-``RequestHistory`` prevents a repeated request from running twice.  An error crosses the wire as ``Refused``, with its code and
-its text.
+``RequestHistory`` prevents a repeated request from running twice.  An error crosses the wire as ``Refused``, with its
+code and its text.
 """
 
 from __future__ import annotations
@@ -198,7 +198,7 @@ class RequestEntry:
 
 @dataclass(slots=True)
 class _PeerRequests:
-    """The requests of one peer; ``lowest_open`` has, for each incarnation of the peer, the id below which none is open."""
+    """The requests of one peer; ``lowest_open`` has, for each of its incarnations, the id below which none is open."""
 
     running: dict[int, RequestEntry] = field(default_factory=dict)
     finished: dict[int, RequestEntry] = field(default_factory=dict)
@@ -207,10 +207,10 @@ class _PeerRequests:
 
 
 class RequestHistory:
-    """The running requests, and the ones that ended in the last ``KEEP_ANSWER_S`` seconds, by public key and request id.
+    """The running requests, and those that ended in the last ``KEEP_ANSWER_S`` seconds, by public key and request id.
 
     A requester includes in each request the oldest one that it still waits for: older ones are forgotten at once, and
-    do not run if they arrive late.  A full ledger rejects new requests: forgetting an old one early could run a method
+    do not run if they arrive late.  A full history rejects new requests: forgetting an old one early could run a method
     with side effects twice.
     """
 

@@ -162,15 +162,15 @@ class Peer:
 class Peers:
     """All peers of an endpoint, ``sessions`` by their index, and the handshakes of this node.
 
-    ``ring`` are the credentials under the team's secrets, newest first; ``admission`` supplies the pass that is shown to
-    others.  ``on_handshake_failed`` is called with a handshake that got no answer to any of its tries.  ``is_far`` returns
-    whether other nodes may know a path to an address; ``on_slow_handshake`` is called with a handshake to such an address that
-    gets no early answer, ``on_established`` with each new session, and ``on_moved`` with a session that received from a
-    new address.
+    ``ring`` are the credentials under the team's secrets, newest first; ``admission`` supplies the pass that is shown
+    to others.  ``on_handshake_failed`` is called with a handshake that got no answer to any of its tries.  ``is_far``
+    returns whether other nodes may know a path to an address; ``on_slow_handshake`` is called with a handshake to such
+    an address that gets no early answer, ``on_established`` with each new session, and ``on_moved`` with a session that
+    received from a new address.
 
-    ``overall_round_trip`` is the round trip to all peers together.  In a network that ``is_large`` it is also the estimate for
-    unknown peers, because there are so many that needless retransmissions matter.  ``loss`` is the loss rate of
-    incoming datagrams.
+    ``overall_round_trip`` is the round trip to all peers together.  In a network that ``is_large`` it is also the
+    estimate for unknown peers, because there are so many that needless retransmissions matter.  ``loss`` is the loss
+    rate of incoming datagrams.
     """
 
     def __init__(
@@ -438,12 +438,17 @@ class Peers:
     # -- outgoing handshakes ----------------------------------------------------------------------------------------
 
     def open(
-        self, peer: Peer, address: Address, early_message: bytes = b"", is_wanted: bool = True, within: float = HANDSHAKE_S
+        self,
+        peer: Peer,
+        address: Address,
+        early_message: bytes = b"",
+        is_wanted: bool = True,
+        within: float = HANDSHAKE_S,
     ) -> bool:
         """Open a session, unless a handshake is under way; return False if there are too many handshakes.
 
-        ``early_message`` is a message for the INIT; it is omitted if it does not fit.  ``within`` is the time in seconds in
-        which the session is needed.
+        ``early_message`` is a message for the INIT; it is omitted if it does not fit.  ``within`` is the time in
+        seconds in which the session is needed.
         """
         if peer.handshake is not None:
             if is_wanted and not peer.handshake.has_request:

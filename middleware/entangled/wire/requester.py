@@ -52,9 +52,10 @@ _FULL_TEXT = "too many requests or bytes are under way; try again later"
 class PendingRequest:
     """A request that waits for its answer.
 
-    ``has_long_timeout``: the caller gave a longer timeout than the default; ``is_fragmented``: the request is sent in fragments;
-    ``avoids_handshake``: the request does not justify a handshake. ``extension_s`` is the time in seconds that the answer has after
-    the request left the queue and after each acknowledged fragment; 0 if the caller gave a timeout.
+    ``has_long_timeout``: the caller gave a longer timeout than the default; ``is_fragmented``: the request is sent in
+    fragments; ``avoids_handshake``: the request does not justify a handshake. ``extension_s`` is the time in seconds
+    that the answer has after the request left the queue and after each acknowledged fragment; 0 if the caller gave a
+    timeout.
     """
 
     number: int
@@ -286,7 +287,7 @@ class Requester:
             else:
                 self._set_timer(request, left)
         elif request.is_fragmented or request.progress_at >= 0:
-            # The courier retransmits fragments; a handshake is needed only if the peer lost the session.
+            # The fragmenter retransmits fragments; a handshake is needed only if the peer lost the session.
             if is_silent or now - session.last_received_at > MAX_TIMEOUT_S:
                 self._open_session(request)
             self._set_timer(request, MAX_TIMEOUT_S)

@@ -111,7 +111,7 @@ class HandshakeFields(NamedTuple):
 
     @property
     def min_init_bytes(self) -> int:
-        """The length of the shortest INIT that may be answered with a pass and a message of ``MIN_ANSWER_BYTES`` bytes."""
+        """The length of the shortest INIT that may be answered with a pass and ``MIN_ANSWER_BYTES`` of message."""
         return MIN_INIT_BYTES + self.max_pass_bytes
 
 
@@ -287,9 +287,9 @@ class Session:
 
     ``local_index`` identifies the session at this node, ``remote_index`` at the peer.  ``contact`` is the peer with the
     source address of its newest datagram.  ``is_confirmed``: the peer has proved at that address that it holds the
-    keys; before that nothing may be sent.  Times are seconds of the endpoint's clock.  ``incarnation`` is the incarnation of
-    the peer; ``is_superseded``: a later incarnation has replaced it.  ``shown`` is the pass in its INIT, until the session is
-    confirmed.
+    keys; before that nothing may be sent.  Times are seconds of the endpoint's clock.  ``incarnation`` is the
+    incarnation of the peer; ``is_superseded``: a later incarnation has replaced it.  ``shown`` is the pass in its INIT,
+    until the session is confirmed.
     """
 
     __slots__ = (

@@ -48,11 +48,11 @@ def admitted(
     return issue_certificate(identity(bootstrap), grant, (packed, invite), came, name, now)
 
 
-def roll(signer: Operator, *packed: bytes, now: float = NOW) -> MembershipList:
+def make_list(signer: Operator, *packed: bytes, now: float = NOW) -> MembershipList:
     made = MembershipList(signer.public)
     for each in packed:
         made.add(each, now)
     return made
 
 
-__all__ = ["LATER", "NOW", "admitted", "granted", "identity", "invited", "operator", "wrap_grant", "roll"]
+__all__ = ["LATER", "NOW", "admitted", "granted", "identity", "invited", "operator", "wrap_grant", "make_list"]

@@ -21,7 +21,7 @@ from middleware.admission.certificate import (
 )
 from middleware.admission.statement import DEFAULT_LIFE_S
 from middleware.entangled.errors import Forged, Malformed
-from tests.middleware.admission.paper import LATER, NOW, admitted, granted, identity, invited, operator, roll
+from tests.middleware.admission.paper import LATER, NOW, admitted, granted, identity, invited, make_list, operator
 
 OPERATOR = operator()
 DOG = identity("dog")
@@ -108,7 +108,7 @@ class CertificateTests(SynchronousTestCase):
         own = wrap_grant(granted(OPERATOR, "page", "gateway"))
         shown = issue_guest_certificate(page, own, phone.public, "phone", NOW)
         member = verify_certificate(OPERATOR.public, phone.public, shown)
-        mine = roll(OPERATOR)
+        mine = make_list(OPERATOR)
         self.assertEqual((member.name, member.roles, mine.find_refusal(member, NOW)), ("phone", ("device",), ""))
         self.assertEqual(mine.find_refusal(member, NOW + GUEST_LIFE_S), "expired")
         self.assertRaises(Forged, verify_certificate, OPERATOR.public, friend.public, shown)

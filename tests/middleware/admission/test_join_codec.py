@@ -51,7 +51,7 @@ def knocked(wish: str = "dog") -> bytes:
     return join_codec.make_request(CODE.key, DOG, EPHEMERAL, wish, random.Random(1))
 
 
-class KnockTests(SynchronousTestCase):
+class JoinCodecTests(SynchronousTestCase):
     def test_knock_is_read_as_it_was_said(self) -> None:
         """A bootstrap node that knows the invitation decodes the newcomer's key, wish and proof."""
         said = knocked()

@@ -12,7 +12,7 @@ from middleware.admission.certificate import renew_certificate, verify_certifica
 from middleware.admission.membership_list import MAX_SECRETS, MembershipList, invitation_id, pack_admission
 from middleware.admission.statement import DEFAULT_LIFE_S, INVITATION_REMEMBERED_S
 from middleware.entangled.errors import Forged, Malformed
-from tests.middleware.admission.paper import LATER, NOW, admitted, granted, identity, invited, operator, roll
+from tests.middleware.admission.paper import LATER, NOW, admitted, granted, identity, invited, make_list, operator
 
 OPERATOR = operator()
 DOG, CAT, VAIO = (identity(name).public for name in ("dog", "cat", "vaio"))
@@ -30,7 +30,7 @@ def entries() -> list[bytes]:
 ENTRIES = entries()
 
 
-class RollTests(SynchronousTestCase):
+class MembershipListTests(SynchronousTestCase):
     def test_foreign_statements_are_refused(self) -> None:
         """Statements of another operator and random bytes are not added."""
         mine = MembershipList(OPERATOR.public)
@@ -48,7 +48,7 @@ class RollTests(SynchronousTestCase):
     def test_later_word_holds(self) -> None:
         """The later of two grants for a key wins in either order; of two revocations the earlier time wins."""
         for order in (ENTRIES, ENTRIES[::-1]):
-            mine = roll(OPERATOR, *order)
+            mine = make_list(OPERATOR, *order)
             found, revocation = mine.find_grant(DOG), mine.find_revocation(DOG)
             assert found is not None and revocation is not None
             self.assertEqual((found[0].roles, revocation.at), (("viewer",), NOW + 4))
@@ -57,7 +57,7 @@ class RollTests(SynchronousTestCase):
     @settings(max_examples=60, deadline=None)
     def test_order_does_not_matter(self, order: list[bytes]) -> None:
         """Two lists with the same statements have the same digest, in any order of arrival."""
-        self.assertEqual(roll(OPERATOR, *order).digest, roll(OPERATOR, *ENTRIES).digest)
+        self.assertEqual(make_list(OPERATOR, *order).digest, make_list(OPERATOR, *ENTRIES).digest)
 
     @given(st.permutations(range(7)))
     @settings(max_examples=60, deadline=None)
@@ -74,23 +74,23 @@ class RollTests(SynchronousTestCase):
             again = renew_certificate(vaio, grant, verify_certificate(OPERATOR.public, public, shown), shown, moment)
             found.append(pack_admission(public, again))
         found.append(OPERATOR.revoke(VAIO, "vaio", later, [CAT], [(DOG, later - 99 + DEFAULT_LIFE_S)]))
-        mine = roll(OPERATOR, *[found[place] for place in [*order, *order]], now=later)
+        mine = make_list(OPERATOR, *[found[place] for place in [*order, *order]], now=later)
         ends = {each.name: each.not_after for each in mine.list_members(later)}
         self.assertEqual(ends, {"cat": NOW + DEFAULT_LIFE_S, "dog": later - 99 + DEFAULT_LIFE_S})
-        self.assertEqual(mine.digest, roll(OPERATOR, *found, *found, now=later).digest)
+        self.assertEqual(mine.digest, make_list(OPERATOR, *found, *found, now=later).digest)
 
     def test_revoked_key(self) -> None:
         """A revoked key stays refused, whatever is granted to it later."""
         shown = admitted(OPERATOR, "dog")
         member = verify_certificate(OPERATOR.public, DOG, shown)
-        mine = roll(OPERATOR, OPERATOR.revoke(DOG, "dog", NOW), OPERATOR.grant(DOG, "dog", ("device",), NOW + 9))
+        mine = make_list(OPERATOR, OPERATOR.revoke(DOG, "dog", NOW), OPERATOR.grant(DOG, "dog", ("device",), NOW + 9))
         self.assertEqual(mine.find_refusal(member, NOW + 9), "revoked")
         self.assertEqual(mine.list_members(NOW + 9), [])
 
     def test_what_has_run_out_goes(self) -> None:
         """An expired invitation is kept for a week, to name the reason of a refusal, and then deleted."""
         _, packed, invite = invited(OPERATOR)
-        mine = roll(OPERATOR, packed)
+        mine = make_list(OPERATOR, packed)
         name = invitation_id(invite.public)
         self.assertEqual(mine.expire(NOW + LATER + INVITATION_REMEMBERED_S - 1), 0)
         self.assertIsNotNone(mine.find_invitation(name))
@@ -100,12 +100,12 @@ class RollTests(SynchronousTestCase):
 
     def test_newest_secrets_stay(self) -> None:
         """The list keeps only the newest secrets of the team."""
-        numbers = [secret.number for secret in roll(OPERATOR, *ENTRIES).list_secrets()]
+        numbers = [secret.number for secret in make_list(OPERATOR, *ENTRIES).list_secrets()]
         self.assertEqual(numbers, [6, 5, 4, 3])
 
     def test_name_of_a_member(self) -> None:
         """A member's roles come from the operator's latest grant, and its admission is kept."""
-        mine = roll(OPERATOR, pack_admission(DOG, admitted(OPERATOR, "dog")))
+        mine = make_list(OPERATOR, pack_admission(DOG, admitted(OPERATOR, "dog")))
         mine.add(OPERATOR.grant(DOG, "dog", ("device", "bootstrap"), NOW + 1), NOW)
         [member] = mine.list_members(NOW + 2)
         self.assertEqual((member.roles, member.admitter), (("device", "bootstrap"), VAIO))

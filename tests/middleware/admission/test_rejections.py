@@ -9,7 +9,7 @@ from middleware.entangled.wire.rejection import Rejection
 from tests.middleware.admission.village import House, VillageCase
 
 
-class RebuffTests(VillageCase):
+class RejectionTests(VillageCase):
     def met(self, house: House, side: str) -> list[Rejection]:
         """Return the refusals that ``house`` logged for ``side``."""
         now = house.node.endpoint.rejections.list_recent(1e9, 1e10)

@@ -43,7 +43,7 @@ ABSENT = ("roll.", "reach.")
 """Prefixes of the methods that not every node exposes."""
 
 
-class RoleDoor(OpenAdmission):
+class RoleAdmission(OpenAdmission):
     """Admits every node, with ``roles`` by public key; ``refusals`` collects the denied calls and writes."""
 
     def __init__(self, known: dict[bytes, tuple[str, ...]], refusals: list[tuple[tuple[str, ...], str]]) -> None:
@@ -182,7 +182,7 @@ class TeamTests(SynchronousTestCase):
         def make(device: Any, identity: Identity, *rest: Any, **more: Any) -> Any:
             role = {"vaio": GATEWAY, "looker": VIEWER}.get(device.name, DEVICE)
             known[identity.public] = (role,)
-            return plain(device, identity, *rest, **{**more, "door": RoleDoor(known, refusals)})
+            return plain(device, identity, *rest, **{**more, "admission": RoleAdmission(known, refusals)})
 
         self.patch(assembly, "SwarmNode", make)
         outcome = run_trial(partial(SimulatedTeam, others=("looker",)), 2, 3)

@@ -18,7 +18,7 @@ from middleware.admission.membership_list import MembershipList
 from middleware.admission.server import MAX_REQUESTS_PER_S, MAX_UNSIGNED_REFUSALS_PER_S, AdmissionServer
 from middleware.entangled.errors import Full, NoAnswer
 from middleware.entangled.network.network import Address
-from tests.middleware.admission.paper import LATER, NOW, granted, identity, invited, operator, roll
+from tests.middleware.admission.paper import LATER, NOW, granted, identity, invited, make_list, operator
 
 OPERATOR = operator()
 CODE, PACKED, INVITE = invited(OPERATOR)
@@ -27,17 +27,19 @@ SECRET = b"e" * 32
 DOG = identity("dog").public
 
 
-class ReceptionTests(SynchronousTestCase):
+class AdmissionServerTests(SynchronousTestCase):
     def setUp(self) -> None:
         self.now = 0.0
         self.sent: list[tuple[bytes, Address]] = []
         terms = OPERATOR.invite("dog", ("device",), 1, NOW, LATER, random.Random(1)).terms
-        self.roll: MembershipList = roll(OPERATOR, granted(OPERATOR, "vaio", "bootstrap"), PACKED, terms)
+        self.membership_list: MembershipList = make_list(
+            OPERATOR, granted(OPERATOR, "vaio", "bootstrap"), PACKED, terms
+        )
         self.taken: Deferred[bool] = succeed(True)
         self.refused: list[tuple[bytes, Address, str]] = []
-        self.admit: Any = lambda packed: self.roll.add(packed, NOW)
-        self.reception = AdmissionServer(
-            self.roll,
+        self.admit: Any = lambda packed: self.membership_list.add(packed, NOW)
+        self.server = AdmissionServer(
+            self.membership_list,
             identity("vaio"),
             lambda invite: self.taken,
             lambda packed: self.admit(packed),
@@ -63,25 +65,25 @@ class ReceptionTests(SynchronousTestCase):
     def test_let_in(self) -> None:
         """A valid join request gets one reply, sent to its source and not larger than the request."""
         said = self.knocked()
-        self.reception.on_request(said, DOOR)
+        self.server.on_request(said, DOOR)
         self.assertIsInstance(self.answer(), JoinReply)
         self.assertEqual([to for _, to in self.sent], [DOOR])
         self.assertLessEqual(len(self.sent[0][0]), len(said))
-        assert self.roll.find_admission(DOG) is not None
+        assert self.membership_list.find_admission(DOG) is not None
 
     def test_repeated_knock_costs_nothing(self) -> None:
         """A repeated datagram gets the same reply, from any source address, and consumes no use of the code."""
         said = self.knocked()
-        self.reception.on_request(said, DOOR)
+        self.server.on_request(said, DOOR)
         self.taken = Deferred()  # a request for another use would block on this
-        self.reception.on_request(said, Address("10.0.0.3", 1))
+        self.server.on_request(said, Address("10.0.0.3", 1))
         self.assertEqual(self.sent[0][0], self.sent[1][0])
 
     def test_answer_under_way(self) -> None:
         """Requests of one newcomer wait while a use is taken; then the newcomer gets one reply."""
         self.taken = Deferred()
         for dice in range(3):
-            self.reception.on_request(self.knocked(dice), DOOR)
+            self.server.on_request(self.knocked(dice), DOOR)
         self.assertEqual(self.sent, [])
         self.taken.callback(True)
         self.assertEqual(len(self.sent), 1)
@@ -89,7 +91,7 @@ class ReceptionTests(SynchronousTestCase):
     def test_nobody_can_tell(self) -> None:
         """A newcomer is refused with "later" if too few peers are reachable or the membership list is full."""
         self.taken = fail(NoAnswer("too few"))
-        self.reception.on_request(self.knocked(1), DOOR)
+        self.server.on_request(self.knocked(1), DOOR)
         self.assertEqual(self.answer(), "later")
         self.taken = succeed(True)
 
@@ -98,10 +100,10 @@ class ReceptionTests(SynchronousTestCase):
 
         self.admit = full
         with capturedLogs() as said:
-            self.reception.on_request(self.knocked(2), DOOR)
+            self.server.on_request(self.knocked(2), DOOR)
         self.assertEqual(self.answer(), "later")
         self.assertIn("no room", "".join(formatEvent(event) for event in said))
-        self.assertIsNone(self.roll.find_admission(DOG))
+        self.assertIsNone(self.membership_list.find_admission(DOG))
 
     def test_strangers_get_nothing(self) -> None:
         """Forged requests for a known invitation get no reply, and do not delay a newcomer with the code."""
@@ -109,15 +111,15 @@ class ReceptionTests(SynchronousTestCase):
         for number in range(int(MAX_REQUESTS_PER_S) * 3):
             forged = bytearray(said)
             forged[40 + number] ^= 1
-            self.reception.on_request(bytes(forged), DOOR)
+            self.server.on_request(bytes(forged), DOOR)
         self.assertEqual(self.sent, [])
-        self.reception.on_request(said, DOOR)
+        self.server.on_request(said, DOOR)
         self.assertIsInstance(self.answer(), JoinReply)
 
     def test_key_that_is_none(self) -> None:
         """A request with an invalid ephemeral key gets no reply and logs no error."""
         bad = join_codec.make_request(CODE.key, DOG, bytes(32), "", random.Random(1))
-        self.reception.on_request(bad, DOOR)
+        self.server.on_request(bad, DOOR)
         self.assertEqual((self.sent, self.flushLoggedErrors()), ([], []))
 
     def test_hints_are_few_and_short(self) -> None:
@@ -126,7 +128,7 @@ class ReceptionTests(SynchronousTestCase):
         strange[1] ^= 1
         with capturedLogs() as said:
             for _ in range(1000):
-                self.reception.on_request(bytes(strange), DOOR)
+                self.server.on_request(bytes(strange), DOOR)
         self.assertEqual(
             (len(self.sent), {len(each) for each, _ in self.sent}), (int(MAX_UNSIGNED_REFUSALS_PER_S), {9})
         )
@@ -135,10 +137,10 @@ class ReceptionTests(SynchronousTestCase):
     def test_checks_are_few(self) -> None:
         """The rate of checked requests is limited, even for newcomers with the code."""
         for number in range(int(MAX_REQUESTS_PER_S) + 10):
-            self.reception.on_request(self.knocked(name=f"dog{number}"), DOOR)
+            self.server.on_request(self.knocked(name=f"dog{number}"), DOOR)
         self.assertEqual(len(self.sent), int(MAX_REQUESTS_PER_S))
         self.now = 1.0
-        self.reception.on_request(self.knocked(name="another"), DOOR)
+        self.server.on_request(self.knocked(name="another"), DOOR)
         self.assertEqual(len(self.sent), int(MAX_REQUESTS_PER_S) + 1)
 
     @given(st.data())
@@ -151,5 +153,5 @@ class ReceptionTests(SynchronousTestCase):
         cut = bytes(said[: data.draw(st.integers(1, len(said)) | st.just(len(said)))])
         before = len(self.sent)
         self.now += 1.0
-        self.reception.on_request(cut, DOOR)
+        self.server.on_request(cut, DOOR)
         self.assertLessEqual(sum(len(each) for each, _ in self.sent[before:]), len(cut))

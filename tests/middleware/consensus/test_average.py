@@ -18,7 +18,7 @@ numbers = st.floats(-1e6, 1e6, allow_nan=False).map(lambda x: round(x, 3))
 places = st.lists(st.tuples(numbers, numbers), min_size=1, max_size=8)
 
 
-def ways(here: tuple[float, ...], points: list[tuple[float, float]]) -> float:
+def paths(here: tuple[float, ...], points: list[tuple[float, float]]) -> float:
     """Return the sum of the distances from all points."""
     return math.fsum(math.dist(here, p) for p in points)
 
@@ -74,7 +74,7 @@ class RendezvousTests(SynchronousTestCase):
             found = median(points, [1.0] * len(points))
             for _ in range(30):
                 near = tuple(x + dice.gauss(0.0, dice.choice([0.01, 0.5])) for x in found)
-                self.assertLessEqual(ways(found, points), ways(near, points) + 1e-3)
+                self.assertLessEqual(paths(found, points), paths(near, points) + 1e-3)
         corner = [(0.0, 0.0), (0.0, 0.0), (0.0, 0.0), (9.0, 9.0)]
         self.assertEqual(median(corner, [1.0] * 4), (0.0, 0.0))
 

@@ -46,10 +46,10 @@ def decided(
     return make_decision_record("t1", epoch, me, others, "nearest", version, consensus, named, 0.1)
 
 
-def record_of(number: int, verdict: DecisionRecord, value: bytes | None = None, name: str = "") -> Record:
+def record_of(number: int, record: DecisionRecord, value: bytes | None = None, name: str = "") -> Record:
     """Return the signed record that dog ``number`` publishes."""
-    content = verdict.pack() if value is None else value
-    slot = name or verdict.slot
+    content = record.pack() if value is None else value
+    slot = name or record.slot
     return Record(decision_records_key("t1"), slot, identity(number).public, 1, "team", 60.0, content).sign(
         identity(number)
     )
@@ -58,14 +58,14 @@ def record_of(number: int, verdict: DecisionRecord, value: bytes | None = None, 
 THREE = [member(1, 1.5), member(2, 0.5), member(3, 1.0)]
 
 
-class VerdictTests(SynchronousTestCase):
+class DecisionRecordTests(SynchronousTestCase):
     def test_survives_the_wire(self) -> None:
         """A packed and signed decision record is unpacked unchanged, with the agent from the key of the signature."""
-        verdict = replace(decided(1, THREE), token=7)
-        self.assertEqual(parse_decision_record(record_of(1, verdict)), verdict)
-        self.assertEqual([r.name for r in verdict.reports], ["dog2", "dog3", "dog1"])
-        self.assertEqual(verdict.winner, THREE[1].uuid)
-        self.assertEqual(verdict.standby, (THREE[2].uuid, THREE[0].uuid))
+        record = replace(decided(1, THREE), token=7)
+        self.assertEqual(parse_decision_record(record_of(1, record)), record)
+        self.assertEqual([r.name for r in record.reports], ["dog2", "dog3", "dog1"])
+        self.assertEqual(record.winner, THREE[1].uuid)
+        self.assertEqual(record.standby, (THREE[2].uuid, THREE[0].uuid))
 
     def test_nobody_testifies_for_another(self) -> None:
         """A copy of dog1's decision record in dog2's slot counts as dog2's."""
@@ -76,9 +76,9 @@ class VerdictTests(SynchronousTestCase):
         """Up to thirty reports are all written, of more only the best eight and the count; the size is bounded."""
         for n, written in ((MAX_REPORTS, MAX_REPORTS), (MAX_REPORTS + 1, MAX_BEST_REPORTS), (500, MAX_BEST_REPORTS)):
             members = [member(i, float(i)) for i in range(1, n + 1)]
-            verdict = decided(1, members)
-            self.assertEqual((len(verdict.reports), verdict.reported), (written, n))
-            self.assertEqual(parse_decision_record(record_of(1, verdict)), verdict)
+            record = decided(1, members)
+            self.assertEqual((len(record.reports), record.reported), (written, n))
+            self.assertEqual(parse_decision_record(record_of(1, record)), record)
         long = [replace(member(i, float(i)), name="\N{SNOWMAN}" * 90) for i in range(1, MAX_REPORTS + 1)]
         long += [replace(member(i, None), name="w" * 90) for i in range(100, 200)]
         consensus = Consensus(long[0].uuid, tuple(m.uuid for m in long), "d" * 90)
@@ -96,10 +96,10 @@ class VerdictTests(SynchronousTestCase):
         members.append(replace(member(3, 1.0), value=(1.0, 2.0)))
         found = Consensus(members[1].uuid, value=(1.0, 2.5), choice="red")
         given = ("t1", 1, members[0], members[1:], "any", "1", found, found.assigned_agent, 0.1, 0)
-        verdict = parse_decision_record(record_of(1, make_decision_record(*given, ReportView(READABLE))))
-        assert verdict is not None
-        self.assertEqual((verdict.value, verdict.choice), ((1.0, 2.5), "red"))
-        told = {r.name: r.more for r in verdict.reports}
+        record = parse_decision_record(record_of(1, make_decision_record(*given, ReportView(READABLE))))
+        assert record is not None
+        self.assertEqual((record.value, record.choice), ((1.0, 2.5), "red"))
+        told = {r.name: r.more for r in record.reports}
         self.assertEqual(told["dog1"], "battery 40%, 2 other tasks")
         self.assertEqual((told["dog2"], told["dog3"]), ("for red, weight 2", "at (1.00, 2.00)"))
         self.assertEqual({r.more for r in make_decision_record(*given, ReportView()).reports}, {""})
@@ -160,13 +160,13 @@ class VerdictTests(SynchronousTestCase):
     def test_name_of_another_spoils_nothing(self) -> None:
         """A member's name with terminal control characters is shown without them, and the record stays readable."""
         hostile = replace(member(2, 0.5), name="a\x1b[2J\ud800")
-        verdict = parse_decision_record(record_of(1, decided(1, [hostile, member(1, 1.0)])))
-        self.assertIsNotNone(verdict)
-        self.assertEqual(verdict and verdict.reports[0].name, "a?[2J?")
+        record = parse_decision_record(record_of(1, decided(1, [hostile, member(1, 1.0)])))
+        self.assertIsNotNone(record)
+        self.assertEqual(record and record.reports[0].name, "a?[2J?")
 
     def test_of_many_the_best_tell(self) -> None:
         """In a group of up to thirty all agents write records; in a larger one the best eight do."""
         members = [member(i, float(i)) for i in range(1, MAX_REPORTS + 2)]
         self.assertTrue(all(decided(n, members[:MAX_REPORTS]).is_publisher for n in range(1, MAX_REPORTS + 1)))
-        told = [verdict for n in range(1, MAX_REPORTS + 2) if (verdict := decided(n, members)).is_publisher]
-        self.assertEqual([verdict.name for verdict in told], [f"dog{n}" for n in range(1, MAX_BEST_REPORTS + 1)])
+        told = [record for n in range(1, MAX_REPORTS + 2) if (record := decided(n, members)).is_publisher]
+        self.assertEqual([record.name for record in told], [f"dog{n}" for n in range(1, MAX_BEST_REPORTS + 1)])

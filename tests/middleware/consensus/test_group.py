@@ -38,7 +38,7 @@ def cost(points: tuple[Consensus, ...], reports: list[Report]) -> float:
     return sum(known[agent, point.task] for point in points for agent in point.assigned)
 
 
-class SharingTests(SynchronousTestCase):
+class MultiTaskTests(SynchronousTestCase):
     def test_one_of_several(self) -> None:
         """``find`` on reports of several tasks returns the decision on the first one of the whole assignment."""
         bids = {("a", "s"): 1.0, ("b", "s"): 2.0, ("a", "t"): 1.0, ("b", "t"): 10.0}
@@ -151,11 +151,11 @@ class SequentialTests(SynchronousTestCase):
         """Each task is on one route, no route exceeds the capacity, and the decisions match the routes."""
         for seed in range(10):
             reports, items = square(4, 10, seed, capacity=3)
-            ways = plan_routes(reports, items) or {}
-            self.assertEqual(sorted(t for way in ways.values() for t in way), [item.task for item in items])
-            self.assertLessEqual(max(map(len, ways.values())), 3)
+            routes = plan_routes(reports, items) or {}
+            self.assertEqual(sorted(t for route in routes.values() for t in route), [item.task for item in items])
+            self.assertLessEqual(max(map(len, routes.values())), 3)
             found = Sequential().find_group(reports, items)
-            self.assertEqual({p.task: p.assigned_agent for p in found}, {t: a for a, w in ways.items() for t in w})
+            self.assertEqual({p.task: p.assigned_agent for p in found}, {t: a for a, w in routes.items() for t in w})
 
     def test_twice_the_best_at_most(self) -> None:
         """The sum of routes is at most twice the optimum, and on average at most 1.15 of it."""
@@ -164,8 +164,8 @@ class SequentialTests(SynchronousTestCase):
             reports, items = square(2, 5, seed, capacity=5)
             starts = {r.agent: r.value for r in reports}
             places = {item.task: item.position for item in items}
-            ways = plan_routes(reports, items) or {}
-            mine = sum(compute_length(starts[a], [places[t] for t in way]) for a, way in ways.items())
+            routes = plan_routes(reports, items) or {}
+            mine = sum(compute_length(starts[a], [places[t] for t in route]) for a, route in routes.items())
             ratios.append(mine / self.best(list(starts.values()), list(places.values())))
         self.assertLessEqual(max(ratios), 2.0)
         self.assertLessEqual(fmean(ratios), 1.15)
@@ -180,11 +180,11 @@ class SequentialTests(SynchronousTestCase):
                     if (mask, last) in ends:
                         for n, p in enumerate(places):
                             if not mask >> n & 1:
-                                way = ends[mask, last] + math.dist(places[last], p)
+                                route = ends[mask, last] + math.dist(places[last], p)
                                 key = (mask | 1 << n, n)
-                                ends[key] = min(way, ends.get(key, math.inf))
+                                ends[key] = min(route, ends.get(key, math.inf))
             for mask in range(1, 1 << len(places)):
-                shortest[which, mask] = min(way for (m, _), way in ends.items() if m == mask)
+                shortest[which, mask] = min(route for (m, _), route in ends.items() if m == mask)
             shortest[which, 0] = 0.0
         whole = (1 << len(places)) - 1
         return min(shortest[0, mask] + shortest[1, whole - mask] for mask in range(whole + 1))

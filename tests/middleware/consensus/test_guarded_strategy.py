@@ -109,36 +109,36 @@ class Inventing(Nearest):
         return "perhaps"  # type: ignore[return-value]
 
 
-class GuardTests(SynchronousTestCase):
-    def assert_falls_back(self, guard: GuardedStrategy, why: str) -> None:
+class GuardedStrategyTests(SynchronousTestCase):
+    def assert_falls_back(self, guarded: GuardedStrategy, why: str) -> None:
         """Check that the nearest agent wins, the reason names the failure, and an error is logged."""
-        found = guard.find(TEAM)
+        found = guarded.find(TEAM)
         self.assertEqual((found.assigned_agent, found.standby), ("b", ("c", "a")))
         self.assertEqual(found.strategy, "nearest")
-        self.assertIn(f"{guard.name} has no opinion (", found.reason)
+        self.assertIn(f"{guarded.name} has no opinion (", found.reason)
         self.assertIn(why, found.reason)
-        guard.find(TEAM)
+        guarded.find(TEAM)
         self.assertTrue(self.flushLoggedErrors())
 
     def test_raising(self) -> None:
         """A strategy that raises is replaced by ``Nearest``; the reason names the exception, which is logged once."""
-        guard = GuardedStrategy(Raising())
-        found = guard.find(TEAM)
+        guarded = GuardedStrategy(Raising())
+        found = guarded.find(TEAM)
         self.assertEqual(found.assigned_agent, "b")
         self.assertEqual(
             found.reason, "raising has no opinion (ZeroDivisionError: I divide); nearest: 1.00, least of 3"
         )
-        guard.find(TEAM)
+        guarded.find(TEAM)
         logged = self.flushLoggedErrors(ZeroDivisionError)
         self.assertEqual(len(logged), 1)
         self.assertIn("in find", logged[0].getTraceback())
 
     def test_raising_elsewhere(self) -> None:
         """``improves`` and ``merge`` of a strategy that raises also fall back to ``Nearest``."""
-        guard = GuardedStrategy(Raising())
-        self.assertTrue(guard.improves(TEAM[0], TEAM[1], 0.1))
-        self.assertFalse(guard.improves(TEAM[1], TEAM[0], 0.1))
-        self.assertEqual(guard.merge(TEAM, TEAM), Nearest().merge(TEAM, ()))
+        guarded = GuardedStrategy(Raising())
+        self.assertTrue(guarded.improves(TEAM[0], TEAM[1], 0.1))
+        self.assertFalse(guarded.improves(TEAM[1], TEAM[0], 0.1))
+        self.assertEqual(guarded.merge(TEAM, TEAM), Nearest().merge(TEAM, ()))
         self.assertEqual(len(self.flushLoggedErrors()), 2)
 
     def test_lying(self) -> None:
@@ -171,34 +171,36 @@ class GuardTests(SynchronousTestCase):
         self.assertEqual(GuardedStrategy(OrderBound()).find(TEAM), GuardedStrategy(OrderBound()).find(TEAM[::-1]))
 
     def test_late(self) -> None:
-        """A strategy that exceeds the timeout ``STRIKES`` times is not called again."""
+        """A strategy that exceeds the timeout ``MAX_LOSSES`` times is not called again."""
         slow = Slow()
-        guard = GuardedStrategy(slow)
+        guarded = GuardedStrategy(slow)
         for _ in range(10):
-            self.assertEqual(guard.find(TEAM).assigned_agent, "b")
+            self.assertEqual(guarded.find(TEAM).assigned_agent, "b")
         self.assertEqual(slow.asked, MAX_LOSSES)
-        self.assertIn("not called again", guard.find(TEAM).reason)
+        self.assertIn("not called again", guarded.find(TEAM).reason)
         self.flushLoggedErrors()
 
     def test_late_now_and_then(self) -> None:
-        """A strategy with fewer than ``STRIKES`` timeouts in ``SPAN`` calls stays in use; with more it does not."""
+        """A strategy with fewer than ``MAX_LOSSES`` timeouts in ``LOSS_SPAN_CALLS`` calls stays in use; with more it
+        does not.
+        """
         for pause, is_out in (
             (LOSS_SPAN_CALLS // (MAX_LOSSES - 1), False),
             (LOSS_SPAN_CALLS // (MAX_LOSSES - 1) - 1, True),
         ):
             moments = Moments(pause)
-            guard = GuardedStrategy(moments)
+            guarded = GuardedStrategy(moments)
             for _ in range(10 * LOSS_SPAN_CALLS):
-                guard.improves(TEAM[0], TEAM[1], 0.1)
+                guarded.improves(TEAM[0], TEAM[1], 0.1)
             self.assertEqual(moments.asked < 10 * LOSS_SPAN_CALLS, is_out, pause)
-            self.assertEqual(guard.find(TEAM).strategy, "nearest" if is_out else "moments")
+            self.assertEqual(guarded.find(TEAM).strategy, "nearest" if is_out else "moments")
         self.flushLoggedErrors()
 
     def test_inventing(self) -> None:
         """A summary with unknown reports, and a result of ``improves`` that is no bool, are rejected."""
-        guard = GuardedStrategy(Inventing())
-        self.assertEqual(guard.merge(TEAM, ()), Nearest().merge(TEAM, ()))
-        self.assertTrue(guard.improves(TEAM[0], TEAM[1], 0.1))
+        guarded = GuardedStrategy(Inventing())
+        self.assertEqual(guarded.merge(TEAM, ()), Nearest().merge(TEAM, ()))
+        self.assertTrue(guarded.improves(TEAM[0], TEAM[1], 0.1))
         self.assertEqual(len(self.flushLoggedErrors()), 2)
 
     def test_group(self) -> None:
@@ -234,8 +236,8 @@ class GuardTests(SynchronousTestCase):
         """A guard passes only valid reports to its strategy."""
         bad = [Report("x", cost) for cost in (math.nan, math.inf, -1.0, 1e300)]
         bad += [Report("x", 0.0, age=3.0, valid_for=2.0), Report("x", 0.0, unmet=("has no camera",))]
-        guard = GuardedStrategy(Nearest())
-        self.assertEqual(guard.find([*bad, *TEAM]), guard.find(TEAM))
+        guarded = GuardedStrategy(Nearest())
+        self.assertEqual(guarded.find([*bad, *TEAM]), guarded.find(TEAM))
         for offer in bad:
             self.assertFalse(GuardedStrategy(Lying(None)).improves(TEAM[0], offer, 0.0))
 

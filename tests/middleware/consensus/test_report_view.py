@@ -17,7 +17,7 @@ FULL = Member(
 )
 
 
-class ViewTests(SynchronousTestCase):
+class ReportViewTests(SynchronousTestCase):
     def test_only_what_is_read_is_shown(self) -> None:
         """A strategy gets only the fields that it declares, or all fields if it declares none."""
         self.assertEqual(make_view(Nearest()).make_report(FULL), Report("a", 2.5))

@@ -14,7 +14,7 @@ from middleware.entangled.control import conversion
 FIELDS = st.none() | st.booleans() | st.integers() | st.floats(allow_nan=False, allow_infinity=False) | st.text()
 
 
-class WordTests(SynchronousTestCase):
+class ConversionTests(SynchronousTestCase):
     @given(st.lists(FIELDS | st.binary()))
     def test_fields_come_back_from_json(self, fields: list[Any]) -> None:
         """Every tuple, including bytes, survives a JSON round trip, and no text is converted to bytes."""
@@ -30,7 +30,7 @@ class WordTests(SynchronousTestCase):
 
     @given(st.text())
     def test_every_word_is_read_or_refused(self, text: str) -> None:
-        """Any word on a command line is parsed as a field or a template field, or raises ``BadWord``."""
+        """Any word on a command line is parsed as a field or a template field, or raises ``InvalidValue``."""
         for read in (conversion.parse_field, conversion.parse_template_field):
             try:
                 field = read(text)

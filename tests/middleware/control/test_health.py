@@ -14,15 +14,15 @@ from middleware.entangled.network.switchboard import LinkConditions
 from tests.fleet import FleetCase, SwarmTeam
 
 
-class GaugeTests(FleetCase):
+class LinkMetricsTests(FleetCase):
     def setUp(self) -> None:
         super().setUp()
         self.team: SwarmTeam = self.swarm(3, weather=LinkConditions(delay_s=0.01))
         self.team.run(3.0)
-        self.gauge: LinkMetrics = self.team.nodes[0].link_metrics
+        self.metrics: LinkMetrics = self.team.nodes[0].link_metrics
 
     def measured(self) -> dict[str, dict[str, Any]]:
-        return {each["id"]: each for each in self.gauge.read()}
+        return {each["id"]: each for each in self.metrics.read()}
 
     def test_answer_at_once(self) -> None:
         """The first report lists the paths without measurements; a second later it has the results of ten probes."""
@@ -47,7 +47,7 @@ class GaugeTests(FleetCase):
         self.assertEqual(losses[0] <= 0.5 and max(losses) > 0.1, True, losses)
 
     def test_end_when_nobody_looks(self) -> None:
-        """Without reports for ``IDLE`` seconds the measurement stops; the next report starts it again."""
+        """Without reports for ``IDLE_S`` seconds the measurement stops; the next report starts it again."""
         asked: list[float] = []
 
         def answer(peer: object, said: bytes) -> bytes:
@@ -76,14 +76,14 @@ class GaugeTests(FleetCase):
             asked.extend([large.clock.seconds()] * (peer.node_id.hex() == large.nodes[0].uuid))
             return said
 
-        gauge = large.nodes[0].link_metrics
-        peers = {each["id"] for each in gauge.read()}
+        metrics = large.nodes[0].link_metrics
+        peers = {each["id"] for each in metrics.read()}
         self.assertGreater(len(peers), 2 * FEW_PEERS)
         for node in large.nodes[1:]:
             node.entangled.endpoint.expose("ping", answer, changes=True)
         for seconds, most in ((1.0, 100.0), (2.0, 100.0), (5.0, 10.0)):
             before = len(asked)
-            gauge.read()
+            metrics.read()
             large.run(seconds)
             self.assertLess(len(asked) - before, most * seconds + 2 * len(peers), seconds)
 
@@ -110,7 +110,7 @@ class HealthTests(FleetCase):
         self.assertEqual((set(dead["times"]), dead["relayed"]), ({None}, False))
 
 
-class LinkTests(SynchronousTestCase):
+class LinkQualityTests(SynchronousTestCase):
     def test_scores(self) -> None:
         """A stable peer on the same LAN has score 100, a barely reachable one 1, an unreachable one 0."""
         rows: list[tuple[list[float | None], bool, int]] = [

@@ -12,7 +12,7 @@ from twisted.trial.unittest import SynchronousTestCase
 from middleware.entangled.control.socket_path import NoControl, find_folder, find_socket, prepare_path
 
 
-class PlaceTests(SynchronousTestCase):
+class SocketPathTests(SynchronousTestCase):
     def setUp(self) -> None:
         # The folders of trial are too deep for the path of a Unix socket.
         self.runtime = Path(tempfile.mkdtemp())

@@ -45,23 +45,25 @@ class DeploymentTests(FleetCase):
         self.addCleanup(lambda: [sys.modules.pop(name) for name in sorted(set(sys.modules) - before)])
         self.world = self.swarm(3)
         self.operator, self.stranger, self.dog = self.world.nodes
-        self.shelf = MemoryModuleStore()
+        self.module_store = MemoryModuleStore()
         self.author = Author("laptop", frozenset({"operator"}))
         self.deployment = self.allow()
 
-    def allow(self, shelf: ModuleStore | None = None, node: SwarmNode | None = None, **more: object) -> Deployment:
+    def allow(
+        self, module_store: ModuleStore | None = None, node: SwarmNode | None = None, **more: object
+    ) -> Deployment:
         """Let the dog (or ``node``) accept "best" from the operator."""
         node = self.dog if node is None else node
         key = self.operator.entangled.identity.public.hex()
         allowed = replace(DeploymentSettings(True, (key,), ("best",)), **more)  # type: ignore[arg-type]
-        shelf = self.shelf if shelf is None else shelf
+        module_store = self.module_store if module_store is None else module_store
         made = Deployment(
             node.entangled,
             node.presence,
             node.wall,
             node.later,
             allowed,
-            shelf,
+            module_store,
             lambda public: self.author,
             make_memory_channel,
             node.clock.seconds,
@@ -196,7 +198,7 @@ class DeploymentTests(FleetCase):
         for number in (1, 2, 3):
             held, source = self.version(number, held)
             self.push(held, source)
-        self.assertEqual(len(self.shelf.contents), 2)
+        self.assertEqual(len(self.module_store.contents), 2)
         for node in (self.operator, self.stranger):
             node.stop_silently()
         self.deployment = self.allow()

@@ -16,7 +16,7 @@ from middleware.deployment.module_channel import (
 )
 
 
-class FrameTests(SynchronousTestCase):
+class ModuleChannelTests(SynchronousTestCase):
     def test_stream_is_split(self) -> None:
         """Messages are decoded whole, however the stream is split."""
         messages = [pack([number, True, b"x" * number]) for number in range(20)]

@@ -9,22 +9,22 @@ from twisted.trial.unittest import SynchronousTestCase
 from middleware.deployment.module_store import FileModuleStore, MemoryModuleStore, ModuleStore
 
 
-class FileShelfTests(SynchronousTestCase):
+class FileModuleStoreTests(SynchronousTestCase):
     def setUp(self) -> None:
         self.folder = Path(self.mktemp()) / "deployed"
 
     def test_keeps_and_drops(self) -> None:
         """Both implementations list the stored entries in the order of their names, without the dropped ones."""
-        shelves: list[ModuleStore] = [FileModuleStore(self.folder), MemoryModuleStore()]
-        for shelf in shelves:
-            self.assertEqual(shelf.list_modules(), [])
-            shelf.delete("a")
-            shelf.save("b", b"2")
-            shelf.save("a", b"1")
-            shelf.save("b", b"3")
-            self.assertEqual(shelf.list_modules(), [("a", b"1"), ("b", b"3")])
-            shelf.delete("a")
-            self.assertEqual(shelf.list_modules(), [("b", b"3")])
+        stores: list[ModuleStore] = [FileModuleStore(self.folder), MemoryModuleStore()]
+        for store in stores:
+            self.assertEqual(store.list_modules(), [])
+            store.delete("a")
+            store.save("b", b"2")
+            store.save("a", b"1")
+            store.save("b", b"3")
+            self.assertEqual(store.list_modules(), [("a", b"1"), ("b", b"3")])
+            store.delete("a")
+            self.assertEqual(store.list_modules(), [("b", b"3")])
 
     def test_crash_in_the_middle_leaves_the_old(self) -> None:
         """After a crash during a write, the old file is read and the temporary file is removed."""

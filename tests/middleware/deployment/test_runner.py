@@ -96,7 +96,7 @@ class RunnerTests(SynchronousTestCase):
         self.assertEqual((lost.state, len(self.processes)), (State.OUT, 1))
 
     def test_silence_costs_the_process(self) -> None:
-        """A process that does not answer is killed; after ``STRIKES`` of them no other is started."""
+        """A process that does not answer is killed; after ``MAX_LOSSES`` of them no other is started."""
         runner = self.runner(lambda number, verb: self.good(number, verb) if verb == "load" else b"")
         for _ in range(MAX_LOSSES):
             self.assertRaises(StrategyLost, runner.call, "call", ONE)
@@ -113,7 +113,7 @@ class RunnerTests(SynchronousTestCase):
         self.assertEqual((runner.state, self.processes[0].is_ended), (State.LOST, True))
 
     def test_hostile_answers(self) -> None:
-        """An invalid answer ends the process and raises only ``NoOpinion``."""
+        """An invalid answer ends the process and raises only ``StrategyError``."""
         for nonsense in (
             module_channel.pack(7),
             module_channel.pack([1]),

@@ -63,20 +63,20 @@ class ExplanationTests(SynchronousTestCase):
 
     def test_order_does_not_matter(self) -> None:
         """Any order of the decision records gives the same explanation, with the newest epoch first."""
-        verdicts = [decided(n, THREE, epoch) for epoch in (1, 2, 3) for n in (1, 2, 3)]
-        verdicts[4] = decided(2, THREE[:1] + [THREE[1]], 2)
-        expected = explain_decisions(verdicts)
+        records = [decided(n, THREE, epoch) for epoch in (1, 2, 3) for n in (1, 2, 3)]
+        records[4] = decided(2, THREE[:1] + [THREE[1]], 2)
+        expected = explain_decisions(records)
         self.assertEqual([ruling.epoch for ruling in expected.epochs], [3, 2, 1])
         rng = random.Random(2)
         for _ in range(10):
-            rng.shuffle(verdicts)
-            self.assertEqual(explain_decisions(verdicts), expected)
+            rng.shuffle(records)
+            self.assertEqual(explain_decisions(records), expected)
 
     def test_most_decide_whoever_dissents(self) -> None:
         """Two agents that agree outvote the third, for each of the three."""
         for lone in (1, 2, 3):
-            verdicts = [decided(n, THREE, assigned=1 if n == lone else None) for n in (1, 2, 3)]
-            (ruling,) = explain_decisions(verdicts).epochs
+            records = [decided(n, THREE, assigned=1 if n == lone else None) for n in (1, 2, 3)]
+            (ruling,) = explain_decisions(records).epochs
             self.assertEqual((ruling.chosen, len(ruling.agree)), ("dog2", 2))
             self.assertEqual([(d.name, d.what) for d in ruling.differ], [(f"dog{lone}", "names dog1")])
 
@@ -96,6 +96,6 @@ class ExplanationTests(SynchronousTestCase):
     def test_of_many_the_best_are_asked(self) -> None:
         """In a group of more than thirty, only the eight agents that write their records are counted."""
         members = [member(i, float(i)) for i in range(1, MAX_REPORTS + 2)]
-        told = [verdict for n in range(1, MAX_REPORTS + 2) if (verdict := decided(n, members)).is_publisher]
+        told = [record for n in range(1, MAX_REPORTS + 2) if (record := decided(n, members)).is_publisher]
         (ruling,) = explain_decisions(told).epochs
         self.assertEqual((len(ruling.agree), ruling.of, ruling.differ), (MAX_BEST_REPORTS, MAX_BEST_REPORTS, ()))

@@ -62,7 +62,7 @@ class PrefixTests(SynchronousTestCase):
                 self.assertLessEqual(len(after), 3 if depth < ROOT_LISTED_DEPTH else 2)
 
     def test_small_team_is_never_split(self) -> None:
-        """The depth is 0 up to ``WHOLE`` members, and returns to 0 only at ``STILL_WHOLE`` members."""
+        """The depth is 0 up to ``MAX_UNDIVIDED`` members, and returns to 0 only at ``UNDIVIDED_AGAIN`` members."""
         self.assertEqual([choose_depth(size, 0) for size in (1, 8, 48, MAX_UNDIVIDED)], [0] * 4)
         self.assertEqual([choose_depth(size) for size in (1, 8, 48, MAX_UNDIVIDED)], [0] * 4)
         self.assertEqual(choose_depth(MAX_UNDIVIDED + 1, 0), 1)

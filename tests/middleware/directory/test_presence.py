@@ -177,7 +177,7 @@ class PresenceTests(SynchronousTestCase):
         self.assertEqual([(d.joined, d.status) for d in self.told if d], [(7, IDLE)])
 
     def test_changes_are_gathered(self) -> None:
-        """Several changes within ``PAUSE`` are announced once; a change without effect is not announced."""
+        """Several changes within ``PAUSE_S`` are announced once; a change without effect is not announced."""
         self.presence.appear(7)
         self.presence.change(status=IDLE)
         self.presence.change(task="t2")

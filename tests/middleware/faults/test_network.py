@@ -14,9 +14,9 @@ from middleware.faults.network import FaultyNetwork
 class FaultyNetworkTests(SynchronousTestCase):
     def setUp(self) -> None:
         self.clock = HeapClock()
-        board = Switchboard(self.clock, random.Random(1))
-        self.network = FaultyNetwork(board.make_network(), self.clock, random.Random(2))
-        self.other = board.make_network()
+        switchboard = Switchboard(self.clock, random.Random(1))
+        self.network = FaultyNetwork(switchboard.make_network(), self.clock, random.Random(2))
+        self.other = switchboard.make_network()
         self.came: list[bytes] = []
         self.answers: list[bytes] = []
         self.network.listen(lambda datagram, source: self.came.append(datagram))

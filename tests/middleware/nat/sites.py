@@ -22,25 +22,25 @@ LINK = LinkConditions(delay_s=0.015)
 """One crossing of a site's uplink: two sites are 60 ms apart, there and back."""
 
 
-class Ground:
+class Sites:
     """A network of sites.
 
-    ``weather`` applies to the uplink of each site; ``nets`` are the address prefixes of the public and the private
+    ``conditions`` applies to the uplink of each site; ``nets`` are the address prefixes of the public and the private
     nets.
     """
 
     def __init__(
         self,
         seed: int = 1,
-        weather: LinkConditions = LINK,
+        conditions: LinkConditions = LINK,
         lifetime: float = 30.0,
         nets: tuple[str, str] = ("203.0.113", "192.168"),
     ) -> None:
         self.seed = seed
-        self.weather = weather
+        self.conditions = conditions
         self.lifetime = lifetime
         self.clock = HeapClock()
-        self.board = Switchboard(self.clock, random.Random(f"{seed}/board"))
+        self.switchboard = Switchboard(self.clock, random.Random(f"{seed}/board"))
         self.nodes: dict[str, EntangledNode] = {}
         self.networks: dict[str, SwitchboardNetwork] = {}
         self.routers: dict[str, NatRouter] = {}
@@ -53,12 +53,12 @@ class Ground:
         if kind != "none":
             host, rng = f"{self.outside}.{10 + len(self.routers)}", random.Random(f"{self.seed}/{name}")
             nat: NatKind = kind  # type: ignore[assignment]
-            self.routers[name] = self.board.add_router(NatRouter(nat, host, rng, self.lifetime), self.weather)
+            self.routers[name] = self.switchboard.add_router(NatRouter(nat, host, rng, self.lifetime), self.conditions)
 
     def node(self, name: str, address: Address, site: str = "") -> EntangledNode:
         """Create and start a node at a site or on the public net; it joins through the public node."""
         identity = Identity(random.Random(f"{self.seed}/{name}").randbytes(32))
-        network = self.board.make_network(*address, home=self.routers.get(site))
+        network = self.switchboard.make_network(*address, home=self.routers.get(site))
         rng = random.Random(f"{self.seed}/{name}/dice")
         node = EntangledNode(identity, TEAM, network, MemoryStore(), self.clock, rng)
         node.rpc("echo")(lambda peer, value: value)
@@ -76,7 +76,7 @@ class Ground:
             return self.node(name, Address(f"{self.inside}.{ord(site) % 200}.{host}", 7000), site)
         address = Address(f"{self.outside}.{100 + len(self.nodes)}", 7000)
         for other in self.networks.values():
-            self.board.set_conditions(address, other.address, self.weather)
+            self.switchboard.set_conditions(address, other.address, self.conditions)
         return self.node(name, address)
 
     def met_at(self, of: EntangledNode) -> Contact:
@@ -115,24 +115,24 @@ class Ground:
             node.stop_silently()
 
 
-class GroundCase(SynchronousTestCase):
+class SitesCase(SynchronousTestCase):
     """A test case with sites that checks that no node leaves a timer after its stop."""
 
-    def ground(
+    def sites(
         self,
         seed: int = 1,
-        weather: LinkConditions = LINK,
+        conditions: LinkConditions = LINK,
         lifetime: float = 30.0,
         nets: tuple[str, str] = ("203.0.113", "192.168"),
-    ) -> Ground:
+    ) -> Sites:
         """Create sites that are stopped after the test."""
-        ground = Ground(seed, weather, lifetime, nets)
-        self.addCleanup(self._end, ground)
-        return ground
+        sites = Sites(seed, conditions, lifetime, nets)
+        self.addCleanup(self._end, sites)
+        return sites
 
-    def _end(self, ground: Ground) -> None:
-        ground.stop()
-        left = [call for call in ground.clock.getDelayedCalls() if not _is_delivery(call)]
+    def _end(self, sites: Sites) -> None:
+        sites.stop()
+        left = [call for call in sites.clock.getDelayedCalls() if not _is_delivery(call)]
         self.assertEqual(left, [], "a node left a timer behind")
 
 

@@ -14,28 +14,28 @@ from middleware.entangled.nat.candidate import MAX_CANDIDATES, is_loopback, is_n
 from middleware.entangled.nat.introducer import ATTEMPT_BURST, ATTEMPTS_PER_S, INTRODUCTIONS_PER_S, IntroductionLimits
 from middleware.entangled.network.network import Address, relayed_address
 from middleware.entangled.network.switchboard import LinkConditions
-from tests.middleware.nat.sites import GroundCase
+from tests.middleware.nat.sites import SitesCase
 
 INTRODUCE, MEET = "reach.introduce", "reach.meet"
 
 
-class QuietTests(GroundCase):
+class QuietTests(SitesCase):
     """Nodes with direct paths cause no traffic for introductions."""
 
     def test_neighbours_ask_nobody(self) -> None:
         """Nodes on one LAN use no introduction, address probe, relay or timer, even if a node fails."""
-        ground = self.ground(weather=LinkConditions(delay_s=0.001))
+        sites = self.sites(conditions=LinkConditions(delay_s=0.001))
         asked: list[bytes] = []
-        ground.nodes["pub"].stop_silently()
-        nodes = [ground.node(f"n{n}", Address(f"192.168.7.{9 + n}", 7000)) for n in range(4)]
+        sites.nodes["pub"].stop_silently()
+        nodes = [sites.node(f"n{n}", Address(f"192.168.7.{9 + n}", 7000)) for n in range(4)]
         first = nodes[0]
         for node in nodes:
             node.join([first.contact.address])
             node.endpoint.expose(INTRODUCE, lambda peer, *rest: asked.append(b""), changes=True)
-        ground.run(5.0)
+        sites.run(5.0)
         self.assertEqual(len(first.overlay.contacts()), 3)
         nodes[3].stop_silently()
-        ground.run(30.0)
+        sites.run(30.0)
         self.assertEqual(asked, [])
         for node in nodes[:3]:
             self.assertFalse(node.nat._upgrades or node.nat._additional_ports or node.nat._is_maintenance_scheduled)
@@ -43,21 +43,21 @@ class QuietTests(GroundCase):
 
     def test_answered_at_once(self) -> None:
         """A node that replies at once is never introduced, at any distance."""
-        ground = self.ground()
-        a = ground.at("a", "none")
-        b = ground.at("b", "none")
+        sites = self.sites()
+        a = sites.at("a", "none")
+        b = sites.at("b", "none")
         asked: list[bytes] = []
-        ground.nodes["pub"].endpoint.expose(INTRODUCE, lambda peer, *rest: asked.append(b""), changes=True)
-        ground.run(20.0)
-        self.assertEqual((ground.way(a, b), asked), ("direct", []))
+        sites.nodes["pub"].endpoint.expose(INTRODUCE, lambda peer, *rest: asked.append(b""), changes=True)
+        sites.run(20.0)
+        self.assertEqual((sites.way(a, b), asked), ("direct", []))
 
 
-class HostileTests(GroundCase):
+class HostileTests(SitesCase):
     """Attacks by members that lie or send too many requests."""
 
     def setUp(self) -> None:
         """Create a public node and two nodes that know it."""
-        self.g = self.ground()
+        self.g = self.sites()
         self.a, self.b = self.g.at("a", "none"), self.g.at("b", "none")
         self.g.run(3.0)
 
@@ -120,8 +120,8 @@ class HostileTests(GroundCase):
 ASKER, OTHER, STRANGER = b"a" * 32, b"o" * 32, b"s" * 32
 
 
-class AllowanceTests(SynchronousTestCase):
-    """Tests of ``Allowance``."""
+class IntroductionLimitsTests(SynchronousTestCase):
+    """Tests of ``IntroductionLimits``."""
 
     def setUp(self) -> None:
         """Create an unused allowance."""

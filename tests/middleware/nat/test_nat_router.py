@@ -22,7 +22,7 @@ def nat(kind: NatKind) -> NatRouter:
 
 
 class NatTests(SynchronousTestCase):
-    """Tests of ``Nat``."""
+    """Tests of ``NatRouter``."""
 
     def test_what_each_kind_lets_in(self) -> None:
         """After a datagram to A, each NAT type filters datagrams from A, its other port and another host correctly."""
@@ -75,11 +75,11 @@ class NatTests(SynchronousTestCase):
     def test_on_the_board(self) -> None:
         """Nodes behind one router reach each other by their private addresses, but not by the public one."""
         clock = HeapClock()
-        board = Switchboard(clock, random.Random(1))
-        router = board.add_router(nat("full"), LinkConditions(delay_s=0.5))
+        switchboard = Switchboard(clock, random.Random(1))
+        router = switchboard.add_router(nat("full"), LinkConditions(delay_s=0.5))
         got: list[tuple[float, bytes, Address]] = []
-        one, other = (board.make_network(f"192.168.1.{n}", 7000, home=router) for n in (2, 3))
-        far = board.make_network(*B)
+        one, other = (switchboard.make_network(f"192.168.1.{n}", 7000, home=router) for n in (2, 3))
+        far = switchboard.make_network(*B)
         for network in (one, other, far):
             network.listen(lambda datagram, source: got.append((clock.seconds(), datagram, source)))
         one.send(b"near", other.address)
@@ -92,14 +92,14 @@ class NatTests(SynchronousTestCase):
         far.send(b"private", one.address)
         clock.advance(1.0)
         self.assertEqual([datagram for _, datagram, _ in got[2:]], [b"back"])
-        self.assertEqual((board.counters["blocked"], board.counters["unheard"]), (1, 1))
+        self.assertEqual((switchboard.counters["blocked"], switchboard.counters["unheard"]), (1, 1))
 
     def test_further_ports_on_the_board(self) -> None:
         """An additional port has a separate mapping; replies to a source that used this port leave from it."""
         clock = HeapClock()
-        board = Switchboard(clock, random.Random(1))
-        router = board.add_router(nat("full"))
-        one, far = board.make_network(*INSIDE, home=router), board.make_network(*B)
+        switchboard = Switchboard(clock, random.Random(1))
+        router = switchboard.add_router(nat("full"))
+        one, far = switchboard.make_network(*INSIDE, home=router), switchboard.make_network(*B)
         sources: list[Address] = []
         one.listen(lambda datagram, source: one.send(datagram, source))
         far.listen(lambda datagram, source: sources.append(source))
@@ -108,7 +108,7 @@ class NatTests(SynchronousTestCase):
         one.send(b"x", B)
         clock.advance(0.0)
         self.assertEqual(sources, [Address(HOST, port)])
-        third = board.make_network(*A)
+        third = switchboard.make_network(*A)
         third.listen(lambda datagram, source: sources.append(source))
         third.send(b"y", Address(HOST, port))
         clock.advance(0.0)

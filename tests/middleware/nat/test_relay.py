@@ -107,7 +107,7 @@ class RelayTests(SynchronousTestCase):
 
 
 class UpgradeTests(SynchronousTestCase):
-    """Tests of ``Upgrades`` with one relayed peer."""
+    """Tests of ``PathUpgrades`` with one relayed peer."""
 
     def setUp(self) -> None:
         """Create a relayed session."""

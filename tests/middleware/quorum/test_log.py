@@ -68,9 +68,9 @@ class LogTests(SynchronousTestCase):
     def test_rotten_notes(self) -> None:
         """If a stored vote is unreadable, the log uses the others and is not whole."""
         granted(self.log, "t", 7, 0.0)
-        for rotten in (b"\xc1", msgpack.packb([1]), msgpack.packb({"t": [1]}), msgpack.packb({"t": 5})):
+        for corrupt in (b"\xc1", msgpack.packb([1]), msgpack.packb({"t": [1]}), msgpack.packb({"t": 5})):
             for name in filter(self.store.get_note, CODEC.names):
-                self.store.set_note(name, rotten)
+                self.store.set_note(name, corrupt)
             self.assertFalse(self.opened().is_complete)
         self.store.set_note("lease/state", b"?")
         self.assertFalse(self.opened().is_complete)

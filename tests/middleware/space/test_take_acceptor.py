@@ -70,23 +70,25 @@ class Exposed:
         self.methods[name] = answer
 
 
-class SeatTests(SynchronousTestCase):
+class TakeAcceptorTests(SynchronousTestCase):
     def setUp(self) -> None:
         self.clock = HeapClock()
         self.store = MemoryStore()
-        self.seat = self.made()
+        self.acceptor = self.made()
 
     def made(self, seed: int = 1) -> TakeAcceptor:
         """Create the member again on the same store, as after a restart."""
         return TakeAcceptor(Exposed(), self.store, self.clock, random.Random(seed))
 
     def claim(self, where: TupleId, counter: int = 1, taker: bytes = b"a", lease: float = 2.0) -> ReplyKind:
-        answer: Any = self.seat.answer_claim(PEER, KEY, [where.pack()], self.seat.incarnation, counter, taker, lease)
+        answer: Any = self.acceptor.answer_claim(
+            PEER, KEY, [where.pack()], self.acceptor.incarnation, counter, taker, lease
+        )
         return self._kind(answer, Event.PREPARE)
 
     def confirm(self, where: TupleId, counter: int = 1, taker: bytes = b"a") -> ReplyKind:
-        life = self.seat.incarnation
-        answer: Any = self.seat.answer_confirm(PEER, KEY, [where.pack()], life, counter, taker, taker)
+        incarnation = self.acceptor.incarnation
+        answer: Any = self.acceptor.answer_confirm(PEER, KEY, [where.pack()], incarnation, counter, taker, taker)
         return self._kind(answer, Event.ACCEPT)
 
     def _kind(self, answer: Any, event: Event) -> ReplyKind:
@@ -96,34 +98,38 @@ class SeatTests(SynchronousTestCase):
 
     def test_lost_memory_is_another_life(self) -> None:
         """A member with an empty or corrupted store has a new incarnation and rejects requests to the old one."""
-        life = self.seat.incarnation
+        incarnation = self.acceptor.incarnation
         self.claim(place(1))
         note = CODEC.bucket_of(place(1))
-        rotten = MemoryStore()
-        rotten.set_note("decree/incarnation", life)
-        rotten.set_note(note, b"rotten")
-        for seed, store in enumerate((MemoryStore(), rotten), start=5):
+        corrupt = MemoryStore()
+        corrupt.set_note("decree/incarnation", incarnation)
+        corrupt.set_note(note, b"rotten")
+        for seed, store in enumerate((MemoryStore(), corrupt), start=5):
             self.store = store
-            self.seat = self.made(seed)
-            self.assertNotEqual(self.seat.incarnation, life)
-            self.assertRaises(Refused, self.seat.answer_claim, PEER, KEY, [place(1).pack()], life, 9, b"b", 1.0)
-            self.assertIsNone(self.seat.find_vote(place(1)))
+            self.acceptor = self.made(seed)
+            self.assertNotEqual(self.acceptor.incarnation, incarnation)
+            self.assertRaises(
+                Refused, self.acceptor.answer_claim, PEER, KEY, [place(1).pack()], incarnation, 9, b"b", 1.0
+            )
+            self.assertIsNone(self.acceptor.find_vote(place(1)))
             self.assertEqual(self.claim(place(1)), ReplyKind.GRANTED)
 
     def test_wrong_questions(self) -> None:
         """An invalid request is rejected and has no effect."""
-        life, where = self.seat.incarnation, place(1).pack()
+        incarnation, where = self.acceptor.incarnation, place(1).pack()
         wrong: list[tuple[Any, ...]] = [
-            (KEY[1:], [where], life, 1, b"a", 1.0), (KEY, [], life, 1, b"a", 1.0),
-            (KEY, [where, where], life, 1, b"a", 1.0),
-            (KEY, [[1]], life, 1, b"a", 1.0), (KEY, [where], b"", 1, b"a", 1.0), (KEY, [where], life, 0, b"a", 1.0),
-            (KEY, [where], life, 1, b"", 1.0), (KEY, [where], life, 1, b"a", 0.0), (KEY, [where], life, 1, b"a", 601.0),
-            (KEY, [place(n).pack() for n in range(MAX_TUPLES + 1)], life, 1, b"a", 1.0),
+            (KEY[1:], [where], incarnation, 1, b"a", 1.0), (KEY, [], incarnation, 1, b"a", 1.0),
+            (KEY, [where, where], incarnation, 1, b"a", 1.0),
+            (KEY, [[1]], incarnation, 1, b"a", 1.0), (KEY, [where], b"", 1, b"a", 1.0),
+            (KEY, [where], incarnation, 0, b"a", 1.0),
+            (KEY, [where], incarnation, 1, b"", 1.0), (KEY, [where], incarnation, 1, b"a", 0.0),
+            (KEY, [where], incarnation, 1, b"a", 601.0),
+            (KEY, [place(n).pack() for n in range(MAX_TUPLES + 1)], incarnation, 1, b"a", 1.0),
         ]  # fmt: skip
         for question in wrong:
-            self.assertRaises(Refused, self.seat.answer_claim, PEER, *question)
-        self.assertRaises(Refused, self.seat.answer_confirm, PEER, KEY, [where], life, 1, b"a", b"")
-        self.assertEqual(len(self.seat), 0)
+            self.assertRaises(Refused, self.acceptor.answer_claim, PEER, *question)
+        self.assertRaises(Refused, self.acceptor.answer_confirm, PEER, KEY, [where], incarnation, 1, b"a", b"")
+        self.assertEqual(len(self.acceptor), 0)
 
     def test_nothing_is_promised_about_what_is_over(self) -> None:
         """A tuple that its publisher removed, or replaced by another one in its slot, cannot be claimed."""
@@ -145,13 +151,13 @@ class SeatTests(SynchronousTestCase):
         self.assertRaises(Refused, self.claim, place(9))
         self.store.put(record(place(1).name, None), 99.0)
         self.assertEqual(self.claim(place(9), counter=1), ReplyKind.GRANTED)
-        self.assertIsNone(self.seat.find_vote(place(1)))
+        self.assertIsNone(self.acceptor.find_vote(place(1)))
         self.assertEqual(self.claim(place(1), counter=9), ReplyKind.OUTBID)
         self.store.put(record(place(0).name, None), 99.0)
         self.claim(place(10), counter=9)
-        self.seat = self.made(2)
+        self.acceptor = self.made(2)
         self.assertEqual(self.claim(place(11), counter=1), ReplyKind.OUTBID)
-        self.assertEqual(len(self.seat), 4)
+        self.assertEqual(len(self.acceptor), 4)
 
     def test_unsettled(self) -> None:
         """An accepted take without an outcome is listed after a while, until it is settled or its tuple is removed."""
@@ -159,25 +165,25 @@ class SeatTests(SynchronousTestCase):
             self.store.put(tuple_record(place(number)), 999.0)
             self.claim(place(number))
             self.confirm(place(number))
-        self.assertEqual(self.seat.list_unfinished(), [])
+        self.assertEqual(self.acceptor.list_unfinished(), [])
         self.store.put(record(place(2).name, None, 2), 999.0)
         self.clock.advance(4.0)
-        self.assertEqual([posted.tuple_id for posted in self.seat.list_unfinished()], [place(1), place(3)])
-        self.assertEqual(self.seat.list_unfinished(), [])
-        self.seat.finish(place(3))
+        self.assertEqual([stored.tuple_id for stored in self.acceptor.list_unfinished()], [place(1), place(3)])
+        self.assertEqual(self.acceptor.list_unfinished(), [])
+        self.acceptor.finish(place(3))
         self.clock.advance(4.0)
-        self.assertEqual([posted.tuple_id for posted in self.seat.list_unfinished()], [place(1)])
-        self.seat = self.made(2)
-        self.seat.load()
+        self.assertEqual([stored.tuple_id for stored in self.acceptor.list_unfinished()], [place(1)])
+        self.acceptor = self.made(2)
+        self.acceptor.load()
         self.clock.advance(4.0)
-        self.assertIn(place(1), [posted.tuple_id for posted in self.seat.list_unfinished()])
+        self.assertIn(place(1), [stored.tuple_id for stored in self.acceptor.list_unfinished()])
 
     def test_answers_wait_for_the_disk(self) -> None:
         """A vote is sent only after the store has written it."""
         disk: Deferred[None] = Deferred()
-        self.seat.wait_for_write = lambda: disk
-        life = self.seat.incarnation
-        answer: Any = self.seat.answer_claim(PEER, KEY, [place(1).pack()], life, 1, b"a", 1.0)
+        self.acceptor.wait_for_write = lambda: disk
+        incarnation = self.acceptor.incarnation
+        answer: Any = self.acceptor.answer_claim(PEER, KEY, [place(1).pack()], incarnation, 1, b"a", 1.0)
         self.assertNoResult(answer)
         disk.callback(None)
         self.assertEqual(self._kind(self.successResultOf(answer), Event.PREPARE), ReplyKind.GRANTED)
@@ -189,7 +195,7 @@ class SeatTests(SynchronousTestCase):
         self.assertEqual(self.claim(place(1), 2, b"b"), ReplyKind.HELD)
         self.clock.advance(1.0)
         self.assertEqual(self.claim(place(1), 2, b"b"), ReplyKind.GRANTED)
-        told = self.seat.answer_claim(PEER, KEY, [place(1).pack()], self.seat.incarnation, 3, b"b", 1.0)
+        told = self.acceptor.answer_claim(PEER, KEY, [place(1).pack()], self.acceptor.incarnation, 3, b"b", 1.0)
         reply = unpack_reply(told[0], Event.PREPARE)  # type: ignore[index]
         assert reply is not None
         self.assertEqual((reply.accepted, reply.value), (Ballot(1, b"a"), b"a"))
@@ -212,7 +218,7 @@ class SeatTests(SynchronousTestCase):
         CODEC.unpack(noise)
 
 
-class PostingTests(SynchronousTestCase):
+class TupleRecordTests(SynchronousTestCase):
     def test_round_trip(self) -> None:
         """A tuple and the note of its taking survive encoding and decoding."""
         council = (Member(PEER, b"i" * 8),)
@@ -223,17 +229,17 @@ class PostingTests(SynchronousTestCase):
     def test_standing(self) -> None:
         """A taken tuple is no longer available; another tuple in the same slot is."""
         note = record("n", pack_taken(place(1), b"taker"))
-        posted, taken = parse_records([tuple_record(place(1)), tuple_record(place(2)), note])
-        self.assertEqual([one.tuple_id for one in posted], [place(2)])
+        stored, taken = parse_records([tuple_record(place(1)), tuple_record(place(2)), note])
+        self.assertEqual([one.tuple_id for one in stored], [place(2)])
         self.assertEqual(list(taken), [place(1)])
         newer = TupleId(KEY, ME.public, place(1).name, b"another!")
         reader = RecordParser()
         for _ in range(2):
-            posted, _ = reader.parse([tuple_record(newer, 2), note])
-            self.assertEqual([one.tuple_id for one in posted], [newer])
+            stored, _ = reader.parse([tuple_record(newer, 2), note])
+            self.assertEqual([one.tuple_id for one in stored], [newer])
 
     def test_unlawful(self) -> None:
-        """A record that is not a posting decodes to None."""
+        """A record that is not a tuple record decodes to None."""
         member = [*PEER.pack(), b"i" * 8]
         for fields in (
             [1, b"short", ["x"], [member]], [1, b"m" * 8, [], [member]], [1, b"m" * 8, ["x"], []],
@@ -248,7 +254,7 @@ class PostingTests(SynchronousTestCase):
     @settings(max_examples=300)
     @given(foreign=FOREIGN, noise=st.binary(max_size=60))
     def test_total(self, foreign: Any, noise: bytes) -> None:
-        """Any record decodes to a posting or None, without an exception."""
+        """Any record decodes to a stored tuple or None, without an exception."""
         self.assertIsInstance(parse_record(record("t", noise)), StoredTuple | TakenNote | None)
         for fields in (foreign, [1, b"m" * 8, foreign, [foreign]], [1, b"m" * 8, ["x"], foreign], [2, foreign, b"t"]):
             try:
@@ -265,9 +271,11 @@ class ResolveTests(SynchronousTestCase):
     def setUp(self) -> None:
         self.clock, self.rng = HeapClock(), random.Random(1)
         self.contacts = [Contact(Identity(bytes([n]) * 32).public, Address("10.0.0.1", 7000 + n)) for n in range(3)]
-        self.seats = [TakeAcceptor(Exposed(), MemoryStore(), self.clock, self.rng) for _ in range(3)]
-        pairs = zip(self.contacts, self.seats, strict=True)
-        self.posted = StoredTuple(place(1), ("x",), tuple(Member(contact, seat.incarnation) for contact, seat in pairs))
+        self.acceptors = [TakeAcceptor(Exposed(), MemoryStore(), self.clock, self.rng) for _ in range(3)]
+        pairs = zip(self.contacts, self.acceptors, strict=True)
+        self.stored = StoredTuple(
+            place(1), ("x",), tuple(Member(contact, acceptor.incarnation) for contact, acceptor in pairs)
+        )
         self.silent: set[int] = set()
         self.council = TakeProposer(self.ask, self.clock, self.rng, Background(self.clock))
 
@@ -275,18 +283,18 @@ class ResolveTests(SynchronousTestCase):
         number = self.contacts.index(contact)
         if number in self.silent:
             return fail(NoAnswer("it is silent"))
-        return maybeDeferred(getattr(self.seats[number], method.replace("decree.", "answer_")), PEER, *arguments)
+        return maybeDeferred(getattr(self.acceptors[number], method.replace("decree.", "answer_")), PEER, *arguments)
 
     def begin(self, number: int, counter: int, taker: bytes) -> None:
         """Let one member accept a take, as if the taker failed afterwards."""
-        seat = self.seats[number]
+        acceptor = self.acceptors[number]
         places: list[object] = [place(1).pack()]
-        seat.answer_claim(PEER, KEY, places, seat.incarnation, counter, taker, 1.0)
-        seat.answer_confirm(PEER, KEY, places, seat.incarnation, counter, taker, taker)
+        acceptor.answer_claim(PEER, KEY, places, acceptor.incarnation, counter, taker, 1.0)
+        acceptor.answer_confirm(PEER, KEY, places, acceptor.incarnation, counter, taker, taker)
 
     def resolve(self, value: bytes | None) -> bytes | None:
         found: list[bytes | None] = []
-        Deferred.fromCoroutine(self.council.resolve(self.posted, OWN, value)).addCallback(found.append)
+        Deferred.fromCoroutine(self.council.resolve(self.stored, OWN, value)).addCallback(found.append)
         self.clock.advance(30.0)
         return found[0]
 

@@ -48,7 +48,7 @@ class SpaceCase(FleetCase):
 
     def called_up(self, node: EntangledNode, answer: Callable[..., object]) -> None:
         """Let ``node`` give this reply to an invitation to a council."""
-        node.take_acceptor.load()  # otherwise the seat would register its method later
+        node.take_acceptor.load()  # otherwise the acceptor would register its method later
         node.endpoint.expose("decree.enrol", answer)
 
     def moment(self, fleet: EntangledTeam, work: Deferred[Any]) -> list[float]:
@@ -308,7 +308,7 @@ class ClaimTests(SpaceCase):
     def test_get_behind_another_call_of_the_same_node(self) -> None:
         """A blocked get takes a tuple after another call of the same node tried to take it and failed."""
         fleet, (a, b, c) = self.spaces(3)
-        b.read(("bell", int)).addErrback(lambda failure: failure.trap(NotRunning))  # keeps the shelf of b open
+        b.read(("bell", int)).addErrback(lambda failure: failure.trap(NotRunning))  # keeps the tuple cache of b open
         self.done(fleet, a.put(("job", 1)), 1.0)
         self._claimed(fleet, c, lease=4.0)
         at_once, waiting = b.get_if_exists(("job", ANY)), b.get(("job", ANY))

@@ -11,8 +11,8 @@ from tests.middleware.consensus.lease.test_lease_codec import MEMBERS
 class VacancyTests(SynchronousTestCase):
     def filled(self, council: str, silent: str, candidates: str, size: int = 3) -> str | None:
         """Return the next council, with its members by number."""
-        seats, gone, others = ([MEMBERS[int(number)] for number in group] for group in (council, silent, candidates))
-        following = choose_successors(seats, gone, others, size)
+        members, gone, others = ([MEMBERS[int(number)] for number in group] for group in (council, silent, candidates))
+        following = choose_successors(members, gone, others, size)
         return None if following is None else "".join(str(MEMBERS.index(member)) for member in following)
 
     def test_silent_members_are_replaced(self) -> None:

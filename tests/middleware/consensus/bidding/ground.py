@@ -40,10 +40,10 @@ def rule() -> MergeRule:
     return MergeRule(Nearest())
 
 
-def party(
+def make_participant(
     place: int, auction: Auction = AUCTION, seed: int = 1, on_summary: OnSummary = lambda reports: None
 ) -> Participant:
-    """Return the party of the node at ``place``, which knows all other nodes."""
+    """Return the participant of the node at ``place``, which knows all other nodes."""
     others = [contact for contact in CONTACTS if contact is not CONTACTS[place]]
     dice = random.Random(f"{seed}/{place}")
     return Participant(auction, CONTACTS[place], rule(), lambda: others, dice, AGENTS[place].sign, on_summary)

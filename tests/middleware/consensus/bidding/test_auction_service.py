@@ -68,8 +68,8 @@ class AuctionCase(FleetCase):
         return self.done(fleet, asked)
 
 
-class DisseminationTests(AuctionCase):
-    """Tests of ``SwarmNode.bidding``."""
+class AuctionServiceTests(AuctionCase):
+    """Tests of ``SwarmNode.start_bidding``."""
 
     def test_all_agree(self) -> None:
         """After the waiting period every bidder has the same reports, the cheapest first."""
@@ -205,9 +205,9 @@ class HostileTests(AuctionCase):
         forged = Announcement(99, 0, (AnnouncedReport(Report(liar.uuid, 0.0)),)).sign(
             liar.entangled.identity.sign, auction
         )
-        party = next(iter(node.auction_service._participants))
+        bidder = next(iter(node.auction_service._participants))
         with self.assertRaises(Refused):
-            node.auction_service._process_announcement(party, forged.pack())
+            node.auction_service._process_announcement(bidder, forged.pack())
 
     def test_bids_for_others(self) -> None:
         """An offer with a bid that its agent did not sign for this auction is refused completely."""
@@ -238,9 +238,9 @@ class HostileTests(AuctionCase):
         self.assertEqual(len(list(victim.auction_service._participants)), 0)
         answer = self.ask(fleet, viewer, victim, "bid.offer", auction.pack(), bids, 0, False)
         self.assertNotIsInstance(answer, Refused)
-        party = next(iter(victim.auction_service._participants))
-        self.assertIsNone(party.summary.get(viewer.uuid))
-        self.assertIsNotNone(party.summary.get(good.uuid))
+        bidder = next(iter(victim.auction_service._participants))
+        self.assertIsNone(bidder.summary.get(viewer.uuid))
+        self.assertIsNotNone(bidder.summary.get(good.uuid))
 
     def test_nonsense(self) -> None:
         """Invalid arguments are refused in one line with the reason, and change nothing."""

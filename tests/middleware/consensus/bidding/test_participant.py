@@ -34,18 +34,18 @@ from tests.middleware.consensus.bidding.ground import (
     COUNCIL,
     announced,
     bid,
-    party,
+    make_participant,
 )
 
 
-def offers(errands: list[OutgoingMessage]) -> list[Offer]:
-    """Return the offers among ``errands``."""
-    return [errand for errand in errands if isinstance(errand, Offer)]
+def offers(messages: list[OutgoingMessage]) -> list[Offer]:
+    """Return the offers among ``messages``."""
+    return [message for message in messages if isinstance(message, Offer)]
 
 
-def notices(errands: list[OutgoingMessage]) -> list[Notice]:
-    """Return the notices among ``errands``."""
-    return [errand for errand in errands if isinstance(errand, Notice)]
+def notices(messages: list[OutgoingMessage]) -> list[Notice]:
+    """Return the notices among ``messages``."""
+    return [message for message in messages if isinstance(message, Notice)]
 
 
 class RouteTests(SynchronousTestCase):
@@ -73,12 +73,12 @@ class RouteTests(SynchronousTestCase):
         self.assertEqual(find_hops(auction, far.node_id, CONTACTS), [member, CONTACTS[11]])
 
 
-class ScaleTests(SynchronousTestCase):
+class PathChoiceTests(SynchronousTestCase):
     def test_goes_over_once(self) -> None:
         """The choice between direct bids and the tree has a hysteresis."""
-        scale = PathChoice()
-        ways = [
-            scale.choose(n)
+        path_choice = PathChoice()
+        paths = [
+            path_choice.choose(n)
             for n in (
                 1,
                 MAX_DIRECT_BIDDERS,
@@ -88,8 +88,8 @@ class ScaleTests(SynchronousTestCase):
                 MIN_TREE_BIDDERS - 1,
             )
         ]
-        self.assertEqual(ways, [DIRECT, DIRECT, TREE, TREE, TREE, DIRECT])
-        self.assertEqual(scale.choose(MAX_DIRECT_BIDDERS), DIRECT)
+        self.assertEqual(paths, [DIRECT, DIRECT, TREE, TREE, TREE, DIRECT])
+        self.assertEqual(path_choice.choose(MAX_DIRECT_BIDDERS), DIRECT)
 
     def test_team_size(self) -> None:
         """A small team is counted; the size of a large team is estimated from the density of the nearest nodes."""
@@ -108,102 +108,102 @@ class ScaleTests(SynchronousTestCase):
         self.assertEqual(estimate_team_size(own, newcomer[: NEAREST_CONTACTS - 1], True), NEAREST_CONTACTS)
 
 
-class AudienceTests(SynchronousTestCase):
+class RecipientsTests(SynchronousTestCase):
     def test_told_once(self) -> None:
         """A listener receives each announcement once; after losses it is repeated with increasing pauses."""
-        audience = Recipients()
-        audience.add(CONTACTS[5])
+        recipients = Recipients()
+        recipients.add(CONTACTS[5])
         one = announced(1, 0)
-        [notice] = audience.take_due_notices(one, True, 0.0)
-        self.assertEqual(audience.take_due_notices(one, True, 0.0), [])
+        [notice] = recipients.take_due_notices(one, True, 0.0)
+        self.assertEqual(recipients.take_due_notices(one, True, 0.0), [])
         now = 0.0
         for pause in RETRY_PAUSES_S:
-            audience.on_failure(notice, now)
-            self.assertEqual(audience.compute_due(one, True), now + pause)
+            recipients.on_failure(notice, now)
+            self.assertEqual(recipients.compute_due(one, True), now + pause)
             now += pause
-            [notice] = audience.take_due_notices(one, True, now)
-        audience.on_failure(notice, now)
-        self.assertEqual(audience.compute_due(one, True), math.inf)
-        self.assertEqual(audience.take_due_notices(one, True, 1e9), [])
-        audience.add(CONTACTS[5])
-        [notice] = audience.take_due_notices(one, True, now)
-        audience.on_answer(notice)
-        self.assertEqual(audience.take_due_notices(one, True, now), [])
-        self.assertEqual(len(audience.take_due_notices(announced(2, 0), True, now)), 1)
+            [notice] = recipients.take_due_notices(one, True, now)
+        recipients.on_failure(notice, now)
+        self.assertEqual(recipients.compute_due(one, True), math.inf)
+        self.assertEqual(recipients.take_due_notices(one, True, 1e9), [])
+        recipients.add(CONTACTS[5])
+        [notice] = recipients.take_due_notices(one, True, now)
+        recipients.on_answer(notice)
+        self.assertEqual(recipients.take_due_notices(one, True, now), [])
+        self.assertEqual(len(recipients.take_due_notices(announced(2, 0), True, now)), 1)
 
     def test_shared_listeners(self) -> None:
         """A bidder that sent to the whole council receives an announcement only from the member that made it."""
-        audience = Recipients()
-        audience.add(CONTACTS[5], is_shared=True)
-        self.assertEqual(audience.take_due_notices(announced(1, 1), False, 0.0), [])
-        self.assertEqual(len(audience.take_due_notices(announced(1, 1), True, 0.0)), 1)
+        recipients = Recipients()
+        recipients.add(CONTACTS[5], is_shared=True)
+        self.assertEqual(recipients.take_due_notices(announced(1, 1), False, 0.0), [])
+        self.assertEqual(len(recipients.take_due_notices(announced(1, 1), True, 0.0)), 1)
 
     def test_room(self) -> None:
         """The oldest listener is removed if there are too many."""
-        audience = Recipients()
+        recipients = Recipients()
         for number in range(MAX_RECIPIENTS + 1):
-            audience.add(Contact(number.to_bytes(32), Address("10.0.0.1", 1)))
-        self.assertEqual(len(audience), MAX_RECIPIENTS)
+            recipients.add(Contact(number.to_bytes(32), Address("10.0.0.1", 1)))
+        self.assertEqual(len(recipients), MAX_RECIPIENTS)
 
 
 class BidderTests(SynchronousTestCase):
     def setUp(self) -> None:
         self.told: list[list[float]] = []
-        self.party = party(5, on_summary=lambda reports: self.told.append([r.cost for r in reports]))
+        self.participant = make_participant(5, on_summary=lambda reports: self.told.append([r.cost for r in reports]))
 
     def test_direct(self) -> None:
         """In a small team a bid is sent to each member of the council, and repeated if it is not confirmed."""
-        self.party.make_bid(bid(5, 2.0), DIRECT, 0.0)
-        sent = offers(self.party.take_due_messages(0.0))
+        self.participant.make_bid(bid(5, 2.0), DIRECT, 0.0)
+        sent = offers(self.participant.take_due_messages(0.0))
         self.assertEqual([offer.to for offer in sent], list(COUNCIL))
         self.assertTrue(all(offer.is_shared for offer in sent))
-        self.party.on_answer(sent[0], 0.1)
-        self.party.on_answer(sent[1], 0.1)
-        self.party.on_failure(sent[2], 0.4)
-        again = offers(self.party.take_due_messages(self.party.due))
+        self.participant.on_answer(sent[0], 0.1)
+        self.participant.on_answer(sent[1], 0.1)
+        self.participant.on_failure(sent[2], 0.4)
+        again = offers(self.participant.take_due_messages(self.participant.due))
         self.assertEqual([offer.to for offer in again], [COUNCIL[2]])
 
     def test_new_bid_while_the_old_one_is_under_way(self) -> None:
         """A confirmation applies to the bid that was sent, not to a newer one."""
-        self.party.make_bid(bid(5, 2.0), DIRECT, 0.0)
-        sent = offers(self.party.take_due_messages(0.0))
-        self.party.make_bid(bid(5, 1.0, 1), DIRECT, 0.01)
+        self.participant.make_bid(bid(5, 2.0), DIRECT, 0.0)
+        sent = offers(self.participant.take_due_messages(0.0))
+        self.participant.make_bid(bid(5, 1.0, 1), DIRECT, 0.01)
         for offer in sent:
-            self.party.on_answer(offer, 0.1)
-        newer = offers(self.party.take_due_messages(0.1))
+            self.participant.on_answer(offer, 0.1)
+        newer = offers(self.participant.take_due_messages(0.1))
         self.assertEqual([offer.bids[0].revision for offer in newer], [1, 1, 1])
 
     def test_own_bid_beats_what_is_announced(self) -> None:
         """A bidder with a better bid than the announced one sends it directly within half a waiting period."""
-        self.party.make_bid(bid(5, 2.0), TREE, 0.0)
-        self.party.on_announcement(announced(1, 0, bid(6, 3.0)), 0.6)
-        due = self.party.due
-        self.party._tree_node._send_at = math.inf
-        self.assertTrue(0.6 <= self.party.due <= 0.6 + AUCTION.waiting_period / 2, due)
-        [straight] = [o for o in offers(self.party.take_due_messages(self.party.due)) if o.is_inquiry]
+        self.participant.make_bid(bid(5, 2.0), TREE, 0.0)
+        self.participant.on_announcement(announced(1, 0, bid(6, 3.0)), 0.6)
+        due = self.participant.due
+        self.participant._tree_node._send_at = math.inf
+        self.assertTrue(0.6 <= self.participant.due <= 0.6 + AUCTION.waiting_period / 2, due)
+        [straight] = [o for o in offers(self.participant.take_due_messages(self.participant.due)) if o.is_inquiry]
         self.assertEqual((straight.to, straight.bids), (COUNCIL[0], (bid(5, 2.0),)))
 
     def test_own_bid_that_does_not_matter(self) -> None:
         """A bidder with a worse bid than the announced one does not contact the council."""
-        self.party.make_bid(bid(5, 4.0), TREE, 0.0)
-        self.party.on_announcement(announced(1, 0, bid(6, 3.0)), 0.6)
+        self.participant.make_bid(bid(5, 4.0), TREE, 0.0)
+        self.participant.on_announcement(announced(1, 0, bid(6, 3.0)), 0.6)
         self.assertEqual(
-            [o for t in range(10) for o in offers(self.party.take_due_messages(float(t))) if o.is_inquiry], []
+            [o for t in range(10) for o in offers(self.participant.take_due_messages(float(t))) if o.is_inquiry], []
         )
 
     def test_silence(self) -> None:
         """A bidder that receives no announcement queries the council members in turn."""
-        self.party.make_bid(bid(5, 2.0), TREE, 0.0)
+        self.participant.make_bid(bid(5, 2.0), TREE, 0.0)
         asked: list[Contact] = []
         now = 0.0
         for _ in range(20):
-            now = max(now, min(self.party.due, 5.0))
-            for offer in offers(self.party.take_due_messages(now)):
+            now = max(now, min(self.participant.due, 5.0))
+            for offer in offers(self.participant.take_due_messages(now)):
                 if offer.is_inquiry:
                     asked.append(offer.to)
-                    self.party.on_failure(offer, now)
+                    self.participant.on_failure(offer, now)
                 else:
-                    self.party.on_answer(offer, now)
+                    self.participant.on_answer(offer, now)
             if len(asked) == 4:
                 break
         self.assertEqual(asked, [*COUNCIL, COUNCIL[0]])
@@ -211,42 +211,42 @@ class BidderTests(SynchronousTestCase):
 
     def test_taken_back_but_still_announced(self) -> None:
         """A bidder sends its withdrawal again while the council still announces its bid."""
-        self.party.make_bid(bid(5, 2.0), DIRECT, 0.0)
-        for offer in offers(self.party.take_due_messages(0.0)):
-            self.party.on_answer(offer, 0.0)
-        self.party.make_bid(bid(5, None, 1), DIRECT, 0.1)
-        for offer in offers(self.party.take_due_messages(0.1)):
-            self.party.on_failure(offer, 0.1)
-        self.party.on_announcement(announced(1, 0, bid(5, 2.0)), 0.6)
-        sent = [offer for offer in offers(self.party.take_due_messages(2.0)) if offer.is_inquiry]
+        self.participant.make_bid(bid(5, 2.0), DIRECT, 0.0)
+        for offer in offers(self.participant.take_due_messages(0.0)):
+            self.participant.on_answer(offer, 0.0)
+        self.participant.make_bid(bid(5, None, 1), DIRECT, 0.1)
+        for offer in offers(self.participant.take_due_messages(0.1)):
+            self.participant.on_failure(offer, 0.1)
+        self.participant.on_announcement(announced(1, 0, bid(5, 2.0)), 0.6)
+        sent = [offer for offer in offers(self.participant.take_due_messages(2.0)) if offer.is_inquiry]
         self.assertEqual([offer.bids for offer in sent], [(bid(5, None, 1),)])
 
     def test_bid_of_a_former_life(self) -> None:
         """A restarted bidder learns its last revision from the announcement."""
-        self.party.make_bid(bid(5, 9.0), DIRECT, 0.0)
-        self.party.on_announcement(announced(1, 0, bid(5, 1.0, 7)), 0.6)
-        self.assertTrue(self.party.is_superseded)
-        self.party.make_bid(bid(5, 9.0, self.party.next_revision), DIRECT, 0.6)
-        self.assertFalse(self.party.is_superseded)
-        self.assertGreater(self.party.next_revision, 8)
+        self.participant.make_bid(bid(5, 9.0), DIRECT, 0.0)
+        self.participant.on_announcement(announced(1, 0, bid(5, 1.0, 7)), 0.6)
+        self.assertTrue(self.participant.is_superseded)
+        self.participant.make_bid(bid(5, 9.0, self.participant.next_revision), DIRECT, 0.6)
+        self.assertFalse(self.participant.is_superseded)
+        self.assertGreater(self.participant.next_revision, 8)
 
     def test_later_announcements(self) -> None:
         """Only an announcement with precedence is reported, in any order of arrival, and none is reported twice."""
         for announcement in (announced(2, 0, bid(6, 1.0)), announced(1, 0, bid(7, 0.5)), announced(2, 1, bid(8, 0.2))):
-            self.party.on_announcement(announcement, 1.0)
-        self.party.on_announcement(announced(3, 1, bid(6, 1.0)), 1.0)
+            self.participant.on_announcement(announcement, 1.0)
+        self.participant.on_announcement(announced(3, 1, bid(6, 1.0)), 1.0)
         self.assertEqual(self.told, [[1.0]])
 
 
-class BranchTests(SynchronousTestCase):
+class TreeNodeTests(SynchronousTestCase):
     def setUp(self) -> None:
-        self.party = party(5)
+        self.participant = make_participant(5)
 
     def test_one_message_for_many(self) -> None:
         """Bids from several children within the wait are sent in one offer to one contact nearer to the key."""
         for place in (6, 7, 8):
-            self.party.on_offer([bid(place, float(place))], CONTACTS[place], 0.0, False, 0.0)
-        [up] = offers(self.party.take_due_messages(self.party.due))
+            self.participant.on_offer([bid(place, float(place))], CONTACTS[place], 0.0, False, 0.0)
+        [up] = offers(self.participant.take_due_messages(self.participant.due))
         self.assertEqual([b.agent for b in up.bids], sorted(AGENTS[place].node_id.hex() for place in (6, 7, 8)))
         self.assertEqual(up.to, find_hops(AUCTION, CONTACTS[5].node_id, CONTACTS)[0])
 
@@ -254,7 +254,7 @@ class BranchTests(SynchronousTestCase):
         """Nodes nearer to the key wait longer for their children, up to half the waiting period."""
         waits = []
         for contact in sorted(CONTACTS[3:], key=lambda c: count_shared_bits(c.node_id, AUCTION.key)):
-            one = party(CONTACTS.index(contact))
+            one = make_participant(CONTACTS.index(contact))
             one.on_offer([bid(6, 1.0)], CONTACTS[6], 0.0, False, 0.0)
             waits.append(one.due)
         self.assertEqual(waits, sorted(waits))
@@ -263,57 +263,57 @@ class BranchTests(SynchronousTestCase):
 
     def test_next_nearest(self) -> None:
         """If the parent does not answer, bids are sent to the next nearest contact, and finally to the council."""
-        self.party.on_offer([bid(6, 1.0)], CONTACTS[6], 0.0, False, 0.0)
+        self.participant.on_offer([bid(6, 1.0)], CONTACTS[6], 0.0, False, 0.0)
         expected = find_hops(AUCTION, CONTACTS[5].node_id, [c for c in CONTACTS if c is not CONTACTS[5]])
         self.assertEqual(len(expected), 4 + len(COUNCIL))
         asked = []
         for _ in expected:
-            [up] = [o for o in offers(self.party.take_due_messages(self.party.due)) if not o.is_inquiry]
+            [up] = [o for o in offers(self.participant.take_due_messages(self.participant.due)) if not o.is_inquiry]
             asked.append(up.to)
-            self.party.on_failure(up, 0.3)
+            self.participant.on_failure(up, 0.3)
         self.assertEqual(asked, expected)
 
     def test_confirmed_is_not_sent_again(self) -> None:
         """Only bids that the parent lacks are sent; a duplicate from a child sends nothing."""
-        self.party.on_offer([bid(6, 1.0)], CONTACTS[6], 0.0, False, 0.0)
-        [up] = offers(self.party.take_due_messages(self.party.due))
-        self.party.on_answer(up, 0.2)
-        self.party.on_offer([bid(6, 1.0)], CONTACTS[6], 0.0, False, 0.3)
-        self.party.on_offer([bid(7, 0.5)], CONTACTS[7], 0.0, False, 0.3)
-        [more] = offers(self.party.take_due_messages(self.party.due))
+        self.participant.on_offer([bid(6, 1.0)], CONTACTS[6], 0.0, False, 0.0)
+        [up] = offers(self.participant.take_due_messages(self.participant.due))
+        self.participant.on_answer(up, 0.2)
+        self.participant.on_offer([bid(6, 1.0)], CONTACTS[6], 0.0, False, 0.3)
+        self.participant.on_offer([bid(7, 0.5)], CONTACTS[7], 0.0, False, 0.3)
+        [more] = offers(self.participant.take_due_messages(self.participant.due))
         self.assertEqual([b.report and b.report.cost for b in more.bids], [0.5])
 
     def test_announcement_goes_down(self) -> None:
         """Each child receives the announcement, a late child in the answer to its offer."""
         for place in (6, 7):
-            self.party.on_offer([bid(place, 1.0)], CONTACTS[place], 0.0, False, 0.0)
+            self.participant.on_offer([bid(place, 1.0)], CONTACTS[place], 0.0, False, 0.0)
         word = announced(1, 0, bid(6, 1.0))
-        self.party.on_announcement(word, 0.6)
-        self.assertEqual([n.to for n in notices(self.party.take_due_messages(0.6))], [CONTACTS[6], CONTACTS[7]])
-        self.assertIs(self.party.on_offer([bid(8, 9.0)], CONTACTS[8], 0.0, False, 0.7), word)
-        self.assertEqual(notices(self.party.take_due_messages(0.7)), [])
+        self.participant.on_announcement(word, 0.6)
+        self.assertEqual([n.to for n in notices(self.participant.take_due_messages(0.6))], [CONTACTS[6], CONTACTS[7]])
+        self.assertIs(self.participant.on_offer([bid(8, 9.0)], CONTACTS[8], 0.0, False, 0.7), word)
+        self.assertEqual(notices(self.participant.take_due_messages(0.7)), [])
 
     def test_relay_asks_for_those_behind(self) -> None:
         """A relay queries the council for its children if no announcement arrives, up to a limit."""
-        self.party.on_offer([bid(6, 1.0)], CONTACTS[6], 0.0, False, 0.0)
+        self.participant.on_offer([bid(6, 1.0)], CONTACTS[6], 0.0, False, 0.0)
         straight = 0
         for step in range(600):
-            for offer in offers(self.party.take_due_messages(step * 0.1)):
+            for offer in offers(self.participant.take_due_messages(step * 0.1)):
                 straight += offer.is_inquiry
-                self.party.on_answer(offer, step * 0.1)
+                self.participant.on_answer(offer, step * 0.1)
         self.assertEqual(straight, MAX_RELAY_REQUESTS)
 
     def test_the_council_hears_everybody(self) -> None:
         """A council member accepts any number of children, because they have no other destination."""
-        member = party(0)
+        member = make_participant(0)
         for number in range(MAX_CHILDREN + 1):
             member.on_offer([], Contact(number.to_bytes(32), Address("10.0.0.1", 1)), 0.0, False, 0.0)
         self.assertTrue(member.has_room(CONTACTS[6]))
 
 
-class TellerTests(SynchronousTestCase):
+class AnnouncerTests(SynchronousTestCase):
     def setUp(self) -> None:
-        self.first, self.second = party(0), party(1)
+        self.first, self.second = make_participant(0), make_participant(1)
 
     def take(
         self, member: Participant, place: int, cost: float | None, now: float, revision: int = 0, shared: bool = True
@@ -348,7 +348,7 @@ class TellerTests(SynchronousTestCase):
         self.second.take_due_messages(self.second.due)
         assert self.second.announcement is not None
         self.assertEqual(self.second.announcement.precedence, (1, -1))
-        third = party(2)
+        third = make_participant(2)
         self.take(third, 5, 2.0, 0.0)
         third.on_announcement(announced(1, 0, bid(5, 2.0)), 0.5)
         third.take_due_messages(5.0)
@@ -381,26 +381,26 @@ class TellerTests(SynchronousTestCase):
 class FloodTests(SynchronousTestCase):
     def cut_off(self, auction: Auction) -> list[OutgoingMessage]:
         """Return the messages of a bidder that cannot reach the council."""
-        one = party(5, auction)
+        one = make_participant(5, auction)
         one.make_bid(bid(5, 2.0, auction=auction), DIRECT, 0.0)
         sent: list[OutgoingMessage] = []
         for step in range(40):
-            for errand in one.take_due_messages(step * 0.1):
-                sent.append(errand)
-                if isinstance(errand, Offer):
-                    one.on_failure(errand, step * 0.1)
+            for message in one.take_due_messages(step * 0.1):
+                sent.append(message)
+                if isinstance(message, Offer):
+                    one.on_failure(message, step * 0.1)
         return sent
 
     def test_only_best_effort(self) -> None:
         """If no council member answers, bids are flooded to eight neighbours, except those for an exclusive task."""
-        cries = [e for e in self.cut_off(BEST_EFFORT) if isinstance(e, FloodedBids)]
-        self.assertEqual(len({cry.to.node_id for cry in cries}), 8)
+        floods = [e for e in self.cut_off(BEST_EFFORT) if isinstance(e, FloodedBids)]
+        self.assertEqual(len({flood.to.node_id for flood in floods}), 8)
         self.assertEqual([e for e in self.cut_off(AUCTION) if isinstance(e, FloodedBids)], [])
 
     def test_each_change_once(self) -> None:
         """A node forwards flooded bids once, and reports them at the end of the waiting period."""
         told: list[list[float]] = []
-        one = party(5, BEST_EFFORT, on_summary=lambda reports: told.append([r.cost for r in reports]))
+        one = make_participant(5, BEST_EFFORT, on_summary=lambda reports: told.append([r.cost for r in reports]))
         one.on_flood([bid(6, 1.0, auction=BEST_EFFORT)], CONTACTS[6], 0.0)
         self.assertEqual(len(one.take_due_messages(0.0)), 8)
         one.on_flood([bid(6, 1.0, auction=BEST_EFFORT)], CONTACTS[7], 0.1)
@@ -410,30 +410,30 @@ class FloodTests(SynchronousTestCase):
         self.assertEqual(told, [[1.0]])
 
 
-class PartiesTests(SynchronousTestCase):
+class ParticipantTableTests(SynchronousTestCase):
     def made(self, number: int) -> Participant:
         """Return a party in one of many auctions."""
-        return party(5, Auction(f"job {number}", 1, COUNCIL))
+        return make_participant(5, Auction(f"job {number}", 1, COUNCIL))
 
     def test_whoever_opens_most_makes_room(self) -> None:
         """A peer that invents auctions displaces its own parties; other peers' parties stay."""
-        parties = ParticipantTable()
+        participants = ParticipantTable()
         own, honest = self.made(0), self.made(1)
-        parties.add(own, OWN_OPENER, 0.0)
-        parties.add(honest, b"honest", 0.0)
+        participants.add(own, OWN_OPENER, 0.0)
+        participants.add(honest, b"honest", 0.0)
         for number in range(2, MAX_PARTICIPANTS + 50):
-            parties.add(self.made(number), b"liar", 1.0)
-        self.assertEqual(len(parties), MAX_PARTICIPANTS)
-        self.assertIs(parties.get(own.auction.digest), own)
-        self.assertIs(parties.get(honest.auction.digest), honest)
+            participants.add(self.made(number), b"liar", 1.0)
+        self.assertEqual(len(participants), MAX_PARTICIPANTS)
+        self.assertIs(participants.get(own.auction.digest), own)
+        self.assertIs(participants.get(honest.auction.digest), honest)
 
     def test_idle_ones_are_forgotten(self) -> None:
         """An idle party is removed when another is added; the parties of this node stay."""
-        parties = ParticipantTable()
+        participants = ParticipantTable()
         own, old, busy = self.made(0), self.made(1), self.made(2)
-        parties.add(own, OWN_OPENER, 0.0)
-        parties.add(old, b"peer", 0.0)
-        parties.add(busy, b"peer", 0.0)
-        parties.touch(busy.auction.digest, MAX_IDLE_S)
-        self.assertEqual(parties.add(self.made(3), b"peer", MAX_IDLE_S + 1.0), [old])
-        self.assertEqual(len(parties), 3)
+        participants.add(own, OWN_OPENER, 0.0)
+        participants.add(old, b"peer", 0.0)
+        participants.add(busy, b"peer", 0.0)
+        participants.touch(busy.auction.digest, MAX_IDLE_S)
+        self.assertEqual(participants.add(self.made(3), b"peer", MAX_IDLE_S + 1.0), [old])
+        self.assertEqual(len(participants), 3)

@@ -1,4 +1,4 @@
-"""Tests of ``middleware.consensus.bidding.reporters``: the reporters of a large group, and the times of their records."""
+"""Tests of ``middleware.consensus.bidding.reporters``: the reporters of a large group, and when they write records."""
 
 from __future__ import annotations
 
@@ -26,89 +26,91 @@ ME = Member("me", "dog", SEARCHING)
 OTHERS = {f"other{n}" for n in range(ENOUGH_RECORDS)}
 
 
-class PanelTests(SynchronousTestCase):
+class ReportersTests(SynchronousTestCase):
     def setUp(self) -> None:
-        self.panel = Reporters("me", 0.5)
-        self.panel.on_records((), MANY, 0.0)
+        self.reporters = Reporters("me", 0.5)
+        self.reporters.on_records((), MANY, 0.0)
         self.turn = LISTENING_S + 0.5 * MANY * TURN_SPACING_S
 
     def full(self) -> None:
         """Let enough records exist."""
-        self.panel.on_records(OTHERS, MANY, 0.1)
+        self.reporters.on_records(OTHERS, MANY, 0.1)
 
     def test_all_write_in_a_small_team(self) -> None:
-        """Up to ``MOST_OPEN`` participants, each report is written at once, and each participant counts."""
-        self.panel.on_records(OTHERS, MAX_SMALL_TEAM, 0.0)
-        self.assertEqual((self.panel.is_partial(0.0), self.panel.is_known(0.0)), (False, True))
-        self.assertEqual(self.panel.compute_due(ME, 0.0), 0.0)
-        self.panel.on_written(ME, 0.0)
-        self.assertEqual(self.panel.compute_due(replace(ME, why="waits"), 0.1), 0.1)
+        """Up to ``MAX_SMALL_TEAM`` participants, each report is written at once, and each participant counts."""
+        self.reporters.on_records(OTHERS, MAX_SMALL_TEAM, 0.0)
+        self.assertEqual((self.reporters.is_partial(0.0), self.reporters.is_known(0.0)), (False, True))
+        self.assertEqual(self.reporters.compute_due(ME, 0.0), 0.0)
+        self.reporters.on_written(ME, 0.0)
+        self.assertEqual(self.reporters.compute_due(replace(ME, why="waits"), 0.1), 0.1)
 
     def test_turn_comes_while_there_are_few(self) -> None:
         """Above that limit, an agent without a decision writes at its turn, unless enough others have written."""
-        self.panel.on_records(OTHERS, MAX_SMALL_TEAM + 1, 0.0)
-        self.assertEqual((self.panel.is_partial(0.0), self.panel.compute_due(ME, 0.0)), (True, math.inf))
-        panel = Reporters("me", 0.5)
-        panel.on_records((), MANY, 0.0)
-        self.assertAlmostEqual(panel.compute_due(ME, 0.0), self.turn)
-        panel.on_records(OTHERS, MANY, 0.2)
-        self.assertEqual(panel.compute_due(ME, 50.0), math.inf)
-        self.assertFalse(panel.is_known(50.0))
+        self.reporters.on_records(OTHERS, MAX_SMALL_TEAM + 1, 0.0)
+        self.assertEqual((self.reporters.is_partial(0.0), self.reporters.compute_due(ME, 0.0)), (True, math.inf))
+        reporters = Reporters("me", 0.5)
+        reporters.on_records((), MANY, 0.0)
+        self.assertAlmostEqual(reporters.compute_due(ME, 0.0), self.turn)
+        reporters.on_records(OTHERS, MANY, 0.2)
+        self.assertEqual(reporters.compute_due(ME, 50.0), math.inf)
+        self.assertFalse(reporters.is_known(50.0))
 
     def test_gone_ones_are_replaced(self) -> None:
         """When records disappear, the turns start again."""
         self.full()
-        self.panel.on_records(sorted(OTHERS)[1:], MANY, 10.0)
-        self.assertAlmostEqual(self.panel.compute_due(ME, 10.0), 10.0 + self.turn)
+        self.reporters.on_records(sorted(OTHERS)[1:], MANY, 10.0)
+        self.assertAlmostEqual(self.reporters.compute_due(ME, 10.0), 10.0 + self.turn)
 
     def test_small_group_of_a_large_team(self) -> None:
         """If few records exist after all turns, the group is small and each agent writes at once."""
         over = LISTENING_S + MANY * TURN_SPACING_S + SETTLING_S
-        self.assertEqual([self.panel.is_partial(over - 0.01), self.panel.is_partial(over)], [True, False])
-        self.assertEqual(self.panel.compute_due(ME, over), over)
+        self.assertEqual([self.reporters.is_partial(over - 0.01), self.reporters.is_partial(over)], [True, False])
+        self.assertEqual(self.reporters.compute_due(ME, over), over)
 
     def test_who_is_announced_writes(self) -> None:
         """An agent that the council announces writes at once, even if enough records exist."""
         self.full()
-        self.panel.on_announcement(["a", "me"], 5.0)
+        self.reporters.on_announcement(["a", "me"], 5.0)
         self.assertEqual(
-            (self.panel.compute_due(ME, 5.0), self.panel.is_known(5.0), self.panel.has_announcement), (5.0, True, True)
+            (self.reporters.compute_due(ME, 5.0), self.reporters.is_known(5.0), self.reporters.has_announcement),
+            (5.0, True, True),
         )
 
     def test_who_acts_writes(self) -> None:
         """An agent that acts, holds a token or is assigned writes at once."""
         self.full()
         for told in (replace(ME, status=EXECUTING), replace(ME, token=3), replace(ME, assigned="me")):
-            self.assertEqual(self.panel.compute_due(told, 5.0), 5.0)
+            self.assertEqual(self.reporters.compute_due(told, 5.0), 5.0)
 
     def test_record_of_a_former_life_is_replaced(self) -> None:
         """A record of this agent from before a restart is replaced with the current state."""
-        self.panel.on_records({*OTHERS, "me"}, MANY, 1.0)
-        self.assertEqual((self.panel.compute_due(ME, 1.0), self.panel.is_written), (1.0, True))
+        self.reporters.on_records({*OTHERS, "me"}, MANY, 1.0)
+        self.assertEqual((self.reporters.compute_due(ME, 1.0), self.reporters.is_written), (1.0, True))
 
     def test_few_changes_are_written(self) -> None:
         """A change of action is written at once, of the assigned agent after a pause, others only if needed."""
         self.full()
-        self.panel.on_written(ME, 1.0)
-        self.assertEqual(self.panel.compute_due(ME, 9.0), math.inf)
-        self.assertEqual(self.panel.compute_due(replace(ME, status=WAITING), 1.1), 1.1)
-        self.assertEqual(self.panel.compute_due(replace(ME, cost=2.0), 1.1), 1.1)
-        self.assertEqual(self.panel.compute_due(replace(ME, available=False), 1.1), 1.1)
-        self.assertEqual(self.panel.compute_due(replace(ME, assigned="a"), 1.1), 1.0 + RECORD_PAUSE_S)
-        self.assertEqual(self.panel.compute_due(replace(ME, why="waits"), 1.1), math.inf)
-        self.panel.on_announcement(["me"], 1.1)
-        self.assertEqual(self.panel.compute_due(replace(ME, why="waits"), 1.2), 1.0 + RECORD_PAUSE_S)
+        self.reporters.on_written(ME, 1.0)
+        self.assertEqual(self.reporters.compute_due(ME, 9.0), math.inf)
+        self.assertEqual(self.reporters.compute_due(replace(ME, status=WAITING), 1.1), 1.1)
+        self.assertEqual(self.reporters.compute_due(replace(ME, cost=2.0), 1.1), 1.1)
+        self.assertEqual(self.reporters.compute_due(replace(ME, available=False), 1.1), 1.1)
+        self.assertEqual(self.reporters.compute_due(replace(ME, assigned="a"), 1.1), 1.0 + RECORD_PAUSE_S)
+        self.assertEqual(self.reporters.compute_due(replace(ME, why="waits"), 1.1), math.inf)
+        self.reporters.on_announcement(["me"], 1.1)
+        self.assertEqual(self.reporters.compute_due(replace(ME, why="waits"), 1.2), 1.0 + RECORD_PAUSE_S)
 
     def test_announced_ones_are_believed_for_a_while(self) -> None:
         """An announced agent counts as present until its record is due, even if it is announced repeatedly."""
-        self.panel.on_announcement(["a"], 1.0)
-        self.panel.on_announcement(["a", "b"], 1.9)
+        self.reporters.on_announcement(["a"], 1.0)
+        self.reporters.on_announcement(["a", "b"], 1.9)
         late = 1.0 + ASSUMED_PRESENT_S
         self.assertEqual(
-            [self.panel.is_assumed_present("a", late - 0.01), self.panel.is_assumed_present("a", late)], [True, False]
+            [self.reporters.is_assumed_present("a", late - 0.01), self.reporters.is_assumed_present("a", late)],
+            [True, False],
         )
         self.assertEqual(
-            [self.panel.is_assumed_present("b", late), self.panel.is_assumed_present("c", late)], [True, False]
+            [self.reporters.is_assumed_present("b", late), self.reporters.is_assumed_present("c", late)], [True, False]
         )
 
     def test_places_are_spread(self) -> None:

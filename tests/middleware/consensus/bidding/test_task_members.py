@@ -24,59 +24,61 @@ def costs(members: list[Member]) -> dict[str, float | None]:
     return {m.uuid: m.cost for m in members}
 
 
-class RollTests(SynchronousTestCase):
+class TaskMembersTests(SynchronousTestCase):
     def setUp(self) -> None:
-        self.roll = TaskMembers()
-        self.roll.update_present([member("a", 3.0), member("b", None)])
+        self.task_members = TaskMembers()
+        self.task_members.update_present([member("a", 3.0), member("b", None)])
 
     def test_announced_bids_count(self) -> None:
         """A bid announced after the record counts; an agent that is not present has no bid."""
-        self.roll.update_announced([Report("b", 1.0), Report("c", 0.5)])
-        self.assertEqual(costs(self.roll.list_members()), {"a": 3.0, "b": 1.0})
+        self.task_members.update_announced([Report("b", 1.0), Report("c", 0.5)])
+        self.assertEqual(costs(self.task_members.list_members()), {"a": 3.0, "b": 1.0})
 
     def test_later_record_counts(self) -> None:
         """A record that changed after the announcement wins, including a withdrawn bid."""
-        self.roll.update_announced([Report("a", 2.0), Report("b", 1.0)])
-        self.roll.update_present([member("a", None), member("b", None)])
-        self.assertEqual(costs(self.roll.list_members()), {"a": None, "b": 1.0})
+        self.task_members.update_announced([Report("a", 2.0), Report("b", 1.0)])
+        self.task_members.update_present([member("a", None), member("b", None)])
+        self.assertEqual(costs(self.task_members.list_members()), {"a": None, "b": 1.0})
 
     def test_announced_bids_tell_all_that_is_read(self) -> None:
         """All fields of an announced bid that the strategy reads count; a changed record overrides them."""
-        roll = TaskMembers(ReportView(("choice", "weight")))
-        roll.update_present([member("a", 3.0), member("b", 2.0)])
-        roll.update_announced([Report("a", 3.0, choice="red", weight=2.0, battery=0.1), Report("b", 2.0, weight=-1.0)])
-        told = {m.uuid: (m.choice, m.weight, m.battery) for m in roll.list_members()}
+        task_members = TaskMembers(ReportView(("choice", "weight")))
+        task_members.update_present([member("a", 3.0), member("b", 2.0)])
+        task_members.update_announced(
+            [Report("a", 3.0, choice="red", weight=2.0, battery=0.1), Report("b", 2.0, weight=-1.0)]
+        )
+        told = {m.uuid: (m.choice, m.weight, m.battery) for m in task_members.list_members()}
         self.assertEqual(told, {"a": ("red", 2.0, 1.0), "b": ("", 1.0, 1.0)})
-        roll.update_present([replace(member("a", 3.0), choice="blue"), member("b", 2.0)])
-        self.assertEqual(roll.list_members()[0].choice, "blue")
+        task_members.update_present([replace(member("a", 3.0), choice="blue"), member("b", 2.0)])
+        self.assertEqual(task_members.list_members()[0].choice, "blue")
 
     def test_who_left_bids_nothing(self) -> None:
         """The announced bid of an agent is dropped when the agent leaves, and does not return with it."""
-        self.roll.update_announced([Report("b", 1.0)])
-        self.roll.update_present([member("a", 3.0)])
-        self.roll.update_present([member("a", 3.0), member("b", None)])
-        self.assertEqual(costs(self.roll.list_members()), {"a": 3.0, "b": None})
-        self.roll.update_present([member("a", 3.0)])
-        self.roll.update_announced([Report("b", 1.0)])
-        self.assertEqual(self.roll.list_awaited(), [])
+        self.task_members.update_announced([Report("b", 1.0)])
+        self.task_members.update_present([member("a", 3.0)])
+        self.task_members.update_present([member("a", 3.0), member("b", None)])
+        self.assertEqual(costs(self.task_members.list_members()), {"a": 3.0, "b": None})
+        self.task_members.update_present([member("a", 3.0)])
+        self.task_members.update_announced([Report("b", 1.0)])
+        self.assertEqual(self.task_members.list_awaited(), [])
 
     def test_announced_before_the_record(self) -> None:
         """A bid announced before the agent's record counts when the record arrives, until the record changes."""
-        self.roll.update_announced([Report("c", 0.5)])
-        self.assertEqual(self.roll.list_awaited(), [Report("c", 0.5)])
+        self.task_members.update_announced([Report("c", 0.5)])
+        self.assertEqual(self.task_members.list_awaited(), [Report("c", 0.5)])
         here = [member("a", 3.0), member("b", None)]
-        self.roll.update_present([*here, member("c", None)])
-        self.assertEqual((costs(self.roll.list_members())["c"], self.roll.list_awaited()), (0.5, []))
-        self.roll.update_present([*here, member("c", 0.7)])
-        self.assertEqual(costs(self.roll.list_members())["c"], 0.7)
+        self.task_members.update_present([*here, member("c", None)])
+        self.assertEqual((costs(self.task_members.list_members())["c"], self.task_members.list_awaited()), (0.5, []))
+        self.task_members.update_present([*here, member("c", 0.7)])
+        self.assertEqual(costs(self.task_members.list_members())["c"], 0.7)
 
     def test_newest_announcement_alone_awaits(self) -> None:
         """An agent that is missing in the newest announcement is not awaited, and its later record wins."""
-        self.roll.update_announced([Report("c", 0.5), Report("d", 0.6)])
-        self.roll.update_present([member("a", 3.0), member("d", None)])
-        self.roll.update_announced([Report("a", 2.0)])
-        self.assertEqual(self.roll.list_awaited(), [])
-        self.assertEqual(costs(self.roll.list_members()), {"a": 2.0, "d": None})
+        self.task_members.update_announced([Report("c", 0.5), Report("d", 0.6)])
+        self.task_members.update_present([member("a", 3.0), member("d", None)])
+        self.task_members.update_announced([Report("a", 2.0)])
+        self.assertEqual(self.task_members.list_awaited(), [])
+        self.assertEqual(costs(self.task_members.list_members()), {"a": 2.0, "d": None})
 
 
 class GroupTests(FleetCase):

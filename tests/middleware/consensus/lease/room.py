@@ -17,7 +17,7 @@ TTL = 1.5
 T = "t0"
 
 
-class RoomCase(SynchronousTestCase):
+class LeaseCase(SynchronousTestCase):
     """Agents and council members; new members grant nothing for one TTL, so ``made`` waits that long."""
 
     def setUp(self) -> None:
@@ -41,7 +41,7 @@ class RoomCase(SynchronousTestCase):
             charter, sitting = charter.with_change(members, ballot, tuple(votes)), list(council)
         return charter
 
-    def lessee(self, place: int) -> LeaseClient:
+    def client(self, place: int) -> LeaseClient:
         """Return the lease client of an agent."""
         return self.room.nodes[place].get_lease_client(T)
 
@@ -51,14 +51,14 @@ class RoomCase(SynchronousTestCase):
 
     def wanting(self, place: int, seconds: float = 0.1) -> LeaseClient:
         """Return the lease client of an agent that has requested the lease ``seconds`` ago."""
-        lessee = self.lessee(place)
-        lessee.claim()
+        client = self.client(place)
+        client.claim()
         self.run_for(seconds)
-        return lessee
+        return client
 
     def holders(self) -> list[int]:
         """Return the agents that hold the lease by their own clocks."""
-        return [place for place in self.room.agents if self.lessee(place).lease is not None]
+        return [place for place in self.room.agents if self.client(place).lease is not None]
 
     def cut(self, place: int, *others: int) -> None:
         """Block the links between ``place`` and ``others``."""
@@ -66,7 +66,7 @@ class RoomCase(SynchronousTestCase):
 
     def token(self, place: int) -> int:
         """Return the token that an agent holds."""
-        lease = self.lessee(place).lease
+        lease = self.client(place).lease
         assert lease is not None, f"{place} holds nothing"
         return lease.token
 

@@ -22,10 +22,10 @@ from middleware.consensus.lease.charter import (
 )
 from middleware.entangled.errors import Refused
 from middleware.entangled.quorum.ballot import Ballot, highest_credible
-from tests.middleware.consensus.lease.room import RoomCase, T
+from tests.middleware.consensus.lease.room import LeaseCase, T
 
 
-class CharterTests(RoomCase):
+class CharterTests(LeaseCase):
     def test_chain(self) -> None:
         """A charter contains the newest council, and survives encoding."""
         charter = self.chartered([3, 4, 6], [0, 4, 6])
@@ -40,7 +40,7 @@ class CharterTests(RoomCase):
         charter = self.chartered([3, 4, 6], [0, 4, 6])
         first, second = charter.changes
         forged = self.room.identities[6]
-        for links in (
+        for changes in (
             (second,),
             (second, first),
             (first, second._replace(members=(*second.members[:2], self.room.contacts[2]))),
@@ -52,7 +52,7 @@ class CharterTests(RoomCase):
             (first, second._replace(votes=(second.votes[0], (2, 7, second.votes[1][2])))),
             (first, second._replace(votes=(second.votes[0], (9, 7, second.votes[1][2])))),
         ):
-            self.assertFalse(replace(charter, changes=links).is_genuine(T), links)
+            self.assertFalse(replace(charter, changes=changes).is_genuine(T), changes)
         self.assertFalse(charter.is_genuine("t1"))
         self.assertFalse(replace(charter, owner=forged.public).is_genuine(T))
         self.assertFalse(replace(charter, first=tuple(self.room.contacts[:3])).is_genuine(T))
@@ -65,10 +65,10 @@ class CharterTests(RoomCase):
     def test_judge(self) -> None:
         """A council pinned by a node without the right to publish tasks is rejected."""
         pinned = create_charter(self.room.identities[0], T, tuple(self.room.contacts[:3]))
-        judge = self.room.charter_verifier
-        self.assertIsNone(judge.parse(T, pinned.packed))
+        verifier = self.room.charter_verifier
+        self.assertIsNone(verifier.parse(T, pinned.packed))
         self.assertEqual(CharterVerifier(lambda public, task_id: True).parse(T, pinned.packed), pinned)
-        self.assertIsNone(judge.parse(T, self.chartered([3, 4, 6], signers=1).packed))
+        self.assertIsNone(verifier.parse(T, self.chartered([3, 4, 6], signers=1).packed))
 
     def test_bounded(self) -> None:
         """The number of links of a charter and its token are limited."""
@@ -77,16 +77,16 @@ class CharterTests(RoomCase):
         self.assertRaises(Refused, full.with_change, charter.members, charter.ballot, ())
         self.assertEqual(parse_charter(full.packed), full)
         self.assertIsNone(parse_charter(replace(charter, changes=charter.changes * (MAX_CHANGES + 1)).packed))
-        link = charter.changes[0]._replace(votes=((0, 2**61, bytes(64)), (1, 3, bytes(64))))
-        self.assertEqual(replace(charter, changes=(link,)).token, MAX_TOKEN)
+        change = charter.changes[0]._replace(votes=((0, 2**61, bytes(64)), (1, 3, bytes(64))))
+        self.assertEqual(replace(charter, changes=(change,)).token, MAX_TOKEN)
 
     def test_ending(self) -> None:
         """A majority of the current council proves the agent that ended the task, and its token."""
         pinned = self.room.charters[T]
-        for charter, seats in ((pinned, [3, 4, 5]), (self.chartered([0, 4, 6]), [0, 4, 6])):
+        for charter, positions in ((pinned, [3, 4, 5]), (self.chartered([0, 4, 6]), [0, 4, 6])):
             votes = [
-                (place, sign_end(self.room.identities[seat], T, charter.configuration, "a", 7))
-                for place, seat in enumerate(seats)
+                (place, sign_end(self.room.identities[position], T, charter.configuration, "a", 7))
+                for place, position in enumerate(positions)
             ]
             ending = parse_end_proof(EndProof(charter, tuple(votes[:2])).packed, pinned)
             assert ending is not None
@@ -118,7 +118,7 @@ class CharterTests(RoomCase):
         self.assertNotEqual(sign_change(identity, T, 1, Ballot(7, "a"), members, 7), sign_end(identity, T, 1, "a", 7))
 
 
-class NumberTests(RoomCase):
+class NumberTests(LeaseCase):
     def test_believed(self) -> None:
         """A high number that a single member of three reports does not count."""
         self.assertEqual(highest_credible([5, 7, 3], 3), 7)

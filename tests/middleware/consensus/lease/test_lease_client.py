@@ -6,44 +6,44 @@ from middleware.consensus.lease.client_states import State
 from middleware.entangled.data.memory import MemoryStore
 from sim.team.leases.radio_link import LinkQuality
 from sim.team.leases.takeover import measure_takeover, measure_upkeep
-from tests.middleware.consensus.lease.room import TTL, RoomCase, T
+from tests.middleware.consensus.lease.room import TTL, LeaseCase, T
 
 
-class LesseeTests(RoomCase):
+class LeaseClientTests(LeaseCase):
     def test_release_by_the_listener(self) -> None:
         """A callback that releases when the lease is lost ends the claim: no further request is sent."""
         for lose in ("outrank", "cut"):
             self.room = self.made(seed=f"listener {lose}")
-            lessee = self.wanting(0)
-            lessee._on_change = lambda lessee=lessee: lessee.release() if not lessee.token else None  # type: ignore[misc]
+            client = self.wanting(0)
+            client._on_change = lambda client=client: client.release() if not client.token else None  # type: ignore[misc]
             if lose == "outrank":
-                lessee.on_higher_token(9)
+                client.on_higher_token(9)
             else:
                 self.cut(0, 3, 4, 5)
                 self.run_for(2 * TTL)
-            self.assertEqual((lessee.state, lessee._round, lessee._timer), (State.IDLE, None, None), lose)
+            self.assertEqual((client.state, client._round, client._timer), (State.IDLE, None, None), lose)
             self.run_for(2 * TTL)
-            self.assertIs(lessee.state, State.IDLE, lose)
+            self.assertIs(client.state, State.IDLE, lose)
 
     def test_first_in_line_is_ready(self) -> None:
         """The first standby gets the lease as soon as it expires at a majority, and never earlier."""
         for seed in range(5):
             self.room = self.made(seed=f"ready {seed}")
             self.wanting(0)
-            self.lessee(1).stand_by(1)
+            self.client(1).stand_by(1)
             self.run_for(TTL)
             self.room.kill(0)
             members = [self.room.nodes[place] for place in (3, 4, 5)]
             _, ends, _ = sorted(one.machine.to_simulator_time(one.acceptor.log.get(T).lease_until) for one in members)  # type: ignore[union-attr]
             self.run_for(ends - self.room.clock.seconds() - 0.001)
-            self.assertIsNone(self.lessee(1).lease, seed)
+            self.assertIsNone(self.client(1).lease, seed)
             self.run_for(0.02)
-            self.assertIsNotNone(self.lessee(1).lease, seed)
+            self.assertIsNotNone(self.client(1).lease, seed)
 
     def test_ready_for_a_lease_that_is_renewed(self) -> None:
         """A standby with a promise does not take over if the holder returns in time."""
         self.wanting(0)
-        self.lessee(1).stand_by(1)
+        self.client(1).stand_by(1)
         self.run_for(TTL)
         self.cut(0, 3, 4, 5)
         until = [self.room.nodes[place].acceptor.log.get(T).lease_until for place in (3, 4, 5)]  # type: ignore[union-attr]
@@ -57,24 +57,24 @@ class LesseeTests(RoomCase):
         for seed in range(5):
             self.room = self.made(seed=f"moved {seed}")
             self.wanting(0)
-            self.lessee(1).stand_by(1)
-            self.lessee(2).stand_by(2)
+            self.client(1).stand_by(1)
+            self.client(2).stand_by(2)
             self.run_for(TTL)
             self.room.kill(0)
             self.run_for(0.55 * TTL)
-            self.lessee(1).stand_by(3)
-            self.lessee(2).stand_by(1)
+            self.client(1).stand_by(3)
+            self.client(2).stand_by(1)
             self.run_for(0.45 * TTL + 0.1)
             self.assertEqual(self.holders()[-1:], [2], seed)
 
     def test_place_in_the_line_that_changes_after_a_release(self) -> None:
         """A standby that does not know the remaining time from a majority claims after a release, at any new rank."""
         self.cut(1, 4, 5)
-        self.lessee(1).stand_by(3)
+        self.client(1).stand_by(3)
         self.run_for(1.5 * TTL)
-        self.lessee(1).on_released(0)
+        self.client(1).on_released(0)
         self.run_for(0.35)
-        self.lessee(1).stand_by(2)
+        self.client(1).stand_by(2)
         self.room.radio.cut.clear()
         self.run_for(0.2)
         self.assertEqual(self.holders(), [1])
@@ -82,12 +82,12 @@ class LesseeTests(RoomCase):
     def test_council_that_moved(self) -> None:
         """A standby that learns of a new council polls it at once, and is notified of a release there."""
         self.wanting(0)
-        self.lessee(1).stand_by(1)
-        moved = self.lessee(0).change_council([self.room.contacts[place] for place in (3, 4, 6)])
+        self.client(1).stand_by(1)
+        moved = self.client(0).change_council([self.room.contacts[place] for place in (3, 4, 6)])
         self.outcome(moved, 0.1)
-        self.lessee(1).suspect_holder()
+        self.client(1).suspect_holder()
         self.run_for(0.1)
-        self.lessee(0).release()
+        self.client(0).release()
         self.run_for(0.1)
         self.assertEqual(self.holders(), [1])
 
@@ -96,8 +96,8 @@ class LesseeTests(RoomCase):
         for seed in range(5):
             self.room = self.made(seed=f"free {seed}")
             for place, rank in ((2, 2), (1, 1)):
-                self.lessee(place).stand_by(rank)
-                self.lessee(place).suspect_holder()
+                self.client(place).stand_by(rank)
+                self.client(place).suspect_holder()
             self.run_for(0.1)
             self.assertEqual(self.holders(), [1], seed)
 
@@ -106,9 +106,9 @@ class LesseeTests(RoomCase):
         for seed in range(5):
             self.room = self.made(seed=f"heir {seed}")
             for _ in range(4):
-                self.lessee(0).release()
+                self.client(0).release()
                 self.wanting(0)
-            self.lessee(1).stand_by(1)
+            self.client(1).stand_by(1)
             self.room.nodes[0].leave(T, [1])
             self.run_for(0.04)
             self.assertEqual(self.holders(), [1], seed)
@@ -126,32 +126,32 @@ class LesseeTests(RoomCase):
 
     def test_stand_by_that_is_named(self) -> None:
         """A standby that then wants the lease gets it; a holder that is given a rank keeps its lease."""
-        self.lessee(0).stand_by(3)
-        self.lessee(0).claim()
+        self.client(0).stand_by(3)
+        self.client(0).claim()
         self.run_for(2 * TTL)
         self.assertEqual(self.holders(), [0])
-        self.lessee(0).stand_by(1)
+        self.client(0).stand_by(1)
         self.run_for(2 * TTL)
         self.assertEqual(self.holders(), [0])
 
     def test_outranked_while_it_holds(self) -> None:
         """If the device has obeyed a higher token, the holder's lease is void and it claims a higher token."""
-        lessee = self.wanting(0)
-        lessee.on_higher_token(1)
+        client = self.wanting(0)
+        client.on_higher_token(1)
         self.assertEqual(self.token(0), 1)
-        lessee.on_higher_token(7)
-        self.assertIsNone(lessee.lease)
+        client.on_higher_token(7)
+        self.assertIsNone(client.lease)
         self.run_for(0.1)
         self.assertEqual(self.token(0), 8)
 
     def test_want_again_while_a_claim_is_under_way(self) -> None:
         """Replies to a request from before a release are ignored; the next claim has a new token."""
-        lessee = self.lessee(0)
+        client = self.client(0)
         for _ in range(5):
-            lessee.claim()
+            client.claim()
             self.run_for(0.003)
-            lessee.release()
-        lessee.claim()
+            client.release()
+        client.claim()
         self.run_for(TTL)
         self.assertEqual(self.holders(), [0])
 
@@ -160,18 +160,18 @@ class LesseeTests(RoomCase):
         for steps in range(1, 12):
             self.room = self.made(seed=f"dropped {steps}")
             self.wanting(0, 0.001 * steps)
-            self.lessee(0).release()
+            self.client(0).release()
             self.wanting(1, 0.4)
             self.assertEqual(self.holders(), [1], steps)
 
     def test_loss_is_told(self) -> None:
         """A holder that cannot renew stops at its deadline, and claims again when it reaches the council."""
-        lessee = self.wanting(0)
+        client = self.wanting(0)
         self.cut(0, 3, 4)
         self.run_for(TTL)
-        self.assertIsNone(lessee.lease)
+        self.assertIsNone(client.lease)
         self.run_for(TTL / 3)
-        self.assertEqual(lessee.token, 0)
+        self.assertEqual(client.token, 0)
         self.room.radio.cut.clear()
         self.run_for(TTL)
         self.assertEqual(self.token(0), 2)
@@ -180,7 +180,7 @@ class LesseeTests(RoomCase):
         """A holder keeps its lease and token, although a member promised a higher ballot while it was unreachable."""
         self.wanting(0)
         self.cut(0, 3)
-        self.lessee(1).stand_by()
+        self.client(1).stand_by()
         self.run_for(2 * TTL)
         self.room.radio.cut.clear()
         self.run_for(2 * TTL)
@@ -198,11 +198,11 @@ class LesseeTests(RoomCase):
         """Cancelling a later claim does not shorten the stopping time of the released lease, despite a fast clock."""
         self.room = self.made(stop_time=0.3, rates=(1.01, 1.0, 1.0, 1.0, 1.0, 1.0, 1.0))
         self.wanting(0, 1.0)
-        self.lessee(0).release()
+        self.client(0).release()
         stopped = self.room.clock.seconds()
         self.run_for(0.27)
         self.wanting(0, 0.01)
-        self.lessee(0).release()
+        self.client(0).release()
         self.run_for(0.1)
         for place in (3, 4, 5):
             bidder = self.room.nodes[place]
@@ -213,13 +213,13 @@ class LesseeTests(RoomCase):
         """A holder with a fast clock that resumes after its deadline releases only when its robot stands still."""
         self.room = self.made(stop_time=0.3, rates=(1.01, 1.0, 1.0, 1.0, 1.0, 1.0, 1.0))
         self.wanting(0, 1.0)
-        machine, lease = self.room.nodes[0].machine, self.lessee(0).lease
+        machine, lease = self.room.nodes[0].machine, self.client(0).lease
         assert lease is not None
         obeyed_until = self.room.clock.seconds() + lease.deadline - machine.seconds()
         machine.freeze(False)
         self.room.clock.advance(machine.to_simulator_time(lease.deadline) + 0.1 - self.room.clock.seconds())
         machine.thaw()
-        self.lessee(0).release()
+        self.client(0).release()
         self.run_for(0.1)
         for place in (3, 4, 5):
             bidder = self.room.nodes[place]
@@ -230,7 +230,7 @@ class LesseeTests(RoomCase):
         """At 50 % loss, with duplicates and delays, there is never more than one holder, and often one."""
         self.room.radio.quality = LinkQuality(0.02, 0.05, 0.5, 0.3, 5.0)
         for place in range(3):
-            self.lessee(place).claim()
+            self.client(place).claim()
         held = 0
         for _ in range(400):
             self.run_for(0.1)
@@ -240,7 +240,7 @@ class LesseeTests(RoomCase):
         self.assertEqual(self.room.recorder.violations, [])
 
 
-class FigureTests(RoomCase):
+class DurationTests(LeaseCase):
     def test_takeover(self) -> None:
         """Of two hundred takeovers at 10 % loss, half take less than 1.5 s, and 99 of 100 less than 2 s."""
         seconds = sorted(measure_takeover(seed) for seed in range(200))

@@ -115,4 +115,4 @@ class NoteTests(SynchronousTestCase):
         self.assertEqual(CODEC.unpack_floor(msgpack.packb([40, 2.0])), Floor(40, 40, 2.0))
         self.assertEqual(CODEC.unpack_floor(msgpack.packb([40, 2.0, 7])), Floor(40, 7, 2.0))
         self.assertEqual(CODEC.pack_floor(Floor(40, 7, 2.0)), msgpack.packb([40, 2.0, 7]))
-        self.assertEqual([CODEC.unpack_floor(rotten) for rotten in (None, b"?", msgpack.packb([1]))], [None] * 3)
+        self.assertEqual([CODEC.unpack_floor(corrupt) for corrupt in (None, b"?", msgpack.packb([1]))], [None] * 3)

@@ -7,26 +7,26 @@ from dataclasses import replace
 from middleware.consensus.lease.lease_proposer import NoMajority, Superseded
 from middleware.entangled.errors import Refused
 from middleware.entangled.quorum.ballot import Ballot
-from tests.middleware.consensus.lease.room import TTL, RoomCase, T
+from tests.middleware.consensus.lease.room import TTL, LeaseCase, T
 
 
-class CouncilTests(RoomCase):
+class LeaseProposerTests(LeaseCase):
     def change(self, place: int, *members: int) -> object:
         """Return the result of a change requested by an agent: None, or the error."""
-        council = self.lessee(place).proposer
+        council = self.client(place).proposer
         return self.outcome(council.change_members([self.room.contacts[n] for n in members]))
 
     def places(self, place: int) -> list[int]:
         """Return the council as an agent knows it."""
-        return [self.room.get_place(member) for member in self.lessee(place).proposer.members]
+        return [self.room.get_place(member) for member in self.client(place).proposer.members]
 
     def test_change(self) -> None:
         """A change installs the new council with configuration + 1, which grants the next lease with a higher token."""
         self.wanting(0)
-        self.lessee(0).release()
+        self.client(0).release()
         self.run_for(0.1)
         self.assertIsNone(self.change(1, 3, 4, 6))
-        self.assertEqual((self.places(1), self.lessee(1).proposer.configuration), ([3, 4, 6], 2))
+        self.assertEqual((self.places(1), self.client(1).proposer.configuration), ([3, 4, 6], 2))
         for gone in (3, 5):
             self.room.kill(gone)
         self.wanting(1, 1.0)
@@ -37,7 +37,7 @@ class CouncilTests(RoomCase):
         self.assertIsNone(self.change(1, 0, 1, 2))
         self.assertEqual(self.places(2), [0, 1, 2])
         self.room.charters[T] = replace(self.room.charters[T], changes=())
-        self.lessee(0)
+        self.client(0)
         self.assertEqual(self.places(0), [3, 4, 5])
         self.wanting(0, 0.3)
         self.assertEqual((self.places(0), self.holders()), ([0, 1, 2], [0]))
@@ -57,11 +57,11 @@ class CouncilTests(RoomCase):
         for stop_time in (0.0, 0.3):
             self.room = self.made(stop_time)
             self.wanting(0)
-            self.lessee(1).stand_by(1)
+            self.client(1).stand_by(1)
             self.run_for(TTL)
             self.room.recorder.stop_robot(0, T)
-            moved = self.lessee(0).change_council([self.room.contacts[n] for n in (3, 4, 6)])
-            self.assertIsNone(self.lessee(0).lease)
+            moved = self.client(0).change_council([self.room.contacts[n] for n in (3, 4, 6)])
+            self.assertIsNone(self.client(0).lease)
             self.assertIsNone(self.outcome(moved, stop_time + 0.2))
             self.assertEqual((self.holders(), self.token(0)), ([0], 2))
             self.assertEqual((self.places(0), self.room.recorder.wins), ([3, 4, 6], 2))
@@ -75,7 +75,7 @@ class CouncilTests(RoomCase):
         """If the change of the council fails, the holder claims the lease again at the old council."""
         self.wanting(0)
         self.run_for(TTL)
-        moved = self.lessee(0).change_council([self.room.contacts[n] for n in (1, 2, 6)])
+        moved = self.client(0).change_council([self.room.contacts[n] for n in (1, 2, 6)])
         self.cut(0, 1, 2, 6)
         self.assertIsInstance(self.outcome(moved), NoMajority)
         self.run_for(TTL)
@@ -88,14 +88,14 @@ class CouncilTests(RoomCase):
         self.wanting(0)
         self.cut(4, *range(4), 5, 6)
         self.run_for(4.0)
-        council = self.lessee(0).proposer
+        council = self.client(0).proposer
         self.assertEqual(
             (council.find_silent_members(3.0), council.find_silent_members(4.5)), ((self.room.contacts[4],), ())
         )
         self.room.radio.cut.clear()
         self.run_for(TTL)
         self.assertEqual(council.find_silent_members(0.0), ())
-        self.lessee(0).release()
+        self.client(0).release()
         self.cut(5, *range(5), 6)
         self.run_for(5.0)
         self.assertEqual(council.find_silent_members(3.0), ())
@@ -106,7 +106,7 @@ class CouncilTests(RoomCase):
 
     def test_learnt_from_the_record(self) -> None:
         """A newer configuration in the task's record is adopted, an older one is ignored."""
-        council = self.lessee(0).proposer
+        council = self.client(0).proposer
         council.learn_charter(self.chartered([4, 5, 6], [0, 1, 2]).packed)
         for packed in (self.chartered([4, 5, 6]).packed, b"", b"?"):
             council.learn_charter(packed)
@@ -117,19 +117,19 @@ class CouncilTests(RoomCase):
         for seed in range(12):
             self.room = self.made(seed=f"two {seed}")
             for place, members in ((0, (3, 4, 6)), (1, (5, 6, 2))):
-                council = self.lessee(place).proposer
+                council = self.client(place).proposer
                 council.change_members([self.room.contacts[n] for n in members]).addErrback(lambda f: f.trap(Refused))
             self.run_for(3.0)
             for place in (0, 1):
                 self.wanting(place, 1.0)
-                self.lessee(place).release()
+                self.client(place).release()
                 self.run_for(0.1)
             self.assertEqual(self.places(0), self.places(1))
 
     def test_change_that_was_half_done_is_completed(self) -> None:
         """A client that finds an accepted but unfinished change completes it before it claims the lease."""
         self.cut(1, 6, 0, 2)
-        council = self.lessee(1).proposer
+        council = self.client(1).proposer
         error = self.outcome(council.change_members([self.room.contacts[n] for n in (0, 2, 6)]))
         self.assertIsInstance(error, NoMajority)
         self.wanting(0, 0.5)
@@ -147,7 +147,7 @@ class CouncilTests(RoomCase):
 
     def test_another_change_came_first(self) -> None:
         """A change of a council that has changed meanwhile fails with ``Superseded``."""
-        self.lessee(2)
+        self.client(2)
         self.assertIsNone(self.change(1, 3, 4, 6))
         self.assertIsInstance(self.change(2, 3, 5, 6), Superseded)
         self.assertEqual(self.places(2), [3, 4, 6])
@@ -155,13 +155,13 @@ class CouncilTests(RoomCase):
     def test_strange_councils(self) -> None:
         """A council without members, or with too many, raises ``ValueError``."""
         for members in ([], [self.room.contacts[0]] * 8):
-            self.assertRaises(ValueError, self.lessee(0).proposer.change_members, members)
+            self.assertRaises(ValueError, self.client(0).proposer.change_members, members)
 
     def test_close_waits_for_whoever_may_still_act(self) -> None:
         """A close is acknowledged when a majority has stored it and the lease in force has expired."""
         self.wanting(0)
         self.cut(0, 3, 4, 5)
-        closing = self.lessee(1).proposer.close()
+        closing = self.client(1).proposer.close()
         self.run_for(TTL - 0.3)
         self.assertNoResult(closing)
         self.run_for(0.4)
@@ -173,14 +173,14 @@ class CouncilTests(RoomCase):
 
     def test_holder_closes_at_once(self) -> None:
         """A holder that stands still closes the task without waiting for its own lease."""
-        lessee = self.wanting(0)
-        self.assertIsNone(self.outcome(lessee.proposer.close(self.token(0)), 0.05))
+        client = self.wanting(0)
+        self.assertIsNone(self.outcome(client.proposer.close(self.token(0)), 0.05))
         self.wanting(1, 1.0)
-        self.assertEqual((self.holders(), self.lessee(1).is_over), ([], True))
+        self.assertEqual((self.holders(), self.client(1).is_over), ([], True))
 
     def test_close_by_who_missed_a_change(self) -> None:
         """A client with an old council is redirected on close, and waits for the lease that the new council granted."""
-        stale = self.lessee(0)
+        stale = self.client(0)
         self.assertIsNone(self.change(1, 3, 6, 2))
         self.wanting(1)
         self.assertEqual(self.holders(), [1])
@@ -190,16 +190,16 @@ class CouncilTests(RoomCase):
         self.assertNoResult(closing)
         self.run_for(0.5)
         self.assertIsNone(self.successResultOf(closing))
-        self.assertEqual((self.holders(), self.lessee(1).is_over), ([], True))
+        self.assertEqual((self.holders(), self.client(1).is_over), ([], True))
 
     def test_close_without_a_majority(self) -> None:
         """A close that only a minority has stored is not acknowledged."""
         self.cut(0, 3, 4)
-        self.assertIsInstance(self.outcome(self.lessee(0).proposer.close()), NoMajority)
+        self.assertIsInstance(self.outcome(self.client(0).proposer.close()), NoMajority)
 
     def test_change_after_the_end(self) -> None:
         """The council of a closed task cannot change."""
-        self.outcome(self.lessee(0).proposer.close())
+        self.outcome(self.client(0).proposer.close())
         error = self.change(1, 3, 4, 6)
         self.assertIsInstance(error, Refused)
         self.assertIn("the task has ended", str(error))

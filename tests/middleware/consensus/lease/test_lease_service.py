@@ -40,7 +40,7 @@ class SlowStore(MemoryStore):
             waiting.callback(None)
 
 
-class DeskTests(FleetCase):
+class LeaseServiceTests(FleetCase):
     def team(self, n: int = 4) -> tuple[SwarmTeam, Task, list[LeaseClient]]:
         """Return nodes that may grant, a task, and the lease client of each node."""
         fleet = self.swarm(n)
@@ -48,39 +48,39 @@ class DeskTests(FleetCase):
         task = self.done(fleet, Deferred.fromCoroutine(fleet.nodes[0].submit(TASK)), 1.0)
         return fleet, task, [node.make_lease_client(task, lambda: None, 0) for node in fleet.nodes]
 
-    def holders(self, lessees: Sequence[LeaseClient]) -> list[int]:
+    def holders(self, clients: Sequence[LeaseClient]) -> list[int]:
         """Return the nodes that hold the lease."""
-        return [place for place, lessee in enumerate(lessees) if lessee.lease is not None]
+        return [place for place, client in enumerate(clients) if client.lease is not None]
 
-    def end(self, fleet: SwarmTeam, lessees: Sequence[LeaseClient]) -> None:
+    def end(self, fleet: SwarmTeam, clients: Sequence[LeaseClient]) -> None:
         """Release all claims, which removes the timers."""
-        for lessee in lessees:
-            lessee.release()
+        for client in clients:
+            client.release()
         fleet.run(2.0)
 
     def test_polite_leave_is_heard_by_those_that_stand_by(self) -> None:
         """The council notifies a standby of a release, and the standby acts long before its next poll."""
-        fleet, _, lessees = self.team()
-        lessees[1].claim()
+        fleet, _, clients = self.team()
+        clients[1].claim()
         fleet.run(0.3)
-        lessees[2].stand_by()
+        clients[2].stand_by()
         fleet.run(2.02)
-        self.assertEqual(self.holders(lessees), [1])
-        lessees[1].release()
+        self.assertEqual(self.holders(clients), [1])
+        clients[1].release()
         fleet.run(0.1)
-        self.assertEqual(self.holders(lessees), [2])
-        self.end(fleet, lessees)
+        self.assertEqual(self.holders(clients), [2])
+        self.end(fleet, clients)
 
     def test_heirs_are_told_by_the_holder(self) -> None:
         """The holder notifies the named standbys of its release, even if they never polled the council."""
-        fleet, _, lessees = self.team()
-        lessees[1].claim()
+        fleet, _, clients = self.team()
+        clients[1].claim()
         fleet.run(0.3)
-        lessees[3].stand_by(3)
-        lessees[1].release([fleet.nodes[3].entangled.contact])
+        clients[3].stand_by(3)
+        clients[1].release([fleet.nodes[3].entangled.contact])
         fleet.run(0.7)
-        self.assertEqual(self.holders(lessees), [3])
-        self.end(fleet, lessees)
+        self.assertEqual(self.holders(clients), [3])
+        self.end(fleet, clients)
 
     def test_answers_wait_for_the_disk(self) -> None:
         """A member sends a promise only after it is stored durably."""
@@ -92,44 +92,44 @@ class DeskTests(FleetCase):
         task = self.done(fleet, Deferred.fromCoroutine(fleet.nodes[0].submit(TASK)), 1.0)
         for store in stores:
             store.is_slow = True
-        lessee = fleet.nodes[1].make_lease_client(task, lambda: None, 0)
-        lessee.claim()
+        client = fleet.nodes[1].make_lease_client(task, lambda: None, 0)
+        client.claim()
         fleet.run(0.2)
-        self.assertIsNone(lessee.lease)
+        self.assertIsNone(client.lease)
         for _ in range(30):
             fleet.run(0.02)
             for store in stores:
                 store.write()
-        self.assertIsNotNone(lessee.lease)
+        self.assertIsNotNone(client.lease)
         for store in stores:
             store.is_slow = False
             store.write()
-        self.end(fleet, [lessee])
+        self.end(fleet, [client])
 
     def test_council_changes_over_the_wire(self) -> None:
         """Real nodes decide a change of the council and the end of the task, and redirect a client."""
-        fleet, task, lessees = self.team(5)
+        fleet, task, clients = self.team(5)
         outsiders = [n.entangled.contact for n in fleet.nodes if n.entangled.contact not in task.council]
         following = [task.council[0], *outsiders[:2]]
-        self.assertIsNone(self.done(fleet, lessees[0].proposer.change_members(following), 1.0))
-        lessees[1].claim()
+        self.assertIsNone(self.done(fleet, clients[0].proposer.change_members(following), 1.0))
+        clients[1].claim()
         fleet.run(0.5)
-        self.assertEqual(self.holders(lessees), [1])
-        self.assertEqual((list(lessees[1].proposer.members), lessees[1].proposer.configuration), (following, 2))
-        self.assertIsNone(self.done(fleet, lessees[2].proposer.close(), 3.0))
-        self.assertEqual((self.holders(lessees), lessees[1].is_over), ([], True))
-        self.end(fleet, lessees)
+        self.assertEqual(self.holders(clients), [1])
+        self.assertEqual((list(clients[1].proposer.members), clients[1].proposer.configuration), (following, 2))
+        self.assertIsNone(self.done(fleet, clients[2].proposer.close(), 3.0))
+        self.assertEqual((self.holders(clients), clients[1].is_over), ([], True))
+        self.end(fleet, clients)
 
     def test_news_for_nobody(self) -> None:
         """A release notification for an unknown or forgotten claim is ignored."""
-        fleet, task, lessees = self.team()
+        fleet, task, clients = self.team()
         to = fleet.nodes[2].entangled.contact
         self.assertIsNone(
             self.done(
                 fleet, fleet.nodes[1].entangled.endpoint.ask(to, "lease.freed", "other", 0, 0.0, changes=True), 0.5
             )
         )
-        self.end(fleet, lessees)
+        self.end(fleet, clients)
 
 
 class InTimeTests(SynchronousTestCase):

@@ -15,7 +15,7 @@ from middleware.entangled.record import Record
 from middleware.tasks.task import COMPLETED, RESULT, Result, Task, find_outcome, group_key
 from sim.team.machine import Machine
 from tests.fleet import FleetCase
-from tests.middleware.consensus.lease.room import TTL, RoomCase, T
+from tests.middleware.consensus.lease.room import TTL, LeaseCase, T
 
 
 class PinnedTests(FleetCase):
@@ -26,24 +26,24 @@ class PinnedTests(FleetCase):
         key = group_key("t1")
         contacts = [node.entangled.contact for node in fleet.nodes]
         self.assertEqual(list(task.council), select_closest(contacts, key, 3))
-        lessee = fleet.nodes[1].make_lease_client(task, lambda: None, 0)
+        client = fleet.nodes[1].make_lease_client(task, lambda: None, 0)
         for place in range(4, 9):
             fleet.nodes.append(fleet.make_node(place))
             fleet.nodes[place].startService()
             fleet.run(0.5)
         now_closest = select_closest([node.entangled.contact for node in fleet.nodes], key, 3)
         self.assertNotEqual(list(task.council), now_closest)
-        self.assertEqual(lessee.proposer.members, task.council)
+        self.assertEqual(client.proposer.members, task.council)
 
 
-class RuleTests(RoomCase):
+class RuleTests(LeaseCase):
     def test_rule_2_council_changes_by_a_majority_of_the_old_one(self) -> None:
         """The old council decides a change by a majority, with configuration + 1, and never during an open claim."""
-        council = self.lessee(1).proposer
+        council = self.client(1).proposer
         following = [self.room.contacts[n] for n in (0, 1, 2)]
         self.wanting(0)
         self.assertIsInstance(self.outcome(council.change_members(following)), LeaseHeld)
-        self.lessee(0).release()
+        self.client(0).release()
         self.run_for(0.1)
         self.cut(1, 3, 4)
         self.assertIsInstance(self.outcome(council.change_members(following)), NoMajority)
@@ -65,7 +65,7 @@ class RuleTests(RoomCase):
             bidder.answer = heard  # type: ignore[method-assign]
         clocks = [bidder.machine.seconds() for bidder in self.room.nodes]
         self.assertGreater(max(clocks) - min(clocks), 100.0)
-        self.lessee(1).stand_by()
+        self.client(1).stand_by()
         self.wanting(0, 3 * TTL)
         self.assertEqual(self.holders(), [0])
         self.assertLessEqual(max(sent), TTL)
@@ -76,7 +76,7 @@ class RuleTests(RoomCase):
         for place in (0, 1, 2, 0):
             self.wanting(place)
             tokens.append(self.token(place))
-            self.lessee(place).release()
+            self.client(place).release()
             self.run_for(0.1)
             for member in range(self.room.n):
                 self.room.kill(member)
@@ -95,7 +95,7 @@ class RuleTests(RoomCase):
                 if is_lost:
                     self.room.stores[member] = MemoryStore()
                 self.room.nodes[member] = self.room.start_life(member)
-            self.lessee(0).release()
+            self.client(0).release()
             self.wanting(1, 0.2)
             self.assertEqual(self.holders(), [] if is_lost else [1])
             self.run_for(TTL)
@@ -104,16 +104,16 @@ class RuleTests(RoomCase):
     def test_rule_5_deadline_counts_from_the_sending(self) -> None:
         """The deadline is the send time + TTL x (1 - 2 rho) - the stopping time, however late the answers arrive."""
         self.room = self.made(stop_time=0.3)
-        lessee = self.lessee(0)
+        client = self.client(0)
         self.wanting(0)
-        lease = lessee.lease
+        lease = client.lease
         assert lease is not None
         asked_at: list[float] = []
         member = self.room.nodes[3].machine
         take = member.deliver_datagram
         member.deliver_datagram = lambda *a: (asked_at.append(self.room.nodes[0].machine.seconds()), take(*a))[1]  # type: ignore[func-returns-value,method-assign]
         self.run_for(TTL / RENEWALS_PER_TTL)
-        renewed = lessee.lease
+        renewed = client.lease
         assert renewed is not None
         sent = renewed.deadline - TTL * (1.0 - CLOCK_MARGIN) + 0.3
         self.assertLess(sent, asked_at[0])
@@ -123,15 +123,15 @@ class RuleTests(RoomCase):
         """The next holder never starts before the previous robot stands still, with clocks that differ by 1 %."""
         for stop_time in (0.0, 0.4):
             self.room = self.made(stop_time, [0.99, 1.01, 1.0, 1.01, 1.01, 1.01, 1.0])
-            lessee = self.wanting(0, 1.0)
-            self.lessee(1).stand_by()
+            client = self.wanting(0, 1.0)
+            self.client(1).stand_by()
             self.run_for(TTL)
-            lease = lessee.lease
+            lease = client.lease
             assert lease is not None
             self.cut(0, 3, 4, 5)
             ends = 0.0
-            while not self.lessee(1).lease:
-                now = lessee.lease
+            while not self.client(1).lease:
+                now = client.lease
                 ends = self.room.nodes[0].machine.to_simulator_time(now.deadline) if now else ends
                 self.run_for(0.005)
             self.assertGreaterEqual(self.room.clock.seconds() + 0.001, ends + stop_time)
@@ -140,10 +140,10 @@ class RuleTests(RoomCase):
     def test_rule_6_stand_by_asks_when_pushes_are_lost(self) -> None:
         """A standby takes over without a notification of the release, because it polls three times per TTL."""
         self.wanting(0)
-        self.lessee(1).stand_by()
+        self.client(1).stand_by()
         self.run_for(TTL)
         self.room.notify = lambda *_: None  # type: ignore[method-assign]
-        self.lessee(0).release()
+        self.client(0).release()
         self.run_for(TTL / RENEWALS_PER_TTL + 0.1)
         self.assertEqual(self.holders(), [1])
 
@@ -151,7 +151,7 @@ class RuleTests(RoomCase):
         """Two lost rounds of renewal do not lose the lease."""
         self.wanting(0)
         for _ in range(20):
-            lease = self.lessee(0).lease
+            lease = self.client(0).lease
             assert lease is not None
             self.cut(0, 3, 4, 5)
             self.run_for(TTL * 0.55)
@@ -161,26 +161,26 @@ class RuleTests(RoomCase):
 
     def test_rule_7_suspended_holder_knows_that_time_has_passed(self) -> None:
         """A holder that resumes after a suspension has no lease, sends nothing, and counts one pause."""
-        lessee = self.wanting(0, 1.0)
-        self.lessee(1).stand_by()
+        client = self.wanting(0, 1.0)
+        self.client(1).stand_by()
         self.run_for(0.2)
         self.room.nodes[0].machine.freeze(is_suspended=True)
         self.run_for(4 * TTL)
         accepted = len(self.room.recorder.accepted[T])
         self.room.nodes[0].machine.thaw()
-        self.assertIsNone(lessee.lease)
+        self.assertIsNone(client.lease)
         self.run_for(1.0)
-        self.assertEqual((self.holders(), lessee.late_timer_count), ([1], 1))
+        self.assertEqual((self.holders(), client.late_timer_count), ([1], 1))
         self.assertEqual({place for _, _, place in self.room.recorder.accepted[T][accepted:]}, {1})
         self.assertEqual(self.room.recorder.violations, [])
 
     def test_rule_7_clock_that_stands_still_is_not_enough(self) -> None:
         """With a clock that stops during a suspension the holder would wrongly trust its old lease."""
         self.patch(Machine, "COUNTS_SUSPENSION", False)
-        lessee = self.wanting(0, 1.0)
+        client = self.wanting(0, 1.0)
         self.room.nodes[0].machine.freeze(is_suspended=True)
         self.run_for(4 * TTL)
-        self.assertIsNotNone(lessee.lease)
+        self.assertIsNotNone(client.lease)
 
     def test_rule_8_device_refuses_lower_tokens_and_stops_by_itself(self) -> None:
         """The device rejects lower tokens from any sender, and its gate ends a motion at its deadline."""
@@ -193,12 +193,12 @@ class RuleTests(RoomCase):
     def test_rule_9_the_end_carries_the_token(self) -> None:
         """A former holder cannot close the task under its old token; of two results the higher token wins."""
         self.wanting(0)
-        self.lessee(0).release()
+        self.client(0).release()
         self.wanting(1)
-        stale = self.lessee(0).proposer.close(1)
+        stale = self.client(0).proposer.close(1)
         self.assertIsInstance(self.outcome(stale), Superseded)
         self.assertEqual(self.holders(), [1])
-        self.assertIsNone(self.outcome(self.lessee(1).proposer.close(2)))
+        self.assertIsNone(self.outcome(self.client(1).proposer.close(2)))
         self.assertEqual(self.holders(), [])
         results = [Result(COMPLETED, "dog1", 1.0, 2), Result(COMPLETED, "dog0", 1.0, 1)]
         records = [
@@ -213,8 +213,8 @@ class RuleTests(RoomCase):
         for stop_time in (0.0, 0.4):
             self.room = self.made(stop_time)
             self.wanting(0)
-            self.lessee(2).stand_by(2)
-            self.lessee(1).stand_by(1)
+            self.client(2).stand_by(2)
+            self.client(1).stand_by(1)
             self.run_for(TTL)
             self.room.nodes[0].leave(T)
             self.run_for(max(0.0, stop_time - 0.01))
@@ -226,14 +226,14 @@ class RuleTests(RoomCase):
     def test_rule_11_suspicion_shortens_no_lease(self) -> None:
         """Suspicion by a standby does not shorten the lease; when it ends, the standby is ready."""
         self.wanting(0)
-        self.lessee(1).stand_by()
+        self.client(1).stand_by()
         for _ in range(40):
-            self.lessee(1).suspect_holder()
+            self.client(1).suspect_holder()
             self.run_for(0.1)
         self.assertEqual((self.holders(), self.token(0)), ([0], 1))
         self.room.kill(0)
-        self.lessee(1).suspect_holder()
+        self.client(1).suspect_holder()
         self.run_for(TTL - 0.6)
-        self.assertIsNone(self.lessee(1).lease)
+        self.assertIsNone(self.client(1).lease)
         self.run_for(0.7)
-        self.assertIsNotNone(self.lessee(1).lease)
+        self.assertIsNotNone(self.client(1).lease)
