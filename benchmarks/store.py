@@ -21,7 +21,7 @@ from twisted.internet.interfaces import IReactorFromThreads
 
 from benchmarks.measure import MIB, percentile, read_memory_bytes
 from middleware.entangled.data.sqlite import SqliteStore
-from middleware.entangled.record import MAX_VALUE_BYTES, Record, hash_key
+from middleware.entangled.record import Record, hash_key
 
 ROOT = Path(__file__).resolve().parents[1]
 KEY = hash_key("kills")
@@ -39,7 +39,7 @@ def make_record(number: int) -> Record:
     Large values are in the same slots in each pass, so the owner never reaches its limit, however fast the writer is.
     """
     rng = random.Random(number)
-    size = min(MAX_VALUE_BYTES, 200_000) if number % SLOTS % 97 == 0 else rng.randrange(300)
+    size = 60_000 if number % SLOTS % 97 == 0 else rng.randrange(300)
     value = None if number % 7 == 0 else rng.randbytes(size)
     signature = hashlib.blake2b(str(number).encode()).digest()
     return Record(KEY, str(number % SLOTS), OWNER, number, "team", TTL_S, value, signature)
