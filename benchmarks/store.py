@@ -21,7 +21,7 @@ from twisted.internet.interfaces import IReactorFromThreads
 
 from benchmarks.measure import MIB, percentile, read_memory_bytes
 from middleware.entangled.data.sqlite import SqliteStore
-from middleware.entangled.record import Record, hash_key
+from middleware.entangled.record import MAX_VALUE_BYTES, Record, hash_key
 
 ROOT = Path(__file__).resolve().parents[1]
 KEY = hash_key("kills")
