@@ -102,14 +102,14 @@ class SwarmNode(Service):
         self.entangled = EntangledNode(identity, team_key, network, store, clock, rng, lease, wall, admission, lan)
         self.uuid = identity.node_id.hex()
         self._admission = admission
-        self._chores = Background(clock)
-        self.later = self._chores.later
+        self._background = Background(clock)
+        self.later = self._background.later
         self.team: Team | None = None
         self.deployed: DeployedModules = {}
         self.stop_deployed: Callable[[], None] = lambda: None
         self.stop_state = StopState()
-        self.directory = Directory(self.entangled, self._chores)
-        self.presence = Presence(self._with_certified_name(device), self._announce, self._chores.later)
+        self.directory = Directory(self.entangled, self._background)
+        self.presence = Presence(self._with_certified_name(device), self._announce, self._background.later)
         self.streams = Streams(self.entangled.endpoint, clock)
         self.joined: Deferred[None] = Deferred()
         self._known_nodes = list(known_nodes)
@@ -148,7 +148,7 @@ class SwarmNode(Service):
         self._leave(self.entangled.stop_silently)
 
     def _leave(self, leave: Callable[[], None]) -> None:
-        self._chores.stop()
+        self._background.stop()
         self.streams.stop()
         while self._stop_calls:
             self._stop_calls.pop()()
@@ -170,7 +170,7 @@ class SwarmNode(Service):
         device = self.presence.device
         self._log.info("{name} joined as number {joined}", name=device.name, joined=device.joined)
         self._update_figures()
-        self._chores.every(FIGURES_INTERVAL_S, self._update_figures)
+        self._background.every(FIGURES_INTERVAL_S, self._update_figures)
         self.joined.callback(None)
         await self._resolve_place()
 
@@ -196,7 +196,7 @@ class SwarmNode(Service):
         in order after one exchange of presences, not after one per device.
         """
         for _ in range(MAX_PLACE_CHECKS):
-            await self._chores.sleep(PLACE_CHECK_INTERVAL_S)
+            await self._background.sleep(PLACE_CHECK_INTERVAL_S)
             others = await self._find_others()
             own_place = self.presence.device.joined
             same = [d for d in others if d.joined == own_place and d.uuid != self.uuid]
@@ -215,7 +215,7 @@ class SwarmNode(Service):
                 raise
             except EntangledError as error:
                 self._log.info("the directory does not answer; retrying: {error}", error=error)
-                await self._chores.sleep(PLACE_CHECK_INTERVAL_S)
+                await self._background.sleep(PLACE_CHECK_INTERVAL_S)
 
     def _with_certified_name(self, device: Device) -> Device:
         """Return ``device`` with the name in its certificate, if it has one."""
@@ -399,7 +399,7 @@ class SwarmNode(Service):
         # Imported on first use.
         from middleware.entangled.control.health import LinkMetrics
 
-        return LinkMetrics(self.entangled, self.clock, self._chores)
+        return LinkMetrics(self.entangled, self.clock, self._background)
 
     @cached_property
     def _strategies(self) -> StrategyRegistry:
@@ -476,7 +476,7 @@ class SwarmNode(Service):
         if not 0 < seconds <= 3600:
             raise Refused("a device disconnects for more than 0 and at most 3600 seconds")
         # Leave after the answer was sent.
-        self._chores.later(0.05, self._on_disconnect, float(seconds))
+        self._background.later(0.05, self._on_disconnect, float(seconds))
         return "leaving"
 
     # -- inside -----------------------------------------------------------------------------------------------------

@@ -32,7 +32,7 @@ MAX_PAGE_BYTES = 65_536 + 16_384
 class Gossip:
     """Keep the membership list of one node in sync with the other members.
 
-    ``on_new`` is called with each entry that is new to this node; ``wall`` is the wall clock in seconds.
+    ``on_new_entry`` is called with each entry that is new to this node; ``wall`` is the wall clock in seconds.
     """
 
     _log = Logger()
@@ -45,15 +45,15 @@ class Gossip:
         rng: random.Random,
         background: Background,
         wall: Callable[[], float],
-        on_new: Callable[[Entry], None],
+        on_new_entry: Callable[[Entry], None],
     ) -> None:
         self._membership_list = membership_list
         self._endpoint = endpoint
         self._contacts = contacts
         self._rng = rng
-        self._chores = background
+        self._background = background
         self._wall = wall
-        self._on_new_entry = on_new
+        self._on_new_entry = on_new_entry
         self._is_full = False
         endpoint.expose("roll.tell", self._answer_tell, changes=True, idempotent=True)
         endpoint.expose("roll.compare", self._answer_compare)
@@ -61,7 +61,7 @@ class Gossip:
 
     def start(self) -> None:
         """Start the periodic comparison."""
-        self._chores.every(COMPARE_INTERVAL_S, self._compare_with_one)
+        self._background.every(COMPARE_INTERVAL_S, self._compare_with_one)
 
     def add(self, packed: bytes) -> Entry | None:
         """Add an entry that originates at this node, and push it; raises as ``MembershipList.add`` does."""
@@ -73,7 +73,7 @@ class Gossip:
 
     def compare_with(self, contact: Contact) -> None:
         """Compare lists with a contact that is new or has returned."""
-        self._chores.fork(self._compare(contact))
+        self._background.fork(self._compare(contact))
 
     # -- implementation ---------------------------------------------------------------------------------------------
 
@@ -107,7 +107,7 @@ class Gossip:
         self._membership_list.expire(self._wall())
         others = self._contacts()
         if others:
-            self._chores.fork(self._compare(self._rng.choice(others)))
+            self._background.fork(self._compare(self._rng.choice(others)))
 
     async def _compare(self, contact: Contact) -> None:
         answer = await self._endpoint.ask(contact, "roll.compare", self._membership_list.digest)

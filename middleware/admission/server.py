@@ -38,10 +38,10 @@ MAX_CACHED_REPLIES = 256
 class AdmissionServer:
     """Admit newcomers at a bootstrap node.
 
-    ``identity`` is the node's key pair.  ``take`` uses up one use of an invitation, ``admit`` publishes an admission,
-    ``given`` returns the reply content for a pass, and ``send`` sends a datagram.  ``now`` is the monotonic clock for
-    rate limits, ``wall`` the wall clock for statements.  ``refused`` is called for each rejected newcomer with its key
-    (empty if the code is unknown), its address and the code of ``REFUSAL_TEXTS``.
+    ``identity`` is the node's key pair.  ``take_use`` uses up one use of an invitation, ``publish_admission`` publishes
+    an admission, ``build_reply`` returns the reply content for a pass, and ``send`` sends a datagram.  ``now`` is the
+    monotonic clock for rate limits, ``wall`` the wall clock for statements.  ``on_refused`` is called for each rejected
+    newcomer with its key (empty if the code is unknown), its address and the code of ``REFUSAL_TEXTS``.
     """
 
     _log = Logger()
@@ -50,27 +50,27 @@ class AdmissionServer:
         self,
         membership_list: MembershipList,
         identity: Identity,
-        take: Callable[[Invite], Deferred[bool]],
-        admit: Callable[[bytes], object],
-        given: Callable[[bytes], JoinReply],
+        take_use: Callable[[Invite], Deferred[bool]],
+        publish_admission: Callable[[bytes], object],
+        build_reply: Callable[[bytes], JoinReply],
         send: Callable[[bytes, Address], None],
         now: Callable[[], float],
         wall: Callable[[], float],
         rng: random.Random,
-        refused: Callable[[bytes, Address, str], None],
+        on_refused: Callable[[bytes, Address, str], None],
     ) -> None:
         self._membership_list = membership_list
         self._identity = identity
-        self._take_use = take
-        self._publish_admission = admit
-        self._build_reply = given
+        self._take_use = take_use
+        self._publish_admission = publish_admission
+        self._build_reply = build_reply
         self._send = send
         self._now = now
         self._wall = wall
         self._rng = rng
         self._cached_replies: OrderedDict[bytes, bytes] = OrderedDict()
         self._pending_names: dict[bytes, str] = {}
-        self._on_refused = refused
+        self._on_refused = on_refused
         self._log_limiter = LogLimiter()
         self._request_rate = TokenBucket(MAX_REQUESTS_PER_S)
         self._unsigned_refusal_rate = TokenBucket(MAX_UNSIGNED_REFUSALS_PER_S)

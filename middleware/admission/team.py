@@ -80,14 +80,14 @@ class Team:
     def attach(self, node: EntangledNode, clock: IReactorTime) -> None:
         """Connect to ``node``, which uses this team's ``admission`` and is not started yet."""
         self._node, self._clock = node, clock
-        self._chores = Background(clock)
+        self._background = Background(clock)
         endpoint = node.endpoint
         self._gossip = Gossip(
             self.membership_list,
             endpoint,
             node.overlay.contacts,
             self._rng,
-            self._chores,
+            self._background,
             self._wall,
             self._on_new_entry,
         )
@@ -126,12 +126,12 @@ class Team:
             # Whether the clock is right is unknown at this point, so the message has both causes.
             self._log.warn("the certificate of this node is not valid by its clock: {why}", why=explain(problem))
         self._gossip.start()
-        self._chores.every(COMPARE_INTERVAL_S, self._run_periodic)
+        self._background.every(COMPARE_INTERVAL_S, self._run_periodic)
 
     def stop(self) -> None:
         """Cancel pending work."""
         if self._node is not None:
-            self._chores.stop()
+            self._background.stop()
         if self._use_counters is not None:
             self._use_counters.stop()
 
@@ -223,10 +223,10 @@ class Team:
         self._evict_former_members()
         self._apply_secrets()
         if self._renewer.is_scan_due(self._wall()):
-            self._chores.fork(self._renew_due())
+            self._background.fork(self._renew_due())
         newest = next(iter(self.membership_list.list_secrets()), None)
         if newest is not None and newest.number > self.membership.secrets[0][0]:
-            self._chores.fork(self._request_secret(newest))
+            self._background.fork(self._request_secret(newest))
 
     async def _renew_due(self) -> None:
         """Renew some of the members that are due and present."""

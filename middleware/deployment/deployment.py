@@ -72,9 +72,9 @@ class _Candidate:
 class Deployment:
     """The pushed modules of one node.
 
-    ``modules`` maps (kind, name) to the factory of the strategy or behaviour; agents look it up there.
-    ``later(seconds, call)`` is the node's timer, which ends with the node.  ``author_of`` returns the holder of a key,
-    ``spawn`` starts a process, ``seconds`` is the monotonic clock.
+    ``modules`` maps (kind, name) to the factory of the strategy or behaviour; agents look it up there. ``later(seconds,
+    call)`` is the node's timer, which ends with the node.  ``find_author`` returns the holder of a key, ``spawn``
+    starts a process, ``seconds`` is the monotonic clock.
     """
 
     _log = Logger()
@@ -87,7 +87,7 @@ class Deployment:
         later: Later,
         allowed: DeploymentSettings,
         module_store: ModuleStore,
-        author_of: Callable[[bytes], Author],
+        find_author: Callable[[bytes], Author],
         spawn: Spawn,
         seconds: Callable[[], float],
     ) -> None:
@@ -98,7 +98,7 @@ class Deployment:
         self._later = later
         self._allowed = allowed
         self._module_store = module_store
-        self._find_author = author_of
+        self._find_author = find_author
         self._spawn = spawn
         self._seconds = seconds
         self._wanted: dict[str, tuple[Manifest, Record]] = {}

@@ -56,7 +56,7 @@ class Directory:
     def __init__(self, entangled: EntangledNode, background: Background) -> None:
         self.depth = 0
         self.entangled = entangled
-        self.chores = background
+        self.background = background
         self._own_id = entangled.identity.node_id
         self._current_places: set[tuple[bytes, str]] = set()
         self._old_places: set[tuple[bytes, str]] = set()
@@ -82,7 +82,7 @@ class Directory:
         for _ in range(PLACEMENT_STEPS):
             if overlay.has_found_neighbours or not overlay.is_large:
                 break
-            await self.chores.sleep(PLACEMENT_STEP_S)
+            await self.background.sleep(PLACEMENT_STEP_S)
         self.depth = choose_depth(self.size)
         return self.depth
 
@@ -156,7 +156,7 @@ class Directory:
             await run_limited(CONCURRENT_READS, map(visit, places))
             on_found(listing)
             if pause and not listing.is_over:
-                await self.chores.sleep(pause)
+                await self.background.sleep(pause)
 
     async def find_devices(
         self, count: int, matches: Matches = lambda device: True, after: bytes | None = None, most_reads: int = 64

@@ -52,7 +52,7 @@ class DeviceSubscription:
         if self._directory.depth > 1 or any(DEPTH_MARK in (record.value or b"") for record in records):
             if not self._is_split:
                 self._is_split = True
-                self._directory.chores.fork(self._read_repeatedly())
+                self._directory.background.fork(self._read_repeatedly())
         elif not self._is_split:
             self._notify(records)
 
@@ -65,7 +65,7 @@ class DeviceSubscription:
             self._remove_missing(listing)
             if listing.is_complete and listing.reads == 1 and self._directory.depth < 2:
                 break
-            await self._directory.chores.sleep(ROUND_PAUSE_S)
+            await self._directory.background.sleep(ROUND_PAUSE_S)
         self._is_split = False
         if self._watch is not None and not self._is_stopped:
             self._on_records(self._watch.records)

@@ -233,7 +233,7 @@ class FaultInjector:
         self.wall.ahead = amount("skew")
         if self._network is not None:
             conditions = LinkConditions(delay_s=amount("delay"), loss=amount("loss"))
-            self._network.weather = PERFECT if conditions == PERFECT else conditions
+            self._network.conditions = PERFECT if conditions == PERFECT else conditions
             self._network.is_receive_blocked = "radio" in self._active
             self._network.is_send_blocked = "radio" in self._active or "one-way" in self._active
         if self._battery is not None:

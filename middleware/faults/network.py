@@ -24,12 +24,12 @@ from middleware.entangled.network.switchboard import PERFECT
 class FaultyNetwork:
     """``network`` with faults.
 
-    ``weather`` applies to each datagram sent and to each one received, so to a request and its response twice.
+    ``conditions`` applies to each datagram sent and to each one received, so to a request and its response twice.
     ``is_receive_blocked``: nothing is received; ``is_send_blocked``: nothing is sent.
     """
 
     def __init__(self, network: Network, clock: IReactorTime, rng: random.Random) -> None:
-        self.weather = PERFECT
+        self.conditions = PERFECT
         self.is_receive_blocked = False
         self.is_send_blocked = False
         self._network = network
@@ -48,7 +48,7 @@ class FaultyNetwork:
         return find_ports(self._network)
 
     @property
-    def detours(self) -> list[Address]:
+    def alternate_paths(self) -> list[Address]:
         """The alternate paths of the network."""
         return find_alternate_paths(self._network)
 
@@ -72,8 +72,8 @@ class FaultyNetwork:
             self._forward(self._deliver_received, datagram, source)
 
     def _forward(self, deliver: Receiver, datagram: bytes, address: Address) -> None:
-        """Forward a datagram according to the weather: now, late, twice or not at all."""
-        for delay in (0.0,) if self.weather is PERFECT else self.weather.draw_delays(self._rng):
+        """Forward a datagram according to the conditions: now, late, twice or not at all."""
+        for delay in (0.0,) if self.conditions is PERFECT else self.conditions.draw_delays(self._rng):
             if delay > 0.0:
                 self._clock.callLater(delay, deliver, datagram, address)
             else:

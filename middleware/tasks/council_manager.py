@@ -31,8 +31,8 @@ SILENT_S = 10.0
 class CouncilManager:
     """The quorum members of tasks, reached through ``entangled``.
 
-    ``born_at`` is the time at which the node started.  ``moved`` is called with a task whose quorum members have
-    changed.  ``may_sit`` returns whether the owner of a key may be a quorum member.
+    ``born_at`` is the time at which the node started.  ``on_change`` is called with a task whose quorum members have
+    changed.  ``may_be_member`` returns whether the owner of a key may be a quorum member.
     """
 
     def __init__(
@@ -42,14 +42,14 @@ class CouncilManager:
         clock: IReactorTime,
         rng: random.Random,
         born_at: float,
-        moved: Callable[[Task], object],
-        may_sit: Callable[[bytes], bool],
+        on_change: Callable[[Task], object],
+        may_be_member: Callable[[bytes], bool],
     ) -> None:
         self._entangled = entangled
         self._clock = clock
         self._rng = rng
-        self._on_change = moved
-        self._may_be_member = may_sit
+        self._on_change = on_change
+        self._may_be_member = may_be_member
         self.charter_verifier = CharterVerifier(self._may_publish)
         self.lease_service = LeaseService(
             entangled.endpoint, entangled.identity, store, clock, born_at, self.charter_verifier, self._may_be_member

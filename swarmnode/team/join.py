@@ -214,7 +214,7 @@ def send_join_requests(
         ]
         client = JoinClient(code, seed, network, clock, rng, wish)
         work = client.join(mapped, timeout)
-        for address in getattr(network, "detours", ()):
+        for address in getattr(network, "alternate_paths", ()):
             clock.callLater(FALLBACK_AFTER_S, client.add_address, address)
 
         def failed(failure: Any) -> None:

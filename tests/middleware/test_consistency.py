@@ -338,7 +338,7 @@ class CutTests(ConsistencyCase):
             self.assertEqual(sorted(self.values(fleet, len(fleet.nodes) - 1)), [b"x", b"y"])
 
     def test_a_lost_memory_was_a_vote(self) -> None:
-        """A node with a lost store is not ``SYNCED_REPLY`` while only nodes answer that may have missed its records."""
+        """A node with a lost store is not synced while only nodes answer that may have missed its records."""
         fleet = self.fleet(3)
         self.cut(fleet, 2)
         self.outcome(fleet, fleet.nodes[0].put(KEY, "a", b"x"))
@@ -360,9 +360,7 @@ class CutTests(ConsistencyCase):
         self.assertEqual([self.values(fleet, place) for place in range(3)], [[b"x"]] * 3)
 
     def test_a_newcomer_and_a_lost_memory(self) -> None:
-        """A new node that joins through a node with a lost store learns the members from it and is not
-        ``SYNCED_REPLY``.
-        """
+        """A new node that joins through a node with a lost store learns the members from it and is not synced."""
         fleet = self.fleet(3)
         self.cut(fleet, 2, 3)
         fleet.nodes[2].stop_silently()
@@ -389,8 +387,7 @@ class CutTests(ConsistencyCase):
         self.assertEqual([node.replica.is_synced() for node in fleet.nodes], [True] * 4)
 
     def test_the_unsure_hold_without_a_vote(self) -> None:
-        """A replica that is not ``SYNCED_REPLY`` stores records without a vote; the writer waits briefly for its vote.
-        """
+        """A replica that is not synced stores records without a vote; the writer waits briefly for its vote."""
         fleet = self.fleet(2)
         unsure = fleet.nodes[1].replica
         genuine, unsure.is_synced = unsure.is_synced, lambda: False
@@ -450,7 +447,7 @@ class StartTests(ConsistencyCase):
         self.assertTrue(fleet.nodes[3].replica.is_synced())
 
     def test_a_new_team_all_at_once(self) -> None:
-        """Nodes that start at the same time and know all addresses are ``SYNCED_REPLY`` within four seconds."""
+        """Nodes that start at the same time and know all addresses are synced within four seconds."""
         fleet = self.fleet(0)
         for place in range(5):
             fleet.nodes.append(fleet.make_node(place))
@@ -460,7 +457,7 @@ class StartTests(ConsistencyCase):
         self.assertEqual([node.replica.is_synced() for node in fleet.nodes], [True] * 5)
 
     def test_a_power_cut(self) -> None:
-        """After a restart from disk of all members but one the team is ``SYNCED_REPLY`` and writes within seconds."""
+        """After a restart from disk of all members but one the team is synced and writes within seconds."""
         fleet = self.fleet(5)
         self.outcome(fleet, fleet.nodes[0].put(KEY, "a", b"x"))
         for node in fleet.nodes:

@@ -313,7 +313,7 @@ class JoinTests(FleetCase):
             fleet.run(3.0)
 
     def test_a_newcomer_takes_over(self) -> None:
-        """Within a second a new node knows all members, is ``SYNCED_REPLY`` and holds its records."""
+        """Within a second a new node knows all members, is synced and holds its records."""
         fleet = self.fleet(10)
         keys = [hash_key(str(number)) for number in range(60)]
         for key in keys:

@@ -180,11 +180,16 @@ class AuctionService:
     _log = Logger()
 
     def __init__(
-        self, identity: Identity, wire: RequestSender, around: Environment, clock: IReactorTime, rng: random.Random
+        self,
+        identity: Identity,
+        endpoint: RequestSender,
+        environment: Environment,
+        clock: IReactorTime,
+        rng: random.Random,
     ) -> None:
         self._identity = identity
-        self._endpoint = wire
-        self._environment = around
+        self._endpoint = endpoint
+        self._environment = environment
         self._clock = clock
         self._rng = rng
         self._path_choice = PathChoice()

@@ -97,8 +97,8 @@ class Group:
     """One participant's connection to the group of ``task``.
 
     - ``on_members``: called with the members and the outcome after each change
-    - ``quietly``: takes writes whose failure is only logged
-    - ``ordered``: called with all records, which include an operator's orders
+    - ``log_failures``: takes writes whose failure is only logged
+    - ``on_orders``: called with all records, which include an operator's orders
     - ``enter``: starts bidding for the task; None: reports are exchanged by records only
     - ``view``: the part of a report that the strategy reads
     - ``reporters``: decides which participants of a team of many ``devices`` write records
@@ -109,8 +109,8 @@ class Group:
         task: Task,
         entangled: EntangledNode,
         on_members: OnMembers,
-        quietly: Callable[[Deferred[Stored]], None],
-        ordered: Callable[[list[Record]], None],
+        log_failures: Callable[[Deferred[Stored]], None],
+        on_orders: Callable[[list[Record]], None],
         enter: StartBidding | None,
         view: ReportView | None,
         reporters: Reporters,
@@ -122,8 +122,8 @@ class Group:
         self._key = group_key(task.task_id)
         self._entangled = entangled
         self._on_members = on_members
-        self._on_orders = ordered
-        self._log_failures = quietly
+        self._on_orders = on_orders
+        self._log_failures = log_failures
         self._view = view or ReportView()
         self._members = TaskMembers(self._view)
         self._outcome: Result | None = None

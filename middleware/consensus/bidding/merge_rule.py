@@ -22,11 +22,11 @@ OnFault = Callable[[str, Exception], None]
 class MergeRule:
     """A guarded ``strategy`` (a ``ConsensusAlgorithm``, with or without ``merge``)."""
 
-    def __init__(self, strategy: Any, blame: OnFault = lambda method, error: None) -> None:
+    def __init__(self, strategy: Any, on_fault: OnFault = lambda method, error: None) -> None:
         self._find = strategy.find
         self._merge: Callable[[Sequence[Report], Sequence[Report]], Iterable[Report]]
         self._merge = getattr(strategy, "merge", select_leading)
-        self._on_fault = blame
+        self._on_fault = on_fault
 
     def merge(self, a: Sequence[Report], b: Sequence[Report]) -> tuple[Report, ...]:
         """Return the join of two summaries: a subset of their reports, one per agent, in a defined order."""

@@ -98,7 +98,7 @@ class LeaseClient:
         proposer: LeaseProposer,
         clock: IReactorTime,
         rng: random.Random,
-        changed: Callable[[], None],
+        on_change: Callable[[], None],
         stop_time: float = 0.0,
     ) -> None:
         self.task_id = proposer.task_id
@@ -108,7 +108,7 @@ class LeaseClient:
         self._step_count = 0
         self._clock = clock
         self._rng = rng
-        self._on_change = changed
+        self._on_change = on_change
         self._stop_time = stop_time
         self._held = _HeldLease()
         self._claimed_ballot = NO_BALLOT

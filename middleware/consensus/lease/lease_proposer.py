@@ -47,9 +47,9 @@ class NoMajority(Refused):
 class LeaseProposer:
     """The council of one task as the proposer ``agent`` knows it.
 
-    ``moved`` is called after a change of the council, to update the task's record.  ``token`` is the highest known
-    token; new claims are above it.  ``charter`` proves the council, ``read`` decodes and checks charters from members,
-    and ``end_proof`` is the proof that the task was closed under a token.
+    ``on_change`` is called after a change of the council, to update the task's record.  ``token`` is the highest known
+    token; new claims are above it.  ``charter`` proves the council, ``parse_charter`` decodes and checks charters from
+    members, and ``end_proof`` is the proof that the task was closed under a token.
     """
 
     def __init__(
@@ -62,10 +62,10 @@ class LeaseProposer:
         clock: IReactorTime,
         rng: random.Random,
         charter: Charter | None = None,
-        read: ParseCharter = lambda task_id, packed: None,
+        parse_charter: ParseCharter = lambda task_id, packed: None,
         configuration: int = FIRST_CONFIGURATION,
         token: int = 0,
-        moved: Callable[[], None] = lambda: None,
+        on_change: Callable[[], None] = lambda: None,
     ) -> None:
         self.task_id = task_id
         self.agent = agent
@@ -75,8 +75,8 @@ class LeaseProposer:
         self.token = token
         self.charter = charter
         self.end_proof = b""
-        self.on_change = moved
-        self._parse_charter = read
+        self.on_change = on_change
+        self._parse_charter = parse_charter
         self._ask = ask
         self._clock = clock
         self._ballot_quotient = 0

@@ -39,7 +39,7 @@ class LeaseService:
     """The lease service of one node: its acceptor, and the lease clients to notify of releases.
 
     It may be created at the first request: ``born_at`` is the start of the node, from which the acceptor's silence
-    counts.  ``charter_verifier`` checks charters; ``may_sit`` returns whether the owner of a key may be a council
+    counts.  ``charter_verifier`` checks charters; ``may_be_member`` returns whether the owner of a key may be a council
     member.
     """
 
@@ -51,12 +51,12 @@ class LeaseService:
         clock: IReactorTime,
         born_at: float,
         charter_verifier: CharterVerifier,
-        may_sit: Callable[[bytes], bool],
+        may_be_member: Callable[[bytes], bool],
     ) -> None:
         self._endpoint = endpoint
         self._identity = identity
         self._charter_verifier = charter_verifier
-        self._may_be_member = may_sit
+        self._may_be_member = may_be_member
         self._store = store
         self._clock = clock
         self._acceptor = LeaseAcceptor(store, born_at)

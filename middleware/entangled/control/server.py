@@ -33,8 +33,8 @@ class ControlProtocol(Protocol):
 
     _log = Logger()
 
-    def __init__(self, port: ControlServer) -> None:
-        self._server = port
+    def __init__(self, server: ControlServer) -> None:
+        self._server = server
         self._buffer = bytearray()
         self._work: Deferred[Any] | None = None
         self._has_request = False
@@ -149,8 +149,8 @@ class ControlServer(Service):
 class _ConnectionFactory(Factory):
     noisy = False
 
-    def __init__(self, port: ControlServer) -> None:
-        self._server = port
+    def __init__(self, server: ControlServer) -> None:
+        self._server = server
 
     def buildProtocol(self, addr: IAddress | None) -> ControlProtocol:
         return ControlProtocol(self._server)

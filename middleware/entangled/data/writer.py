@@ -53,15 +53,15 @@ class _Batch:
 class Writer:
     """Writes changes to ``connection``, the file ``path``, from ``start`` to ``close``.
 
-    ``deliver`` notifies of written changes in the caller's thread; if it is None, ``flush`` and ``close`` do.
+    ``call_in_thread`` notifies of written changes in the caller's thread; if it is None, ``flush`` and ``close`` do.
     """
 
     _log = Logger()
 
-    def __init__(self, path: str, connection: sqlite3.Connection, deliver: CallInThread | None) -> None:
+    def __init__(self, path: str, connection: sqlite3.Connection, call_in_thread: CallInThread | None) -> None:
         self._path = path
         self._connection = connection
-        self._call_in_thread = deliver
+        self._call_in_thread = call_in_thread
         self._condition = threading.Condition()
         # Access to these needs the lock of ``_condition``.
         self._pending = _Batch()

@@ -64,8 +64,8 @@ class ProbeInterval:
 class LivenessProber:
     """The probes of one node's contacts in a large network.
 
-    ``upkeep`` is called with the time at each run of infrequent maintenance.  ``needs_keep_alive`` returns whether the
-    path to a contact stays open only while it is used.
+    ``on_maintenance`` is called with the time at each run of infrequent maintenance.  ``needs_keep_alive`` returns
+    whether the path to a contact stays open only while it is used.
     """
 
     def __init__(
@@ -74,7 +74,7 @@ class LivenessProber:
         endpoint: Endpoint,
         rng: random.Random,
         background: Background,
-        upkeep: Callable[[float], None],
+        on_maintenance: Callable[[float], None],
     ) -> None:
         self.needs_keep_alive: Callable[[Contact], bool] = lambda contact: False
         self.interval = ProbeInterval()
@@ -82,7 +82,7 @@ class LivenessProber:
         self._endpoint = endpoint
         self._rng = rng
         self._background = background
-        self._on_maintenance = upkeep
+        self._on_maintenance = on_maintenance
         self._probing: set[bytes] = set()
         self._next_distant_at = self._next_maintenance_at = float("-inf")
         self._keep_alive_contacts: list[Contact] = []

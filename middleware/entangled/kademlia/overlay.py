@@ -94,10 +94,10 @@ class Overlay:
     """
 
     def __init__(
-        self, me: Callable[[], Contact], endpoint: Endpoint, clock: IReactorTime, background: Background
+        self, own_contact: Callable[[], Contact], endpoint: Endpoint, clock: IReactorTime, background: Background
     ) -> None:
-        self.own_contact = me
-        self.own_id = me().node_id
+        self.own_contact = own_contact
+        self.own_id = own_contact().node_id
         self._endpoint = endpoint
         self._clock = clock
         self._background = background

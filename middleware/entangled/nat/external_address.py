@@ -32,24 +32,24 @@ its NAT mapping open and shows its current address."""
 class ExternalAddresses:
     """The addresses at which peers see this node.
 
-    ``contacts`` returns the known contacts.  ``moved`` is called with the reporting peer when the external address
+    ``contacts`` returns the known contacts.  ``on_changed`` is called with the reporting peer when the external address
     changed.  A node ``is_translated`` as soon as one peer saw it at an address that is not one of its interfaces.
     """
 
     def __init__(
         self,
         endpoint: Endpoint,
-        paths: RelayedNetwork,
+        network: RelayedNetwork,
         contacts: Callable[[], Iterable[Contact]],
-        moved: Callable[[Contact], None],
+        on_changed: Callable[[Contact], None],
         clock: IReactorTime,
         background: Background,
     ) -> None:
         self.is_translated = False
-        self._on_changed = moved
+        self._on_changed = on_changed
         self._endpoint = endpoint
         self._peers = endpoint.peers
-        self._network = paths
+        self._network = network
         self._contacts = contacts
         self._clock = clock
         self._background = background

@@ -69,7 +69,7 @@ class IntroductionLimits:
 
 
 class Introducer:
-    """Introduces peers to each other, within the ``allowance``; ``relay`` forwards for them if there is room."""
+    """Introduces peers to each other, within the ``limits``; ``relay`` forwards for them if there is room."""
 
     def __init__(
         self,
@@ -77,14 +77,14 @@ class Introducer:
         known: KnownPeers,
         relays: RelayClient,
         relay: Relay,
-        allowance: IntroductionLimits,
+        limits: IntroductionLimits,
         clock: IReactorTime,
     ) -> None:
         self._endpoint = endpoint
         self._known = known
         self._relays = relays
         self._relay = relay
-        self._limits = allowance
+        self._limits = limits
         self._clock = clock
 
     async def answer_introduce(

@@ -31,13 +31,13 @@ class PathTracker:
     def __init__(
         self,
         peers: Peers,
-        paths: RelayedNetwork,
+        network: RelayedNetwork,
         external: ExternalAddresses,
         relays: RelayClient,
         clock: IReactorTime,
     ) -> None:
         self._peers = peers
-        self._network = paths
+        self._network = network
         self._external = external
         self._relays = relays
         self._clock = clock
@@ -131,8 +131,8 @@ class PathTracker:
 class AdditionalPorts:
     """Additional local ports for hole punching, if early INITs may have spoilt the usual port."""
 
-    def __init__(self, paths: RelayedNetwork, tracker: PathTracker, clock: IReactorTime) -> None:
-        self._network = paths
+    def __init__(self, network: RelayedNetwork, tracker: PathTracker, clock: IReactorTime) -> None:
+        self._network = network
         self._tracker = tracker
         self._clock = clock
         self._opened_at: dict[int, float] = {}

@@ -40,19 +40,19 @@ class _Pair:
 
 
 class Relay:
-    """Relays for others.  ``session_of`` returns the direct session with a peer, by its id.
+    """Relays for others.  ``find_session`` returns the direct session with a peer, by its id.
 
     ``counters`` counts the datagrams that were relayed (``carried``) and rejected by the limits (``uncarried``).
     """
 
     def __init__(
         self,
-        session_of: Callable[[bytes], Session | None],
+        find_session: Callable[[bytes], Session | None],
         send: Callable[[Session, bytes], None],
         clock: IReactorTime,
         counters: Counter[str],
     ) -> None:
-        self._find_session = session_of
+        self._find_session = find_session
         self._send = send
         self._clock = clock
         self._counters = counters

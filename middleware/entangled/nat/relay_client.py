@@ -25,10 +25,10 @@ MAX_RELAYS = 3
 class RelayClient:
     """The relays to each node, by its id, and the datagrams through them."""
 
-    def __init__(self, own_id: bytes, endpoint: Endpoint, paths: RelayedNetwork, clock: IReactorTime) -> None:
+    def __init__(self, own_id: bytes, endpoint: Endpoint, network: RelayedNetwork, clock: IReactorTime) -> None:
         self._own_id = own_id
         self._endpoint = endpoint
-        self._network = paths
+        self._network = network
         self._clock = clock
         self._relays: dict[bytes, dict[bytes, float]] = {}
 

@@ -87,7 +87,7 @@ class NatTraversal:
         self,
         own_id: bytes,
         endpoint: Endpoint,
-        paths: RelayedNetwork,
+        network: RelayedNetwork,
         contacts: Callable[[], Iterable[Contact]],
         clock: IReactorTime,
         background: Background,
@@ -95,24 +95,24 @@ class NatTraversal:
         self._own_id = own_id
         self._endpoint = endpoint
         self._peers = endpoint.peers
-        self._network = paths
+        self._network = network
         self._clock = clock
         self._background = background
         self._known = KnownPeers(endpoint.peers)
         self._is_maintenance_scheduled = False
         self._reopened_at = float("-inf")
-        self.external = ExternalAddresses(endpoint, paths, contacts, self._reopen, clock, background)
-        self._relays = RelayClient(own_id, endpoint, paths, clock)
+        self.external = ExternalAddresses(endpoint, network, contacts, self._reopen, clock, background)
+        self._relays = RelayClient(own_id, endpoint, network, clock)
         self.selector = IntroducerSelector(
             own_id, endpoint.peers, contacts, self.external, self._relays, clock, lambda: self._rng
         )
-        self.paths = PathTracker(endpoint.peers, paths, self.external, self._relays, clock)
-        self._additional_ports = AdditionalPorts(paths, self.paths, clock)
+        self.paths = PathTracker(endpoint.peers, network, self.external, self._relays, clock)
+        self._additional_ports = AdditionalPorts(network, self.paths, clock)
         self.relay = Relay(self._known.find_direct_session, endpoint.send_sealed, clock, endpoint.counters)
         self._limits = IntroductionLimits(clock)
         self.introducer = Introducer(endpoint, self._known, self._relays, self.relay, self._limits, clock)
         self._upgrades = PathUpgrades(endpoint.peers)
-        self.query = AddressQuery(endpoint.send_sealed, paths, clock, lambda: self._rng, background)
+        self.query = AddressQuery(endpoint.send_sealed, network, clock, lambda: self._rng, background)
         endpoint.route_message(RELAY_REQUEST, self.relay.on_request)
         endpoint.route_message(RELAYED_DATAGRAM, self._relays.on_relayed)
         endpoint.route_message(ADDRESS_REQUEST, self.query.on_request)
@@ -127,7 +127,7 @@ class NatTraversal:
         self._peers.on_moved.add(self.external.report_change)
         endpoint.on_seen.add(self.external.record)
         endpoint.on_forgotten.add(self._forget)
-        paths.send_relayed = self._relays.send
+        network.send_relayed = self._relays.send
 
     @cached_property
     def _rng(self) -> random.Random:

@@ -38,9 +38,9 @@ class JointNetwork:
         return find_ports(self.udp)
 
     @property
-    def detours(self) -> list[Address]:
+    def alternate_paths(self) -> list[Address]:
         """The virtual addresses of the tunnels that may be dialled."""
-        return self.tunnel.detours
+        return self.tunnel.alternate_paths
 
     @property
     def closed(self) -> Any:

@@ -46,9 +46,9 @@ class LanMulticast:
         self._families: list[_Family] = []
         self._timer: IDelayedCall | None = None
 
-    def listen(self, receiver: Receiver, moved: Callable[[], None]) -> None:
+    def listen(self, receiver: Receiver, on_moved: Callable[[], None]) -> None:
         """Join on every interface and pass each datagram to ``receiver``; an unavailable address family is skipped."""
-        self._on_move = moved
+        self._on_move = on_moved
         for kind in (_Ipv4, _Ipv6):
             try:
                 self._families.append(kind(self._reactor, receiver, self.counters))

@@ -19,10 +19,11 @@ GROUP6 = Address("ff02::8357", 8483)
 class Multicast(Protocol):
     """One node's membership of the group; all nodes on the LAN receive its datagrams and reply to their source."""
 
-    def listen(self, receiver: Receiver, moved: Callable[[], None]) -> None:
+    def listen(self, receiver: Receiver, on_moved: Callable[[], None]) -> None:
         """Pass each datagram from the group, and each reply, to ``receiver``; never raises.
 
-        ``moved`` is called, until ``close``, when the node has moved to another LAN and should search for nodes again.
+        ``on_moved`` is called, until ``close``, when the node has moved to another LAN and should search for nodes
+        again.
         """
 
     def send(self, datagram: bytes) -> None:
@@ -55,20 +56,22 @@ class SimulatedMulticast:
     when it moves the node to another LAN.
     """
 
-    def __init__(self, segment: SimulatedLan, ear: SwitchboardNetwork, mouth: SwitchboardNetwork) -> None:
+    def __init__(
+        self, lan: SimulatedLan, receiving_network: SwitchboardNetwork, sending_network: SwitchboardNetwork
+    ) -> None:
         self.on_moved: Callable[[], None] = lambda: None
-        self._lan = segment
-        self._receiving_network = ear
-        self._sending_network = mouth
+        self._lan = lan
+        self._receiving_network = receiving_network
+        self._sending_network = sending_network
 
     @property
     def addresses(self) -> tuple[Address, Address]:
         """The address that receives from the group, and the one that sends and receives replies."""
         return self._receiving_network.address, self._sending_network.address
 
-    def listen(self, receiver: Receiver, moved: Callable[[], None]) -> None:
+    def listen(self, receiver: Receiver, on_moved: Callable[[], None]) -> None:
         """Pass each datagram from the group, and each reply, to ``receiver``."""
-        self.on_moved = moved
+        self.on_moved = on_moved
         self._receiving_network.listen(receiver)
         self._sending_network.listen(receiver)
         self._lan.groups.append(self)

@@ -122,5 +122,5 @@ def find_ports(network: object) -> LocalPorts | None:
 
 
 def find_alternate_paths(network: object) -> list[Address]:
-    """Return the virtual addresses by which a network reaches known nodes without UDP (its ``detours``)."""
-    return list(getattr(network, "detours", ()))
+    """Return the virtual addresses by which a network reaches known nodes without UDP (its ``alternate_paths``)."""
+    return list(getattr(network, "alternate_paths", ()))

@@ -84,7 +84,7 @@ class TrafficCounters:
 
 
 class SwitchboardNetwork:
-    """One node's port on a ``Switchboard``, behind the router ``home``; a ``Network`` and ``Ports``.
+    """One node's port on a ``Switchboard``, behind the router ``router``; a ``Network`` and ``Ports``.
 
     ``traffic`` counts its datagrams; it may be passed on to the port of a restarted node.
     """
@@ -93,14 +93,14 @@ class SwitchboardNetwork:
         self,
         switchboard: Switchboard,
         address: Address,
-        home: NatRouter | None = None,
+        router: NatRouter | None = None,
         traffic: TrafficCounters | None = None,
     ) -> None:
         self._switchboard = switchboard
         self._address = address
         self._port_by_target: dict[Address, int] = {}
         self.traffic = TrafficCounters() if traffic is None else traffic
-        self.router = home
+        self.router = router
         self.additional_ports: set[int] = set()
         self.receiver: Receiver | None = None
         self.is_unplugged = False

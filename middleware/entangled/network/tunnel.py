@@ -106,7 +106,7 @@ class TunnelNetwork:
         return Address(VIRTUAL_PREFIX + "0" * 12, 1)
 
     @property
-    def detours(self) -> list[Address]:
+    def alternate_paths(self) -> list[Address]:
         """The addresses of the URLs that may be dialled."""
         return list(self._targets)
 

@@ -60,7 +60,7 @@ class TunnelConnection(StreamProtocol):
 
     def __init__(
         self,
-        owner: ConnectionListener,
+        listener: ConnectionListener,
         clock: IReactorTime,
         address: Address,
         host: str,
@@ -73,7 +73,7 @@ class TunnelConnection(StreamProtocol):
         self.is_closed = False
         self.dropped = 0
         self.socket = socket
-        self._listener = owner
+        self._listener = listener
         self._clock = clock
         self._layers = layers
         self._short: deque[bytes] = deque()

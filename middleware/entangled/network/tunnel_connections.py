@@ -50,9 +50,9 @@ class _Progress:
 
 
 class TunnelConnections:
-    """The connections of the tunnel to ``address``; ``measure`` returns the state of a transport's stream."""
+    """The connections of the tunnel to ``address``; ``read_state`` returns the state of a transport's stream."""
 
-    def __init__(self, address: Address, measure: ReadState, now: float) -> None:
+    def __init__(self, address: Address, read_state: ReadState, now: float) -> None:
         self.address = address
         self.token = b""
         """Identifies the tunnel to the other end, which groups its connections by it."""
@@ -60,7 +60,7 @@ class TunnelConnections:
         self.is_answered = False
         self.started_at = self.active_at = now
         self.hold_until = float("-inf")
-        self._read_state = measure
+        self._read_state = read_state
         self._redundant_until = float("-inf")
         self._progress: dict[TunnelConnection, _Progress] = {}
 

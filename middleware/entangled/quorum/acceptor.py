@@ -147,9 +147,9 @@ class AcceptorSettings:
 class Acceptor(Generic[Key]):
     """An acceptor started at ``born_at``; if its log is incomplete it grants nothing for the longest ttl."""
 
-    def __init__(self, log: RegisterLog[Key], terms: AcceptorSettings, born_at: float = -math.inf) -> None:
+    def __init__(self, log: RegisterLog[Key], settings: AcceptorSettings, born_at: float = -math.inf) -> None:
         self.log = log
-        self._settings = terms
+        self._settings = settings
         self._started_at = born_at
 
     def prepare(

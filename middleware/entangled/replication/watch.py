@@ -95,10 +95,10 @@ class Watch:
     def __init__(
         self,
         key: bytes,
-        changed: OnChanged,
-        unwatch: Callable[[Watch], None],
+        on_changed: OnChanged,
+        on_stop: Callable[[Watch], None],
         own_id: bytes = b"",
-        keep: bool = False,
+        has_copies: bool = False,
     ) -> None:
         self.key = key
         self.view = View(own_id)
@@ -106,9 +106,9 @@ class Watch:
         self.requested: set[bytes] = set()
         self.push_numbers: dict[bytes, int] = {}
         self.due_at = 0.0
-        self.has_copies = keep
-        self._on_changed = changed
-        self._on_stop = unwatch
+        self.has_copies = has_copies
+        self._on_changed = on_changed
+        self._on_stop = on_stop
 
     def update(self) -> None:
         """Merge the view, and notify the subscriber if the records changed."""

@@ -101,7 +101,7 @@ class Claim:
 class Taker:
     """The takes of one node in one space; ``claimed`` are its claimed tuples, ``taken`` the tuples known to be taken.
 
-    ``freed`` is called when this node gives up a tuple that it held or failed to claim, ``put_back`` with a tuple
+    ``on_freed`` is called when this node gives up a tuple that it held or failed to claim, ``on_unwanted`` with a tuple
     that was confirmed for a call that has ended.
     """
 
@@ -112,12 +112,12 @@ class Taker:
         rng: random.Random,
         background: Background,
         slots: SlotMaintenance,
-        council: int,
-        freed: Callable[[TupleId], None],
-        put_back: Callable[[Tuple], object],
+        council_size: int,
+        on_freed: Callable[[TupleId], None],
+        on_unwanted: Callable[[Tuple], object],
     ) -> None:
-        self._on_freed = freed
-        self._on_unwanted = put_back
+        self._on_freed = on_freed
+        self._on_unwanted = on_unwanted
         self.claimed: set[TupleId] = set()
         self.taken: dict[TupleId, bytes] = {}
         self._node = node
@@ -125,7 +125,7 @@ class Taker:
         self._rng = rng
         self._background = background
         self._slots = slots
-        self._council_size = council
+        self._council_size = council_size
         self._proposer = TakeProposer(self._ask, clock, rng, background)
         self._seed = zlib.crc32(node.identity.node_id)
         self._counters: dict[TupleId, int] = {}

@@ -39,12 +39,12 @@ class RoundTrip:
 
     __slots__ = ("timeout", "is_measured", "_smoothed", "_deviation", "_min_timeout")
 
-    def __init__(self, first: float = INITIAL_TIMEOUT_S, shortest: float = MIN_TIMEOUT_S) -> None:
-        self.timeout = first
+    def __init__(self, initial_timeout: float = INITIAL_TIMEOUT_S, min_timeout: float = MIN_TIMEOUT_S) -> None:
+        self.timeout = initial_timeout
         self.is_measured = False
         self._smoothed = 0.0
         self._deviation = 0.0
-        self._min_timeout = shortest
+        self._min_timeout = min_timeout
 
     def add_sample(self, seconds: float) -> None:
         """Update the estimate with the round trip of a first try."""

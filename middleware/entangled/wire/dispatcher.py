@@ -53,7 +53,8 @@ _GONE_TEXT = "the call ran, but its answer was too large to keep; read the state
 class Dispatcher:
     """Dispatches requests of peers to exposed methods; ``send`` is called with a session and the bytes of a message.
 
-    ``may`` returns whether a peer (its public key) may call a method; ``refused`` is called for each rejected call.
+    ``may_call`` returns whether a peer (its public key) may call a method; ``on_refused_call`` is called for each
+    rejected call.
     """
 
     _log = Logger()
@@ -64,12 +65,12 @@ class Dispatcher:
         send: Callable[[Session, bytes], None],
         fragmenter: Fragmenter,
         counters: Counter[str],
-        may: Callable[[bytes, str], bool],
-        refused: Callable[[Contact, str], None],
+        may_call: Callable[[bytes, str], bool],
+        on_refused_call: Callable[[Contact, str], None],
     ) -> None:
         self.methods: dict[str, Method] = {}
-        self._may_call = may
-        self._on_refused_call = refused
+        self._may_call = may_call
+        self._on_refused_call = on_refused_call
         self._clock = clock
         self._send = send
         self._fragmenter = fragmenter

@@ -133,7 +133,7 @@ class FragmentedMessage:
 
 
 class Flow:
-    """The fragmented messages to one peer; ``send`` seals bytes for it.
+    """The fragmented messages to one peer; ``send_sealed`` seals bytes for it.
 
     A fragment that is not acknowledged is retransmitted when later ones have arrived, or when nothing was received for
     a smoothed round trip plus four deviations (``first_wait`` before the first measurement).
@@ -142,14 +142,14 @@ class Flow:
     def __init__(
         self,
         clock: IReactorTime,
-        send: Callable[[bytes], None],
-        ended: Callable[[FragmentedMessage], None],
+        send_sealed: Callable[[bytes], None],
+        on_ended: Callable[[FragmentedMessage], None],
         first_wait: float,
     ) -> None:
         self.messages: OrderedDict[MessageKey, FragmentedMessage] = OrderedDict()
         self._clock = clock
-        self._send_sealed = send
-        self._on_ended = ended
+        self._send_sealed = send_sealed
+        self._on_ended = on_ended
         self._window = CongestionWindow()
         self._round_trip = RoundTrip(first_wait, MIN_TIMEOUT_S)
         self._rotation: deque[FragmentedMessage] = deque()

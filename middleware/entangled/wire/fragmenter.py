@@ -94,26 +94,26 @@ class IncomingMessage:
 class Fragmenter:
     """The message fragmenter of an endpoint.
 
-    ``send`` seals bytes for a peer; ``deliver`` is called with a session and each message that has arrived completely;
-    ``first_wait`` returns the time in seconds to wait for a peer's first receipt; ``is_awaited`` returns whether a
-    request to a peer still waits for its answer. ``on_progress`` is called with the id of a request of this node and a
-    peer, whenever the peer acknowledged a fragment of the request or a fragment of the answer arrived.
+    ``send_sealed`` seals bytes for a peer; ``deliver`` is called with a session and each message that has arrived
+    completely; ``first_timeout`` returns the time in seconds to wait for a peer's first receipt; ``is_awaited`` returns
+    whether a request to a peer still waits for its answer. ``on_progress`` is called with the id of a request of this
+    node and a peer, whenever the peer acknowledged a fragment of the request or a fragment of the answer arrived.
     """
 
     def __init__(
         self,
         clock: IReactorTime,
-        send: Callable[[bytes, bytes], None],
+        send_sealed: Callable[[bytes, bytes], None],
         deliver: Callable[[Session, MessageKey, bytes], None],
-        first_wait: Callable[[bytes], float],
+        first_timeout: Callable[[bytes], float],
         is_awaited: Callable[[int, bytes], bool],
         on_progress: Callable[[int, bytes], None],
         counters: Counter[str],
     ) -> None:
         self._clock = clock
-        self._send_sealed = send
+        self._send_sealed = send_sealed
         self._deliver = deliver
-        self._first_timeout = first_wait
+        self._first_timeout = first_timeout
         self._is_awaited = is_awaited
         self._on_progress = on_progress
         self._counters = counters

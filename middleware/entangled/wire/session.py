@@ -142,7 +142,7 @@ class InitiatorHandshake:
 
     def __init__(
         self,
-        own: Credentials,
+        credentials: Credentials,
         remote_static: bytes,
         ephemeral_secret: bytes,
         local_index: int,
@@ -150,13 +150,13 @@ class InitiatorHandshake:
         hello: HandshakeFields = OPEN_TEAM_FIELDS,
         timestamp: int = 0,
     ) -> None:
-        self.credentials = own
-        self._noise = Initiator(own.static, remote_static, ephemeral_secret, PROLOGUE, own.psk)
+        self.credentials = credentials
+        self._noise = Initiator(credentials.static, remote_static, ephemeral_secret, PROLOGUE, credentials.psk)
         self.local_index = local_index
         index = local_index.to_bytes(INDEX_BYTES, "little")
         payload = (
             index
-            + own.public
+            + credentials.public
             + _pack_incarnation(hello.incarnation)
             + _prefix_length(hello.own_pass)
             + _prefix_length(early_message)
@@ -164,7 +164,7 @@ class InitiatorHandshake:
         payload += timestamp.to_bytes(TIMESTAMP_BYTES, "little")
         payload = payload.ljust(_PAYLOAD_BYTES + hello.min_init_bytes - _INIT_FIXED_BYTES, b"\0")
         bare = bytes([INIT]) + self._noise.write(payload)
-        self.mac = _keyed_hash(own.mac_key, bare)
+        self.mac = _keyed_hash(credentials.mac_key, bare)
         self._init_without_cookie = bare + self.mac
 
     def make_init(self, cookie: bytes = b"") -> bytes:
@@ -198,8 +198,8 @@ class ResponderHandshake:
     its message, ``stamp`` its timestamp.  Raises ``Forged`` for an invalid INIT.
     """
 
-    def __init__(self, own: Credentials, datagram: bytes, ephemeral_secret: bytes) -> None:
-        self._noise = Responder(own.static, ephemeral_secret, PROLOGUE, own.psk)
+    def __init__(self, credentials: Credentials, datagram: bytes, ephemeral_secret: bytes) -> None:
+        self._noise = Responder(credentials.static, ephemeral_secret, PROLOGUE, credentials.psk)
         payload, static = self._noise.read(datagram[1 : -2 * MAC_BYTES])
         self.remote_index = int.from_bytes(payload[:INDEX_BYTES], "little")
         self.public = payload[INDEX_BYTES : INDEX_BYTES + KEY_BYTES]

@@ -106,7 +106,7 @@ class BiddingServices:
     def council_manager(self) -> CouncilManager:
         """The councils of tasks, as ``SwarmNode.council_manager``; a reconfiguration is not recorded."""
         seen = self._node.store, self._clock, self._rng, self._born_at
-        return CouncilManager(self._node, *seen, moved=lambda task: None, may_sit=lambda public: True)
+        return CouncilManager(self._node, *seen, on_change=lambda task: None, may_be_member=lambda public: True)
 
     @cached_property
     def auction_service(self) -> AuctionService:

@@ -105,9 +105,7 @@ class LargeTeamTests(YearsCase):
 
 class BatchTests(YearsCase):
     def test_a_few_at_once(self) -> None:
-        """A bootstrap node signs at most ``MAX_RENEWALS_PER_SCAN`` renewals at a time, and continues until all are
-        renewed.
-        """
+        """A bootstrap node signs at most ``MAX_RENEWALS_PER_SCAN`` renewals at a time, until all are renewed."""
         years = self.years(bootstraps=1)
         for number in range(MAX_RENEWALS_PER_SCAN + 3):
             years.tell(years.signer.grant(bytes([number]) * 32, f"p{number}", ("device",), years.wall()))

@@ -181,9 +181,7 @@ class GuardedStrategyTests(SynchronousTestCase):
         self.flushLoggedErrors()
 
     def test_late_now_and_then(self) -> None:
-        """A strategy with fewer than ``MAX_LOSSES`` timeouts in ``LOSS_SPAN_CALLS`` calls stays in use; with more it
-        does not.
-        """
+        """A strategy stays in use only with fewer than ``MAX_LOSSES`` timeouts in ``LOSS_SPAN_CALLS`` calls."""
         for pause, is_out in (
             (LOSS_SPAN_CALLS // (MAX_LOSSES - 1), False),
             (LOSS_SPAN_CALLS // (MAX_LOSSES - 1) - 1, True),

@@ -46,31 +46,31 @@ class FaultyNetworkTests(SynchronousTestCase):
 
     def test_loss(self) -> None:
         """A lossy node loses the configured share of datagrams in each direction; the rest arrives at once."""
-        self.network.weather = LinkConditions(loss=0.2)
+        self.network.conditions = LinkConditions(loss=0.2)
         came, went = self.exchange(times=1000)
         self.assertTrue(750 < came < 850 and 750 < went < 850, (came, went))
 
     def test_duplicates_and_jitter(self) -> None:
         """Duplicated datagrams arrive twice, jitter stays within its bounds, and reordered datagrams arrive last."""
-        self.network.weather = LinkConditions(delay_s=0.1, jitter_s=0.05, duplicate=1.0, reorder=1.0)
+        self.network.conditions = LinkConditions(delay_s=0.1, jitter_s=0.05, duplicate=1.0, reorder=1.0)
         self.assertEqual(self.exchange(0.14), (0, 0))
         self.assertEqual(self.exchange(0.12)[0], 2)
 
     def test_delay(self) -> None:
         """A delayed datagram arrives late by the delay; a datagram in flight when the port closes is lost."""
-        self.network.weather = LinkConditions(delay_s=0.3)
+        self.network.conditions = LinkConditions(delay_s=0.3)
         self.assertEqual(self.exchange(0.29), (0, 0))
         self.clock.advance(0.02)
         self.assertEqual((len(self.came), len(self.answers)), (1, 1))
         self.exchange(0.1)
-        self.network.weather = PERFECT
+        self.network.conditions = PERFECT
         self.network.close()
         self.clock.advance(1.0)
         self.assertEqual((len(self.came), len(self.answers)), (1, 1))
 
     def test_cut_catches_what_is_on_its_way(self) -> None:
         """A node that is disconnected while datagrams are in flight neither receives nor sends them."""
-        self.network.weather = LinkConditions(delay_s=0.3)
+        self.network.conditions = LinkConditions(delay_s=0.3)
         self.exchange(0.1)
         self.network.is_receive_blocked = self.network.is_send_blocked = True
         self.clock.advance(1.0)
