@@ -67,7 +67,7 @@ LAYERS: dict[str, Layer] = {
         _entangled("data", "kademlia", "nat", "network", "replication", "space", "wire"),
     ),
     "middleware.directory": Layer("presence of devices, and the list of all, split by prefix", LIBRARY),
-    "middleware.consensus.lease": Layer("task leases with fencing tokens, granted by the majority of a council", LIBRARY),
+    "middleware.consensus.lease": Layer("task leases with fencing tokens, granted by a majority of a council", LIBRARY),
     "middleware.stop": Layer("stops of the whole team and their releases", LIBRARY),
     "middleware.tasks": Layer(
         "tasks, orders about them, and their councils", (*LIBRARY, *_middleware("directory", "consensus.lease"))
