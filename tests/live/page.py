@@ -249,7 +249,7 @@ class BrowserCase(SynchronousTestCase):
 
     def told(self, page: Any, words: str) -> None:
         """Wait until the page says so."""
-        page.locator("#line", has_text=words).wait_for()
+        page.locator("#status-line", has_text=words).wait_for()
 
     def tab_to(self, page: Any, what: str) -> None:
         """Go there by the Tab key alone."""

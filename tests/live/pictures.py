@@ -57,7 +57,7 @@ class Photographer:
         page.evaluate(f"location.hash = {name!r}")
         page.locator(f"body[data-view={name}]").wait_for()
         if name == "network":
-            page.locator("#ties td").first.wait_for()
+            page.locator("#round-trips td").first.wait_for()
 
     def seen(self, page: Any) -> Picture:
         """What the page shows now."""
@@ -230,7 +230,7 @@ def opened(photographer: Photographer, demo: Demonstration) -> None:
     for screen, scheme, name in ((DESK, "dark", "device-desktop"), (PHONE, "light", "device-phone")):
         page = photographer.opened(screen, scheme)
         page.evaluate(f"location.hash = 'device/{uuid}'")
-        page.locator("dialog[open] .knob").first.wait_for()
+        page.locator("dialog[open] .setting").first.wait_for()
         photographer.take(page, name)
         page.context.close()
 
@@ -242,7 +242,7 @@ def stopped(photographer: Photographer) -> None:
     phone.locator(".device[data-state=SEARCHING]").nth(2).wait_for()
     phone.locator(".stop").click()
     phone.locator(".halted").wait_for()
-    phone.locator("#line", has_text="Stopped: 3 robots stand").wait_for()
+    phone.locator("#status-line", has_text="Stopped: 3 robots stand").wait_for()
     photographer.take(phone, "stop-phone")
     phone.get_by_role("button", name="Release").click()
 
@@ -258,7 +258,7 @@ def outdoors(browser: Any) -> None:
         photographer = Photographer(browser, f"{team.url}#code={team.code}")
         phone = photographer.opened(PHONE)
         photographer.view(phone, "map")
-        phone.locator("#spots .spot").nth(2).wait_for()
+        phone.locator("#position-map .spot").nth(2).wait_for()
         phone.wait_for_timeout(300)
         photographer.take(phone, "map-phone")
     finally:

@@ -89,7 +89,7 @@ class ActionPageTests(PageCase):
         page = self.opened(DESK)
         at = self.floor(page)
         page.locator(".dog .grip").nth(2).wait_for(state="attached")
-        target = page.locator("#place").inner_text()
+        target = page.locator("#target-position").inner_text()
         page.mouse.move(*at(0.6, 0.6))
         page.mouse.down()
         page.mouse.move(*at(1.0, 0.8), steps=4)
@@ -111,7 +111,7 @@ class ActionPageTests(PageCase):
         page.wait_for_function(
             "nose => document.querySelector('.dog[data-key=dog3] > g').getAttribute('transform') !== nose", arg=nose
         )
-        self.assertEqual(page.locator("#place").inner_text(), target)
+        self.assertEqual(page.locator("#target-position").inner_text(), target)
         self.assertEqual(self.faults, [])
 
     def test_lift_a_robot_by_touch(self) -> None:
@@ -133,13 +133,15 @@ class ActionPageTests(PageCase):
             finger("touchMove", (0.6, 0.6 + 0.2 * step))
         finger("touchEnd")
         self.told(page, "dog1 moved to")
-        x, y = (float(word.strip(",")) for word in page.locator("#line").inner_text().split()[3:5])
+        x, y = (float(word.strip(",")) for word in page.locator("#status-line").inner_text().split()[3:5])
         self.assertLess(abs(x - 0.6) + abs(y - 1.6), 0.1)
         finger("touchStart", (1.8, 1.7))
         for step in range(1, 6):
             finger("touchMove", (1.8, 1.7 - 0.2 * step))
         finger("touchEnd")
-        page.locator("#place", has_text=re.compile(r"Target at 1\.8\d, 0\.[67]|Target at 1\.7\d, 0\.[67]")).wait_for()
+        page.locator(
+            "#target-position", has_text=re.compile(r"Target at 1\.8\d, 0\.[67]|Target at 1\.7\d, 0\.[67]")
+        ).wait_for()
         self.assertEqual(page.evaluate("scrollY"), before)
         nose = page.locator(".dog[data-key=dog3] > g").get_attribute("transform")
         finger("touchStart", (2.5, 0.7))

@@ -80,7 +80,7 @@ class DemonstrationPageTests(DemonstrationPageCase):
         page.locator("#d-messages", has_text="operator: good dog").wait_for()
         page.locator("#d-seconds").fill("3")
         page.get_by_role("button", name="Disconnect").tap()
-        page.locator("#d-answer", has_text="3 s").wait_for()
+        page.locator("#d-result", has_text="3 s").wait_for()
         page.locator("#d-close").tap()
         page.locator(".device[data-state=GONE]", has_text="dog2").wait_for()
         self.fits(page)
@@ -88,9 +88,9 @@ class DemonstrationPageTests(DemonstrationPageCase):
 
         self.view(page, "map")
         page.get_by_role("button", name="Remove target").tap()
-        page.locator("#place", has_text="No target").wait_for()
+        page.locator("#target-position", has_text="No target").wait_for()
         page.get_by_role("button", name="Place target").tap()
-        page.locator("#place", has_text="Target at").wait_for()
+        page.locator("#target-position", has_text="Target at").wait_for()
         floor = page.locator(".floor")
         floor.scroll_into_view_if_needed()
         box = floor.bounding_box()
@@ -98,11 +98,13 @@ class DemonstrationPageTests(DemonstrationPageCase):
         for right, down in ((0.15, 0.15), (0.85, 0.15), (0.15, 0.85), (0.85, 0.85)):
             with page.expect_response("**/api/v1/target"):
                 page.touchscreen.tap(box["x"] + right * box["width"], box["y"] + down * box["height"])
-            page.wait_for_function("() => !document.querySelector('#line').textContent.includes('Moving the target')")
-            if "Target moved" in page.locator("#line").inner_text():
+            page.wait_for_function(
+                "() => !document.querySelector('#status-line').textContent.includes('Moving the target')"
+            )
+            if "Target moved" in page.locator("#status-line").inner_text():
                 break
         else:
-            self.fail(page.locator("#line").inner_text())
+            self.fail(page.locator("#status-line").inner_text())
 
     def stop(self, page: Any) -> None:
         """Stop, pressed while dogs search, has all three stand at once and for 3 s; then they go on."""

@@ -45,7 +45,7 @@ class MatrixTests(PageCase):
             page.locator(f"#place-{view}").scroll_into_view_if_needed()
         if view == "network":
             page.locator("#place-network").scroll_into_view_if_needed()
-            page.locator("#ties td").first.wait_for()
+            page.locator("#round-trips td").first.wait_for()
         self.assertTrue(page.evaluate(SHOWN, f"place-{view}"), view)
         if by_key and view in USED:
             self.tab_to(page, USED[view])
@@ -66,7 +66,7 @@ class MatrixTests(PageCase):
             else:
                 page.locator(".device").first.tap()
             page.locator("dialog[open] tr").first.wait_for()
-            page.locator("dialog[open] .knob").first.wait_for()
+            page.locator("dialog[open] .setting").first.wait_for()
             self.sound(page)
             page.context.close()
         self.assertEqual([url for url in self.asked if not url.startswith(self.team.url)], [])

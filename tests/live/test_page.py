@@ -8,19 +8,19 @@ from typing import Any
 from tests.live.page import DESK, PHONE, PageCase, Team
 
 TWINS = """async () => {
-  const { keyed } = await import("/static/element.js");
+  const { updateList } = await import("/static/element.js");
   const list = document.createElement("ul");
   const seen = ["abab", "aba", "baa"].map((items) => {
     const before = new Set(list.children);
     const update = (child, item) => { child.textContent = item; };
-    keyed(list, [...items], (item) => item, () => document.createElement("li"), update);
+    updateList(list, [...items], (item) => item, () => document.createElement("li"), update);
     return [list.textContent, [...list.children].filter((child) => !before.has(child)).length];
   });
   return seen;
 }"""
 """A list that is kept in step with items two of which are alike: what it shows, and how many rows were made anew."""
 PANELS = """async () => {
-  const { panel } = await import("/static/panel.js");
+  const { registerPanel } = await import("/static/panel.js");
   const { model } = await import("/static/model.js");
   globalThis.seen = { model };
   const needs = { role: "operator", has: "wings" };
@@ -31,8 +31,8 @@ PANELS = """async () => {
       close: () => { document.body.dataset.closed = root.dataset.told; },
     };
   };
-  panel({ place: "groups", order: 20, title: "Second", needs, load: async () => ({ make: noted }) });
-  panel({ place: "groups", order: 10, title: "First", needs, make: (root) => {
+  registerPanel({ place: "groups", order: 20, title: "Second", needs, load: async () => ({ make: noted }) });
+  registerPanel({ place: "groups", order: 10, title: "First", needs, make: (root) => {
     root.textContent = "first";
     return { update: (_, event) => { if (event === "state") throw new Error("a fault of one"); } };
   } });
@@ -115,7 +115,7 @@ class PageTests(PageCase):
         self.assertFalse(asks())
         self.view(page, "network")
         page.locator("#network-line", has_text="dog3 did not answer").wait_for()
-        rows = [row.split("\t") for row in page.locator("#ties tr").all_inner_texts()]
+        rows = [row.split("\t") for row in page.locator("#round-trips tr").all_inner_texts()]
         self.assertEqual(rows[1:], [["dog1", "", "3.6", "5.4"], ["dog2", "1.8", "", "not known"]])
         self.assertEqual(page.locator(".tie").count(), 2)
         self.assertIn("5 asked in 2 hops, 8 found", page.locator("#lookups").inner_text())
@@ -204,10 +204,10 @@ class PageTests(PageCase):
         page.locator("#d-name", has_text="dog1").wait_for()
         page.locator("#d-text").fill("sit")
         page.keyboard.press("Enter")
-        page.locator("#d-answer", has_text="Message sent").wait_for()
+        page.locator("#d-result", has_text="Message sent").wait_for()
         self.assertEqual(page.locator("#d-text").input_value(), "")
         page.get_by_role("button", name="Disconnect").click()
-        page.locator("#d-answer", has_text="15 s").wait_for()
+        page.locator("#d-result", has_text="15 s").wait_for()
         page.locator("#d-close").click()
         dialog.wait_for(state="hidden")
         self.assertNotIn("#device", page.url)
@@ -294,7 +294,7 @@ class PageTests(PageCase):
         page = self.opened(DESK)
         at = self.floor(page)
         page.mouse.click(*at(2.03, 2.0))
-        page.locator("#place", has_text="Target at 2.0").wait_for()
+        page.locator("#target-position", has_text="Target at 2.0").wait_for()
         ball = page.locator(".target .ball").bounding_box()
         page.mouse.move(ball["x"] + ball["width"] / 2, ball["y"] + ball["height"] / 2)
         page.mouse.down()
@@ -302,15 +302,15 @@ class PageTests(PageCase):
         page.mouse.move(*at(1.03, 1.0), steps=4)
         page.mouse.up()
         self.told(page, "Target moved to 1.0")
-        page.locator("#place", has_text="Target at 1.0").wait_for()
+        page.locator("#target-position", has_text="Target at 1.0").wait_for()
         page.locator(".target").focus()
         for _ in range(4):
             page.keyboard.press("ArrowRight")
-        page.locator("#place", has_text="Target at 1.2").wait_for()
+        page.locator("#target-position", has_text="Target at 1.2").wait_for()
         page.get_by_role("button", name="Remove target").click()
-        page.locator("#place", has_text="No target").wait_for()
+        page.locator("#target-position", has_text="No target").wait_for()
         page.get_by_role("button", name="Place target").click()
-        page.locator("#place", has_text="Target at 1.50, 1.20").wait_for()
+        page.locator("#target-position", has_text="Target at 1.50, 1.20").wait_for()
 
     def test_survive_loss(self) -> None:
         """A frozen node is noticed within about two seconds, a killed one at once; the page goes on when it is back."""

@@ -19,14 +19,14 @@ from tests.live.until import until
 
 PLACES = ((0.3, 2.1), (2.7, 2.1), (0.3, 0.3), (2.7, 0.3))
 SIGHTS = """async (pictures) => {
-  const { sighted } = await import("/static/sight.js");
+  const { detectTarget } = await import("/static/detection.js");
   const found = [];
   for (const picture of pictures) {
     const image = await createImageBitmap(new Blob([Uint8Array.from(atob(picture), (each) => each.charCodeAt(0))]));
     const canvas = new OffscreenCanvas(image.width, image.height).getContext("2d");
     canvas.drawImage(image, 0, 0);
     const { data } = canvas.getImageData(0, 0, image.width, image.height);
-    const seen = sighted(data, image.width, image.height, { radius: 0.08, height: 0.22 }, 56.9 * Math.PI / 180);
+    const seen = detectTarget(data, image.width, image.height, { radius: 0.08, height: 0.22 }, 56.9 * Math.PI / 180);
     found.push(seen && [seen.bearing, seen.distance]);
   }
   return found;
@@ -62,7 +62,7 @@ class PhoneViewTests(BrowserCase, TeamCase):
             else:
                 page.locator("#phone-name").focus()
                 page.keyboard.press("Enter")
-            page.locator(".phone .said", has_text="Look for the red target").wait_for()
+            page.locator(".phone .request", has_text="Look for the red target").wait_for()
             page.locator(".phone", has_text="Target at about 0.2").wait_for()
             look(page)
             page.get_by_role("button", name="Stop taking part").click()
@@ -74,7 +74,7 @@ class PhoneViewTests(BrowserCase, TeamCase):
         """Out of sight it leaves and lets the camera go; in sight again it comes back by itself, as the same phone."""
         page = self.opened()
         page.get_by_role("button", name="Take part", exact=True).tap()
-        page.locator(".phone .said", has_text="Look for the red target").wait_for()
+        page.locator(".phone .request", has_text="Look for the red target").wait_for()
         secret = page.evaluate("localStorage.getItem('swarm.phone')")
         page.evaluate(HIDE, True)
         page.locator(".phone .trouble", has_text="Left the team, as this page was hidden").wait_for()
@@ -83,7 +83,7 @@ class PhoneViewTests(BrowserCase, TeamCase):
         page.locator(
             ".phone .trouble", has_text="The phone left while this page was hidden, and has returned"
         ).wait_for()
-        page.locator(".phone .said", has_text="Look for the red target").wait_for()
+        page.locator(".phone .request", has_text="Look for the red target").wait_for()
         self.assertEqual(json.loads(joined.value.post_data)["secret"], json.loads(secret)["secret"])
         self.assertEqual(self.faults, [])
 
@@ -161,7 +161,7 @@ class DemonstrationPhoneTests(BrowserCase, DemonstrationCase):
 
     def has_task(self, page: Any) -> bool:
         """Whether the phone has the task, by its own page and by the team's."""
-        said = page.locator(".phone .said").text_content()
+        said = page.locator(".phone .request").text_content()
         return "You have the task" in said and self.statuses().get("anna") == "EXECUTING"
 
     def place_target(self) -> None:
@@ -192,9 +192,11 @@ class DemonstrationPhoneTests(BrowserCase, DemonstrationCase):
         before = self.devices()["anna"]
         self.demo.send_signal("vaio", signal.SIGKILL)
         page.locator("#node", has_text="pi").wait_for()
-        self.demo.sign_in(page.evaluate("import('/static/link.js').then(({ base }) => base())") + "/")
+        self.demo.sign_in(
+            page.evaluate("import('/static/connection.js').then(({ currentOrigin }) => currentOrigin())") + "/"
+        )
         self.until(lambda: self.devices().get("anna", before)["address"] != before["address"], page=page)
-        page.locator(".phone .said", has_text="Nothing to do").wait_for()
+        page.locator(".phone .request", has_text="Nothing to do").wait_for()
         after = self.devices()["anna"]
         self.assertEqual(after["uuid"], before["uuid"])
         self.assertIsNone(after["gone"])

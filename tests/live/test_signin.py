@@ -69,7 +69,7 @@ class SigningInTests(PageCase):
         for screen, scheme in ((PHONE, "dark"), (DESK, "light")):
             page = self.opened(screen, scheme)
             page.get_by_role("button", name="Run Demo").click()
-            page.locator("#line", has_text="The demo runs").wait_for()
+            page.locator("#status-line", has_text="The demo runs").wait_for()
             self.view(page, "more")
             page.get_by_text("Audit log").focus()
             page.keyboard.press("Enter")

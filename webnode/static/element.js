@@ -1,16 +1,16 @@
 // Elements: create them, and update lists of them without rebuilding the ones that a person is using.
 const SVG = "http://www.w3.org/2000/svg";
 
-export const at = (id) => document.getElementById(id);
+export const byId = (id) => document.getElementById(id);
 
-export function element(tag, attributes = {}, ...children) {
+export function createElement(tag, attributes = {}, ...children) {
   const node = document.createElement(tag);
   for (const [name, value] of Object.entries(attributes)) node.setAttribute(name, value);
   node.append(...children);
   return node;
 }
 
-export function drawn(tag, attributes = {}, ...children) {
+export function createSvg(tag, attributes = {}, ...children) {
   const node = document.createElementNS(SVG, tag);
   for (const [name, value] of Object.entries(attributes)) node.setAttribute(name, value);
   node.append(...children);
@@ -18,16 +18,16 @@ export function drawn(tag, attributes = {}, ...children) {
 }
 
 // Change a text only if it differs, so that a screen reader does not repeat it.
-export function words(node, text) {
+export function setText(node, text) {
   if (node.textContent !== text) node.textContent = text;
 }
 
-export function attribute(node, name, value) {
+export function setAttribute(node, name, value) {
   if (node.getAttribute(name) !== String(value)) node.setAttribute(name, value);
 }
 
 // One child per item, in order; `make` is called once for a new key, `update` each time.  Keys may repeat.
-export function keyed(parent, items, key, make, update) {
+export function updateList(parent, items, key, make, update) {
   const old = new Map();
   for (const child of parent.children) old.set(child.dataset.key, [...(old.get(child.dataset.key) ?? []), child]);
   items.forEach((item, place) => {
@@ -59,24 +59,24 @@ const SHAPES = {
   UNKNOWN: "M6.8 11h2.4v2.5H6.8zM8 2a4 4 0 0 1 1.2 7.8H6.8V7.6H8A1.8 1.8 0 1 0 6.2 5.8H4A4 4 0 0 1 8 2z",
 };
 
-export function badge() {
-  return element("span", { class: "badge" }, drawn("svg", { viewBox: "0 0 16 16", "aria-hidden": "true" }, drawn("path")), element("span"));
+export function createBadge() {
+  return createElement("span", { class: "badge" }, createSvg("svg", { viewBox: "0 0 16 16", "aria-hidden": "true" }, createSvg("path")), createElement("span"));
 }
 
-export function state(node, status) {
-  attribute(node, "data-state", status);
-  attribute(node.querySelector("path"), "d", SHAPES[status] ?? SHAPES.UNKNOWN);
-  words(node.lastChild, status.toLowerCase());
+export function setBadge(node, status) {
+  setAttribute(node, "data-state", status);
+  setAttribute(node.querySelector("path"), "d", SHAPES[status] ?? SHAPES.UNKNOWN);
+  setText(node.lastChild, status.toLowerCase());
 }
 
 // The first names, and the number of further ones.
-export function several(names, most = 8) {
+export function joinNames(names, most = 8) {
   const more = names.length - most;
   return more > 1 ? `${names.slice(0, most).join(", ")} and ${more} more` : names.join(", ");
 }
 
 // Group names by equal reasons: [names, reasons] each.
-export function alike(refused) {
+export function groupByReason(refused) {
   const found = new Map();
   for (const [name, reasons] of Object.entries(refused)) {
     const why = [].concat(reasons).join(", ");
@@ -85,7 +85,7 @@ export function alike(refused) {
   return [...found].map(([why, names]) => [names, why]);
 }
 
-export function span(seconds) {
+export function formatDuration(seconds) {
   const s = Math.max(0, Math.round(seconds));
   if (s < 60) return `${s} s`;
   if (s < 3600) return `${Math.floor(s / 60)} min`;
@@ -93,4 +93,4 @@ export function span(seconds) {
 }
 
 // The time since a device joined or left.
-export const sojourn = ({ gone, since }, now) => (gone === null ? `here ${span(now - since)}` : `gone ${span(now - gone)}`);
+export const formatPresence = ({ gone, since }, now) => (gone === null ? `here ${formatDuration(now - since)}` : `gone ${formatDuration(now - gone)}`);

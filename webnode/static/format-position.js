@@ -1,5 +1,5 @@
 // The reported position of a device as text.
-export function whereabouts(position) {
+export function formatPosition(position) {
   if (!position) return "";
   if ("x" in position) {
     const { x, y, heading } = position;

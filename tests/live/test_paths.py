@@ -12,7 +12,7 @@ class WaysTests(PageCase):
         """The network's view, when both panels have come."""
         page = self.opened(screen)
         self.view(page, "network")
-        page.locator("#ways li").nth(2).wait_for()
+        page.locator("#paths li").nth(2).wait_for()
         page.locator("#team-kind").scroll_into_view_if_needed()
         page.locator("#members li").nth(2).wait_for()
         return page
@@ -20,7 +20,7 @@ class WaysTests(PageCase):
     def test_tell_the_ways(self) -> None:
         """Each way has its number, a word, how and since when; of the others the worst is first; axe finds nothing."""
         page = self.looked(PHONE)
-        rows = [item.inner_text().split("\n") for item in page.locator("#ways li").all()]
+        rows = [item.inner_text().split("\n") for item in page.locator("#paths li").all()]
         self.assertEqual(
             [(row[0], row[1], row[2]) for row in rows],
             [
@@ -31,13 +31,13 @@ class WaysTests(PageCase):
         )
         self.assertEqual(rows[2][3], "110 ms, jitter 11 ms, 20 % lost")
         lit = "e => [...e.querySelectorAll('rect')].filter(bar => bar.dataset.lit === 'true').length"
-        self.assertEqual([page.locator("#ways .score").nth(n).evaluate(lit) for n in range(3)], [4, 3, 2])
-        page.locator("#ways-others summary").tap()
-        others = [item.inner_text().split("\n")[:2] for item in page.locator("#ways-between li").all()]
+        self.assertEqual([page.locator("#paths .score").nth(n).evaluate(lit) for n in range(3)], [4, 3, 2])
+        page.locator("#paths-others summary").tap()
+        others = [item.inner_text().split("\n")[:2] for item in page.locator("#paths-between li").all()]
         self.assertEqual(
             others, [["dog2 \N{EN DASH} dog1", "70 \N{EN DASH} fair"], ["dog2 \N{EN DASH} dog3", "measuring"]]
         )
-        self.assertEqual(page.locator("#ways-line").inner_text(), "5 links: 1 poor, 2 fair. 1 did not answer.")
+        self.assertEqual(page.locator("#paths-line").inner_text(), "5 links: 1 poor, 2 fair. 1 did not answer.")
         self.sound_by_day_and_night(page)
 
     def test_tell_who_was_turned_away(self) -> None:
@@ -98,7 +98,7 @@ class WaysTests(PageCase):
 
         self.assertFalse(asks())
         self.view(page, "network")
-        page.locator("#ways li").first.wait_for()
+        page.locator("#paths li").first.wait_for()
         self.assertTrue(asks())
         self.view(page, "devices")
         self.assertFalse(asks())

@@ -1,9 +1,9 @@
 // A phone's camera: the picture for the team, and the values that the phone measures with each picture.
-import { sighted } from "./sight.js";
+import { detectTarget } from "./detection.js";
 
 const SIDE = 208;
-const SIGHT_SIDE = 104;
-const SIGHT_MS = 200;
+const DETECTION_SIDE = 104;
+const DETECTION_MS = 200;
 const QUALITY = 0.6;
 const RAD = Math.PI / 180;
 
@@ -15,49 +15,49 @@ const REFUSALS = {
   OverconstrainedError: "The camera does not support the picture size. Use another phone.",
   AbortError: "The camera did not start. Try again.",
 };
-export const why = ({ name, message }) => REFUSALS[name] ?? `The camera did not start: ${message || name}. Try again.`;
+export const describeCameraError = ({ name, message }) => REFUSALS[name] ?? `The camera did not start: ${message || name}. Try again.`;
 
 // iOS asks for permission, and only in response to a tap; other browsers do not ask.
-async function orientation() {
+async function requestOrientation() {
   const { requestPermission } = globalThis.DeviceOrientationEvent ?? {};
   if (!requestPermission) return "DeviceOrientationEvent" in globalThis;
   return (await requestPermission.call(DeviceOrientationEvent).catch(() => "denied")) === "granted";
 }
 
-const between = (value, least, most) => Math.min(most, Math.max(least, value));
+const clamp = (value, least, most) => Math.min(most, Math.max(least, value));
 
-// Open the camera.  `canvas` shows the picture that the team gets; `lost` is called when the camera stops.  Throws the
+// Open the camera.  `canvas` shows the picture that the team gets; `onLost` is called when the camera stops.  Throws the
 // browser's error.
-export async function opened(canvas, tellsPlace, lost) {
+export async function openCamera(canvas, sendsPosition, onLost) {
   // Both requests belong to the same tap: iOS ignores a later one.
-  const turns = orientation();
+  const turns = requestOrientation();
   const wanted = { facingMode: "environment", width: { ideal: 640 }, height: { ideal: 480 }, frameRate: { ideal: 15 } };
   const stream = await navigator.mediaDevices.getUserMedia({ video: wanted, audio: false });
   const video = Object.assign(document.createElement("video"), { srcObject: stream, muted: true, playsInline: true });
-  for (const track of stream.getTracks()) track.addEventListener("ended", lost);
+  for (const track of stream.getTracks()) track.addEventListener("ended", onLost);
   const small = document.createElement("canvas");
-  const held = {};
-  let sight = null;
-  let sightAt = -SIGHT_MS;
+  const measured = {};
+  let detection = null;
+  let detectedAt = -DETECTION_MS;
   let place = 0;
 
-  const onTurn = ({ alpha, beta, gamma }) => {
+  const onOrientation = ({ alpha, beta, gamma }) => {
     if (alpha === null || beta === null || gamma === null) return;
-    held["orientation.yaw"] = between(alpha * RAD, 0, 2 * Math.PI);
-    held["orientation.pitch"] = between(beta * RAD, -Math.PI, Math.PI);
-    held["orientation.roll"] = between(gamma * RAD, -Math.PI, Math.PI);
+    measured["orientation.yaw"] = clamp(alpha * RAD, 0, 2 * Math.PI);
+    measured["orientation.pitch"] = clamp(beta * RAD, -Math.PI, Math.PI);
+    measured["orientation.roll"] = clamp(gamma * RAD, -Math.PI, Math.PI);
   };
   const hasOrientation = await turns;
-  if (hasOrientation) addEventListener("deviceorientation", onTurn);
-  if (tellsPlace) {
+  if (hasOrientation) addEventListener("deviceorientation", onOrientation);
+  if (sendsPosition) {
     place = navigator.geolocation?.watchPosition(({ coords }) => {
-      held["position.lat"] = coords.latitude;
-      held["position.lon"] = coords.longitude;
-      held["position.accuracy"] = between(coords.accuracy, 0, 1e6);
+      measured["position.lat"] = coords.latitude;
+      measured["position.lon"] = coords.longitude;
+      measured["position.accuracy"] = clamp(coords.accuracy, 0, 1e6);
     }, () => {});
   }
 
-  function scaled(to, side) {
+  function drawScaled(to, side) {
     const scale = side / Math.max(video.videoWidth, video.videoHeight, 1);
     const [width, height] = [video.videoWidth, video.videoHeight].map((each) => Math.max(16, Math.round(each * scale)));
     if (to.width !== width || to.height !== height) Object.assign(to, { width, height });
@@ -66,28 +66,28 @@ export async function opened(canvas, tellsPlace, lost) {
     return pen;
   }
 
-  function find(now) {
-    if (now - sightAt < SIGHT_MS) return;
-    sightAt = now;
-    const { data } = scaled(small, SIGHT_SIDE).getImageData(0, 0, small.width, small.height);
-    sight = sighted(data, small.width, small.height);
+  function updateDetection(now) {
+    if (now - detectedAt < DETECTION_MS) return;
+    detectedAt = now;
+    const { data } = drawScaled(small, DETECTION_SIDE).getImageData(0, 0, small.width, small.height);
+    detection = detectTarget(data, small.width, small.height);
   }
 
-  const eye = {
-    has: { orientation: hasOrientation, position: tellsPlace && "geolocation" in navigator },
+  const camera = {
+    has: { orientation: hasOrientation, position: sendsPosition && "geolocation" in navigator },
     // The current picture as bytes, the measured values, and the detection with its box and picture size in pixels.
-    async look() {
-      find(performance.now());
-      scaled(canvas, SIDE);
+    async capture() {
+      updateDetection(performance.now());
+      drawScaled(canvas, SIDE);
       const blob = await new Promise((done) => canvas.toBlob(done, "image/jpeg", QUALITY));
       if (!blob) throw new Error("no picture");
-      const values = { ...held, ...(sight && { "target.bearing": sight.bearing, "target.distance": sight.distance }) };
-      return { picture: await blob.arrayBuffer(), values, sight, of: { width: small.width, height: small.height } };
+      const values = { ...measured, ...(detection && { "target.bearing": detection.bearing, "target.distance": detection.distance }) };
+      return { picture: await blob.arrayBuffer(), values, detection, of: { width: small.width, height: small.height } };
     },
     close() {
       for (const track of stream.getTracks()) track.stop();
       video.srcObject = null;
-      removeEventListener("deviceorientation", onTurn);
+      removeEventListener("deviceorientation", onOrientation);
       if (place) navigator.geolocation.clearWatch(place);
     },
   };
@@ -95,9 +95,9 @@ export async function opened(canvas, tellsPlace, lost) {
     // Some phones start a video only after play(), and know its size only then.
     await video.play();
   } catch (fault) {
-    eye.close();
+    camera.close();
     throw fault;
   }
-  scaled(canvas, SIDE);
-  return eye;
+  drawScaled(canvas, SIDE);
+  return camera;
 }
