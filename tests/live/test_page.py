@@ -31,8 +31,8 @@ PANELS = """async () => {
       close: () => { document.body.dataset.closed = root.dataset.told; },
     };
   };
-  registerPanel({ place: "groups", order: 20, title: "Second", needs, load: async () => ({ make: noted }) });
-  registerPanel({ place: "groups", order: 10, title: "First", needs, make: (root) => {
+  registerPanel({ place: "groups", order: 20, needs, load: async () => ({ make: noted }) });
+  registerPanel({ place: "groups", order: 10, needs, make: (root) => {
     root.textContent = "first";
     return { update: (_, event) => { if (event === "state") throw new Error("a fault of one"); } };
   } });

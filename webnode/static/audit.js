@@ -1,5 +1,6 @@
 // The audit log: changes made through this node, for operators; fetched when it is opened.
 import { createElement, updateList, setText } from "./element.js";
+import { formatTime, text, textOf } from "./texts.js";
 
 const SHOWN = 50;
 
@@ -9,24 +10,23 @@ function createRow() {
 
 function updateRow(item, line) {
   const [time, who, what, how] = item.children;
-  const at = new Date(1000 * line.at);
-  time.dateTime = at.toISOString();
-  setText(time, at.toLocaleTimeString());
-  setText(who, line.who || line.role);
+  time.dateTime = new Date(1000 * line.at).toISOString();
+  setText(time, formatTime(line.at));
+  setText(who, line.who || textOf("role", line.role));
   setText(what, `${line.route.replace("/api/v1/", "")}${line.target ? ` (${line.target})` : ""}`);
-  setText(how, `${line.outcome}, from ${line.from}${line.repeated ? `, and ${line.repeated} times more before` : ""}`);
+  setText(how, text(line.repeated ? "audit.repeated" : "audit.outcome", { outcome: line.outcome, address: line.from, count: line.repeated }));
 }
 
 export function make(root, { get }) {
   const list = createElement("ol", { class: "audit" });
   const line = createElement("p", { role: "status" });
-  const again = createElement("button", { type: "button" }, "Refresh");
-  const box = createElement("details", {}, createElement("summary", {}, "Audit log"), line, list, again);
+  const again = createElement("button", { type: "button" }, text("action.refresh"));
+  const box = createElement("details", {}, createElement("summary", {}, text("audit.title")), line, list, again);
   async function load() {
     try {
       const lines = await get(`audit?count=${SHOWN}`);
       updateList(list, lines, (each) => `${each.at} ${each.session} ${each.route} ${each.target}`, createRow, updateRow);
-      setText(line, lines.length ? "" : "No changes so far.");
+      setText(line, lines.length ? "" : text("audit.none"));
     } catch (error) {
       setText(line, error.message);
     }

@@ -2,6 +2,7 @@
 import { byId, setAttribute, createElement, updateList, setText } from "./element.js";
 import { fetchFrame } from "./connection.js";
 import { registerPanel } from "./panel.js";
+import { formatNumber, text } from "./texts.js";
 
 const cameras = new Map();
 const figures = new WeakMap();
@@ -58,7 +59,7 @@ class Camera {
           this.draw(picture);
           this.problem = "";
         } else if (answer.status !== 204) {
-          this.problem = (await answer.json().catch(() => ({}))).error?.problem ?? "no picture";
+          this.problem = (await answer.json().catch(() => ({}))).error?.problem ?? text("camera.no_picture");
           await pause();
         }
       } catch {
@@ -86,9 +87,9 @@ class Camera {
   showAge() {
     const age = (performance.now() - this.at) / 1000;
     const state = this.gone ? "gone" : !this.at ? "wait" : age < 1 ? "live" : "late";
-    const seen = this.at ? `${age < 10 ? age.toFixed(1) : Math.round(age)} s old` : "no picture yet";
+    const seen = this.at ? text("camera.age", { seconds: formatNumber(age, age < 10 ? 1 : 0) }) : text("camera.no_picture_yet");
     setAttribute(this.figure, "data-camera", state);
-    setText(this.age, this.gone ? `gone, ${seen}` : this.problem && state !== "live" ? this.problem : state === "live" ? `live, ${seen}` : seen);
+    setText(this.age, this.gone ? text("camera.gone", { age: seen }) : this.problem && state !== "live" ? this.problem : state === "live" ? text("camera.live", { age: seen }) : seen);
   }
 
   close() {
@@ -116,7 +117,7 @@ function showCameras(devices) {
     (figure, device) => {
       const camera = cameras.get(device.uuid);
       setText(camera.name, device.name);
-      setAttribute(camera.canvas, "aria-label", `Camera of ${device.name}`);
+      setAttribute(camera.canvas, "aria-label", text("camera.label", { name: device.name }));
       camera.gone = device.gone !== null;
       camera.updateLoop();
     });
@@ -124,7 +125,6 @@ function showCameras(devices) {
 
 registerPanel({
   place: "cameras",
-  title: "Cameras",
   make() {
     document.addEventListener("visibilitychange", () => cameras.forEach((camera) => camera.updateLoop()));
     setInterval(() => cameras.forEach((camera) => { if (camera.visible) camera.showAge(); }), 250);

@@ -3,6 +3,7 @@
 import { raceNodes, storePages } from "./failover.js";
 import { getTicket, getToken, storeSession } from "./session.js";
 import { createStream } from "./stream.js";
+import { text } from "./texts.js";
 
 const API = "/api/v1/";
 const PATIENCE = 5000;
@@ -78,15 +79,16 @@ async function call(method, path, body) {
     } catch {
       await Promise.race([findNode(), pause(Math.max(0, end - performance.now()))]);
       if (performance.now() >= end) {
-        throw new Error(`The node does not answer. ${order ? "The order may not have been carried out; check" : "Check"} the state, then try again.`);
+        throw new Error(text(order ? "error.no_answer_order" : "error.no_answer"));
       }
       await pause(50);
     }
   }
   const reply = await answer.json().catch(() => ({}));
   if (answer.ok) return { reply, at };
-  const { field = "request", problem = `failed (${answer.status})`, remedy = "try again" } = reply.error ?? {};
-  throw Object.assign(new Error(`${field}: ${problem}; ${remedy}.`), { status: answer.status, field });
+  const { field = "", problem, remedy } = reply.error ?? {};
+  const message = problem ? `${field}: ${problem}; ${remedy}.` : text("error.failed", { status: String(answer.status) });
+  throw Object.assign(new Error(message), { status: answer.status, field });
 }
 
 // Both return the node's answer, or throw an Error with a message for people (with status and field, if refused).

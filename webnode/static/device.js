@@ -1,8 +1,9 @@
 // Device: the dialog with the details of one device, and the orders to it.
-import { byId, createElement, updateList, formatPresence, setText } from "./element.js";
+import { byId, createElement, describeStatus, updateList, formatPresence, setText } from "./element.js";
 import { describeDelivery, sendRequest } from "./request.js";
 import { back } from "./shell.js";
 import { formatPosition } from "./format-position.js";
+import { formatNumber, formatTime, text, textOf } from "./texts.js";
 
 let devices = new Map();
 let open = "";
@@ -30,29 +31,32 @@ function listProperties(list, entries) {
 function showDetails() {
   const device = devices.get(open);
   if (!device) {
-    setText(byId("d-status"), "This device has left the network.");
+    setText(byId("d-status"), text("device.left"));
     return;
   }
   setText(byId("d-name"), device.name);
-  const task = device.objective ? `, task: ${device.objective}` : ", no task";
-  setText(byId("d-status"), `${device.kind || "device"}, ${device.status.toLowerCase()}${task}, ${formatPresence(device, now)}`);
+  setText(byId("d-status"), text(device.objective ? "device.summary" : "device.summary_no_task", {
+    kind: device.kind || text("device.kind_unknown"), status: describeStatus(device.status), task: device.objective, time: formatPresence(device, now),
+  }));
   setText(byId("d-about"), device.description);
-  const properties = (entries) => Object.entries(entries).map(([name, value]) => `${name} ${value}`).join(", ") || "yes";
+  const properties = (entries) => Object.entries(entries).map(([name, value]) => `${name} ${value}`).join(", ") || text("device.has");
   listProperties(byId("d-capabilities"), Object.entries(device.capabilities).map(([name, entries]) => [name, properties(entries)]));
   listProperties(byId("d-network"), [
-    ["address", device.address], ["roles", device.roles.join(", ")], ["joined", device.joined ? `as number ${device.joined}` : ""],
-    ...["laptop", "agent"].filter((name) => device[name]).map((name) => [name, device[name]]),
-    ...(device.position ? [["position", formatPosition(device.position)]] : []),
-    ...Object.entries(device.network), ...Object.entries(device.deployed).map(([name, label]) => [`deployed ${name}`, label]),
+    [text("device.address"), device.address], [text("device.roles"), device.roles.join(", ")],
+    [text("device.joined"), device.joined ? text("device.joined_as", { number: device.joined }) : ""],
+    ...(device.laptop ? [[text("device.laptop"), device.laptop]] : []), ...(device.agent ? [[text("device.agent"), device.agent]] : []),
+    ...(device.position ? [[text("device.position"), formatPosition(device.position)]] : []),
+    ...Object.entries(device.network).map(([name, value]) => [textOf("device.network", name), formatNumber(value)]),
+    ...Object.entries(device.deployed).map(([name, label]) => [text("device.deployed", { name }), label]),
     ["uuid", device.uuid]]);
-  const told = device.messages.map(([moment, text]) => [new Date(moment * 1000).toLocaleTimeString([], { hourCycle: "h23" }), text]);
-  updateList(byId("d-messages"), told.length ? told : [["", "No messages."]], (entry) => entry.join(), () => createElement("li"),
+  const told = device.messages.map(([moment, message]) => [formatTime(moment), message]);
+  updateList(byId("d-messages"), told.length ? told : [["", text("message.none")]], (entry) => entry.join(), () => createElement("li"),
     (item, entry) => setText(item, entry.join(" ").trim()));
   for (const button of byId("place-device").querySelectorAll("form button")) button.disabled = device.gone !== null;
 }
 
 function startDevice() {
-  const line = (text) => setText(byId("d-result"), text);
+  const line = (message) => setText(byId("d-result"), message);
   const dialog = byId("place-device");
   byId("d-close").addEventListener("click", () => dialog.close());
   dialog.addEventListener("close", () => { if (location.hash === `#device/${open}`) back(); });
@@ -60,13 +64,13 @@ function startDevice() {
   byId("d-message").addEventListener("submit", async (event) => {
     event.preventDefault();
     const body = { text: byId("d-text").value };
-    if (await sendRequest("Message", `devices/${open}/message`, { body, line, done: describeDelivery })) byId("d-text").value = "";
+    if (await sendRequest(text("message.action"), `devices/${open}/message`, { body, line, done: describeDelivery })) byId("d-text").value = "";
   });
   byId("d-leave").addEventListener("submit", (event) => {
     event.preventDefault();
     const seconds = Number(byId("d-seconds").value);
-    sendRequest("Disconnecting", `devices/${open}/disconnect`,
-      { body: { seconds }, line, done: () => `The device leaves the network and returns after ${seconds} s.` });
+    sendRequest(text("device.disconnecting"), `devices/${open}/disconnect`,
+      { body: { seconds }, line, done: () => text("device.disconnected", { seconds }) });
   });
 }
 

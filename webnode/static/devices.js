@@ -1,8 +1,9 @@
 // Devices: the list in the order of joining, with a filter if it is long.
-import { byId, setAttribute, createBadge, createElement, updateList, formatPresence, setBadge, setText } from "./element.js";
+import { byId, setAttribute, createBadge, createElement, describeStatus, updateList, formatPresence, setBadge, setText } from "./element.js";
 import { describeDelivery, showStatus, sendRequest } from "./request.js";
 import { registerPanel } from "./panel.js";
 import { go } from "./shell.js";
+import { formatNumber, text } from "./texts.js";
 
 const FEW = 20;
 const MANY = 100;
@@ -12,7 +13,7 @@ let now = 0;
 let updatedAt = 0;
 
 const searchableText = ({ name, kind, status, objective, capabilities }) =>
-  [name, kind, status, objective, ...Object.keys(capabilities)].join(" ").toLowerCase();
+  [name, kind, status, describeStatus(status), objective, ...Object.keys(capabilities)].join(" ").toLowerCase();
 
 function showDevices(list) {
   devices = list;
@@ -31,7 +32,7 @@ function showMatching() {
   const asked = byId("filter").hidden ? [] : byId("filter").value.toLowerCase().split(" ").filter(Boolean);
   const found = asked.length ? devices.filter((device) => asked.every((word) => searchableText(device).includes(word))) : devices;
   const here = devices.filter((device) => device.gone === null).length;
-  setText(byId("count"), !devices.length ? "" : asked.length ? `${found.length} of ${devices.length}` : String(here));
+  setText(byId("count"), !devices.length ? "" : asked.length ? text("devices.found", { count: found.length, total: devices.length }) : formatNumber(here));
   byId("not-found").hidden = !asked.length || found.length > 0;
   updateList(byId("devices"), found, (device) => device.uuid, createRow, updateRow);
 }
@@ -68,7 +69,7 @@ function updateRow(item, device) {
   setText(item.querySelector("b"), device.name);
   setText(item.querySelector(".kind"), device.kind);
   setBadge(item.querySelector(".badge"), device.status);
-  setText(item.querySelector(".objective"), device.objective || "no task");
+  setText(item.querySelector(".objective"), device.objective || text("device.no_task"));
   setText(shown.age, formatPresence(device, now));
 }
 
@@ -77,13 +78,12 @@ function startDevices() {
   byId("announce").addEventListener("submit", async (event) => {
     event.preventDefault();
     const body = { text: byId("announce-text").value };
-    if (await sendRequest("Message", "message", { body, line: showStatus, done: describeDelivery })) byId("announce-text").value = "";
+    if (await sendRequest(text("message.action"), "message", { body, line: showStatus, done: describeDelivery })) byId("announce-text").value = "";
   });
 }
 
 registerPanel({
   place: "devices",
-  title: "Devices",
   make() {
     startDevices();
     return {
@@ -95,4 +95,4 @@ registerPanel({
   },
 });
 
-registerPanel({ place: "device", title: "Device", load: () => import("./device.js") });
+registerPanel({ place: "device", load: () => import("./device.js") });

@@ -1,4 +1,6 @@
 // Elements: create them, and update lists of them without rebuilding the ones that a person is using.
+import { text, textOf } from "./texts.js";
+
 const SVG = "http://www.w3.org/2000/svg";
 
 export const byId = (id) => document.getElementById(id);
@@ -18,8 +20,8 @@ export function createSvg(tag, attributes = {}, ...children) {
 }
 
 // Change a text only if it differs, so that a screen reader does not repeat it.
-export function setText(node, text) {
-  if (node.textContent !== text) node.textContent = text;
+export function setText(node, value) {
+  if (node.textContent !== value) node.textContent = value;
 }
 
 export function setAttribute(node, name, value) {
@@ -59,6 +61,8 @@ const SHAPES = {
   UNKNOWN: "M6.8 11h2.4v2.5H6.8zM8 2a4 4 0 0 1 1.2 7.8H6.8V7.6H8A1.8 1.8 0 1 0 6.2 5.8H4A4 4 0 0 1 8 2z",
 };
 
+export const describeStatus = (status) => textOf("status", status, status.toLowerCase());
+
 export function createBadge() {
   return createElement("span", { class: "badge" }, createSvg("svg", { viewBox: "0 0 16 16", "aria-hidden": "true" }, createSvg("path")), createElement("span"));
 }
@@ -66,13 +70,13 @@ export function createBadge() {
 export function setBadge(node, status) {
   setAttribute(node, "data-state", status);
   setAttribute(node.querySelector("path"), "d", SHAPES[status] ?? SHAPES.UNKNOWN);
-  setText(node.lastChild, status.toLowerCase());
+  setText(node.lastChild, describeStatus(status));
 }
 
 // The first names, and the number of further ones.
 export function joinNames(names, most = 8) {
   const more = names.length - most;
-  return more > 1 ? `${names.slice(0, most).join(", ")} and ${more} more` : names.join(", ");
+  return more > 1 ? text("list.more", { names: names.slice(0, most).join(", "), count: more }) : names.join(", ");
 }
 
 // Group names by equal reasons: [names, reasons] each.
@@ -87,10 +91,10 @@ export function groupByReason(refused) {
 
 export function formatDuration(seconds) {
   const s = Math.max(0, Math.round(seconds));
-  if (s < 60) return `${s} s`;
-  if (s < 3600) return `${Math.floor(s / 60)} min`;
-  return s < 86400 ? `${Math.floor(s / 3600)} h` : `${Math.floor(s / 86400)} d`;
+  if (s < 60) return text("duration.seconds", { count: s });
+  if (s < 3600) return text("duration.minutes", { count: Math.floor(s / 60) });
+  return s < 86400 ? text("duration.hours", { count: Math.floor(s / 3600) }) : text("duration.days", { count: Math.floor(s / 86400) });
 }
 
 // The time since a device joined or left.
-export const formatPresence = ({ gone, since }, now) => (gone === null ? `here ${formatDuration(now - since)}` : `gone ${formatDuration(now - gone)}`);
+export const formatPresence = ({ gone, since }, now) => (gone === null ? text("device.here", { time: formatDuration(now - since) }) : text("device.gone", { time: formatDuration(now - gone) }));

@@ -1,6 +1,7 @@
 // Events: the changes that this node observed in the team, all or by kind.
 import { byId, setText } from "./element.js";
 import { describeStart, listEntries } from "./history.js";
+import { text } from "./texts.js";
 
 const KINDS = {
   all: () => true,
@@ -12,7 +13,7 @@ const KINDS = {
 export function make(root, { model }) {
   const show = () => {
     const entries = model.events.filter(KINDS[byId("event-kind").value]);
-    setText(byId("events-since"), `${model.node ? `Observed by ${model.node}` : "Observed"} ${describeStart(model.events)}`.trim());
+    setText(byId("events-since"), [text("events.observed", { node: model.node || text("connection.this_node") }), describeStart(model.events)].join(" ").trim());
     listEntries(byId("events"), entries);
   };
   byId("event-kind").addEventListener("change", show);

@@ -12,5 +12,5 @@ const loadFaults = async (name) => {
   return { make: kinds.length ? (await import("./faults.js"))[name] : () => ({}) };
 };
 
-registerPanel({ place: "devices", order: 90, title: "Takeovers", needs, load: () => loadFaults("createTakeovers") });
-registerPanel({ place: "device", order: 60, title: "Faults", needs, load: () => loadFaults("createButtons") });
+registerPanel({ place: "devices", order: 90, needs, load: () => loadFaults("createTakeovers") });
+registerPanel({ place: "device", order: 60, needs, load: () => loadFaults("createButtons") });

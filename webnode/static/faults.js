@@ -1,11 +1,8 @@
 // Faults: buttons that inject faults into a device, and for each fault the time until another device takes over.
 import { setAttribute, createElement, updateList, setText } from "./element.js";
 import { send, get } from "./connection.js";
+import { formatNumber, text, textOf } from "./texts.js";
 
-const LABELS = {
-  kill: "Kill", freeze: "Freeze", radio: "Cut radio", "one-way": "Mute radio",
-  delay: "Delay 0.3 s", loss: "Lose 20 %", skew: "Skew clock 1 h", battery: "Low battery",
-};
 const IDLE = 5000;
 const BUSY = 500;
 const TICK = 100;
@@ -15,7 +12,7 @@ let told = { kinds: [], can: {}, active: [] };
 let heard = 0;
 let timer = 0;
 
-const labelOf = (kind) => LABELS[kind] ?? kind;
+const labelOf = (kind) => textOf("fault.kind", kind);
 const isBusy = () => told.active.some((row) => row.watched || row.left_s > 0);
 
 async function refresh() {
@@ -39,11 +36,11 @@ setInterval(() => {
 document.addEventListener("visibilitychange", refresh);
 
 function describeTakeover(row, passed) {
-  if (row.takeover_s !== null) return [row.takeover_s <= IN_TIME ? "held" : "late", `${row.to} took over after ${row.takeover_s.toFixed(2)} s`];
-  if (!row.task) return ["none", "had no task"];
+  if (row.takeover_s !== null) return [row.takeover_s <= IN_TIME ? "held" : "late", text("fault.takeover", { name: row.to, seconds: formatNumber(row.takeover_s, 2) })];
+  if (!row.task) return ["none", text("fault.no_task")];
   const isLost = told.kinds.find((kind) => kind.kind === row.kind)?.is_lost;
-  if (row.watched && isLost) return ["runs", `no takeover yet: ${(row.since_s + passed).toFixed(1)} s`];
-  return isLost ? ["late", "no takeover"] : ["none", "continues its task"];
+  if (row.watched && isLost) return ["runs", text("fault.no_takeover_yet", { seconds: formatNumber(row.since_s + passed, 1) })];
+  return isLost ? ["late", text("fault.no_takeover")] : ["none", text("fault.continues")];
 }
 
 function createRow() {
@@ -53,12 +50,12 @@ function createRow() {
 function updateRow(item, fault) {
   const passed = (performance.now() - heard) / 1000;
   const left = Math.max(0, fault.left_s - passed);
-  const [state, text] = describeTakeover(fault, passed);
+  const [state, takeover] = describeTakeover(fault, passed);
   setAttribute(item, "data-clock", state);
   setText(item.children[0], fault.name);
-  const rest = fault.kind === "kill" ? "" : left > 0 ? `, ${Math.ceil(left)} s left` : ", over";
-  setText(item.children[1], `${labelOf(fault.kind)}${rest}`);
-  setText(item.children[2], text);
+  const name = labelOf(fault.kind);
+  setText(item.children[1], fault.kind === "kill" ? name : text(left > 0 ? "fault.left" : "fault.over", { name, seconds: Math.ceil(left) }));
+  setText(item.children[2], takeover);
 }
 
 const updateFaults = (parent, rows) => updateList(parent, rows, (fault) => fault.n, createRow, updateRow);
@@ -66,7 +63,7 @@ const updateFaults = (parent, rows) => updateList(parent, rows, (fault) => fault
 // The faults injected in the team, and their takeovers.
 export function createTakeovers(root) {
   const rows = createElement("ol", { class: "faults" });
-  const head = createElement("h3", {}, "Injected faults");
+  const head = createElement("h3", {}, text("fault.injected"));
   root.append(head, rows);
   const draw = () => {
     root.hidden = told.active.length === 0;
@@ -85,16 +82,16 @@ export function createButtons(root) {
   const grid = createElement("div", { class: "fault-buttons" });
   const line = createElement("p", { role: "status" });
   const rows = createElement("ol", { class: "faults" });
-  const none = createElement("p", { class: "empty" }, "This device does not allow fault injection.");
-  const form = createElement("form", {}, createElement("label", { for: "f-seconds" }, "Inject a fault for (seconds)"), seconds, grid);
-  root.append(createElement("h3", {}, "Faults"), none, form, line, rows);
+  const none = createElement("p", { class: "empty" }, text("fault.not_allowed"));
+  const form = createElement("form", {}, createElement("label", { for: "f-seconds" }, text("fault.seconds_label")), seconds, grid);
+  root.append(createElement("h3", {}, text("fault.title")), none, form, line, rows);
 
   async function injectFault(kind) {
     if (!seconds.reportValidity()) return;
-    setText(line, `${labelOf(kind)} …`);
+    setText(line, text("request.runs", { action: labelOf(kind) }));
     try {
       const { seconds: lasts } = await send("POST", `devices/${uuid}/faults`, { kind, seconds: Number(seconds.value) });
-      setText(line, kind === "kill" ? "The process is killed; its supervisor restarts it." : `${labelOf(kind)}: for ${lasts} s, then it ends.`);
+      setText(line, kind === "kill" ? text("fault.killed") : text("fault.lasts", { name: labelOf(kind), seconds: lasts }));
     } catch (error) {
       setText(line, error.message);
     }
@@ -107,7 +104,7 @@ export function createButtons(root) {
     form.hidden = can.length === 0;
     updateList(grid, told.kinds.filter(({ kind }) => can.includes(kind)), ({ kind }) => kind,
       ({ kind, about, is_lost: isLost }) => {
-        const button = createElement("button", { type: "button", title: about, ...(isLost ? { class: "danger" } : {}) }, labelOf(kind));
+        const button = createElement("button", { type: "button", title: textOf("fault.about", kind, about), ...(isLost ? { class: "danger" } : {}) }, labelOf(kind));
         button.addEventListener("click", () => injectFault(kind));
         return button;
       }, () => {});

@@ -1,6 +1,7 @@
 // Groups: each agent's bid for a task, the winner that it computed, and whether they agree.
 import { byId, setAttribute, createElement, updateList, setText } from "./element.js";
 import { registerPanel } from "./panel.js";
+import { formatNumber, text, textOf } from "./texts.js";
 
 function showGroups(groups) {
   byId("no-groups").hidden = groups.length > 0;
@@ -9,11 +10,11 @@ function showGroups(groups) {
 }
 
 function describeConsensus(group) {
-  if (!group.assigned) return "No consensus yet: no agent has named a winner.";
-  let told = `${group.assigned} – ${group.agree} of ${group.of} agree`;
-  if (group.differ.length) told += `; ${group.differ.join(", ")} ${group.differ.length > 1 ? "differ" : "differs"}`;
-  if (group.undecided.length) told += `; ${group.undecided.join(", ")} undecided`;
-  return told;
+  if (!group.assigned) return text("consensus.no_winner");
+  const parts = [text("consensus.agree", { name: group.assigned, count: group.agree, total: group.of })];
+  if (group.differ.length) parts.push(text("consensus.differ", { names: group.differ.join(", "), count: group.differ.length }));
+  if (group.undecided.length) parts.push(text("consensus.undecided", { names: group.undecided.join(", ") }));
+  return parts.join("; ");
 }
 
 function updateGroup(article, group) {
@@ -26,12 +27,14 @@ function updateGroup(article, group) {
     setAttribute(item, "data-winner", member.uuid === group.assigned_uuid);
     setText(name, member.name);
     bar.firstChild.style.width = `${100 * (member.share ?? 0)}%`;
-    setText(cost, member.cost === null ? (member.available ? "no bid" : "not free") : `${member.cost.toFixed(2)} m`);
+    setText(cost, member.cost === null ? text(member.available ? "consensus.no_bid" : "consensus.not_free") : text("length.metres", { value: formatNumber(member.cost, 2) }));
     // The state of a standby contains its place: WAITING(2).
-    const state = member.state.toLowerCase().replace(/\((\d+)\)$/, " as number $1");
-    const detail = [state, member.post === null ? "" : `goes to ${member.post}°`,
-      member.progress === null ? "" : `${Math.round(100 * member.progress)} % done`].filter(Boolean).join(", ");
-    setText(choice, `${member.choice ? `names ${member.choice}` : "undecided"}${member.token ? `, token ${member.token}` : ""}${member.why ? ` – ${member.why}` : ""}${detail ? ` (${detail})` : ""}`);
+    const [, state, rank] = /^(.*?)(?:\((\d+)\))?$/.exec(member.state);
+    const said = textOf("agent.state", state, state.toLowerCase());
+    const detail = [rank ? text("agent.state_as", { state: said, number: rank }) : said, member.post === null ? "" : text("agent.goes_to", { degrees: member.post }),
+      member.progress === null ? "" : text("agent.progress", { percent: Math.round(100 * member.progress) })].filter(Boolean).join(", ");
+    const named = [member.choice ? text("agent.names", { name: member.choice }) : text("agent.undecided"), member.token ? text("agent.token", { token: String(member.token) }) : ""].filter(Boolean).join(", ");
+    setText(choice, `${named}${member.why ? ` – ${member.why}` : ""}${detail ? ` (${detail})` : ""}`);
   });
 }
 
@@ -42,7 +45,6 @@ function createBid() {
 
 registerPanel({
   place: "groups",
-  title: "Consensus",
   make() {
     return {
       update(model, event) {

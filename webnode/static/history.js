@@ -2,14 +2,14 @@
 import { setAttribute, createElement, updateList, setText } from "./element.js";
 import { get } from "./connection.js";
 import { model } from "./model.js";
+import { formatTime, text } from "./texts.js";
 
 const SHOWN = 100;
-const formatTime = (at) => new Date(at * 1000).toLocaleTimeString([], { hourCycle: "h23" });
 
 // List chronicle entries; an empty list gets a placeholder.
 export function listEntries(list, entries) {
   const newest = entries.slice(-SHOWN).reverse();
-  const none = { n: 0, at: 0, kind: "none", text: "Nothing so far." };
+  const none = { n: 0, at: 0, kind: "none", text: text("history.none") };
   updateList(list, newest.length ? newest : [none], (entry) => entry.n, () => createElement("li", {}, createElement("time"), " ", createElement("span")),
     (item, entry) => {
       setAttribute(item, "data-kind", entry.kind);
@@ -19,7 +19,7 @@ export function listEntries(list, entries) {
 }
 
 // The start of the record: a node knows nothing earlier.
-export const describeStart = (entries) => (entries.length ? `since ${formatTime(entries[0].at)}` : "");
+export const describeStart = (entries) => (entries.length ? text("events.since", { time: formatTime(entries[0].at) }) : "");
 
 // The history of one device or task: the entries that the node keeps, and later ones.
 export class History {

@@ -2,21 +2,14 @@
 // Loaded on demand.
 import { setAttribute, createElement, setText } from "./element.js";
 import { send } from "./connection.js";
+import { formatMoment, text } from "./texts.js";
 
-const KINDS = { phone: "Join with a phone", viewer: "View the team" };
+const KINDS = { phone: "invite.phone", viewer: "invite.viewer" };
 const DRAWINGS = "image/svg+xml";
 
 const STEPS = {
-  "Android (Chrome)": [
-    "Open the address of the certificate on the phone; ca.crt is downloaded.",
-    "Settings, Security & privacy, More security settings, Encryption & credentials, Install a certificate, CA certificate, Install anyway.",
-    "Choose ca.crt, then scan the first code.",
-  ],
-  "iPhone, iPad (Safari)": [
-    "Open the address of the certificate in Safari, and allow the download.",
-    "Settings, Profile Downloaded, Install.",
-    "Settings, General, About, Certificate Trust Settings: switch on the node's name. Then scan the first code.",
-  ],
+  "Android (Chrome)": ["invite.android.download", "invite.android.settings", "invite.android.choose"],
+  "iPhone, iPad (Safari)": ["invite.ios.download", "invite.ios.install", "invite.ios.trust"],
 };
 
 // Load the style sheet before the QR code is shown.
@@ -42,24 +35,24 @@ function showQrCode(figure, svg, label) {
 
 // A text with a copy button; over http, where browsers offer no clipboard API, with execCommand.
 function createCopyField(label, id, tell) {
-  const text = createElement("input", { id, readonly: "" });
-  const button = createElement("button", { type: "button" }, "Copy");
+  const field = createElement("input", { id, readonly: "" });
+  const button = createElement("button", { type: "button" }, text("invite.copy"));
   button.onclick = async () => {
-    text.select();
-    const done = navigator.clipboard ? await navigator.clipboard.writeText(text.value).then(() => true, () => false) : document.execCommand("copy");
-    tell(done ? "Copied." : "Select the text and copy it.");
+    field.select();
+    const done = navigator.clipboard ? await navigator.clipboard.writeText(field.value).then(() => true, () => false) : document.execCommand("copy");
+    tell(text(done ? "invite.copied" : "invite.copy_yourself"));
   };
-  return [text, createElement("div", {}, createElement("label", { for: id }, label), createElement("div", { class: "row" }, text, button))];
+  return [field, createElement("div", {}, createElement("label", { for: id }, label), createElement("div", { class: "row" }, field, button))];
 }
 
 function createSteps() {
   return Object.entries(STEPS).map(([name, lines]) =>
-    createElement("details", {}, createElement("summary", {}, name), createElement("ol", {}, ...lines.map((line) => createElement("li", {}, line)))));
+    createElement("details", {}, createElement("summary", {}, name), createElement("ol", {}, ...lines.map((key) => createElement("li", {}, text(key))))));
 }
 
 function createDialog() {
   const line = createElement("p", { role: "status" });
-  const tell = (text) => setText(line, text);
+  const tell = (message) => setText(line, message);
   const parts = {
     line, tell,
     kind: createElement("select", { id: "i-kind" }),
@@ -68,23 +61,21 @@ function createDialog() {
     hint: createElement("p"),
     alone: createElement("p", { class: "warn" }),
     plain: createElement("p", { class: "warn" }),
-    close: createElement("button", { type: "button" }, "Close"),
+    close: createElement("button", { type: "button" }, text("action.close")),
     authority: createElement("figure", { class: "code" }),
     mark: createElement("p", { class: "mark" }),
   };
-  const [link, linkRow] = createCopyField("Link", "i-link", tell);
-  const [certificate, certificateRow] = createCopyField("Certificate", "i-certificate", tell);
+  const [link, linkRow] = createCopyField(text("invite.link"), "i-link", tell);
+  const [certificate, certificateRow] = createCopyField(text("invite.certificate"), "i-certificate", tell);
   const trust = createElement("section", { class: "trust" },
-    createElement("h3", {}, "If the phone warns about the connection"),
-    createElement("p", {}, "The warning is expected: the node signs its own certificate, which the phone does not know. For one visit accept the warning: ",
-      createElement("b", {}, "Advanced, Proceed"), " (Chrome) or ", createElement("b", {}, "Show Details, visit this website"), " (Safari). ",
-      "For further visits let the phone trust this node, once; to switch to other web nodes, let it trust those as well:"),
+    createElement("h3", {}, text("invite.warning_title")),
+    createElement("p", {}, text("invite.warning")), createElement("p", {}, text("invite.warning_trust")),
     ...createSteps(), parts.authority, certificateRow, parts.mark);
   const choices = createElement("div", { class: "choices" },
-    createElement("div", {}, createElement("label", { for: "i-kind" }, "Purpose"), parts.kind),
-    createElement("div", {}, createElement("label", { for: "i-page" }, "Address"), parts.page));
+    createElement("div", {}, createElement("label", { for: "i-kind" }, text("invite.purpose")), parts.kind),
+    createElement("div", {}, createElement("label", { for: "i-page" }, text("invite.address")), parts.page));
   const dialog = createElement("dialog", { id: "invite", "aria-labelledby": "h-invite" },
-    createElement("div", { class: "bar" }, createElement("h2", { id: "h-invite" }, "Invite"), parts.close),
+    createElement("div", { class: "bar" }, createElement("h2", { id: "h-invite" }, text("invite.title")), parts.close),
     choices, parts.alone, parts.plain, parts.code, linkRow, parts.hint, line, trust);
   return { ...parts, link, certificate, trust, dialog };
 }
@@ -97,27 +88,24 @@ function setOptions(select, entries, chosen) {
 function show(parts, invitation, role) {
   const isHere = invitation.reaches === "machine";
   parts.alone.hidden = !isHere;
-  setText(parts.alone, isHere ? "Only this machine can open the page. For phones start the demonstration with make demo WEB_HOST=0.0.0.0, or a node with host = \"0.0.0.0\" below [web]." : "");
-  showQrCode(parts.code, isHere ? "" : invitation.code, "QR code of the link below");
+  setText(parts.alone, isHere ? text("invite.machine_only") : "");
+  showQrCode(parts.code, isHere ? "" : invitation.code, text("invite.code_label"));
   parts.link.value = invitation.link;
-  const until = new Date(1000 * invitation.until).toLocaleString([], { weekday: "long", hour: "2-digit", minute: "2-digit" });
-  const may = role === "phone" ? "to join the team with a phone" : "to view the team, without orders";
-  setText(parts.hint, `${isHere ? "The link is for a browser of this machine." : "Scan the code, or send the link."} It allows its holder ${may}, until ${until}.`);
+  const use = text(isHere ? "invite.use_here" : "invite.use");
+  setText(parts.hint, `${use} ${text(role === "phone" ? "invite.allows_phone" : "invite.allows_viewer", { time: formatMoment(invitation.until) })}`);
   parts.plain.hidden = invitation.is_secure || role !== "phone";
-  setText(parts.plain, invitation.certificate
-    ? "Browsers do not allow the camera over http. Choose an address that begins with https."
-    : "Browsers do not allow the camera over http, and this node has no https. Run pip install 'swarm-node[tls]', set tls = \"auto\" below [web], and restart the node.");
+  setText(parts.plain, text(invitation.certificate ? "invite.choose_https" : "invite.no_https"));
   parts.trust.hidden = !invitation.is_secure || isHere;
-  showQrCode(parts.authority, invitation.certificate_code, "QR code of the certificate's address");
+  showQrCode(parts.authority, invitation.certificate_code, text("invite.certificate_label"));
   parts.certificate.value = invitation.certificate;
-  setText(parts.mark, `Compare the SHA-256 fingerprint that the phone shows: ${invitation.fingerprint}`);
+  setText(parts.mark, text("invite.fingerprint", { fingerprint: invitation.fingerprint }));
 }
 
 export async function openInvitation(model) {
   await loadStyle();
   const parts = createDialog();
   const kinds = Object.entries(KINDS).filter(([role]) => role !== "phone" || model.has.includes("phones"));
-  setOptions(parts.kind, kinds, kinds[0][0]);
+  setOptions(parts.kind, kinds.map(([role, key]) => [role, text(key)]), kinds[0][0]);
   async function invite() {
     const role = parts.kind.value;
     parts.tell("");

@@ -1,6 +1,8 @@
 // Robots of the simulator: move one by finger, mouse or arrow keys; a tap or Enter turns it.
 import { byId, setAttribute, createSvg } from "./element.js";
+import { formatPosition } from "./format-position.js";
 import { sendRequest } from "./request.js";
+import { text } from "./texts.js";
 
 const STEP = 0.05;
 const TURN = Math.PI / 4;
@@ -14,7 +16,7 @@ export function make(root, { model }) {
   const hint = document.createElement("p");
   let dragged = null;
   hint.className = "hint";
-  hint.textContent = "Drag a robot to move it, tap it to turn it; or select it and use the arrow keys and Enter.";
+  hint.textContent = text("robot.hint");
   root.append(hint);
   byId("target-position")?.after(root);
 
@@ -37,8 +39,8 @@ export function make(root, { model }) {
   }
 
   function put(name, place) {
-    const done = ({ x, y }) => `${name} moved to ${x.toFixed(2)}, ${y.toFixed(2)} m.`;
-    return sendRequest(`Moving ${name}`, `yard/robots/${encodeURIComponent(name)}`, { method: "PUT", body: place, done });
+    const done = (spot) => text("robot.moved", { name, position: formatPosition({ x: spot.x, y: spot.y }) });
+    return sendRequest(text("robot.moving", { name }), `yard/robots/${encodeURIComponent(name)}`, { method: "PUT", body: place, done });
   }
 
   function show(spot) {
@@ -101,7 +103,7 @@ export function make(root, { model }) {
         if (shape.querySelector(".grip")) continue;
         shape.append(createSvg("circle", { class: "grip", r: 18 }));
         for (const [name, value] of [["tabindex", 0], ["role", "button"]]) setAttribute(shape, name, value);
-        setAttribute(shape, "aria-label", `${shape.dataset.key}; arrow keys move it, Enter turns it`);
+        setAttribute(shape, "aria-label", text("robot.label", { name: shape.dataset.key }));
       }
     },
     close() {

@@ -1,7 +1,9 @@
 // The map of the simulator, in centimetres with y upwards; the target follows a finger, a mouse or the arrow keys.
 import { byId, setAttribute, createSvg, updateList, setText } from "./element.js";
+import { formatPosition } from "./format-position.js";
 import { sendRequest } from "./request.js";
 import { registerPanel } from "./panel.js";
+import { text } from "./texts.js";
 
 const STEP = 0.05;
 const ARROWS = { ArrowLeft: [-1, 0], ArrowRight: [1, 0], ArrowUp: [0, 1], ArrowDown: [0, -1] };
@@ -54,10 +56,10 @@ function placeTarget(spot) {
   if (!spot) target.removeAttribute("tabindex");
   else setAttribute(target, "tabindex", 0);
   byId("remove-target").disabled = !spot;
-  setText(byId("target-position"), spot ? `Target at ${spot.x.toFixed(2)}, ${spot.y.toFixed(2)} m. Tap, drag or use the arrow keys.` : "No target. Tap the map to place it.");
+  setText(byId("target-position"), spot ? text("target.at", { position: formatPosition(spot) }) : text("target.none"));
   if (!spot) return;
   setAttribute(target, "transform", `translate(${(spot.x * 100).toFixed(1)} ${((world.walls[1] - spot.y) * 100).toFixed(1)})`);
-  setAttribute(target, "aria-label", `Target at ${spot.x.toFixed(1)}, ${spot.y.toFixed(1)} metres; arrow keys move it`);
+  setAttribute(target, "aria-label", text("target.label", { position: formatPosition(spot) }));
 }
 
 function positionOf(event) {
@@ -89,8 +91,8 @@ function moveTarget(spot) {
   world = { ...world, target: spot && { ...world.target, ...spot } };
   placeTarget(world.target);
   send(spot
-    ? () => sendRequest("Moving the target", "target", { body: spot, done: () => `Target moved to ${spot.x.toFixed(2)}, ${spot.y.toFixed(2)} m.` })
-    : () => sendRequest("Removing the target", "target", { method: "DELETE", done: () => "Target removed." }));
+    ? () => sendRequest(text("target.moving"), "target", { body: spot, done: () => text("target.moved", { position: formatPosition(spot) }) })
+    : () => sendRequest(text("target.removing"), "target", { method: "DELETE", done: () => text("target.removed") }));
 }
 
 function startMap() {
@@ -119,7 +121,6 @@ function startMap() {
 
 registerPanel({
   place: "map",
-  title: "Simulator",
   make() {
     startMap();
     return {

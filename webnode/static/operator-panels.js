@@ -3,6 +3,6 @@ import { registerPanel } from "./panel.js";
 
 const operator = { role: "operator" };
 
-registerPanel({ place: "tasks", order: 10, title: "Who could take it", load: () => import("./preview.js") });
-registerPanel({ place: "map", order: 10, title: "Robots", needs: { ...operator, has: "yard" }, load: () => import("./map-robots.js") });
-registerPanel({ place: "device", order: 20, title: "Settings", load: () => import("./settings.js") });
+registerPanel({ place: "tasks", order: 10, load: () => import("./preview.js") });
+registerPanel({ place: "map", order: 10, needs: { ...operator, has: "yard" }, load: () => import("./map-robots.js") });
+registerPanel({ place: "device", order: 20, load: () => import("./settings.js") });

@@ -2,7 +2,6 @@
 //
 // place    header, devices, device, groups, tasks, task, cameras, map, network, events, more
 // order    0: the view itself, with the place as its root; others follow in their own roots, sorted by order
-// title    name for people
 // needs    { role, has }: shown to visitors of that role, if the node has that service (model.me.role, model.has)
 // make     make(root, { model, get, send, go }) fills the root and returns handlers, all optional:
 //          update(model, event)  an event arrived: state, yard, beat, link, ... ; once at the start, with event ""

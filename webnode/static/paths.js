@@ -2,25 +2,24 @@
 import { byId, setAttribute, createSvg, createElement, updateList, joinNames, formatDuration, setText } from "./element.js";
 import { get } from "./connection.js";
 import { pollWhileVisible } from "./polling.js";
+import { formatNumber, text, textOf } from "./texts.js";
 
 const EVERY = 2500;
 const SHOWN = 40;
-const WAYS = { none: "no path yet", machine: "on one machine", lan: "LAN", direct: "direct", punched: "hole punched", tunnel: "tunnel over TLS" };
-const GRADES = { well: "well", fair: "fair", poor: "poor", silent: "no answer", measuring: "measuring" };
 const BARS = { well: 4, fair: 3, poor: 2, silent: 0, measuring: 0 };
 
 const gradeOf = (score) => (score === null ? "measuring" : score >= 80 ? "well" : score >= 50 ? "fair" : score > 0 ? "poor" : "silent");
-const formatMs = (value) => (value < 10 ? value.toFixed(1) : String(Math.round(value)));
+const formatMs = (value) => formatNumber(value, value < 10 ? 1 : 0);
 const rankOf = ({ score }) => score ?? 101;
 
 function describePath(link) {
-  const way = link.way === "carried" ? `relayed by ${link.by || "no node now"}` : WAYS[link.way];
-  return link.for_s === null ? way : `${way}, for ${formatDuration(link.for_s)}`;
+  const path = link.way === "carried" ? text("path.relayed", { name: link.by || text("path.no_relay") }) : textOf("path.kind", link.way);
+  return link.for_s === null ? path : text("path.since", { path, time: formatDuration(link.for_s) });
 }
 
 function describeQuality({ loss, rtt_ms: trip, jitter_ms: jitter }) {
   if (loss === null) return "";
-  return trip === null ? "no answer" : `${formatMs(trip)} ms, jitter ${formatMs(jitter)} ms, ${Math.round(100 * loss)} % lost`;
+  return trip === null ? text("quality.silent") : text("path.figures", { trip: formatMs(trip), jitter: formatMs(jitter), percent: Math.round(100 * loss) });
 }
 
 function createRow() {
@@ -36,7 +35,7 @@ function updateRow(item, { label, link }) {
   setText(name, label);
   setAttribute(score, "data-grade", found);
   [...score.firstChild.children].forEach((bar, n) => setAttribute(bar, "data-lit", n < BARS[found]));
-  setText(score.lastChild, link.score === null || !link.score ? GRADES[found] : `${link.score} – ${GRADES[found]}`);
+  setText(score.lastChild, link.score === null || !link.score ? text(`quality.${found}`) : `${formatNumber(link.score)} – ${text(`quality.${found}`)}`);
   setText(way, describePath(link));
   setText(told, describeQuality(link));
 }
@@ -61,7 +60,7 @@ function mergeRefusals(told, name) {
   for (const [uuid, view] of Object.entries(told.devices)) {
     for (const each of view.refusals) {
       const other = each.who || each.at;
-      const [who, by] = each.side === "they" ? [name(uuid), other] : [each.side === "code" ? `a newcomer at ${each.at}` : other, name(uuid)];
+      const [who, by] = each.side === "they" ? [name(uuid), other] : [each.side === "code" ? text("refusal.newcomer", { address: each.at }) : other, name(uuid)];
       const key = `${who} ${each.code} ${each.side === "call"}`;
       const known = found.get(key) ?? { ...each, key, who, by: [], count: 0 };
       found.set(key, { ...known, by: [...new Set([...known.by, by])], count: known.count + each.count, ago_s: Math.min(known.ago_s, each.ago_s) });
@@ -72,20 +71,20 @@ function mergeRefusals(told, name) {
 
 function updateRefusal(item, each) {
   const [who, why, remedy] = item.children;
-  const times = each.count > 1 ? `, ${each.count} times` : "";
-  const what = each.side === "call" ? `is not authorized for a request to ${joinNames(each.by, 3)}` : `is rejected by ${joinNames(each.by, 3)}`;
+  const what = text(each.side === "call" ? "refusal.call" : "refusal.rejected", { names: joinNames(each.by, 3) });
   setText(who.firstChild, each.who);
-  setText(who.lastChild, ` ${what}; ${formatDuration(each.ago_s)} ago${times}`);
+  setText(who.lastChild, ` ${what}; ${text(each.count > 1 ? "refusal.ago_times" : "refusal.ago", { time: formatDuration(each.ago_s), count: each.count })}`);
   setText(why, `${each.code}: ${each.why}`);
-  setText(remedy, each.remedy ? `Remedy: ${each.remedy}` : "");
+  setText(remedy, each.remedy ? text("refusal.remedy", { remedy: each.remedy }) : "");
 }
 
 function summarize(told, own, others) {
   const graded = (least, most) => [...own, ...others].filter(({ link }) => link.score !== null && link.score >= least && link.score < most).length;
   const [poor, fair] = [graded(0, 50), graded(50, 80)];
-  const silent = told.silent.length ? ` ${told.silent.length} did not answer.` : "";
-  const state = own.some(({ link }) => link.score === null) ? "measuring" : [poor && `${poor} poor`, fair && `${fair} fair`].filter(Boolean).join(", ") || "all well";
-  return `${own.length + others.length} links: ${state}.${silent}`;
+  const silent = told.silent.length ? ` ${text("path.silent", { count: told.silent.length })}` : "";
+  const grades = [poor && text("path.poor", { count: poor }), fair && text("path.fair", { count: fair })].filter(Boolean).join(", ");
+  const state = own.some(({ link }) => link.score === null) ? text("quality.measuring") : grades || text("path.all_well");
+  return text("path.summary", { count: own.length + others.length, state }) + silent;
 }
 
 function show(told, model) {
@@ -94,12 +93,12 @@ function show(told, model) {
   const others = pairLinks(told, name);
   const turned = mergeRefusals(told, name);
   setText(byId("paths-line"), summarize(told, own, others));
-  setText(byId("paths-from"), `Links of ${name(told.here)}, score 0 to 100`);
+  setText(byId("paths-from"), text("path.of_node", { name: name(told.here) }));
   updateList(byId("paths"), own, ({ key }) => key, createRow, updateRow);
   byId("paths-others").hidden = others.length === 0;
-  setText(byId("paths-others").firstChild, `Between the others: ${others.length}, worst first`);
+  setText(byId("paths-others").firstChild, text("path.between", { count: others.length }));
   updateList(byId("paths-between"), others.slice(0, SHOWN), ({ key }) => key, createRow, updateRow);
-  setText(byId("refusals-line"), turned.length ? "Rejected nodes of the last hour" : "No node was rejected in the last hour.");
+  setText(byId("refusals-line"), text(turned.length ? "refusal.title" : "refusal.none"));
   updateList(byId("refusals"), turned, ({ key }) => key,
     () => createElement("li", {}, createElement("span", {}, createElement("b"), createElement("span")), createElement("span", { class: "why" }), createElement("span", { class: "remedy" })), updateRefusal);
 }
@@ -108,7 +107,7 @@ if (!document.querySelector("link[href='/static/paths.css']")) document.head.app
 
 export function make(root, { model }) {
   root.append(
-    createElement("h3", {}, "Links"), createElement("p", { class: "hint", id: "paths-line", role: "status" }, "Querying the devices …"),
+    createElement("h3", {}, text("path.title")), createElement("p", { class: "hint", id: "paths-line", role: "status" }, text("path.querying")),
     createElement("p", { class: "hint", id: "paths-from" }), createElement("ul", { id: "paths" }),
     createElement("details", { id: "paths-others", hidden: "" }, createElement("summary"), createElement("ul", { id: "paths-between" })),
     createElement("p", { class: "hint", id: "refusals-line" }), createElement("ul", { id: "refusals" }));

@@ -1,5 +1,6 @@
 // A phone's camera: the picture for the team, and the values that the phone measures with each picture.
 import { detectTarget } from "./detection.js";
+import { text, textOf } from "./texts.js";
 
 const SIDE = 208;
 const DETECTION_SIDE = 104;
@@ -7,15 +8,8 @@ const DETECTION_MS = 200;
 const QUALITY = 0.6;
 const RAD = Math.PI / 180;
 
-// Error names of browsers as text for people, with a remedy.
-const REFUSALS = {
-  NotAllowedError: "The camera is not allowed. Allow it for this page (next to the address, or in the browser's settings), then try again.",
-  NotFoundError: "No camera was found. Connect one, or use another phone.",
-  NotReadableError: "Another program uses the camera. Close it, then try again.",
-  OverconstrainedError: "The camera does not support the picture size. Use another phone.",
-  AbortError: "The camera did not start. Try again.",
-};
-export const describeCameraError = ({ name, message }) => REFUSALS[name] ?? `The camera did not start: ${message || name}. Try again.`;
+// The error names of browsers are codes of the catalogue.
+export const describeCameraError = ({ name, message }) => textOf("camera.error", name, text("camera.error_other", { problem: message || name }));
 
 // iOS asks for permission, and only in response to a tap; other browsers do not ask.
 async function requestOrientation() {
@@ -80,7 +74,7 @@ export async function openCamera(canvas, sendsPosition, onLost) {
       updateDetection(performance.now());
       drawScaled(canvas, SIDE);
       const blob = await new Promise((done) => canvas.toBlob(done, "image/jpeg", QUALITY));
-      if (!blob) throw new Error("no picture");
+      if (!blob) throw new Error(text("camera.no_picture"));
       const values = { ...measured, ...(detection && { "target.bearing": detection.bearing, "target.distance": detection.distance }) };
       return { picture: await blob.arrayBuffer(), values, detection, of: { width: small.width, height: small.height } };
     },

@@ -2,13 +2,12 @@
 import { setAttribute, createBadge, createSvg, createElement, setBadge, setText } from "./element.js";
 import { describeCameraError, openCamera } from "./phone-camera.js";
 import { apiUrl, currentOrigin, fetchOnce, send } from "./connection.js";
+import { formatNumber, text } from "./texts.js";
 
 const STORAGE_KEY = "swarm.phone";
 const RETRY_MS = 300;
 const RETRY_REFUSED_MS = 2000;
 const SHOWN_MS = 8000;
-const NONE = "No target in view.";
-const REMEDY = "Browsers allow the camera on https pages, and on pages of this machine.";
 
 // The secret identifies the device, after a reload and at each web node of the team.
 function readPhone() {
@@ -35,24 +34,24 @@ function storePhone(phone) {
 const phoneUrl = (path, query, at) => apiUrl(`${path}?${new URLSearchParams(query)}`, at);
 
 const pause = (ms) => new Promise((done) => setTimeout(done, Math.max(0, ms)));
-const normalizeName = (text) => text.normalize("NFKD").replace(/[^\w-]+/g, "-").replace(/^-+|-+$/g, "").slice(0, 40);
+const normalizeName = (value) => value.normalize("NFKD").replace(/[^\w-]+/g, "-").replace(/^-+|-+$/g, "").slice(0, 40);
 
 // The reason why the camera cannot be used; "" if it can.
 function findObstacle({ me, pages }) {
   if (!isSecureContext) {
     const secure = pages.find((page) => page.is_secure)?.url;
-    return `${REMEDY} ${secure ? `Open ${secure} and join there.` : "This node serves no https page: set tls = \"auto\" below [web] in its settings."}`;
+    return `${text("phone.remedy_https")} ${secure ? text("phone.open_secure", { url: secure }) : text("phone.no_https")}`;
   }
-  if (!navigator.mediaDevices?.getUserMedia) return `This browser has no camera. ${REMEDY}`;
-  if (me.role === "viewer") return "You are signed in as viewer. Ask an operator for an invitation for phones.";
+  if (!navigator.mediaDevices?.getUserMedia) return `${text("phone.no_camera")} ${text("phone.remedy_https")}`;
+  if (me.role === "viewer") return text("phone.is_viewer");
   return "";
 }
 
 function describeDetection(detection) {
-  if (!detection) return "No red target in view.";
+  if (!detection) return text("phone.no_target");
   const degrees = Math.round(detection.bearing * 180 / Math.PI);
-  const side = degrees > 1 ? `, ${degrees}° left` : degrees < -1 ? `, ${-degrees}° right` : ", straight ahead";
-  return `Target at about ${detection.distance.toFixed(2)} m${side}.`;
+  const key = degrees > 1 ? "phone.target_left" : degrees < -1 ? "phone.target_right" : "phone.target_ahead";
+  return text(key, { metres: formatNumber(detection.distance, 2), degrees: Math.abs(degrees) });
 }
 
 export function make(root, { model, go }) {
@@ -68,23 +67,23 @@ export function make(root, { model, go }) {
   }
   const name = createElement("input", { id: "phone-name", maxlength: 40, autocomplete: "off", required: "" });
   const place = createElement("input", { id: "phone-place", type: "checkbox" });
-  const start = createElement("button", { class: "primary" }, "Take part");
-  const no = createElement("button", { type: "button" }, "Not now");
+  const start = createElement("button", { class: "primary" }, text("phone.join"));
+  const no = createElement("button", { type: "button" }, text("phone.not_now"));
   const form = createElement("form", {},
-    createElement("p", {}, "Your phone becomes a device of the team. Its camera sees the target, it bids for tasks that need no motors, and it may ask you to point it at things."),
-    createElement("label", { for: "phone-name" }, "Name"), name,
-    createElement("label", { class: "choice", for: "phone-place" }, place, " Send the position"), createElement("div", { class: "row" }, start, no),
-    createElement("p", { class: "hint" }, "Pictures are sent to the team while this page is visible, and are not stored."));
-  const canvas = createElement("canvas", { width: 208, height: 156, role: "img", "aria-label": "Picture that this phone sends" });
+    createElement("p", {}, text("phone.about")),
+    createElement("label", { for: "phone-name" }, text("phone.name")), name,
+    createElement("label", { class: "choice", for: "phone-place" }, place, ` ${text("phone.send_position")}`), createElement("div", { class: "row" }, start, no),
+    createElement("p", { class: "hint" }, text("phone.privacy")));
+  const canvas = createElement("canvas", { width: 208, height: 156, role: "img", "aria-label": text("phone.picture_label") });
   const ring = createSvg("rect", { rx: 3 });
   const overlay = createSvg("svg", { "aria-hidden": "true" }, ring);
   const request = createElement("p", { class: "request", role: "status" });
   const status = createBadge();
   const as = createElement("b");
   const task = createElement("span", { class: "hint" });
-  const progress = createElement("progress", { max: 1, "aria-label": "Share of the task that is done" });
+  const progress = createElement("progress", { max: 1, "aria-label": text("phone.progress_label") });
   const detectionLine = createElement("p", { class: "hint" });
-  const stop = createElement("button", { class: "danger", type: "button" }, "Stop taking part");
+  const stop = createElement("button", { class: "danger", type: "button" }, text("phone.leave"));
   const on = createElement("div", { class: "on" }, createElement("div", { class: "preview" }, canvas, overlay),
     createElement("div", {}, request, createElement("p", { class: "row as" }, as, status), task, progress, detectionLine, stop));
   const trouble = createElement("p", { class: "trouble", role: "alert" });
@@ -161,7 +160,7 @@ export function make(root, { model, go }) {
         if (run !== mine) return;
         failing = true;
         // Errors of the node are for people; errors of the network are not.
-        setText(trouble, error.status ? `${error.message} Trying again.` : "The node does not answer. Trying again.");
+        setText(trouble, text("error.trying_again", { problem: error.status ? error.message : text("error.no_answer_now") }));
         await pause(error.status ? RETRY_REFUSED_MS : RETRY_MS);
       }
       tell();
@@ -183,10 +182,10 @@ export function make(root, { model, go }) {
 
   async function begin(line = "") {
     const mine = run += 1;
-    show("asking", "Allow the camera, if the browser asks.");
+    show("asking", text("phone.allow_camera"));
     try {
       const found = await openCamera(canvas, place.checked, () => {
-        if (run === mine) leave("off", "The camera stopped: another program took it, or it was disconnected. Join again.");
+        if (run === mine) leave("off", text("phone.camera_stopped"));
       });
       if (run !== mine) return found.close();
       camera = found;
@@ -194,8 +193,8 @@ export function make(root, { model, go }) {
       if (run === mine) show("off", describeCameraError(error));
       return;
     }
-    setText(request, "Joining the team");
-    setText(detectionLine, NONE);
+    setText(request, text("phone.joining"));
+    setText(detectionLine, text("phone.no_target"));
     show("on", line);
     setTimeout(() => { if (trouble.textContent === line) setText(trouble, ""); }, SHOWN_MS);
     keepScreenOn();
@@ -210,14 +209,14 @@ export function make(root, { model, go }) {
     begin();
   });
   no.addEventListener("click", () => go(""));
-  stop.addEventListener("click", () => leave("off", "This phone has left the team."));
+  stop.addEventListener("click", () => leave("off", text("phone.left")));
   // A hidden page gets no usable camera pictures: the phone leaves, and returns when the page is visible.
   const onHidden = () => {
-    if (stage === "on") leave("away", "Left the team, as this page was hidden.");
+    if (stage === "on") leave("away", text("phone.left_hidden"));
   };
   const onVisibility = () => {
     if (document.hidden) onHidden();
-    else if (stage === "away") begin("The phone left while this page was hidden, and has returned.");
+    else if (stage === "away") begin(text("phone.returned"));
   };
   document.addEventListener("visibilitychange", onVisibility);
   addEventListener("pagehide", onHidden);

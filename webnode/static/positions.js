@@ -3,6 +3,7 @@ import { byId, setAttribute, createSvg, createElement, updateList, setText } fro
 import { registerPanel } from "./panel.js";
 import { go } from "./shell.js";
 import { formatPosition } from "./format-position.js";
+import { formatNumber, text } from "./texts.js";
 
 const LEAST = 2;
 const MARGIN = 36;
@@ -33,7 +34,7 @@ function roundDown(metres) {
   return [5, 2, 1].find((n) => n * power <= metres) * power;
 }
 
-const formatLength = (metres) => (metres >= 1000 ? `${metres / 1000} km` : metres >= 1 ? `${metres} m` : `${Math.round(metres * 100)} cm`);
+const formatLength = (metres) => (metres >= 1000 ? `${formatNumber(metres / 1000)} km` : metres >= 1 ? `${formatNumber(metres)} m` : `${formatNumber(metres * 100)} cm`);
 
 function createMarker({ uuid }) {
   const show = (event) => {
@@ -53,9 +54,8 @@ document.head.append(createElement("link", { rel: "stylesheet", href: "/static/p
 registerPanel({
   place: "map",
   order: 5,
-  title: "Map",
   make(root) {
-    const map = createSvg("svg", { id: "position-map", role: "group", "aria-label": "Map of the positions that devices report" });
+    const map = createSvg("svg", { id: "position-map", role: "group", "aria-label": text("map.positions_label") });
     const bar = createSvg("g", { class: "scale" }, createSvg("path"), createSvg("text", { y: -8 }));
     const spots = createSvg("g");
     const list = createElement("ul", { class: "plain places" });
@@ -100,7 +100,7 @@ registerPanel({
         const { device, heading, accuracy } = each;
         setAttribute(spot, "transform", `translate(${place(each).map((n) => n.toFixed(1)).join(" ")})`);
         setAttribute(spot, "data-state", device.status);
-        setAttribute(spot, "aria-label", `${device.name} at ${formatPosition(device.position)}`);
+        setAttribute(spot, "aria-label", text("position.device", { name: device.name, position: formatPosition(device.position) }));
         setAttribute(spot.querySelector(".blur"), "r", Math.min((accuracy ?? 0) * scale, width).toFixed(1));
         const way = spot.querySelector(".way");
         setAttribute(way, "display", Number.isFinite(heading) ? "inline" : "none");
@@ -113,8 +113,7 @@ registerPanel({
       setText(bar.lastChild, formatLength(metres));
       const isLocal = isMetres(found[0].device);
       const others = placed.length - found.length;
-      setText(hint, `${isLocal ? "In metres, as the devices report it." : "By latitude and longitude, as the devices report it; north is up."}${
-        others ? ` ${others} more ${others > 1 ? "are" : "is"} reported in another frame, and only listed.` : ""}`);
+      setText(hint, [text(isLocal ? "map.local_frame" : "map.globe_frame"), ...(others ? [text("map.other_frame", { count: others })] : [])].join(" "));
       updateList(list, placed.slice(0, NAMED), (device) => device.uuid, () => createElement("li", {}, createElement("b"), " ", createElement("span")), (item, device) => {
         setText(item.firstChild, device.name);
         setText(item.lastChild, formatPosition(device.position));
@@ -128,8 +127,7 @@ registerPanel({
         const section = byId("place-map");
         section.classList.toggle("reported", !model.yard);
         root.hidden = !placed.length;
-        setText(byId("h-map"), model.yard ? "Simulator" : "Map");
-        setText(document.querySelector("#views [href='#map']"), model.yard ? "Simulator" : "Map");
+        for (const node of [byId("h-map"), document.querySelector("#views [href='#map']")]) setText(node, text(model.yard ? "map.simulator" : "map.title"));
         if (!model.yard) section.hidden = !placed.length;
         refresh();
       },

@@ -1,23 +1,24 @@
 // Preview: shows, before a task is assigned, which devices can take it and why others cannot.
 import { groupByReason, byId, createElement, updateList, joinNames } from "./element.js";
 import { send } from "./connection.js";
+import { text } from "./texts.js";
 
 const PAUSE = 400;
 const NOBODY = { able: [], refused: {}, likely: null, together: [] };
 
 function describePreview({ able, refused, likely, together }, group) {
-  const could = joinNames(able.map(({ name, busy }) => (busy ? `${name} (now: ${busy})` : name)));
-  const who = likely ? `${likely} is the nearest by present reports.` : "The nearest is chosen when they have reported.";
-  const yes = able.length ? [["can", `${could}. ${able.length > 1 ? who : ""}`.trim()]] : [["nobody", "No device here can take it."]];
+  const could = joinNames(able.map(({ name, busy }) => (busy ? text("preview.busy", { name, task: busy }) : name)));
+  const who = likely ? text("preview.likely", { name: likely }) : text("preview.not_reported");
+  const yes = able.length ? [["can", `${could}. ${able.length > 1 ? who : ""}`.trim()]] : [["nobody", text("preview.nobody")]];
   const others = together.map(({ title }) => title).join(", ");
-  const divided = group ? [["with", others ? `${others}.` : `no other task yet; this is the first of group ${group}.`]] : [];
+  const divided = group ? [["with", others ? `${others}.` : text("preview.first_of_group", { group })]] : [];
   return [...yes, ...divided, ...groupByReason(refused).map(([names, why]) => ["cannot", `${joinNames(names)}: ${why}`])];
 }
 
-const SAID = { can: "Can take it: ", cannot: "Cannot: ", nobody: "", with: "Divided together with: " };
+const HEADS = { can: text("preview.can"), cannot: text("preview.cannot"), with: text("preview.with") };
 
 export function make(root, { model }) {
-  const list = createElement("ul", { class: "preview", "aria-label": "Devices that can take this task" });
+  const list = createElement("ul", { class: "preview", "aria-label": text("preview.label") });
   let told = "";
   let due = 0;
   root.append(list);
@@ -27,7 +28,7 @@ export function make(root, { model }) {
     const rows = describePreview(preview, group);
     if (told === JSON.stringify(rows)) return;
     told = JSON.stringify(rows);
-    list.replaceChildren(...rows.map(([kind, text]) => createElement("li", { "data-can": kind }, createElement("b", {}, SAID[kind]), text)));
+    list.replaceChildren(...rows.map(([kind, line]) => createElement("li", { "data-can": kind }, ...(HEADS[kind] ? [createElement("b", {}, HEADS[kind]), " "] : []), line)));
   }
 
   // Changes of devices come in bursts: request once after each burst.

@@ -3,6 +3,7 @@ import { createElement, setText } from "./element.js";
 import { currentOrigin, endSession, get, openSession } from "./connection.js";
 import { registerPanel } from "./panel.js";
 import { clearSessions, getToken, storeSession } from "./session.js";
+import { text, textOf } from "./texts.js";
 
 const PAUSE = 3000;
 let isChecking = false;
@@ -47,12 +48,11 @@ async function ensureSession(trouble = "") {
 registerPanel({
   place: "more",
   order: 90,
-  title: "Session",
   needs: { role: "viewer" },
   make(root, { model }) {
     const who = createElement("p", { class: "hint" });
-    const out = createElement("button", {}, "Sign out");
-    const more = createElement("button", { class: "operators" }, "Invite …");
+    const out = createElement("button", {}, text("session.sign_out"));
+    const more = createElement("button", { class: "operators" }, text("session.invite"));
     const trouble = createElement("p", { role: "status" });
     out.onclick = async () => {
       await endSession();
@@ -73,7 +73,7 @@ registerPanel({
       update(model) {
         link = model.link;
         const { name, role } = model.me;
-        setText(who, `Signed in as ${name && name !== role ? `${name}, ${role}` : role}.`);
+        setText(who, text(name && name !== role ? "session.signed_in" : "session.signed_in_role", { name, role: textOf("role", role) }));
         out.hidden = !getToken(currentOrigin());
       },
       close: () => clearInterval(timer),
@@ -84,7 +84,6 @@ registerPanel({
 registerPanel({
   place: "more",
   order: 95,
-  title: "Audit log",
   needs: { role: "operator" },
   load: () => import("./audit.js"),
 });

@@ -3,6 +3,7 @@ import { groupByReason, byId, setAttribute, createBadge, createElement, updateLi
 import { showStatus, sendRequest } from "./request.js";
 import { send, get } from "./connection.js";
 import { registerPanel } from "./panel.js";
+import { formatNumber, text } from "./texts.js";
 
 const ENDED = ["COMPLETED", "FAILED", "CANCELLED"];
 const SHOWN = 8;
@@ -13,24 +14,25 @@ function showTasks(tasks) {
   updateList(byId("tasks"), tasks.slice(0, SHOWN), (task) => task.id, createRow, (item, task) => {
     setText(item.querySelector("b"), task.title);
     setBadge(item.querySelector(".badge"), task.status);
-    const result = task.result ? `Done by ${task.result.by} in ${task.result.took.toFixed(1)} s. ` : "";
-    setText(item.querySelector(".note"), (task.group && `Group ${task.group}. `) + result + task.note);
+    const result = task.result ? text("tasks.result", { name: task.result.by, seconds: formatNumber(task.result.took, 1) }) : "";
+    setText(item.querySelector(".note"), [task.group && text("tasks.group", { name: task.group }), result, task.note].filter(Boolean).join(" "));
     showDecisions(item.querySelector(".why"), task.why);
     const [button, rest] = item.querySelectorAll("button");
     button.hidden = rest.hidden = ENDED.includes(task.status);
-    button.setAttribute("aria-label", `Cancel ${task.title}`);
-    setText(rest, task.paused ? "Resume" : "Pause");
-    rest.setAttribute("aria-label", `${rest.textContent} ${task.title}`);
+    button.setAttribute("aria-label", text("tasks.cancel_label", { title: task.title }));
+    rest.dataset.paused = task.paused;
+    setText(rest, text(task.paused ? "tasks.resume" : "tasks.pause"));
+    rest.setAttribute("aria-label", text(task.paused ? "tasks.resume_label" : "tasks.pause_label", { title: task.title }));
   });
 }
 
 function createRow(task) {
-  const button = createElement("button", {}, "Cancel");
-  button.addEventListener("click", () => sendRequest(`Cancelling ${task.title}`, `tasks/${encodeURIComponent(task.id)}/cancel`));
-  const rest = createElement("button", {}, "Pause");
+  const button = createElement("button", {}, text("tasks.cancel"));
+  button.addEventListener("click", () => sendRequest(text("tasks.cancelling", { title: task.title }), `tasks/${encodeURIComponent(task.id)}/cancel`));
+  const rest = createElement("button", {}, text("tasks.pause"));
   rest.addEventListener("click", () => {
-    const isPaused = rest.textContent === "Resume";
-    sendRequest(`${isPaused ? "Resuming" : "Pausing"} ${task.title}`, `tasks/${encodeURIComponent(task.id)}/${isPaused ? "resume" : "pause"}`);
+    const isPaused = rest.dataset.paused === "true";
+    sendRequest(text(isPaused ? "tasks.resuming" : "tasks.pausing", { title: task.title }), `tasks/${encodeURIComponent(task.id)}/${isPaused ? "resume" : "pause"}`);
   });
   return createElement("li", {}, createElement("b"), createBadge(), createElement("span", { class: "note" }),
     createElement("details", { class: "why" }, createElement("summary"), createElement("div")), createHistory(task), button, rest);
@@ -38,8 +40,8 @@ function createRow(task) {
 
 // The history of a task, loaded when it is opened.
 function createHistory(task) {
-  const list = createElement("ol", { class: "story", tabindex: 0, "aria-label": `History of ${task.title}, the newest first` });
-  const box = createElement("details", { class: "history" }, createElement("summary", {}, "History"), list);
+  const list = createElement("ol", { class: "story", tabindex: 0, "aria-label": text("tasks.history_label", { title: task.title }) });
+  const box = createElement("details", { class: "history" }, createElement("summary", {}, text("history.title")), list);
   box.addEventListener("toggle", async () => {
     const { History } = await import("./history.js");
     if (box.open) histories.set(task.id, new History(list, task.id));
@@ -54,19 +56,20 @@ function showDecisions(box, epochs) {
   const told = JSON.stringify(epochs);
   if (box.hidden || box.dataset.told === told) return;
   box.dataset.told = told;
-  setText(box.firstChild, `${epochs[0].chosen} – ${epochs[0].agree} of ${epochs[0].of} agree${epochs[0].differ.map((name) => `, ${name} differs`).join("")}`);
+  setText(box.firstChild, [text("consensus.agree", { name: epochs[0].chosen, count: epochs[0].agree, total: epochs[0].of }),
+    ...epochs[0].differ.map((name) => text("consensus.differ", { names: name, count: 1 }))].join(", "));
   setAttribute(box, "data-agree", epochs[0].agree === epochs[0].of && !epochs[0].differ.length);
   box.lastChild.replaceChildren(...epochs.flatMap((each) => [
-    createElement("p", {}, createElement("b", {}, `${each.epoch}. ${each.chosen}`), ` by ${each.rule}: ${each.hysteresis}${each.agreed && `; agreed on ${each.agreed}`}`),
+    createElement("p", {}, createElement("b", {}, `${each.epoch}. ${each.chosen}`), ` ${text(each.agreed ? "tasks.rule_agreed" : "tasks.rule", { rule: each.rule, reason: each.hysteresis, value: each.agreed })}`),
     createElement("table", {}, ...each.rows.map((row) => createElement("tr", {}, createElement("th", { scope: "row" }, row.name),
-      createElement("td", {}, row.cost?.toFixed(2) ?? "no report"), createElement("td", {}, row.note)))),
-    ...(each.reported > each.rows.length ? [`of ${each.reported} reports`] : [])]));
+      createElement("td", {}, (Number.isFinite(row.cost) ? formatNumber(row.cost, 2) : text("tasks.no_report"))), createElement("td", {}, row.note)))),
+    ...(each.reported > each.rows.length ? [text("tasks.of_reports", { count: each.reported })] : [])]));
 }
 
 function describeAssignment({ able = [], refused = {} }) {
-  const no = groupByReason(refused).map(([names, why]) => `Not possible for ${joinNames(names)}: ${why}`);
-  const yes = able.length ? [`Assigned to ${joinNames(able)}`] : no.length ? ["No device can take it"] : ["Assigned"];
-  return `${[...yes, ...no].join(". ")}.`;
+  const no = groupByReason(refused).map(([names, why]) => text("tasks.not_possible", { names: joinNames(names), reason: why }));
+  const yes = able.length ? [text("tasks.assigned_to", { names: joinNames(able) })] : [text(no.length ? "tasks.nobody" : "tasks.assigned")];
+  return [...yes, ...no].join(" ");
 }
 
 // The catalogue is read when the page connects or reconnects.
@@ -81,16 +84,16 @@ async function readCatalogue() {
 function startTasks() {
   byId("assign").addEventListener("submit", (event) => {
     event.preventDefault();
-    if (!byId("task").value) return showStatus("There is no predefined task to assign.");
+    if (!byId("task").value) return showStatus(text("tasks.no_predefined"));
     const group = byId("group").value.trim();
-    sendRequest("Assigning", "tasks", { body: { name: byId("task").value, ...(group && { group }) }, done: describeAssignment });
+    sendRequest(text("tasks.assigning"), "tasks", { body: { name: byId("task").value, ...(group && { group }) }, done: describeAssignment });
   });
   byId("demo").addEventListener("click", async () => {
     byId("demo").disabled = true;
-    showStatus("Starting the demo …");
+    showStatus(text("demo.starting"));
     try {
       await send("POST", "demo");
-      showStatus("The demo runs.");
+      showStatus(text("demo.runs"));
     } catch (error) {
       showStatus(error.message);
     }
@@ -100,7 +103,6 @@ function startTasks() {
 
 registerPanel({
   place: "tasks",
-  title: "Tasks",
   make() {
     startTasks();
     return {

@@ -2,9 +2,10 @@
 import { createElement } from "./element.js";
 import { registerPanel } from "./panel.js";
 import { STORAGE_KEY, readTheme } from "./theme.js";
+import { text } from "./texts.js";
 
-const THEMES = { "light dark": "As the system", light: "Light", dark: "Dark" };
-const MORE = { groups: "Consensus", network: "Network", events: "Events" };
+const THEMES = { "light dark": text("theme.system"), light: text("theme.light"), dark: text("theme.dark") };
+const MORE = { groups: text("consensus.title"), network: text("network.title"), events: text("events.title") };
 
 function setTheme(theme) {
   document.documentElement.style.colorScheme = theme;
@@ -21,9 +22,9 @@ function createMoreView(root) {
   choice.value = readTheme();
   choice.addEventListener("change", () => setTheme(choice.value));
   root.append(
-    createElement("nav", { class: "further", "aria-label": "More views" },
+    createElement("nav", { class: "further", "aria-label": text("views.more_label") },
       ...Object.entries(MORE).map(([place, name]) => createElement("a", { href: `#${place}` }, name))),
-    createElement("div", { class: "row" }, createElement("label", { for: "theme" }, "Colours"), choice));
+    createElement("div", { class: "row" }, createElement("label", { for: "theme" }, text("theme.label")), choice));
 }
 
 // The module for phones is loaded when the visitor opens its view.
@@ -40,17 +41,17 @@ function createPhoneView(root, tools) {
 }
 
 document.querySelector("main").before(createElement("section", { class: "phone", id: "place-phone", "aria-labelledby": "h-phone", hidden: "" },
-  createElement("h2", { id: "h-phone" }, "This phone")));
-registerPanel({ place: "more", order: 30, title: "More", make: createMoreView });
+  createElement("h2", { id: "h-phone" }, text("phone.title"))));
+registerPanel({ place: "more", order: 30, make: createMoreView });
 
-registerPanel({ place: "more", order: 35, title: "Take part", needs: { role: "phone", has: "phones" }, make(root, { go }) {
-  const button = createElement("button", {}, "Take part with this device");
+registerPanel({ place: "more", order: 35, needs: { role: "phone", has: "phones" }, make(root, { go }) {
+  const button = createElement("button", {}, text("phone.join_device"));
   button.onclick = () => go("phone");
   root.append(createElement("p", { class: "row" }, button));
 } });
-registerPanel({ place: "phone", title: "This phone", needs: { role: "viewer", has: "phones" }, make: createPhoneView });
-registerPanel({ place: "events", title: "Events", load: () => import("./events.js") });
-registerPanel({ place: "network", order: 5, title: "Links", needs: { role: "viewer", has: "survey" }, load: () => import("./paths.js") });
-registerPanel({ place: "network", order: 7, title: "Team", needs: { role: "viewer", has: "survey" }, load: () => import("./membership.js") });
-registerPanel({ place: "network", order: 10, title: "Network", needs: { has: "survey" }, load: () => import("./network.js") });
-registerPanel({ place: "device", order: 10, title: "Records", needs: { has: "survey" }, load: () => import("./inventory.js") });
+registerPanel({ place: "phone", needs: { role: "viewer", has: "phones" }, make: createPhoneView });
+registerPanel({ place: "events", load: () => import("./events.js") });
+registerPanel({ place: "network", order: 5, needs: { role: "viewer", has: "survey" }, load: () => import("./paths.js") });
+registerPanel({ place: "network", order: 7, needs: { role: "viewer", has: "survey" }, load: () => import("./membership.js") });
+registerPanel({ place: "network", order: 10, needs: { has: "survey" }, load: () => import("./network.js") });
+registerPanel({ place: "device", order: 10, needs: { has: "survey" }, load: () => import("./inventory.js") });
