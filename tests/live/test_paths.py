@@ -50,12 +50,12 @@ class WaysTests(PageCase):
                 [
                     "dog9 is rejected by vaio, dog1; 3 min ago, 6 times",
                     "revoked: the operator revoked the certificate",
-                    "Remedy: only a new invitation lets it in",
+                    "Remedy: admit the node again with a new code (swarm invite, swarm join)",
                 ],
                 [
                     "a newcomer at 192.0.2.66:8484 is rejected by vaio; 3 min ago",
                     "used: this code was used as often as it may be",
-                    "Remedy: ask the operator for another one",
+                    "Remedy: ask the operator for another one (swarm invite)",
                 ],
             ],
         )

@@ -3,7 +3,7 @@ import { createElement } from "./element.js";
 import { get } from "./connection.js";
 import { formatNumber, text } from "./texts.js";
 
-const formatSize = (bytes) => (bytes < 10000 ? `${formatNumber(bytes)} B` : bytes < 2 ** 20 ? `${formatNumber(bytes / 1024)} KiB` : `${formatNumber(bytes / 2 ** 20, 1)} MiB`);
+const formatSize = (bytes) => (bytes < 10000 ? `${formatNumber(bytes)} B` : bytes < 2 ** 20 ? `${formatNumber(bytes / 1024, 0)} KiB` : `${formatNumber(bytes / 2 ** 20, 1)} MiB`);
 
 export function make(root) {
   const line = createElement("p", { class: "note", role: "status" });

@@ -74,8 +74,10 @@ function updateRefusal(item, each) {
   const what = text(each.side === "call" ? "refusal.call" : "refusal.rejected", { names: joinNames(each.by, 3) });
   setText(who.firstChild, each.who);
   setText(who.lastChild, ` ${what}; ${text(each.count > 1 ? "refusal.ago_times" : "refusal.ago", { time: formatDuration(each.ago_s), count: each.count })}`);
-  setText(why, `${each.code}: ${each.why}`);
-  setText(remedy, each.remedy ? text("refusal.remedy", { remedy: each.remedy }) : "");
+  const isJoin = each.side === "code";
+  setText(why, `${each.code}: ${textOf(isJoin ? "refusal.join_why" : "refusal.member_why", each.code, each.why)}`);
+  const advice = textOf(isJoin ? "refusal.join_remedy" : "refusal.member_remedy", each.code, each.remedy);
+  setText(remedy, advice ? text("refusal.remedy", { remedy: advice }) : "");
 }
 
 function summarize(told, own, others) {

@@ -34,7 +34,7 @@ function roundDown(metres) {
   return [5, 2, 1].find((n) => n * power <= metres) * power;
 }
 
-const formatLength = (metres) => (metres >= 1000 ? `${formatNumber(metres / 1000)} km` : metres >= 1 ? `${formatNumber(metres)} m` : `${formatNumber(metres * 100)} cm`);
+const formatLength = (metres) => (metres >= 1000 ? `${formatNumber(metres / 1000)} km` : metres >= 1 ? `${formatNumber(metres)} m` : `${formatNumber(metres * 100, 0)} cm`);
 
 function createMarker({ uuid }) {
   const show = (event) => {

@@ -12,9 +12,11 @@ const calendar = new Intl.DateTimeFormat(locale, { dateStyle: "medium" });
 const moment = new Intl.DateTimeFormat(locale, { weekday: "long", hour: "2-digit", minute: "2-digit" });
 const numbers = new Map();
 
-export function formatNumber(value, digits = 0) {
+// With `digits` fractional digits; without, with as many as the number has, at most three.
+export function formatNumber(value, digits) {
   if (!numbers.has(digits)) {
-    numbers.set(digits, new Intl.NumberFormat(locale, { minimumFractionDigits: digits, maximumFractionDigits: digits, useGrouping: "min2" }));
+    const options = { minimumFractionDigits: digits, maximumFractionDigits: digits, useGrouping: "min2" };
+    numbers.set(digits, new Intl.NumberFormat(locale, options));
   }
   return numbers.get(digits).format(value);
 }
