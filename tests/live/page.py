@@ -26,6 +26,8 @@ from typing import Any
 
 from twisted.trial.unittest import SynchronousTestCase
 
+from tests.webnode.texts import catalogue
+
 CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
 FLAGS = [
     *("--no-sandbox", "--disable-gpu", "--disable-quic", "--no-first-run", "--disable-background-networking"),
@@ -37,6 +39,8 @@ PHONE = {"viewport": {"width": 412, "height": 839}, "has_touch": True}
 TABLET = {"viewport": {"width": 820, "height": 1180}, "has_touch": True}
 DESK = {"viewport": {"width": 1280, "height": 800}}
 VIEWS = ("tasks", "cameras", "map", "groups", "network", "events", "more", "devices")
+TEXTS = catalogue("en")
+"""The texts that the page shows in the tests' browser."""
 PATIENCE_MS = 45_000
 """How long a page is waited for on a machine that has more to do; where it is in time nothing waits for that."""
 INFORMED = """async () => {

@@ -72,7 +72,7 @@ class Photographer:
 
     def executing(self, page: Any) -> str:
         """Have the demonstration run until a dog goes; returns its name."""
-        page.get_by_role("button", name="Run Demo").click()
+        page.locator("#demo").click()
         going = page.locator(".device[data-state=EXECUTING] b")
         going.wait_for(state="attached")
         return str(going.text_content())
@@ -238,13 +238,13 @@ def opened(photographer: Photographer, demo: Demonstration) -> None:
 def stopped(photographer: Photographer) -> None:
     """The team stands while its dogs search."""
     phone = photographer.opened(PHONE)
-    phone.get_by_role("button", name="Run Demo").click()
+    phone.locator("#demo").click()
     phone.locator(".device[data-state=SEARCHING]").nth(2).wait_for()
     phone.locator(".stop").click()
     phone.locator(".halted").wait_for()
     phone.locator("#status-line", has_text="Stopped: 3 robots stand").wait_for()
     photographer.take(phone, "stop-phone")
-    phone.get_by_role("button", name="Release").click()
+    phone.locator(".halted button").click()
 
 
 def outdoors(browser: Any) -> None:

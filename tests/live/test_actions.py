@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 
-from tests.live.page import DESK, PHONE, PageCase
+from tests.live.page import DESK, PHONE, TEXTS, PageCase
 
 
 class ActionPageTests(PageCase):
@@ -17,8 +17,8 @@ class ActionPageTests(PageCase):
         page.locator(".stop").tap()
         self.told(page, "Stopped: 3 robots stand.")
         page.locator(".halted").wait_for()
-        page.get_by_role("button", name="Release").tap()
-        self.told(page, "The team is released.")
+        page.locator(".halted button").tap()
+        self.told(page, TEXTS["stop.released"])
         page.locator(".halted").wait_for(state="hidden")
         self.view(page, "tasks")
         page.locator("#assign").scroll_into_view_if_needed()
@@ -45,7 +45,7 @@ class ActionPageTests(PageCase):
         page.locator(".halted").wait_for()
         self.tab_to(page, ".halted button")
         page.keyboard.press("Enter")
-        self.told(page, "The team is released.")
+        self.told(page, TEXTS["stop.released"])
 
     def test_ask_before_assigning(self) -> None:
         """Who could take the chosen task and who not, and why, stands below it before it is assigned."""
@@ -54,7 +54,7 @@ class ActionPageTests(PageCase):
         page.locator(".preview [data-can=can]", has_text="dog1, dog2 (now: Patrol the yard)").wait_for()
         self.assertIn("dog3: no gripper, no lift", page.locator(".preview").inner_text())
         page.locator("#task").select_option("patrol")
-        page.locator(".preview [data-can=nobody]", has_text="No device here can take it").wait_for()
+        page.locator(".preview [data-can=nobody]", has_text=TEXTS["preview.nobody"]).wait_for()
 
     def test_assign_to_a_group(self) -> None:
         """By touch and by keyboard a task is put into a group, after its preview has said what it is divided with."""
@@ -75,7 +75,7 @@ class ActionPageTests(PageCase):
                 if type_on:
                     page.keyboard.press("Enter")
                 else:
-                    page.get_by_role("button", name="Assign").tap()
+                    page.locator("#assign button").tap()
             self.assertEqual(asked.value.post_data_json, {"name": "search", "group": "yard"})
             self.told(page, "Assigned")
             page.locator("#group").fill("elsewhere")
@@ -159,7 +159,7 @@ class ActionPageTests(PageCase):
         name.fill("lame")
         page.keyboard.press("Enter")
         answer = page.locator(".settings + .hint")
-        page.locator(".settings + .hint", has_text="Settings saved").wait_for()
+        page.locator(".settings + .hint", has_text=TEXTS["settings.saved"]).wait_for()
         self.assertEqual(name.input_value(), "lame")
         page.get_by_role("button", name="Save settings").tap()
         self.assertEqual(answer.inner_text(), "No changes to save.")

@@ -7,7 +7,7 @@ import signal
 from typing import Any
 
 from tests.live.demonstration import DemonstrationPageCase
-from tests.live.page import DESK, BrowserCase, Team
+from tests.live.page import DESK, TEXTS, BrowserCase, Team
 
 NAMES = ("vaio", "pi")
 CAMERAS = "figure[data-camera=live]"
@@ -72,9 +72,9 @@ class FallbackTests(BrowserCase):
         """SIGSTOP: the page changes over, though a frozen node still accepts connections; the other does the order."""
         self.opened()
         os.kill(self.pid(0), signal.SIGSTOP)
-        self.page.get_by_role("button", name="Run Demo").click()
+        self.page.locator("#demo").click()
         self.wait_for_node(self.page, "pi")
-        self.page.locator("#status-line", has_text="The demo runs").wait_for()
+        self.page.locator("#status-line", has_text=TEXTS["demo.runs"]).wait_for()
         self.served("pi")
 
     def test_go_past_an_impostor(self) -> None:
@@ -91,8 +91,8 @@ class FallbackTests(BrowserCase):
         self.assertEqual(sorted(held), sorted(web.url[:-1] for web in self.webs))
         self.lose(signal.SIGSTOP)
         self.served("pi")
-        self.page.get_by_role("button", name="Run Demo").click()
-        self.page.locator("#status-line", has_text="The demo runs").wait_for()
+        self.page.locator("#demo").click()
+        self.page.locator("#status-line", has_text=TEXTS["demo.runs"]).wait_for()
         self.assertEqual([url for url, _ in shown if url.startswith(eve.url)], [])
         tokens = {url: session["token"] for url, session in held.items()}
         for url, token in tokens.items():
@@ -156,7 +156,7 @@ class DemonstrationFallbackTests(DemonstrationPageCase):
         """The dog on its way is killed and the page's node frozen: page and task go on; then the other one crashes."""
         page = self.opened(DESK)
         page.locator("#standby-nodes", has_text="pi").wait_for()
-        page.get_by_role("button", name="Run Demo").click()
+        page.locator("#demo").click()
         going = page.locator(".device[data-state=EXECUTING] b")
         going.wait_for()
         dog = going.inner_text()

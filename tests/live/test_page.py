@@ -5,7 +5,7 @@ from __future__ import annotations
 import time
 from typing import Any
 
-from tests.live.page import DESK, PHONE, PageCase, Team
+from tests.live.page import DESK, PHONE, TEXTS, PageCase, Team
 
 TWINS = """async () => {
   const { updateList } = await import("/static/element.js");
@@ -49,17 +49,17 @@ class PageTests(PageCase):
         page = self.opened(PHONE)
         shown = "[...document.querySelectorAll('main section, footer')].filter(e => e.checkVisibility()).map(e => e.id)"
         for name, ways in {
-            "devices": ["Devices"],
-            "tasks": ["Tasks"],
-            "cameras": ["Cameras"],
-            "map": ["Simulator"],
-            "groups": ["More", "Consensus"],
-            "network": ["More", "Network"],
-            "events": ["More", "Events"],
-            "more": ["More"],
+            "devices": ["devices"],
+            "tasks": ["tasks"],
+            "cameras": ["cameras"],
+            "map": ["map"],
+            "groups": ["more", "groups"],
+            "network": ["more", "network"],
+            "events": ["more", "events"],
+            "more": ["more"],
         }.items():
             for way in ways:
-                page.get_by_role("link", name=way, exact=True).tap()
+                page.locator(f"a[href='#{way}']").tap()
             page.locator(f"body[data-view={name}]").wait_for()
             beside = ["place-groups"] if name == "tasks" else []
             self.assertEqual(sorted(page.evaluate(shown)), sorted([f"place-{name}", *beside]))
@@ -166,7 +166,7 @@ class PageTests(PageCase):
         phone = self.opened(PHONE, has_clock=True)
         self.pass_by(phone, 10.0)
         self.assertFalse([url for url in self.asked if "/shot/" in url])
-        phone.get_by_role("link", name="Cameras").tap()
+        phone.locator("a[href='#cameras']").tap()
         phone.locator("figure[data-camera=live]").first.wait_for()
 
     def test_show_who_left(self) -> None:
@@ -204,9 +204,9 @@ class PageTests(PageCase):
         page.locator("#d-name", has_text="dog1").wait_for()
         page.locator("#d-text").fill("sit")
         page.keyboard.press("Enter")
-        page.locator("#d-result", has_text="Message sent").wait_for()
+        page.locator("#d-result", has_text=TEXTS["message.sent"].rstrip(".")).wait_for()
         self.assertEqual(page.locator("#d-text").input_value(), "")
-        page.get_by_role("button", name="Disconnect").click()
+        page.locator("#d-leave button").click()
         page.locator("#d-result", has_text="15 s").wait_for()
         page.locator("#d-close").click()
         dialog.wait_for(state="hidden")
@@ -260,11 +260,11 @@ class PageTests(PageCase):
     def test_give_tasks(self) -> None:
         """On a phone a task is assigned and cancelled by a button, and the group shows its bids and whom it names."""
         page = self.opened(PHONE)
-        page.get_by_role("button", name="Run Demo").tap()
-        self.told(page, "The demo runs")
-        page.get_by_role("link", name="Tasks").tap()
+        page.locator("#demo").tap()
+        self.told(page, TEXTS["demo.runs"])
+        page.locator("a[href='#tasks']").tap()
         page.locator("#task").select_option("patrol")
-        page.get_by_role("button", name="Assign").tap()
+        page.locator("#assign button").tap()
         self.told(page, "Assigned")
         page.get_by_role("button", name="Cancel").first.tap()
         self.told(page, "sent")
@@ -307,9 +307,9 @@ class PageTests(PageCase):
         for _ in range(4):
             page.keyboard.press("ArrowRight")
         page.locator("#target-position", has_text="Target at 1.2").wait_for()
-        page.get_by_role("button", name="Remove target").click()
-        page.locator("#target-position", has_text="No target").wait_for()
-        page.get_by_role("button", name="Place target").click()
+        page.locator("#remove-target").click()
+        page.locator("#target-position", has_text=TEXTS["target.none"]).wait_for()
+        page.locator("#set-target").click()
         page.locator("#target-position", has_text="Target at 1.50, 1.20").wait_for()
 
     def test_survive_loss(self) -> None:
@@ -323,8 +323,8 @@ class PageTests(PageCase):
         page.locator("#link[data-link=live]").wait_for()
         self.team.stop()
         page.locator("#link[data-link=lost]").wait_for()
-        self.told(page, "Connection lost")
-        page.get_by_role("button", name="Run Demo").click()
+        self.told(page, TEXTS["connection.lost_status"])
+        page.locator("#demo").click()
         self.told(page, "does not answer")
         self.team = Team(self.team.port)
         page.locator("#link[data-link=live]").wait_for()

@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import Any
 
 from tests.live.page import DESK, PHONE, VIEWS, PageCase
-from tests.webnode.test_texts import catalogue
+from tests.webnode.texts import catalogue
 
 MARKED = "[...document.querySelectorAll('[data-text]')].map(e => [e.dataset.text, e.textContent])"
 """The keys of the template's texts, each with the text that the page shows."""

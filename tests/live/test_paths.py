@@ -1,4 +1,4 @@
-"""The ways of the team in a real browser: how each device is reached, who is in the team, and who was turned away."""
+"""The paths of the team in a real browser: how each device is reached, the members, and the rejected nodes."""
 
 from __future__ import annotations
 
@@ -7,8 +7,8 @@ from typing import Any
 from tests.live.page import DESK, PHONE, PageCase
 
 
-class WaysTests(PageCase):
-    def looked(self, screen: dict[str, Any]) -> Any:
+class PathsTests(PageCase):
+    def open_network(self, screen: dict[str, Any]) -> Any:
         """The network's view, when both panels have come."""
         page = self.opened(screen)
         self.view(page, "network")
@@ -19,7 +19,7 @@ class WaysTests(PageCase):
 
     def test_tell_the_ways(self) -> None:
         """Each way has its number, a word, how and since when; of the others the worst is first; axe finds nothing."""
-        page = self.looked(PHONE)
+        page = self.open_network(PHONE)
         rows = [item.inner_text().split("\n") for item in page.locator("#paths li").all()]
         self.assertEqual(
             [(row[0], row[1], row[2]) for row in rows],
@@ -42,7 +42,7 @@ class WaysTests(PageCase):
 
     def test_tell_who_was_turned_away(self) -> None:
         """What several tell of one refusal is one line, with who, by whom, why and the remedy."""
-        page = self.looked(DESK)
+        page = self.open_network(DESK)
         told = [item.inner_text().split("\n") for item in page.locator("#refusals li").all()]
         self.assertEqual(
             told,
@@ -66,7 +66,7 @@ class WaysTests(PageCase):
         An operator reads by which command a member is put out; a viewer sees the members without, and no button.
         However much a member may do, its name stands in one line.
         """
-        page = self.looked(DESK)
+        page = self.open_network(DESK)
         self.assertEqual(page.locator("#team-kind").inner_text(), "Closed team yard")
         self.assertIn("Fingerprint 1a2b 3c4d 5e6f 7081", page.locator("#team-about").inner_text())
         first, second, third = (item.inner_text() for item in page.locator("#members li").all())

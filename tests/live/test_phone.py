@@ -14,7 +14,7 @@ from importlib.util import find_spec
 from typing import Any
 
 from tests.live.demonstration import DemonstrationCase
-from tests.live.page import DESK, PHONE, TABLET, BrowserCase, TeamCase, pin
+from tests.live.page import DESK, PHONE, TABLET, TEXTS, BrowserCase, TeamCase, pin
 from tests.live.until import until
 
 PLACES = ((0.3, 2.1), (2.7, 2.1), (0.3, 0.3), (2.7, 0.3))
@@ -77,12 +77,10 @@ class PhoneViewTests(BrowserCase, TeamCase):
         page.locator(".phone .request", has_text="Look for the red target").wait_for()
         secret = page.evaluate("localStorage.getItem('swarm.phone')")
         page.evaluate(HIDE, True)
-        page.locator(".phone .trouble", has_text="Left the team, as this page was hidden").wait_for()
+        page.locator(".phone .trouble", has_text=TEXTS["phone.left_hidden"]).wait_for()
         with page.expect_request("**/api/v1/phones") as joined:
             page.evaluate(HIDE, False)
-        page.locator(
-            ".phone .trouble", has_text="The phone left while this page was hidden, and has returned"
-        ).wait_for()
+        page.locator(".phone .trouble", has_text=TEXTS["phone.returned"]).wait_for()
         page.locator(".phone .request", has_text="Look for the red target").wait_for()
         self.assertEqual(json.loads(joined.value.post_data)["secret"], json.loads(secret)["secret"])
         self.assertEqual(self.faults, [])
@@ -91,14 +89,14 @@ class PhoneViewTests(BrowserCase, TeamCase):
         """A refused camera, a page that is not secure and a visitor who only looks: each is told what to do."""
         page = self.opened(may_film=False)
         page.get_by_role("button", name="Take part", exact=True).tap()
-        page.locator(".phone .trouble", has_text="The camera is not allowed. Allow it").wait_for()
+        page.locator(".phone .trouble", has_text=TEXTS["camera.error.NotAllowedError"]).wait_for()
         self.sound(page)
         page = self.opened(base=f"http://vaio.local:{self.team.port}/", may_film=False)
         page.locator(".phone .trouble", has_text="allow the camera on https pages").wait_for()
         self.assertTrue(page.get_by_role("button", name="Take part", exact=True).is_disabled())
         page = self.tab(PHONE)
         page.goto(f"{self.team.url}#code={self.invited('viewer')}/phone")
-        page.locator(".phone .trouble", has_text="Ask an operator for an invitation").wait_for()
+        page.locator(".phone .trouble", has_text=TEXTS["phone.is_viewer"]).wait_for()
 
     def invited(self, role: str) -> str:
         body = json.dumps({"role": role}).encode()

@@ -24,7 +24,7 @@ class PositionTests(PageCase):
         for place in ("dog1 x=0 y=0 heading=0", "dog2 x=30 y=0 heading=1.5708", "dog3 x=0 y=12 heading=0"):
             self.team.order(f"place {place}")
         page = self.opened(PHONE)
-        page.get_by_role("link", name="Map", exact=True).tap()
+        page.locator("a[href='#map']").tap()
         page.locator("#position-map .spot").nth(2).wait_for()
         one, two, three = self.centres(page, "dog1", "dog2", "dog3")
         metre = (two[0] - one[0]) / 30

@@ -5,12 +5,12 @@ from __future__ import annotations
 import json
 import re
 from collections.abc import Iterator
-from pathlib import Path
 from typing import Any
 
 from twisted.trial.unittest import SynchronousTestCase
 
-ROOM = Path(__file__).parents[2] / "webnode"
+from tests.webnode.texts import ROOM, catalogue
+
 STATIC = ROOM / "static"
 MODULES = {path.name: path.read_text() for path in sorted(STATIC.glob("*.js"))}
 TEMPLATE = (ROOM / "templates" / "index.html").read_text()
@@ -41,17 +41,6 @@ NO_TEXT = {
 """The strings that look like a text and are not translated, with the reason."""
 
 
-def catalogue(language: str) -> dict[str, Any]:
-    """The texts of a language by key; a text with plural forms is a mapping."""
-    source = (STATIC / "texts" / f"{language}.js").read_text()
-    found = re.fullmatch(r"export default (\{.*\});\n", source, re.DOTALL)
-    assert found is not None, f"texts/{language}.js is not one object in JSON"
-    pairs: list[tuple[str, Any]] = json.loads(found[1], object_pairs_hook=list)
-    keys = [key for key, _ in pairs]
-    assert keys == sorted(set(keys)), f"the keys of texts/{language}.js are not sorted, or one is there twice"
-    return {key: dict(text) if isinstance(text, list) else text for key, text in pairs}
-
-
 def forms(text: Any) -> list[str]:
     """The plural forms of a text; one form if it has none."""
     return list(text.values()) if isinstance(text, dict) else [text]
@@ -59,8 +48,8 @@ def forms(text: Any) -> list[str]:
 
 def strings(source: str) -> Iterator[tuple[str, str]]:
     """Each string and each constant part of a template in a module, with the code before it."""
-    at, depths = 0, []  # the depth of braces in each template that is open
-    start = 0
+    at = start = 0
+    depths: list[int] = []  # the depth of braces in each template that is open
     while at < len(source):
         char = source[at]
         is_in_template = bool(depths) and depths[-1] == 0
