@@ -79,10 +79,14 @@ class StaticFiles(JsonResource):
 
     def __init__(self, folder: Path = STATIC) -> None:
         super().__init__()
-        paths = [path for path in sorted(folder.iterdir()) if path.is_file()]
+        paths = [path for path in sorted(folder.rglob("*")) if path.is_file()]
+        folders: dict[Path, Resource] = {folder: self}
         for path in paths:
-            self.putChild(path.name.encode(), _StaticFile(path.name, read_static(path)))
-        listed = json.dumps([f"/static/{path.name}" for path in paths]).encode()
+            if path.parent not in folders:
+                folders[path.parent] = JsonResource()
+                folders[path.parent.parent].putChild(path.parent.name.encode(), folders[path.parent])
+            folders[path.parent].putChild(path.name.encode(), _StaticFile(path.name, read_static(path)))
+        listed = json.dumps([f"/static/{path.relative_to(folder).as_posix()}" for path in paths]).encode()
         self.putChild(b"files.json", _StaticFile("files.json", listed))
 
 

@@ -26,6 +26,8 @@ from typing import Any
 
 from twisted.trial.unittest import SynchronousTestCase
 
+from tests.webnode.texts import catalogue
+
 CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
 FLAGS = [
     *("--no-sandbox", "--disable-gpu", "--disable-quic", "--no-first-run", "--disable-background-networking"),
@@ -37,6 +39,8 @@ PHONE = {"viewport": {"width": 412, "height": 839}, "has_touch": True}
 TABLET = {"viewport": {"width": 820, "height": 1180}, "has_touch": True}
 DESK = {"viewport": {"width": 1280, "height": 800}}
 VIEWS = ("tasks", "cameras", "map", "groups", "network", "events", "more", "devices")
+TEXTS = catalogue("en")
+"""The texts that the page shows in the tests' browser."""
 PATIENCE_MS = 45_000
 """The timeout of a wait, for a loaded machine; a page that is in time is not delayed."""
 INFORMED = """async () => {
@@ -249,7 +253,7 @@ class BrowserCase(SynchronousTestCase):
 
     def told(self, page: Any, words: str) -> None:
         """Wait until the page shows this message."""
-        page.locator("#line", has_text=words).wait_for()
+        page.locator("#status-line", has_text=words).wait_for()
 
     def tab_to(self, page: Any, what: str) -> None:
         """Move the focus to an element with the Tab key."""

@@ -57,7 +57,7 @@ class Photographer:
         page.evaluate(f"location.hash = {name!r}")
         page.locator(f"body[data-view={name}]").wait_for()
         if name == "network":
-            page.locator("#ties td").first.wait_for()
+            page.locator("#round-trips td").first.wait_for()
 
     def seen(self, page: Any) -> Picture:
         """Return a screenshot of the page."""
@@ -72,7 +72,7 @@ class Photographer:
 
     def executing(self, page: Any) -> str:
         """Run the demonstration until a dog acts; return the dog's name."""
-        page.get_by_role("button", name="Run Demo").click()
+        page.locator("#demo").click()
         going = page.locator(".device[data-state=EXECUTING] b")
         going.wait_for(state="attached")
         return str(going.text_content())
@@ -230,7 +230,7 @@ def opened(photographer: Photographer, demo: Demonstration) -> None:
     for screen, scheme, name in ((DESK, "dark", "device-desktop"), (PHONE, "light", "device-phone")):
         page = photographer.opened(screen, scheme)
         page.evaluate(f"location.hash = 'device/{uuid}'")
-        page.locator("dialog[open] .knob").first.wait_for()
+        page.locator("dialog[open] .setting").first.wait_for()
         photographer.take(page, name)
         page.context.close()
 
@@ -238,13 +238,13 @@ def opened(photographer: Photographer, demo: Demonstration) -> None:
 def stopped(photographer: Photographer) -> None:
     """Take a picture of the stopped team."""
     phone = photographer.opened(PHONE)
-    phone.get_by_role("button", name="Run Demo").click()
+    phone.locator("#demo").click()
     phone.locator(".device[data-state=SEARCHING]").nth(2).wait_for()
     phone.locator(".stop").click()
     phone.locator(".halted").wait_for()
-    phone.locator("#line", has_text="Stopped: 3 robots stand").wait_for()
+    phone.locator("#status-line", has_text="Stopped: 3 robots stand").wait_for()
     photographer.take(phone, "stop-phone")
-    phone.get_by_role("button", name="Release").click()
+    phone.locator(".halted button").click()
 
 
 def outdoors(browser: Any) -> None:
@@ -258,7 +258,7 @@ def outdoors(browser: Any) -> None:
         photographer = Photographer(browser, f"{team.url}#code={team.code}")
         phone = photographer.opened(PHONE)
         photographer.view(phone, "map")
-        phone.locator("#spots .spot").nth(2).wait_for()
+        phone.locator("#position-map .spot").nth(2).wait_for()
         phone.wait_for_timeout(300)
         photographer.take(phone, "map-phone")
     finally:

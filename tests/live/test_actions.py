@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 
-from tests.live.page import DESK, PHONE, PageCase
+from tests.live.page import DESK, PHONE, TEXTS, PageCase
 
 
 class ActionPageTests(PageCase):
@@ -17,8 +17,8 @@ class ActionPageTests(PageCase):
         page.locator(".stop").tap()
         self.told(page, "Stopped: 3 robots stand.")
         page.locator(".halted").wait_for()
-        page.get_by_role("button", name="Release").tap()
-        self.told(page, "The team is released.")
+        page.locator(".halted button").tap()
+        self.told(page, TEXTS["stop.released"])
         page.locator(".halted").wait_for(state="hidden")
         self.view(page, "tasks")
         page.locator("#assign").scroll_into_view_if_needed()
@@ -45,7 +45,7 @@ class ActionPageTests(PageCase):
         page.locator(".halted").wait_for()
         self.tab_to(page, ".halted button")
         page.keyboard.press("Enter")
-        self.told(page, "The team is released.")
+        self.told(page, TEXTS["stop.released"])
 
     def test_ask_before_assigning(self) -> None:
         """Before a task is assigned, the page shows the devices that can execute it, and reasons for the others."""
@@ -54,7 +54,7 @@ class ActionPageTests(PageCase):
         page.locator(".preview [data-can=can]", has_text="dog1, dog2 (now: Patrol the yard)").wait_for()
         self.assertIn("dog3: no gripper, no lift", page.locator(".preview").inner_text())
         page.locator("#task").select_option("patrol")
-        page.locator(".preview [data-can=nobody]", has_text="No device here can take it").wait_for()
+        page.locator(".preview [data-can=nobody]", has_text=TEXTS["preview.nobody"]).wait_for()
 
     def test_assign_to_a_group(self) -> None:
         """A task is added to a group by touch and by keyboard; the preview lists the tasks of the group."""
@@ -75,7 +75,7 @@ class ActionPageTests(PageCase):
                 if type_on:
                     page.keyboard.press("Enter")
                 else:
-                    page.get_by_role("button", name="Assign").tap()
+                    page.locator("#assign button").tap()
             self.assertEqual(asked.value.post_data_json, {"name": "search", "group": "yard"})
             self.told(page, "Assigned")
             page.locator("#group").fill("elsewhere")
@@ -89,7 +89,7 @@ class ActionPageTests(PageCase):
         page = self.opened(DESK)
         at = self.floor(page)
         page.locator(".dog .grip").nth(2).wait_for(state="attached")
-        target = page.locator("#place").inner_text()
+        target = page.locator("#target-position").inner_text()
         page.mouse.move(*at(0.6, 0.6))
         page.mouse.down()
         page.mouse.move(*at(1.0, 0.8), steps=4)
@@ -111,7 +111,7 @@ class ActionPageTests(PageCase):
         page.wait_for_function(
             "nose => document.querySelector('.dog[data-key=dog3] > g').getAttribute('transform') !== nose", arg=nose
         )
-        self.assertEqual(page.locator("#place").inner_text(), target)
+        self.assertEqual(page.locator("#target-position").inner_text(), target)
         self.assertEqual(self.faults, [])
 
     def test_lift_a_robot_by_touch(self) -> None:
@@ -133,13 +133,15 @@ class ActionPageTests(PageCase):
             finger("touchMove", (0.6, 0.6 + 0.2 * step))
         finger("touchEnd")
         self.told(page, "dog1 moved to")
-        x, y = (float(word.strip(",")) for word in page.locator("#line").inner_text().split()[3:5])
+        x, y = (float(word.strip(",")) for word in page.locator("#status-line").inner_text().split()[3:5])
         self.assertLess(abs(x - 0.6) + abs(y - 1.6), 0.1)
         finger("touchStart", (1.8, 1.7))
         for step in range(1, 6):
             finger("touchMove", (1.8, 1.7 - 0.2 * step))
         finger("touchEnd")
-        page.locator("#place", has_text=re.compile(r"Target at 1\.8\d, 0\.[67]|Target at 1\.7\d, 0\.[67]")).wait_for()
+        page.locator(
+            "#target-position", has_text=re.compile(r"Target at 1\.8\d, 0\.[67]|Target at 1\.7\d, 0\.[67]")
+        ).wait_for()
         self.assertEqual(page.evaluate("scrollY"), before)
         nose = page.locator(".dog[data-key=dog3] > g").get_attribute("transform")
         finger("touchStart", (2.5, 0.7))
@@ -157,7 +159,7 @@ class ActionPageTests(PageCase):
         name.fill("lame")
         page.keyboard.press("Enter")
         answer = page.locator(".settings + .hint")
-        page.locator(".settings + .hint", has_text="Settings saved").wait_for()
+        page.locator(".settings + .hint", has_text=TEXTS["settings.saved"]).wait_for()
         self.assertEqual(name.input_value(), "lame")
         page.get_by_role("button", name="Save settings").tap()
         self.assertEqual(answer.inner_text(), "No changes to save.")

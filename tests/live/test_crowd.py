@@ -13,14 +13,14 @@ SHOWN_S = 40.0
 TOLD_MS = 1000.0
 """The limit of the page's work for one change; 23 to 33 ms there."""
 CHANGE = """async () => {
-  const { model, take } = await import("/static/model.js");
-  const { tell } = await import("/static/shell.js");
+  const { applyEvent, model } = await import("/static/model.js");
+  const { notifyPanels } = await import("/static/shell.js");
   const [first] = model.devices.values();
   const taken = [];
   for (const status of ["DONE", "IDLE", "SEARCHING", "DONE", "WAITING"]) {
     const began = performance.now();
-    take("change", { devices: [{ ...first, status }] });
-    tell("state");
+    applyEvent("change", { devices: [{ ...first, status }] });
+    notifyPanels("state");
     document.body.offsetHeight;
     taken.push(performance.now() - began);
     await new Promise((go) => requestAnimationFrame(() => setTimeout(go)));

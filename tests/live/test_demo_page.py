@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import Any
 
 from tests.live.demonstration import DemonstrationPageCase
-from tests.live.page import DESK, PHONE
+from tests.live.page import DESK, PHONE, TEXTS
 
 SMALL = """index => {
   const seen = document.querySelectorAll("#cameras canvas")[index];
@@ -59,7 +59,7 @@ class DemonstrationPageTests(DemonstrationPageCase):
     def drive(self, page: Any) -> None:
         """Run the demo, stop and release it, open a device, send it a message, disconnect it, and move the target."""
         self.fits(page)
-        page.get_by_role("button", name="Run Demo").tap()
+        page.locator("#demo").tap()
         self.stop(page)
         self.view(page, "devices")
         page.locator(".device[data-state=EXECUTING]").first.wait_for()
@@ -79,18 +79,18 @@ class DemonstrationPageTests(DemonstrationPageCase):
         page.locator("#d-message button").tap()
         page.locator("#d-messages", has_text="operator: good dog").wait_for()
         page.locator("#d-seconds").fill("3")
-        page.get_by_role("button", name="Disconnect").tap()
-        page.locator("#d-answer", has_text="3 s").wait_for()
+        page.locator("#d-leave button").tap()
+        page.locator("#d-result", has_text="3 s").wait_for()
         page.locator("#d-close").tap()
         page.locator(".device[data-state=GONE]", has_text="dog2").wait_for()
         self.fits(page)
         page.locator(".device[data-state=IDLE]", has_text="dog2").wait_for()
 
         self.view(page, "map")
-        page.get_by_role("button", name="Remove target").tap()
-        page.locator("#place", has_text="No target").wait_for()
-        page.get_by_role("button", name="Place target").tap()
-        page.locator("#place", has_text="Target at").wait_for()
+        page.locator("#remove-target").tap()
+        page.locator("#target-position", has_text=TEXTS["target.none"]).wait_for()
+        page.locator("#set-target").tap()
+        page.locator("#target-position", has_text="Target at").wait_for()
         floor = page.locator(".floor")
         floor.scroll_into_view_if_needed()
         box = floor.bounding_box()
@@ -98,11 +98,13 @@ class DemonstrationPageTests(DemonstrationPageCase):
         for right, down in ((0.15, 0.15), (0.85, 0.15), (0.15, 0.85), (0.85, 0.85)):
             with page.expect_response("**/api/v1/target"):
                 page.touchscreen.tap(box["x"] + right * box["width"], box["y"] + down * box["height"])
-            page.wait_for_function("() => !document.querySelector('#line').textContent.includes('Moving the target')")
-            if "Target moved" in page.locator("#line").inner_text():
+            page.wait_for_function(
+                "() => !document.querySelector('#status-line').textContent.includes('Moving the target')"
+            )
+            if "Target moved" in page.locator("#status-line").inner_text():
                 break
         else:
-            self.fail(page.locator("#line").inner_text())
+            self.fail(page.locator("#status-line").inner_text())
 
     def stop(self, page: Any) -> None:
         """A stop during the search halts all three dogs at once and for 3 s; after the release they continue."""
@@ -111,7 +113,7 @@ class DemonstrationPageTests(DemonstrationPageCase):
         self.assertEqual(seen["moved"], 0)
         page.locator(".halted").wait_for()
         self.fits(page)
-        page.get_by_role("button", name="Release").tap()
+        page.locator(".halted button").tap()
         page.locator(".halted").wait_for(state="hidden")
 
     def look(self, page: Any) -> None:
@@ -124,7 +126,7 @@ class DemonstrationPageTests(DemonstrationPageCase):
         self.assertEqual(page.locator("#map .dog").count() or page.locator("#map .body").count(), 3)
         self.fits(page)
 
-        page.get_by_role("button", name="Run Demo").click()
+        page.locator("#demo").click()
         page.locator(".device[data-state=SEARCHING]").first.wait_for()
         views = [page.evaluate(SMALL, index) for index in range(3)]
         for index, before in enumerate(views):

@@ -7,7 +7,7 @@ import signal
 from typing import Any
 
 from tests.live.demonstration import DemonstrationPageCase
-from tests.live.page import DESK, BrowserCase, Team
+from tests.live.page import DESK, TEXTS, BrowserCase, Team
 
 NAMES = ("vaio", "pi")
 CAMERAS = "figure[data-camera=live]"
@@ -42,7 +42,7 @@ class FallbackTests(BrowserCase):
     def opened(self) -> None:
         self.page.goto(f"{self.webs[0].url}#code={self.webs[0].code}")
         self.served("vaio")
-        self.page.locator("#reserve", has_text="reserve").wait_for()
+        self.page.locator("#standby-nodes", has_text="reserve").wait_for()
 
     def pid(self, place: int) -> int:
         return self.webs[place].pid
@@ -61,10 +61,10 @@ class FallbackTests(BrowserCase):
         self.assertTrue(self.page.url.endswith("#device/" + "02" * 16))
         self.assertEqual(self.page.locator("#d-text").input_value(), "half a sentence")
         self.page.locator("#d-message button").click()
-        self.page.locator("#d-answer", has_text="sent").wait_for()
+        self.page.locator("#d-result", has_text="sent").wait_for()
         self.page.locator("#d-close").click()
         self.served("pi")
-        self.page.locator("#line", has_text="pi serves the page").wait_for()
+        self.page.locator("#status-line", has_text="pi serves the page").wait_for()
         self.webs[1].order("status dog3 IDLE")
         self.page.locator(".device[data-state=IDLE]", has_text="dog3").wait_for()
 
@@ -72,9 +72,9 @@ class FallbackTests(BrowserCase):
         """After a SIGSTOP, with connections still accepted, the page sends the request to the other node."""
         self.opened()
         os.kill(self.pid(0), signal.SIGSTOP)
-        self.page.get_by_role("button", name="Run Demo").click()
+        self.page.locator("#demo").click()
         self.wait_for_node(self.page, "pi")
-        self.page.locator("#line", has_text="The demo runs").wait_for()
+        self.page.locator("#status-line", has_text=TEXTS["demo.runs"]).wait_for()
         self.served("pi")
 
     def test_go_past_an_impostor(self) -> None:
@@ -91,8 +91,8 @@ class FallbackTests(BrowserCase):
         self.assertEqual(sorted(held), sorted(web.url[:-1] for web in self.webs))
         self.lose(signal.SIGSTOP)
         self.served("pi")
-        self.page.get_by_role("button", name="Run Demo").click()
-        self.page.locator("#line", has_text="The demo runs").wait_for()
+        self.page.locator("#demo").click()
+        self.page.locator("#status-line", has_text=TEXTS["demo.runs"]).wait_for()
         self.assertEqual([url for url, _ in shown if url.startswith(eve.url)], [])
         tokens = {url: session["token"] for url, session in held.items()}
         for url, token in tokens.items():
@@ -155,8 +155,8 @@ class DemonstrationFallbackTests(DemonstrationPageCase):
     def test_experiment_2_and_the_web_node(self) -> None:
         """The acting dog is killed and the page's node frozen; page and task continue, then the other node dies."""
         page = self.opened(DESK)
-        page.locator("#reserve", has_text="pi").wait_for()
-        page.get_by_role("button", name="Run Demo").click()
+        page.locator("#standby-nodes", has_text="pi").wait_for()
+        page.locator("#demo").click()
         going = page.locator(".device[data-state=EXECUTING] b")
         going.wait_for()
         dog = going.inner_text()
@@ -169,7 +169,7 @@ class DemonstrationFallbackTests(DemonstrationPageCase):
         self.assertNotIn(f"Done by {dog}", done)
         page.locator(CAMERAS).first.wait_for()
         os.kill(frozen, signal.SIGCONT)
-        page.locator("#reserve", has_text="vaio").wait_for()
+        page.locator("#standby-nodes", has_text="vaio").wait_for()
         self.demo.send_signal("pi", signal.SIGKILL)
         self.wait_for_node(page, "vaio")
         page.locator(CAMERAS).first.wait_for()

@@ -31,7 +31,7 @@ class HttpsPageTests(BrowserCase, NodeCase):
         page.locator("#link[data-link=live]").wait_for()
         self.assertTrue(page.evaluate("isSecureContext && !!navigator.mediaDevices?.getUserMedia"))
         self.assertTrue(page.evaluate("navigator.serviceWorker.ready.then(({ active }) => !!active)"))
-        page.locator("#reserve", has_text="pi").wait_for()
+        page.locator("#standby-nodes", has_text="pi").wait_for()
         told = json.loads(asked(f"{first.plain}/api/v1/node"))["pages"]
         self.assertEqual({each["url"] for each in told}, {first.plain, first.secure, second.plain, second.secure})
         first.process.send_signal(signal.SIGKILL)

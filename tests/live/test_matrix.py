@@ -6,16 +6,6 @@ from typing import Any
 
 from tests.live.page import DESK, PHONE, TABLET, VIEWS, PageCase
 
-LINKS = {
-    "devices": "Devices",
-    "tasks": "Tasks",
-    "cameras": "Cameras",
-    "map": "Simulator",
-    "more": "More",
-    "groups": "Consensus",
-    "network": "Network",
-    "events": "Events",
-}
 FURTHER = ("groups", "network", "events")
 """The views that a phone opens through *More*."""
 USED = {
@@ -39,13 +29,13 @@ class MatrixTests(PageCase):
                 self.tab_to(page, f"a[href='#{place}']")
                 page.keyboard.press("Enter")
             else:
-                page.get_by_role("link", name=LINKS[place], exact=True).tap()
+                page.locator(f"a[href='#{place}']").tap()
             page.locator(f"body[data-view={place}]").wait_for()
         if not is_phone and not by_key:
             page.locator(f"#place-{view}").scroll_into_view_if_needed()
         if view == "network":
             page.locator("#place-network").scroll_into_view_if_needed()
-            page.locator("#ties td").first.wait_for()
+            page.locator("#round-trips td").first.wait_for()
         self.assertTrue(page.evaluate(SHOWN, f"place-{view}"), view)
         if by_key and view in USED:
             self.tab_to(page, USED[view])
@@ -66,7 +56,7 @@ class MatrixTests(PageCase):
             else:
                 page.locator(".device").first.tap()
             page.locator("dialog[open] tr").first.wait_for()
-            page.locator("dialog[open] .knob").first.wait_for()
+            page.locator("dialog[open] .setting").first.wait_for()
             self.sound(page)
             page.context.close()
         self.assertEqual([url for url in self.asked if not url.startswith(self.team.url)], [])

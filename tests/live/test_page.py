@@ -5,22 +5,22 @@ from __future__ import annotations
 import time
 from typing import Any
 
-from tests.live.page import DESK, PHONE, PageCase, Team
+from tests.live.page import DESK, PHONE, TEXTS, PageCase, Team
 
 TWINS = """async () => {
-  const { keyed } = await import("/static/element.js");
+  const { updateList } = await import("/static/element.js");
   const list = document.createElement("ul");
   const seen = ["abab", "aba", "baa"].map((items) => {
     const before = new Set(list.children);
     const update = (child, item) => { child.textContent = item; };
-    keyed(list, [...items], (item) => item, () => document.createElement("li"), update);
+    updateList(list, [...items], (item) => item, () => document.createElement("li"), update);
     return [list.textContent, [...list.children].filter((child) => !before.has(child)).length];
   });
   return seen;
 }"""
 """A list updated with items of which two are equal: its text, and the number of new rows."""
 PANELS = """async () => {
-  const { panel } = await import("/static/panel.js");
+  const { registerPanel } = await import("/static/panel.js");
   const { model } = await import("/static/model.js");
   globalThis.seen = { model };
   const needs = { role: "operator", has: "wings" };
@@ -31,8 +31,8 @@ PANELS = """async () => {
       close: () => { document.body.dataset.closed = root.dataset.told; },
     };
   };
-  panel({ place: "groups", order: 20, title: "Second", needs, load: async () => ({ make: noted }) });
-  panel({ place: "groups", order: 10, title: "First", needs, make: (root) => {
+  registerPanel({ place: "groups", order: 20, needs, load: async () => ({ make: noted }) });
+  registerPanel({ place: "groups", order: 10, needs, make: (root) => {
     root.textContent = "first";
     return { update: (_, event) => { if (event === "state") throw new Error("a fault of one"); } };
   } });
@@ -48,22 +48,22 @@ class PageTests(PageCase):
         """On a phone each view is shown alone after at most two taps; keys, back and links open it as well."""
         page = self.opened(PHONE)
         shown = "[...document.querySelectorAll('main section, footer')].filter(e => e.checkVisibility()).map(e => e.id)"
-        for name, names in {
-            "devices": ["Devices"],
-            "tasks": ["Tasks"],
-            "cameras": ["Cameras"],
-            "map": ["Simulator"],
-            "groups": ["More", "Consensus"],
-            "network": ["More", "Network"],
-            "events": ["More", "Events"],
-            "more": ["More"],
+        for name, links in {
+            "devices": ["devices"],
+            "tasks": ["tasks"],
+            "cameras": ["cameras"],
+            "map": ["map"],
+            "groups": ["more", "groups"],
+            "network": ["more", "network"],
+            "events": ["more", "events"],
+            "more": ["more"],
         }.items():
-            for link in names:
-                page.get_by_role("link", name=link, exact=True).tap()
+            for link in links:
+                page.locator(f"a[href='#{link}']").tap()
             page.locator(f"body[data-view={name}]").wait_for()
             beside = ["place-groups"] if name == "tasks" else []
             self.assertEqual(sorted(page.evaluate(shown)), sorted([f"place-{name}", *beside]))
-            self.assertEqual(page.locator("#views [aria-current=page]").count(), len(names) == 1)
+            self.assertEqual(page.locator("#views [aria-current=page]").count(), len(links) == 1)
             page.wait_for_function("() => scrollY === 0")
         page.go_back()
         page.locator("body[data-view=events]").wait_for()
@@ -115,7 +115,7 @@ class PageTests(PageCase):
         self.assertFalse(asks())
         self.view(page, "network")
         page.locator("#network-line", has_text="dog3 did not answer").wait_for()
-        rows = [row.split("\t") for row in page.locator("#ties tr").all_inner_texts()]
+        rows = [row.split("\t") for row in page.locator("#round-trips tr").all_inner_texts()]
         self.assertEqual(rows[1:], [["dog1", "", "3.6", "5.4"], ["dog2", "1.8", "", "not known"]])
         self.assertEqual(page.locator(".tie").count(), 2)
         self.assertIn("5 asked in 2 hops, 8 found", page.locator("#lookups").inner_text())
@@ -166,7 +166,7 @@ class PageTests(PageCase):
         phone = self.opened(PHONE, has_clock=True)
         self.pass_by(phone, 10.0)
         self.assertFalse([url for url in self.asked if "/shot/" in url])
-        phone.get_by_role("link", name="Cameras").tap()
+        phone.locator("a[href='#cameras']").tap()
         phone.locator("figure[data-camera=live]").first.wait_for()
 
     def test_show_who_left(self) -> None:
@@ -204,10 +204,10 @@ class PageTests(PageCase):
         page.locator("#d-name", has_text="dog1").wait_for()
         page.locator("#d-text").fill("sit")
         page.keyboard.press("Enter")
-        page.locator("#d-answer", has_text="Message sent").wait_for()
+        page.locator("#d-result", has_text=TEXTS["message.sent"].rstrip(".")).wait_for()
         self.assertEqual(page.locator("#d-text").input_value(), "")
-        page.get_by_role("button", name="Disconnect").click()
-        page.locator("#d-answer", has_text="15 s").wait_for()
+        page.locator("#d-leave button").click()
+        page.locator("#d-result", has_text="15 s").wait_for()
         page.locator("#d-close").click()
         dialog.wait_for(state="hidden")
         self.assertNotIn("#device", page.url)
@@ -260,11 +260,11 @@ class PageTests(PageCase):
     def test_give_tasks(self) -> None:
         """On a phone, buttons assign and cancel a task, and the group shows its bids and the assigned agent."""
         page = self.opened(PHONE)
-        page.get_by_role("button", name="Run Demo").tap()
-        self.told(page, "The demo runs")
-        page.get_by_role("link", name="Tasks").tap()
+        page.locator("#demo").tap()
+        self.told(page, TEXTS["demo.runs"])
+        page.locator("a[href='#tasks']").tap()
         page.locator("#task").select_option("patrol")
-        page.get_by_role("button", name="Assign").tap()
+        page.locator("#assign button").tap()
         self.told(page, "Assigned")
         page.get_by_role("button", name="Cancel").first.tap()
         self.told(page, "sent")
@@ -294,7 +294,7 @@ class PageTests(PageCase):
         page = self.opened(DESK)
         at = self.floor(page)
         page.mouse.click(*at(2.03, 2.0))
-        page.locator("#place", has_text="Target at 2.0").wait_for()
+        page.locator("#target-position", has_text="Target at 2.0").wait_for()
         ball = page.locator(".target .ball").bounding_box()
         page.mouse.move(ball["x"] + ball["width"] / 2, ball["y"] + ball["height"] / 2)
         page.mouse.down()
@@ -302,15 +302,15 @@ class PageTests(PageCase):
         page.mouse.move(*at(1.03, 1.0), steps=4)
         page.mouse.up()
         self.told(page, "Target moved to 1.0")
-        page.locator("#place", has_text="Target at 1.0").wait_for()
+        page.locator("#target-position", has_text="Target at 1.0").wait_for()
         page.locator(".target").focus()
         for _ in range(4):
             page.keyboard.press("ArrowRight")
-        page.locator("#place", has_text="Target at 1.2").wait_for()
-        page.get_by_role("button", name="Remove target").click()
-        page.locator("#place", has_text="No target").wait_for()
-        page.get_by_role("button", name="Place target").click()
-        page.locator("#place", has_text="Target at 1.50, 1.20").wait_for()
+        page.locator("#target-position", has_text="Target at 1.2").wait_for()
+        page.locator("#remove-target").click()
+        page.locator("#target-position", has_text=TEXTS["target.none"]).wait_for()
+        page.locator("#set-target").click()
+        page.locator("#target-position", has_text="Target at 1.50, 1.20").wait_for()
 
     def test_survive_loss(self) -> None:
         """A frozen node is detected in about two seconds, a killed one at once; the page recovers when it is back."""
@@ -323,8 +323,8 @@ class PageTests(PageCase):
         page.locator("#link[data-link=live]").wait_for()
         self.team.stop()
         page.locator("#link[data-link=lost]").wait_for()
-        self.told(page, "Connection lost")
-        page.get_by_role("button", name="Run Demo").click()
+        self.told(page, TEXTS["connection.lost_status"])
+        page.locator("#demo").click()
         self.told(page, "does not answer")
         self.team = Team(self.team.port)
         page.locator("#link[data-link=live]").wait_for()

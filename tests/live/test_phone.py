@@ -14,19 +14,19 @@ from importlib.util import find_spec
 from typing import Any
 
 from tests.live.demonstration import DemonstrationCase
-from tests.live.page import DESK, PHONE, TABLET, BrowserCase, TeamCase, pin
+from tests.live.page import DESK, PHONE, TABLET, TEXTS, BrowserCase, TeamCase, pin
 from tests.live.until import until
 
 PLACES = ((0.3, 2.1), (2.7, 2.1), (0.3, 0.3), (2.7, 0.3))
 SIGHTS = """async (pictures) => {
-  const { sighted } = await import("/static/sight.js");
+  const { detectTarget } = await import("/static/detection.js");
   const found = [];
   for (const picture of pictures) {
     const image = await createImageBitmap(new Blob([Uint8Array.from(atob(picture), (each) => each.charCodeAt(0))]));
     const canvas = new OffscreenCanvas(image.width, image.height).getContext("2d");
     canvas.drawImage(image, 0, 0);
     const { data } = canvas.getImageData(0, 0, image.width, image.height);
-    const seen = sighted(data, image.width, image.height, { radius: 0.08, height: 0.22 }, 56.9 * Math.PI / 180);
+    const seen = detectTarget(data, image.width, image.height, { radius: 0.08, height: 0.22 }, 56.9 * Math.PI / 180);
     found.push(seen && [seen.bearing, seen.distance]);
   }
   return found;
@@ -62,7 +62,7 @@ class PhoneViewTests(BrowserCase, TeamCase):
             else:
                 page.locator("#phone-name").focus()
                 page.keyboard.press("Enter")
-            page.locator(".phone .said", has_text="Look for the red target").wait_for()
+            page.locator(".phone .request", has_text="Look for the red target").wait_for()
             page.locator(".phone", has_text="Target at about 0.2").wait_for()
             look(page)
             page.get_by_role("button", name="Stop taking part").click()
@@ -74,16 +74,14 @@ class PhoneViewTests(BrowserCase, TeamCase):
         """A hidden page leaves and releases the camera; a visible one rejoins automatically as the same phone."""
         page = self.opened()
         page.get_by_role("button", name="Take part", exact=True).tap()
-        page.locator(".phone .said", has_text="Look for the red target").wait_for()
+        page.locator(".phone .request", has_text="Look for the red target").wait_for()
         secret = page.evaluate("localStorage.getItem('swarm.phone')")
         page.evaluate(HIDE, True)
-        page.locator(".phone .trouble", has_text="Left the team, as this page was hidden").wait_for()
+        page.locator(".phone .trouble", has_text=TEXTS["phone.left_hidden"]).wait_for()
         with page.expect_request("**/api/v1/phones") as joined:
             page.evaluate(HIDE, False)
-        page.locator(
-            ".phone .trouble", has_text="The phone left while this page was hidden, and has returned"
-        ).wait_for()
-        page.locator(".phone .said", has_text="Look for the red target").wait_for()
+        page.locator(".phone .trouble", has_text=TEXTS["phone.returned"]).wait_for()
+        page.locator(".phone .request", has_text="Look for the red target").wait_for()
         self.assertEqual(json.loads(joined.value.post_data)["secret"], json.loads(secret)["secret"])
         self.assertEqual(self.faults, [])
 
@@ -91,14 +89,14 @@ class PhoneViewTests(BrowserCase, TeamCase):
         """A denied camera, an insecure page and a viewer each get a message with the remedy."""
         page = self.opened(may_film=False)
         page.get_by_role("button", name="Take part", exact=True).tap()
-        page.locator(".phone .trouble", has_text="The camera is not allowed. Allow it").wait_for()
+        page.locator(".phone .trouble", has_text=TEXTS["camera.error.NotAllowedError"]).wait_for()
         self.sound(page)
         page = self.opened(base=f"http://vaio.local:{self.team.port}/", may_film=False)
         page.locator(".phone .trouble", has_text="allow the camera on https pages").wait_for()
         self.assertTrue(page.get_by_role("button", name="Take part", exact=True).is_disabled())
         page = self.tab(PHONE)
         page.goto(f"{self.team.url}#code={self.invited('viewer')}/phone")
-        page.locator(".phone .trouble", has_text="Ask an operator for an invitation").wait_for()
+        page.locator(".phone .trouble", has_text=TEXTS["phone.is_viewer"]).wait_for()
 
     def invited(self, role: str) -> str:
         body = json.dumps({"role": role}).encode()
@@ -161,7 +159,7 @@ class DemonstrationPhoneTests(BrowserCase, DemonstrationCase):
 
     def has_task(self, page: Any) -> bool:
         """Return whether the phone has the task, by its page and by the team's."""
-        said = page.locator(".phone .said").text_content()
+        said = page.locator(".phone .request").text_content()
         return "You have the task" in said and self.statuses().get("anna") == "EXECUTING"
 
     def place_target(self) -> None:
@@ -192,9 +190,11 @@ class DemonstrationPhoneTests(BrowserCase, DemonstrationCase):
         before = self.devices()["anna"]
         self.demo.send_signal("vaio", signal.SIGKILL)
         page.locator("#node", has_text="pi").wait_for()
-        self.demo.sign_in(page.evaluate("import('/static/link.js').then(({ base }) => base())") + "/")
+        self.demo.sign_in(
+            page.evaluate("import('/static/connection.js').then(({ currentOrigin }) => currentOrigin())") + "/"
+        )
         self.until(lambda: self.devices().get("anna", before)["address"] != before["address"], page=page)
-        page.locator(".phone .said", has_text="Nothing to do").wait_for()
+        page.locator(".phone .request", has_text="Nothing to do").wait_for()
         after = self.devices()["anna"]
         self.assertEqual(after["uuid"], before["uuid"])
         self.assertIsNone(after["gone"])

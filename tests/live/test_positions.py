@@ -24,8 +24,8 @@ class PositionTests(PageCase):
         for place in ("dog1 x=0 y=0 heading=0", "dog2 x=30 y=0 heading=1.5708", "dog3 x=0 y=12 heading=0"):
             self.team.order(f"place {place}")
         page = self.opened(PHONE)
-        page.get_by_role("link", name="Map", exact=True).tap()
-        page.locator("#spots .spot").nth(2).wait_for()
+        page.locator("a[href='#map']").tap()
+        page.locator("#position-map .spot").nth(2).wait_for()
         one, two, three = self.centres(page, "dog1", "dog2", "dog3")
         metre = (two[0] - one[0]) / 30
         self.assertLess(abs(one[1] - three[1] - (12 * metre)), 2)
@@ -34,7 +34,7 @@ class PositionTests(PageCase):
         bar = page.locator(".scale path").evaluate("e => e.getBoundingClientRect().width")
         self.assertLess(abs(bar - (10 * metre)), 4)
         self.assertIn("30.00, 0.00 m, heading 90°", page.locator(".places").inner_text())
-        self.assertEqual(page.locator("#map:visible, #put:visible, #place:visible").count(), 0)
+        self.assertEqual(page.locator("#map:visible, #set-target:visible, #target-position:visible").count(), 0)
         self.team.order("place dog3 x=0 y=6 heading=0")
         page.locator(".spot[aria-label*='0.00, 6.00 m']").wait_for()
         one, three = self.centres(page, "dog1", "dog3")
@@ -51,7 +51,7 @@ class PositionTests(PageCase):
         for screen, scheme in ((PHONE, "light"), (TABLET, "dark"), (DESK, "light")):
             page = self.opened(screen, scheme)
             self.view(page, "map")
-            page.locator("#spots .spot").nth(1).wait_for()
+            page.locator("#position-map .spot").nth(1).wait_for()
             # The drawing is to scale after the page has received all three positions.
             page.locator("#place-map", has_text="north is up. 1 more is reported in another frame").wait_for()
             one, two = self.centres(page, "dog1", "dog2")
@@ -72,6 +72,6 @@ class PositionTests(PageCase):
         page = self.opened(DESK)
         page.locator("#map .dog").nth(2).wait_for()
         page.wait_for_function("performance.getEntriesByType('resource').some(e => e.name.endsWith('positions.js'))")
-        page.locator("#put").wait_for()
-        self.assertFalse(page.locator("#spots").is_visible())
-        self.assertEqual(page.locator("#h-yard").inner_text(), "Simulator")
+        page.locator("#set-target").wait_for()
+        self.assertFalse(page.locator("#position-map").is_visible())
+        self.assertEqual(page.locator("#h-map").inner_text(), "Simulator")

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
-from tests.live.page import DESK, PHONE, PageCase
+from tests.live.page import DESK, PHONE, TEXTS, PageCase
 
 
 class SigningInTests(PageCase):
@@ -68,8 +68,8 @@ class SigningInTests(PageCase):
         """An operator opens the audit log by keyboard and sees the last action; a viewer is not offered the log."""
         for screen, scheme in ((PHONE, "dark"), (DESK, "light")):
             page = self.opened(screen, scheme)
-            page.get_by_role("button", name="Run Demo").click()
-            page.locator("#line", has_text="The demo runs").wait_for()
+            page.locator("#demo").click()
+            page.locator("#status-line", has_text=TEXTS["demo.runs"]).wait_for()
             self.view(page, "more")
             page.get_by_text("Audit log").focus()
             page.keyboard.press("Enter")

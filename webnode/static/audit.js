@@ -1,38 +1,38 @@
 // The audit log: changes made through this node, for operators; fetched when it is opened.
-import { element, keyed, words } from "./element.js";
+import { createElement, updateList, setText } from "./element.js";
+import { formatTime, text, textOf } from "./texts.js";
 
 const SHOWN = 50;
 
-function row() {
-  return element("li", {}, element("time"), element("b"), element("span"), element("span", { class: "hint" }));
+function createRow() {
+  return createElement("li", {}, createElement("time"), createElement("b"), createElement("span"), createElement("span", { class: "hint" }));
 }
 
-function tell(item, line) {
+function updateRow(item, line) {
   const [time, who, what, how] = item.children;
-  const at = new Date(1000 * line.at);
-  time.dateTime = at.toISOString();
-  words(time, at.toLocaleTimeString());
-  words(who, line.who || line.role);
-  words(what, `${line.route.replace("/api/v1/", "")}${line.target ? ` (${line.target})` : ""}`);
-  words(how, `${line.outcome}, from ${line.from}${line.repeated ? `, and ${line.repeated} times more before` : ""}`);
+  time.dateTime = new Date(1000 * line.at).toISOString();
+  setText(time, formatTime(line.at));
+  setText(who, line.who || textOf("role", line.role));
+  setText(what, `${line.route.replace("/api/v1/", "")}${line.target ? ` (${line.target})` : ""}`);
+  setText(how, text(line.repeated ? "audit.repeated" : "audit.outcome", { outcome: line.outcome, address: line.from, count: line.repeated }));
 }
 
 export function make(root, { get }) {
-  const list = element("ol", { class: "audit" });
-  const line = element("p", { role: "status" });
-  const again = element("button", { type: "button" }, "Refresh");
-  const box = element("details", {}, element("summary", {}, "Audit log"), line, list, again);
-  async function look() {
+  const list = createElement("ol", { class: "audit" });
+  const line = createElement("p", { role: "status" });
+  const again = createElement("button", { type: "button" }, text("action.refresh"));
+  const box = createElement("details", {}, createElement("summary", {}, text("audit.title")), line, list, again);
+  async function load() {
     try {
       const lines = await get(`audit?count=${SHOWN}`);
-      keyed(list, lines, (each) => `${each.at} ${each.session} ${each.route} ${each.target}`, row, tell);
-      words(line, lines.length ? "" : "No changes so far.");
+      updateList(list, lines, (each) => `${each.at} ${each.session} ${each.route} ${each.target}`, createRow, updateRow);
+      setText(line, lines.length ? "" : text("audit.none"));
     } catch (error) {
-      words(line, error.message);
+      setText(line, error.message);
     }
   }
-  box.ontoggle = () => { if (box.open) look(); };
-  again.onclick = look;
+  box.ontoggle = () => { if (box.open) load(); };
+  again.onclick = load;
   root.append(box);
   return {};
 }

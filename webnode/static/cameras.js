@@ -1,13 +1,14 @@
-// Cameras: one loop and one picture in flight per camera; a camera that is not in view fetches nothing.
-import { at, attribute, element, keyed, words } from "./element.js";
-import { frames } from "./link.js";
-import { panel } from "./panel.js";
+// Cameras: one loop and one request in flight per camera; a camera that is not in view fetches nothing.
+import { byId, setAttribute, createElement, updateList, setText } from "./element.js";
+import { fetchFrame } from "./connection.js";
+import { registerPanel } from "./panel.js";
+import { formatNumber, text } from "./texts.js";
 
 const cameras = new Map();
 const figures = new WeakMap();
 // One observer for all figures: which of them are in view.
-const sight = new IntersectionObserver((entries) => {
-  for (const { target, isIntersecting } of entries) figures.get(target)?.seen(isIntersecting);
+const observer = new IntersectionObserver((entries) => {
+  for (const { target, isIntersecting } of entries) figures.get(target)?.setVisible(isIntersecting);
 });
 
 class Camera {
@@ -18,63 +19,63 @@ class Camera {
     this.visible = false;
     this.gone = false;
     this.closed = false;
-    this.flight = null;
-    this.moved = false;
-    this.trouble = "";
-    this.canvas = element("canvas", { width: 208, height: 160, role: "img" });
-    this.name = element("b");
-    this.told = element("span", { class: "age" });
-    this.figure = element("figure", { "data-camera": "wait" }, this.canvas, element("figcaption", {}, this.name, this.told));
+    this.request = null;
+    this.isRestarted = false;
+    this.problem = "";
+    this.canvas = createElement("canvas", { width: 208, height: 160, role: "img" });
+    this.name = createElement("b");
+    this.age = createElement("span", { class: "age" });
+    this.figure = createElement("figure", { "data-camera": "wait" }, this.canvas, createElement("figcaption", {}, this.name, this.age));
     figures.set(this.figure, this);
-    sight.observe(this.figure);
+    observer.observe(this.figure);
   }
 
-  seen(visible) {
+  setVisible(visible) {
     this.visible = visible;
-    this.turn();
-    this.tell();
+    this.updateLoop();
+    this.showAge();
   }
 
-  get wanted() {
+  get isWanted() {
     return this.visible && !this.gone && !this.closed && !document.hidden;
   }
 
-  // Start the loop if the camera is in view, else abort the request in flight.
-  turn() {
-    if (!this.wanted) this.flight?.abort();
-    else if (!this.flight) this.loop();
+  // Start the loop if the camera is in view, else abort the pending request.
+  updateLoop() {
+    if (!this.isWanted) this.request?.abort();
+    else if (!this.request) this.loop();
   }
 
   async loop() {
-    while (this.wanted) {
-      this.flight = new AbortController();
-      const deadline = setTimeout(() => this.flight?.abort(), 12000);
+    while (this.isWanted) {
+      this.request = new AbortController();
+      const deadline = setTimeout(() => this.request?.abort(), 12000);
       try {
-        const answer = await frames(this.uuid, this.seq, this.flight.signal);
+        const answer = await fetchFrame(this.uuid, this.seq, this.request.signal);
         if (answer.status === 200) {
           const picture = await createImageBitmap(await answer.blob());
           this.seq = answer.headers.get("X-Seq");
           this.at = performance.now() - 1000 * Number(answer.headers.get("X-Age"));
           this.draw(picture);
-          this.trouble = "";
+          this.problem = "";
         } else if (answer.status !== 204) {
-          this.trouble = (await answer.json().catch(() => ({}))).error?.problem ?? "no picture";
+          this.problem = (await answer.json().catch(() => ({}))).error?.problem ?? text("camera.no_picture");
           await pause();
         }
       } catch {
-        if (this.wanted && !this.moved) await pause();
-        this.moved = false;
+        if (this.isWanted && !this.isRestarted) await pause();
+        this.isRestarted = false;
       }
       clearTimeout(deadline);
     }
-    this.flight = null;
+    this.request = null;
   }
 
   // Request from the node that serves now; a pending answer of the last node is of no use.
-  renew() {
+  restart() {
     this.seq = "";
-    this.moved = this.flight !== null;
-    this.flight?.abort();
+    this.isRestarted = this.request !== null;
+    this.request?.abort();
   }
 
   draw(picture) {
@@ -83,18 +84,18 @@ class Camera {
     picture.close();
   }
 
-  tell() {
+  showAge() {
     const age = (performance.now() - this.at) / 1000;
     const state = this.gone ? "gone" : !this.at ? "wait" : age < 1 ? "live" : "late";
-    const seen = this.at ? `${age < 10 ? age.toFixed(1) : Math.round(age)} s old` : "no picture yet";
-    attribute(this.figure, "data-camera", state);
-    words(this.told, this.gone ? `gone, ${seen}` : this.trouble && state !== "live" ? this.trouble : state === "live" ? `live, ${seen}` : seen);
+    const seen = this.at ? text("camera.age", { seconds: formatNumber(age, age < 10 ? 1 : 0) }) : text("camera.no_picture_yet");
+    setAttribute(this.figure, "data-camera", state);
+    setText(this.age, this.gone ? text("camera.gone", { age: seen }) : this.problem && state !== "live" ? this.problem : state === "live" ? text("camera.live", { age: seen }) : seen);
   }
 
   close() {
     this.closed = true;
-    sight.unobserve(this.figure);
-    this.flight?.abort();
+    observer.unobserve(this.figure);
+    this.request?.abort();
   }
 }
 
@@ -102,36 +103,35 @@ const pause = () => new Promise((done) => setTimeout(done, 1000));
 
 function showCameras(devices) {
   const seeing = devices.filter((device) => device.capabilities.camera);
-  at("no-cameras").hidden = seeing.length > 0;
+  byId("no-cameras").hidden = seeing.length > 0;
   for (const [uuid, camera] of cameras) {
     if (seeing.some((device) => device.uuid === uuid)) continue;
     camera.close();
     cameras.delete(uuid);
   }
-  keyed(at("cameras"), seeing, (device) => device.uuid,
+  updateList(byId("cameras"), seeing, (device) => device.uuid,
     (device) => {
       cameras.set(device.uuid, new Camera(device.uuid));
       return cameras.get(device.uuid).figure;
     },
     (figure, device) => {
       const camera = cameras.get(device.uuid);
-      words(camera.name, device.name);
-      attribute(camera.canvas, "aria-label", `Camera of ${device.name}`);
+      setText(camera.name, device.name);
+      setAttribute(camera.canvas, "aria-label", text("camera.label", { name: device.name }));
       camera.gone = device.gone !== null;
-      camera.turn();
+      camera.updateLoop();
     });
 }
 
-panel({
+registerPanel({
   place: "cameras",
-  title: "Cameras",
   make() {
-    document.addEventListener("visibilitychange", () => cameras.forEach((camera) => camera.turn()));
-    setInterval(() => cameras.forEach((camera) => { if (camera.visible) camera.tell(); }), 250);
+    document.addEventListener("visibilitychange", () => cameras.forEach((camera) => camera.updateLoop()));
+    setInterval(() => cameras.forEach((camera) => { if (camera.visible) camera.showAge(); }), 250);
     return {
       update(model, event) {
         if (event === "state") showCameras([...model.devices.values()]);
-        if (event === "link" && model.link === "live") cameras.forEach((camera) => camera.renew());
+        if (event === "link" && model.link === "live") cameras.forEach((camera) => camera.restart());
       },
     };
   },

@@ -1,72 +1,76 @@
 // Device: the dialog with the details of one device, and the orders to it.
-import { at, element, keyed, sojourn, words } from "./element.js";
-import { delivery, wish } from "./desk.js";
+import { byId, createElement, describeStatus, updateList, formatPresence, setText } from "./element.js";
+import { describeDelivery, sendRequest } from "./request.js";
 import { back } from "./shell.js";
-import { whereabouts } from "./whereabouts.js";
+import { formatPosition } from "./format-position.js";
+import { formatNumber, formatTime, text, textOf } from "./texts.js";
 
 let devices = new Map();
 let open = "";
 let history = null;
 let now = 0;
 
-function show(uuid) {
+function openDevice(uuid) {
   open = uuid;
-  words(at("d-answer"), "");
+  setText(byId("d-result"), "");
   history = null;
-  import("./history.js").then(({ History }) => { if (open === uuid) history = new History(at("d-events"), uuid); });
-  fill();
-  if (!at("place-device").open) at("place-device").showModal();
+  import("./history.js").then(({ History }) => { if (open === uuid) history = new History(byId("d-events"), uuid); });
+  showDetails();
+  if (!byId("place-device").open) byId("place-device").showModal();
 }
 
-function facts(list, entries) {
+function listProperties(list, entries) {
   const rows = entries.map(([name, value]) => [name, value === "" ? "–" : String(value)]);
   const told = JSON.stringify(rows);
   if (list.dataset.told === told) return;
   list.dataset.told = told;
   list.replaceChildren(...rows.map(([name, value]) =>
-    element("div", {}, element("dt", {}, name), element("dd", {}, value))));
+    createElement("div", {}, createElement("dt", {}, name), createElement("dd", {}, value))));
 }
 
-function fill() {
+function showDetails() {
   const device = devices.get(open);
   if (!device) {
-    words(at("d-status"), "This device has left the network.");
+    setText(byId("d-status"), text("device.left"));
     return;
   }
-  words(at("d-name"), device.name);
-  const task = device.objective ? `, task: ${device.objective}` : ", no task";
-  words(at("d-status"), `${device.kind || "device"}, ${device.status.toLowerCase()}${task}, ${sojourn(device, now)}`);
-  words(at("d-about"), device.description);
-  const properties = (entries) => Object.entries(entries).map(([name, value]) => `${name} ${value}`).join(", ") || "yes";
-  facts(at("d-capabilities"), Object.entries(device.capabilities).map(([name, entries]) => [name, properties(entries)]));
-  facts(at("d-network"), [
-    ["address", device.address], ["roles", device.roles.join(", ")], ["joined", device.joined ? `as number ${device.joined}` : ""],
-    ...["laptop", "agent"].filter((name) => device[name]).map((name) => [name, device[name]]),
-    ...(device.position ? [["position", whereabouts(device.position)]] : []),
-    ...Object.entries(device.network), ...Object.entries(device.deployed).map(([name, label]) => [`deployed ${name}`, label]),
+  setText(byId("d-name"), device.name);
+  setText(byId("d-status"), text(device.objective ? "device.summary" : "device.summary_no_task", {
+    kind: device.kind || text("device.kind_unknown"), status: describeStatus(device.status), task: device.objective, time: formatPresence(device, now),
+  }));
+  setText(byId("d-about"), device.description);
+  const properties = (entries) => Object.entries(entries).map(([name, value]) => `${name} ${value}`).join(", ") || text("device.has");
+  listProperties(byId("d-capabilities"), Object.entries(device.capabilities).map(([name, entries]) => [name, properties(entries)]));
+  listProperties(byId("d-network"), [
+    [text("device.address"), device.address], [text("device.roles"), device.roles.join(", ")],
+    [text("device.joined"), device.joined ? text("device.joined_as", { number: device.joined }) : ""],
+    ...(device.laptop ? [[text("device.laptop"), device.laptop]] : []), ...(device.agent ? [[text("device.agent"), device.agent]] : []),
+    ...(device.position ? [[text("device.position"), formatPosition(device.position)]] : []),
+    ...Object.entries(device.network).map(([name, value]) => [textOf("device.network", name), formatNumber(value)]),
+    ...Object.entries(device.deployed).map(([name, label]) => [text("device.deployed", { name }), label]),
     ["uuid", device.uuid]]);
-  const told = device.messages.map(([moment, text]) => [new Date(moment * 1000).toLocaleTimeString([], { hourCycle: "h23" }), text]);
-  keyed(at("d-messages"), told.length ? told : [["", "No messages."]], (entry) => entry.join(), () => element("li"),
-    (item, entry) => words(item, entry.join(" ").trim()));
-  for (const button of at("place-device").querySelectorAll("form button")) button.disabled = device.gone !== null;
+  const told = device.messages.map(([moment, message]) => [formatTime(moment), message]);
+  updateList(byId("d-messages"), told.length ? told : [["", text("message.none")]], (entry) => entry.join(), () => createElement("li"),
+    (item, entry) => setText(item, entry.join(" ").trim()));
+  for (const button of byId("place-device").querySelectorAll("form button")) button.disabled = device.gone !== null;
 }
 
 function startDevice() {
-  const line = (text) => words(at("d-answer"), text);
-  const dialog = at("place-device");
-  at("d-close").addEventListener("click", () => dialog.close());
+  const line = (message) => setText(byId("d-result"), message);
+  const dialog = byId("place-device");
+  byId("d-close").addEventListener("click", () => dialog.close());
   dialog.addEventListener("close", () => { if (location.hash === `#device/${open}`) back(); });
   dialog.addEventListener("click", (event) => { if (event.target === dialog) dialog.close(); });
-  at("d-message").addEventListener("submit", async (event) => {
+  byId("d-message").addEventListener("submit", async (event) => {
     event.preventDefault();
-    const body = { text: at("d-text").value };
-    if (await wish("Message", `devices/${open}/message`, { body, line, done: delivery })) at("d-text").value = "";
+    const body = { text: byId("d-text").value };
+    if (await sendRequest(text("message.action"), `devices/${open}/message`, { body, line, done: describeDelivery })) byId("d-text").value = "";
   });
-  at("d-leave").addEventListener("submit", (event) => {
+  byId("d-leave").addEventListener("submit", (event) => {
     event.preventDefault();
-    const seconds = Number(at("d-seconds").value);
-    wish("Disconnecting", `devices/${open}/disconnect`,
-      { body: { seconds }, line, done: () => `The device leaves the network and returns after ${seconds} s.` });
+    const seconds = Number(byId("d-seconds").value);
+    sendRequest(text("device.disconnecting"), `devices/${open}/disconnect`,
+      { body: { seconds }, line, done: () => text("device.disconnected", { seconds }) });
   });
 }
 
@@ -76,10 +80,10 @@ export function make(dialog, { model }) {
   return {
     update(model, event) {
       ({ devices, now } = model);
-      if (open && event === "state") fill();
+      if (open && event === "state") showDetails();
       if (open && event === "event") history?.update();
     },
-    show,
+    show: openDevice,
     hide() {
       open = "";
       dialog.close();

@@ -1,16 +1,18 @@
 // Elements: create them, and update lists of them without rebuilding the ones that a person is using.
+import { text, textOf } from "./texts.js";
+
 const SVG = "http://www.w3.org/2000/svg";
 
-export const at = (id) => document.getElementById(id);
+export const byId = (id) => document.getElementById(id);
 
-export function element(tag, attributes = {}, ...children) {
+export function createElement(tag, attributes = {}, ...children) {
   const node = document.createElement(tag);
   for (const [name, value] of Object.entries(attributes)) node.setAttribute(name, value);
   node.append(...children);
   return node;
 }
 
-export function drawn(tag, attributes = {}, ...children) {
+export function createSvg(tag, attributes = {}, ...children) {
   const node = document.createElementNS(SVG, tag);
   for (const [name, value] of Object.entries(attributes)) node.setAttribute(name, value);
   node.append(...children);
@@ -18,16 +20,16 @@ export function drawn(tag, attributes = {}, ...children) {
 }
 
 // Change a text only if it differs, so that a screen reader does not repeat it.
-export function words(node, text) {
-  if (node.textContent !== text) node.textContent = text;
+export function setText(node, value) {
+  if (node.textContent !== value) node.textContent = value;
 }
 
-export function attribute(node, name, value) {
+export function setAttribute(node, name, value) {
   if (node.getAttribute(name) !== String(value)) node.setAttribute(name, value);
 }
 
 // One child per item, in order; `make` is called once for a new key, `update` each time.  Keys may repeat.
-export function keyed(parent, items, key, make, update) {
+export function updateList(parent, items, key, make, update) {
   const old = new Map();
   for (const child of parent.children) old.set(child.dataset.key, [...(old.get(child.dataset.key) ?? []), child]);
   items.forEach((item, place) => {
@@ -59,24 +61,26 @@ const SHAPES = {
   UNKNOWN: "M6.8 11h2.4v2.5H6.8zM8 2a4 4 0 0 1 1.2 7.8H6.8V7.6H8A1.8 1.8 0 1 0 6.2 5.8H4A4 4 0 0 1 8 2z",
 };
 
-export function badge() {
-  return element("span", { class: "badge" }, drawn("svg", { viewBox: "0 0 16 16", "aria-hidden": "true" }, drawn("path")), element("span"));
+export const describeStatus = (status) => textOf("status", status, status.toLowerCase());
+
+export function createBadge() {
+  return createElement("span", { class: "badge" }, createSvg("svg", { viewBox: "0 0 16 16", "aria-hidden": "true" }, createSvg("path")), createElement("span"));
 }
 
-export function state(node, status) {
-  attribute(node, "data-state", status);
-  attribute(node.querySelector("path"), "d", SHAPES[status] ?? SHAPES.UNKNOWN);
-  words(node.lastChild, status.toLowerCase());
+export function setBadge(node, status) {
+  setAttribute(node, "data-state", status);
+  setAttribute(node.querySelector("path"), "d", SHAPES[status] ?? SHAPES.UNKNOWN);
+  setText(node.lastChild, describeStatus(status));
 }
 
 // The first names, and the number of further ones.
-export function several(names, most = 8) {
+export function joinNames(names, most = 8) {
   const more = names.length - most;
-  return more > 1 ? `${names.slice(0, most).join(", ")} and ${more} more` : names.join(", ");
+  return more > 1 ? text("list.more", { names: names.slice(0, most).join(", "), count: more }) : names.join(", ");
 }
 
 // Group names by equal reasons: [names, reasons] each.
-export function alike(refused) {
+export function groupByReason(refused) {
   const found = new Map();
   for (const [name, reasons] of Object.entries(refused)) {
     const why = [].concat(reasons).join(", ");
@@ -85,12 +89,12 @@ export function alike(refused) {
   return [...found].map(([why, names]) => [names, why]);
 }
 
-export function span(seconds) {
+export function formatDuration(seconds) {
   const s = Math.max(0, Math.round(seconds));
-  if (s < 60) return `${s} s`;
-  if (s < 3600) return `${Math.floor(s / 60)} min`;
-  return s < 86400 ? `${Math.floor(s / 3600)} h` : `${Math.floor(s / 86400)} d`;
+  if (s < 60) return text("duration.seconds", { count: s });
+  if (s < 3600) return text("duration.minutes", { count: Math.floor(s / 60) });
+  return s < 86400 ? text("duration.hours", { count: Math.floor(s / 3600) }) : text("duration.days", { count: Math.floor(s / 86400) });
 }
 
 // The time since a device joined or left.
-export const sojourn = ({ gone, since }, now) => (gone === null ? `here ${span(now - since)}` : `gone ${span(now - gone)}`);
+export const formatPresence = ({ gone, since }, now) => (gone === null ? text("device.here", { time: formatDuration(now - since) }) : text("device.gone", { time: formatDuration(now - gone) }));

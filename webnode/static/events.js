@@ -1,6 +1,7 @@
 // Events: the changes that this node observed in the team, all or by kind.
-import { at, words } from "./element.js";
-import { listEntries, since } from "./history.js";
+import { byId, setText } from "./element.js";
+import { describeStart, listEntries } from "./history.js";
+import { text } from "./texts.js";
 
 const KINDS = {
   all: () => true,
@@ -11,11 +12,11 @@ const KINDS = {
 
 export function make(root, { model }) {
   const show = () => {
-    const entries = model.events.filter(KINDS[at("event-kind").value]);
-    words(at("events-since"), `${model.node ? `Observed by ${model.node}` : "Observed"} ${since(model.events)}`.trim());
-    listEntries(at("events"), entries);
+    const entries = model.events.filter(KINDS[byId("event-kind").value]);
+    setText(byId("events-since"), [text("events.observed", { node: model.node || text("connection.this_node") }), describeStart(model.events)].join(" ").trim());
+    listEntries(byId("events"), entries);
   };
-  at("event-kind").addEventListener("change", show);
+  byId("event-kind").addEventListener("change", show);
   return {
     update(_, event) {
       if (["", "event", "state"].includes(event)) show();

@@ -1,11 +1,8 @@
 // Faults: buttons that inject faults into a device, and for each fault the time until another device takes over.
-import { attribute, element, keyed, words } from "./element.js";
-import { ask, get } from "./link.js";
+import { setAttribute, createElement, updateList, setText } from "./element.js";
+import { send, get } from "./connection.js";
+import { formatNumber, text, textOf } from "./texts.js";
 
-const LABELS = {
-  kill: "Kill", freeze: "Freeze", radio: "Cut radio", "one-way": "Mute radio",
-  delay: "Delay 0.3 s", loss: "Lose 20 %", skew: "Skew clock 1 h", battery: "Low battery",
-};
 const IDLE = 5000;
 const BUSY = 500;
 const TICK = 100;
@@ -15,10 +12,10 @@ let told = { kinds: [], can: {}, active: [] };
 let heard = 0;
 let timer = 0;
 
-const label = (kind) => LABELS[kind] ?? kind;
+const labelOf = (kind) => textOf("fault.kind", kind);
 const isBusy = () => told.active.some((row) => row.watched || row.left_s > 0);
 
-async function look() {
+async function refresh() {
   clearTimeout(timer);
   if (!document.hidden) {
     try {
@@ -29,89 +26,89 @@ async function look() {
       // The last answer stays on the page; the header shows that the node is lost.
     }
   }
-  timer = setTimeout(look, isBusy() ? BUSY : IDLE);
+  timer = setTimeout(refresh, isBusy() ? BUSY : IDLE);
 }
 
 // Between two answers the times run locally.
 setInterval(() => {
   if (isBusy() && !document.hidden) for (const draw of views) draw();
 }, TICK);
-document.addEventListener("visibilitychange", look);
+document.addEventListener("visibilitychange", refresh);
 
-function clock(row, passed) {
-  if (row.takeover_s !== null) return [row.takeover_s <= IN_TIME ? "held" : "late", `${row.to} took over after ${row.takeover_s.toFixed(2)} s`];
-  if (!row.task) return ["none", "had no task"];
+function describeTakeover(row, passed) {
+  if (row.takeover_s !== null) return [row.takeover_s <= IN_TIME ? "held" : "late", text("fault.takeover", { name: row.to, seconds: formatNumber(row.takeover_s, 2) })];
+  if (!row.task) return ["none", text("fault.no_task")];
   const isLost = told.kinds.find((kind) => kind.kind === row.kind)?.is_lost;
-  if (row.watched && isLost) return ["runs", `no takeover yet: ${(row.since_s + passed).toFixed(1)} s`];
-  return isLost ? ["late", "no takeover"] : ["none", "continues its task"];
+  if (row.watched && isLost) return ["runs", text("fault.no_takeover_yet", { seconds: formatNumber(row.since_s + passed, 1) })];
+  return isLost ? ["late", text("fault.no_takeover")] : ["none", text("fault.continues")];
 }
 
-function row() {
-  return element("li", { class: "fault" }, element("b"), " ", element("span"), element("strong"));
+function createRow() {
+  return createElement("li", { class: "fault" }, createElement("b"), " ", createElement("span"), createElement("strong"));
 }
 
-function fill(item, fault) {
+function updateRow(item, fault) {
   const passed = (performance.now() - heard) / 1000;
   const left = Math.max(0, fault.left_s - passed);
-  const [state, text] = clock(fault, passed);
-  attribute(item, "data-clock", state);
-  words(item.children[0], fault.name);
-  const rest = fault.kind === "kill" ? "" : left > 0 ? `, ${Math.ceil(left)} s left` : ", over";
-  words(item.children[1], `${label(fault.kind)}${rest}`);
-  words(item.children[2], text);
+  const [state, takeover] = describeTakeover(fault, passed);
+  setAttribute(item, "data-clock", state);
+  setText(item.children[0], fault.name);
+  const name = labelOf(fault.kind);
+  setText(item.children[1], fault.kind === "kill" ? name : text(left > 0 ? "fault.left" : "fault.over", { name, seconds: Math.ceil(left) }));
+  setText(item.children[2], takeover);
 }
 
-const list = (parent, rows) => keyed(parent, rows, (fault) => fault.n, row, fill);
+const updateFaults = (parent, rows) => updateList(parent, rows, (fault) => fault.n, createRow, updateRow);
 
 // The faults injected in the team, and their takeovers.
-export function takeovers(root) {
-  const rows = element("ol", { class: "faults" });
-  const head = element("h3", {}, "Injected faults");
+export function createTakeovers(root) {
+  const rows = createElement("ol", { class: "faults" });
+  const head = createElement("h3", {}, text("fault.injected"));
   root.append(head, rows);
   const draw = () => {
     root.hidden = told.active.length === 0;
-    list(rows, told.active.slice(0, 6));
+    updateFaults(rows, told.active.slice(0, 6));
   };
   views.add(draw);
   draw();
-  look();
+  refresh();
   return { close: () => views.delete(draw) };
 }
 
 // The buttons of one device.
-export function buttons(root) {
+export function createButtons(root) {
   let uuid = "";
-  const seconds = element("input", { id: "f-seconds", type: "number", min: 1, max: 600, value: 15, required: "" });
-  const grid = element("div", { class: "fault-buttons" });
-  const line = element("p", { role: "status" });
-  const rows = element("ol", { class: "faults" });
-  const none = element("p", { class: "empty" }, "This device does not allow fault injection.");
-  const form = element("form", {}, element("label", { for: "f-seconds" }, "Inject a fault for (seconds)"), seconds, grid);
-  root.append(element("h3", {}, "Faults"), none, form, line, rows);
+  const seconds = createElement("input", { id: "f-seconds", type: "number", min: 1, max: 600, value: 15, required: "" });
+  const grid = createElement("div", { class: "fault-buttons" });
+  const line = createElement("p", { role: "status" });
+  const rows = createElement("ol", { class: "faults" });
+  const none = createElement("p", { class: "empty" }, text("fault.not_allowed"));
+  const form = createElement("form", {}, createElement("label", { for: "f-seconds" }, text("fault.seconds_label")), seconds, grid);
+  root.append(createElement("h3", {}, text("fault.title")), none, form, line, rows);
 
-  async function cause(kind) {
+  async function injectFault(kind) {
     if (!seconds.reportValidity()) return;
-    words(line, `${label(kind)} …`);
+    setText(line, text("request.runs", { action: labelOf(kind) }));
     try {
-      const { seconds: lasts } = await ask("POST", `devices/${uuid}/faults`, { kind, seconds: Number(seconds.value) });
-      words(line, kind === "kill" ? "The process is killed; its supervisor restarts it." : `${label(kind)}: for ${lasts} s, then it ends.`);
+      const { seconds: lasts } = await send("POST", `devices/${uuid}/faults`, { kind, seconds: Number(seconds.value) });
+      setText(line, kind === "kill" ? text("fault.killed") : text("fault.lasts", { name: labelOf(kind), seconds: lasts }));
     } catch (error) {
-      words(line, error.message);
+      setText(line, error.message);
     }
-    look();
+    refresh();
   }
 
   function draw() {
     const can = told.can[uuid] ?? [];
     none.hidden = can.length > 0;
     form.hidden = can.length === 0;
-    keyed(grid, told.kinds.filter(({ kind }) => can.includes(kind)), ({ kind }) => kind,
+    updateList(grid, told.kinds.filter(({ kind }) => can.includes(kind)), ({ kind }) => kind,
       ({ kind, about, is_lost: isLost }) => {
-        const button = element("button", { type: "button", title: about, ...(isLost ? { class: "danger" } : {}) }, label(kind));
-        button.addEventListener("click", () => cause(kind));
+        const button = createElement("button", { type: "button", title: textOf("fault.about", kind, about), ...(isLost ? { class: "danger" } : {}) }, labelOf(kind));
+        button.addEventListener("click", () => injectFault(kind));
         return button;
       }, () => {});
-    list(rows, told.active.filter((fault) => fault.uuid === uuid).slice(0, 4));
+    updateFaults(rows, told.active.filter((fault) => fault.uuid === uuid).slice(0, 4));
   }
 
   form.addEventListener("submit", (event) => event.preventDefault());
@@ -119,9 +116,9 @@ export function buttons(root) {
   return {
     show(argument) {
       uuid = argument;
-      words(line, "");
+      setText(line, "");
       draw();
-      look();
+      refresh();
     },
     hide() {
       uuid = "";

@@ -1,48 +1,50 @@
 // Groups: each agent's bid for a task, the winner that it computed, and whether they agree.
-import { at, attribute, element, keyed, words } from "./element.js";
-import { panel } from "./panel.js";
+import { byId, setAttribute, createElement, updateList, setText } from "./element.js";
+import { registerPanel } from "./panel.js";
+import { formatNumber, text, textOf } from "./texts.js";
 
 function showGroups(groups) {
-  at("no-groups").hidden = groups.length > 0;
-  keyed(at("groups"), groups, (group) => group.task,
-    () => element("article", {}, element("h3"), element("p", { class: "point" }), element("ul", { class: "bids" })), update);
+  byId("no-groups").hidden = groups.length > 0;
+  updateList(byId("groups"), groups, (group) => group.task,
+    () => createElement("article", {}, createElement("h3"), createElement("p", { class: "point" }), createElement("ul", { class: "bids" })), updateGroup);
 }
 
-function point(group) {
-  if (!group.assigned) return "No consensus yet: no agent has named a winner.";
-  let told = `${group.assigned} – ${group.agree} of ${group.of} agree`;
-  if (group.differ.length) told += `; ${group.differ.join(", ")} ${group.differ.length > 1 ? "differ" : "differs"}`;
-  if (group.undecided.length) told += `; ${group.undecided.join(", ")} undecided`;
-  return told;
+function describeConsensus(group) {
+  if (!group.assigned) return text("consensus.no_winner");
+  const parts = [text("consensus.agree", { name: group.assigned, count: group.agree, total: group.of })];
+  if (group.differ.length) parts.push(text("consensus.differ", { names: group.differ.join(", "), count: group.differ.length }));
+  if (group.undecided.length) parts.push(text("consensus.undecided", { names: group.undecided.join(", ") }));
+  return parts.join("; ");
 }
 
-function update(article, group) {
+function updateGroup(article, group) {
   const [title, told, bids] = article.children;
-  words(title, group.title);
-  words(told, point(group));
-  attribute(told, "data-agree", Boolean(group.assigned) && group.agree === group.of);
-  keyed(bids, group.members, (member) => member.uuid, bid, (item, member) => {
+  setText(title, group.title);
+  setText(told, describeConsensus(group));
+  setAttribute(told, "data-agree", Boolean(group.assigned) && group.agree === group.of);
+  updateList(bids, group.members, (member) => member.uuid, createBid, (item, member) => {
     const [name, bar, cost, choice] = item.children;
-    attribute(item, "data-winner", member.uuid === group.assigned_uuid);
-    words(name, member.name);
+    setAttribute(item, "data-winner", member.uuid === group.assigned_uuid);
+    setText(name, member.name);
     bar.firstChild.style.width = `${100 * (member.share ?? 0)}%`;
-    words(cost, member.cost === null ? (member.available ? "no bid" : "not free") : `${member.cost.toFixed(2)} m`);
+    setText(cost, member.cost === null ? text(member.available ? "consensus.no_bid" : "consensus.not_free") : text("length.metres", { value: formatNumber(member.cost, 2) }));
     // The state of a standby contains its place: WAITING(2).
-    const state = member.state.toLowerCase().replace(/\((\d+)\)$/, " as number $1");
-    const detail = [state, member.post === null ? "" : `goes to ${member.post}°`,
-      member.progress === null ? "" : `${Math.round(100 * member.progress)} % done`].filter(Boolean).join(", ");
-    words(choice, `${member.choice ? `names ${member.choice}` : "undecided"}${member.token ? `, token ${member.token}` : ""}${member.why ? ` – ${member.why}` : ""}${detail ? ` (${detail})` : ""}`);
+    const [, state, rank] = /^(.*?)(?:\((\d+)\))?$/.exec(member.state);
+    const said = textOf("agent.state", state, state.toLowerCase());
+    const detail = [rank ? text("agent.state_as", { state: said, number: rank }) : said, member.post === null ? "" : text("agent.goes_to", { degrees: member.post }),
+      member.progress === null ? "" : text("agent.progress", { percent: Math.round(100 * member.progress) })].filter(Boolean).join(", ");
+    const named = [member.choice ? text("agent.names", { name: member.choice }) : text("agent.undecided"), member.token ? text("agent.token", { token: String(member.token) }) : ""].filter(Boolean).join(", ");
+    setText(choice, `${named}${member.why ? ` – ${member.why}` : ""}${detail ? ` (${detail})` : ""}`);
   });
 }
 
-function bid() {
-  return element("li", {}, element("b"), element("span", { class: "bid", "aria-hidden": "true" }, element("i")),
-    element("span", { class: "cost" }), element("span", { class: "choice" }));
+function createBid() {
+  return createElement("li", {}, createElement("b"), createElement("span", { class: "bid", "aria-hidden": "true" }, createElement("i")),
+    createElement("span", { class: "cost" }), createElement("span", { class: "choice" }));
 }
 
-panel({
+registerPanel({
   place: "groups",
-  title: "Consensus",
   make() {
     return {
       update(model, event) {

@@ -1,25 +1,25 @@
 // History: events of the team, or of one device or task, newest first.
-import { attribute, element, keyed, words } from "./element.js";
-import { get } from "./link.js";
+import { setAttribute, createElement, updateList, setText } from "./element.js";
+import { get } from "./connection.js";
 import { model } from "./model.js";
+import { formatTime, text } from "./texts.js";
 
 const SHOWN = 100;
-const clock = (at) => new Date(at * 1000).toLocaleTimeString([], { hourCycle: "h23" });
 
 // List chronicle entries; an empty list gets a placeholder.
 export function listEntries(list, entries) {
   const newest = entries.slice(-SHOWN).reverse();
-  const none = { n: 0, at: 0, kind: "none", text: "Nothing so far." };
-  keyed(list, newest.length ? newest : [none], (entry) => entry.n, () => element("li", {}, element("time"), " ", element("span")),
+  const none = { n: 0, at: 0, kind: "none", text: text("history.none") };
+  updateList(list, newest.length ? newest : [none], (entry) => entry.n, () => createElement("li", {}, createElement("time"), " ", createElement("span")),
     (item, entry) => {
-      attribute(item, "data-kind", entry.kind);
-      words(item.firstChild, entry.at ? clock(entry.at) : "");
-      words(item.lastChild, entry.text);
+      setAttribute(item, "data-kind", entry.kind);
+      setText(item.firstChild, entry.at ? formatTime(entry.at) : "");
+      setText(item.lastChild, entry.text);
     });
 }
 
 // The start of the record: a node knows nothing earlier.
-export const since = (entries) => (entries.length ? `since ${clock(entries[0].at)}` : "");
+export const describeStart = (entries) => (entries.length ? text("events.since", { time: formatTime(entries[0].at) }) : "");
 
 // The history of one device or task: the entries that the node keeps, and later ones.
 export class History {

@@ -1,39 +1,42 @@
 // The records that a device stores, queried when its dialog is opened.
-import { element } from "./element.js";
-import { get } from "./link.js";
+import { createElement } from "./element.js";
+import { get } from "./connection.js";
+import { formatNumber, text } from "./texts.js";
 
-const size = (bytes) => (bytes < 10000 ? `${bytes} B` : bytes < 2 ** 20 ? `${Math.round(bytes / 1024)} KiB` : `${(bytes / 2 ** 20).toFixed(1)} MiB`);
+const formatSize = (bytes) => (bytes < 10000 ? `${formatNumber(bytes)} B` : bytes < 2 ** 20 ? `${formatNumber(bytes / 1024, 0)} KiB` : `${formatNumber(bytes / 2 ** 20, 1)} MiB`);
 
 export function make(root) {
-  const line = element("p", { class: "note", role: "status" });
-  const kinds = element("ul", { class: "plain" });
-  const newest = element("table");
-  const again = element("button", {}, "Refresh");
+  const line = createElement("p", { class: "note", role: "status" });
+  const kinds = createElement("ul", { class: "plain" });
+  const newest = createElement("table");
+  const again = createElement("button", {}, text("action.refresh"));
   let open = "";
-  root.append(element("h3", {}, "Stores"), line, kinds, element("div", { class: "wide", tabindex: 0, role: "region", "aria-label": "Newest records" }, newest), again);
+  root.append(createElement("h3", {}, text("records.title")), line, kinds, createElement("div", { class: "wide", tabindex: 0, role: "region", "aria-label": text("records.newest_label") }, newest), again);
 
-  async function ask() {
+  async function query() {
     const asked = open;
-    line.textContent = "Querying the device …";
+    line.textContent = text("device.querying");
     kinds.replaceChildren();
     newest.replaceChildren();
     try {
       const told = await get(`devices/${asked}/inventory`);
       if (asked !== open) return;
-      line.textContent = `${told.records} records, ${size(told.bytes)} of ${size(told.most_bytes)}${told.deleted ? `; ${told.deleted} tombstones` : ""}.`;
-      kinds.replaceChildren(...Object.entries(told.kinds).map(([kind, count]) => element("li", {}, `${count} of ${kind}`)));
-      newest.replaceChildren(...told.newest.map(([kind, name, bytes, lifetime]) => element("tr", {},
-        element("th", { scope: "row" }, name || "–"), element("td", {}, kind), element("td", {}, size(bytes)), element("td", {}, lifetime))));
+      line.textContent = text(told.deleted ? "records.summary_deleted" : "records.summary", {
+        count: told.records, size: formatSize(told.bytes), most: formatSize(told.most_bytes), deleted: told.deleted,
+      });
+      kinds.replaceChildren(...Object.entries(told.kinds).map(([kind, count]) => createElement("li", {}, text("records.kind", { count, kind }))));
+      newest.replaceChildren(...told.newest.map(([kind, name, bytes, lifetime]) => createElement("tr", {},
+        createElement("th", { scope: "row" }, name || "–"), createElement("td", {}, kind), createElement("td", {}, formatSize(bytes)), createElement("td", {}, lifetime))));
     } catch (error) {
       if (asked === open) line.textContent = error.message;
     }
   }
 
-  again.addEventListener("click", ask);
+  again.addEventListener("click", query);
   return {
     show(uuid) {
       open = uuid;
-      ask();
+      query();
     },
     hide() {
       open = "";

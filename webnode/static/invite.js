@@ -1,133 +1,121 @@
 // Invitations: the page's address as QR code and text, and the steps with which a phone trusts the page's certificate.
 // Loaded on demand.
-import { attribute, element, words } from "./element.js";
-import { ask } from "./link.js";
+import { setAttribute, createElement, setText } from "./element.js";
+import { send } from "./connection.js";
+import { formatMoment, text } from "./texts.js";
 
-const KINDS = { phone: "Join with a phone", viewer: "View the team" };
+const KINDS = { phone: "invite.phone", viewer: "invite.viewer" };
 const DRAWINGS = "image/svg+xml";
 
 const STEPS = {
-  "Android (Chrome)": [
-    "Open the address of the certificate on the phone; ca.crt is downloaded.",
-    "Settings, Security & privacy, More security settings, Encryption & credentials, Install a certificate, CA certificate, Install anyway.",
-    "Choose ca.crt, then scan the first code.",
-  ],
-  "iPhone, iPad (Safari)": [
-    "Open the address of the certificate in Safari, and allow the download.",
-    "Settings, Profile Downloaded, Install.",
-    "Settings, General, About, Certificate Trust Settings: switch on the node's name. Then scan the first code.",
-  ],
+  "Android (Chrome)": ["invite.android.download", "invite.android.settings", "invite.android.choose"],
+  "iPhone, iPad (Safari)": ["invite.ios.download", "invite.ios.install", "invite.ios.trust"],
 };
 
 // Load the style sheet before the QR code is shown.
-let styled;
-function style() {
-  styled ??= new Promise((done) => {
-    const sheet = element("link", { rel: "stylesheet", href: "/static/invite.css" });
+let styleLoaded;
+function loadStyle() {
+  styleLoaded ??= new Promise((done) => {
+    const sheet = createElement("link", { rel: "stylesheet", href: "/static/invite.css" });
     sheet.onload = sheet.onerror = done;
     document.head.append(sheet);
   });
-  return styled;
+  return styleLoaded;
 }
 
 // Show the SVG drawn by the node; hidden if the node lacks the library for it.
-function draw(figure, svg, label) {
+function showQrCode(figure, svg, label) {
   figure.hidden = !svg;
   if (!svg) return;
   const drawing = document.importNode(new DOMParser().parseFromString(svg, DRAWINGS).documentElement, true);
-  attribute(drawing, "role", "img");
-  attribute(drawing, "aria-label", label);
+  setAttribute(drawing, "role", "img");
+  setAttribute(drawing, "aria-label", label);
   figure.replaceChildren(drawing);
 }
 
 // A text with a copy button; over http, where browsers offer no clipboard API, with execCommand.
-function copied(label, id, tell) {
-  const text = element("input", { id, readonly: "" });
-  const button = element("button", { type: "button" }, "Copy");
+function createCopyField(label, id, tell) {
+  const field = createElement("input", { id, readonly: "" });
+  const button = createElement("button", { type: "button" }, text("invite.copy"));
   button.onclick = async () => {
-    text.select();
-    const done = navigator.clipboard ? await navigator.clipboard.writeText(text.value).then(() => true, () => false) : document.execCommand("copy");
-    tell(done ? "Copied." : "Select the text and copy it.");
+    field.select();
+    const done = navigator.clipboard ? await navigator.clipboard.writeText(field.value).then(() => true, () => false) : document.execCommand("copy");
+    tell(text(done ? "invite.copied" : "invite.copy_yourself"));
   };
-  return [text, element("div", {}, element("label", { for: id }, label), element("div", { class: "row" }, text, button))];
+  return [field, createElement("div", {}, createElement("label", { for: id }, label), createElement("div", { class: "row" }, field, button))];
 }
 
-function steps() {
+function createSteps() {
   return Object.entries(STEPS).map(([name, lines]) =>
-    element("details", {}, element("summary", {}, name), element("ol", {}, ...lines.map((line) => element("li", {}, line)))));
+    createElement("details", {}, createElement("summary", {}, name), createElement("ol", {}, ...lines.map((key) => createElement("li", {}, text(key))))));
 }
 
-function built() {
-  const line = element("p", { role: "status" });
-  const tell = (text) => words(line, text);
+function createDialog() {
+  const line = createElement("p", { role: "status" });
+  const tell = (message) => setText(line, message);
   const parts = {
     line, tell,
-    kind: element("select", { id: "i-kind" }),
-    page: element("select", { id: "i-page" }),
-    code: element("figure", { class: "code" }),
-    hint: element("p"),
-    alone: element("p", { class: "warn" }),
-    plain: element("p", { class: "warn" }),
-    close: element("button", { type: "button" }, "Close"),
-    authority: element("figure", { class: "code" }),
-    mark: element("p", { class: "mark" }),
+    kind: createElement("select", { id: "i-kind" }),
+    page: createElement("select", { id: "i-page" }),
+    code: createElement("figure", { class: "code" }),
+    hint: createElement("p"),
+    alone: createElement("p", { class: "warn" }),
+    plain: createElement("p", { class: "warn" }),
+    close: createElement("button", { type: "button" }, text("action.close")),
+    authority: createElement("figure", { class: "code" }),
+    mark: createElement("p", { class: "mark" }),
   };
-  const [link, linkRow] = copied("Link", "i-link", tell);
-  const [certificate, certificateRow] = copied("Certificate", "i-certificate", tell);
-  const trust = element("section", { class: "trust" },
-    element("h3", {}, "If the phone warns about the connection"),
-    element("p", {}, "The warning is expected: the node signs its own certificate, which the phone does not know. For one visit accept the warning: ",
-      element("b", {}, "Advanced, Proceed"), " (Chrome) or ", element("b", {}, "Show Details, visit this website"), " (Safari). ",
-      "For further visits let the phone trust this node, once; to switch to other web nodes, let it trust those as well:"),
-    ...steps(), parts.authority, certificateRow, parts.mark);
-  const choices = element("div", { class: "choices" },
-    element("div", {}, element("label", { for: "i-kind" }, "Purpose"), parts.kind),
-    element("div", {}, element("label", { for: "i-page" }, "Address"), parts.page));
-  const dialog = element("dialog", { id: "invite", "aria-labelledby": "h-invite" },
-    element("div", { class: "bar" }, element("h2", { id: "h-invite" }, "Invite"), parts.close),
+  const [link, linkRow] = createCopyField(text("invite.link"), "i-link", tell);
+  const [certificate, certificateRow] = createCopyField(text("invite.certificate"), "i-certificate", tell);
+  const trust = createElement("section", { class: "trust" },
+    createElement("h3", {}, text("invite.warning_title")),
+    createElement("p", {}, text("invite.warning")), createElement("p", {}, text("invite.warning_trust")),
+    ...createSteps(), parts.authority, certificateRow, parts.mark);
+  const choices = createElement("div", { class: "choices" },
+    createElement("div", {}, createElement("label", { for: "i-kind" }, text("invite.purpose")), parts.kind),
+    createElement("div", {}, createElement("label", { for: "i-page" }, text("invite.address")), parts.page));
+  const dialog = createElement("dialog", { id: "invite", "aria-labelledby": "h-invite" },
+    createElement("div", { class: "bar" }, createElement("h2", { id: "h-invite" }, text("invite.title")), parts.close),
     choices, parts.alone, parts.plain, parts.code, linkRow, parts.hint, line, trust);
   return { ...parts, link, certificate, trust, dialog };
 }
 
-function options(select, entries, chosen) {
-  select.replaceChildren(...entries.map(([value, name]) => element("option", { value }, name)));
+function setOptions(select, entries, chosen) {
+  select.replaceChildren(...entries.map(([value, name]) => createElement("option", { value }, name)));
   select.value = chosen;
 }
 
-function show(parts, told, role) {
-  const isHere = told.reaches === "machine";
+function show(parts, invitation, role) {
+  const isHere = invitation.reaches === "machine";
   parts.alone.hidden = !isHere;
-  words(parts.alone, isHere ? "Only this machine can open the page. For phones start the demonstration with make demo WEB_HOST=0.0.0.0, or a node with host = \"0.0.0.0\" below [web]." : "");
-  draw(parts.code, isHere ? "" : told.code, "QR code of the link below");
-  parts.link.value = told.link;
-  const until = new Date(1000 * told.until).toLocaleString([], { weekday: "long", hour: "2-digit", minute: "2-digit" });
-  const may = role === "phone" ? "to join the team with a phone" : "to view the team, without orders";
-  words(parts.hint, `${isHere ? "The link is for a browser of this machine." : "Scan the code, or send the link."} It allows its holder ${may}, until ${until}.`);
-  parts.plain.hidden = told.is_secure || role !== "phone";
-  words(parts.plain, told.certificate
-    ? "Browsers do not allow the camera over http. Choose an address that begins with https."
-    : "Browsers do not allow the camera over http, and this node has no https. Run pip install 'swarm-node[tls]', set tls = \"auto\" below [web], and restart the node.");
-  parts.trust.hidden = !told.is_secure || isHere;
-  draw(parts.authority, told.certificate_code, "QR code of the certificate's address");
-  parts.certificate.value = told.certificate;
-  words(parts.mark, `Compare the SHA-256 fingerprint that the phone shows: ${told.fingerprint}`);
+  setText(parts.alone, isHere ? text("invite.machine_only") : "");
+  showQrCode(parts.code, isHere ? "" : invitation.code, text("invite.code_label"));
+  parts.link.value = invitation.link;
+  const use = text(isHere ? "invite.use_here" : "invite.use");
+  setText(parts.hint, `${use} ${text(role === "phone" ? "invite.allows_phone" : "invite.allows_viewer", { time: formatMoment(invitation.until) })}`);
+  parts.plain.hidden = invitation.is_secure || role !== "phone";
+  setText(parts.plain, text(invitation.certificate ? "invite.choose_https" : "invite.no_https"));
+  parts.trust.hidden = !invitation.is_secure || isHere;
+  showQrCode(parts.authority, invitation.certificate_code, text("invite.certificate_label"));
+  parts.certificate.value = invitation.certificate;
+  setText(parts.mark, text("invite.fingerprint", { fingerprint: invitation.fingerprint }));
 }
 
-export async function open(model) {
-  await style();
-  const parts = built();
+export async function openInvitation(model) {
+  await loadStyle();
+  const parts = createDialog();
   const kinds = Object.entries(KINDS).filter(([role]) => role !== "phone" || model.has.includes("phones"));
-  options(parts.kind, kinds, kinds[0][0]);
+  setOptions(parts.kind, kinds.map(([role, key]) => [role, text(key)]), kinds[0][0]);
   async function invite() {
     const role = parts.kind.value;
     parts.tell("");
     try {
-      const told = await ask("POST", "invitations", { role, draw: true, page: parts.page.value });
+      const invitation = await send("POST", "invitations", { role, draw: true, page: parts.page.value });
       // A node that does not know its URLs was at least reached by this address.
-      told.link ??= `${location.origin}/#code=${told.token}${role === "phone" ? "/phone" : ""}`;
-      told.pages ??= [location.origin];
-      if (!parts.page.options.length) options(parts.page, told.pages.map((url) => [url, url]), told.pages[0]);
-      show(parts, told, role);
+      invitation.link ??= `${location.origin}/#code=${invitation.token}${role === "phone" ? "/phone" : ""}`;
+      invitation.pages ??= [location.origin];
+      if (!parts.page.options.length) setOptions(parts.page, invitation.pages.map((url) => [url, url]), invitation.pages[0]);
+      show(parts, invitation, role);
     } catch (error) {
       parts.tell(error.message);
     }

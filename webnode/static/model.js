@@ -22,7 +22,7 @@ const KEYS = { devices: "uuid", tasks: "id", groups: "task" };
 const ENTRIES = 2000;
 
 // Apply an event of the stream; maps keep the order of the node's lists.
-const TAKERS = {
+const HANDLERS = {
   state(state) {
     // Another node numbers its events from its own start.
     if (state.node !== model.node) model.events = [];
@@ -34,19 +34,19 @@ const TAKERS = {
     model.halt = state.halt ?? null;
   },
   // New and changed rows, and the keys of removed rows; the order is the same as in the node's lists.
-  change({ without = {}, ...told }) {
+  change({ without = {}, ...changed }) {
     for (const [name, key] of Object.entries(KEYS)) {
-      if (!told[name] && !without[name]) continue;
-      model[name] = new Map([...model[name], ...byKey(told[name] ?? [], key)]);
+      if (!changed[name] && !without[name]) continue;
+      model[name] = new Map([...model[name], ...byKey(changed[name] ?? [], key)]);
       without[name]?.forEach((each) => model[name].delete(each));
     }
-    if (told.devices) model.devices = inOrder(model.devices, (a, b) => a.joined - b.joined || (a.uuid < b.uuid ? -1 : 1));
-    if (told.tasks) model.tasks = inOrder(model.tasks, (a, b) => b.created - a.created || (a.id < b.id ? -1 : 1));
+    if (changed.devices) model.devices = inOrder(model.devices, (a, b) => a.joined - b.joined || (a.uuid < b.uuid ? -1 : 1));
+    if (changed.tasks) model.tasks = inOrder(model.tasks, (a, b) => b.created - a.created || (a.id < b.id ? -1 : 1));
     const places = [...model.tasks.keys()];
-    if (told.groups) model.groups = inOrder(model.groups, (a, b) => places.indexOf(a.task) - places.indexOf(b.task));
-    model.node = told.node ?? model.node;
-    model.halted = told.halted ?? model.halted;
-    model.halt = told.halt ?? model.halt;
+    if (changed.groups) model.groups = inOrder(model.groups, (a, b) => places.indexOf(a.task) - places.indexOf(b.task));
+    model.node = changed.node ?? model.node;
+    model.halted = changed.halted ?? model.halted;
+    model.halt = changed.halt ?? model.halt;
   },
   pages(pages) {
     model.pages = pages;
@@ -74,6 +74,6 @@ const TAKERS = {
   },
 };
 
-export function take(event, data) {
-  TAKERS[event]?.(data);
+export function applyEvent(event, data) {
+  HANDLERS[event]?.(data);
 }

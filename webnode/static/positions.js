@@ -1,8 +1,9 @@
 // Positions: without a simulator, a map of the devices that report their positions, scaled to fit them.
-import { at, attribute, drawn, element, keyed, words } from "./element.js";
-import { panel } from "./panel.js";
+import { byId, setAttribute, createSvg, createElement, updateList, setText } from "./element.js";
+import { registerPanel } from "./panel.js";
 import { go } from "./shell.js";
-import { whereabouts } from "./whereabouts.js";
+import { formatPosition } from "./format-position.js";
+import { formatNumber, text } from "./texts.js";
 
 const LEAST = 2;
 const MARGIN = 36;
@@ -14,7 +15,7 @@ const isMetres = ({ position }) => "x" in position;
 
 // Coordinates in metres for devices that share a frame: the local frame, or east and north of the first device on the
 // globe.  The frame that more devices use is drawn.  A degree of longitude shrinks towards the poles.
-function frame(placed) {
+function projectPositions(placed) {
   const local = placed.filter(isMetres);
   if (2 * local.length >= placed.length) return local.map((device) => ({ device, ...device.position }));
   const drawn = placed.filter((device) => !isMetres(device));
@@ -28,39 +29,38 @@ function frame(placed) {
 }
 
 // The largest of 1, 2 or 5 times a power of ten that is not longer than `metres`.
-function round(metres) {
+function roundDown(metres) {
   const power = 10 ** Math.floor(Math.log10(metres));
   return [5, 2, 1].find((n) => n * power <= metres) * power;
 }
 
-const length = (metres) => (metres >= 1000 ? `${metres / 1000} km` : metres >= 1 ? `${metres} m` : `${Math.round(metres * 100)} cm`);
+const formatLength = (metres) => (metres >= 1000 ? `${formatNumber(metres / 1000)} km` : metres >= 1 ? `${formatNumber(metres)} m` : `${formatNumber(metres * 100, 0)} cm`);
 
-function shape({ uuid }) {
+function createMarker({ uuid }) {
   const show = (event) => {
     if (event.type === "keydown" && event.key !== "Enter") return;
     go(`device/${uuid}`);
   };
-  const made = drawn("g", { class: "spot", role: "button", tabindex: 0 },
-    drawn("circle", { class: "blur" }), drawn("circle", { class: "reach", r: 22 }), drawn("path", { class: "way", d: "M9 -7 22 0 9 7z" }),
-    drawn("circle", { class: "dot", r: 8 }), drawn("text", { y: 24 }));
+  const made = createSvg("g", { class: "spot", role: "button", tabindex: 0 },
+    createSvg("circle", { class: "blur" }), createSvg("circle", { class: "reach", r: 22 }), createSvg("path", { class: "way", d: "M9 -7 22 0 9 7z" }),
+    createSvg("circle", { class: "dot", r: 8 }), createSvg("text", { y: 24 }));
   made.addEventListener("click", show);
   made.addEventListener("keydown", show);
   return made;
 }
 
-document.head.append(element("link", { rel: "stylesheet", href: "/static/positions.css" }));
+document.head.append(createElement("link", { rel: "stylesheet", href: "/static/positions.css" }));
 
-panel({
+registerPanel({
   place: "map",
   order: 5,
-  title: "Map",
   make(root) {
-    const map = drawn("svg", { id: "spots", role: "group", "aria-label": "Map of the positions that devices report" });
-    const bar = drawn("g", { class: "scale" }, drawn("path"), drawn("text", { y: -8 }));
-    const spots = drawn("g");
-    const list = element("ul", { class: "plain places" });
-    const hint = element("p", { class: "hint" });
-    map.append(drawn("rect", { class: "floor", rx: 6 }), bar, spots);
+    const map = createSvg("svg", { id: "position-map", role: "group", "aria-label": text("map.positions_label") });
+    const bar = createSvg("g", { class: "scale" }, createSvg("path"), createSvg("text", { y: -8 }));
+    const spots = createSvg("g");
+    const list = createElement("ul", { class: "plain places" });
+    const hint = createElement("p", { class: "hint" });
+    map.append(createSvg("rect", { class: "floor", rx: 6 }), bar, spots);
     root.append(map, hint, list);
     let placed = [];
     let known = "";
@@ -79,7 +79,7 @@ panel({
     }
 
     function draw() {
-      const found = frame(placed);
+      const found = projectPositions(placed);
       const width = root.clientWidth;
       const range = (key, room) => {
         const seen = found.map((each) => [each[key], Math.min(each.accuracy ?? 0, room)]);
@@ -93,31 +93,30 @@ panel({
       const scale = Math.min((width - 2 * MARGIN) / Math.max(east - west, LEAST), (width - 2 * MARGIN) / Math.max(north - south, LEAST));
       const height = Math.max((north - south) * scale, 120) + 2 * MARGIN + FOOT;
       const place = ({ x, y }) => [width / 2 + (x - (west + east) / 2) * scale, (height - FOOT) / 2 - (y - (south + north) / 2) * scale];
-      attribute(map, "viewBox", `0 0 ${width} ${height.toFixed(0)}`);
-      attribute(map.firstChild, "width", width);
-      attribute(map.firstChild, "height", height.toFixed(0));
-      keyed(spots, found, ({ device }) => device.uuid, ({ device }) => shape(device), (spot, each) => {
+      setAttribute(map, "viewBox", `0 0 ${width} ${height.toFixed(0)}`);
+      setAttribute(map.firstChild, "width", width);
+      setAttribute(map.firstChild, "height", height.toFixed(0));
+      updateList(spots, found, ({ device }) => device.uuid, ({ device }) => createMarker(device), (spot, each) => {
         const { device, heading, accuracy } = each;
-        attribute(spot, "transform", `translate(${place(each).map((n) => n.toFixed(1)).join(" ")})`);
-        attribute(spot, "data-state", device.status);
-        attribute(spot, "aria-label", `${device.name} at ${whereabouts(device.position)}`);
-        attribute(spot.querySelector(".blur"), "r", Math.min((accuracy ?? 0) * scale, width).toFixed(1));
+        setAttribute(spot, "transform", `translate(${place(each).map((n) => n.toFixed(1)).join(" ")})`);
+        setAttribute(spot, "data-state", device.status);
+        setAttribute(spot, "aria-label", text("position.device", { name: device.name, position: formatPosition(device.position) }));
+        setAttribute(spot.querySelector(".blur"), "r", Math.min((accuracy ?? 0) * scale, width).toFixed(1));
         const way = spot.querySelector(".way");
-        attribute(way, "display", Number.isFinite(heading) ? "inline" : "none");
-        if (Number.isFinite(heading)) attribute(way, "transform", `rotate(${((-heading * 180) / Math.PI).toFixed(1)})`);
-        words(spot.lastChild, found.length > NAMED ? "" : device.name);
+        setAttribute(way, "display", Number.isFinite(heading) ? "inline" : "none");
+        if (Number.isFinite(heading)) setAttribute(way, "transform", `rotate(${((-heading * 180) / Math.PI).toFixed(1)})`);
+        setText(spot.lastChild, found.length > NAMED ? "" : device.name);
       });
-      const metres = round((width / 3) / scale);
-      attribute(bar, "transform", `translate(14 ${(height - 12).toFixed(0)})`);
-      attribute(bar.firstChild, "d", `M0 -5V0H${(metres * scale).toFixed(1)}V-5`);
-      words(bar.lastChild, length(metres));
+      const metres = roundDown((width / 3) / scale);
+      setAttribute(bar, "transform", `translate(14 ${(height - 12).toFixed(0)})`);
+      setAttribute(bar.firstChild, "d", `M0 -5V0H${(metres * scale).toFixed(1)}V-5`);
+      setText(bar.lastChild, formatLength(metres));
       const isLocal = isMetres(found[0].device);
       const others = placed.length - found.length;
-      words(hint, `${isLocal ? "In metres, as the devices report it." : "By latitude and longitude, as the devices report it; north is up."}${
-        others ? ` ${others} more ${others > 1 ? "are" : "is"} reported in another frame, and only listed.` : ""}`);
-      keyed(list, placed.slice(0, NAMED), (device) => device.uuid, () => element("li", {}, element("b"), " ", element("span")), (item, device) => {
-        words(item.firstChild, device.name);
-        words(item.lastChild, whereabouts(device.position));
+      setText(hint, [text(isLocal ? "map.local_frame" : "map.globe_frame"), ...(others ? [text("map.other_frame", { count: others })] : [])].join(" "));
+      updateList(list, placed.slice(0, NAMED), (device) => device.uuid, () => createElement("li", {}, createElement("b"), " ", createElement("span")), (item, device) => {
+        setText(item.firstChild, device.name);
+        setText(item.lastChild, formatPosition(device.position));
       });
     }
 
@@ -125,11 +124,10 @@ panel({
       update(model, event) {
         if (event !== "state" && event !== "yard" && event !== "") return;
         placed = model.yard ? [] : [...model.devices.values()].filter((device) => device.position);
-        const section = at("place-map");
+        const section = byId("place-map");
         section.classList.toggle("reported", !model.yard);
         root.hidden = !placed.length;
-        words(at("h-yard"), model.yard ? "Simulator" : "Map");
-        words(document.querySelector("#views [href='#map']"), model.yard ? "Simulator" : "Map");
+        for (const node of [byId("h-map"), document.querySelector("#views [href='#map']")]) setText(node, text(model.yard ? "map.simulator" : "map.title"));
         if (!model.yard) section.hidden = !placed.length;
         refresh();
       },

@@ -1,56 +1,58 @@
 // Settings of a device: a field for each one that the device reports, and a button that sends the changes.
-import { element, words } from "./element.js";
-import { wish } from "./desk.js";
-import { get } from "./link.js";
+import { createElement, setText } from "./element.js";
+import { sendRequest } from "./request.js";
+import { get } from "./connection.js";
+import { text, textOf } from "./texts.js";
 
-let number = 0;
+let count = 0;
 
 // A field for one setting: its row, its present value, and whether it was changed.
-function field({ key, value, about, unit, least, most }) {
-  const id = `setting-${++number}`;
+function createField({ key, value, about, unit, least, most }) {
+  const id = `setting-${++count}`;
   const isTable = typeof value === "object" && value !== null;
   const shown = isTable ? JSON.stringify(value, null, 1) : String(value ?? "");
-  const input = element(isTable ? "textarea" : "input", { id, name: key });
+  const input = createElement(isTable ? "textarea" : "input", { id, name: key });
   if (isTable) input.rows = Math.min(8, shown.split("\n").length);
   if (typeof value === "number") Object.assign(input, { type: "number", step: "any", min: least ?? "", max: most ?? "", required: true });
   else if (!isTable && most) input.maxLength = most;
   input.value = shown;
-  const range = typeof value === "number" && least !== null && most !== null ? `, ${least} to ${most}` : "";
+  const range = typeof value === "number" && least !== null && most !== null ? text("settings.range", { least, most }) : "";
+  const limits = [unit && textOf("settings.unit", unit.replace(" ", "_"), unit), range].filter(Boolean).join(", ");
   return {
     key,
-    row: element("div", { class: "knob" }, element("label", { for: id }, `${about}${unit ? ` (${unit}${range})` : range}`), input),
+    row: createElement("div", { class: "setting" }, createElement("label", { for: id }, textOf("settings.about", key, about) + (limits && ` (${limits})`)), input),
     isChanged: () => input.value !== shown,
     value: () => (isTable ? JSON.parse(input.value) : typeof value === "number" ? Number(input.value) : input.value),
   };
 }
 
 export function make(root, { model }) {
-  const form = element("form", { class: "settings" });
-  const line = element("p", { role: "status", class: "hint" });
-  const save = element("button", {}, "Save settings");
+  const form = createElement("form", { class: "settings" });
+  const line = createElement("p", { role: "status", class: "hint" });
+  const save = createElement("button", {}, text("settings.save"));
   let uuid = "";
   let fields = [];
-  root.append(element("h3", {}, "Settings"), form, line);
+  root.append(createElement("h3", {}, text("settings.title")), form, line);
 
-  function fill(knobs) {
-    fields = knobs.map(field);
+  function fill(settings) {
+    fields = settings.map(createField);
     const may = model.me.role === "operator";
     form.replaceChildren(...fields.map(({ row }) => row), ...(may && fields.length ? [save] : []));
     for (const input of form.querySelectorAll("input, textarea")) input.readOnly = !may;
-    if (!knobs.length) words(line, "This device has no settings that can be changed.");
+    if (!settings.length) setText(line, text("settings.none"));
   }
 
   async function load() {
     const asked = uuid;
     form.replaceChildren();
-    words(line, "Querying the device …");
+    setText(line, text("device.querying"));
     try {
-      const knobs = await get(`devices/${asked}/settings`);
+      const settings = await get(`devices/${asked}/settings`);
       if (asked !== uuid) return;
-      words(line, "");
-      fill(knobs);
+      setText(line, "");
+      fill(settings);
     } catch (error) {
-      if (asked === uuid) words(line, error.message);
+      if (asked === uuid) setText(line, error.message);
     }
   }
 
@@ -61,15 +63,15 @@ export function make(root, { model }) {
       try {
         body[each.key] = each.value();
       } catch {
-        return words(line, `${each.key}: not a table; write for example {"gripper": {"width": 0.1}}.`);
+        return setText(line, text("settings.not_a_table", { name: each.key, example: '{"gripper": {"width": 0.1}}' }));
       }
     }
-    if (!Object.keys(body).length) return words(line, "No changes to save.");
-    const done = (knobs) => {
-      fill(knobs);
-      return "Settings saved.";
+    if (!Object.keys(body).length) return setText(line, text("settings.no_changes"));
+    const done = (settings) => {
+      fill(settings);
+      return text("settings.saved");
     };
-    wish("Saving", `devices/${uuid}/settings`, { method: "PUT", body, line: (text) => words(line, text), done });
+    sendRequest(text("settings.saving"), `devices/${uuid}/settings`, { method: "PUT", body, line: (message) => setText(line, message), done });
   });
 
   return {

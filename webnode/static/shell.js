@@ -1,13 +1,13 @@
 // The shell: opens panels at their places, passes events to them, and switches views.
-import { at } from "./element.js";
+import { byId } from "./element.js";
 import { panels } from "./panel.js";
 
-const AGAIN = 3000;
+const RETRY_MS = 3000;
 // A phone sees the same as a viewer.
 const RANKS = { anyone: 0, viewer: 1, phone: 2, operator: 3 };
 const shown = new Map();
 let shared = {};
-let looked = "";
+let lastPlace = "";
 // A narrow screen shows one of these views at a time, with a navigation bar; ?view=cameras shows one view alone.
 const VIEWS = ["devices", "tasks", "cameras", "map", "groups", "network", "events", "phone", "more"];
 const NARROW = matchMedia("(max-width: 43.99rem)");
@@ -18,20 +18,20 @@ export function go(view) {
   if (view) location.hash = view;
   else if (location.hash) {
     history.pushState(null, "", location.pathname + location.search);
-    look();
+    followLocation();
   }
 }
 
-export const back = () => go(view() === VIEWS[0] ? "" : view());
+export const back = () => go(currentView() === VIEWS[0] ? "" : currentView());
 
-const view = () => document.body.dataset.view ?? VIEWS[0];
+const currentView = () => document.body.dataset.view ?? VIEWS[0];
 
 // Mark the views that are not shown; the style sheet decides on which screens they are hidden.
-function lookAt(name) {
+function markView(name) {
   document.body.dataset.view = name;
   document.body.toggleAttribute("data-only", VIEWS.includes(only));
   for (const each of VIEWS) {
-    const place = at(`place-${each}`);
+    const place = byId(`place-${each}`);
     place?.classList.toggle("other", each !== name && !(name === "tasks" && each === "groups"));
     place?.classList.toggle("aside", VIEWS.includes(only) && each !== only);
   }
@@ -41,16 +41,16 @@ function lookAt(name) {
   }
 }
 
-function wanted({ place, needs = {} }) {
+function isWanted({ place, needs = {} }) {
   const { me, has } = shared.model;
   const mayLook = RANKS[me.role] >= RANKS[needs.role ?? "anyone"];
-  return at(`place-${place}`) && mayLook && (!needs.has || has.includes(needs.has));
+  return byId(`place-${place}`) && mayLook && (!needs.has || has.includes(needs.has));
 }
 
 async function open(panel) {
-  const place = at(`place-${panel.place}`);
+  const place = byId(`place-${panel.place}`);
   const root = panel.order ? document.createElement("div") : place;
-  const entry = { panel, root, acts: {} };
+  const entry = { panel, root, handlers: {} };
   shown.set(panel, entry);
   if (root !== place) {
     root.dataset.order = panel.order;
@@ -61,63 +61,63 @@ async function open(panel) {
     make ??= (await panel.load()).make;
   } catch {
     // The node is gone, or too busy to send the module: try again later.
-    setTimeout(() => shown.get(panel) === entry && close(entry), AGAIN);
+    setTimeout(() => shown.get(panel) === entry && close(entry), RETRY_MS);
     return;
   }
   if (shown.get(panel) !== entry) return;
-  entry.acts = make(root, shared) ?? {};
-  entry.acts.update?.(shared.model, "");
-  const [name, argument] = viewed();
-  if (name === panel.place) entry.acts.show?.(argument);
+  entry.handlers = make(root, shared) ?? {};
+  entry.handlers.update?.(shared.model, "");
+  const [name, argument] = parseLocation();
+  if (name === panel.place) entry.handlers.show?.(argument);
 }
 
 function close(entry) {
   shown.delete(entry.panel);
-  entry.acts.close?.();
+  entry.handlers.close?.();
   if (entry.panel.order) entry.root.remove();
 }
 
-function viewed() {
+function parseLocation() {
   const [name, ...rest] = location.hash.slice(1).split("/");
   return [name, rest.join("/")];
 }
 
-function look() {
-  const [name, argument] = viewed();
-  for (const { panel, acts } of shown.values()) {
-    if (panel.place === name) acts.show?.(argument);
-    else if (panel.place === looked) acts.hide?.();
+function followLocation() {
+  const [name, argument] = parseLocation();
+  for (const { panel, handlers } of shown.values()) {
+    if (panel.place === name) handlers.show?.(argument);
+    else if (panel.place === lastPlace) handlers.hide?.();
   }
   if (VIEWS.includes(name)) {
-    lookAt(name);
+    markView(name);
     if (NARROW.matches) scrollTo(0, 0);
-    else at(`place-${name}`)?.scrollIntoView();
-  } else if (!name || !document.body.dataset.view) lookAt(VIEWS[0]);
-  looked = name;
+    else byId(`place-${name}`)?.scrollIntoView();
+  } else if (!name || !document.body.dataset.view) markView(VIEWS[0]);
+  lastPlace = name;
 }
 
 // Open the panels that the visitor may see, and close the others.
-function sort() {
+function updatePanels() {
   for (const panel of panels) {
     const entry = shown.get(panel);
-    if (!entry && wanted(panel)) open(panel);
-    else if (entry && !wanted(panel)) close(entry);
+    if (!entry && isWanted(panel)) open(panel);
+    else if (entry && !isWanted(panel)) close(entry);
   }
 }
 
-export function start(tools) {
+export function startPanels(tools) {
   shared = tools;
-  addEventListener("hashchange", look);
-  sort();
-  look();
+  addEventListener("hashchange", followLocation);
+  updatePanels();
+  followLocation();
 }
 
 // Pass an event to all panels; an error in one panel does not affect the others.
-export function tell(event) {
-  sort();
-  for (const { acts } of [...shown.values()]) {
+export function notifyPanels(event) {
+  updatePanels();
+  for (const { handlers } of [...shown.values()]) {
     try {
-      acts.update?.(shared.model, event);
+      handlers.update?.(shared.model, event);
     } catch (fault) {
       reportError(fault);
     }

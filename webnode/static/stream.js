@@ -1,8 +1,8 @@
 // The stream of events: regarded as lost when it breaks, or when it is silent for some time.
-// url() returns its URL for each connection; heard(name, data, id) is called per event, lost() once at its end.
+// url() returns its URL for each connection; onMessage(name, data, id) is called per event, onLost() once at its end.
 const PATIENCE = 1500;
 
-export function stream({ url, names, heard, lost }) {
+export function createStream({ url, names, onMessage, onLost }) {
   let source = null;
   let at = 0;
 
@@ -13,7 +13,7 @@ export function stream({ url, names, heard, lost }) {
 
   function fail() {
     close();
-    lost();
+    onLost();
   }
 
   setInterval(() => {
@@ -30,7 +30,7 @@ export function stream({ url, names, heard, lost }) {
         source.addEventListener(name, (event) => {
           if (source !== opened) return;
           at = performance.now();
-          heard(name, JSON.parse(event.data), event.lastEventId);
+          onMessage(name, JSON.parse(event.data), event.lastEventId);
         });
       }
       source.onerror = () => { if (source === opened) fail(); };

@@ -1,45 +1,47 @@
 // Tasks: assign a predefined one, show the state of each, and cancel, pause or resume it.
-import { alike, at, attribute, badge, element, keyed, several, state, words } from "./element.js";
-import { say, wish } from "./desk.js";
-import { ask, get } from "./link.js";
-import { panel } from "./panel.js";
+import { groupByReason, byId, setAttribute, createBadge, createElement, updateList, joinNames, setBadge, setText } from "./element.js";
+import { showStatus, sendRequest } from "./request.js";
+import { send, get } from "./connection.js";
+import { registerPanel } from "./panel.js";
+import { formatNumber, text } from "./texts.js";
 
 const ENDED = ["COMPLETED", "FAILED", "CANCELLED"];
 const SHOWN = 8;
 const histories = new Map();
 
 function showTasks(tasks) {
-  at("no-tasks").hidden = tasks.length > 0;
-  keyed(at("tasks"), tasks.slice(0, SHOWN), (task) => task.id, row, (item, task) => {
-    words(item.querySelector("b"), task.title);
-    state(item.querySelector(".badge"), task.status);
-    const result = task.result ? `Done by ${task.result.by} in ${task.result.took.toFixed(1)} s. ` : "";
-    words(item.querySelector(".note"), (task.group && `Group ${task.group}. `) + result + task.note);
-    why(item.querySelector(".why"), task.why);
+  byId("no-tasks").hidden = tasks.length > 0;
+  updateList(byId("tasks"), tasks.slice(0, SHOWN), (task) => task.id, createRow, (item, task) => {
+    setText(item.querySelector("b"), task.title);
+    setBadge(item.querySelector(".badge"), task.status);
+    const result = task.result ? text("tasks.result", { name: task.result.by, seconds: formatNumber(task.result.took, 1) }) : "";
+    setText(item.querySelector(".note"), [task.group && text("tasks.group", { name: task.group }), result, task.note].filter(Boolean).join(" "));
+    showDecisions(item.querySelector(".why"), task.why);
     const [button, rest] = item.querySelectorAll("button");
     button.hidden = rest.hidden = ENDED.includes(task.status);
-    button.setAttribute("aria-label", `Cancel ${task.title}`);
-    words(rest, task.paused ? "Resume" : "Pause");
-    rest.setAttribute("aria-label", `${rest.textContent} ${task.title}`);
+    button.setAttribute("aria-label", text("tasks.cancel_label", { title: task.title }));
+    rest.dataset.paused = task.paused;
+    setText(rest, text(task.paused ? "tasks.resume" : "tasks.pause"));
+    rest.setAttribute("aria-label", text(task.paused ? "tasks.resume_label" : "tasks.pause_label", { title: task.title }));
   });
 }
 
-function row(task) {
-  const button = element("button", {}, "Cancel");
-  button.addEventListener("click", () => wish(`Cancelling ${task.title}`, `tasks/${encodeURIComponent(task.id)}/cancel`));
-  const rest = element("button", {}, "Pause");
+function createRow(task) {
+  const button = createElement("button", {}, text("tasks.cancel"));
+  button.addEventListener("click", () => sendRequest(text("tasks.cancelling", { title: task.title }), `tasks/${encodeURIComponent(task.id)}/cancel`));
+  const rest = createElement("button", {}, text("tasks.pause"));
   rest.addEventListener("click", () => {
-    const isPaused = rest.textContent === "Resume";
-    wish(`${isPaused ? "Resuming" : "Pausing"} ${task.title}`, `tasks/${encodeURIComponent(task.id)}/${isPaused ? "resume" : "pause"}`);
+    const isPaused = rest.dataset.paused === "true";
+    sendRequest(text(isPaused ? "tasks.resuming" : "tasks.pausing", { title: task.title }), `tasks/${encodeURIComponent(task.id)}/${isPaused ? "resume" : "pause"}`);
   });
-  return element("li", {}, element("b"), badge(), element("span", { class: "note" }),
-    element("details", { class: "why" }, element("summary"), element("div")), history(task), button, rest);
+  return createElement("li", {}, createElement("b"), createBadge(), createElement("span", { class: "note" }),
+    createElement("details", { class: "why" }, createElement("summary"), createElement("div")), createHistory(task), button, rest);
 }
 
 // The history of a task, loaded when it is opened.
-function history(task) {
-  const list = element("ol", { class: "story", tabindex: 0, "aria-label": `History of ${task.title}, the newest first` });
-  const box = element("details", { class: "history" }, element("summary", {}, "History"), list);
+function createHistory(task) {
+  const list = createElement("ol", { class: "story", tabindex: 0, "aria-label": text("tasks.history_label", { title: task.title }) });
+  const box = createElement("details", { class: "history" }, createElement("summary", {}, text("history.title")), list);
   box.addEventListener("toggle", async () => {
     const { History } = await import("./history.js");
     if (box.open) histories.set(task.id, new History(list, task.id));
@@ -49,58 +51,58 @@ function history(task) {
 }
 
 // The decisions on a task: the newest in one line; opened, each with its rule and the reports.
-function why(box, epochs) {
+function showDecisions(box, epochs) {
   box.hidden = !epochs.length;
   const told = JSON.stringify(epochs);
   if (box.hidden || box.dataset.told === told) return;
   box.dataset.told = told;
-  words(box.firstChild, `${epochs[0].chosen} – ${epochs[0].agree} of ${epochs[0].of} agree${epochs[0].differ.map((name) => `, ${name} differs`).join("")}`);
-  attribute(box, "data-agree", epochs[0].agree === epochs[0].of && !epochs[0].differ.length);
+  setText(box.firstChild, [text("consensus.agree", { name: epochs[0].chosen, count: epochs[0].agree, total: epochs[0].of }),
+    ...epochs[0].differ.map((name) => text("consensus.differ", { names: name, count: 1 }))].join(", "));
+  setAttribute(box, "data-agree", epochs[0].agree === epochs[0].of && !epochs[0].differ.length);
   box.lastChild.replaceChildren(...epochs.flatMap((each) => [
-    element("p", {}, element("b", {}, `${each.epoch}. ${each.chosen}`), ` by ${each.rule}: ${each.hysteresis}${each.agreed && `; agreed on ${each.agreed}`}`),
-    element("table", {}, ...each.rows.map((row) => element("tr", {}, element("th", { scope: "row" }, row.name),
-      element("td", {}, row.cost?.toFixed(2) ?? "no report"), element("td", {}, row.note)))),
-    ...(each.reported > each.rows.length ? [`of ${each.reported} reports`] : [])]));
+    createElement("p", {}, createElement("b", {}, `${each.epoch}. ${each.chosen}`), ` ${text(each.agreed ? "tasks.rule_agreed" : "tasks.rule", { rule: each.rule, reason: each.hysteresis, value: each.agreed })}`),
+    createElement("table", {}, ...each.rows.map((row) => createElement("tr", {}, createElement("th", { scope: "row" }, row.name),
+      createElement("td", {}, (Number.isFinite(row.cost) ? formatNumber(row.cost, 2) : text("tasks.no_report"))), createElement("td", {}, row.note)))),
+    ...(each.reported > each.rows.length ? [text("tasks.of_reports", { count: each.reported })] : [])]));
 }
 
-function outcome({ able = [], refused = {} }) {
-  const no = alike(refused).map(([names, why]) => `Not possible for ${several(names)}: ${why}`);
-  const yes = able.length ? [`Assigned to ${several(able)}`] : no.length ? ["No device can take it"] : ["Assigned"];
-  return `${[...yes, ...no].join(". ")}.`;
+function describeAssignment({ able = [], refused = {} }) {
+  const no = groupByReason(refused).map(([names, why]) => text("tasks.not_possible", { names: joinNames(names), reason: why }));
+  const yes = able.length ? [text("tasks.assigned_to", { names: joinNames(able) })] : [text(no.length ? "tasks.nobody" : "tasks.assigned")];
+  return [...yes, ...no].join(" ");
 }
 
 // The catalogue is read when the page connects or reconnects.
 async function readCatalogue() {
   const catalogue = await get("catalogue").catch(() => null);
   if (!catalogue) return;
-  const chosen = at("task").value;
-  at("task").replaceChildren(...catalogue.map((task) => element("option", { value: task.name }, task.title || task.name)));
-  if (chosen) at("task").value = chosen;
+  const chosen = byId("task").value;
+  byId("task").replaceChildren(...catalogue.map((task) => createElement("option", { value: task.name }, task.title || task.name)));
+  if (chosen) byId("task").value = chosen;
 }
 
 function startTasks() {
-  at("assign").addEventListener("submit", (event) => {
+  byId("assign").addEventListener("submit", (event) => {
     event.preventDefault();
-    if (!at("task").value) return say("There is no predefined task to assign.");
-    const group = at("group").value.trim();
-    wish("Assigning", "tasks", { body: { name: at("task").value, ...(group && { group }) }, done: outcome });
+    if (!byId("task").value) return showStatus(text("tasks.no_predefined"));
+    const group = byId("group").value.trim();
+    sendRequest(text("tasks.assigning"), "tasks", { body: { name: byId("task").value, ...(group && { group }) }, done: describeAssignment });
   });
-  at("demo").addEventListener("click", async () => {
-    at("demo").disabled = true;
-    say("Starting the demo …");
+  byId("demo").addEventListener("click", async () => {
+    byId("demo").disabled = true;
+    showStatus(text("demo.starting"));
     try {
-      await ask("POST", "demo");
-      say("The demo runs.");
+      await send("POST", "demo");
+      showStatus(text("demo.runs"));
     } catch (error) {
-      say(error.message);
+      showStatus(error.message);
     }
-    at("demo").disabled = false;
+    byId("demo").disabled = false;
   });
 }
 
-panel({
+registerPanel({
   place: "tasks",
-  title: "Tasks",
   make() {
     startTasks();
     return {

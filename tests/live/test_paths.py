@@ -7,20 +7,20 @@ from typing import Any
 from tests.live.page import DESK, PHONE, PageCase
 
 
-class WaysTests(PageCase):
-    def looked(self, screen: dict[str, Any]) -> Any:
+class PathsTests(PageCase):
+    def open_network(self, screen: dict[str, Any]) -> Any:
         """Return the page with the network view when both panels are shown."""
         page = self.opened(screen)
         self.view(page, "network")
-        page.locator("#ways li").nth(2).wait_for()
+        page.locator("#paths li").nth(2).wait_for()
         page.locator("#team-kind").scroll_into_view_if_needed()
         page.locator("#members li").nth(2).wait_for()
         return page
 
     def test_tell_the_ways(self) -> None:
         """Each path shows its score, rating, kind and duration; among other nodes' links the worst is first."""
-        page = self.looked(PHONE)
-        rows = [item.inner_text().split("\n") for item in page.locator("#ways li").all()]
+        page = self.open_network(PHONE)
+        rows = [item.inner_text().split("\n") for item in page.locator("#paths li").all()]
         self.assertEqual(
             [(row[0], row[1], row[2]) for row in rows],
             [
@@ -31,18 +31,18 @@ class WaysTests(PageCase):
         )
         self.assertEqual(rows[2][3], "110 ms, jitter 11 ms, 20 % lost")
         lit = "e => [...e.querySelectorAll('rect')].filter(bar => bar.dataset.lit === 'true').length"
-        self.assertEqual([page.locator("#ways .score").nth(n).evaluate(lit) for n in range(3)], [4, 3, 2])
-        page.locator("#ways-others summary").tap()
-        others = [item.inner_text().split("\n")[:2] for item in page.locator("#ways-between li").all()]
+        self.assertEqual([page.locator("#paths .score").nth(n).evaluate(lit) for n in range(3)], [4, 3, 2])
+        page.locator("#paths-others summary").tap()
+        others = [item.inner_text().split("\n")[:2] for item in page.locator("#paths-between li").all()]
         self.assertEqual(
             others, [["dog2 \N{EN DASH} dog1", "70 \N{EN DASH} fair"], ["dog2 \N{EN DASH} dog3", "measuring"]]
         )
-        self.assertEqual(page.locator("#ways-line").inner_text(), "5 links: 1 poor, 2 fair. 1 did not answer.")
+        self.assertEqual(page.locator("#paths-line").inner_text(), "5 links: 1 poor, 2 fair. 1 did not answer.")
         self.sound_by_day_and_night(page)
 
     def test_tell_who_was_turned_away(self) -> None:
         """Several nodes' reports of one rejection are one line with peer, reporters, reason and remedy."""
-        page = self.looked(DESK)
+        page = self.open_network(DESK)
         told = [item.inner_text().split("\n") for item in page.locator("#refusals li").all()]
         self.assertEqual(
             told,
@@ -50,12 +50,12 @@ class WaysTests(PageCase):
                 [
                     "dog9 is rejected by vaio, dog1; 3 min ago, 6 times",
                     "revoked: the operator revoked the certificate",
-                    "Remedy: only a new invitation lets it in",
+                    "Remedy: admit the node again with a new code (swarm invite, swarm join)",
                 ],
                 [
                     "a newcomer at 192.0.2.66:8484 is rejected by vaio; 3 min ago",
                     "used: this code was used as often as it may be",
-                    "Remedy: ask the operator for another one",
+                    "Remedy: ask the operator for another one (swarm invite)",
                 ],
             ],
         )
@@ -66,7 +66,7 @@ class WaysTests(PageCase):
         An operator sees the command that revokes a member; a viewer sees the members without commands and buttons. A
         member with many roles still has its name on one line.
         """
-        page = self.looked(DESK)
+        page = self.open_network(DESK)
         self.assertEqual(page.locator("#team-kind").inner_text(), "Closed team yard")
         self.assertIn("Fingerprint 1a2b 3c4d 5e6f 7081", page.locator("#team-about").inner_text())
         first, second, third = (item.inner_text() for item in page.locator("#members li").all())
@@ -98,7 +98,7 @@ class WaysTests(PageCase):
 
         self.assertFalse(asks())
         self.view(page, "network")
-        page.locator("#ways li").first.wait_for()
+        page.locator("#paths li").first.wait_for()
         self.assertTrue(asks())
         self.view(page, "devices")
         self.assertFalse(asks())

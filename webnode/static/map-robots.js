@@ -1,6 +1,8 @@
 // Robots of the simulator: move one by finger, mouse or arrow keys; a tap or Enter turns it.
-import { at, attribute, drawn } from "./element.js";
-import { wish } from "./desk.js";
+import { byId, setAttribute, createSvg } from "./element.js";
+import { formatPosition } from "./format-position.js";
+import { sendRequest } from "./request.js";
+import { text } from "./texts.js";
 
 const STEP = 0.05;
 const TURN = Math.PI / 4;
@@ -9,24 +11,24 @@ const NEAR = 0.03;
 const ARROWS = { ArrowLeft: [-1, 0], ArrowRight: [1, 0], ArrowUp: [0, 1], ArrowDown: [0, -1] };
 
 export function make(root, { model }) {
-  const map = at("map");
-  const ghost = drawn("circle", { class: "ghost", r: 14 });
+  const map = byId("map");
+  const ghost = createSvg("circle", { class: "ghost", r: 14 });
   const hint = document.createElement("p");
-  let lifted = null;
+  let dragged = null;
   hint.className = "hint";
-  hint.textContent = "Drag a robot to move it, tap it to turn it; or select it and use the arrow keys and Enter.";
+  hint.textContent = text("robot.hint");
   root.append(hint);
-  at("place")?.after(root);
+  byId("target-position")?.after(root);
 
   const robot = (name) => model.yard?.dogs.find((dog) => dog.name === name);
   const shapeOf = (event) => event.target.closest?.("#map .dog");
 
-  function spotOf(event) {
+  function positionOf(event) {
     const point = new DOMPoint(event.clientX, event.clientY).matrixTransform(map.getScreenCTM().inverse());
-    return inside(point.x / 100, model.yard.walls[1] - point.y / 100);
+    return clampPosition(point.x / 100, model.yard.walls[1] - point.y / 100);
   }
 
-  function inside(x, y) {
+  function clampPosition(x, y) {
     const within = (value, side) => Math.round(Math.min(Math.max(value, MARGIN), side - MARGIN) * 1000) / 1000;
     return { x: within(x, model.yard.walls[0]), y: within(y, model.yard.walls[1]) };
   }
@@ -37,14 +39,14 @@ export function make(root, { model }) {
   }
 
   function put(name, place) {
-    const done = ({ x, y }) => `${name} moved to ${x.toFixed(2)}, ${y.toFixed(2)} m.`;
-    return wish(`Moving ${name}`, `yard/robots/${encodeURIComponent(name)}`, { method: "PUT", body: place, done });
+    const done = (spot) => text("robot.moved", { name, position: formatPosition({ x: spot.x, y: spot.y }) });
+    return sendRequest(text("robot.moving", { name }), `yard/robots/${encodeURIComponent(name)}`, { method: "PUT", body: place, done });
   }
 
   function show(spot) {
     if (!spot) return ghost.remove();
-    attribute(ghost, "cx", spot.x * 100);
-    attribute(ghost, "cy", (model.yard.walls[1] - spot.y) * 100);
+    setAttribute(ghost, "cx", spot.x * 100);
+    setAttribute(ghost, "cy", (model.yard.walls[1] - spot.y) * 100);
     map.append(ghost);
   }
 
@@ -52,19 +54,19 @@ export function make(root, { model }) {
     const shape = shapeOf(event);
     if (!shape || !model.yard) return;
     shape.setPointerCapture(event.pointerId);
-    lifted = { name: shape.dataset.key, from: spotOf(event), spot: null };
+    dragged = { name: shape.dataset.key, from: positionOf(event), spot: null };
   }
 
   function move(event) {
-    if (!lifted || !model.yard) return;
-    const spot = spotOf(event);
-    if (lifted.spot || Math.hypot(spot.x - lifted.from.x, spot.y - lifted.from.y) > NEAR) show(lifted.spot = spot);
+    if (!dragged || !model.yard) return;
+    const spot = positionOf(event);
+    if (dragged.spot || Math.hypot(spot.x - dragged.from.x, spot.y - dragged.from.y) > NEAR) show(dragged.spot = spot);
   }
 
   function up(event) {
-    const dog = robot(lifted?.name);
-    if (dog && event.type === "pointerup") lifted.spot ? put(dog.name, lifted.spot) : turn(dog);
-    lifted = null;
+    const dog = robot(dragged?.name);
+    if (dog && event.type === "pointerup") dragged.spot ? put(dog.name, dragged.spot) : turn(dog);
+    dragged = null;
     show(null);
   }
 
@@ -86,12 +88,12 @@ export function make(root, { model }) {
     event.preventDefault();
     if (sending) return;
     sending = true;
-    await (arrow ? put(dog.name, inside(dog.x + arrow[0] * STEP, dog.y + arrow[1] * STEP)) : turn(dog));
+    await (arrow ? put(dog.name, clampPosition(dog.x + arrow[0] * STEP, dog.y + arrow[1] * STEP)) : turn(dog));
     sending = false;
   }
 
-  const heard = [["pointerdown", down], ["pointermove", move], ["pointerup", up], ["pointercancel", up], ["click", click], ["keydown", key]];
-  for (const [name, act] of heard) map.addEventListener(name, act, true);
+  const listeners = [["pointerdown", down], ["pointermove", move], ["pointerup", up], ["pointercancel", up], ["click", click], ["keydown", key]];
+  for (const [name, act] of listeners) map.addEventListener(name, act, true);
   map.addEventListener("touchstart", touch, { passive: false });
 
   return {
@@ -99,13 +101,13 @@ export function make(root, { model }) {
       if (event !== "yard" && event !== "") return;
       for (const shape of map.querySelectorAll(".dog")) {
         if (shape.querySelector(".grip")) continue;
-        shape.append(drawn("circle", { class: "grip", r: 18 }));
-        for (const [name, value] of [["tabindex", 0], ["role", "button"]]) attribute(shape, name, value);
-        attribute(shape, "aria-label", `${shape.dataset.key}; arrow keys move it, Enter turns it`);
+        shape.append(createSvg("circle", { class: "grip", r: 18 }));
+        for (const [name, value] of [["tabindex", 0], ["role", "button"]]) setAttribute(shape, name, value);
+        setAttribute(shape, "aria-label", text("robot.label", { name: shape.dataset.key }));
       }
     },
     close() {
-      for (const [name, act] of heard) map.removeEventListener(name, act, true);
+      for (const [name, act] of listeners) map.removeEventListener(name, act, true);
       map.removeEventListener("touchstart", touch);
       ghost.remove();
       for (const shape of map.querySelectorAll(".dog")) {

@@ -12,7 +12,7 @@ const MOST = 100;
 export const LENS = 65 * Math.PI / 180;
 export const TARGET = { radius: 0.08, height: 0.22 };
 
-function colours(pixels, count) {
+function classifyPixels(pixels, count) {
   const isRed = new Uint8Array(count);
   const redness = new Float32Array(count);
   for (let n = 0; n < count; n += 1) {
@@ -26,7 +26,7 @@ function colours(pixels, count) {
 }
 
 // The largest blob of neighbours: its area in pixels, its centre, and its bounding box.
-function largest(isRed, columns, rows) {
+function findLargestBlob(isRed, columns, rows) {
   let best = { area: 0 };
   const waiting = [];
   for (let start = 0; start < isRed.length; start += 1) {
@@ -53,7 +53,7 @@ function largest(isRed, columns, rows) {
   return best;
 }
 
-function percentile(values, share) {
+function computePercentile(values, share) {
   const sorted = Float32Array.from(values).sort();
   const at = (sorted.length - 1) * share;
   const below = Math.floor(at);
@@ -61,12 +61,12 @@ function percentile(values, share) {
 }
 
 // The width and height of the blob in pixels, with fractions.
-function extent(redness, columns, rows, { left, top, right, bottom }) {
+function measureBlob(redness, columns, rows, { left, top, right, bottom }) {
   const [x0, x1] = [Math.max(0, left - BLUR), Math.min(columns - 1, right + BLUR)];
   const [y0, y1] = [Math.max(0, top - BLUR), Math.min(rows - 1, bottom + BLUR)];
   const around = [];
   for (let y = y0; y <= y1; y += 1) for (let x = x0; x <= x1; x += 1) around.push(redness[y * columns + x]);
-  const full = Math.max(percentile(around, 0.9) - GREY, 1);
+  const full = Math.max(computePercentile(around, 0.9) - GREY, 1);
   const across = new Float32Array(y1 - y0 + 1);
   const up = new Float32Array(x1 - x0 + 1);
   around.forEach((value, n) => {
@@ -75,17 +75,17 @@ function extent(redness, columns, rows, { left, top, right, bottom }) {
     across[Math.floor(n / up.length)] += share;
     up[n % up.length] += share;
   });
-  return [Math.max(percentile(across, 0.75), 1), Math.max(percentile(up, 0.75), 1)];
+  return [Math.max(computePercentile(across, 0.75), 1), Math.max(computePercentile(up, 0.75), 1)];
 }
 
 // The target in RGBA pixels: bearing in radians (left positive), distance in metres, and its box in pixels; or null.
-export function sighted(pixels, columns, rows, size = TARGET, lens = LENS) {
-  const { isRed, redness } = colours(pixels, columns * rows);
-  const blob = largest(isRed, columns, rows);
+export function detectTarget(pixels, columns, rows, size = TARGET, lens = LENS) {
+  const { isRed, redness } = classifyPixels(pixels, columns * rows);
+  const blob = findLargestBlob(isRed, columns, rows);
   if (blob.area < LEAST_AREA) return null;
   const focal = Math.max(columns, rows) / 2 / Math.tan(lens / 2);
   const bearing = Math.atan2(columns / 2 - (blob.x + 0.5), focal);
-  const [across, up] = extent(redness, columns, rows, blob);
+  const [across, up] = measureBlob(redness, columns, rows, blob);
   const byWidth = focal * 2 * size.radius / across;
   const byHeight = focal * size.height / up;
   const isWhole = blob.left > 0 && blob.right < columns - 1 && Math.abs(byWidth / byHeight - 1) < SAME_SHAPE;

@@ -4,7 +4,7 @@ const SHELL = "swarm.shell";
 for (const name of ["history", "invite", "phone"]) import(`./${name}.js`).catch(() => {});
 
 // All files or none: an incomplete page does not start.
-async function keep() {
+async function cacheFiles() {
   await navigator.serviceWorker.register("/sw.js");
   await navigator.serviceWorker.ready;
   const files = await (await fetch("/static/files.json")).json();
@@ -12,4 +12,4 @@ async function keep() {
 }
 
 // Without a cache the page works while its node does.
-if (navigator.serviceWorker && isSecureContext) keep().catch(() => {});
+if (navigator.serviceWorker && isSecureContext) cacheFiles().catch(() => {});

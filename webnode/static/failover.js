@@ -1,30 +1,30 @@
-// The reserve: the URLs of the team's other web nodes, and which of the nodes answers now.
-import { has, sort } from "./session.js";
+// Failover: the URLs of the team's other web nodes, and which of the nodes answers now.
+import { hasSession, replaceSessions } from "./session.js";
 
 const VERSION = 1;
 const PATIENCE = 800;
 const LEAD = 150;
-const KEPT = "swarm.pages";
+const STORAGE_KEY = "swarm.pages";
 const isLoopback = (url) => /^https?:\/\/(127\.|localhost[:/]|localhost$|\[::1\])/.test(url);
 const isSecure = (url) => url.startsWith("https:");
-let pages = kept();
+let pages = readPages();
 
 // The stored list serves a page that was opened from the cache while its node is gone.
-function kept() {
+function readPages() {
   try {
-    return JSON.parse(localStorage.getItem(KEPT)) ?? [];
+    return JSON.parse(localStorage.getItem(STORAGE_KEY)) ?? [];
   } catch {
     return [];
   }
 }
 
 // `passes` are the tokens for the other nodes, by uuid; the node issues them only for gateways of the team.
-export function remember(told, passes, here) {
-  pages = told;
-  const more = told.filter((page) => passes[page.node]).map((page) => [page.url, passes[page.node]]);
-  sort([here, location.origin, ...told.map(({ url }) => url)], Object.fromEntries(more));
+export function storePages(listed, passes, here) {
+  pages = listed;
+  const more = listed.filter((page) => passes[page.node]).map((page) => [page.url, passes[page.node]]);
+  replaceSessions([here, location.origin, ...listed.map(({ url }) => url)], Object.fromEntries(more));
   try {
-    localStorage.setItem(KEPT, JSON.stringify(told));
+    localStorage.setItem(STORAGE_KEY, JSON.stringify(listed));
   } catch {
     // Without storage the list is lost with the page.
   }
@@ -32,27 +32,27 @@ export function remember(told, passes, here) {
 
 // A node without a token is not asked.  A page over TLS does not switch to one without, and loopback URLs are used only
 // by a page of this machine.
-function reachable({ url }) {
-  if (!has(url)) return false;
+function isReachable({ url }) {
+  if (!hasSession(url)) return false;
   if (isSecure(location.origin) && !isSecure(url)) return false;
   return !isLoopback(url) || isLoopback(location.origin);
 }
 
 // A frozen node still accepts connections, so only a complete answer counts.
-async function present(url, node) {
+async function checkNode(url, node) {
   const answer = await fetch(`${url}/api/v1/node`, { cache: "no-store", signal: AbortSignal.timeout(PATIENCE) });
-  const told = await answer.json();
-  if (!answer.ok || told.api !== VERSION || (node && told.node !== node)) throw new Error(url);
+  const reply = await answer.json();
+  if (!answer.ok || reply.api !== VERSION || (node && reply.node !== node)) throw new Error(url);
   return url;
 }
 
 // Return the first node that answers; `first` is asked first, each other one a little later or when the one before fails.
-export async function race(first) {
+export async function raceNodes(first) {
   const known = new Map([[first, ""], [location.origin, ""]]);
-  for (const page of pages.filter(reachable)) if (!known.has(page.url)) known.set(page.url, page.node);
+  for (const page of pages.filter(isReachable)) if (!known.has(page.url)) known.set(page.url, page.node);
   const asked = [];
   for (const [url, node] of known) {
-    asked.push(present(url, node));
+    asked.push(checkNode(url, node));
     const won = await Promise.race([Promise.any(asked).catch(() => ""), new Promise((done) => setTimeout(done, LEAD, ""))]);
     if (won) return won;
   }

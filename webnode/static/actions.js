@@ -1,8 +1,0 @@
-// Panels for operators that are not part of the first view; each is loaded when it is needed.
-import { panel } from "./panel.js";
-
-const operator = { role: "operator" };
-
-panel({ place: "tasks", order: 10, title: "Who could take it", load: () => import("./preview.js") });
-panel({ place: "map", order: 10, title: "Robots", needs: { ...operator, has: "yard" }, load: () => import("./yard.js") });
-panel({ place: "device", order: 20, title: "Settings", load: () => import("./settings.js") });
