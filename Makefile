@@ -92,7 +92,7 @@ check: $(DEV)
 	$(PY) -m ruff format --check .
 	$(PY) -m ruff check .
 	$(PY) -m mypy
-	$(PY) -m twisted.trial --reporter=summary tests.test_house
+	$(PY) -m twisted.trial --reporter=summary tests.test_house tests.test_prose
 
 format: $(DEV)
 	$(PY) -m ruff check --fix --select I .

@@ -166,7 +166,7 @@ def is_within(module: str, package: str) -> bool:
 def write_table() -> str:
     """Return the table of the architecture page."""
     rows = [f"| `{name.replace('.', '/')}` | {each.job} | {_uses(name, each)} |\n" for name, each in LAYERS.items()]
-    return f"{BEGIN}\n| package | its job | may import, beside itself |\n|---|---|---|\n{''.join(rows)}\n{END}"
+    return f"{BEGIN}\n| package | its job | may import, in addition to itself |\n|---|---|---|\n{''.join(rows)}\n{END}"
 
 
 def _uses(package: str, layer: Layer) -> str:

@@ -23,7 +23,7 @@ def _group(methods: Mapping[str, frozenset[str]]) -> list[tuple[str, frozenset[s
     groups: dict[frozenset[str], list[str]] = {}
     for name, roles in methods.items():
         groups.setdefault(roles, []).append(f"`{name}`")
-    groups.setdefault(frozenset(OTHER_METHODS), []).append("methods that a program exposes beside these")
+    groups.setdefault(frozenset(OTHER_METHODS), []).append("methods that a program exposes in addition")
     return [(", ".join(names), roles) for roles, names in groups.items()]
 
 

@@ -35,7 +35,7 @@ READ_PAUSE_FACTOR = 4
 CHECK_S = 1.0
 """Interval in seconds at which the sessions of open streams are checked."""
 RENEWAL_LEAD_S = 3600.0
-"""Seconds before the end of a session at which the page is asked to renew it."""
+"""Seconds before the end of a session at which the page has to renew it."""
 IDLE_S = 1.0
 """Interval of reading the state without any stream, for the event log and to expire departed devices."""
 MAX_VIEWERS = 256
@@ -246,7 +246,7 @@ class EventStreams(JsonResource):
         self._read_duration_s = self._clock.seconds() - now
 
     def _make_backlog(self, viewer: Viewer, is_again: bool) -> str:
-        """Return the missed changes or the whole state, whichever is smaller, and the missed event log entries."""
+        """Return the missed changes or the whole state, if that is smaller, and the missed event log entries."""
         journal, text = self._journal, []
         missed = None if viewer.is_whole else journal.list_since(viewer.last_change)
         if (

@@ -1,18 +1,18 @@
-"""Codecs of the join request (KNOCK) and the join reply (WELCOME, HINT); thesis, Figure 4.5.
+"""Codecs of the join request (JOIN_REQUEST) and the join reply (JOIN_REPLY, HINT); thesis, Figure 4.5.
 
 ::
 
-    KNOCK    0x17 | id of the invitation 8 | nonce 24 | encrypted under the invitation's psk, padded to 1400 in all
-    WELCOME  0x18 | id 8 | encrypted to the newcomer's ephemeral key and the psk
-    HINT     0x18 | id 8 | the code of a refusal in ASCII, at most 16; unauthenticated
+    JOIN_REQUEST  0x17 | id of the invitation 8 | nonce 24 | encrypted under the invitation's psk, padded to 1400 in all
+    JOIN_REPLY    0x18 | id 8 | encrypted to the newcomer's ephemeral key and the psk
+    HINT          0x18 | id 8 | the code of a refusal in ASCII, at most 16; unauthenticated
 
 The psk is derived from the invitation's *public* key, which members know from the membership list and the holder of the
-code can derive.  A KNOCK that decrypts therefore comes from a member or from a holder of the code, and strangers cannot
-read it.  The psk does not authenticate the replying node.  Three parts of a WELCOME do, because other members cannot
-forge them: the encrypted ``terms`` of the invitation, from which only the newcomer learns the operator's key; the
-replying node's grant by that operator with the role bootstrap; and that node's signature over the content and both keys
-of the newcomer.  A WELCOME is never longer than its KNOCK.  The modules ``newcomer`` and ``reception`` implement the
-two sides.
+code can derive.  A JOIN_REQUEST that decrypts therefore comes from a member or from a holder of the code, and strangers
+cannot read it.  The psk does not authenticate the replying node.  Three parts of a JOIN_REPLY do, because other members
+cannot forge them: the encrypted ``terms`` of the invitation, from which only the newcomer learns the operator's key;
+the replying node's grant by that operator with the role bootstrap; and that node's signature over the content and both
+keys of the newcomer.  A JOIN_REPLY is never longer than its JOIN_REQUEST.  The modules ``join_client`` and ``server``
+implement the two sides.
 """
 
 from __future__ import annotations
@@ -98,7 +98,7 @@ def derive_psk(invitation: bytes) -> bytes:
 def make_request(
     invitation: Identity, public: bytes, ephemeral: bytes, requested_name: str, rng: random.Random
 ) -> bytes:
-    """Return the KNOCK of the newcomer ``public`` that asks for the name ``requested_name`` (empty: any)."""
+    """Return the JOIN_REQUEST of the newcomer ``public`` that asks for the name ``requested_name`` (empty: any)."""
     signature = sign_join(invitation, public, requested_name)
     body = msgpack.packb([public, ephemeral, requested_name, signature]).ljust(_BODY_BYTES, b"\0")
     head, nonce = bytes([JOIN_REQUEST]) + invitation_id(invitation.public), rng.randbytes(_NONCE_BYTES)
@@ -107,7 +107,7 @@ def make_request(
 
 
 def read_invitation_id(datagram: bytes) -> bytes:
-    """Return the invitation id in a KNOCK or WELCOME; raises ``Malformed``."""
+    """Return the invitation id in a JOIN_REQUEST or JOIN_REPLY; raises ``Malformed``."""
     is_request = datagram[:1] == bytes([JOIN_REQUEST])
     if len(datagram) < _HEAD_BYTES or (is_request and len(datagram) != JOIN_REQUEST_BYTES):
         raise Malformed(f"the join datagram has a wrong length, {len(datagram)} bytes")
@@ -115,7 +115,7 @@ def read_invitation_id(datagram: bytes) -> bytes:
 
 
 def open_request(datagram: bytes, invitation: bytes) -> JoinRequest:
-    """Decrypt a KNOCK under the invitation with that public key; raises ``Forged`` or ``Malformed``.
+    """Decrypt a JOIN_REQUEST under the invitation with that public key; raises ``Forged`` or ``Malformed``.
 
     The caller verifies the proof.
     """
@@ -142,7 +142,7 @@ def open_request(datagram: bytes, invitation: bytes) -> JoinRequest:
 
 
 def make_reply(invitation: bytes, request: JoinRequest, reply: JoinReply, signer: Signer, rng: random.Random) -> bytes:
-    """Return the WELCOME for a newcomer, with as many contacts as fit.
+    """Return the JOIN_REPLY for a newcomer, with as many contacts as fit.
 
     Raises ``Forged`` if the newcomer's ephemeral key is not valid.
     """
@@ -156,7 +156,7 @@ def make_reply(invitation: bytes, request: JoinRequest, reply: JoinReply, signer
 
 
 def make_refusal(invitation: bytes, request: JoinRequest, code: str, signer: Signer, rng: random.Random) -> bytes:
-    """Return the WELCOME that rejects a newcomer with a code of ``errors.REFUSAL_TEXTS``."""
+    """Return the JOIN_REPLY that rejects a newcomer with a code of ``errors.REFUSAL_TEXTS``."""
     body = _sign_body(invitation, request, msgpack.packb([code]), signer)
     return _encrypt_reply(invitation, request.ephemeral, body, rng)
 
@@ -167,7 +167,7 @@ def make_unsigned_refusal(name: bytes, code: str = "") -> bytes:
 
 
 def open_reply(datagram: bytes, code: JoinCode, public: bytes, ephemeral: bytes) -> VerifiedReply | UnsignedRefusal:
-    """Parse and verify the reply to the KNOCK of ``public``; ``ephemeral`` is the secret half of its ephemeral key.
+    """Parse and verify the reply to the request of ``public``; ``ephemeral`` is the secret half of its ephemeral key.
 
     Raises ``Forged`` or ``Malformed``.
     """

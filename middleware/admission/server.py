@@ -76,7 +76,7 @@ class AdmissionServer:
         self._unsigned_refusal_rate = TokenBucket(MAX_UNSIGNED_REFUSALS_PER_S)
 
     def on_request(self, datagram: bytes, source: Address) -> None:
-        """Handle a KNOCK; never raises because of its content."""
+        """Handle a JOIN_REQUEST; never raises because of its content."""
         digest = hashlib.blake2s(datagram, digest_size=16).digest()
         answer = self._cached_replies.get(digest)
         if answer is not None:

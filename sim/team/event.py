@@ -298,7 +298,7 @@ class LivingMembers(Event):
 
 @dataclass(frozen=True, slots=True)
 class AnswerRepeated(Event):
-    """A member was asked again for the tuple that it accepted for ``taker``, and answered this (None: invalid)."""
+    """A member had another request for the tuple that it accepted for ``taker``, and answered this (None: invalid)."""
 
     fields: Hashable
     taker: bytes

@@ -61,7 +61,7 @@ class Run:
 
     ``looked`` is called after each slice, at times that follow from the seed, and may stop the run.  ``watched`` is
     called more often on a slow machine, according to the real time ``seconds``, and may stop the run as well.
-    ``grown`` is called when all nodes exist: from then on most of the memory has their lifetime.
+    ``grown`` is called when all nodes exist: after that most of the memory has their lifetime.
     """
 
     _log = Logger()

@@ -132,7 +132,7 @@ class FloodTests(FloodCase):
         self.assertEqual(len(self.successResultOf(asked)), 8)
 
     def test_knocks(self) -> None:
-        """KNOCKs without an invitation cost one table lookup; few are answered, and few lines are logged."""
+        """Join requests without an invitation cost one table lookup; few are answered, and few lines are logged."""
         dice = random.Random(3)
         received = self.flood(
             lambda number: bytes([join_codec.JOIN_REQUEST]) + dice.randbytes(join_codec.JOIN_REQUEST_BYTES - 1)
@@ -144,7 +144,7 @@ class FloodTests(FloodCase):
         self.assertLessEqual(len(self.lines), 20 + SECONDS)
 
     def test_knocks_of_who_knows_the_id(self) -> None:
-        """KNOCKs that name a real invitation but cannot be decrypted are dropped without a signature check."""
+        """Join requests that name a real invitation but cannot be decrypted are dropped without a signature check."""
         code = self.team.invite("dog")
         [invite] = self.team.houses[0].team.membership_list.list_invitations()
         self.assertTrue(code)
@@ -155,7 +155,7 @@ class FloodTests(FloodCase):
         self.assertEqual(self.answers(), [])
 
     def test_knocks_of_who_has_the_code(self) -> None:
-        """KNOCKs with a real code, each with another key, cause only a limited rate of signature checks."""
+        """Join requests with a real code, each with another key, cause only a limited rate of signature checks."""
         code, packed, terms = self.team.signer.invite("pig", ("device",), 1, self.team.wall(), 900.0, random.Random(5))
         self.team.tell(terms)
         self.team.tell(packed)
@@ -173,7 +173,7 @@ class FloodTests(FloodCase):
         self.assertNotEqual(draw_code(self.team.signer.public, dice).text, code.text)
 
     def test_hails(self) -> None:
-        """Twenty HAILs per second are answered, each with the size of the request."""
+        """Twenty PROBE datagrams per second are answered, each with the size of the request."""
         self.flood(lambda number: pack_probe(number.to_bytes(16, "little")))
         answers = self.answers()
         self.assertLessEqual(len(answers), REPLIES_PER_S * (SECONDS + 1))

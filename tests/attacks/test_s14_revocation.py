@@ -122,7 +122,7 @@ class UnlistedTests(SiegeCase):
         self.assertIsInstance(error, NotAdmitted)
 
     def test_any_key_can_be_revoked(self) -> None:
-        """An unlisted key can be revoked, and its certificate is refused from then on."""
+        """An unlisted key can be revoked, and its certificate is refused after that."""
         team = self.village()
         paper = team.paper("ghost", "viewer")
         public = paper.identity.public

@@ -49,7 +49,7 @@ class JoinTests(SiegeCase):
         self.terms = terms
 
     def check_true_team(self, answer: Answer) -> None:
-        """Let the hostile member ``answer`` each KNOCK before a bootstrap node; the real team must be joined."""
+        """Let the hostile member ``answer`` each JOIN_REQUEST before a bootstrap node; the real team must be joined."""
         network = self.team.switchboard.make_network(*DOOR)
         answered: list[JoinRequest] = []
 
@@ -79,12 +79,12 @@ class JoinTests(SiegeCase):
         return Signer(identity, grant, terms or self.terms)
 
     def give(self, signer: Signer, shown: bytes) -> Answer:
-        """Answer each KNOCK with a certificate and secret that the operator did not issue."""
+        """Answer each JOIN_REQUEST with a certificate and secret that the operator did not issue."""
         given = JoinReply(shown, ((9, b"x" * 32, 0),))
         return lambda datagram, heard: join_codec.make_reply(self.invitation, heard, given, signer, self.rng)
 
     def forge(self, heard: JoinRequest, operator: Operator, terms: bytes) -> bytes:
-        """Return a complete WELCOME of another operator, with its invitation, bootstrap node and certificate."""
+        """Return a complete JOIN_REPLY of another operator, with its invitation, bootstrap node and certificate."""
         boot, now = Identity(b"b" * 32), int(self.team.wall())
         grant = operator.grant(boot.public, "boot", ("bootstrap",), now)
         invite = Invite(self.invitation, "dog", ("device",), 1, now, now + 3600, 3600)

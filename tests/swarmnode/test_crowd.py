@@ -27,7 +27,7 @@ class CrowdTeamTests(SynchronousTestCase):
     def test_search_among_others(self) -> None:
         """The thesis' experiment in a crowd: the agents agree on the nearest, which reaches the target.
 
-        The desk has no robot, each agent has one, and each node has its own address.
+        The control has no robot, each agent has one, and each node has its own address.
         """
         team = self.made(3)
         self.assertEqual(list(team.services), [TASK_NODE, *team.simulator.names])

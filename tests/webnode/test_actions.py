@@ -127,7 +127,7 @@ class ActionTests(SynchronousTestCase):
         self.assertEqual(self.event_log.list_since(0), [])
 
     def test_disconnecting_is_a_fault_on_purpose(self) -> None:
-        """A device that is disconnected is a fault in the event log, so the takeover is timed from then on."""
+        """A device that is disconnected is a fault in the event log, so the takeover is timed from that moment."""
         self.ask("POST", "devices/01/disconnect", {"seconds": 5})
         (entry,) = self.event_log.list_since(0)
         self.assertEqual((entry.kind, entry.uuid, entry.at), ("fault", "01", 1e9))

@@ -1,7 +1,7 @@
 """Sync state of a replica: whether its replies count in a majority, and which replies it needs before they do.
 
-A replica in state NOVICE has never caught up with others.  In state ELDER it once did, and holds all records that it
-acknowledged since.  In state SURE (*synced*) it has caught up and been in contact with a majority since.
+A replica in state NEVER_SYNCED has never caught up with others.  In state STALE it once did, and holds all records that
+it acknowledged since.  In state CURRENT it has caught up and been in contact with a majority since.
 """
 
 from __future__ import annotations

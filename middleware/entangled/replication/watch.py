@@ -86,7 +86,7 @@ class View:
 class Watch:
     """One subscription to one key; ``records`` are the records known now.
 
-    ``requested`` are the node ids of the replicas that were asked to push; pushes of other nodes are ignored.
+    ``requested`` are the node ids of the replicas that have the request to push; pushes of other nodes are ignored.
     ``has_copies`` says whether the records are also kept in the node's own store.  ``push_numbers`` maps replicas to
     the number of their last push; ``due_at`` is the time of the next renewal in a large network.  ``on_stop`` is called
     at the end.

@@ -201,7 +201,7 @@ class Endpoint:
     def evict(self, public: bytes, code: str = REVOKED) -> None:
         """Close the sessions with a peer: send it ``code``, and fail the requests to it with ``NotAdmitted``.
 
-        The admission check must reject the peer from then on.
+        The admission check must reject the peer after that.
         """
         peer = self._peers.get(public)
         if peer is not None and peer.session is not None:

@@ -27,7 +27,7 @@ VERSION = 1
 TOKEN_BYTES = 16
 FINGERPRINT_BYTES = 8
 REPLIES_PER_S = 20.0
-"""ECHOs per second: enough for the diagnostics of a whole team, and 8 kbit/s at most."""
+"""PROBE_REPLY datagrams per second: enough for the diagnostics of a whole team, and 8 kbit/s at most."""
 _HEADER_BYTES = 1 + TOKEN_BYTES
 PROBE_BYTES = _HEADER_BYTES + 1 + FINGERPRINT_BYTES + 8 + ADDRESS_BYTES
 
@@ -72,7 +72,7 @@ def parse_reply(datagram: bytes) -> ProbeReply:
 
 
 class ProbeResponder:
-    """Answers up to ``REPLIES_PER_S`` HAILs per second; ``send`` sends a datagram, ``wall`` returns Unix seconds."""
+    """Answers up to ``REPLIES_PER_S`` probes per second; ``send`` sends a datagram, ``wall`` returns Unix seconds."""
 
     def __init__(
         self, send: Callable[[bytes, Address], None], clock: IReactorTime, fingerprint: Callable[[], bytes]
@@ -154,7 +154,7 @@ class ProbeSender(Generic[T]):
 
 
 class Prober(ProbeSender[ProbeReply]):
-    """Sends HAILs to addresses; ``send`` sends a datagram."""
+    """Sends PROBE datagrams to addresses; ``send`` sends a datagram."""
 
     def __init__(self, send: Callable[[bytes, Address], None], clock: IReactorTime, rng: random.Random) -> None:
         super().__init__(send, clock)

@@ -120,5 +120,5 @@ CURVES = (
         bound=Bound(0.01),
         min_nodes=LARGE_NODES,
     ),
-    Curve("directory.seconds.p50", "... seconds until somebody has listed all devices", "s"),
+    Curve("directory.seconds.p50", "... seconds until a node has listed all devices", "s"),
 )

@@ -84,7 +84,7 @@ class VoteRecorder:
         self.votes[place][ballot].add(member)
 
     def record_members(self, nodes: Iterable[EntangledNode]) -> None:
-        """Record the living members and their incarnations; a request would make them take their seats."""
+        """Record the living members and their incarnations; a request would start their acceptors."""
         members = [
             (node.identity.public, node.take_acceptor._incarnation or node.store.get_note(INCARNATION) or b"")
             for node in nodes

@@ -27,7 +27,7 @@ DOG = identity("dog").public
 SECRET = bytes(range(32))
 EPHEMERAL = bindings.crypto_scalarmult_base(SECRET)
 CONTACTS = tuple(Contact(identity(str(n)).public, Address("2001:db8::" + "1234:" * 3 + str(n), 7000)) for n in range(8))
-WELCOME = JoinReply(b"p" * MAX_CERTIFICATE_BYTES, ((2, b"s" * 32, 9), (1, b"t" * 32, 0)), CONTACTS)
+JOIN_REPLY = JoinReply(b"p" * MAX_CERTIFICATE_BYTES, ((2, b"s" * 32, 9), (1, b"t" * 32, 0)), CONTACTS)
 CONTENT = TermsContent(OPERATOR.public, "yard", {"lan": True})
 HEARD = join_codec.JoinRequest(DOG, EPHEMERAL, "dog", b"")
 
@@ -38,8 +38,8 @@ def signer(name: str = "vaio", role: str = "bootstrap", code: JoinCode = CODE) -
 
 
 def welcomed(by: Signer | None = None) -> bytes:
-    """Return a join reply (WELCOME), valid unless ``by`` is another node."""
-    return join_codec.make_reply(INVITE.public, HEARD, WELCOME, by or signer(), random.Random(2))
+    """Return a join reply (JOIN_REPLY), valid unless ``by`` is another node."""
+    return join_codec.make_reply(INVITE.public, HEARD, JOIN_REPLY, by or signer(), random.Random(2))
 
 
 def read(datagram: bytes, code: JoinCode = CODE, secret: bytes = SECRET) -> VerifiedReply | UnsignedRefusal:
@@ -61,7 +61,7 @@ class JoinCodecTests(SynchronousTestCase):
         self.assertFalse(is_join_signature(INVITE.public, DOG, "cat", found.proof))
 
     def test_knock_hides_who_comes(self) -> None:
-        """A join request (KNOCK) reveals neither key nor name, and always has the maximum size of a datagram."""
+        """A join request (JOIN_REQUEST) reveals neither key nor name, and always has the maximum size of a datagram."""
         said = knocked()
         self.assertNotIn(DOG, said)
         self.assertEqual({len(knocked(name)) for name in ("", "dog", "n" * 40)}, {1400})
@@ -73,7 +73,7 @@ class JoinCodecTests(SynchronousTestCase):
         found = read(said)
         assert isinstance(found, VerifiedReply) and isinstance(found.content, JoinReply)
         self.assertEqual(
-            (found.content.certificate, found.content.secrets), (b"p" * MAX_CERTIFICATE_BYTES, WELCOME.secrets)
+            (found.content.certificate, found.content.secrets), (b"p" * MAX_CERTIFICATE_BYTES, JOIN_REPLY.secrets)
         )
         self.assertEqual(found.terms, CONTENT)
         self.assertEqual(found.content.contacts, CONTACTS[: len(found.content.contacts)])

@@ -52,7 +52,7 @@ class AdmissionServerTests(SynchronousTestCase):
         )
 
     def knocked(self, dice: int = 1, name: str = "dog", secret: bytes = SECRET) -> bytes:
-        """Return a valid join request (KNOCK); another seed gives other bytes."""
+        """Return a valid join request (JOIN_REQUEST); another seed gives other bytes."""
         shared = bindings.crypto_scalarmult_base(secret)
         return join_codec.make_request(CODE.key, identity(name).public, shared, "", random.Random(dice))
 

@@ -71,10 +71,10 @@ def made() -> dict[str, str]:
         "renewed pass by a code": renew_certificate(boot, anchor, came_in, by_code, NOW + 9),
         "admission": pack_admission(dog.public, chain),
         "digest of the admission": compute_digest(pack_admission(dog.public, chain)),
-        "KNOCK": join_codec.make_request(code.key, dog.public, shared, "rex", dice),
+        "JOIN_REQUEST": join_codec.make_request(code.key, dog.public, shared, "rex", dice),
         "terms": sign_statement(operator, Terms(code.key.public, sealed, NOW, NOW + 100)),
-        "WELCOME": join_codec.make_reply(code.key.public, heard, given, signer, dice),
-        "WELCOME that refuses": join_codec.make_refusal(code.key.public, heard, "used", signer, dice),
+        "JOIN_REPLY": join_codec.make_reply(code.key.public, heard, given, signer, dice),
+        "JOIN_REPLY that refuses": join_codec.make_refusal(code.key.public, heard, "used", signer, dice),
     }
     return {"code": code.text, **{name: whole.hex() for name, whole in found.items()}}
 

@@ -88,7 +88,7 @@ class ExplanationTests(SynchronousTestCase):
         self.assertEqual(len(ruling.agree), 1)
 
     def test_nothing_decided(self) -> None:
-        """No decision record gives an empty explanation, and an epoch without a winner names "nobody"."""
+        """No decision record gives an empty explanation, and an epoch without a winner names ``nobody``."""
         self.assertEqual(format_explanation(explain_decisions([])), "")
         (ruling,) = explain_decisions([decided(1, [member(1, None)])]).epochs
         self.assertEqual((ruling.winner, ruling.chosen), ("", "nobody"))

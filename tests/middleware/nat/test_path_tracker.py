@@ -45,7 +45,7 @@ class PathTests(SitesCase):
     """The path between each pair of router types."""
 
     def test_punchable_pairs_are_direct(self) -> None:
-        """13 of the 15 pairs of router types are punched within a second and use direct paths from then on."""
+        """13 of the 15 pairs of router types are punched within a second and use direct paths after that."""
         for one in KINDS:
             for other in KINDS:
                 if frozenset({one, other}) not in UNPUNCHABLE:

@@ -1,4 +1,4 @@
-"""Tests of the acceptors of tuple takes, of stored postings, and of the completion of takes."""
+"""Tests of the acceptors of tuple takes, of stored tuples, and of the completion of takes."""
 
 from __future__ import annotations
 

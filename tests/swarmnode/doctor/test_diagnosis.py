@@ -34,7 +34,7 @@ WELL = Facts(
     is_gateway_resolved=True,
 )
 CALLED = LanDiscovery((), is_sent=True, has_received_own=True)
-"""A call to the LAN that nobody answered."""
+"""A call to the LAN without an answer."""
 DAY = 86400.0
 OFF = Probe(Address("192.168.1.33", 8484), is_near=True, is_resolved=False)
 STRANGER = Probe(FAR, Answer(FAR, fingerprint=b"b" * 8, offset=0.0))
