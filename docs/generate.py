@@ -1,6 +1,8 @@
-"""Write the reference pages that the code knows: the command line, the settings file and the Python API.
+"""Write the reference pages that the code knows, and the columns of tables in other reference pages.
 
-``docs/conf.py`` calls ``generate`` at each build; the pages are not kept in the repository.
+``docs/conf.py`` calls ``generate`` at each build.  The pages of the command line, the settings file and the Python API
+are not kept in the repository.  In the pages of ``TABLES`` it updates the first columns of the table between ``BEGIN``
+and ``END``; other columns and the text are kept.
 """
 
 from __future__ import annotations
@@ -12,7 +14,7 @@ import os
 import re
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import redirect_stdout, suppress
-from dataclasses import fields, is_dataclass
+from dataclasses import MISSING, Field, fields, is_dataclass
 from pathlib import Path
 from typing import Any
 
@@ -26,7 +28,13 @@ API = {
     "Errors": ("middleware.errors", "middleware.entangled.errors", "drivers.errors"),
 }
 """The modules that a program may import, by purpose."""
+BEGIN, END = "<!-- rows: docs/generate.py -->", "<!-- end of the rows -->"
+TEAM_VERBS = ("devices", "team roll", "team tell")
+"""The verbs of ``swarmnode.team.verb``."""
+UNPACKED_TYPES = {"Capabilities": "table of tables", "Mapping[str, float | str]": "table of numbers and texts"}
+TYPE_WORDS = {"str": "text", "int": "integer", "float": "number", "bool": "boolean", "tuple[Contact, ...]": "contacts"}
 Main = Callable[[Sequence[str]], Any]
+Rows = dict[str, tuple[str, ...]]
 
 
 def generate() -> None:
@@ -35,6 +43,11 @@ def generate() -> None:
     pages = {"command-line": write_command_line, "settings": write_settings, "python-api": write_api}
     for name, write in pages.items():
         (REFERENCE / f"{name}.md").write_text(write(), encoding="utf-8")
+    for name, list_rows in TABLES.items():
+        page = REFERENCE / f"{name}.md"
+        text = page.read_text(encoding="utf-8")
+        if (updated := update_rows(text, list_rows())) != text:
+            page.write_text(updated, encoding="utf-8")
 
 
 def write_command_line() -> str:
@@ -115,3 +128,64 @@ def write_api() -> str:
         for module in modules:
             parts.append(f"### `{module}`\n\n```{{eval-rst}}\n.. automodule:: {module}\n   :members:\n```\n")
     return "\n".join(parts)
+
+
+def list_task_fields() -> Rows:
+    """Return type and default of each field of a task."""
+    from middleware.tasks.task import Task
+
+    words = {**TYPE_WORDS, **UNPACKED_TYPES}
+    return {each.name: (words.get(str(each.type), str(each.type)), _format_default(each)) for each in fields(Task)}
+
+
+def _format_default(each: Field[Any]) -> str:
+    """Return the default of a field as a cell of a table."""
+    if each.default is MISSING:
+        return "required" if each.default_factory is MISSING else "empty"
+    return f"`{each.default!r}`" if each.default not in ("", b"", ()) else "empty"
+
+
+def list_strategies() -> Rows:
+    """Return for each built-in strategy whether it divides several tasks, and the fields of a report that it reads."""
+    from middleware.consensus.strategy import BUILT_IN, find_read_fields, load_strategy
+
+    loaded = {name: load_strategy(name) for name in BUILT_IN}
+    return {
+        name: (
+            "several" if hasattr(strategy, "find_group") else "one",
+            ", ".join(("cost", *find_read_fields(strategy))),
+        )
+        for name, strategy in loaded.items()
+    }
+
+
+def list_verbs() -> Rows:
+    """Return the verbs of the control socket, and whether each sends events."""
+    from middleware.entangled.control.request_handler import RequestHandler
+
+    node: Any = None
+    known = (*RequestHandler(node, node, node, node)._find_handlers(), *TEAM_VERBS)
+    return {name: ("events" if name.endswith(" watch") else "answer",) for name in known}
+
+
+def update_rows(text: str, rows: Rows) -> str:
+    """Return a page with the first columns of its table set to ``rows``; the other columns of each row are kept.
+
+    A new row gets empty cells, and a row without an entry is removed.
+    """
+    before, begin, rest = text.partition(BEGIN)
+    table, end, after = rest.partition(END)
+    head, line, *old = table.strip().splitlines()
+    columns = head.count(" | ") + 1
+    split = ([cell.strip() for cell in row.strip("|").split("|")] for row in old)
+    kept = {cells[0].strip("`"): cells for cells in split}
+    new = []
+    for name, cells in rows.items():
+        known = kept.get(name, [])[1 + len(cells) :]
+        blank = [""] * (columns - 1 - len(cells) - len(known))
+        new.append(f"| {' | '.join([f'`{name}`', *cells, *known, *blank])} |")
+    return "\n".join((before + begin, "", head, line, *new, "", end + after))
+
+
+TABLES = {"tasks": list_task_fields, "strategies": list_strategies, "control-socket": list_verbs}
+"""The rows of the tables in pages that are kept in the repository."""
