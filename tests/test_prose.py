@@ -100,6 +100,7 @@ class ProseTest(SynchronousTestCase):
     """The texts of the tree, and the check itself."""
 
     def test_rules_find_phrases(self) -> None:
+        """Docstrings, comments and text are searched; code, code blocks and names in backticks are not."""
         rules = RULES | read_terms(GLOSSARY.read_text())
         examples = {
             "a.py": '"""Return the lease.\n\nWhoever holds it asks anew."""\nx = 1  # the lessee\n',
@@ -123,6 +124,7 @@ class ProseTest(SynchronousTestCase):
         )
 
     def test_tree_breaks_no_rule(self) -> None:
+        """No file under version control has a phrase that a rule replaces."""
         rules = RULES | read_terms(GLOSSARY.read_text())
         listed = subprocess.run(["git", "ls-files", "-z"], cwd=ROOT, capture_output=True, text=True, check=True)
         names = [name for name in listed.stdout.split("\0") if Path(name).suffix in READERS and (ROOT / name).exists()]
@@ -133,5 +135,6 @@ class ProseTest(SynchronousTestCase):
         )
 
     def test_exceptions_are_needed(self) -> None:
+        """Each exception names an existing file."""
         unused = [name for name, _ in EXCEPTIONS if not (ROOT / name).exists()]
         self.assertEqual(unused, [])
