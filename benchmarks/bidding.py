@@ -31,7 +31,7 @@ from middleware.consensus.bidding.path_choice import PathChoice
 from middleware.consensus.strategy import Report, load_strategy
 from middleware.entangled.contact import Contact
 from middleware.entangled.kademlia.distance import select_closest
-from middleware.entangled.kademlia.routing import RoutingTable
+from middleware.entangled.kademlia.routing_table import RoutingTable
 from middleware.entangled.network.network import Address
 
 BITS = 160

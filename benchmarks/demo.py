@@ -26,7 +26,7 @@ from urllib.parse import urlsplit
 
 from benchmarks.measure import read_cpu_s, read_maps_mib, read_udp_counter
 from middleware.admission import operator as operators
-from middleware.admission.membership import MembershipFile, create_membership_file
+from middleware.admission.membership_file import MembershipFile, create_membership_file
 
 START_LIMIT_S = 60.0
 TASK_LIMIT_S = 120.0

@@ -25,7 +25,7 @@ from pathlib import Path
 from typing import Any
 
 from benchmarks.measure import ChildProcess, percentile
-from middleware.admission import join_codec, membership
+from middleware.admission import join_codec, membership_file
 from middleware.admission.operator import create_operator
 from middleware.entangled.identity import Identity
 from middleware.entangled.wire import discovery, probe, session
@@ -138,7 +138,7 @@ def _measure(seconds: float, rate: int) -> dict[str, Any]:
     with tempfile.TemporaryDirectory(prefix="flood") as folder:
         paths = [Path(folder) / name for name in ("target", "friend")]
         for path, paper in zip(paths, (first, second), strict=True):
-            membership.create_membership_file(path, paper)
+            membership_file.create_membership_file(path, paper)
         keys = [Identity(paper.seed).public.hex() for paper in (first, second)]
         try:
             children.append(ChildProcess("benchmarks.flood_node", str(paths[0]), "", keys[1]))

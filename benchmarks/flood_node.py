@@ -23,7 +23,7 @@ from twisted.internet.protocol import Protocol  # noqa: E402
 from twisted.internet.stdio import StandardIO  # noqa: E402
 
 from benchmarks.measure import read_memory_bytes  # noqa: E402
-from middleware.admission.membership import MembershipFile  # noqa: E402
+from middleware.admission.membership_file import MembershipFile  # noqa: E402
 from middleware.admission.team import Team  # noqa: E402
 from middleware.entangled.contact import Contact  # noqa: E402
 from middleware.entangled.data.memory import MemoryStore  # noqa: E402

@@ -14,7 +14,7 @@ from middleware.entangled.network.multicast import Multicast
 from middleware.entangled.network.network import Network
 
 if TYPE_CHECKING:
-    from middleware.admission.membership import MembershipStore
+    from middleware.admission.membership_file import MembershipStore
     from middleware.deployment.module_channel import Channel
     from middleware.faults.injector import Process
 

@@ -33,7 +33,7 @@ def make_dependencies(settings: Settings, reactor: Any) -> Dependencies:
     """Return the dependencies of a node on this machine."""
     membership = None
     if settings.node.membership:
-        from middleware.admission.membership import MembershipFile
+        from middleware.admission.membership_file import MembershipFile
 
         membership = MembershipFile(Path(settings.node.membership))
     path = settings.node.store

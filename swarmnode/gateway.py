@@ -170,7 +170,7 @@ class Gateway:
         dependencies = self._make_dependencies()
         dependencies.store.set_note("identity", seed)
         if self._node.team is not None:
-            from middleware.admission.membership import MemoryMembership
+            from middleware.admission.membership_file import MemoryMembership
 
             dependencies = replace(dependencies, membership=MemoryMembership(self._node.team.create_guest(seed, name)))
         settings = _make_settings(self._settings, self._node, name, can)

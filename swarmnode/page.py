@@ -26,10 +26,10 @@ from swarmnode.gateway import make_gateway
 from swarmnode.page_access import announce_page, find_terminal
 from webnode.audit import AuditLog
 from webnode.diagnostics import Diagnostics
-from webnode.fallback import TeamFallbacks
+from webnode.failover import TeamFallbacks
 from webnode.faults import FaultControl
-from webnode.guard import LOCAL_SUFFIXES
 from webnode.invite import Invites
+from webnode.request_guard import LOCAL_SUFFIXES
 from webnode.server import WebService
 from webnode.services import Phones, Services
 from webnode.session import make_sessions

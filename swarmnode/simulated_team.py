@@ -14,7 +14,7 @@ from twisted.internet.defer import Deferred
 from agents.catalogue import DEMO_TASK, TASKS
 from drivers.link import MemoryConnector
 from drivers.sim.client import SimulatorClient
-from middleware.admission.membership import MemoryMembership
+from middleware.admission.membership_file import MemoryMembership
 from middleware.admission.operator import FIRST_NODE_ROLES, create_operator
 from middleware.admission.statement import SECRET_BYTES
 from middleware.config.settings import Settings

@@ -27,7 +27,7 @@ def add_tunnels(
     urls = settings.tunnel_urls
     if not (urls or settings.tunnel_port):
         return udp
-    from middleware.entangled.network.joint import JointNetwork
+    from middleware.entangled.network.combined_network import JointNetwork
     from middleware.entangled.network.tcp import TcpTransport
     from middleware.entangled.network.tunnel import TunnelNetwork
 

@@ -18,7 +18,15 @@ from werkzeug.exceptions import HTTPException
 
 from webnode.dispatch import Dispatch
 from webnode.errors import Refusal
-from webnode.guard import HEADERS, MAX_BODY, IsAllowedOrigin, choose_token, find_refusal, is_own_origin, make_headers
+from webnode.request_guard import (
+    HEADERS,
+    MAX_BODY,
+    IsAllowedOrigin,
+    choose_token,
+    find_refusal,
+    is_own_origin,
+    make_headers,
+)
 from webnode.route import API, Content, Route, RouteRequest, check_request, check_role
 from webnode.routes.registry import TABLE
 from webnode.services import Services

@@ -18,8 +18,8 @@ from twisted.web.server import Site
 
 from webnode.auth import User
 from webnode.errors import Refusal
-from webnode.guard import HEADERS, MAX_BODY
 from webnode.limits import AddressLimits, CountedKind
+from webnode.request_guard import HEADERS, MAX_BODY
 
 HEADERS_LIMIT_S = 10.0
 """Deadline for a request's headers, after its first byte or after the connection was made."""

@@ -10,7 +10,7 @@ from urllib.parse import urlsplit
 from twisted.internet.defer import Deferred
 from twisted.internet.threads import deferToThreadPool
 
-from webnode.fallback import is_loopback
+from webnode.failover import is_loopback
 
 MARGIN = 4
 """Width of the quiet zone around a QR code, in modules."""

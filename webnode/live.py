@@ -22,11 +22,11 @@ from zope.interface import implementer
 
 from webnode.camera import CameraStream, OnFrame
 from webnode.errors import Refusal
-from webnode.guard import choose_token
-from webnode.journal import Journal, encode_json
+from webnode.request_guard import choose_token
 from webnode.resource import JsonResource, read_argument, write_refusal
 from webnode.services import Services
 from webnode.state import State
+from webnode.state_journal import Journal, encode_json
 
 BEAT_S = 0.2
 CHANGES_INTERVAL_S = 0.1

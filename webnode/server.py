@@ -33,9 +33,9 @@ from webnode.app import OnReactor, create_app
 from webnode.auth import Role
 from webnode.channel import LimitedRequest, limit_connections
 from webnode.errors import PortTaken, Refusal
-from webnode.fallback import make_urls
-from webnode.guard import find_refusal, make_headers
+from webnode.failover import make_urls
 from webnode.live import CameraImages, EventStreams, read_token
+from webnode.request_guard import find_refusal, make_headers
 from webnode.resource import JsonResource, RefusedResource
 from webnode.route import check_role
 from webnode.routes.registry import TABLE

@@ -12,7 +12,7 @@ from webnode.audit import AuditLog
 from webnode.auth import Sessions
 from webnode.diagnostics import Diagnostics
 from webnode.event_log import EventLog
-from webnode.fallback import Fallbacks
+from webnode.failover import Fallbacks
 from webnode.faults import FaultControl
 from webnode.invite import Invites
 from webnode.limits import AddressLimits

@@ -18,7 +18,7 @@ from middleware.errors import BadSetting
 from middleware.node import SwarmNode
 from webnode.auth import OpenSessions, Role, Sessions, Token, User
 from webnode.errors import Refusal
-from webnode.fallback import TeamFallbacks, is_loopback
+from webnode.failover import TeamFallbacks, is_loopback
 from webnode.password import draw_code, parse_hash, verify_password
 from webnode.revocation import Revocations, TeamRevocations
 from webnode.sign_in_delay import MAX_SOURCES, SignInDelays, get_network

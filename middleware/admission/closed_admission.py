@@ -19,7 +19,7 @@ from middleware.admission.certificate import (
     verify_certificate,
     wrap_grant,
 )
-from middleware.admission.membership import Membership
+from middleware.admission.membership_file import Membership
 from middleware.admission.membership_list import MembershipList
 from middleware.entangled.data.store import Store
 from middleware.entangled.errors import Full, RemoteError

@@ -14,10 +14,10 @@ from twisted.internet.interfaces import IDelayedCall, IReactorTime
 
 from middleware.admission import join_codec
 from middleware.admission.certificate import verify_certificate
-from middleware.admission.code import JoinCode, TermsContent
 from middleware.admission.errors import NotWelcome
+from middleware.admission.join_code import JoinCode, TermsContent
 from middleware.admission.join_codec import JoinReply, UnsignedRefusal
-from middleware.admission.membership import Membership
+from middleware.admission.membership_file import Membership
 from middleware.entangled.errors import NoAnswer, RemoteError
 from middleware.entangled.identity import Identity
 from middleware.entangled.network.network import Address, Network

@@ -28,8 +28,8 @@ from nacl.exceptions import CryptoError
 
 from middleware.admission import sealed_box
 from middleware.admission.certificate import BOOTSTRAP, MAX_CERTIFICATE_BYTES, sign_join
-from middleware.admission.code import JoinCode, TermsContent, open_terms
 from middleware.admission.errors import REFUSAL_TEXTS
+from middleware.admission.join_code import JoinCode, TermsContent, open_terms
 from middleware.admission.membership_list import INVITATION_ID_BYTES, invitation_id
 from middleware.admission.statement import SECRET_BYTES, Grant, check_bytes, check_name, check_number, open_statement
 from middleware.entangled.contact import Contact, parse_contact

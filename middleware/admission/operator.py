@@ -11,11 +11,11 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from middleware.admission import code, keyfile
+from middleware.admission import keyfile
 from middleware.admission.certificate import wrap_grant
-from middleware.admission.code import TermsContent, seal_terms
 from middleware.admission.errors import BadKeyFile
-from middleware.admission.membership import Membership
+from middleware.admission.join_code import JoinCode, TermsContent, draw_code, seal_terms
+from middleware.admission.membership_file import Membership
 from middleware.admission.statement import (
     DEFAULT_LIFE_S,
     MAX_KEPT,
@@ -44,7 +44,7 @@ FIRST_NODE_ROLES = ("device", "operator", "gateway", "bootstrap")
 class Invitation(NamedTuple):
     """A code and the two statements that activate it; publish ``terms`` before ``invite``."""
 
-    code: code.JoinCode
+    code: JoinCode
     invite: bytes
     terms: bytes
 
@@ -88,7 +88,7 @@ class Operator:
 
         Raises ``ValueError`` for values that an invitation cannot have.
         """
-        join_code = code.draw_code(self.public, rng)
+        join_code = draw_code(self.public, rng)
         end = int(now + expires)
         invite = Invite(join_code.key.public, name, tuple(roles), uses, int(now), end, int(life))
         sealed_terms = seal_terms(join_code, TermsContent(self.public, self.team, self.settings), rng)

@@ -131,7 +131,7 @@ class Invite(Entry):
 
 @dataclass(frozen=True)
 class Terms(Entry):
-    """The encrypted terms of the invitation ``public`` (``middleware.admission.code``), until ``not_after``."""
+    """The encrypted terms of the invitation ``public`` (``middleware.admission.join_code``), until ``not_after``."""
 
     kind = "terms"
     public: bytes

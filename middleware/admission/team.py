@@ -17,7 +17,7 @@ from middleware.admission.closed_admission import ClosedAdmission, start_incarna
 from middleware.admission.errors import REFUSAL_TEXTS, BadKeyFile
 from middleware.admission.gossip import COMPARE_INTERVAL_S, Gossip
 from middleware.admission.join_codec import JoinReply
-from middleware.admission.membership import Membership, MembershipStore
+from middleware.admission.membership_file import Membership, MembershipStore
 from middleware.admission.membership_list import MAX_ENTRIES, Admission, MembershipList, Renewal, invitation_id
 from middleware.admission.renewal import Renewer
 from middleware.admission.server import AdmissionServer

@@ -8,7 +8,7 @@ from twisted.internet.defer import Deferred, fail, succeed
 from twisted.internet.interfaces import IReactorTime
 
 from middleware.entangled.data.memory import MemoryStore
-from middleware.entangled.data.writer import COMMIT_AFTER_S, RETRY_INTERVAL_S
+from middleware.entangled.data.writer_thread import COMMIT_AFTER_S, RETRY_INTERVAL_S
 from middleware.entangled.errors import Unwritable
 from middleware.entangled.record import Record, Slot
 

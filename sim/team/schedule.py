@@ -15,7 +15,7 @@ from middleware.entangled.node import EntangledNode
 from sim.team.checker import find_violations
 from sim.team.event import Settled
 from sim.team.faults.timeline import TimedFault, Timeline
-from sim.team.reduction import NO_REDUCTION, Reduction
+from sim.team.shrinking import NO_REDUCTION, Reduction
 from sim.team.simulation import EntangledTeam
 from sim.team.workload import Workload
 

@@ -22,7 +22,7 @@ from twisted.internet.interfaces import IDelayedCall
 from middleware.entangled.clock import HeapClock
 from middleware.entangled.data.sqlite import SqliteStore
 from middleware.entangled.data.store import Store
-from middleware.entangled.data.writer import COMMIT_AFTER_S, RETRY_INTERVAL_S, Writer, _Batch
+from middleware.entangled.data.writer_thread import COMMIT_AFTER_S, RETRY_INTERVAL_S, Writer, _Batch
 from middleware.entangled.network.switchboard import PERFECT, LinkConditions
 from middleware.entangled.record import Record, Slot
 from sim.team.simulation import EntangledTeam

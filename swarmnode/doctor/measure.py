@@ -110,7 +110,7 @@ def load_team(settings: Settings) -> Team:
     if not path:
         return Team([settings.node.team_secret])
     # Imported on demand: only needed for closed teams.
-    from middleware.admission.membership import MembershipFile
+    from middleware.admission.membership_file import MembershipFile
 
     try:
         kept = MembershipFile(Path(path)).membership

@@ -9,9 +9,9 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-from middleware.admission import membership as memberships
+from middleware.admission import membership_file as memberships
 from middleware.admission import operator as operators
-from middleware.admission.membership import Membership
+from middleware.admission.membership_file import Membership
 from middleware.admission.operator import FIRST_NODE_ROLES, Operator
 from middleware.admission.statement import ROLES
 from middleware.config.settings import COMMAND_LINE, NODE_PORT, Settings

@@ -15,13 +15,13 @@ from typing import Any
 
 from twisted.internet.defer import Deferred
 
-from middleware.admission import code as codes
+from middleware.admission import join_code as codes
 from middleware.admission import keyfile
-from middleware.admission import membership as memberships
-from middleware.admission.code import JoinCode
+from middleware.admission import membership_file as memberships
 from middleware.admission.errors import BadCode, BadKeyFile
 from middleware.admission.join_client import JOIN_TIMEOUT_S, JoinClient
-from middleware.admission.membership import Membership
+from middleware.admission.join_code import JoinCode
+from middleware.admission.membership_file import Membership
 from middleware.admission.statement import NAME_PATTERN, check_bytes
 from middleware.config.settings import COMMAND_LINE, NodeSettings, Settings
 from middleware.entangled.errors import EntangledError, RemoteError

@@ -11,7 +11,7 @@ from twisted.trial.unittest import SynchronousTestCase
 
 from middleware.entangled.clock import HeapClock
 from middleware.entangled.identity import Identity
-from middleware.entangled.wire.flow import IDLE_TIMEOUT_S
+from middleware.entangled.wire.fragment_sender import IDLE_TIMEOUT_S
 from middleware.entangled.wire.fragmenter import MAX_IN_BYTES, MAX_IN_PER_PEER_BYTES, Fragmenter
 from middleware.entangled.wire.message import FRAGMENT_BYTES, MAX_FRAGMENTS, MAX_MESSAGE_BYTES, PART, MessageKey
 from tests.attacks.siege import OneSession

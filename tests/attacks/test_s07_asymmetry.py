@@ -9,7 +9,7 @@ from typing import Any
 from twisted.logger import LogLevel
 
 from middleware.admission import certificate, join_codec, server
-from middleware.admission.code import draw_code
+from middleware.admission.join_code import draw_code
 from middleware.admission.membership_list import invitation_id
 from middleware.entangled.identity import Identity, derive_exchange_key
 from middleware.entangled.network.network import Address

@@ -10,7 +10,7 @@ from twisted.trial.unittest import SynchronousTestCase
 from middleware.entangled.contact import Contact
 from middleware.entangled.errors import NotAdmitted
 from middleware.entangled.identity import Identity, derive_node_id
-from middleware.entangled.kademlia.routing import RoutingTable
+from middleware.entangled.kademlia.routing_table import RoutingTable
 from middleware.entangled.network.network import Address
 from middleware.entangled.record import hash_key
 from tests.attacks.siege import SOURCE, SiegeCase

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
-from middleware.admission.membership import Membership
+from middleware.admission.membership_file import Membership
 from middleware.entangled.record import hash_key
 from tests.attacks.siege import SOURCE, SiegeCase
 from tests.middleware.admission.village import House, Village, network_of

@@ -11,9 +11,9 @@ from typing import Any
 
 from twisted.logger import formatEvent
 
-from middleware.admission import keyfile, membership, operator
+from middleware.admission import keyfile, membership_file, operator
 from middleware.admission.errors import BadKeyFile
-from middleware.admission.membership import Membership, MembershipFile
+from middleware.admission.membership_file import Membership, MembershipFile
 from middleware.admission.operator import Operator
 from middleware.entangled.data.sqlite import SqliteStore
 from middleware.entangled.identity import Identity
@@ -31,14 +31,14 @@ class FileTests(SiegeCase):
         self.signer: Operator = drawn(1)
         self.paper: Membership = self.signer.create_membership("vaio", ("device",), NOW, random.Random(1))
         self.files = {self.folder / "membership": MembershipFile, self.folder / "operator": operator.load_operator}
-        membership.create_membership_file(self.folder / "membership", self.paper)
+        membership_file.create_membership_file(self.folder / "membership", self.paper)
         operator.create_operator_file(self.folder / "operator", self.signer)
 
     def test_made_for_the_owner_alone(self) -> None:
         """New and replaced key files, and the files of the store, have the mode 0600 under any umask."""
         before = os.umask(0)
         self.addCleanup(os.umask, before)
-        membership.create_membership_file(self.folder / "other", self.paper)
+        membership_file.create_membership_file(self.folder / "other", self.paper)
         found = MembershipFile(self.folder / "other")
         found.save(self.paper.with_secret(2, bytes(32), 0))
         store = SqliteStore.open(self.folder / "store.db", 0.0)

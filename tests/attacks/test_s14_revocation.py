@@ -6,7 +6,7 @@ import random
 
 from middleware.admission.certificate import issue_certificate, issue_guest_certificate, sign_join
 from middleware.admission.closed_admission import MAX_GUESTS_PER_GATEWAY
-from middleware.admission.code import JoinCode, parse_code
+from middleware.admission.join_code import JoinCode, parse_code
 from middleware.admission.membership_list import (
     MAX_ENTRIES,
     RESERVED_ENTRIES,

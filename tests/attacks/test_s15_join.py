@@ -15,10 +15,10 @@ from twisted.trial.unittest import SynchronousTestCase
 
 from middleware.admission import join_codec
 from middleware.admission.certificate import issue_certificate, sign_join
-from middleware.admission.code import JoinCode, TermsContent, compute_fingerprint, parse_code, seal_terms
 from middleware.admission.join_client import JoinClient
+from middleware.admission.join_code import JoinCode, TermsContent, compute_fingerprint, parse_code, seal_terms
 from middleware.admission.join_codec import JoinReply, JoinRequest, Signer
-from middleware.admission.membership import Membership
+from middleware.admission.membership_file import Membership
 from middleware.admission.operator import Operator
 from middleware.admission.statement import Invite, Terms, open_statement, sign_statement
 from middleware.entangled.errors import Forged

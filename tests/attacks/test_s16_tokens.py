@@ -16,7 +16,7 @@ from twisted.internet.defer import Deferred
 from twisted.logger import capturedLogs, formatEvent
 from twisted.trial.unittest import SynchronousTestCase
 
-from middleware.admission.membership import MemoryMembership
+from middleware.admission.membership_file import MemoryMembership
 from middleware.admission.operator import FIRST_NODE_ROLES
 from middleware.config.settings import Settings
 from swarmnode import page_access
@@ -25,7 +25,7 @@ from tests.webnode.memory import MemoryTeamControl
 from webnode.app import create_app
 from webnode.auth import OpenSessions, Token, User
 from webnode.errors import Refusal
-from webnode.fallback import TeamFallbacks
+from webnode.failover import TeamFallbacks
 from webnode.services import Services
 from webnode.session import SignedSessions, make_sessions
 from webnode.state import format_state

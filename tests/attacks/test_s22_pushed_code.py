@@ -8,7 +8,7 @@ from dataclasses import replace
 from twisted.internet.defer import Deferred
 from twisted.trial.unittest import SynchronousTestCase
 
-from middleware.admission.membership import MemoryMembership
+from middleware.admission.membership_file import MemoryMembership
 from middleware.deployment.module_store import MemoryModuleStore
 from middleware.entangled.control.socket_path import prepare_path
 from middleware.node import SwarmNode

@@ -15,8 +15,8 @@ from middleware.admission.certificate import (
     verify_certificate,
     wrap_grant,
 )
-from middleware.admission.code import JoinCode, parse_code
-from middleware.admission.membership import Membership
+from middleware.admission.join_code import JoinCode, parse_code
+from middleware.admission.membership_file import Membership
 from middleware.admission.membership_list import invitation_id, pack_admission
 from middleware.admission.statement import DEFAULT_LIFE_S
 from middleware.entangled.identity import Identity

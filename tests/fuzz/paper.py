@@ -15,7 +15,7 @@ from twisted.internet.defer import Deferred, succeed
 
 from middleware.admission import join_codec
 from middleware.admission.certificate import verify_certificate, wrap_grant
-from middleware.admission.code import TermsContent, seal_terms
+from middleware.admission.join_code import TermsContent, seal_terms
 from middleware.admission.join_codec import JoinReply, JoinRequest, Signer, VerifiedReply, open_reply, open_request
 from middleware.admission.membership_list import MembershipList, pack_admission
 from middleware.admission.server import AdmissionServer

@@ -13,7 +13,7 @@ from pathlib import Path
 
 from middleware.errors import BadSetting
 from sim.team import seed_log
-from sim.team.reduction import Reduction
+from sim.team.shrinking import Reduction
 from tests.invariants.bug import BUGS, FINDERS
 from tests.invariants.run import ALONE, WORKLOADS, Least, Outcome, hunt_all, least, line, run_all
 

@@ -26,7 +26,7 @@ from middleware.entangled.contact import Contact
 from middleware.entangled.data import schema
 from middleware.entangled.data.memory import MemoryStore
 from middleware.entangled.data.sqlite import SqliteStore
-from middleware.entangled.data.writer import Writer
+from middleware.entangled.data.writer_thread import Writer
 from middleware.entangled.errors import EntangledError
 from middleware.entangled.kademlia import overlay
 from middleware.entangled.kademlia.member_table import MemberTable
@@ -34,7 +34,7 @@ from middleware.entangled.kademlia.overlay import Overlay, Voters
 from middleware.entangled.quorum import acceptor as acceptor_
 from middleware.entangled.quorum import round as round_
 from middleware.entangled.quorum.acceptor import TABLE, Acceptor, BallotRelation, Event, State
-from middleware.entangled.quorum.log import RegisterLog
+from middleware.entangled.quorum.acceptor_log import RegisterLog
 from middleware.entangled.quorum.proposer import Result, conclude
 from middleware.entangled.quorum.register import Register, Reply, ReplyKind
 from middleware.entangled.quorum.round import Round, Tally

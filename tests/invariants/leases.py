@@ -20,7 +20,7 @@ from sim.team.event import CommandExpected
 from sim.team.faults.timeline import TimedFault, Timeline
 from sim.team.leases.radio_link import DEFAULT_QUALITY, LinkQuality
 from sim.team.leases.team import LeaseTeam
-from sim.team.reduction import NO_REDUCTION, Reduction
+from sim.team.shrinking import NO_REDUCTION, Reduction
 
 TTL = 1.5
 SLACK = 0.8

@@ -8,8 +8,8 @@ from dataclasses import dataclass, replace
 from functools import partial
 from typing import Protocol
 
-from sim.team.reduction import NO_REDUCTION, Reduction, reduce_run
 from sim.team.schedule import Schedule
+from sim.team.shrinking import NO_REDUCTION, Reduction, reduce_run
 from sim.team.simulation import EntangledTeam
 from sim.team.sqlite_files import SqliteTeam
 from sim.team.sweep import run_seeds

@@ -24,7 +24,7 @@ from middleware.tasks.task import CANCELLED, Member, Result, Task
 from sim.team.checker import find_violations
 from sim.team.event import ActiveTasks, Born, Decided, Died, FaultFree, OpenTask, OutcomeExpired, OutcomeStored, Report
 from sim.team.history import History
-from sim.team.reduction import NO_REDUCTION, Reduction
+from sim.team.shrinking import NO_REDUCTION, Reduction
 from tests.invariants.ether import OPERATOR, Ether, LeaseClientStub, NetworkConditions, Node
 from tests.invariants.walk import Robot, restarted
 

@@ -39,7 +39,7 @@ from webnode.audit import AuditLog
 from webnode.auth import Token, User
 from webnode.camera import OnFrame
 from webnode.event_log import EventLog
-from webnode.fallback import Fallbacks, Page
+from webnode.failover import Fallbacks, Page
 from webnode.invite import Invites
 from webnode.limits import AddressLimits
 from webnode.password import hash_password, verify_password

@@ -15,7 +15,7 @@ from twisted.internet.defer import Deferred, inlineCallbacks
 from twisted.internet.task import deferLater
 from twisted.trial.unittest import SkipTest, TestCase
 
-from middleware.admission.membership import Membership, MemoryMembership
+from middleware.admission.membership_file import Membership, MemoryMembership
 from middleware.admission.operator import create_operator
 from middleware.admission.team import Team
 from middleware.entangled.data.memory import MemoryStore

@@ -15,7 +15,7 @@ from typing import Any, get_args
 from tests.live.keys import key_of
 from tests.live.page import TeamCase
 from webnode.auth import Role
-from webnode.guard import HEADERS
+from webnode.request_guard import HEADERS
 from webnode.route import ALLOWED_ROLES, Route
 from webnode.routes.phones import PHONE_PREFIX
 from webnode.routes.registry import TABLE

@@ -9,9 +9,9 @@ from twisted.trial.unittest import SynchronousTestCase
 
 from middleware.entangled.contact import Contact, parse_contact
 from middleware.entangled.identity import Identity
-from middleware.entangled.network.joint import JointNetwork
+from middleware.entangled.network.combined_network import JointNetwork
+from middleware.entangled.network.memory_streams import PipeNetwork
 from middleware.entangled.network.network import Address, relayed_address
-from middleware.entangled.network.pipes import PipeNetwork
 from middleware.entangled.network.tunnel import TunnelNetwork
 from middleware.entangled.network.url import Url
 from middleware.entangled.node import EntangledNode

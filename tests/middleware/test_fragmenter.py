@@ -9,7 +9,7 @@ from middleware.entangled.contact import Contact
 from middleware.entangled.errors import Crowded, NoAnswer, Refused, TooLarge
 from middleware.entangled.network.switchboard import LinkConditions
 from middleware.entangled.wire import fragmenter
-from middleware.entangled.wire.flow import IDLE_TIMEOUT_S
+from middleware.entangled.wire.fragment_sender import IDLE_TIMEOUT_S
 from middleware.entangled.wire.fragmenter import MAX_OUT_PER_PEER_BYTES, IncomingMessage
 from middleware.entangled.wire.message import (
     FRAGMENT_BYTES,

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from twisted.trial.unittest import SynchronousTestCase
 
-from sim.team.reduction import Reduction
 from sim.team.schedule import Schedule
+from sim.team.shrinking import Reduction
 from sim.team.sqlite_files import SqliteTeam
 from tests.invariants.bug import FINDERS, seeded
 from tests.invariants.leases import Leases

@@ -12,7 +12,7 @@ from middleware.entangled.contact import Contact
 from middleware.entangled.identity import ID_BYTES
 from middleware.entangled.kademlia.distance import bucket_index, distance, select_closest
 from middleware.entangled.kademlia.lookup import Lookup
-from middleware.entangled.kademlia.routing import RoutingTable
+from middleware.entangled.kademlia.routing_table import RoutingTable
 from middleware.entangled.network.network import Address
 
 TARGET = b"\x55" * 20

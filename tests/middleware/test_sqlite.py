@@ -16,7 +16,7 @@ from twisted.logger import ILogObserver, LogEvent, globalLogPublisher
 from twisted.trial.unittest import SynchronousTestCase
 from zope.interface import implementer
 
-from middleware.entangled.data import writer
+from middleware.entangled.data import writer_thread
 from middleware.entangled.data.schema import MAX_CORRUPT_ROWS, SCHEMA_VERSION
 from middleware.entangled.data.sqlite import SqliteStore, read_records
 from middleware.entangled.data.store import MAX_BYTES, Durability, Store, count_bytes
@@ -218,7 +218,7 @@ class ReopenTest(SynchronousTestCase):
 class FullDiskTest(SynchronousTestCase):
     def setUp(self) -> None:
         # Only a flush commits, which prevents a commit between two changes.
-        self.patch(writer, "COMMIT_AFTER_S", 60.0)
+        self.patch(writer_thread, "COMMIT_AFTER_S", 60.0)
         self.store = SqliteStore.open(self.mktemp(), 0.0)
         self.addCleanup(self.store.close)
         self.store.put(record("a"), FOREVER)

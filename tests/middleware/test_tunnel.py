@@ -11,10 +11,10 @@ from twisted.trial.unittest import SynchronousTestCase
 
 from middleware.entangled.clock import HeapClock
 from middleware.entangled.errors import PortInUse
-from middleware.entangled.network.joint import JointNetwork
+from middleware.entangled.network.combined_network import JointNetwork
 from middleware.entangled.network.layer import ProxyLayer, TlsLayer, make_client_context, make_server_context
+from middleware.entangled.network.memory_streams import PipeNetwork
 from middleware.entangled.network.network import Address
-from middleware.entangled.network.pipes import PipeNetwork
 from middleware.entangled.network.selfsigned import make_certificate
 from middleware.entangled.network.switchboard import Switchboard
 from middleware.entangled.network.tunnel import (

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import random
 
+from middleware.entangled.network.memory_streams import Pipe
 from middleware.entangled.network.network import Address
-from middleware.entangled.network.pipes import Pipe
 from middleware.entangled.network.tunnel import MAX_PER_HOST, MAX_TOTAL_CONNECTIONS, TunnelNetwork
 from middleware.entangled.network.tunnel_connections import (
     COPIES,

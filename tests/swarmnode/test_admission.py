@@ -16,9 +16,9 @@ from typing import Any
 from twisted.trial.unittest import SynchronousTestCase
 
 from middleware.admission import operator as operators
-from middleware.admission.code import JoinCode
 from middleware.admission.join_client import JoinClient
-from middleware.admission.membership import Membership, MembershipFile, MemoryMembership
+from middleware.admission.join_code import JoinCode
+from middleware.admission.membership_file import Membership, MembershipFile, MemoryMembership
 from middleware.config.settings import Settings
 from middleware.entangled.errors import EntangledError, NoAnswer
 from middleware.entangled.network.network import Address

@@ -10,7 +10,7 @@ from twisted.trial.unittest import SynchronousTestCase
 
 from middleware.config.settings import Settings
 from middleware.entangled.clock import HeapClock
-from middleware.entangled.network.joint import JointNetwork
+from middleware.entangled.network.combined_network import JointNetwork
 from middleware.entangled.network.network import Network, find_alternate_paths
 from middleware.entangled.network.switchboard import Switchboard
 from middleware.entangled.network.url import Proxy, Url

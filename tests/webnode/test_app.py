@@ -14,8 +14,8 @@ from twisted.trial.unittest import SynchronousTestCase
 from tests.webnode.memory import MemoryTeamControl
 from webnode.app import create_app
 from webnode.auth import OpenSessions
-from webnode.fallback import Fallbacks, Page
-from webnode.guard import HEADERS
+from webnode.failover import Fallbacks, Page
+from webnode.request_guard import HEADERS
 from webnode.server import read_static
 from webnode.services import Services
 from webnode.state import DepartedDevices, State, format_state

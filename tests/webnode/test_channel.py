@@ -13,8 +13,8 @@ from twisted.web.server import NOT_DONE_YET
 
 from tests.webnode.browser import Connection, site_of
 from webnode.channel import CLOSE_LIMIT_S, GRACE_S, HEADERS_LIMIT_S, KEEP_ALIVE_S, PACE, STALL_LIMIT_S, Channel
-from webnode.guard import HEADERS, MAX_BODY
 from webnode.limits import AddressLimits
+from webnode.request_guard import HEADERS, MAX_BODY
 
 HEAD = b"POST / HTTP/1.1\r\nHost: vaio\r\nContent-Length: %d\r\n\r\n"
 

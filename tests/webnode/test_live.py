@@ -17,11 +17,11 @@ from webnode.auth import OpenSessions, User
 from webnode.camera import OnFrame
 from webnode.errors import Refusal
 from webnode.event_log import EventLog
-from webnode.fallback import Page
-from webnode.journal import MAX_CHANGES
+from webnode.failover import Page
 from webnode.live import MAX_VIEWERS, MAX_WAITING, RENEWAL_LEAD_S, CameraImages, EventStreams
 from webnode.services import Services
 from webnode.state import State
+from webnode.state_journal import MAX_CHANGES
 
 MORE = "x" * 999
 """What makes a state longer than a few changes."""

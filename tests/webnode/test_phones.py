@@ -20,9 +20,9 @@ from tests.webnode.picture import jpeg
 from webnode.app import create_app
 from webnode.audit import AuditLog
 from webnode.auth import OpenSessions
-from webnode.fallback import Fallbacks, Page
-from webnode.guard import MAX_BODY
+from webnode.failover import Fallbacks, Page
 from webnode.limits import AddressLimits
+from webnode.request_guard import MAX_BODY
 from webnode.routes.phones import ROUTES, VALUE_RANGES
 from webnode.server import Root
 from webnode.services import Services

@@ -19,8 +19,8 @@ from tests.webnode.guests import Guests
 from tests.webnode.memory import MemoryTeamControl
 from webnode.auth import OpenSessions
 from webnode.errors import Refusal
-from webnode.fallback import Fallbacks, Page
-from webnode.guard import MAX_BODY
+from webnode.failover import Fallbacks, Page
+from webnode.request_guard import MAX_BODY
 from webnode.resource import JsonResource
 from webnode.server import Root, StaticFiles, make_caller, read_static
 from webnode.services import Services

@@ -12,7 +12,7 @@ from middleware.entangled.identity import Identity
 from tests.webnode.memory import MemoryInvites, MemoryTeamControl
 from webnode.app import create_app
 from webnode.audit import AuditLog
-from webnode.fallback import Fallbacks, Page
+from webnode.failover import Fallbacks, Page
 from webnode.password import hash_password, verify_password
 from webnode.services import Services
 from webnode.session import SignedSessions

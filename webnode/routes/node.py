@@ -6,7 +6,7 @@ from collections.abc import Iterable
 from dataclasses import asdict
 from pathlib import Path
 
-from webnode.fallback import Page
+from webnode.failover import Page
 from webnode.route import API, DEVICE, Content, Field, Route, RouteRequest
 from webnode.sanitize import Json
 

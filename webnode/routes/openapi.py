@@ -11,7 +11,7 @@ from typing import Any
 
 import msgspec
 
-from webnode.guard import MAX_BODY
+from webnode.request_guard import MAX_BODY
 from webnode.route import API, REQUIRED, Field, Route, RouteRequest, make_type_hint
 
 VERSION = "1"

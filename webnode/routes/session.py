@@ -10,7 +10,7 @@ from twisted.internet.defer import Deferred, gatherResults
 
 from webnode.auth import Token
 from webnode.errors import Refusal
-from webnode.fallback import is_loopback
+from webnode.failover import is_loopback
 from webnode.invite import Invites
 from webnode.route import API, Content, Field, Route, RouteRequest
 from webnode.sanitize import Json

@@ -5,8 +5,8 @@ from __future__ import annotations
 from middleware.consensus.lease.lease_codec import CODEC, EARLY_PROMISE_SHARE
 from middleware.entangled.data.store import Store
 from middleware.entangled.quorum.acceptor import Acceptor, AcceptorSettings
+from middleware.entangled.quorum.acceptor_log import RegisterLog
 from middleware.entangled.quorum.ballot import FIRST_CONFIGURATION, Ballot
-from middleware.entangled.quorum.log import RegisterLog
 from middleware.entangled.quorum.register import Register, Reply, ReplyKind
 
 MAX_LISTENERS = 16

@@ -10,8 +10,8 @@ import zlib
 import msgpack
 
 from middleware.entangled.contact import Contact, parse_contact
+from middleware.entangled.quorum.acceptor_log import Codec, Floor
 from middleware.entangled.quorum.ballot import NO_BALLOT, Ballot, Ceiling, is_number
-from middleware.entangled.quorum.log import Codec, Floor
 from middleware.entangled.quorum.register import Register, Reply, ReplyKind
 
 MAX_COUNCIL = 7

@@ -27,7 +27,7 @@ from middleware.entangled.data.schema import (
     use_bytes,
 )
 from middleware.entangled.data.store import MAX_BYTES, MAX_ROWS, TOMBSTONE_HOLD_S, Durability, Origin, Store
-from middleware.entangled.data.writer import CallInThread, Writer
+from middleware.entangled.data.writer_thread import CallInThread, Writer
 from middleware.entangled.errors import BadStore, NotRunning
 from middleware.entangled.record import Record, Slot
 

@@ -23,7 +23,7 @@ from middleware.entangled.errors import EntangledError, NoAnswer, Refused
 from middleware.entangled.kademlia.distance import select_closest
 from middleware.entangled.kademlia.lookup import Lookup
 from middleware.entangled.kademlia.member_table import MAX_MEMBERS, MemberTable
-from middleware.entangled.kademlia.routing import STALE_AFTER, RoutingTable
+from middleware.entangled.kademlia.routing_table import STALE_AFTER, RoutingTable
 from middleware.entangled.listeners import Listeners
 from middleware.entangled.wire.congestion import RoundTrip
 from middleware.entangled.wire.endpoint import Endpoint

@@ -13,8 +13,8 @@ from dataclasses import dataclass
 from enum import Enum
 from typing import Any, Generic, NamedTuple
 
+from middleware.entangled.quorum.acceptor_log import Key, RegisterLog
 from middleware.entangled.quorum.ballot import FIRST_CONFIGURATION, NO_BALLOT, Ballot, Ceiling, ProposerName
-from middleware.entangled.quorum.log import Key, RegisterLog
 from middleware.entangled.quorum.register import Register, Reply, ReplyKind
 
 NO_ROOM_REPLY = Reply(ReplyKind.QUIET, remaining=1.0)

@@ -22,7 +22,7 @@ from middleware.entangled.kademlia.overlay import Overlay
 from middleware.entangled.listeners import Listeners
 from middleware.entangled.record import KEY_BYTES, Record, SignatureCache, Slot, parse_record
 from middleware.entangled.replication.cache import PathCache
-from middleware.entangled.replication.certificates import Certificates
+from middleware.entangled.replication.owner_certificates import Certificates
 from middleware.entangled.replication.pusher import WATCH_TTL_S, Pusher
 from middleware.entangled.replication.store_reply import STORED, UNSYNCED, Outcome, StoreReply
 from middleware.entangled.replication.watch import digest_of

@@ -18,8 +18,8 @@ from middleware.entangled.contact import Contact
 from middleware.entangled.data.store import Store
 from middleware.entangled.errors import Refused
 from middleware.entangled.quorum.acceptor import Acceptor, AcceptorSettings, Event
+from middleware.entangled.quorum.acceptor_log import MAX_REGISTERS, RegisterLog
 from middleware.entangled.quorum.ballot import FIRST_CONFIGURATION, NO_BALLOT, Ballot
-from middleware.entangled.quorum.log import MAX_REGISTERS, RegisterLog
 from middleware.entangled.quorum.register import Register, Reply, ReplyKind
 from middleware.entangled.record import KEY_BYTES
 from middleware.entangled.space.take_codec import CODEC, MAX_LEASE_S, is_counter, pack_reply

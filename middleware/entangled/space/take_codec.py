@@ -8,8 +8,8 @@ from typing import Any
 import msgpack
 
 from middleware.entangled.quorum.acceptor import Event
+from middleware.entangled.quorum.acceptor_log import Codec, Floor
 from middleware.entangled.quorum.ballot import NO_BALLOT, Ballot, Ceiling
-from middleware.entangled.quorum.log import Codec, Floor
 from middleware.entangled.quorum.register import Register, Reply, ReplyKind
 from middleware.entangled.record import KEY_BYTES
 from middleware.entangled.space.tuple_record import TupleId, is_taker_name, parse_tuple_id

@@ -15,7 +15,7 @@ from twisted.internet.interfaces import IDelayedCall, IReactorTime
 from middleware.entangled.background import cancel
 from middleware.entangled.bounded import put_bounded
 from middleware.entangled.errors import Malformed
-from middleware.entangled.wire.flow import IDLE_TIMEOUT_S, Flow, FragmentedMessage
+from middleware.entangled.wire.fragment_sender import IDLE_TIMEOUT_S, Flow, FragmentedMessage
 from middleware.entangled.wire.message import (
     MAX_MESSAGE_BYTES,
     Fragment,

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
-from sim.team.reduction import Reduction
+from sim.team.shrinking import Reduction
 
 
 @dataclass(frozen=True)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import random
 
 from middleware.admission.certificate import issue_certificate, sign_join, wrap_grant
-from middleware.admission.code import JoinCode
+from middleware.admission.join_code import JoinCode
 from middleware.admission.membership_list import MembershipList
 from middleware.admission.operator import Operator, create_operator
 from middleware.admission.statement import Invite, open_statement

@@ -14,7 +14,7 @@ from twisted.trial.unittest import SynchronousTestCase
 
 from middleware.admission import join_codec
 from middleware.admission.certificate import MAX_CERTIFICATE_BYTES, is_join_signature
-from middleware.admission.code import JoinCode, TermsContent, seal_terms
+from middleware.admission.join_code import JoinCode, TermsContent, seal_terms
 from middleware.admission.join_codec import JoinReply, Signer, UnsignedRefusal, VerifiedReply
 from middleware.entangled.contact import Contact
 from middleware.entangled.errors import Forged, Malformed

@@ -18,7 +18,7 @@ from middleware.admission.certificate import (
     verify_certificate,
     wrap_grant,
 )
-from middleware.admission.code import JoinCode, TermsContent, seal_terms
+from middleware.admission.join_code import JoinCode, TermsContent, seal_terms
 from middleware.admission.membership_list import compute_digest, pack_admission
 from middleware.admission.statement import DEFAULT_LIFE_S, Grant, Invite, Revocation, Terms, seal_secret, sign_statement
 from middleware.entangled.contact import Contact

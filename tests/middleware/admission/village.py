@@ -9,9 +9,9 @@ from typing import Any, TypeVar
 from twisted.internet.defer import Deferred
 from twisted.trial.unittest import SynchronousTestCase
 
-from middleware.admission.code import JoinCode, parse_code
 from middleware.admission.join_client import JoinClient
-from middleware.admission.membership import Membership, MemoryMembership
+from middleware.admission.join_code import JoinCode, parse_code
+from middleware.admission.membership_file import Membership, MemoryMembership
 from middleware.admission.operator import Operator
 from middleware.admission.team import Team
 from middleware.entangled.contact import Contact

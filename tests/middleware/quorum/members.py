@@ -9,8 +9,8 @@ from middleware.consensus.lease import lease_codec
 from middleware.consensus.lease.lease_codec import EARLY_PROMISE_SHARE
 from middleware.entangled.data.memory import MemoryStore
 from middleware.entangled.quorum.acceptor import Acceptor, AcceptorSettings
+from middleware.entangled.quorum.acceptor_log import Codec, RegisterLog
 from middleware.entangled.quorum.ballot import FIRST_CONFIGURATION, Ballot
-from middleware.entangled.quorum.log import Codec, RegisterLog
 from middleware.entangled.quorum.register import Reply
 from middleware.entangled.space import take_acceptor, take_codec
 from middleware.entangled.space.tuple_record import TupleId

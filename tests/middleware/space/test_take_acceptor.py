@@ -19,7 +19,7 @@ from middleware.entangled.data.memory import MemoryStore
 from middleware.entangled.errors import NoAnswer, Refused
 from middleware.entangled.identity import Identity
 from middleware.entangled.network.network import Address
-from middleware.entangled.quorum import log as module
+from middleware.entangled.quorum import acceptor_log as module
 from middleware.entangled.quorum.acceptor import Event
 from middleware.entangled.quorum.ballot import Ballot
 from middleware.entangled.quorum.register import ReplyKind

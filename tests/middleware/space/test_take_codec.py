@@ -10,8 +10,8 @@ from hypothesis import strategies as st
 from twisted.trial.unittest import SynchronousTestCase
 
 from middleware.entangled.quorum.acceptor import Event
+from middleware.entangled.quorum.acceptor_log import Floor
 from middleware.entangled.quorum.ballot import NO_BALLOT, Ballot
-from middleware.entangled.quorum.log import Floor
 from middleware.entangled.quorum.register import Reply, ReplyKind
 from middleware.entangled.space.take_codec import CODEC, pack_reply, unpack_reply
 from middleware.entangled.space.tuple_record import TupleId

@@ -8,7 +8,7 @@ from collections.abc import Iterator
 
 from twisted.trial.unittest import SynchronousTestCase
 
-from sim.team.reduction import NO_REDUCTION, Reduction, minimize, reduce_run
+from sim.team.shrinking import NO_REDUCTION, Reduction, minimize, reduce_run
 
 
 class MinimizeTests(SynchronousTestCase):

@@ -9,7 +9,7 @@ from twisted.trial.unittest import SynchronousTestCase
 from middleware.consensus.lease.acceptor import IDLE_AGE_S, MAX_LISTENERS, LeaseAcceptor
 from middleware.consensus.lease.lease_codec import BALLOT_MODULUS, CODEC
 from middleware.entangled.data.memory import MemoryStore
-from middleware.entangled.quorum import log
+from middleware.entangled.quorum import acceptor_log
 from middleware.entangled.quorum.ballot import Ballot
 from middleware.entangled.quorum.register import Reply, ReplyKind
 from tests.middleware.consensus.lease.test_lease_codec import MEMBERS
@@ -151,7 +151,7 @@ class AcceptorTests(SynchronousTestCase):
 
     def test_no_room(self) -> None:
         """An acceptor that cannot store more tasks answers QUIET and grants nothing."""
-        self.patch(log, "MAX_REGISTERS", 1)
+        self.patch(acceptor_log, "MAX_REGISTERS", 1)
         self.prepare(1, "a", 0.0)
         for reply in (
             self.acceptor.prepare("u", 1, ballot(1, "a"), TTL, 0.0),
@@ -228,14 +228,14 @@ class AcceptorTests(SynchronousTestCase):
 
     def test_forgotten(self) -> None:
         """An evicted task leaves a lower bound for ballots and tokens, also after a restart."""
-        self.patch(log, "MAX_REGISTERS", 1)
+        self.patch(acceptor_log, "MAX_REGISTERS", 1)
         store = MemoryStore()
         self.acceptor = LeaseAcceptor(store, -math.inf)
         self.prepare(2, "b", 0.0)
         self.propose(2, "b", 5, 0.0)
         self.assertEqual(self.acceptor.prepare("u", 1, ballot(9, "a"), TTL, 0.9 * IDLE_AGE_S).kind, ReplyKind.QUIET)
         self.assertEqual(self.acceptor.prepare("u", 1, ballot(9, "a"), TTL, 1.1 * IDLE_AGE_S).kind, ReplyKind.GRANTED)
-        self.patch(log, "MAX_REGISTERS", 2)
+        self.patch(acceptor_log, "MAX_REGISTERS", 2)
         for acceptor in (self.acceptor, LeaseAcceptor(store, 1.2 * IDLE_AGE_S)):
             asked = acceptor.prepare("t", 1, ballot(2, "a"), TTL, 1.3 * IDLE_AGE_S)
             self.assertEqual((asked.kind, asked.token), (ReplyKind.OUTBID, 5))

@@ -19,8 +19,8 @@ from middleware.consensus.lease.lease_codec import (
 )
 from middleware.entangled.contact import Contact
 from middleware.entangled.network.network import Address
+from middleware.entangled.quorum.acceptor_log import Floor
 from middleware.entangled.quorum.ballot import Ballot
-from middleware.entangled.quorum.log import Floor
 from middleware.entangled.quorum.register import Reply, ReplyKind
 
 MEMBERS = tuple(Contact(bytes([n]) * 32, Address("10.0.0.1", 7000 + n)) for n in range(MAX_COUNCIL + 1))

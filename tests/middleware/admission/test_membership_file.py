@@ -8,10 +8,10 @@ from pathlib import Path
 
 from twisted.trial.unittest import SynchronousTestCase
 
-from middleware.admission import keyfile, membership
+from middleware.admission import keyfile, membership_file
 from middleware.admission import operator as operators
 from middleware.admission.errors import BadKeyFile
-from middleware.admission.membership import Membership, MembershipFile
+from middleware.admission.membership_file import Membership, MembershipFile
 from tests.middleware.admission.paper import NOW, operator
 
 
@@ -26,7 +26,7 @@ class MembershipTests(SynchronousTestCase):
 
     def test_read_as_it_was_kept(self) -> None:
         """A membership is unchanged after a write and a read, and its file is readable by its owner alone."""
-        membership.create_membership_file(self.path, self.membership)
+        membership_file.create_membership_file(self.path, self.membership)
         self.assertEqual(MembershipFile(self.path).membership, self.membership)
         self.assertEqual(self.path.stat().st_mode & 0o777, 0o600)
 
@@ -49,7 +49,7 @@ class MembershipTests(SynchronousTestCase):
 
     def test_replaced_whole(self) -> None:
         """A new secret replaces the file and leaves no temporary file; an unwritable folder is reported."""
-        membership.create_membership_file(self.path, self.membership)
+        membership_file.create_membership_file(self.path, self.membership)
         kept = MembershipFile(self.path)
         kept.save(self.membership.with_secret(2, b"2" * 32, NOW + 60))
         self.assertEqual(MembershipFile(self.path).membership, kept.membership)
@@ -58,7 +58,7 @@ class MembershipTests(SynchronousTestCase):
         nowhere = Path(self.mktemp()) / "folder" / "file"
         self.assertIn(
             "cannot be written",
-            str(self.assertRaises(BadKeyFile, membership.create_membership_file, nowhere, kept.membership)),
+            str(self.assertRaises(BadKeyFile, membership_file.create_membership_file, nowhere, kept.membership)),
         )
 
     def test_old_secrets_run_out(self) -> None:

@@ -8,32 +8,32 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from twisted.trial.unittest import SynchronousTestCase
 
-from middleware.admission import code
+from middleware.admission import join_code
 from middleware.admission.errors import BadCode
 from tests.middleware.admission.paper import operator
 
 
 class CodeTests(SynchronousTestCase):
     def setUp(self) -> None:
-        self.code = code.draw_code(operator().public, random.Random(1))
+        self.code = join_code.draw_code(operator().public, random.Random(1))
 
     def test_what_is_read_out_is_what_is_typed(self) -> None:
         """The text of a code has four groups of five characters, and decodes to the same code and key."""
         self.assertEqual([len(group) for group in self.code.text.split("-")], [5, 5, 5, 5])
-        again = code.parse_code(self.code.text)
+        again = join_code.parse_code(self.code.text)
         self.assertEqual((again, again.key.public), (self.code, self.code.key.public))
 
     def test_hands_are_forgiven(self) -> None:
         """Lower case, other groups and letters that look like digits are accepted."""
-        meant = code.JoinCode(0x1_0001, 0x10)
+        meant = join_code.JoinCode(0x1_0001, 0x10)
         self.assertEqual(
-            code.parse_code(meant.text.replace("0", "o").replace("1", "l").replace("-", " ").lower()), meant
+            join_code.parse_code(meant.text.replace("0", "o").replace("1", "l").replace("-", " ").lower()), meant
         )
 
     def test_every_slip_is_noticed(self) -> None:
         """Any single wrong character and any two swapped characters are reported as mistyped."""
         letters = self.code.text.replace("-", "")
-        slips = [letters[:at] + other + letters[at + 1 :] for at in range(20) for other in code.ALPHABET]
+        slips = [letters[:at] + other + letters[at + 1 :] for at in range(20) for other in join_code.ALPHABET]
         for first in range(20):
             for second in range(first):
                 swapped = list(letters)
@@ -41,12 +41,12 @@ class CodeTests(SynchronousTestCase):
                 slips.append("".join(swapped))
         for slip in slips:
             if slip != letters:
-                self.assertIn("mistyped", str(self.assertRaises(BadCode, code.parse_code, slip)))
+                self.assertIn("mistyped", str(self.assertRaises(BadCode, join_code.parse_code, slip)))
 
     def test_length_and_letters_are_named(self) -> None:
         """The error for a code of the wrong length or with an invalid letter names the length or the letter."""
-        self.assertIn("has 19", str(self.assertRaises(BadCode, code.parse_code, self.code.text[:-1])))
-        self.assertIn("'U'", str(self.assertRaises(BadCode, code.parse_code, "u" + self.code.text[1:])))
+        self.assertIn("has 19", str(self.assertRaises(BadCode, join_code.parse_code, self.code.text[:-1])))
+        self.assertIn("'U'", str(self.assertRaises(BadCode, join_code.parse_code, "u" + self.code.text[1:])))
 
     def test_code_names_its_operator(self) -> None:
         """A code fits the operator that created it, and no other operator."""
@@ -62,7 +62,7 @@ class CodeTests(SynchronousTestCase):
     def test_reads_anything(self, text: str) -> None:
         """Any text is either a code or raises ``BadCode``."""
         try:
-            found = code.parse_code(text)
+            found = join_code.parse_code(text)
         except BadCode:
             return
-        self.assertEqual(code.parse_code(found.text), found)
+        self.assertEqual(join_code.parse_code(found.text), found)

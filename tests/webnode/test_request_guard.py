@@ -1,10 +1,18 @@
-"""Tests of ``webnode.guard``."""
+"""Tests of ``webnode.request_guard``."""
 
 from __future__ import annotations
 
 from twisted.trial.unittest import SynchronousTestCase
 
-from webnode.guard import HEADERS, choose_token, find_refusal, is_local_name, is_own_host, is_own_origin, make_headers
+from webnode.request_guard import (
+    HEADERS,
+    choose_token,
+    find_refusal,
+    is_local_name,
+    is_own_host,
+    is_own_origin,
+    make_headers,
+)
 
 
 class GuardTests(SynchronousTestCase):

@@ -10,7 +10,7 @@ from twisted.trial.unittest import SynchronousTestCase
 
 from middleware.entangled.contact import Contact
 from middleware.entangled.kademlia.distance import bucket_index, select_closest
-from middleware.entangled.kademlia.routing import DROPPED_AFTER, PING_INTERVAL_S, STALE_AFTER, RoutingTable
+from middleware.entangled.kademlia.routing_table import DROPPED_AFTER, PING_INTERVAL_S, STALE_AFTER, RoutingTable
 from middleware.entangled.network.network import Address
 
 OWN = Contact(b"\xee" * 32, Address("10.0.0.1", 7000))

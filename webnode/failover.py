@@ -17,7 +17,7 @@ from middleware.admission.roles import GATEWAY
 from middleware.directory.presence import Device, parse_devices
 from middleware.entangled.record import Record
 from middleware.node import SwarmNode
-from webnode.guard import is_local_name
+from webnode.request_guard import is_local_name
 
 ORIGIN_KEPT_S = 3600.0
 """Seconds for which the origin of a web node that left is still accepted: its page may still run in a browser."""

@@ -1,4 +1,4 @@
-"""Tests of ``webnode.journal``."""
+"""Tests of ``webnode.state_journal``."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from typing import Any
 
 from twisted.trial.unittest import SynchronousTestCase
 
-from webnode.journal import KEYS, MAX_CHANGES, Journal
+from webnode.state_journal import KEYS, MAX_CHANGES, Journal
 
 
 def state(**devices: Any) -> dict[str, Any]:

@@ -1,4 +1,4 @@
-"""Tests of ``middleware.entangled.replication.certificates``, which requests the certificates of unknown owners."""
+"""Tests of ``owner_certificates`` of ``replication``, which requests the certificates of unknown owners."""
 
 from __future__ import annotations
 
@@ -12,7 +12,12 @@ from middleware.entangled.contact import Contact
 from middleware.entangled.errors import NoAnswer
 from middleware.entangled.identity import Identity
 from middleware.entangled.network.network import Address
-from middleware.entangled.replication.certificates import MAX_FAILED_PEERS, MAX_OWNERS, RETRY_AFTER_S, Certificates
+from middleware.entangled.replication.owner_certificates import (
+    MAX_FAILED_PEERS,
+    MAX_OWNERS,
+    RETRY_AFTER_S,
+    Certificates,
+)
 from middleware.entangled.wire.admission_check import FOREIGN, Authority, OpenAdmission
 
 

@@ -1,4 +1,4 @@
-"""Tests of ``webnode.fallback``."""
+"""Tests of ``webnode.failover``."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ from twisted.trial.unittest import SynchronousTestCase
 
 from middleware.directory.presence import Device
 from tests.fleet import FleetCase, SwarmTeam
-from webnode.fallback import ORIGIN_KEPT_S, Page, TeamFallbacks, find_pages, get_origin, make_urls
+from webnode.failover import ORIGIN_KEPT_S, Page, TeamFallbacks, find_pages, get_origin, make_urls
 
 
 class UrlTests(SynchronousTestCase):

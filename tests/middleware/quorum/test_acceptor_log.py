@@ -1,4 +1,4 @@
-"""Tests of ``middleware.entangled.quorum.log``, with the codecs of both users."""
+"""Tests of ``middleware.entangled.quorum.acceptor_log``, with the codecs of both users."""
 
 from __future__ import annotations
 
@@ -9,9 +9,9 @@ from twisted.trial.unittest import SynchronousTestCase
 from middleware.consensus.lease.acceptor import may_evict
 from middleware.consensus.lease.lease_codec import CODEC, parse_row
 from middleware.entangled.data.memory import MemoryStore
-from middleware.entangled.quorum import log as module
+from middleware.entangled.quorum import acceptor_log as module
+from middleware.entangled.quorum.acceptor_log import RegisterLog
 from middleware.entangled.quorum.ballot import FIRST_CONFIGURATION, NO_BALLOT, Ballot
-from middleware.entangled.quorum.log import RegisterLog
 from middleware.entangled.quorum.register import Register
 from tests.middleware.consensus.lease.test_lease_codec import ANYTHING, MEMBERS
 
