@@ -1,1 +1,2 @@
-"""Attacks S1 to S25 by outsiders, malicious members and thieves, one module each, with the defence that stops them."""
+"""Attacks S1 to S25 by outsiders, malicious members and thieves: one module per attack, with the defence that stops it.
+"""

@@ -1,9 +1,9 @@
 """Try every method and every record namespace of a running team as each kind of insider.
 
-``python -m tests.attacks.role_matrix`` prints the counts. The subjects are a viewer, a device, a gateway, and an
-operator with a revoked certificate. Each has a real key and a real certificate, and uses the real protocol. The role
-table (``middleware.admission.roles``) lists the forbidden attempts: every node has to refuse each of them, and the
-state of the team must not change.
+``python -m tests.attacks.role_matrix`` prints the counts. The insiders are a viewer, a device, a gateway, and an
+operator with a revoked certificate. Each insider has a real key and a real certificate, and uses the real protocol. The
+role table (``middleware.admission.roles``) determines which attempts are forbidden: every node has to reject each of
+them, and the state of the team must not change.
 """
 
 from __future__ import annotations
@@ -41,9 +41,9 @@ from tests.attacks.siege import AnyAdmission
 REVOKED_OPERATOR = "revoked operator"
 SUBJECTS = (VIEWER, DEVICE, GATEWAY, REVOKED_OPERATOR)
 UNLISTED_METHOD = "made.up"
-"""A method that a program exposes and that the role table does not list."""
+"""A method that a program exposes but that the role table does not contain."""
 REVOCATION_S = 12.0
-"""Seconds within which every connected node knows a revocation."""
+"""Seconds within which every connected node learns of a revocation."""
 ARGUMENTS: dict[str, Sequence[object]] = {
     "device.message": ["hello"],
     "device.disconnect": [30.0],
@@ -52,12 +52,15 @@ ARGUMENTS: dict[str, Sequence[object]] = {
     "device.assign": ["search"],
     "stream.part": [1, b"x"],
 }
-"""Arguments with which a method would have an effect; the others are called without any."""
+"""Arguments with which a method would have an effect; methods that are missing here are called without arguments."""
 
 
 @dataclass
 class Counts:
-    """The outcome of the attempts of one subject; ``wrong`` lists those with another outcome than in the role table."""
+    """The outcome of the attempts of one insider.
+
+    ``wrong`` lists the attempts with an outcome that contradicts the role table.
+    """
 
     subject: str
     methods: int = 0
@@ -77,7 +80,8 @@ class Counts:
 
 
 def list_slots(owner: bytes) -> list[Slot]:
-    """Return slots of ``owner`` with the key of each namespace's example and the name of each."""
+    """Return every combination of the keys and the slot names that the namespaces of the role table use, for ``owner``.
+    """
     examples = [namespace.slot(owner) for namespace in NAMESPACES.values()]
     keys = dict.fromkeys(slot.key for slot in examples)
     names = dict.fromkeys([*(slot.name for slot in examples), "x"])
@@ -85,7 +89,7 @@ def list_slots(owner: bytes) -> list[Slot]:
 
 
 class Insider:
-    """A subject of the trial: its key, its current roles, and its endpoint."""
+    """A member that makes the attempts: its key, its current roles, and its endpoint."""
 
     def __init__(self, team: SimulatedTeam, name: str, roles: Sequence[str], port: int) -> None:
         rng = random.Random(f"insider {name}")
@@ -100,7 +104,7 @@ class Insider:
 
 
 class Trial:
-    """One team and one insider that tries everything at each of its nodes."""
+    """One team, and one insider that makes every attempt at each node of the team."""
 
     def __init__(self, subject: str, seed: int = 1) -> None:
         self.counts = Counts(subject)
@@ -111,7 +115,7 @@ class Trial:
                 node.entangled.take_acceptor,
                 node.council_manager,
                 node.auction_service,
-            )  # their methods are exposed at their first use
+            )  # a node exposes the methods of these objects when it first uses them
             node.entangled.endpoint.expose(UNLISTED_METHOD, lambda peer: None, changes=True)
         is_revoked = subject == REVOKED_OPERATOR
         self.insider = Insider(self.team, "mallory", [OPERATOR] if is_revoked else [subject], 7601)
@@ -165,7 +169,7 @@ class Trial:
                 self.counts.wrong.append(f"{name} {method}: {outcome!r}")
 
     def _try_allowed(self, name: str, contact: Contact) -> None:
-        """Call the allowed methods without arguments; ``goodbye`` is last, because it removes the peer."""
+        """Call the allowed methods without arguments; ``goodbye`` is last, because after it a node drops the peer."""
         allowed = [method for method in METHODS if may_call(self.insider.roles, method) and method != "goodbye"]
         for method in (*allowed, *(["goodbye"] if may_call(self.insider.roles, "goodbye") else [])):
             self.counts.allowed += 1
@@ -209,7 +213,7 @@ class Trial:
         return [node.entangled.contact for node in self.nodes.values()]
 
     def _state(self) -> dict[tuple[str, Any], object]:
-        """Return the state of the team that an insider without the right must not change."""
+        """Return the state of the team that an insider must not change without the right to do so."""
         found: dict[tuple[str, Any], object] = {}
         for name, node in self.nodes.items():
             for record in node.store.records():
@@ -235,7 +239,7 @@ def _is_refusal(outcome: object) -> bool:
 
 
 def try_everything(subject: str) -> Counts:
-    """Let ``subject`` try everything at a new team."""
+    """Let an insider of this kind make every attempt at a new team."""
     trial = Trial(subject)
     try:
         return trial.run()
@@ -244,7 +248,7 @@ def try_everything(subject: str) -> Counts:
 
 
 def main() -> int:
-    """Print one line for each subject; the exit code is 1 if an attempt had another outcome than in the role table."""
+    """Print one line for each kind of insider; the exit code is 1 if an outcome contradicts the role table."""
     found = [try_everything(subject) for subject in SUBJECTS]
     lines = [line for counts in found for line in (str(counts), *(f"    {wrong}" for wrong in counts.wrong))]
     sys.stdout.write("\n".join([*lines, f"{len(METHODS)} methods, {len(KINDS)} namespaces", ""]))

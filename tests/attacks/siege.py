@@ -35,12 +35,12 @@ class AnyAdmission(OpenAdmission):
 
 
 class SiegeCase(VillageCase):
-    """A test with a closed team and its attackers."""
+    """A test case with a closed team and its attackers."""
 
     def attacker(
         self, team: Village, identity: Identity, secret: bytes, certificate: bytes, at: Address = SOURCE, life: int = 1
     ) -> Endpoint:
-        """Return an endpoint that presents an arbitrary certificate, stopped when the test ends."""
+        """Return an endpoint that presents an arbitrary certificate; it is stopped when the test ends."""
         network = team.switchboard.make_network(*at)
         dice = random.Random(f"attacker {at}")
         endpoint = Endpoint(identity, secret, network, team.clock, dice, AnyAdmission(certificate, life=life))
@@ -49,14 +49,14 @@ class SiegeCase(VillageCase):
         return endpoint
 
     def insider(self, team: Village, name: str, *which: str, at: Address = SOURCE) -> tuple[Endpoint, Identity]:
-        """Return an endpoint with a valid certificate for these roles, but without the checks of a node."""
+        """Return an endpoint with a valid certificate for these roles, but without the admission check of a node."""
         paper = team.paper(name, *which)
         secret = paper.secrets[0][1]
         return self.attacker(team, paper.identity, secret, paper.certificate, at), paper.identity
 
 
 class OneSession:
-    """The attributes of a session that receivers of datagrams read."""
+    """A session stub with only the attributes that receivers of datagrams read."""
 
     def __init__(self, public: bytes, at: Address = SOURCE) -> None:
         self.contact = Contact(public, at)

@@ -1,4 +1,4 @@
-"""Attack S1: execute code from received content: pickles, marshalled code, YAML tags, format strings."""
+"""Attack S1: execute code from received content, such as pickles, marshalled code, YAML tags and format strings."""
 
 from __future__ import annotations
 
@@ -25,25 +25,25 @@ UNSAFE = (
 )
 CALLS = ("eval", "exec", "compile", "__import__", "execfile", "input")
 ALLOWED = {
-    # The content is signed by an operator that the node's owner allowed; see tests/swarmnode/test_deploy.py.
+    # The content is signed by an operator that the owner of the node allowed; see tests/swarmnode/test_deploy.py.
     ("middleware.deployment.module_loader", "exec"),
     ("middleware.deployment.module_loader", "compile"),
 }
 LOADERS = {
-    # The name comes from the settings of the node's owner, or from a table in the source.
+    # The name of the imported module comes from the settings of the node's owner, or from a table in the source.
     "swarmnode.sandbox",
     *("agents.behaviour", "agents.registry", "drivers.registry", "middleware.consensus.strategy_worker"),
     *("middleware.consensus.strategy", "swarmnode.driver.catalogue", "swarmnode.command"),
     "webnode.routes.registry",
 }
 HOOKS = {("middleware.entangled.wire.message", hook) for hook in ("ext_hook", "object_hook")}
-"""Hooks that are allowed: the first one refuses every extension, the second one counts."""
+"""Permitted hooks: the first one rejects every extension type, the second one counts the entries of a map."""
 LOG = ("debug", "info", "warn", "error", "critical", "failure")
 FIRED: list[str] = []
 
 
 def fire(what: str) -> str:
-    """Record a call; the pickles of the corpus would call this function."""
+    """Record a call; the pickles in the corpus call this function when they are loaded."""
     FIRED.append(what)
     return what
 
@@ -79,7 +79,7 @@ def trees() -> Iterator[tuple[str, ast.Module]]:
 
 
 def faults_of(module: str, tree: ast.Module) -> list[str]:
-    """Return the places in a module that could execute received content."""
+    """Return the lines of a module that could execute received content."""
     fixed = _constants(tree)
     return [
         f"{module} line {getattr(node, 'lineno', 0)}: {why}"
@@ -89,7 +89,7 @@ def faults_of(module: str, tree: ast.Module) -> list[str]:
 
 
 def _constants(tree: ast.Module) -> set[str]:
-    """Return the names that a module assigns only constants to."""
+    """Return the names to which a module assigns only constants."""
     given: dict[str, bool] = {}
     for node in ast.walk(tree):
         if isinstance(node, ast.Assign):
@@ -141,7 +141,7 @@ def _of_call(module: str, call: ast.Call, fixed: set[str]) -> Iterator[str]:
 
 
 def _is_fixed(node: ast.AST | None, fixed: set[str]) -> bool:
-    """Return whether a text is constant in the source, as a whole or in parts."""
+    """Return whether a string is constant in the source, as a whole or in all of its parts."""
     if isinstance(node, ast.IfExp):
         return _is_fixed(node.body, fixed) and _is_fixed(node.orelse, fixed)
     if isinstance(node, ast.BinOp):
@@ -159,7 +159,7 @@ def _last(node: ast.AST) -> str:
 
 class TreeTests(SynchronousTestCase):
     def test_nothing_in_the_tree_runs_content(self) -> None:
-        """No module of a node evaluates, unpickles, formats with or loads received content."""
+        """No module of a node evaluates or unpickles received content, uses it as a format string, or imports by it."""
         found = [fault for module, tree in trees() for fault in faults_of(module, tree)]
         self.assertEqual(found, [])
 
@@ -194,12 +194,12 @@ class ContentTests(FleetCase):
         self.events = events_of(self)
 
     def test_the_corpus_fires(self) -> None:
-        """The corpus works: unpickling it calls ``fire``."""
+        """The corpus is effective: unpickling it calls ``fire``."""
         pickle.loads(CORPUS[0])
         self.assertEqual(FIRED, ["a pickle was read"])
 
     def test_values_stay_bytes(self) -> None:
-        """The corpus passes through records unchanged, and no code runs."""
+        """The corpus survives as the value of a record unchanged, and no code in it is executed."""
         fleet = self.fleet(3)
         for place, value in enumerate(CORPUS):
             key = hash_key(f"corpus {place}")
@@ -209,7 +209,7 @@ class ContentTests(FleetCase):
         self.assertEqual(FIRED, [])
 
     def test_messages_stay_data(self) -> None:
-        """As methods, arguments, answers and reasons the corpus is data or malformed, and no code runs."""
+        """As methods, arguments, answers and reasons, the corpus is data or malformed; no code in it is executed."""
         for text, raw in zip(TEXTS, CORPUS, strict=True):
             for message in (
                 Request(1, text[:60], (raw, text, [raw])),
@@ -224,7 +224,7 @@ class ContentTests(FleetCase):
         self.assertEqual(FIRED, [])
 
     def test_a_team_hears_them(self) -> None:
-        """As text messages the corpus arrives unchanged, and no log line expands it."""
+        """As text messages, the corpus arrives unchanged, and no log line expands it."""
         swarm = self.swarm(2)
         heard: list[str] = []
         swarm.nodes[1].on_message(heard.append)
@@ -241,7 +241,7 @@ class ContentTests(FleetCase):
         self.assertFalse([line for line in logged if "<class" in line or "49" in line and "7*7" in line])
 
     def test_any_bytes_as_methods(self) -> None:
-        """A method that is not exposed is refused, whatever its name."""
+        """A method that is not exposed is rejected, whatever its name is."""
         fleet = self.fleet(2)
         dice = random.Random(3)
         names = ["__class__", "endpoint.stop", "eval", *(dice.randbytes(8).hex() for _ in range(20))]

@@ -1,4 +1,4 @@
-"""Attack S2: act without the right: others' records, old records, an expired certificate, the wrong role."""
+"""Attack S2: act without the right: change others' records, use an expired certificate or the wrong role."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ NAMES = ("order", "member", "result", "council", "done", "verdict/1", "source", 
 
 class MethodTests(SiegeCase):
     def test_every_method_by_every_role(self) -> None:
-        """A method that a role may not call does not run and is refused with "role"; allowed methods are not."""
+        """A method that a role may not call is rejected with "role" and not executed; allowed methods are executed."""
         team = self.village()
         house = team.houses[0]
         ran: list[str] = []
@@ -34,7 +34,7 @@ class MethodTests(SiegeCase):
             self.every(team, attacker, (role,), ran)
 
     def every(self, team: Any, attacker: Any, which: tuple[str, ...], ran: list[str]) -> None:
-        """Try every method, and one that the table does not list."""
+        """Call every method of the role table, and a method that the table does not contain."""
         contact = team.contact(team.houses[0])
         refused = team.houses[0].node.endpoint.counters["refused"]
         team.houses[0].node.endpoint.expose("made.up", lambda peer: ran.append("made.up"))
@@ -43,7 +43,7 @@ class MethodTests(SiegeCase):
         asked = {name: attacker.ask(contact, name, changes=True) for name in names}
         outcomes = {name: self.outcome(team, each, 0.05) for name, each in asked.items()}
         for name in set(names) - {each for each in names if may_call(which, each)}:
-            attacker.notify(contact, name)  # a notification without a request is refused as well
+            attacker.notify(contact, name)  # a notification, which gets no answer, must be rejected, too
         team.run(1.0)
         allowed = [name for name in names if may_call(which, name)]
         self.assertEqual(sorted(ran), sorted(allowed), which)
@@ -56,14 +56,14 @@ class MethodTests(SiegeCase):
     @settings(max_examples=60)
     @given(st.sets(st.sampled_from(ROLES)), st.sampled_from([*METHODS, "made.up", ""]), st.sampled_from(ROLES))
     def test_more_roles_allow_no_less(self, which: set[str], method: str, more: str) -> None:
-        """An additional role never removes a right, and without roles there are no rights."""
+        """An additional role never removes a right, and a member without roles has no rights."""
         self.assertLessEqual(may_call(which, method), may_call(which | {more}, method))
         self.assertFalse(may_call((), method))
 
 
 class RecordTests(SiegeCase):
     def test_every_kind_by_every_role(self) -> None:
-        """A record of a kind that its owner's role forbids is not stored, and its sender gets the reason."""
+        """A record in a namespace that its owner's role forbids is not stored, and its sender gets the reason."""
         team = self.village()
         house = team.houses[0]
         kinds = set()
@@ -95,13 +95,13 @@ class OwnerTests(SiegeCase):
         self.bad, self.own = self.insider(self.team, "bad", "device", "operator", "gateway", "bootstrap")
 
     def held(self) -> list[Record]:
-        """Return the record at its replicas, which must be equal everywhere."""
+        """Return the stored records of the key, which must be equal at all replicas."""
         found = [house.node.replica.get_held(self.key) for house in self.team.houses]
         self.assertTrue(all(each == found[0] for each in found))
         return found[0]
 
     def attack(self, record: Record) -> None:
-        """Send a record with every method that accepts one, to every node."""
+        """Send a record to every node with every method that accepts records."""
         packed, key = [record.pack()], record.key
         for house in self.team.houses:
             contact = self.team.contact(house)
@@ -119,7 +119,7 @@ class OwnerTests(SiegeCase):
         self.team.run(0.5)
 
     def test_anything_of_it_changed(self) -> None:
-        """A record with a changed field, another signature or another signer is refused everywhere."""
+        """A record with a changed field, a changed signature or a different signer is rejected by every node."""
         other = Identity(b"z" * 32)
         newer = replace(self.record, sequence=self.record.sequence + 9)
         for record in (
@@ -137,14 +137,14 @@ class OwnerTests(SiegeCase):
             self.assertEqual(self.held(), [self.record])
 
     def test_an_older_one(self) -> None:
-        """An older version that its owner had signed does not replace the record."""
+        """An older version that the owner had signed earlier does not replace the record."""
         first = Record(self.key, "slot", self.record.owner, 1, "team", self.record.ttl, b"true")
         older = first.sign(self.team.houses[0].kept.membership.identity)
         self.attack(older)
         self.assertEqual(self.held(), [self.record])
 
     def test_a_deleted_one(self) -> None:
-        """A removed record stays removed, even if another node has kept it."""
+        """A removed record stays removed, even if another node stored a copy of it."""
         self.outcome(self.team, self.team.houses[0].node.remove(self.key, "slot"))
         self.attack(self.record)
         self.assertEqual([record.value for record in self.held()], [None])
@@ -152,7 +152,7 @@ class OwnerTests(SiegeCase):
     @settings(max_examples=25)
     @given(st.data())
     def test_any_mixture(self, data: Any) -> None:
-        """No combination of changes replaces the record."""
+        """No combination of changed fields replaces the record."""
         changed = replace(
             self.record,
             name=data.draw(st.sampled_from(["slot", "", "other"])),
@@ -169,14 +169,15 @@ class OwnerTests(SiegeCase):
 
 class CertificateTests(SiegeCase):
     def refused(self, number: int, certificate: bytes, incarnation: Identity, secret: bytes) -> str:
-        """Return the code with which a member with this certificate is refused."""
+        """Return the code with which a node rejects a peer that presents this certificate."""
         attacker = self.attacker(self.team, incarnation, secret, certificate, SOURCE._replace(port=700 + number))
         code = self.refusal(self.team, attacker.ask, self.team.houses[0], 3.0)
         self.assertNotIn(incarnation.public, [each.public for each in self.team.houses[0].node.overlay.contacts()])
         return code
 
     def test_passes_that_do_not_hold(self) -> None:
-        """An expired, early, stolen, truncated or missing certificate, or one of another team, is refused."""
+        """An expired, early, stolen, truncated or missing certificate, or a certificate of another team, is rejected.
+        """
         self.team = team = self.village()
         other = self.village(seed=2)
         secret = team.houses[0].kept.membership.secrets[0][1]

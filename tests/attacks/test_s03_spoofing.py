@@ -1,4 +1,4 @@
-"""Attack S3: datagrams with spoofed addresses, and answers that are misdirected, guessed or unsolicited."""
+"""Attack S3: datagrams with spoofed addresses, and answers from the wrong node, with guessed numbers or unsolicited."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ def sealed(ground: Ground, plain: bytes) -> bytes:
 
 
 class Spoofing(RuleBasedStateMachine):
-    """A node with a session, and an attacker that can spoof any address but knows no key."""
+    """A node with a session, and an attacker that can spoof any source address but has no key."""
 
     @initialize(seed=st.integers(0, 99))
     def begin(self, seed: int) -> None:
@@ -53,7 +53,7 @@ class Spoofing(RuleBasedStateMachine):
             self.ground.stop()
 
     def fire(self, datagram: bytes, source: Address) -> None:
-        """Deliver one datagram; the reply must not be larger."""
+        """Deliver one datagram; the reply must not be larger than the datagram."""
         if self.ground.shoot(datagram, source) > len(datagram):
             raise AssertionError("more was sent than had come")
 
@@ -70,12 +70,12 @@ class Spoofing(RuleBasedStateMachine):
         """Send a recorded datagram with one changed bit."""
         datagram = bytearray(self.ground.recorded[index % len(self.ground.recorded)])
         datagram[bit // 8 % len(datagram)] ^= 1 << bit % 8
-        if datagram[0] != DISCOVERY:  # with another nonce it is still the same probe
+        if datagram[0] != DISCOVERY:  # a DISCOVERY stays the same if only its nonce changes
             self.fire(bytes(datagram), source)
 
     @rule(source=st.sampled_from(PLACES), counter=st.integers(0, 2**64 - 1), size=st.integers(16, 200))
     def guessed_session(self, source: Address, counter: int, size: int) -> None:
-        """Send DATA with the real session number, which is not encrypted."""
+        """Send DATA with the real session number, which is sent unencrypted and so is known to the attacker."""
         [index] = list(self.ground.target._sessions)[:1]
         head = bytes([DATA]) + index.to_bytes(4, "little") + counter.to_bytes(8, "little")
         self.fire(head + self.dice.randbytes(size), source)
@@ -94,7 +94,7 @@ class Spoofing(RuleBasedStateMachine):
 
     @invariant()
     def nothing_changed(self) -> None:
-        """The state of the node is unchanged, and no request was answered."""
+        """Check that the state of the node is unchanged, and that no request got an answer."""
         if hasattr(self, "ground"):
             assert self.ground.state() == self.before
             assert self.answers == []
@@ -106,7 +106,7 @@ class SpoofingTests(SynchronousTestCase):
         run_state_machine_as_test(Spoofing, settings=SEQUENCES)
 
     def test_the_machine_notices(self) -> None:
-        """A node that accepts one of them is detected."""
+        """The state machine fails if a node accepts one of these datagrams."""
         ground = Ground()
         self.addCleanup(ground.stop)
         before = ground.state()
@@ -121,7 +121,7 @@ class ElsewhereTests(SynchronousTestCase):
         self.counters = self.ground.target.counters
 
     def test_answer_of_another_member(self) -> None:
-        """An answer from another member with a guessed request number is ignored."""
+        """An answer with a guessed request number is ignored if it comes from a different member."""
         ground = self.ground
         silent = Contact(Identity(b"s" * 32).public, Address("10.0.0.7", 7))
         asked = ground.target.ask(silent, "echo", 1)
@@ -133,7 +133,7 @@ class ElsewhereTests(SynchronousTestCase):
         self.failureResultOf(asked, NoAnswer)
 
     def test_greeting_from_elsewhere(self) -> None:
-        """A DISCOVERY_REPLY with the right token from another address than the probed one is dropped and counted."""
+        """A DISCOVERY_REPLY with the right token, but not from the probed address, is dropped and counted."""
         ground = self.ground
         greeted = ground.target.discover(Address("10.0.0.8", 8))
         [token] = list(ground.target.discoverer._pending)
@@ -145,7 +145,7 @@ class ElsewhereTests(SynchronousTestCase):
         self.failureResultOf(greeted, NoAnswer)
 
     def test_greeting_with_a_guessed_token(self) -> None:
-        """A DISCOVERY_REPLY from the right address with another token is dropped."""
+        """A DISCOVERY_REPLY from the right address is dropped if its token is wrong."""
         ground = self.ground
         at = Address("10.0.0.8", 8)
         greeted = ground.target.discover(at)
@@ -156,7 +156,7 @@ class ElsewhereTests(SynchronousTestCase):
         self.failureResultOf(greeted, NoAnswer)
 
     def test_who_of_a_stranger(self) -> None:
-        """A DISCOVERY without the team's key gets no answer."""
+        """A DISCOVERY that is not encrypted under the team's key gets no reply."""
         datagram = pack_discovery(bytes(32), bytes(16), random.Random(1))
         self.assertEqual(self.ground.shoot(datagram), 0)
         self.assertEqual(self.counters["forged"], 1)

@@ -1,4 +1,4 @@
-"""Attack S4: replay a recording at once, later, after a restart, to other nodes, and to other teams."""
+"""Attack S4: replay a recording immediately, later, after a restart, to other nodes, and to other teams."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ ELSEWHERE = Address("10.9.9.9", 99)
 
 
 class ReplayCase(SiegeCase):
-    """A team of four with a complete recording of some seconds of work."""
+    """A test case with a team of four, and a complete recording of its datagrams during some seconds."""
 
     def setUp(self) -> None:
         """Record joins, writes, reads, watches, calls and a removal."""
@@ -40,7 +40,7 @@ class ReplayCase(SiegeCase):
         self.team.tape = None
 
     def expose(self) -> None:
-        """Expose a method that counts its calls."""
+        """Expose a method that counts its calls at each node."""
 
         def add(peer: object, number: int) -> int:
             self.runs.append(number)
@@ -63,18 +63,19 @@ class ReplayCase(SiegeCase):
             self.successResultOf(each)
 
     def states(self, team: Village) -> list[str]:
-        """Return the hash of each node's lasting state."""
+        """Return the hash of each node's state that outlasts a session."""
         found = []
         for house in team.houses:
             endpoint = house.node.endpoint
             half = endpoint._half_open
             self.assertLessEqual(len(half._unconfirmed), MAX_UNCONFIRMED)
             self.assertLessEqual(len(half._responses), MAX_RESPONSES)
-            # Sessions of a fresh INIT that were never confirmed are limited in number, and send nothing.
+            # A replayed INIT may open a session that is never confirmed. Such sessions are limited in number and send
+            # nothing.
             for session in list(half._unconfirmed.values()):
                 half.forget(session)
             half.clear()
-            # A recording from before a restart looks like a copy of the node, and is logged once for each member.
+            # A node takes a recording from before a restart for a copy of the sender and logs it, once for each member.
             self.assertLessEqual(len(endpoint._log_limiter._logged), len(team.houses))
             timers = sorted(call.getTime() for call in team.clock.getDelayedCalls())
             noted, endpoint._log_limiter = endpoint._log_limiter, LogLimiter()
@@ -88,7 +89,7 @@ class ReplayCase(SiegeCase):
         to: Callable[[int], SwitchboardNetwork] | None = None,
         source: Address | None = None,
     ) -> None:
-        """Send the whole recording again at once; no method may run, and no state may change."""
+        """Replay the whole recording immediately; no method may run, and no state may change."""
         places = [house.node._network for house in team.houses]
         known: list[Any] = [network for network, _, _ in self.tape.heard]
         number = {id(network): place for place, network in enumerate(dict.fromkeys(known))}
@@ -104,11 +105,12 @@ class ReplayCase(SiegeCase):
         self.assertLessEqual(self.bytes_out(team) - bytes_out, received)
 
     def bytes_out(self, team: Village) -> int:
-        """Return the bytes that a team's nodes have sent since ``freeze``."""
+        """Return the number of bytes that the nodes of the team have sent since ``freeze``."""
         return self.sent[id(team)]
 
     def freeze(self, team: Village) -> None:
-        """Drop all sent datagrams, because an answer to a replay would be the attacker's work."""
+        """Drop all datagrams that the nodes send from now on, because a reply to a replay must not reach another node.
+        """
         for house in team.houses:
             network: Any = house.node._network
 
@@ -120,14 +122,15 @@ class ReplayCase(SiegeCase):
 
 class ReplayTests(ReplayCase):
     def test_the_tape_is_rich(self) -> None:
-        """The recording contains many datagrams, and each kind that a team sends."""
+        """The recording contains many datagrams, and at least one of each kind that a team sends."""
         kinds = {datagram[0] for _, datagram, _ in self.tape.heard}
         self.assertGreaterEqual(kinds, {0x11, 0x12, 0x13, 0x14, 0x15})
         self.assertGreater(len(self.tape.heard), 200)
         self.assertEqual(self.runs, [0, 1, 2, 3, 4])
 
     def test_at_once(self) -> None:
-        """A replay at once to the same nodes, from another address, and to other nodes has no effect."""
+        """A replay has no effect if it follows immediately, to the same nodes, from another address, or to other nodes.
+        """
         self.freeze(self.team)
         self.replay(self.team)
         self.replay(self.team, source=ELSEWHERE)
@@ -138,13 +141,13 @@ class ReplayTests(ReplayCase):
         self.replay(self.team, to=lambda place: network_of(self.team.houses[(place + 1) % count]))
 
     def test_after_responses_are_forgotten(self) -> None:
-        """A replay after the cached responses have expired has no effect."""
+        """A replay has no effect after the nodes have deleted their cached responses."""
         self.team.run(4 * KEEP_ANSWER_S)
         self.freeze(self.team)
         self.replay(self.team)
 
     def test_after_a_restart(self) -> None:
-        """A replay after a restart of the nodes has no effect, because they share no session with the recording."""
+        """A replay has no effect after a restart of the nodes, because their sessions in the recording have ended."""
         for house in self.team.houses:
             self.team.close(house, is_sudden=True)
         self.team.run(1.0)
@@ -167,7 +170,7 @@ class ReplayTests(ReplayCase):
         self.assertEqual(self.bytes_out(other), 0)
 
     def test_after_a_rotation(self) -> None:
-        """A replay after a rotation of the secret gets no answer."""
+        """A replay gets no answer after a rotation of the team's secret."""
         members = [house.public for house in self.team.houses]
         self.team.tell(self.team.signer.rotate_secret(2, members, self.team.wall(), 5.0, self.team.dice))
         self.team.run(60.0)
@@ -177,7 +180,7 @@ class ReplayTests(ReplayCase):
         self.replay(self.team)
 
     def test_the_hash_notices(self) -> None:
-        """One datagram that is not a replay changes the hash."""
+        """A single datagram that is not a replay changes the hash."""
         before = self.states(self.team)
         asked = self.team.houses[1].node.call(self.team.contact(self.team.houses[0]), "add", 9, changes=True)
         self.team.run(0.1)

@@ -28,7 +28,7 @@ def part(number: int, total: int, place: int, data: bytes, is_wanted: bool = Fal
 
 
 class FragmenterCase(SynchronousTestCase):
-    """A fragmenter, and members by number."""
+    """A test case with a fragmenter that receives from members with a number as their name."""
 
     def setUp(self) -> None:
         self.clock = HeapClock()
@@ -55,7 +55,7 @@ class FragmenterCase(SynchronousTestCase):
         return self.fragmenter._bytes_in.total()
 
     def send_whole(self, member: int, number: int, size: int) -> None:
-        """Send a valid message in fragments, in order."""
+        """Send a valid message as fragments, in order."""
         for place in range(-(-size // FRAGMENT_BYTES)):
             here = min(FRAGMENT_BYTES, size - place * FRAGMENT_BYTES)
             self.take(member, part(number, size, place, bytes(here), True))
@@ -63,7 +63,7 @@ class FragmenterCase(SynchronousTestCase):
 
 class FragmentTests(FragmenterCase):
     def test_never_completed(self) -> None:
-        """One member has at most its share of incomplete messages, and ten seconds later none."""
+        """Incomplete messages of one member take at most its share of the space, and are deleted after ten seconds."""
         for number in range(2000):
             self.take(1, part(number, HALF, 0, bytes(FRAGMENT_BYTES)))
         self.assertLessEqual(self.bytes_in(), MAX_IN_PER_PEER_BYTES)
@@ -72,7 +72,7 @@ class FragmentTests(FragmenterCase):
         self.assertEqual((self.bytes_in(), len(self.fragmenter._incoming)), (0, 0))
 
     def test_lies_about_its_size(self) -> None:
-        """Fragments with invalid sizes or positions, or another total, are malformed and reserve nothing."""
+        """Fragments with an invalid size or position, or a different total size, are malformed and reserve nothing."""
         wrong = (
             part(1, 2**32 - 1, 0, bytes(FRAGMENT_BYTES)),
             part(1, MAX_MESSAGE_BYTES + 1, 0, bytes(FRAGMENT_BYTES)),
@@ -90,7 +90,7 @@ class FragmentTests(FragmenterCase):
         self.assertEqual(self.counters["malformed"], len(wrong) + 1)
 
     def test_overlapping(self) -> None:
-        """With overlapping fragments the message has its announced length, and is delivered once."""
+        """A message with overlapping fragments has its announced length, and is delivered once."""
         size = 3 * FRAGMENT_BYTES
         for fill in (b"a", b"b", b"a"):
             for place in (0, 2):
@@ -101,7 +101,7 @@ class FragmentTests(FragmenterCase):
         self.assertEqual(self.counters["repeated"], 1)
 
     def test_interleaved_from_a_thousand(self) -> None:
-        """A thousand members with unfinished messages stay within the limit, also in allocated memory."""
+        """Unfinished messages of a thousand members stay within the limit, also in allocated memory."""
         tracemalloc.start()
         self.addCleanup(tracemalloc.stop)
         base, _ = tracemalloc.get_traced_memory()
@@ -113,7 +113,7 @@ class FragmentTests(FragmenterCase):
         self.assertLess(used - base, MAX_IN_BYTES * 1.1)
 
     def test_others_get_through(self) -> None:
-        """If slowly growing messages take all the space, another one of 64 KiB arrives within two seconds."""
+        """If messages that grow slowly take all the space, another message of 64 KiB arrives within two seconds."""
         for member in range(2, 200):
             self.take(member, part(1, 64 * KIB, 0, bytes(FRAGMENT_BYTES)))
         self.assertGreater(self.bytes_in(), MAX_IN_BYTES - 64 * KIB)
@@ -142,7 +142,7 @@ class FragmentTests(FragmenterCase):
 
 class EndToEndTests(SynchronousTestCase):
     def test_a_transfer_beside(self) -> None:
-        """While a member fills its share with unfinished messages, its other message of 64 KiB arrives."""
+        """A member's message of 64 KiB arrives while unfinished messages of the same member fill its share."""
         ground = Ground()
         self.addCleanup(ground.stop)
         session = next(iter(ground.other._sessions.values()))

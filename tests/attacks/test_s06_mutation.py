@@ -1,4 +1,4 @@
-"""Attack S6: arbitrary bytes at every decoder: a bounded run of every target of ``tests/fuzz``."""
+"""Attack S6: send arbitrary bytes to every decoder, in a short run of every target of ``tests/fuzz``."""
 
 from __future__ import annotations
 
@@ -24,14 +24,14 @@ TARGETS: dict[str, tuple[Callable[[bytes], None], int]] = {
 }
 BOUNDED = settings(max_examples=120)
 SLOWEST_S = 0.25
-"""Maximum seconds for one input on a busy machine; an idle machine needs about a millisecond."""
+"""Maximum duration of one input in seconds, on a busy machine; an idle machine needs about a millisecond."""
 
 
 class MutationTests(SynchronousTestCase):
-    """No input raises or is logged, a refused one leaves no trace, and no answer is longer than its request."""
+    """No input raises or is logged, a rejected input changes nothing, and no reply is longer than its request."""
 
     def test_every_target(self) -> None:
-        """All targets accept the stored inputs and some mutations of them without a violation."""
+        """The stored inputs, and some mutations of them, cause no violation in any target."""
         for name, (check, count) in TARGETS.items():
             with self.subTest(target=name):
                 inputs, dice = seeds(name), random.Random(f"s6/{name}/1")
@@ -42,11 +42,11 @@ class MutationTests(SynchronousTestCase):
     @BOUNDED
     @given(st.integers(0, 255), st.binary(max_size=200))
     def test_any_paper(self, kind: int, data: bytes) -> None:
-        """Arbitrary bytes as a statement, certificate, join request or reply cause no violation."""
+        """Arbitrary bytes as a statement, certificate, join request or join reply cause no violation."""
         paper.check(bytes([kind]) + data)
 
     def test_paper_is_quick(self) -> None:
-        """Statements, certificates, join requests and replies are refused quickly, including large ones."""
+        """Invalid statements, certificates, join requests and join replies are rejected quickly, even large ones."""
         dice = random.Random(8)
         large = [bytes([kind]) + dice.randbytes(65_000) for kind in range(4)]
         large += [bytes([kind]) + b"\x91" * 65_000 for kind in range(4)]
@@ -57,7 +57,7 @@ class MutationTests(SynchronousTestCase):
             self.assertLess(time.thread_time() - began, SLOWEST_S)
 
     def test_the_targets_notice(self) -> None:
-        """Valid inputs are accepted, and a target that would refuse everything is detected."""
+        """Valid inputs are accepted, so a target that rejects everything would be detected."""
         for kind, each in paper.LAWFUL.items():
             for place, whole in enumerate(each):
                 paper.check(bytes([paper.KINDS.index(kind) + 4 * place]) + whole)

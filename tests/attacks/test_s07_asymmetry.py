@@ -1,4 +1,4 @@
-"""Attack S7: make a node do more work than the attacker: floods of handshakes, join requests and probes."""
+"""Attack S7: cause more work at a node than the attacker has, by floods of handshakes, join requests and probes."""
 
 from __future__ import annotations
 
@@ -72,7 +72,7 @@ class FloodCase(SiegeCase):
         return [str(each.get("log_format")) for each in self.events if each["log_level"] >= LogLevel.info]
 
     def flood(self, made: Callable[[int], bytes], seconds: int = SECONDS) -> int:
-        """Send datagrams of ``made`` from a thousand addresses; return the bytes sent."""
+        """Send the datagrams that ``made`` returns from a thousand addresses; return the number of bytes sent."""
         total = 0
         for number in range(PER_SECOND * seconds):
             datagram = made(number)
@@ -84,20 +84,20 @@ class FloodCase(SiegeCase):
         return total
 
     def answers(self) -> list[bytes]:
-        """Return the datagrams sent to the addresses of the flood."""
+        """Return the datagrams that the node sent to the source addresses of the flood."""
         return [datagram for datagram, to in self.sent if to.port == 999]
 
 
 class FloodTests(FloodCase):
     def test_forged_handshakes(self) -> None:
-        """INITs with a wrong MAC cost one hash each: no key exchange, no answer, no state."""
+        """An INIT with a wrong MAC costs the node one hash, but no key exchange, no answer and no state."""
         dice = random.Random(1)
         self.flood(lambda number: bytes([INIT]) + dice.randbytes(1300))
         self.assertEqual((len(self.exchanges), self.lines), (0, []))
         self.assertEqual(self.answers(), [])
 
     def handshakes(self) -> Callable[[int], bytes]:
-        """Return INITs of a malicious member with the team's secret, with new ephemeral keys."""
+        """Return INITs of a malicious member, encrypted with the team's secret and new ephemeral keys."""
         own = Credentials.derive(Identity(b"i" * 32), self.house.team.secret)
         remote, dice = derive_exchange_key(self.house.public), random.Random(2)
         hello = HandshakeFields(max_pass_bytes=640)
@@ -111,7 +111,7 @@ class FloodTests(FloodCase):
         return made
 
     def test_handshakes_of_a_member(self) -> None:
-        """A member that floods and ignores the answers causes only a limited rate of key exchanges."""
+        """A member that floods a node and ignores its answers causes key exchanges at a limited rate only."""
         received = self.flood(self.handshakes())
         self.assertLessEqual(len(self.exchanges), MAX_HANDSHAKES_PER_S * (SECONDS + 2))
         self.assertLessEqual(sum(map(len, self.answers())), received)
@@ -123,7 +123,7 @@ class FloodTests(FloodCase):
         self.assertLess(MAX_HANDSHAKES_PER_S, MAX_COOKIE_HANDSHAKES_PER_S)
 
     def test_others_still_come_in(self) -> None:
-        """During a flood another member opens a session in one additional round trip, with the cookie."""
+        """During a flood another member, which returns the cookie, opens a session with one additional round trip."""
         made = self.handshakes()
         self.flood(made, 1)
         friend, _ = self.insider(self.team, "friend")
@@ -132,7 +132,10 @@ class FloodTests(FloodCase):
         self.assertEqual(len(self.successResultOf(asked)), 8)
 
     def test_knocks(self) -> None:
-        """Join requests without an invitation cost one table lookup; few are answered, and few lines are logged."""
+        """A join request without an invitation costs one table lookup.
+
+        Few such requests are answered, and few lines are logged.
+        """
         dice = random.Random(3)
         received = self.flood(
             lambda number: bytes([join_codec.JOIN_REQUEST]) + dice.randbytes(join_codec.JOIN_REQUEST_BYTES - 1)
@@ -144,7 +147,7 @@ class FloodTests(FloodCase):
         self.assertLessEqual(len(self.lines), 20 + SECONDS)
 
     def test_knocks_of_who_knows_the_id(self) -> None:
-        """Join requests that name a real invitation but cannot be decrypted are dropped without a signature check."""
+        """A join request with the id of a real invitation, but not decryptable, costs no signature check."""
         code = self.team.invite("dog")
         [invite] = self.team.houses[0].team.membership_list.list_invitations()
         self.assertTrue(code)
@@ -155,7 +158,7 @@ class FloodTests(FloodCase):
         self.assertEqual(self.answers(), [])
 
     def test_knocks_of_who_has_the_code(self) -> None:
-        """Join requests with a real code, each with another key, cause only a limited rate of signature checks."""
+        """Join requests with a real code, each with a different key, cause signature checks at a limited rate only."""
         code, packed, terms = self.team.signer.invite("pig", ("device",), 1, self.team.wall(), 900.0, random.Random(5))
         self.team.tell(terms)
         self.team.tell(packed)
@@ -173,14 +176,14 @@ class FloodTests(FloodCase):
         self.assertNotEqual(draw_code(self.team.signer.public, dice).text, code.text)
 
     def test_hails(self) -> None:
-        """Twenty PROBE datagrams per second are answered, each with the size of the request."""
+        """At most twenty PROBE datagrams per second are answered, and each reply is as long as its request."""
         self.flood(lambda number: pack_probe(number.to_bytes(16, "little")))
         answers = self.answers()
         self.assertLessEqual(len(answers), REPLIES_PER_S * (SECONDS + 1))
         self.assertLessEqual({len(datagram) for datagram in answers}, {PROBE_BYTES})
 
     def test_questions_of_a_member(self) -> None:
-        """A member's requests are limited in rate, and those beyond the limit are refused as busy."""
+        """A member's requests are executed at a limited rate; requests beyond the limit are rejected with "busy"."""
         bad, _ = self.insider(self.team, "bad")
         contact = self.team.contact(self.house)
         self.outcome(self.team, bad.ask(contact, "ping", bytes(8), changes=True))
@@ -208,7 +211,7 @@ class FloodTests(FloodCase):
         self.assertGreater(ran[-1], began + seconds + 5.0)
 
     def test_a_cookie_of_another(self) -> None:
-        """A cookie is valid only for the address that received it."""
+        """A cookie is valid only for the address to which it was sent."""
         made = self.handshakes()
         self.flood(made, 1)
         self.assertEqual(made(1)[-MAC_BYTES:], bytes(MAC_BYTES))

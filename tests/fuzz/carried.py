@@ -1,8 +1,9 @@
-"""Fuzz the relayed and path messages of a member in a session.
+"""Fuzz the messages for relays and paths that a member sends in a session.
 
-Each input consists of several plaintexts, as in ``envelope``; the first byte of each selects the kind: RELAY_REQUEST to
-a known or unknown node, RELAYED_DATAGRAM as if from a node, ADDRESS_REQUEST, ADDRESS_REPLY. No input raises or is
-logged, a message for a node without a session changes nothing, and the target sends no more than it received.
+Each input consists of several plaintexts, as in ``envelope``. The first byte of each plaintext selects its kind:
+RELAY_REQUEST to a known or unknown node, RELAYED_DATAGRAM as if from a node, ADDRESS_REQUEST or ADDRESS_REPLY. No input
+may raise an exception or cause a log line. A message for a node without a session must change nothing. The target must
+send little more than it receives.
 """
 
 from __future__ import annotations
@@ -18,7 +19,7 @@ KINDS = (RELAY_REQUEST, RELAYED_DATAGRAM, ADDRESS_REQUEST, ADDRESS_REPLY)
 
 
 def plain_of(ground: Ground, data: bytes) -> bytes:
-    """Return the plaintext that some bytes encode."""
+    """Return the plaintext that ``data`` encodes."""
     first = data[0] if data else 0
     kind = KINDS[first % 4]
     known = (derive_node_id(ground.identity.public), ground.contact.node_id, bytes(20), data[1:21])
@@ -30,7 +31,7 @@ def plain_of(ground: Ground, data: bytes) -> bytes:
 
 
 def shot(ground: Ground, data: bytes) -> None:
-    """Send one input; raises ``Violation``."""
+    """Send one input to the target; raises ``Violation``."""
     session = next(iter(ground.other._sessions.values()))
     for each in plaintexts(data):
         plain = plain_of(ground, each)[:1423]

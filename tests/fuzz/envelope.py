@@ -1,6 +1,6 @@
-"""Fuzz the sealed messages of a member in a session: a malformed message must change nothing.
+"""Fuzz the encrypted messages that a member sends in a session: a malformed message must change nothing.
 
-Several plaintexts in one input are several datagrams: each begins with its length in two bytes.
+An input encodes several datagrams. The plaintext of each datagram is preceded by its length in two bytes.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ MAX_SHOTS = 8
 
 
 def plaintexts(data: bytes) -> list[bytes]:
-    """Return the plaintexts in an input."""
+    """Return the plaintexts that an input encodes."""
     found: list[bytes] = []
     while data and len(found) < MAX_SHOTS:
         length = int.from_bytes(data[:2], "little") % 1372
@@ -23,13 +23,13 @@ def plaintexts(data: bytes) -> list[bytes]:
 
 
 def shot(ground: Ground, data: bytes) -> None:
-    """Send one input; raises ``Violation``."""
+    """Send one input to the target; raises ``Violation``."""
     session = next(iter(ground.other._sessions.values()))
     for plain in plaintexts(data):
         counted = ground.target.counters["malformed"]
         before = _lasting(ground)
         ground.shoot(session.seal(plain), ground.other.address)
-        # The last fragment completes a message, whatever its content.
+        # A last fragment completes a message and so changes the state, whatever its content is.
         is_whole = plain[:1] != bytes([PART])
         if is_whole and ground.target.counters["malformed"] > counted and _lasting(ground) != before:
             raise Violation("a malformed message changed the node")
@@ -37,7 +37,7 @@ def shot(ground: Ground, data: bytes) -> None:
 
 
 def _lasting(ground: Ground) -> str:
-    """Return the hash of the state without the session of the datagram, because its counters always change."""
+    """Return the hash of the state, except the session of the datagram, because its counters always change."""
     target, node = ground.target, ground.node
     session = next(iter(target._sessions.values()), None)
     half_open = [target._half_open._responses, list(target._half_open._unconfirmed)]

@@ -1,6 +1,6 @@
 """Provide the node that the fuzz targets attack, and the checks after every input.
 
-``state_of`` hashes the complete state of a node by walking its objects, which includes new attributes automatically.
+``state_of`` hashes the complete state of a node by walking its objects, so new attributes are included automatically.
 It excludes the counters (including the handshake rate), the random generator, the clock and the network.
 """
 
@@ -47,12 +47,12 @@ APART = (FunctionType, MethodType, type, random.Random, HeapClock, Switchboard)
 
 
 class Violation(AssertionError):
-    """An input had a forbidden effect."""
+    """Raised if an input had a forbidden effect."""
 
 
 @implementer(ILogObserver)
 class Ground:
-    """A node ``target`` and a member ``other`` with a session between them, and the same ``admission`` check.
+    """A node ``target`` and a member ``other`` that share a session and use the same ``admission`` check.
 
     All datagrams to the target are recorded.
     """
@@ -60,7 +60,7 @@ class Ground:
     def __init__(self, admission: AdmissionCheck = OPEN_ADMISSION) -> None:
         self.room = admission.max_pass_bytes
         self.errors: list[str] = []
-        self.known = ""  # the hash after the last input, for targets that let no time pass
+        self.known = ""  # the hash after the last input, for targets that do not advance the clock
         self._is_shooting = False
         self.clock = HeapClock()
         self.switchboard = Switchboard(self.clock, random.Random(1))
@@ -97,7 +97,7 @@ class Ground:
         self.clock.advance(0.5)
 
     def stop(self) -> None:
-        """Stop both nodes, which removes their timers."""
+        """Stop both nodes, which cancels their timers."""
         self.node.stop_silently()
         self.other.stop()
 
@@ -121,7 +121,7 @@ class Ground:
         return sum(len(datagram) for datagram, to in self.sent if to == source)
 
     def state(self) -> str:
-        """Return the hash of the target's state: table, store, sessions, pending calls, timers."""
+        """Return the hash of the target's state: tables, store, sessions, pending calls and timers."""
         timers = sorted(call.getTime() for call in self.clock.getDelayedCalls())
         return state_of([self.node, self.store, timers])
 
@@ -138,7 +138,7 @@ class Ground:
 
         def noted(datagram: bytes, to: Address) -> None:
             self.sent.append((datagram, to))
-            if not self._is_shooting:  # a datagram in flight would count as state
+            if not self._is_shooting:  # a datagram in transit would be part of the hashed state
                 send(datagram, to)
 
         network.listen, network.send = tapped, noted
@@ -146,13 +146,13 @@ class Ground:
         return tapped_network
 
     def __call__(self, event: Any) -> None:
-        """Record warnings during an input, except refusals of peers, which have a ``code``."""
+        """Record warnings during an input, except rejections of peers, which have a ``code``."""
         if event["log_level"] >= LogLevel.warn and "code" not in event:
             self.errors.append(str(event.get("log_format")))
 
 
 def state_of(thing: object, without: object = None) -> str:
-    """Return the hash of every object reachable from ``thing``, but not through ``without``."""
+    """Return the hash of every object that is reachable from ``thing`` by a path without objects in ``without``."""
     said: list[str] = []
     _walk(thing, said.append, {id(without): -1})
     return hashlib.blake2b(";".join(said).encode(), digest_size=16).hexdigest()

@@ -1,8 +1,11 @@
-"""Fuzz INIT, RESP and COOKIE of a member with the team's key and arbitrary contents.
+"""Fuzz INIT, RESP and COOKIE datagrams that a member encrypts with the team's key, with arbitrary contents.
 
-The content is a life, a certificate, a message and padding, or random bytes; a RESP may also be a refusal. A refused
-handshake changes nothing (R1), and no reply is longer than its request (R3). The first byte of an input selects one of
-the three, and a closed team (from 3 on); in an INIT the seed of its ephemeral key follows.
+The content of an INIT or RESP should be an incarnation number, a certificate, a message and padding; here it is
+arbitrary, and a RESP may also contain a rejection. A rejected handshake must change nothing, and no reply may be longer
+than its request.
+
+The first byte of an input selects the kind: INIT, RESP and COOKIE are 0 to 2 for an open team and 3 to 5 for a closed
+team. For an INIT, the next byte is the seed of its ephemeral key.
 """
 
 from __future__ import annotations
@@ -35,7 +38,7 @@ AT = Address("10.0.0.3", 3)
 
 
 class ShortPass(Gate):
-    """An admission check with short certificates."""
+    """An admission check that permits certificates of at most 64 bytes."""
 
     def __init__(self) -> None:
         super().__init__(shown=b"pass")
@@ -43,7 +46,8 @@ class ShortPass(Gate):
 
 
 def init(ground: Ground, data: bytes) -> bytes:
-    """Return an INIT with a payload; the bytes after the first 600 change the finished datagram."""
+    """Return an INIT that contains ``data``; if the length of ``data`` is even, its last bytes replace the second MAC.
+    """
     remote = derive_exchange_key(ground.contact.public)
     noise = Initiator(OWN.static, remote, random.Random(data[:1]).randbytes(32), PROLOGUE, OWN.psk)
     payload = data[1:] if data[:1] < b"\x80" else data[1:5] + OWN.public + data[5:]
@@ -53,7 +57,7 @@ def init(ground: Ground, data: bytes) -> bytes:
 
 
 def resp(ground: Ground, asked: bytes, data: bytes) -> bytes:
-    """Return a RESP to the target's INIT, with a payload."""
+    """Return a RESP that contains ``data``, in reply to the target's INIT ``asked``."""
     noise = Responder(OWN.static, bytes(range(32)), PROLOGUE, OWN.psk)
     payload, _ = noise.read(asked[1 : -2 * MAC_BYTES])
     message, _ = noise.write(data[:1300])
@@ -61,14 +65,14 @@ def resp(ground: Ground, asked: bytes, data: bytes) -> bytes:
 
 
 def cookie(asked: bytes, data: bytes) -> bytes:
-    """Return a COOKIE for the target's INIT, with content of any length."""
+    """Return a COOKIE in reply to the target's INIT ``asked``, with content of any length."""
     head, nonce = bytes([COOKIE]) + read_mac(asked), bytes(24)
     key = derive_key(TEAM, b"cookie")
     return head + nonce + bindings.crypto_aead_xchacha20poly1305_ietf_encrypt(data[:1300], head, nonce, key)
 
 
 def shot(ground: Ground, data: bytes) -> None:
-    """Send one input; raises ``Violation``."""
+    """Send one input to the target; raises ``Violation``."""
     kind, data = data[0] % 3 if data else 0, data[1:]
     source = STRANGER
     if kind:
@@ -87,7 +91,7 @@ def shot(ground: Ground, data: bytes) -> None:
     sent_bytes = ground.shoot(datagram, source)
     if not kind and sent_bytes > len(datagram):
         raise Violation(f"{sent_bytes} bytes sent for {len(datagram)} received")
-    # A RESP opens its session even if its message is invalid; only the message is dropped.
+    # A valid RESP opens its session even if the message in it is invalid; only the message is dropped.
     if kind != 1 and counters["forged"] + counters["malformed"] > refused and ground.state() != before:
         raise Violation("a refused handshake changed the node")
     ground.clock.advance(2.0 if kind else 0.02)
@@ -97,7 +101,7 @@ _open, _closed = Again(shot), Again(shot, made=lambda: Ground(ShortPass()))
 
 
 def check(data: bytes) -> None:
-    """Send one input to a node of an open or of a closed team."""
+    """Send one input to a node of an open or of a closed team; raises ``Violation``."""
     (_closed if data and data[0] // 3 % 2 else _open)(data)
 
 

@@ -1,9 +1,11 @@
-"""Fuzz certificates, statements, join requests and join replies: changed, truncated or invented.
+"""Fuzz certificates, statements, join requests and join replies with changed, truncated and random input.
 
-The first byte of an input selects the kind (see ``KINDS``). From 128 on a valid one is taken, and each following three
-bytes give the position and value of a change. Every decoder returns a valid object or raises ``Malformed`` or
-``Forged``; the membership list accepts nothing without the signature of its operator or of a bootstrap node; and a
-bootstrap node's reply to a join request is no longer than the request, without an exception or a log line.
+The first byte of an input selects the kind (see ``KINDS``). If this byte is at least 128, a valid message of the kind
+is changed: each following three bytes give the position and value of one change.
+
+Every decoder must return a valid object or raise ``Malformed`` or ``Forged``. The membership list must accept nothing
+without the signature of its operator or of a bootstrap node. A bootstrap node's reply to a join request must not be
+longer than the request, and the request must cause no exception and no log line.
 """
 
 from __future__ import annotations
@@ -40,7 +42,7 @@ EPHEMERAL = bytes(range(32))
 
 
 def lawful() -> dict[str, list[bytes]]:
-    """Return valid messages of each kind."""
+    """Return valid messages, by kind."""
     grant = granted(SIGNER, "vaio", "bootstrap")
     chain = admitted(SIGNER, "dog")
     secret = SIGNER.rotate_secret(2, [NEWCOMER.public], NOW, 60, random.Random(2))
@@ -81,7 +83,7 @@ def changed(base: bytes, data: bytes) -> bytes:
 
 
 def check(data: bytes) -> None:
-    """Decode one input with all decoders of its kind; raises ``Violation``."""
+    """Decode one input with all decoders of its kind; raises ``Violation`` if a decoder breaks a rule."""
     first = data[0] if data else 0
     kind = KINDS[first % len(KINDS)]
     base = LAWFUL[kind][first // len(KINDS) % len(LAWFUL[kind])]

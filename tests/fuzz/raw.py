@@ -1,6 +1,6 @@
-"""Fuzz an open port with arbitrary datagrams of a stranger, including changed recordings.
+"""Fuzz an open port with arbitrary datagrams of a node outside the team, including changed recordings.
 
-A stranger changes nothing (R1) and gets no more bytes than it sent (R3).
+Such a datagram must change nothing, and its sender must get no more bytes than it sent.
 """
 
 from __future__ import annotations
@@ -14,8 +14,8 @@ RECORDED = 128
 def datagram_of(data: bytes, recorded: list[bytes]) -> bytes:
     """Return the datagram that an input encodes.
 
-    From ``RECORDED`` on the first byte selects a recording; each following three bytes give the position and value of
-    a change.
+    If the first byte is at least ``RECORDED``, it selects a recording; each following three bytes give the position and
+    value of one change.
     """
     if not data or data[0] < RECORDED or not recorded:
         return data[1:]
@@ -30,7 +30,7 @@ def datagram_of(data: bytes, recorded: list[bytes]) -> bytes:
 
 
 def shot(ground: Ground, data: bytes) -> None:
-    """Send one input; raises ``Violation``."""
+    """Send one input to the target; raises ``Violation``."""
     datagram = datagram_of(data, ground.recorded)
     before = ground.known or ground.state()
     sent = ground.shoot(datagram)

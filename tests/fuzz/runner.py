@@ -1,7 +1,7 @@
 """Run a fuzz target for some time, with atheris if it is installed, otherwise with simple mutations.
 
-``python -m tests.fuzz.raw --seconds 600`` prints the number of inputs and the duration of the slowest one; an input
-that violates a rule is written to a file, and its name is printed.
+``python -m tests.fuzz.raw --seconds 600`` prints the number of inputs and the duration of the slowest input. An input
+that violates a rule is written to a file, and the file name is printed.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ Check = Callable[[bytes], None]
 
 
 class Again:
-    """A check on a ground that is recreated after ``period`` inputs, because valid inputs change its state."""
+    """A check that creates a new ``Ground`` after every ``period`` inputs, because valid inputs change the state."""
 
     def __init__(
         self, shot: Callable[[Ground, bytes], None], period: int = 200, made: Callable[[], Ground] = Ground
@@ -35,7 +35,7 @@ class Again:
         self._ground: Ground | None = None
 
     def __call__(self, data: bytes) -> None:
-        """Send one input."""
+        """Check one input; raises ``Violation``."""
         if self._ground is None or not self._left:
             if self._ground is not None:
                 self._ground.stop()
@@ -49,12 +49,12 @@ class Again:
 
 
 def seeds(name: str) -> list[bytes]:
-    """Return the corpus of a target."""
+    """Return the stored inputs of a target."""
     return [path.read_bytes() for path in sorted((CORPUS / name).iterdir())]
 
 
 def mutated(rng: random.Random, inputs: list[bytes]) -> bytes:
-    """Return a mutation of the known inputs."""
+    """Return a random mutation of the known inputs."""
     data = bytearray(rng.choice(inputs))
     for _ in range(rng.randrange(1, 6)):
         place = rng.randrange(len(data) + 1)
@@ -97,7 +97,7 @@ def main(name: str, check: Check) -> None:
 
 
 def _functions() -> list[FunctionType]:
-    """Return the functions and methods of the library, for which coverage is measured."""
+    """Return the functions and methods of the middleware, for which coverage is measured."""
     found = []
     for name, module in list(sys.modules.items()):
         if name.startswith("middleware.entangled"):
@@ -124,7 +124,7 @@ def _mutate(check: Check, inputs: list[bytes], seconds: float, seed: int) -> Non
 
 
 class _Timed:
-    """Counts the inputs, and measures the slowest one."""
+    """Counts the inputs, and measures the duration of the slowest input."""
 
     def __init__(self, check: Check) -> None:
         self._check = check

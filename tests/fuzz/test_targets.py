@@ -13,12 +13,12 @@ BOUNDED = settings(max_examples=150)
 
 
 class TargetTests(SynchronousTestCase):
-    """No input violates a rule: R1 (refused input changes nothing) and R3 (no reply is larger than its request)."""
+    """No input violates a rule: a rejected input changes nothing, and no reply is larger than its request."""
 
     @BOUNDED
     @given(st.binary(max_size=1500))
     def test_any_datagram(self, data: bytes) -> None:
-        """Arbitrary datagrams of a stranger violate no rule."""
+        """Arbitrary datagrams of a node outside the team violate no rule."""
         raw.check(b"\0" + data)
 
     @BOUNDED
@@ -30,11 +30,11 @@ class TargetTests(SynchronousTestCase):
     @BOUNDED
     @given(st.binary(max_size=1371))
     def test_any_plaintext(self, data: bytes) -> None:
-        """Arbitrary plaintexts, sealed by a member, violate no rule."""
+        """Arbitrary plaintexts, encrypted in a member's session, violate no rule."""
         envelope.check(len(data).to_bytes(2, "little") + data)
 
     def test_the_ground_notices(self) -> None:
-        """The hash covers new sessions, timers and pending calls; a longer reply is a violation."""
+        """The hash covers new sessions, timers and pending calls; a reply longer than its request is a violation."""
         ground = Ground()
         self.addCleanup(ground.stop)
         before = ground.state()
