@@ -1,2 +1,1 @@
-"""Attacks S1 to S25 by outsiders, malicious members and thieves: one module per attack, with the defence that stops it.
-"""
+"""Attacks S1 to S25 by outsiders, malicious members and thieves, one module per attack, with the defence against it."""

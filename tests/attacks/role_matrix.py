@@ -80,8 +80,7 @@ class Counts:
 
 
 def list_slots(owner: bytes) -> list[Slot]:
-    """Return every combination of the keys and the slot names that the namespaces of the role table use, for ``owner``.
-    """
+    """Return every combination of the keys and slot names of the role table's namespaces, for ``owner``."""
     examples = [namespace.slot(owner) for namespace in NAMESPACES.values()]
     keys = dict.fromkeys(slot.key for slot in examples)
     names = dict.fromkeys([*(slot.name for slot in examples), "x"])

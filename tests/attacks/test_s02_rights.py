@@ -176,8 +176,7 @@ class CertificateTests(SiegeCase):
         return code
 
     def test_passes_that_do_not_hold(self) -> None:
-        """An expired, early, stolen, truncated or missing certificate, or a certificate of another team, is rejected.
-        """
+        """An expired, early, stolen, truncated or missing certificate, or one of another team, is rejected."""
         self.team = team = self.village()
         other = self.village(seed=2)
         secret = team.houses[0].kept.membership.secrets[0][1]

@@ -109,8 +109,7 @@ class ReplayCase(SiegeCase):
         return self.sent[id(team)]
 
     def freeze(self, team: Village) -> None:
-        """Drop all datagrams that the nodes send from now on, because a reply to a replay must not reach another node.
-        """
+        """Drop all datagrams that the nodes send from now on, so that none reaches another node; they are counted."""
         for house in team.houses:
             network: Any = house.node._network
 
@@ -129,8 +128,7 @@ class ReplayTests(ReplayCase):
         self.assertEqual(self.runs, [0, 1, 2, 3, 4])
 
     def test_at_once(self) -> None:
-        """A replay has no effect if it follows immediately, to the same nodes, from another address, or to other nodes.
-        """
+        """An immediate replay to the same nodes, from another address, or to other nodes has no effect."""
         self.freeze(self.team)
         self.replay(self.team)
         self.replay(self.team, source=ELSEWHERE)

@@ -1,4 +1,4 @@
-"""Attack S8: make a node send more than it received, to a third party, or on behalf of strangers."""
+"""Attack S8: make a node send more than it receives, to a third party, or on behalf of nodes outside the team."""
 
 from __future__ import annotations
 
@@ -50,14 +50,14 @@ class AmplificationTests(SiegeCase):
         self.dice = random.Random(1)
 
     def back(self, datagram: bytes, seconds: float = 2.0) -> int:
-        """Return the bytes that a victim receives after one datagram with its address as source."""
+        """Return the number of bytes that a victim receives after one datagram with its address as source."""
         self.sent.clear()
         self.network.receiver(datagram, VICTIM)
         self.team.run(seconds)
         return self.sent[VICTIM]
 
     def test_every_kind(self) -> None:
-        """No answer to an unverified address is longer than its request."""
+        """No reply to an unverified address is longer than its request."""
         secret = self.house.team.secret
         own = Credentials.derive(Identity(b"i" * 32), secret)
         remote = derive_exchange_key(self.house.public)
@@ -89,7 +89,7 @@ class AmplificationTests(SiegeCase):
         self.assertLessEqual(max(ratios.values()), 1.0, ratios)
 
     def test_again_and_again(self) -> None:
-        """A recorded INIT sent a hundred times gets at most as many bytes as it has."""
+        """A hundred copies of a recorded INIT cause replies with at most as many bytes as the copies."""
         own = Credentials.derive(Identity(b"i" * 32), self.house.team.secret)
         made = InitiatorHandshake(
             own,
@@ -104,7 +104,7 @@ class AmplificationTests(SiegeCase):
         self.assertLessEqual(back, 100 * len(datagram))
 
     def test_others_are_not_drawn_in(self) -> None:
-        """Strangers' datagrams do not make a node send more to third parties."""
+        """Datagrams of nodes outside the team do not make a node send more to third parties."""
         self.team.run(10.0)
         self.sent.clear()
         self.team.run(5.0)
@@ -120,7 +120,7 @@ class AmplificationTests(SiegeCase):
 
 class IntroductionTests(SiegeCase):
     def test_knocks_at_a_victim(self) -> None:
-        """The rate of bytes to an address that a member names in introductions is limited."""
+        """If a member requests introductions to a victim's address, the rate of bytes to this address is limited."""
         team = self.village()
         bad, _ = self.insider(team, "bad")
         self.outcome(team, bad.ask(team.contact(team.houses[0]), "ping", bytes(8), changes=True))
@@ -152,7 +152,7 @@ class IntroductionTests(SiegeCase):
 
 class RelayTests(SiegeCase):
     def test_a_stranger_is_not_carried_for(self) -> None:
-        """A relay forwards only in a session: the same bytes without one are dropped."""
+        """A relay forwards a datagram only in a session; the same bytes outside of a session are dropped."""
         team = self.village()
         team.enlist("dog")
         network: Any = network_of(team.houses[0])
@@ -184,11 +184,11 @@ class RelayTests(SiegeCase):
         session = next(iter(bad._sessions.values()))
         team.tell(team.signer.revoke(paper.identity.public, "bad", team.wall()))
         team.run(2.0)
-        bad._sessions.setdefault(session.local_index, session)  # the attacker ignores the revocation
+        bad._sessions.setdefault(session.local_index, session)  # the attacker ignores its revocation
         self.assertEqual(carry(), 0)
 
     def relay(self) -> tuple[Any, Any, list[int]]:
-        """Return a relay with a session for every id, its clock, and its sent bytes."""
+        """Return a relay that finds a session for every node id, its clock, and the list of datagrams that it sends."""
         clock, sent = HeapClock(), [0]
 
         def send(session: object, plain: bytes) -> None:
@@ -216,7 +216,7 @@ class RelayTests(SiegeCase):
         self.assertEqual(sent[0], before)
 
     def test_quota_of_all(self) -> None:
-        """All pairs together are limited to ``ALL_RATE``, and to 256 pairs."""
+        """All pairs together are limited to the rate ``ALL_RATE``, and their number to 256."""
         relay, clock, sent = self.relay()
         for _ in range(10):
             for number in range(400):

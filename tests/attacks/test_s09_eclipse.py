@@ -1,4 +1,4 @@
-"""Attack S9: surround a key or a node with the attacker's identities, poison tables, and lie in lookups."""
+"""Attack S9: surround a key or a node with identities of the attacker, poison routing tables, and lie in lookups."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ K = 8
 
 
 def sybils(count: int, seed: int = 1) -> list[Contact]:
-    """Return invented identities, each with another address."""
+    """Return invented identities, each with a different address."""
     dice = random.Random(seed)
     return [
         Contact(dice.randbytes(32), Address(f"10.{6 + n // 65025}.{n // 255 % 255}.{1 + n % 254}", 666))
@@ -36,7 +36,10 @@ class OutsiderTests(SiegeCase):
         return {contact.public for node in nodes for contact in node.overlay.contacts()}
 
     def test_ten_thousand_around_a_key(self) -> None:
-        """Ten thousand identities near a key enter no table, although a member names them; the key stays readable."""
+        """Ten thousand invented identities near a key enter no table although a member returns them.
+
+        The key stays readable.
+        """
         team = self.village()
         for name in ("dog", "cat", "pig", "cow"):
             team.enlist(name)
@@ -48,7 +51,7 @@ class OutsiderTests(SiegeCase):
         )
         for house in team.houses:
             self.assertFalse(crowd[0] in house.node.overlay.contacts())
-        bad, _ = self.insider(team, "bad")  # a member that names the invented identities
+        bad, _ = self.insider(team, "bad")  # a member returns the invented identities in lookups
         page = [contact.pack() for contact in crowd[:K]]
         bad.expose("find_node", lambda peer, target: page)
         bad.expose("members", lambda peer, after: page)
@@ -63,7 +66,7 @@ class OutsiderTests(SiegeCase):
         self.assertLessEqual(members, self.everybody(team))
 
     def test_identities_without_certificates(self) -> None:
-        """Invented identities with the team's secret but no certificate are refused, and enter no table."""
+        """Invented identities that have the team's secret but no certificate are rejected, and enter no table."""
         team = self.village()
         secret = team.houses[0].team.secret
         refused = 0
@@ -79,7 +82,7 @@ class OutsiderTests(SiegeCase):
 
 class TableTests(SynchronousTestCase):
     def test_flushed_by_ever_new_ids(self) -> None:
-        """Ten thousand newcomers displace no contact that answers."""
+        """Ten thousand new contacts displace no contact that still replies."""
         old, [me] = sybils(40, 3), sybils(1, 2)
         table = RoutingTable(me.node_id, K)
         for contact in old:
@@ -88,7 +91,7 @@ class TableTests(SynchronousTestCase):
         for moment, contact in enumerate(sybils(10_000)):
             doubtful = table.record_contact(contact, 10.0 + moment / 100)
             if doubtful is not None and doubtful in before:
-                table.record_contact(doubtful, 10.0 + moment / 100)  # it answers
+                table.record_contact(doubtful, 10.0 + moment / 100)  # the old contact replies
         self.assertLessEqual(before, set(table.list_contacts()))
         self.assertLess(len(table), 40 * K)
 
@@ -121,7 +124,7 @@ class InsiderTests(FleetCase):
         return [place for place in range(len(fleet.nodes)) if place not in liars]
 
     def share_read(self, share: float) -> float:
-        """Return the share of 40 keys, written before the lies, that honest members read correctly."""
+        """Return the share of 40 keys, written before the members lie, that honest members read correctly."""
         fleet = self.fleet(20)
         fleet.run(10.0)
         values = {hash_key(f"k{number}"): b"%d" % number for number in range(40)}
@@ -144,7 +147,7 @@ class InsiderTests(FleetCase):
             self.assertGreaterEqual(self.share_read(share), least, share)
 
     def test_liars_bring_nobody_in(self) -> None:
-        """Contacts that liars name enter no table before they prove their key at their address."""
+        """A contact that a liar returns enters no table before it proves its key at its address."""
         fleet = self.fleet(12)
         fleet.run(5.0)
         self.lied(fleet, 0.3)

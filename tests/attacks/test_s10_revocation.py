@@ -1,4 +1,4 @@
-"""Attack S10: a stolen or malicious member; within ten seconds of its revocation it is excluded."""
+"""Attack S10: act as a stolen or malicious member, which the team must exclude within ten seconds of its revocation."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ class RevocationCase(SiegeCase):
         self.team.tell(self.team.signer.revoke(self.bad.public, self.bad.name, self.team.wall()))
 
     def out(self, among: list[House]) -> list[str]:
-        """Return the nodes that still have a contact, a session or a membership entry of the revoked member."""
+        """Return the nodes that still have the revoked member as a contact, in a session or in the membership list."""
         return [
             house.name
             for house in among
@@ -41,11 +41,11 @@ class RevocationCase(SiegeCase):
         ]
 
     def refusals(self, bare: Any, among: list[House]) -> set[str]:
-        """Return the refusals that an attacker with the stolen identity gets."""
+        """Return the codes with which nodes reject an attacker that uses the stolen identity."""
         return {self.refusal(self.team, bare.ask, house, 0.5) for house in among}
 
     def bare(self, at: int = 1, incarnation: int = 2**62) -> Any:
-        """Return an endpoint with identity, certificate and secret of the stolen store, on another machine."""
+        """Return an endpoint on another machine with the identity, certificate and secret of the stolen store."""
         paper: Membership = self.bad.kept.membership
         where = SOURCE._replace(port=600 + at)
         return self.attacker(self.team, paper.identity, paper.secrets[0][1], paper.certificate, where, incarnation)
@@ -55,7 +55,10 @@ class TwentyTests(RevocationCase):
     members = 20
 
     def test_out_within_ten_seconds(self) -> None:
-        """After ten seconds no connected node has the member, and each refuses it with ``revoked``."""
+        """Ten seconds after the revocation no connected node has the member as a contact.
+
+        Each rejects it as ``revoked``.
+        """
         self.revoke()
         self.team.run(IN_FORCE)
         self.assertEqual(self.out(self.others), [])
@@ -63,7 +66,7 @@ class TwentyTests(RevocationCase):
         self.assertEqual(self.refusals(self.bare(), self.others), {"revoked"})
 
     def test_after_a_cut(self) -> None:
-        """Nodes behind a partition exclude the member within ten seconds after it heals."""
+        """When a partition ends, the nodes behind it exclude the revoked member within ten seconds."""
         near = self.team.houses[:12]
         far = self.team.houses[12:]
         self.team.switchboard.partition([self.team.address_of(each) for each in near])
@@ -78,7 +81,7 @@ class TwentyTests(RevocationCase):
 
 class RevocationTests(RevocationCase):
     def test_across_a_restart(self) -> None:
-        """Restarted nodes still refuse the member, without any other node to ask."""
+        """A restarted node still rejects the member, even if it can contact no other node."""
         self.revoke()
         self.team.run(IN_FORCE)
         self.team.close(self.bad, is_sudden=True)
@@ -95,17 +98,17 @@ class RevocationTests(RevocationCase):
         self.assertEqual(self.refusals(self.bare(2), self.others[:4]), {"revoked"})
 
     def test_a_copy_of_its_store(self) -> None:
-        """A copy of the member's store on another machine is refused, with an older or newer life number."""
+        """A copy of the member's store on another machine is rejected, with a lower or higher incarnation number."""
         self.revoke()
         self.team.run(IN_FORCE)
         for number, incarnation in enumerate(
             (1, 2**62)
-        ):  # with an older life number the refusal may also name the newer life
+        ):  # with a lower incarnation number the reason may also be that a higher number is known
             told = self.refusals(self.bare(number, incarnation), self.others[:3])
             self.assertLessEqual(told, {"revoked", "doubled"} if incarnation == 1 else {"revoked"})
 
     def test_its_bootstrap_days_are_over(self) -> None:
-        """A revoked bootstrap node admits no newcomer."""
+        """A revoked bootstrap node cannot admit a new member."""
         code = self.team.invite("pup")
         self.revoke()
         self.team.run(IN_FORCE)
@@ -124,7 +127,7 @@ class RevocationTests(RevocationCase):
         self.assertEqual(self.outcome(self.team, self.others[0].node.get(key)), [])
 
     def test_after_the_secret_is_rotated(self) -> None:
-        """After a rotation of the secret the revoked member gets no answer to a handshake."""
+        """After a rotation of the secret the revoked member gets no reply to a handshake."""
         self.revoke()
         members = [house.public for house in self.others]
         self.team.run(2.0)

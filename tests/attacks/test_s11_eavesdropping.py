@@ -1,7 +1,7 @@
 """Attack S11: read names, tasks, positions, messages and keys in the datagrams of a team.
 
-This module searches every byte on the switchboard; ``tests/live/test_eavesdropping.py`` does the same for real
-datagrams on loopback.
+This module searches every byte on the switchboard. ``tests/live/test_eavesdropping.py`` searches real datagrams on
+loopback in the same way.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ def forms(secret: bytes) -> set[bytes]:
 
 
 def found(stream: Iterable[bytes], needles: Iterable[bytes]) -> list[bytes]:
-    """Return the needles that occur in any of the datagrams."""
+    """Return the strings of ``needles`` that occur in any of the datagrams."""
     whole = b"\0\0\0\0".join(stream)
     return [needle for needle in needles if needle in whole]
 
@@ -58,7 +58,7 @@ class EavesdroppingTests(SiegeCase):
         self.assertEqual(found(self.heard, needles | {PLACE, b"12.345678", b"-7.8910", b"capabilities"}), [])
 
     def test_nobody_is_told_by_its_key(self) -> None:
-        """No datagram contains a public key, node id or record key, which would identify the peers."""
+        """No datagram contains a public key, node id or record key, so a listener cannot identify the peers."""
         keys = [house.public for house in self.team.houses]
         needles = set().union(*(forms(each) for each in (*keys, *map(derive_node_id, keys), self.key)))
         self.assertEqual(found(self.heard, needles), [])
@@ -74,14 +74,14 @@ class EavesdroppingTests(SiegeCase):
         self.assertEqual(found(self.heard, needles), [])
 
     def test_the_ear_hears(self) -> None:
-        """The search finds the only plain text, the fingerprint of the team in a PROBE_REPLY."""
+        """The search works: it finds the only unencrypted value, the fingerprint of the team in a PROBE_REPLY."""
         self.outcome(self.team, self.dog.node.endpoint.probe(self.team.address(0)))
         heard = [datagram for _, datagram, _ in self.tape.heard]
         fingerprint = self.team.houses[0].team.admission.fingerprint
         self.assertEqual(found(heard, [fingerprint]), [fingerprint])
 
     def test_the_same_word_looks_different(self) -> None:
-        """Two equal messages share no eight bytes, which hides the repetition."""
+        """The ciphertexts of two equal messages share no eight bytes, so a listener cannot see the repetition."""
         contact = self.team.contact(self.team.houses[0])
         start = len(self.tape.heard)
         for _ in range(2):

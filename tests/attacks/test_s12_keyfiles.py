@@ -1,4 +1,4 @@
-"""Attack S12: get keys from files that other users can read, from logs, or from a node's answers."""
+"""Attack S12: read keys from files that are readable by other users, from logs, or from a node's answers."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ class FileTests(SiegeCase):
         operator.create_operator_file(self.folder / "operator", self.signer)
 
     def test_made_for_the_owner_alone(self) -> None:
-        """New and replaced key files, and the files of the store, have the mode 0600 under any umask."""
+        """New and replaced key files, and the files of the store, have mode 0600 under any umask."""
         before = os.umask(0)
         self.addCleanup(os.umask, before)
         membership_file.create_membership_file(self.folder / "other", self.paper)
@@ -48,7 +48,7 @@ class FileTests(SiegeCase):
             self.assertEqual(stat.S_IMODE(path.stat().st_mode), 0o600, path)
 
     def test_readable_by_others(self) -> None:
-        """A key file with any permission for other users is refused, and the error names the remedy."""
+        """A key file that other users may access in any way is rejected, and the error states the remedy."""
         for path, load in self.files.items():
             for mode in (0o640, 0o604, 0o660, 0o606, 0o620, 0o602, 0o601, 0o610, 0o777):
                 path.chmod(mode)
@@ -58,7 +58,7 @@ class FileTests(SiegeCase):
             load(path)
 
     def test_no_file_at_all(self) -> None:
-        """A folder, a dangling link and invalid content are refused, and the error does not contain the content."""
+        """A folder, a dangling link and invalid content are rejected, and the error does not contain the content."""
         (self.folder / "dir").mkdir()
         (self.folder / "nowhere").symlink_to(self.folder / "gone")
         (self.folder / "rubbish").write_bytes(b'{"seed": "topsecretseed"')
@@ -69,7 +69,7 @@ class FileTests(SiegeCase):
                 self.assertNotIn("topsecretseed", str(error))
 
     def test_one_for_the_other(self) -> None:
-        """An operator's key file is not accepted as a membership, and the reverse."""
+        """An operator's key file is rejected as a membership file, and a membership file as an operator's key file."""
         self.assertRaises(BadKeyFile, MembershipFile, self.folder / "operator")
         self.assertRaises(BadKeyFile, operator.load_operator, self.folder / "membership")
 
@@ -86,7 +86,7 @@ class SaidTests(SiegeCase):
         self.events = events_of(self)
 
     def secrets(self, team: Any) -> list[str]:
-        """Return every secret of a team, in the forms in which a text could contain it."""
+        """Return every secret of a team, in all forms that a log line could contain."""
         raw = [team.signer.seed]
         for house in team.houses:
             kept = house.kept.membership
@@ -94,7 +94,7 @@ class SaidTests(SiegeCase):
         return [form for each in raw for form in (each.hex(), repr(each)[2:-1], base64.b64encode(each).decode()[:-1])]
 
     def test_nothing_in_logs(self) -> None:
-        """No log event contains a secret or code while a team joins, invites, admits, refuses, revokes and rotates."""
+        """No log line contains a secret or code while a team joins, invites, admits, rejects, revokes and rotates."""
         team = self.village()
         dog = team.welcome("dog")
         code = team.invite("cat")
@@ -130,7 +130,7 @@ class SaidTests(SiegeCase):
         self.assertEqual([each for each in self.secrets(team) if each in "\n".join(shown)], [])
 
     def test_nothing_is_told_to_members(self) -> None:
-        """The answers that any member can request contain neither another member's seed nor the operator's key."""
+        """No answer that any member can request contains another member's seed or the operator's key."""
         team = self.village()
         team.enlist("dog")
         bare, _ = self.insider(team, "eye", "viewer")

@@ -1,4 +1,4 @@
-"""Attack S13: records of owners without a certificate: invented keys, revoked keys, and one owner that floods."""
+"""Attack S13: store records of owners without a certificate, of revoked owners, and more than an owner's share."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ STOP = bytes(range(16))
 
 
 def written(owner: Identity, key: bytes, name: str, value: bytes = b"\xc3", sequence: int = 1) -> Record:
-    """Return a team record with a valid signature of its owner."""
+    """Return a record that outlives its owner, with the owner's valid signature."""
     return Record(key, name, owner.public, sequence, "team", 3600.0, value).sign(owner)
 
 
@@ -40,16 +40,16 @@ class RecordCase(SiegeCase):
         self.team.run(10.0)
 
     def forged(self, owner: Identity) -> list[Record]:
-        """Return a release of a stop, a task and another record, signed by ``owner``."""
+        """Return three records signed by ``owner``: a release of a stop, a task and one record of another kind."""
         release = msgpack.packb(Statement({}, (STOP,), "nobody").pack())
         return [written(owner, STOPS_KEY, SLOT, release), written(owner, TASKS, "t1"), written(owner, OTHER, "x")]
 
     def holders(self, records: list[Record], among: list[House]) -> list[str]:
-        """Return the nodes that store any of the records."""
+        """Return the nodes that store at least one of the records."""
         return [h.name for h in among if any(h.node.store.get_slot(record.slot) is not None for record in records)]
 
     def read(self, records: list[Record], house: House) -> list[Record]:
-        """Return the given records that a node reads with the consistency level majority."""
+        """Return those of the given records that a node reads at the consistency level majority."""
         keys = dict.fromkeys(record.key for record in records)
         found = [self.outcome(self.team, house.node.get(key)) for key in keys]
         return [record for each in found for record in each if record in records]
@@ -70,7 +70,7 @@ class RecordCase(SiegeCase):
         self.team.invite("pup")
 
     def accomplice(self) -> House:
-        """Return a member with a node that accepts, transfers and returns any record."""
+        """Return a member with a modified node that accepts, transfers and returns any record."""
         house = self.team.houses[-1]
         house.node.replica.may_store = house.node.replica.may_stay = lambda slot: True
         return house
@@ -83,7 +83,7 @@ class InventedKeyTests(RecordCase):
         self.records = self.forged(self.invented)
 
     def test_brought_by_a_viewer(self) -> None:
-        """A viewer cannot store records signed with an invented key by any method that accepts records."""
+        """A viewer cannot store records signed with an invented key, by any method that accepts records."""
         team = self.team
         viewer, own = self.insider(team, "eye", VIEWER)
         viewer.expose("watch", lambda peer, key, digest, ttl=8.0: [0, [[], None]], changes=True)
@@ -111,7 +111,7 @@ class InventedKeyTests(RecordCase):
         self.assertEqual(self.read(self.records, team.houses[0]), [])
 
     def test_told_by_a_lying_replica(self) -> None:
-        """A reader ignores records of uncertified owners in a replica's answers to a read, a watch or a fetch."""
+        """A reader ignores records of uncertified owners in a malicious replica's replies."""
         team, house = self.team, self.team.houses[0]
         liar, _ = self.insider(team, "eye", VIEWER)
         by_key = {record.key: record for record in self.records}
@@ -139,7 +139,10 @@ class InventedKeyTests(RecordCase):
         self.assertEqual(self.holders(self.records, [house]), [])
 
     def test_handed_over_by_an_accomplice(self) -> None:
-        """A node that stores such records cannot transfer them, and no read or watch of other nodes returns them."""
+        """An accomplice's node that stores such records cannot transfer them.
+
+        No read or watch at other nodes returns them.
+        """
         team = self.team
         accomplice = self.accomplice()
         others = [house for house in team.houses if house is not accomplice]
@@ -180,13 +183,13 @@ class RevokedKeyTests(RecordCase):
         self.later = written(self.boss.kept.membership.identity, TASKS, "later", sequence=2**40)
 
     def revoke(self) -> None:
-        """Revoke the member and stop its node."""
+        """Revoke the member, and stop its node."""
         self.team.tell(self.team.signer.revoke(self.boss.public, self.boss.name, self.team.wall()))
         self.team.run(10.0)
         self.team.close(self.boss, is_sudden=True)
 
     def test_what_it_ordered_before(self) -> None:
-        """A revoked operator's records disappear from every store and watch when the revocation arrives."""
+        """A revoked operator's records disappear from every store and watch when its revocation arrives."""
         watches = [watch for house in self.others for watch in self.watch([self.before], house)]
         self.team.run(3.0)
         self.assertEqual([watch.records for watch in watches], [[self.before]] * len(watches))
@@ -196,7 +199,10 @@ class RevokedKeyTests(RecordCase):
         self.assertEqual(self.read([self.before], self.others[0]), [])
 
     def test_its_stop_stays(self) -> None:
-        """A stop of a revoked operator stays in force, also across restarts, and the operator cannot release it."""
+        """A stop by a later revoked operator stays in force, also across restarts.
+
+        The revoked operator cannot release it.
+        """
         stop = msgpack.packb(Statement({STOP: "boss"}).pack())
         self.outcome(self.team, self.boss.node.put(STOPS_KEY, SLOT, stop))
         self.revoke()
@@ -217,7 +223,7 @@ class RevokedKeyTests(RecordCase):
             self.assertNotEqual(house.node.store.get_slot(release.slot), release)
 
     def test_what_it_signs_afterwards(self) -> None:
-        """Records signed after the revocation are refused from a member, and from an accomplice's node."""
+        """Records that the member signs after its revocation are rejected, also from an accomplice's node."""
         self.revoke()
         bad, _ = self.insider(self.team, "bad", DEVICE)
         for house in self.others:
@@ -232,7 +238,7 @@ class RevokedKeyTests(RecordCase):
         self.assertEqual(self.read([self.later], honest[0]), [])
 
     def test_after_a_restart(self) -> None:
-        """A node that was off during the revocation drops the stored records when it learns of it."""
+        """A node that was off during the revocation deletes the member's records when it learns of the revocation."""
         sleeper = self.others[1]
         self.team.close(sleeper)
         self.revoke()
@@ -251,7 +257,7 @@ class RevokedKeyTests(RecordCase):
 
 class FloodTests(RecordCase):
     def test_it_fills_its_own_share_only(self) -> None:
-        """A device that floods every store fills only its own share, and all other members can write."""
+        """A device that floods every store fills only its own share; all other members can still write."""
         team = self.team
         bad, own = self.insider(team, "bad", DEVICE)
         names = [f"{number}" for number in range(JUNK)]
@@ -271,7 +277,7 @@ class FloodTests(RecordCase):
         self.assertEqual(self.outcome(team, asked), [0], "a full owner can still delete")
 
     def test_it_blocks_no_reads(self) -> None:
-        """A member with a full share at all replicas but one cannot make the reads of a key fail."""
+        """A member whose share is full at all replicas except one cannot make reads of the key fail."""
         team = self.team
         bad, own = self.insider(team, "bad", OPERATOR)
         for house in team.houses[1:]:

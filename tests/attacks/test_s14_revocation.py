@@ -27,7 +27,7 @@ BOOT = identity("boot")
 
 class BackdatingTests(SiegeCase):
     def setUp(self) -> None:
-        """Create a team with a malicious bootstrap node, and a code with five uses."""
+        """Create a team with a malicious bootstrap node, and a join code for five members."""
         super().setUp()
         self.team: Village = self.village(bootstraps=2)
         self.thief = self.team.houses[1]
@@ -41,20 +41,23 @@ class BackdatingTests(SiegeCase):
         self.packed = known[1]
 
     def mint(self, seed: int, begin: int) -> tuple[Identity, bytes]:
-        """Return a member that the malicious node admits with the code, with a certificate that starts at ``begin``."""
+        """Return a new member that the malicious node admits, with a certificate that starts at ``begin``."""
         own = Identity(bytes([seed]) * 32)
         came = (own.public, "", sign_join(self.code.key, own.public, ""))
         thief = self.thief.kept.membership.identity
         return own, issue_certificate(thief, self.grant, (self.packed, self.invite), came, f"dog-{seed}", begin)
 
     def enter(self, own: Identity, shown: bytes, port: int) -> str:
-        """Return the code with which the first node refuses the member, or "" if it admits it."""
+        """Return the code with which the first node rejects the member, or "" if the node admits the member."""
         secret = self.team.houses[0].kept.membership.secrets[0][1]
         endpoint = self.attacker(self.team, own, secret, shown, SOURCE._replace(port=port))
         return self.refusal(self.team, endpoint.ask, self.team.houses[0], 4.0)
 
     def test_backdated_members(self) -> None:
-        """Members admitted by a revoked bootstrap node are refused, whatever their dates; a kept member stays."""
+        """Members admitted by a revoked bootstrap node are rejected, whatever their dates.
+
+        Members that the revocation keeps stay.
+        """
         kept, shown = self.mint(1, int(self.team.wall()))
         self.assertEqual(self.enter(kept, shown, 701), "")
         revoke = self.team.signer.revoke(self.thief.public, "boot1", self.team.wall(), members=[kept.public])
@@ -67,7 +70,7 @@ class BackdatingTests(SiegeCase):
         self.assertNotIn("dog-2", self.team.members())
 
     def test_revoked_with_all(self) -> None:
-        """A revocation without kept members also revokes the members that the bootstrap node admitted."""
+        """The revocation of a bootstrap node also revokes the members that it admitted, except those that it keeps."""
         own, shown = self.mint(1, int(self.team.wall()))
         self.enter(own, shown, 701)
         self.assertIn("dog-1", self.team.members())
@@ -83,7 +86,7 @@ class BackdatingTests(SiegeCase):
 
 class RoomTests(SiegeCase):
     def test_room_for_the_operator(self) -> None:
-        """A membership list that a bootstrap node filled accepts the operator's revocation, which frees space."""
+        """A membership list that a bootstrap node filled accepts a revocation of the operator, which frees space."""
         signer = operator(1)
         membership_list = MembershipList(signer.public)
         grant = granted(signer, "boot", "bootstrap")
@@ -108,7 +111,7 @@ class RoomTests(SiegeCase):
 
 class UnlistedTests(SiegeCase):
     def test_who_is_met_is_listed(self) -> None:
-        """A member with an unlisted grant is on every list after its first session, and can be revoked."""
+        """A member with a grant that no list contains is on every list after its first session, and can be revoked."""
         team = self.village()
         team.enlist("cat")
         hidden, own = self.insider(team, "ghost", "viewer")
@@ -122,7 +125,7 @@ class UnlistedTests(SiegeCase):
         self.assertIsInstance(error, NotAdmitted)
 
     def test_any_key_can_be_revoked(self) -> None:
-        """An unlisted key can be revoked, and its certificate is refused after that."""
+        """A key that is not on the membership list can be revoked; after that its certificate is rejected."""
         team = self.village()
         paper = team.paper("ghost", "viewer")
         public = paper.identity.public
@@ -133,7 +136,7 @@ class UnlistedTests(SiegeCase):
 
 class GuestTests(SiegeCase):
     def test_guests_of_one_gateway_are_few(self) -> None:
-        """A node admits a limited number of guests of one gateway, and refuses the others with the reason."""
+        """A node admits a limited number of guests of one gateway, and rejects further guests as unlisted."""
         team = self.village()
         paper = team.paper("gate", "gateway")
         refused = []

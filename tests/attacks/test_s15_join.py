@@ -1,4 +1,4 @@
-"""Attack S15: a member replies to a newcomer instead of a bootstrap node, or with forged terms."""
+"""Attack S15: reply to a newcomer as an ordinary member instead of a bootstrap node, or with forged terms."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ Answer = Callable[[bytes, JoinRequest], bytes]
 
 
 class JoinTests(SiegeCase):
-    """A team with an open code, and a hostile member with the knowledge of a member."""
+    """A team with a join code, and a hostile member that knows everything that a member knows."""
 
     def setUp(self) -> None:
         super().setUp()
@@ -49,7 +49,10 @@ class JoinTests(SiegeCase):
         self.terms = terms
 
     def check_true_team(self, answer: Answer) -> None:
-        """Let the hostile member ``answer`` each JOIN_REQUEST before a bootstrap node; the real team must be joined."""
+        """Let the hostile member send ``answer`` to each JOIN_REQUEST first.
+
+        The newcomer must still join the real team.
+        """
         network = self.team.switchboard.make_network(*DOOR)
         answered: list[JoinRequest] = []
 
@@ -74,17 +77,17 @@ class JoinTests(SiegeCase):
         self.assertEqual(membership.secrets[0][1], self.team.houses[0].kept.membership.secrets[0][1])
 
     def signer(self, identity: Identity, granted: Identity, role: str, terms: bytes = b"") -> Signer:
-        """Return a node that replies with the operator's grant for ``granted``, and with the real or other terms."""
+        """Return a signer with the operator's grant for the key ``granted``, and with the real terms or ``terms``."""
         grant = self.team.signer.grant(granted.public, "eye", (role,), self.team.wall())
         return Signer(identity, grant, terms or self.terms)
 
     def give(self, signer: Signer, shown: bytes) -> Answer:
-        """Answer each JOIN_REQUEST with a certificate and secret that the operator did not issue."""
+        """Return a function that replies to each JOIN_REQUEST with a certificate and a secret of the attacker."""
         given = JoinReply(shown, ((9, b"x" * 32, 0),))
         return lambda datagram, heard: join_codec.make_reply(self.invitation, heard, given, signer, self.rng)
 
     def forge(self, heard: JoinRequest, operator: Operator, terms: bytes) -> bytes:
-        """Return a complete JOIN_REPLY of another operator, with its invitation, bootstrap node and certificate."""
+        """Return a complete JOIN_REPLY of another operator, with its own invitation, bootstrap node and certificate."""
         boot, now = Identity(b"b" * 32), int(self.team.wall())
         grant = operator.grant(boot.public, "boot", ("bootstrap",), now)
         invite = Invite(self.invitation, "dog", ("device",), 1, now, now + 3600, 3600)
@@ -94,21 +97,25 @@ class JoinTests(SiegeCase):
         return join_codec.make_reply(self.invitation, heard, given, Signer(boot, grant, terms), self.rng)
 
     def test_another_operator(self) -> None:
-        """A reply for another operator with its own terms is rejected."""
+        """A reply in the name of another operator is rejected if it contains that operator's terms."""
         impostor = Operator("yard", b"i" * 32, {"presence_lease": 9.0})
         false = JoinCode(self.code.secret ^ 1, compute_fingerprint(impostor.public))
         terms = seal_terms(false, TermsContent(impostor.public, "yard", impostor.settings), self.rng)
         self.check_true_team(lambda datagram, heard: self.forge(heard, impostor, terms))
 
     def test_another_operator_with_the_true_terms(self) -> None:
-        """The real terms name the real operator, which rejects a reply by another operator's bootstrap node."""
+        """The real terms in a reply of another operator's bootstrap node do not help: they name the real operator."""
         impostor = Operator("yard", b"i" * 32)
         self.check_true_team(lambda datagram, heard: self.forge(heard, impostor, self.terms))
 
     def test_an_operator_with_the_same_mark(self) -> None:
-        """An operator key with the same 20-bit mark is not enough: sealing terms needs the code's secret."""
+        """An operator key with the same 20-bit fingerprint is not enough.
+
+        Only the secret of the code can seal the terms.
+        """
         impostor = Operator("yard", b"i" * 32)
-        # A search for a key with the code's mark takes a minute; instead the code gets the mark of the key.
+        # A search for a key with the fingerprint in the code takes a minute; instead the code gets the fingerprint of
+        # the key.
         code = JoinCode(self.code.secret, compute_fingerprint(impostor.public))
         self.invitation = code.key.public
         false = JoinCode(self.code.secret ^ 1, code.fingerprint)
@@ -119,7 +126,7 @@ class JoinTests(SiegeCase):
         self.assertRaises(Forged, join_codec.open_reply, said, code, NEWCOMER.public, b"e" * 32)
 
     def test_secrets_of_a_member(self) -> None:
-        """A member without the role bootstrap cannot issue a secret or certificate in the operator's name."""
+        """A member without the role bootstrap cannot give a newcomer a secret or certificate in the operator's name."""
         signer = self.signer(self.eye.team.identity, self.eye.team.identity, "viewer")
         self.check_true_team(self.give(signer, self.eye.kept.membership.certificate))
 
@@ -133,7 +140,7 @@ class JoinTests(SiegeCase):
         self.check_true_team(self.give(signer, admission.certificate))
 
     def test_terms_of_another_invitation(self) -> None:
-        """Terms sealed for another code can be opened only with that code."""
+        """Terms that were sealed for another code cannot be opened with this code."""
         other = self.team.signer.invite("cat", ("device",), 1, self.team.wall(), 3600.0, random.Random(9))
         statement = open_statement(self.team.signer.public, other.terms)
         assert isinstance(statement, Terms)
@@ -150,20 +157,20 @@ class JoinTests(SiegeCase):
         self.check_true_team(lambda datagram, heard: recorded)
 
     def test_a_forged_refusal(self) -> None:
-        """A refusal signed by a member without the role bootstrap does not end the attempt."""
+        """A signed rejection from a member without the role bootstrap does not end the newcomer's attempt."""
         signer = self.signer(self.eye.team.identity, self.eye.team.identity, "viewer")
         self.check_true_team(
             lambda datagram, heard: join_codec.make_refusal(self.invitation, heard, "used", signer, self.rng)
         )
 
     def test_a_hint(self) -> None:
-        """An unauthenticated hint that the code was used does not end the attempt."""
+        """An unauthenticated hint that the code is used up does not end the newcomer's attempt."""
         self.check_true_team(
             lambda datagram, heard: join_codec.make_unsigned_refusal(join_codec.read_invitation_id(datagram), "used")
         )
 
     def test_an_invitation_without_terms(self) -> None:
-        """A newcomer with a code of an older version is refused with the advice to request another code."""
+        """A newcomer with a code of an older version is rejected, and the error advises to request a new code."""
         village = self.village(seed=3)
         old = village.signer.invite("dog", ("device",), 1, village.wall(), 3600.0, village.dice)
         village.tell(old.invite)
@@ -177,7 +184,7 @@ class SettingsTests(SynchronousTestCase):
     @settings(max_examples=100)
     @given(LINE, LINE)
     def test_no_text_becomes_structure(self, kind: str, membership: str) -> None:
-        """Text in generated settings is read back as the same text; it adds no table and no key."""
+        """Text in generated settings is parsed back as the same text; it cannot add a table or a key."""
         text = format_settings("dog", membership, ["edge"], None, (), {"kind": kind})
         found = tomllib.loads(text)
         self.assertEqual(set(found), {"node"})
@@ -185,6 +192,6 @@ class SettingsTests(SynchronousTestCase):
         self.assertEqual(set(found["node"]), {"name", "membership", "store", "roles", "kind"})
 
     def test_keys_that_may_be_given(self) -> None:
-        """Newcomers cannot receive settings that run code, open a page, grant a right or name a file."""
+        """A newcomer cannot receive settings that run code, open a page, grant a right or contain a file path."""
         for key in ("name", "store", "membership", "team_key", "roles", "host", "known_nodes", "tunnels", "deployment"):
             self.assertNotIn(key, SHARED_KEYS)

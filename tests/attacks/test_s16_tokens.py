@@ -1,4 +1,4 @@
-"""Attack S16: members try to become operators of the page: tokens, invitations, TLS, failover and guessing."""
+"""Attack S16: become an operator of the page as a member, by tokens, invitations, TLS, failover or guessing."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ IN_FORCE = 3.0
 
 
 class TokenTeam(SimulatedTeam):
-    """Three web nodes with the role gateway, and a viewer, eve, with arbitrary code."""
+    """Three web nodes with the role gateway, and a viewer named eve, which runs arbitrary code."""
 
     def __init__(self) -> None:
         super().__init__(16, dogs=(), others=("pi", "nuc", "eve"))
@@ -53,7 +53,7 @@ class TokenTeam(SimulatedTeam):
 
 @dataclass
 class Web:
-    """The parts of a web node that handle sessions and failover."""
+    """The parts of a web node that manage sessions and failover."""
 
     sessions: SignedSessions
     fallbacks: TeamFallbacks
@@ -62,7 +62,7 @@ class Web:
 
 
 class PageCase(SynchronousTestCase):
-    """A closed team of real nodes; each of ``webs`` serves a page."""
+    """A closed team of real nodes; each node in ``webs`` serves a page."""
 
     def setUp(self) -> None:
         self.team = TokenTeam()
@@ -73,7 +73,7 @@ class PageCase(SynchronousTestCase):
         self.token = self.signed(self.vaio)
 
     def web(self, name: str, port: int) -> Web:
-        """Return the page of a node, which announces its address to the team."""
+        """Return the web node with this name, which announces the address of its page to the team."""
         service = self.team.services[name]
         node, rng = service.assembly.node, random.Random(name)
         settings = replace(service.settings, web=replace(service.settings.web, code=CODE))
@@ -93,7 +93,7 @@ class PageCase(SynchronousTestCase):
         return self.successResultOf(web.sessions.sign_in(proof, source, self.now()))
 
     def refused(self, web: Web, proof: str, source: str = HOME, later: float = 0.0) -> int:
-        """Return the status with which a sign-in is refused."""
+        """Return the HTTP status with which a sign-in is rejected."""
         failure = self.failureResultOf(web.sessions.sign_in(proof, source, self.now() + later), Refusal)
         return int(failure.value.status)
 
@@ -102,14 +102,14 @@ class PageCase(SynchronousTestCase):
         return web.sessions.authenticate(token, self.now()).role
 
     def passes(self, web: Web, token: str) -> dict[str, Token]:
-        """Return the visitor's tokens for the other web nodes, by the name of the node."""
+        """Return the tokens that a visitor gets for the other web nodes, by the name of the web node."""
         user = web.sessions.authenticate(token, self.now())
         nodes = {each.node.uuid: name for name, each in self.webs.items()}
         pages = [page.node for page in web.fallbacks.list_pages() if not page.is_self]
         return {nodes[uuid]: token for uuid, token in web.sessions.issue_peer_tokens(user, pages, self.now()).items()}
 
     def tell(self, packed: bytes) -> None:
-        """Publish a statement of the operator, and wait for its distribution."""
+        """Publish a statement of the operator, and wait until all nodes have it."""
         self.successResultOf(Deferred.fromCoroutine(self.vaio.node.team.publish(packed)))
         self.run_for(IN_FORCE)
 
@@ -118,7 +118,7 @@ class PageCase(SynchronousTestCase):
         self.tell(self.team.operator.revoke(web.node.entangled.identity.public, name, self.now()))
 
     def rotate(self) -> None:
-        """Give the other members a new secret, effective at once."""
+        """Give the members except pi and eve a new secret, which replaces the old one immediately."""
         members = [self.webs[name].node.entangled.identity.public for name in ("vaio", "nuc")]
         self.tell(self.team.operator.rotate_secret(2, members, self.now(), 0.0, random.Random(2)))
 
@@ -128,11 +128,11 @@ class PageCase(SynchronousTestCase):
         return list(dict.fromkeys(found))
 
     def minted(self, claim: Claim, audience: Web) -> list[str]:
-        """Return operator tokens forged with eve's key and with all knowledge that members share."""
+        """Return operator tokens that eve can forge with her key and with the secrets of the team."""
         own = TokenKey(self.eve.node.entangled.identity)
         at = audience.node.entangled.identity.node_id
         found = [own.sign_token(claim), own.sign_token(claim, at)]
-        # Sign in the name of the web node, with every key that can be derived from the members' knowledge.
+        # Sign as the web node, with every key that can be derived from the members' secrets.
         for secret in self.secrets():
             page = hashlib.blake2s(secret, person=b"page").hexdigest()
             for known in (secret, hashlib.blake2s(page.encode()).digest(), hashlib.blake2s(secret).digest()):
@@ -164,7 +164,7 @@ class MintTests(PageCase):
                 self.assertIn(self.refused(web, text, f"10.0.{len(text)}.1"), (401, 429))
 
     def test_mint_after_revoke_and_rotate(self) -> None:
-        """After her revocation and a rotation, forged tokens with old and new secrets stay invalid."""
+        """After the revocation of eve and a rotation, tokens forged with old and new secrets stay invalid."""
         self.revoke("eve")
         self.rotate()
         self.assertGreater(len(self.secrets()), 1)
@@ -172,14 +172,14 @@ class MintTests(PageCase):
             self.assertEqual(self.vaio.sessions.authenticate(text, self.now()), NOBODY)
 
     def test_serve_a_page_oneself(self) -> None:
-        """Eve's web node accepts no code or token, because it lacks the role gateway."""
+        """A web node of eve accepts no code and no token, because it lacks the role gateway."""
         self.assertEqual(self.refused(self.eve, CODE), 403)
         self.assertEqual(
             self.role(self.eve, TokenKey(self.eve.node.entangled.identity).sign_token(self.claim())), "anyone"
         )
 
     def test_invite_beyond_oneself(self) -> None:
-        """A guest cannot invite another guest for longer than the guest's own invitation."""
+        """A guest cannot invite another guest for longer than the guest's own invitation is valid."""
         user = self.vaio.sessions.authenticate(self.token.text, self.now())
         invited = self.signed(
             self.vaio, self.vaio.sessions.issue_guest_token(user, "guest", "operator", self.now(), 3600.0).text
@@ -191,7 +191,7 @@ class MintTests(PageCase):
 
 class StandingTests(PageCase):
     def test_revoked_gateway(self) -> None:
-        """Tokens of a revoked gateway, and all tokens derived from them, are invalid at once, without a restart."""
+        """Tokens of a revoked gateway, and tokens derived from them, become invalid immediately, without a restart."""
         signed = self.signed(self.pi)
         given = self.passes(self.pi, signed.text)
         self.assertEqual(self.role(self.vaio, given["vaio"].text), "operator")
@@ -215,13 +215,14 @@ class StandingTests(PageCase):
         self.assertEqual(self.role(self.vaio, made[0].text), "anyone")
 
     def test_revoked_gateway_serves_nobody(self) -> None:
-        """A gateway that learns of its revocation, or is now a viewer, accepts no visitors."""
+        """A gateway that learns of its revocation, or that it is now a viewer, accepts no visitors."""
         for name, web in (("pi", self.pi), ("nuc", self.nuc)):
             signed = self.signed(web)
             self.assertEqual(self.role(web, signed.text), "operator")
             if name == "pi":
                 self.revoke(name)
-                # The gateway may be disconnected before the revocation arrives; it reacts as soon as a peer sends it.
+                # The gateway may lose its peers before the revocation arrives; it reacts as soon as a peer sends the
+                # revocation.
                 public = web.node.entangled.identity.public
                 web.node.team._gossip.add(self.team.operator.revoke(public, name, self.now()))
             else:
@@ -231,7 +232,7 @@ class StandingTests(PageCase):
             self.assertEqual(self.refused(web, CODE), 403)
 
     def test_role_taken_away(self) -> None:
-        """Tokens of a gateway that is now a viewer are invalid at other nodes."""
+        """Tokens of a former gateway that is now a viewer are invalid at other nodes."""
         given = self.passes(self.nuc, self.signed(self.nuc).text)["vaio"]
         self.assertEqual(self.role(self.vaio, given.text), "operator")
         public = self.nuc.node.entangled.identity.public
@@ -241,7 +242,7 @@ class StandingTests(PageCase):
 
 class FailoverTests(PageCase):
     def test_advertise_a_page(self) -> None:
-        """A viewer's page is not listed, its origin is not allowed, and no token is issued for it."""
+        """The page of a viewer is not listed, its origin is not allowed, and no token is issued for it."""
         told = {page.node for page in self.pi.fallbacks.list_pages()}
         self.assertIn(self.vaio.node.uuid, told)
         for web in (self.vaio, self.pi, self.nuc):
@@ -252,7 +253,7 @@ class FailoverTests(PageCase):
         self.assertEqual(self.vaio.sessions.issue_peer_tokens(user, [], self.now()), {})
 
     def test_use_a_token_elsewhere(self) -> None:
-        """A token for one web node is invalid at all others, and thus useless to them."""
+        """A token for one web node is invalid at all other web nodes."""
         given = self.passes(self.vaio, self.token.text)
         self.assertEqual(sorted(given), ["nuc", "pi"])
         for name, token in given.items():
@@ -263,14 +264,14 @@ class FailoverTests(PageCase):
             self.assertEqual((self.role(web, self.token.text), self.role(web, self.token.ticket)), ("anyone",) * 2)
 
     def test_wait_with_a_token(self) -> None:
-        """A failover token is valid for minutes, and only the session at the new web node renews it."""
+        """A failover token is valid for minutes; only the web node that accepts it can renew the session."""
         given = self.passes(self.vaio, self.token.text)["pi"]
         self.assertLessEqual(given.until - self.now(), 900.0)
         roles = [self.pi.sessions.authenticate(given.text, given.until + late).role for late in (-1.0, 1.0)]
         self.assertEqual(roles, ["operator", "anyone"])
 
     def test_sign_out_everywhere(self) -> None:
-        """Signing out at one web node also ends the sessions at the web nodes of a failover."""
+        """A sign-out at one web node also ends the sessions that the visitor opened at other web nodes by failover."""
         given = self.passes(self.vaio, self.token.text)["pi"]
         moved = self.pi.sessions.renew_token(self.pi.sessions.authenticate(given.text, self.now()), self.now())
         self.assertEqual(self.role(self.pi, moved.text), "operator")
@@ -282,7 +283,7 @@ class FailoverTests(PageCase):
 
 class GuessTests(PageCase):
     def test_guess_from_many_addresses(self) -> None:
-        """Of ten thousand guesses in an hour, each from another address, few are checked."""
+        """Of ten thousand guesses in an hour, each from a different address, few are checked."""
         looked = 0
         for number in range(10_000):
             source = f"10.{number // 250}.{number % 250}.1"
@@ -290,7 +291,7 @@ class GuessTests(PageCase):
         self.assertLess(looked, 250)
 
     def test_lock_out_nobody(self) -> None:
-        """During an attack sessions are renewed; invitations, loopback and known addresses can sign in."""
+        """During an attack sessions are renewed, and invitations, loopback and known addresses can sign in."""
         for number in range(1000):
             self.refused(self.vaio, f"guess{number}", f"10.{number // 250}.{number % 250}.1")
         now = self.now()
@@ -305,7 +306,7 @@ class GuessTests(PageCase):
 
 class LogTests(SynchronousTestCase):
     def test_read_the_log(self) -> None:
-        """The log contains the page's address, but neither the code nor a link with it."""
+        """The log contains the address of the page, but neither the code nor a link with the code."""
         self.patch(os, "environ", {**os.environ, "XDG_RUNTIME_DIR": self.mktemp()})
         with capturedLogs() as said:
             page_access.announce_page("s16", "127.0.0.1", lambda: 8080, CODE)
@@ -334,7 +335,10 @@ class TlsTests(PageCase):
         skip = "TLS IS NOT TESTED: missing OpenSSL or cryptography (pip install 'swarm-node[tls]')"
 
     def test_sign_a_leaf(self) -> None:
-        """No key that can be derived from the team's secrets is a web node's TLS authority; each node has another."""
+        """No key that can be derived from the team's secrets is the TLS authority of a web node.
+
+        No two nodes share a key.
+        """
         from webnode.certificate import make_authority
         from webnode.tls import make_tls_port
 

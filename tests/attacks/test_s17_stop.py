@@ -1,4 +1,4 @@
-"""Attack S17: a member tries to release a stop, to disable later stops, or to have one forgotten."""
+"""Attack S17: release a stop, prevent later stops, or make a node forget a stop."""
 
 from __future__ import annotations
 
@@ -32,14 +32,14 @@ SEQUENCES, STEPS = 3, 25
 
 
 class HaltingTeam(Village):
-    """A closed team with ``device.halt`` at each node; ``halts`` are the current ones, by name."""
+    """A closed team with ``device.halt`` at each node; ``halts`` contains the current halts, by name."""
 
     def __init__(self, seed: int) -> None:
         self.halts: dict[str, StopState] = {}
         super().__init__(seed)
 
     def open(self, house: House) -> None:
-        """Start a node, which stands still until it has learned of the stops."""
+        """Start a node, which keeps its robot still until it has learned of the stops in force."""
         super().open(house)
         node: Any = house.node
         halt = expose_stops(node, self.make_life_rng(house.place), node._background.later, lambda stops, words: None)
@@ -67,7 +67,7 @@ class HaltingTeam(Village):
 
 
 class StopCase(SiegeCase):
-    """A team with an operator ``ann``, a second operator ``bob`` and two robots."""
+    """A test case with a team with an operator ``ann``, a second operator ``bob`` and two robots."""
 
     def setUp(self) -> None:
         super().setUp()
@@ -97,7 +97,7 @@ class StopCase(SiegeCase):
         return list(self.team.halt(house).stops)
 
     def ask(self, bare: Any, house: House, *arguments: object) -> Any:
-        """Return the result of one call by an attacker."""
+        """Return the result of one call that an attacker makes at a node."""
         return self.outcome(self.team, bare.ask(self.team.contact(house), METHOD, *arguments, changes=True), 0.2)
 
     def record(self, own: Identity, fields: object, sequence: int = 1) -> Record:
@@ -113,7 +113,7 @@ class StopCase(SiegeCase):
 
 class DisablingTests(StopCase):
     def test_no_number_disables_a_stop(self) -> None:
-        """Huge numbers in an operator's calls and records prevent no later stop."""
+        """Huge numbers in an operator's calls and records do not prevent a later stop."""
         bare, own = self.insider(self.team, "thief", OPERATOR)
         for number in (2**53, 2**63, 2**64 - 1):
             for house in self.team.houses:
@@ -124,7 +124,7 @@ class DisablingTests(StopCase):
         self.assertEqual(set(self.team.is_on().values()), {True})
 
     def test_releases_in_advance_disable_no_stop(self) -> None:
-        """Releases of invented ids, more than the table can hold, end no stop and prevent none."""
+        """Releases of invented ids, more than the table can contain, end no stop and prevent no later stop."""
         bare, own = self.insider(self.team, "thief", OPERATOR)
         self.stop(self.bob)
         dice = random.Random(1)
@@ -163,7 +163,7 @@ class DisablingTests(StopCase):
 
 class RightsTests(StopCase):
     def test_only_who_may_order(self) -> None:
-        """By call and by record, only the roles operator and gateway stop the team or release a stop."""
+        """Only the roles operator and gateway can stop the team or release a stop, by a call or by a record."""
         self.stop(self.ann)
         [stop] = self.stops(self.dogs[0])
         for number, role in enumerate(ROLES):
@@ -178,7 +178,7 @@ class RightsTests(StopCase):
         self.assertEqual({role for role in ROLES if may_call((role,), METHOD)}, {OPERATOR, GATEWAY})
 
     def test_invented_keys_release_nothing(self) -> None:
-        """A viewer's release, signed with an invented key, is not obeyed."""
+        """A release that a viewer signs with an invented key has no effect."""
         self.stop(self.ann)
         [stop] = self.stops(self.dogs[0])
         bare, _ = self.insider(self.team, "eye", VIEWER)
@@ -186,7 +186,7 @@ class RightsTests(StopCase):
         self.assertEqual(set(self.team.is_on().values()), {True})
 
     def test_a_revoked_operator_releases_nothing(self) -> None:
-        """A release record that an operator signs after its revocation is not obeyed, from any sender."""
+        """A release that an operator signs after its own revocation has no effect, whichever node sends it."""
         self.stop(self.ann)
         [stop] = self.stops(self.dogs[0])
         own = self.bob.kept.membership.identity
@@ -199,7 +199,7 @@ class RightsTests(StopCase):
         self.assertEqual(set(self.team.is_on().values()), {True})
 
     def test_junk_changes_nothing(self) -> None:
-        """Malformed calls and records are refused or ignored."""
+        """Malformed calls and records are rejected or ignored."""
         self.stop(self.ann)
         [stop] = self.stops(self.dogs[0])
         bare, own = self.insider(self.team, "thief", OPERATOR)
@@ -249,7 +249,7 @@ class ReplayTests(StopCase):
         self.assertEqual(set(self.team.is_on().values()), {True})
 
     def test_a_released_stop_does_not_come_back(self) -> None:
-        """The record of a released stop, stored again, stops nothing."""
+        """If the record of a released stop is stored again, it stops no robot."""
         self.stop(self.ann)
         stop = self.stops(self.dogs[0])
         [old] = [record for record in self.dogs[0].node.store.get(STOPS_KEY) if record.owner == self.ann.public]
@@ -263,7 +263,7 @@ class ReplayTests(StopCase):
 
 class LossTests(StopCase):
     def test_a_restart_of_all_releases_nothing(self) -> None:
-        """After a sudden restart of all nodes all stand still at once, before they contact any peer."""
+        """After a sudden restart of all nodes each keeps its robot still, even before it contacts a peer."""
         self.assertEqual(self.stop(self.ann)["dog1"], STANDS_STILL)
         for house in self.team.houses:
             self.team.close(house, is_sudden=True)
@@ -298,20 +298,20 @@ class LossTests(StopCase):
         self.assertEqual(set(self.team.is_on().values()), {False})
 
     def lose(self, house: House, slot: Slot) -> None:
-        """Let a replica drop a record, like an expired one."""
+        """Let a replica drop a record as if the record had expired."""
         record = house.node.store.get_slot(slot)
         if record is not None and house.node.store.discard(slot):
             house.node.replica._notify_gone([record])
 
     def test_a_stop_that_is_not_saved_says_so(self) -> None:
-        """A node that cannot store a stop obeys it, and answers that the stop is not saved."""
+        """A node that cannot store a stop still obeys it, and states in its answer that the stop is not saved."""
         store: Any = self.dogs[0].node.store
         self.patch(store, "wait_for_write", lambda: fail(Unwritable("the disk is full")))
         self.assertEqual(self.stop(self.ann)["dog1"], STANDS_STILL + NOT_SAVED)
         self.assertTrue(self.team.halt(self.dogs[0]).is_motion_forbidden)
 
     def test_a_damaged_note_stands(self) -> None:
-        """A node with a corrupt stored entry stands still until that stop is released by its id."""
+        """A node with a corrupt stored stop keeps its robot still until that stop is released by its id."""
         self.dogs[0].node.store.set_note("halt/stops", b"\xc1junk")
         self.team.reopen(self.dogs[0])
         self.team.run(3.0)
@@ -320,7 +320,7 @@ class LossTests(StopCase):
         self.assertEqual(set(self.team.is_on().values()), {False})
 
     def test_a_stop_of_an_earlier_version_stands(self) -> None:
-        """A stop of an earlier version must be released by its id; a release of an earlier version ends none."""
+        """A stop of an earlier version has to be released by its id; a release of an earlier version ends no stop."""
         own = self.bob.kept.membership.identity
         bare, _ = self.insider(self.team, "dog3", DEVICE)
         self.store(bare, self.record(own, [7, True, "bob"]))
@@ -331,7 +331,7 @@ class LossTests(StopCase):
         self.assertEqual(set(self.team.is_on().values()), {False})
 
     def test_more_senders_than_places(self) -> None:
-        """Beyond the maximum number of senders each further stop is in force, and must be released."""
+        """Stops of more senders than the table can contain are still in force, and each of them must be released."""
         dog, dice = self.team.halt(self.dogs[0]), random.Random(1)
         for number in range(MAX_SENDERS + 40):
             peer = Contact(number.to_bytes(32, "big"), SOURCE)
@@ -345,7 +345,10 @@ class LossTests(StopCase):
 
 class SequenceTests(StopCase):
     def test_stop_holds_on_whole_nodes(self) -> None:
-        """Through stops, releases, partitions, restarts and a viewer's messages, a stop holds until its release."""
+        """A stop holds until its release.
+
+        Meanwhile there are other stops and releases, partitions, restarts and messages of a viewer.
+        """
         bare, own = self.insider(self.team, "eye", VIEWER)
         for seed in range(SEQUENCES):
             dice = random.Random(seed)
@@ -394,5 +397,5 @@ class SequenceTests(StopCase):
             self.assertLessEqual(held[dog.name] - set(self.stops(dog)), self.released(dog))
 
     def released(self, dog: House) -> set[bytes]:
-        """Return the ids that an operator has released."""
+        """Return the ids of the stops that an operator has released."""
         return {stop for house in (self.ann, self.bob) for stop in self.team.halt(house)._own_releases}

@@ -1,4 +1,4 @@
-"""Attack S18: a member tries to break, end, move or block another's lease, or to use another's name."""
+"""Attack S18: break, end, move or block the lease of another node, or use the name of another device."""
 
 from __future__ import annotations
 
@@ -74,7 +74,7 @@ class LeaseCase(SiegeCase):
         self.bad, self.own = self.insider(team, "bad", "device")
 
     def make_client(self, place: int) -> LeaseClient:
-        """Return the lease client of an honest node, released when the test ends."""
+        """Return the lease client of an honest node; it is released when the test ends."""
         make_client = self.team.nodes[place].make_lease_client(self.task, lambda: None, 0)
         self.clients.append(make_client)
         self.addCleanup(self.team.run, 2.0)
@@ -82,7 +82,7 @@ class LeaseCase(SiegeCase):
         return make_client
 
     def held_by(self, place: int, within: float = 1.0) -> LeaseClient:
-        """Return the lease client of an honest node that gets the lease."""
+        """Return the lease client of an honest node after it has won the lease."""
         make_client = self.make_client(place)
         make_client.claim()
         self.team.run(within)
@@ -90,7 +90,7 @@ class LeaseCase(SiegeCase):
         return make_client
 
     def assert_won(self, make_client: LeaseClient) -> None:
-        """Check that the client holds the lease, with a token far below the limit."""
+        """Check that the client holds the lease, with a token far below the maximum."""
         self.assertIsNotNone(make_client.lease, "an honest node does not win the lease")
         self.assertLess(make_client.token, 2**40)
 
@@ -106,7 +106,7 @@ class LeaseCase(SiegeCase):
         return self.attack("store", [record.pack() for record in records])
 
     def members(self) -> list[int]:
-        """Return the council members' positions in the team."""
+        """Return the indexes of the council members in the team."""
         known = [house.public for house in self.team.houses]
         return [known.index(member.public) for member in self.task.council]
 
@@ -116,7 +116,7 @@ class LeaseCase(SiegeCase):
 
 class ReconfigurationTests(LeaseCase):
     def test_forged_council(self) -> None:
-        """A council that one device invents is not installed, and no second node gets the lease through it."""
+        """A council that one device invents is not installed, and no second node gets the lease from it."""
         holder = self.held_by(self.members()[0])
         others = [self.team.contact(self.team.houses[place]) for place in self.outsiders()]
         own = Contact(self.own.public, SOURCE)
@@ -131,7 +131,7 @@ class ReconfigurationTests(LeaseCase):
         self.assertEqual((second.proposer.configuration, second.proposer.members), (1, self.task.council))
 
     def test_member_that_lies_about_the_council(self) -> None:
-        """A member that lies about the council redirects no client."""
+        """A member that returns a wrong council redirects no client."""
         holder = self.held_by(self.members()[0])
         liar, accomplices = self.members()[1], self.outsiders()
         forged = tuple(self.team.contact(self.team.houses[place]) for place in accomplices)
@@ -145,7 +145,7 @@ class ReconfigurationTests(LeaseCase):
         self.assertEqual(second.proposer.members, self.task.council)
 
     def test_council_of_the_device_alone(self) -> None:
-        """A council rejects a change to a council with a majority of the device's own or invented keys."""
+        """A council rejects a change to a new council in which the device or invented keys have a majority."""
         own = Contact(self.own.public, SOURCE).pack()
         invented = [Contact(Identity(bytes([n]) * 32).public, SOURCE).pack() for n in range(2)]
         viewer = Contact(self.insider(self.team, "eye", "viewer", at=SOURCE._replace(port=7))[1].public, SOURCE)
@@ -157,7 +157,7 @@ class ReconfigurationTests(LeaseCase):
         self.held_by(self.outsiders()[0])
 
     def test_certified_council(self) -> None:
-        """A council that the old council signed is installed, and its tokens are higher than the old ones."""
+        """A council that the old council signed is installed, and its tokens are higher than the old tokens."""
         holder = self.held_by(self.members()[0])
         token = holder.token
         contacts = [self.team.contact(house) for house in self.team.houses]
@@ -182,21 +182,21 @@ class ClosingTests(LeaseCase):
         self.assertFalse(holder.is_over)
 
     def test_device_closes_before_anybody_acts(self) -> None:
-        """A device cannot close a task without a holder either."""
+        """A device cannot close a task while no node holds its lease."""
         for token in (0, 1, HUGE):
             self.attack("lease.close", TASK.task_id, 1, token)
         self.attack("lease.cancel", TASK.task_id, 1)
         self.held_by(2)
 
     def test_operator_closes(self) -> None:
-        """The gateway, which may order, closes a task that another node holds."""
+        """The gateway, which may send orders, closes a task while another node holds its lease."""
         holder = self.held_by(self.members()[0])
         council = self.team.nodes[0].council_manager.make_proposer(self.task)
         self.assertIsNone(self.outcome(self.team, council.close(), 4.0))
         self.assertTrue(holder.is_over)
 
     def test_member_that_says_it_is_over(self) -> None:
-        """One member that falsely reports the end does not keep a client from the lease."""
+        """A client gets the lease although one member falsely replies that the task has ended."""
         liar = self.members()[1]
         acceptor: Any = self.team.nodes[liar].council_manager.lease_service._acceptor
         for name in ("prepare", "lease"):
@@ -206,13 +206,13 @@ class ClosingTests(LeaseCase):
 
 class NumberTests(LeaseCase):
     def test_highest_ballot(self) -> None:
-        """After a device has used the highest ballots, other nodes still get the lease."""
+        """After a device has used the highest ballots, other nodes can still get the lease."""
         for counter in (HUGE, HUGE - 1, 2**61, 2**52, 2**40):
             self.attack("lease.prepare", TASK.task_id, 1, counter, 1.5)
         self.held_by(self.outsiders()[0], 3.0)
 
     def test_highest_token(self) -> None:
-        """After a device has proposed the highest tokens, other nodes still get the lease when it expires."""
+        """After a device has proposed the highest tokens, other nodes can still get the lease when it expires."""
         for number in range(1, 4):
             self.attack("lease.prepare", TASK.task_id, 1, number * 2**20, 0.1)
             for token in (HUGE + 1, HUGE, 2**61, 2**53, 2**40):
@@ -221,7 +221,7 @@ class NumberTests(LeaseCase):
         self.held_by(self.outsiders()[0], 3.0)
 
     def test_false_news(self) -> None:
-        """A device that notifies clients of the highest token blocks none of them."""
+        """Notifications with the highest token, sent by a device, do not block any client."""
         place = self.outsiders()[0]
         make_client = self.make_client(place)
         make_client.stand_by(1)
@@ -233,7 +233,7 @@ class NumberTests(LeaseCase):
         self.assert_won(make_client)
 
     def test_member_that_lies_about_numbers(self) -> None:
-        """One member that answers with the highest numbers blocks no client."""
+        """A member that replies with the highest numbers does not block any client."""
         acceptor: Any = self.team.nodes[self.members()[1]].council_manager.lease_service._acceptor
         genuine = acceptor.prepare
 
@@ -251,13 +251,13 @@ class TaskTests(LeaseCase):
         return Record(key, name, own.public, 2**40, "team", 600.0, value).sign(own)
 
     def seen(self) -> dict[str, Task]:
-        """Return the tasks, which every node must read equally."""
+        """Return the tasks, which must be the same at every node."""
         all_seen = [parse_tasks(self.outcome(self.team, node.entangled.get(TASKS), 1.0)) for node in self.team.nodes]
         self.assertTrue(all(seen == all_seen[0] for seen in all_seen))
         return all_seen[0]
 
     def test_task_made_or_altered(self) -> None:
-        """A device cannot create or change a task or its council."""
+        """A device cannot create a task, or change a task or its council."""
         before = self.seen()
         other = replace(self.task, generation=9, priority=9, council=self.task.council[:1], charter=b"")
         self.store(
@@ -266,7 +266,7 @@ class TaskTests(LeaseCase):
         self.assertEqual(self.seen(), before)
 
     def test_task_concluded(self) -> None:
-        """A device's record about the end of another's task is ignored by every node."""
+        """Every node ignores a device's record that another device's task has ended."""
         heard: dict[int, Result | None] = {}
 
         def follow(place: int) -> Group:
@@ -287,7 +287,7 @@ class TaskTests(LeaseCase):
 
 class NameTests(LeaseCase):
     def test_name_of_another(self) -> None:
-        """A device that announces itself under another's name is not listed under it."""
+        """A device that announces itself under the name of another device is not listed under this name."""
         device = Device(self.own.node_id.hex(), DEVICE_NAME, capabilities={"camera": {"width": 208}}, joined=9)
         for slot in (DEVICE_NAME, "bad"):
             self.store(Record(DEVICES, slot, self.own.public, 1, "leased", 60.0, device.pack()).sign(self.own))
@@ -299,7 +299,7 @@ class NameTests(LeaseCase):
         self.assertEqual(self.names(listing.records), ["bad", "dog1", "dog2", "dog3", "dog4", "vaio"])
 
     def test_two_members_of_one_name(self) -> None:
-        """Two members with the same name are listed with a part of their ids."""
+        """Two members with the same name are listed with a part of their ids after the name."""
         self.team.enlist("dog2", "device")
         self.team.run(2.0)
         listing = self.outcome(self.team, self.team.nodes[0].list_devices(), 2.0)

@@ -1,4 +1,4 @@
-"""Attack S19: make a node answer, act or store state with a recorded handshake and the request in it."""
+"""Attack S19: make a node reply, act or store state by a recorded handshake that contains a request."""
 
 from __future__ import annotations
 
@@ -56,14 +56,14 @@ ARGUMENTS: dict[str, tuple[object, ...]] = {
     "stream.open": ("camera",),
     "stream.part": ("camera", 1, 0, 1, b"x", 0),
 }
-"""Arguments of the methods of a node; the other methods are called without any."""
+"""Arguments with which the methods of a node are called; methods that are missing here are called without arguments."""
 
 
 class RecordedQuestionTests(SiegeCase):
-    """A node of a closed team with a camera and every method, which has no sessions after a restart."""
+    """A node of a closed team with a camera and all methods, which has no sessions after a restart."""
 
     def setUp(self) -> None:
-        """Count the bytes that the node sends to each address, and record methods that run without a session."""
+        """Count the bytes that the node sends to each address, and record the methods that run without a session."""
         super().setUp()
         self.team: Village = self.village()
         for name in ("cat", "pig", "cow", "hen", "fox", "owl"):
@@ -76,7 +76,7 @@ class RecordedQuestionTests(SiegeCase):
         self.restart()
 
     def restart(self) -> None:
-        """Restart the node, which clears its state of handshakes."""
+        """Restart the node, which deletes its handshakes and sessions."""
         self.team.close(self.house, is_sudden=True)
         self.team.open(self.house)
         network, endpoint = network_of(self.house), self.house.node.endpoint
@@ -94,17 +94,17 @@ class RecordedQuestionTests(SiegeCase):
 
         def count(datagram: bytes, to: Address) -> None:
             self.sent[to] += len(datagram)
-            if to != VICTIM:  # no node is there, and a datagram in flight would count as state
+            if to != VICTIM:  # no node has this address, so a datagram in transit would stay in the state
                 send(datagram, to)
 
         port: Any = network
         port.send = count
         for method in endpoint._dispatcher.methods.values():
-            _ = method._signature  # otherwise it is determined at the first call
+            _ = method._signature  # otherwise the value would be determined at the first call
         self.team.run(20.0)
 
     def recording(self, method: str) -> bytes:
-        """Return a member's recorded INIT with a request in it."""
+        """Return a member's recorded INIT, which contains a request."""
         self.numbers += 1
         request = encode(Request(self.numbers, method, ARGUMENTS.get(method, ())))
         own = Credentials.derive(self.member.identity, self.house.team.secret)
@@ -129,19 +129,19 @@ class RecordedQuestionTests(SiegeCase):
         return found
 
     def play(self, datagram: bytes) -> None:
-        """Send a recording to the node with the address of a victim as its source."""
+        """Send a recording to the node, with the address of a victim as its source."""
         receiver = network_of(self.house).receiver
         assert receiver is not None
         receiver(datagram, VICTIM)
 
     def show(self, seconds: float) -> None:
-        """Let time pass while the camera takes ten pictures a second."""
+        """Let time pass while the camera provides ten pictures per second."""
         for number in range(int(10 * seconds)):
             self.streams.publish("camera", number, bytes(20 * PART_BYTES))
             self.team.run(0.1)
 
     def test_every_method(self) -> None:
-        """A recorded INIT with a request for any method gets no more bytes than it has, and changes nothing."""
+        """A recorded INIT with a request changes nothing and gets no more bytes than it has, for any method."""
         methods = self.house.node.endpoint._dispatcher.methods
         self.assertLessEqual(set(METHODS), set(methods))
         answered = []
@@ -155,11 +155,11 @@ class RecordedQuestionTests(SiegeCase):
             self.show(3.0)
             self.assertLessEqual(self.sent[VICTIM], len(recording), name)
             self.assertEqual(changed, [])
-        self.assertEqual(answered, list(methods))  # each was accepted and got its RESP
+        self.assertEqual(answered, list(methods))  # the node accepted each INIT and sent a RESP
         self.assertEqual(self.ran, [])
 
     def test_pictures_for_a_victim(self) -> None:
-        """A recorded INIT that requests pictures, replayed after a restart, sends none to a spoofed address."""
+        """A recorded INIT that requests pictures, replayed after a restart, causes no picture to a spoofed address."""
         recording = self.recording("stream.open")
         for _ in range(5):
             self.sent.clear()
@@ -169,7 +169,7 @@ class RecordedQuestionTests(SiegeCase):
             self.restart()
 
     def test_a_member_gets_its_pictures(self) -> None:
-        """A member that confirms its session gets pictures."""
+        """A member that confirms its session gets the pictures that it requested."""
         viewer, _ = self.insider(self.team, "eye", "viewer")
         shown: list[int] = []
         watching = Streams(viewer, self.team.clock)
@@ -189,13 +189,13 @@ class TimestampTests(SiegeCase):
         self.tape.tap(network_of(self.house))
 
     def open_again(self, house: House) -> bytes:
-        """Let a node open another session with the first node; return its INIT."""
+        """Let a member open a further session with the first node; return the INIT of this member."""
         house.node.endpoint.reopen(self.team.contact(self.house))
         self.team.run(1.0)
         return [datagram for _, datagram, _ in self.tape.heard if datagram[0] == INIT][-1]
 
     def played(self, recording: bytes) -> tuple[int, int]:
-        """Return the number of bytes that a recording gets in return, and of sessions that it opens."""
+        """Return the number of bytes that the node sends for a recording, and the number of sessions that it opens."""
         network: Any = network_of(self.house)
         endpoint = self.house.node.endpoint
         sent, sessions = [0], len(endpoint._sessions)
@@ -205,7 +205,10 @@ class TimestampTests(SiegeCase):
         return sum(sent), len(endpoint._sessions) - sessions
 
     def test_an_older_one_is_dropped(self) -> None:
-        """All INITs of a member up to the newest are dropped without an answer; a newer one is answered."""
+        """Replayed INITs that are not newer than the member's last INIT are dropped without a reply.
+
+        A newer INIT is answered.
+        """
         dog = self.team.houses[1]
         recordings = [self.open_again(dog) for _ in range(3)]
         self.assertEqual(len(set(recordings)), 3)
@@ -217,7 +220,7 @@ class TimestampTests(SiegeCase):
         self.assertTrue(self.house.node.endpoint.has_session(self.team.contact(dog)))
 
     def test_one_of_an_earlier_life(self) -> None:
-        """A recording from before its sender's restart opens no session, and its sender can still connect."""
+        """An INIT from before a restart of its sender opens no session, and the sender can still connect."""
         dog = self.team.houses[1]
         recording = self.open_again(dog)
         self.team.close(dog, is_sudden=True)
@@ -253,7 +256,7 @@ class TimestampTests(SiegeCase):
 
 class RoundTripTests(EndpointCase):
     def asked(self, method: str, *arguments: object, changes: bool) -> float:
-        """Return the round trips that the first request to a peer takes."""
+        """Return the number of round trips until the first request to a peer is answered."""
         identity = Identity(self.rng.randbytes(32))
         requester = Endpoint(identity, b"k" * 32, self.switchboard.make_network("127.0.0.1", 0), self.clock, self.rng)
         requester.start()
@@ -267,7 +270,7 @@ class RoundTripTests(EndpointCase):
         return trips
 
     def test_one_more_for_changes_and_large_answers(self) -> None:
-        """A first request for a small read takes one round trip, any other two."""
+        """The first request to a peer takes one round trip for a read with a small answer, otherwise two."""
         self.b.expose("zeros", lambda peer, count: bytes(count), early=True)
         self.b.expose("late", lambda peer: 1)
         self.assertEqual(self.asked("echo", 1, changes=False), 1.0)
@@ -281,7 +284,7 @@ class RoundTripTests(EndpointCase):
         self.assertRaises(ValueError, self.b.expose, "bad", lambda peer: 1, changes=True, early=True)
 
     def test_early_and_slow(self) -> None:
-        """An early method that does not return at once is cancelled, and runs again in the session."""
+        """An early method that returns a Deferred without a result is cancelled, and runs again in the session."""
         cancelled: list[object] = []
         waiting: list[Deferred[int]] = []
 
@@ -299,7 +302,7 @@ class RoundTripTests(EndpointCase):
 
 class KeyLifeTests(SiegeCase):
     def test_keys_are_replaced(self) -> None:
-        """Active sessions get new keys every two minutes, and no node keeps keys older than three minutes."""
+        """Sessions in use get new keys every two minutes, and no node has keys that are older than three minutes."""
         team = self.village()
         for name in ("dog", "cat"):
             team.enlist(name)

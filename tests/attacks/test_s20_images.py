@@ -53,7 +53,7 @@ def encoded(width: int, height: int, *options: int) -> bytes:
 
 
 def claiming(width: int, height: int, kind: bytes = b"\xff\xc0") -> bytes:
-    """Return a small picture with another size, and optionally another coding, in its header."""
+    """Return a small picture whose header states a different size, and optionally a different coding."""
     data = bytearray(encoded(8, 8))
     start = data.index(b"\xff\xc0")
     data[start : start + 2] = kind
@@ -62,7 +62,7 @@ def claiming(width: int, height: int, kind: bytes = b"\xff\xc0") -> bytes:
 
 
 def of_scans(width: int, height: int, count: int) -> bytes:
-    """Return a progressive picture with its last scan repeated."""
+    """Return a progressive picture in which the last scan is repeated."""
     data = encoded(width, height, cv2.IMWRITE_JPEG_PROGRESSIVE, 1)
     last = data[data.rindex(START_OF_SCAN) : -len(END)]
     return data[: -len(END)] + (count - data.count(START_OF_SCAN)) * last + END
@@ -85,7 +85,7 @@ BOMBS = {
 
 
 class BombCase(SynchronousTestCase):
-    """Counts the calls of the decoder and the sizes of its pictures."""
+    """A test case that counts the calls of the decoder and the sizes of the decoded pictures."""
 
     def setUp(self) -> None:
         self.decoded: list[tuple[int, ...]] = []
@@ -102,7 +102,7 @@ class BombCase(SynchronousTestCase):
 
 class HeaderTests(BombCase):
     def test_no_bomb_is_decoded(self) -> None:
-        """Detection and student programs decode none of the bombs; each is at most half a megabyte."""
+        """Neither the detection nor student programs decode the bombs, which have at most half a megabyte each."""
         pyro = PyroCamera(8, 8)
         pyro.addFilter(lambda camera: len(camera.data))
         for number, (name, bomb) in enumerate(BOMBS.items(), start=1):
@@ -128,7 +128,7 @@ class HeaderTests(BombCase):
         return seen and seen.frame
 
     def from_folder(self, jpeg: bytes) -> object:
-        """Return the frame from a folder that contains only ``jpeg``."""
+        """Return the frame of a camera that reads a folder with only ``jpeg`` in it."""
         folder = Path(self.mktemp())
         folder.mkdir()
         (folder / "1.jpg").write_bytes(jpeg)
@@ -140,7 +140,7 @@ class HeaderTests(BombCase):
             return None
 
     def on_page(self, jpeg: bytes) -> object:
-        """Return the frame that a web node keeps for browsers."""
+        """Return the frame that a web node stores for browsers."""
         clock, frames = Clock(), MemoryFrames()
         camera = WebCamera(clock, lambda on_frame: frames.watch("dog", on_frame), lambda: None)
         frames.show("dog", 1, jpeg)
@@ -149,7 +149,7 @@ class HeaderTests(BombCase):
         return kept
 
     def test_no_bomb_is_taken(self) -> None:
-        """A camera, a robot, a phone and a page reject all bombs, which are neither shown nor forwarded."""
+        """A camera, a robot, a phone and a page reject all bombs; no bomb is shown or forwarded."""
         for name, bomb in BOMBS.items():
             text = base64.b64encode(bomb).decode()
             self.assertRaises(BadFrame, codec.decode_picture, {"format": "jpeg", "data": text})
@@ -177,14 +177,14 @@ class HeaderTests(BombCase):
         self.assertEqual(len(self.decoded), 5)
 
     def test_most_that_is_decoded(self) -> None:
-        """The limit counts the pixels of all scans."""
+        """The limit applies to the number of pixels of all scans together."""
         most = MAX_DECODED_PX // 1024**2
         self.assertEqual(read_size(of_scans(1024, 1024, most)), (1024, 1024))
         self.assertIsNone(read_size(of_scans(1024, 1024, most + 1)))
 
 
 class PooledClock(Clock):
-    """A clock with a thread pool that runs its jobs when the test calls ``work``."""
+    """A clock with a thread pool; the jobs of the pool run when the test calls ``work``."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -192,7 +192,7 @@ class PooledClock(Clock):
         self.jobs: list[Callable[[], None]] = []
 
     def getThreadPool(self) -> PooledClock:  # noqa: N802 (Twisted's)
-        """Return this object."""
+        """Return this object as the thread pool."""
         return self
 
     def callInThreadWithCallback(self, done: Callable[[bool, object], None], function: Callable[[], object]) -> None:  # noqa: N802 (Twisted's)
@@ -207,11 +207,11 @@ class PooledClock(Clock):
         self.jobs.append(job)
 
     def callFromThread(self, function: Callable[..., object], *arguments: object) -> None:  # noqa: N802 (Twisted's)
-        """Call ``function`` at once, because there is only one thread."""
+        """Call ``function`` immediately, because the test has only one thread."""
         function(*arguments)
 
     def work(self) -> int:
-        """Run the stored jobs; return their number."""
+        """Run the queued jobs; return their number."""
         jobs, self.jobs = self.jobs, []
         for job in jobs:
             job()
@@ -219,14 +219,14 @@ class PooledClock(Clock):
 
 
 class StillDriver:
-    """The attributes of a driver that a robot reads before it moves."""
+    """A driver stub with the attributes that a robot reads before it moves."""
 
     description = describe("camera", {"url": "http://10.0.0.7/"})
 
 
 class QueueTests(BombCase):
     def test_reactor_decodes_nothing(self) -> None:
-        """Of 100 pictures an agent decodes two, the first and the newest, both in the thread pool."""
+        """Of 100 pictures an agent decodes only the first and the newest, both in the thread pool."""
         for kind in ("find-target", "watch-target"):
             with self.subTest(kind=kind):
                 clock = PooledClock()
@@ -261,7 +261,10 @@ class QueueTests(BombCase):
 
 class ThreadTests(TestCase):
     async def test_not_in_the_thread_of_the_reactor(self) -> None:
-        """With a real reactor, pictures are searched in another thread, and the result returns to the reactor."""
+        """With a real reactor, pictures are searched in another thread.
+
+        The result is delivered in the reactor's thread.
+        """
         threads: list[int] = []
         done: Deferred[None] = Deferred()
 

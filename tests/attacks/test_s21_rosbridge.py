@@ -21,9 +21,9 @@ from sim.robots.emulator.simulated_robot import MemoryRobot
 from tests.formats.rfc6455 import CONTINUATION, PING, PONG, TEXT, framed
 
 READ = 65536
-"""Bytes that a reactor reads at once."""
+"""The number of bytes that a reactor reads at a time."""
 ROOM = 24 * 2**20
-"""Maximum memory in bytes for decoding an accepted message."""
+"""The maximum memory in bytes that decoding an accepted message may take."""
 
 
 def published(inner: bytes) -> bytes:
@@ -62,7 +62,7 @@ DEEP = {
 
 class MessageTests(SynchronousTestCase):
     def peak(self, data: bytes) -> tuple[bool, int]:
-        """Return whether a message is accepted, and the peak memory of a rejected one."""
+        """Return whether a message is accepted, and the peak memory for a rejected message."""
         tracemalloc.start()
         try:
             decode_message(data)
@@ -73,7 +73,7 @@ class MessageTests(SynchronousTestCase):
         return True, 0
 
     def test_many_values(self) -> None:
-        """Messages of 4 MB with up to two million values are rejected before they become objects."""
+        """Messages of 4 MB with up to two million values are rejected before objects are created for the values."""
         for name, data in MANY.items():
             self.assertLessEqual(len(data), MAX_MESSAGE_BYTES)
             is_taken, peak = self.peak(data)
@@ -81,7 +81,7 @@ class MessageTests(SynchronousTestCase):
             self.assertLess(peak, 10_000, name)
 
     def test_long_numbers(self) -> None:
-        """Numbers with up to a megabyte of digits are rejected without being computed."""
+        """Numbers with up to a million digits are rejected before they are converted."""
         for name, data in LONG.items():
             is_taken, peak = self.peak(data)
             self.assertFalse(is_taken, name)
@@ -93,7 +93,7 @@ class MessageTests(SynchronousTestCase):
             self.assertFalse(self.peak(data)[0], name)
 
     def test_nesting_is_not_printed(self) -> None:
-        """A deep or large value in place of a text or number is reported only by its type."""
+        """If a text or number is expected, an error contains only the type of a deep or large value."""
         for depth in range(50, 1000):
             deep = b"[" * depth + b"]" * depth
             for data in (b'{"op":' + deep + b"}", b'{"op":"service_response","id":"1","values":' + deep + b"}"):
@@ -108,7 +108,10 @@ class MessageTests(SynchronousTestCase):
         self.assertEqual(status, Status("error", "a list"))
 
     def test_most_that_is_taken(self) -> None:
-        """The most expensive accepted message uses limited memory; the largest scans and numbers are accepted."""
+        """Decoding the most expensive accepted message takes limited memory.
+
+        The largest scans and numbers are accepted.
+        """
         worst = published(b"[" + b",".join([b'{"":0}'] * (MAX_VALUES // 2 - 5)) + b"]")
         tracemalloc.start()
         try:
@@ -168,13 +171,16 @@ class FloodTests(SynchronousTestCase):
         return self.connector.links[-1]
 
     def hear(self, data: bytes) -> None:
-        """Deliver ``data`` to the driver in the chunks of a reactor."""
+        """Deliver ``data`` to the driver in chunks of the size that a reactor reads."""
         for start in range(0, len(data), READ):
             if self.link.receiver is not None:
                 self.link.receiver.data_received(data[start : start + READ])
 
     def test_flood_of_empty_frames(self) -> None:
-        """Of a megabyte of empty frames about a thousand are processed; the driver disconnects and reconnects later."""
+        """The driver processes about a thousand of a megabyte of empty frames.
+
+        Then it disconnects, and reconnects later.
+        """
         for opcode in (PING, PONG, CONTINUATION, TEXT):
             with self.subTest(opcode=opcode):
                 self.taken = 0
@@ -187,7 +193,7 @@ class FloodTests(SynchronousTestCase):
                 self.assertEqual(self.driver.state, "ready")
 
     def test_flood_comes_again(self) -> None:
-        """A server that floods each connection is reconnected at most every few seconds, which limits the cost."""
+        """The driver reconnects to a flooding server only every few seconds, which limits the load."""
         flood = framed(PING, b"", None) * (READ // 2)
         self.taken = 0
         for _ in range(6000):
@@ -197,7 +203,7 @@ class FloodTests(SynchronousTestCase):
         self.assertLess(self.taken, 60 * MAX_FRAMES)
 
     def test_pongs_do_not_pile_up(self) -> None:
-        """If the peer reads nothing, its pings are not answered."""
+        """Pings of a peer that reads nothing are not answered."""
         sent: list[bytes] = []
         self.patch(self.link, "send", sent.append)
         self.link.is_busy = True
@@ -208,7 +214,7 @@ class FloodTests(SynchronousTestCase):
         self.assertEqual(len(sent), 1)
 
     def test_driver_survives(self) -> None:
-        """No hostile message closes the connection or raises; the driver continues with the next valid one."""
+        """No hostile message closes the connection or raises; the driver then processes the next valid message."""
         before = self.driver.diagnostics()["bad_frames"]
         hostile = [*MANY.values(), *LONG.values(), *DEEP.values()]
         for data in hostile:
@@ -218,7 +224,7 @@ class FloodTests(SynchronousTestCase):
         self.assertEqual(self.driver.state, "ready")
 
     def test_answers_to_calls(self) -> None:
-        """A failed call with a deeply nested reason fails with a short text."""
+        """If a call fails with a deeply nested reason, the error text is short."""
         errors: list[object] = []
         asked = self.driver._call_service("/dance")
         asked.addErrback(lambda failure: errors.append(failure.check(RobotError) and failure.getErrorMessage()))

@@ -1,4 +1,4 @@
-"""Attack S22: an author that is not, or no longer, an operator of the team runs code on a node."""
+"""Attack S22: run code on a node as an author that is not, or no longer, an operator of the team."""
 
 from __future__ import annotations
 
@@ -42,7 +42,10 @@ IN_FORCE = 10.0
 
 
 class PushedCodeTests(SynchronousTestCase):
-    """A closed team: the laptop is its first node, ``author`` pushes, and the dog lists the author's key."""
+    """A closed team with a laptop as its first node, and a dog.
+
+    ``author`` pushes modules, and the dog's settings list the author's key.
+    """
 
     def setUp(self) -> None:
         self.folder = runtime_folder(self, "author")
@@ -71,7 +74,7 @@ class PushedCodeTests(SynchronousTestCase):
         return self.team.services["dog1"].assembly.node
 
     def push(self, author: SwarmNode, source: str = SOURCE, kind: str = "strategy") -> int:
-        """Push a module at the author's node; return the exit code."""
+        """Push a module at the author's node; return the exit code of the command."""
         path = self.folder / "best.py"
         path.write_text(source)
         shell = Shell(self.team, author)
@@ -109,11 +112,11 @@ class PushedCodeTests(SynchronousTestCase):
         return str(device["deployed"].get("best", ""))
 
     def assert_nothing_runs(self, dog: SwarmNode) -> None:
-        """Check that the module has not run and is not available to tasks."""
+        """Check that the code of the module has not run, and that tasks cannot use it."""
         self.assertEqual((dict(dog.deployed), CANARY in sys.modules), ({}, False))
 
     def test_gateway_does_not_push(self) -> None:
-        """A gateway may write operators' records, but cannot run code, even if its key is listed."""
+        """A gateway may write in the namespaces of operators, but cannot run code, even if its key is listed."""
         author = self.join("author", "gateway")
         dog = self.allow(author)
         self.assertNotEqual(self.push(author), 0)
@@ -140,7 +143,7 @@ class PushedCodeTests(SynchronousTestCase):
         self.assertIn("refused", self.shown())
 
     def test_revoked_operator_is_not_loaded_again(self) -> None:
-        """A restarted node does not load a revoked operator's module from its file."""
+        """A restarted node does not load the stored module of a revoked operator."""
         author = self.join("author", "operator")
         dog = self.allow(author)
         self.push(author)
@@ -153,7 +156,7 @@ class PushedCodeTests(SynchronousTestCase):
         self.assert_nothing_runs(dog)
 
     def test_another_operator_follows_a_revoked_one(self) -> None:
-        """A revoked operator's module, of any version, does not block the next operator."""
+        """A module of a revoked operator, of any version, does not block a module of the next operator."""
         author, second = self.join("author", "operator"), self.join("second", "operator")
         dog = self.allow(author, second)
         self.push(author)

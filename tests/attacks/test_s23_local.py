@@ -1,4 +1,4 @@
-"""Attack S23: another user of the same computer: control sockets in a shared folder, secrets on command lines."""
+"""Attack S23: attack as another user of the same computer, by control sockets and secrets on command lines."""
 
 from __future__ import annotations
 
@@ -23,17 +23,17 @@ SECRET = "the secret of a classroom"
 
 
 class ControlSocketTests(SynchronousTestCase):
-    """Another user created the folder or the socket before the node."""
+    """Another user created the folder or the socket before the node started."""
 
     def setUp(self) -> None:
-        # The path of a socket has a maximum length, which trial's folders exceed.
+        # The path of a socket has a maximum length, and the folders of trial exceed it.
         self.runtime = Path(tempfile.mkdtemp())
         self.addCleanup(shutil.rmtree, self.runtime)
         self.patch(os, "environ", {**os.environ, "XDG_RUNTIME_DIR": str(self.runtime)})
         self.me = os.getuid()
 
     def be_another(self) -> None:
-        """Continue as another user, which owns none of the existing files."""
+        """Continue as another user, who owns none of the existing files."""
         self.patch(os, "getuid", lambda: self.me + 1)
 
     def listening(self, name: str) -> Path:
@@ -45,7 +45,7 @@ class ControlSocketTests(SynchronousTestCase):
         return path
 
     def test_folder_of_another(self) -> None:
-        """A folder of another user is neither read nor used for a socket."""
+        """The folder of another user is neither read nor used for a socket."""
         prepare_path("vaio").touch()
         self.assertEqual(find_socket("vaio").name, "vaio.control")
         self.be_another()
@@ -53,7 +53,7 @@ class ControlSocketTests(SynchronousTestCase):
             self.assertIn("accessible to other users", str(self.assertRaises(NoControl, use, "vaio")))
 
     def test_page_of_another(self) -> None:
-        """A page in another user's note is not opened."""
+        """A page address in another user's file is not opened."""
         note = {"name": "vaio", "url": "http://127.0.0.1:1/", "code": "loud-otter", "pid": os.getpid()}
         prepare_path("vaio").with_suffix(".page").write_text(json.dumps(note))
         self.assertEqual([each.name for each in list_pages()], ["vaio"])
@@ -68,7 +68,7 @@ class ControlSocketTests(SynchronousTestCase):
             self.assertRaises(NoControl, use, "vaio")
 
     def test_folder_that_is_a_link(self) -> None:
-        """A symbolic link is refused as the folder, even if its target is valid."""
+        """A symbolic link is rejected in place of the folder, even if its target is valid."""
         other = self.runtime / "elsewhere"
         other.mkdir(mode=0o700)
         (other / "vaio.control").touch()
@@ -77,7 +77,7 @@ class ControlSocketTests(SynchronousTestCase):
             self.assertRaises(NoControl, use, "vaio")
 
     def test_socket_of_another(self) -> None:
-        """A socket of another user, and a file that is not a socket, get no request."""
+        """A socket of another user, or a file that is not a socket, gets no request."""
         prepare_path("vaio")
         path = self.listening("vaio")
         file = find_folder() / "file.control"
@@ -90,7 +90,7 @@ class ControlSocketTests(SynchronousTestCase):
         self.assertIn("accessible to other users", str(self.assertRaises(NoControl, list, send_request(path, {}))))
 
     def test_service_of_another_user(self) -> None:
-        """Root may contact another user's service in a named folder, but not in the shared folder."""
+        """Root may connect to another user's service in a folder that root names, but not in the shared folder."""
         prepare_path("vaio")
         path = self.listening("vaio")
         for each in (find_folder(), path):
@@ -104,7 +104,7 @@ class ControlSocketTests(SynchronousTestCase):
         self.assertRaises(NoControl, check_socket, path)
 
     def test_process_of_another(self) -> None:
-        """A socket with another user's process behind it is refused."""
+        """A socket is rejected if the process that listens on it belongs to another user."""
         here, there = socket.socketpair(socket.AF_UNIX)
         self.addCleanup(here.close)
         self.addCleanup(there.close)
@@ -137,20 +137,20 @@ class TeamKeyTests(SynchronousTestCase):
         return options
 
     def refusal(self, *words: str) -> str:
-        """Return the error of a refused command line."""
+        """Return the error message for a rejected command line."""
         said = io.StringIO()
         self.patch(sys, "stderr", said)
         self.assertEqual(self.assertRaises(SystemExit, self.options, *words).code, 2)
         return said.getvalue()
 
     def test_not_on_the_command_line(self) -> None:
-        """A secret on the command line is refused with the remedy, and the error does not repeat it."""
+        """A secret on the command line is rejected, and the error states the remedy without repeating the secret."""
         said = self.refusal("--team-key", SECRET)
         self.assertIn("--team-key-file", said)
         self.assertNotIn(SECRET, said)
 
     def test_from_a_file_of_the_owner(self) -> None:
-        """The secret is read from a file or standard input; a file that other users can read is refused."""
+        """The secret is read from a file or from standard input; a file that other users can read is rejected."""
         self.assertEqual(self.options("--team-key-file", str(self.path)).settings.node.team_key, SECRET)
         self.patch(sys, "stdin", io.TextIOWrapper(io.BytesIO(SECRET.encode())))
         self.assertEqual(self.options("--team-key-file", "-").settings.node.team_key, SECRET)

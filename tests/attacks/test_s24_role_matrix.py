@@ -1,4 +1,4 @@
-"""Attack S24: an insider tries every method and every record namespace of a running team.
+"""Attack S24: try every method and every record namespace of a running team as an insider.
 
 ``python -m tests.attacks.role_matrix`` prints the counts.
 """
@@ -12,12 +12,12 @@ from tests.attacks.role_matrix import REVOKED_OPERATOR, list_slots, try_everythi
 
 
 class RoleMatrixTests(SynchronousTestCase):
-    """Each subject acts in a new team; attempts that the role table forbids are refused and change nothing."""
+    """Each insider acts in a new team; attempts that the role table forbids are rejected and change nothing."""
 
     def test_every_subject(self) -> None:
-        """All attempts that a subject's roles forbid are refused; allowed ones are not refused for the role.
+        """All attempts that an insider's roles forbid are rejected; no permitted attempt is rejected for the role.
 
-        A viewer only writes its presence, a device does not order, and a revoked operator can do nothing, neither
+        A viewer writes only its presence, a device cannot send orders, and a revoked operator can do nothing, neither
         directly nor through a member that sends its records.
         """
         subjects: dict[str, tuple[tuple[str, ...], int]] = {
@@ -39,5 +39,5 @@ class RoleMatrixTests(SynchronousTestCase):
                 self.assertEqual(counts.allowed, nodes * sum(may_call(roles, name) for name in METHODS))
 
     def test_slots_cover_the_table(self) -> None:
-        """The tried slots cover every namespace of the table."""
+        """The slots of the attempts cover every namespace of the role table."""
         self.assertEqual({classify_slot(slot) for slot in list_slots(b"o" * 32)}, set(KINDS))

@@ -1,4 +1,4 @@
-"""Attack S25: evade the operator's decision by renewals: self-made, backdated, and by hostile nodes."""
+"""Attack S25: evade the operator's decision by renewals that are self-made, backdated, or signed by hostile nodes."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ DOG = identity("dog")
 
 
 class RenewalCase(SiegeCase):
-    """A team with two bootstrap nodes, the second one hostile, and a plain member that checks certificates."""
+    """A team with two bootstrap nodes, of which the second is hostile, and a plain member that checks certificates."""
 
     def setUp(self) -> None:
         super().setUp()
@@ -46,25 +46,25 @@ class RenewalCase(SiegeCase):
         return found[1]
 
     def word(self, roles: Sequence[str] = ("device",), life: float = DEFAULT_LIFE_S, own: Identity = DOG) -> bytes:
-        """Return the certificate of a key with the operator's grant from now on."""
+        """Return a certificate that consists of a new grant of the operator, valid from now on."""
         return wrap_grant(self.team.signer.grant(own.public, "dog", roles, self.team.wall(), life))
 
     def read(self, shown: bytes, own: Identity = DOG) -> Member:
         return verify_certificate(self.team.signer.public, own.public, shown)
 
     def renew(self, shown: bytes, ago: float = 0.0, own: Identity = DOG, by: int = 1) -> bytes:
-        """Return ``shown``, renewed by a bootstrap node (the hostile one by default) ``ago`` seconds ago."""
+        """Return ``shown``, renewed ``ago`` seconds ago by a bootstrap node, by default the hostile one."""
         member, begin = self.read(shown, own), int(self.team.wall() - ago)
         return renew_certificate(self.keys[by], (self.honest, self.thief)[by], member, shown, begin)
 
     def said(self, shown: bytes, own: Identity = DOG) -> str:
-        """Return the code with which the honest nodes refuse a certificate, or "" if they accept it."""
+        """Return the code with which the honest nodes reject a certificate, or "" if they accept it."""
         answers = {self.team.houses[place].team.admission.admit(own.public, shown) for place in (0, 2)}
         self.assertEqual(len(answers), 1, answers)
         return answers.pop()
 
     def end(self, own: Identity = DOG) -> int:
-        """Return the expiry of a key's certificate in the list of a plain member."""
+        """Return the expiry of the key's certificate, as known by a plain member."""
         member = self.admission.team.admission.find_member(own.public)
         assert member is not None
         return member.not_after
@@ -81,7 +81,7 @@ class RenewalCase(SiegeCase):
         self.team.run(2.0)
 
     def enter(self, shown: bytes, own: Identity = DOG) -> str:
-        """Return the code with which a node refuses the key with this certificate."""
+        """Return the code with which a node rejects a peer with this key and certificate."""
         secret = self.admission.kept.membership.secrets[0][1]
         self.port += 1
         endpoint = self.attacker(self.team, own, secret, shown, SOURCE._replace(port=self.port))
@@ -90,7 +90,7 @@ class RenewalCase(SiegeCase):
 
 class RevokedBootstrapTests(RenewalCase):
     def test_backdated(self) -> None:
-        """After a bootstrap node's revocation only the renewals kept by the operator are valid, for any dates."""
+        """After a bootstrap node's revocation only its renewals that the operator kept are valid, for any dates."""
         old = self.word()
         self.team.days = 300
         kept = self.renew(old)
@@ -104,7 +104,7 @@ class RevokedBootstrapTests(RenewalCase):
         for ago in (0, 95 * DAY, 100 * DAY, 399 * DAY):
             late = self.renew(old, ago)
             if late != kept:
-                self.assertEqual(self.said(late), "")  # the kept renewal is on the list
+                self.assertEqual(self.said(late), "")  # the kept renewal is on the membership list and applies instead
         self.assertEqual(self.end(), end)
         self.team.days = 300 + 366
         self.assertEqual({self.said(self.renew(old, ago * DAY)) for ago in (0, 10, 300, 360)}, {EXPIRED})
@@ -122,7 +122,7 @@ class RevokedBootstrapTests(RenewalCase):
         self.assertEqual(self.said(self.renew(old, by=0)), "")
 
     def test_behind_a_void_renewal(self) -> None:
-        """A member with a void renewal of a valid grant is admitted by the grant, and is on the list."""
+        """A member with a valid grant and a void renewal of it is admitted by the grant, and is on the list."""
         ghost = identity("ghost")
         old = wrap_grant(self.team.signer.grant(ghost.public, "ghost", ("viewer",), self.team.wall()))
         self.tell(self.team.signer.revoke(self.keys[1].public, "boot1", self.team.wall()))
@@ -130,7 +130,7 @@ class RevokedBootstrapTests(RenewalCase):
         self.assertEqual([("ghost" in self.team.members(place)) for place in (0, 2)], [True, True])
 
     def test_without_the_role(self) -> None:
-        """A bootstrap node that lost this role cannot renew, even with its earlier grant."""
+        """A bootstrap node that lost this role cannot renew certificates, even with its earlier grant."""
         old = self.word()
         self.team.days = 300
         grant = self.team.signer.grant(self.keys[1].public, "boot1", ("device",), self.team.wall())
@@ -139,7 +139,7 @@ class RevokedBootstrapTests(RenewalCase):
         self.assertEqual({self.said(self.renew(old, ago * DAY)) for ago in (0, 80, 360)}, {EXPIRED})
 
     def test_laundered_admission(self) -> None:
-        """A member admitted by a revoked bootstrap node is revoked with it, even if another node renewed it."""
+        """A member that a revoked bootstrap node admitted is revoked, too, even if another node renewed it."""
         shown = self.let_in(parse_code(self.team.invite("pup")), "pup")
         self.team.days = 300
         shown = self.renew(shown, by=0)
@@ -151,7 +151,7 @@ class RevokedBootstrapTests(RenewalCase):
 
 class SelfRenewalTests(RenewalCase):
     def test_a_plain_member(self) -> None:
-        """A renewal signed by a member without the role bootstrap, for any key, is invalid."""
+        """A renewal that is signed by a member without the role bootstrap is invalid, for any key."""
         old = self.word(("device", "operator", "gateway"))
         grant = msgpack.unpackb(old)[1]
         self.team.days = 360
@@ -161,7 +161,7 @@ class SelfRenewalTests(RenewalCase):
         self.assertEqual(self.said(forged), FOREIGN)
 
     def test_a_bootstrap_node_beside_others(self) -> None:
-        """A bootstrap node with a lapsed renewal cannot renew itself while there is another bootstrap node."""
+        """A bootstrap node with an expired renewal cannot renew itself while there is another bootstrap node."""
         old, own = wrap_grant(self.thief), self.keys[1]
         self.team.days = 300
         mine = [self.renew(old, ago, own) for ago in (0, 200 * DAY)]
@@ -170,7 +170,7 @@ class SelfRenewalTests(RenewalCase):
         self.assertEqual({self.said(each, own) for each in mine}, {EXPIRED})
 
     def tell_renewal(self, place: int) -> None:
-        """Let the other bootstrap node renew the bootstrap node at ``place``."""
+        """Let the other bootstrap node renew the bootstrap node with index ``place``."""
         shown = wrap_grant((self.honest, self.thief)[place])
         public = self.keys[place].public
         again = self.renew(shown, own=self.keys[place], by=1 - place)
@@ -178,7 +178,7 @@ class SelfRenewalTests(RenewalCase):
         self.team.run(2.0)
 
     def test_a_short_one_renews_nobody(self) -> None:
-        """A bootstrap node with a grant for a month cannot renew, even within that month."""
+        """A bootstrap node with a grant for a month cannot renew certificates, even within that month."""
         own = identity("helper")
         grant = self.team.signer.grant(own.public, "helper", ("bootstrap",), self.team.wall(), 30 * DAY)
         old = self.word()
@@ -188,7 +188,7 @@ class SelfRenewalTests(RenewalCase):
 
 class WideningTests(RenewalCase):
     def test_roles_that_were_taken_away(self) -> None:
-        """A renewal of an earlier grant does not restore roles that the operator removed."""
+        """A renewal of an earlier grant does not restore roles that the operator removed with a later grant."""
         old = self.word(("device", "operator"))
         self.team.days = 1
         self.tell(msgpack.unpackb(self.word(("viewer",)))[1])
@@ -209,7 +209,7 @@ class WideningTests(RenewalCase):
         self.assertEqual(self.said(self.renew(old)), EXPIRED)
 
     def test_another_word(self) -> None:
-        """Roles, name, lifetime and dates of a renewal are signed, and any change is refused."""
+        """Roles, name, lifetime and dates of a renewal are signed; a renewal with any change is rejected."""
         old = self.word()
         self.team.days = 300
         fields = msgpack.unpackb(self.renew(old))
@@ -219,7 +219,7 @@ class WideningTests(RenewalCase):
             self.assertEqual(self.said(msgpack.packb(changed)), FOREIGN)
 
     def test_longer_than_its_life(self) -> None:
-        """A renewal for longer than the lifetime that the operator granted is refused."""
+        """A renewal that exceeds the lifetime granted by the operator is rejected."""
         old = self.word()
         member = self.read(old)
         long = Member(member.public, "dog", member.roles, 0, 0, since=member.since, life=3 * DEFAULT_LIFE_S)
@@ -227,7 +227,7 @@ class WideningTests(RenewalCase):
         self.assertEqual(self.said(again), FOREIGN)
 
     def test_a_name_by_a_bootstrap_node(self) -> None:
-        """A bootstrap node cannot change the name of a member that joined by code."""
+        """A bootstrap node cannot change the name of a member that joined with a code."""
         dog = self.team.welcome("dog")
         shown, own = dog.kept.membership.certificate, dog.kept.membership.identity
         fields = msgpack.unpackb(shown)
@@ -238,7 +238,7 @@ class WideningTests(RenewalCase):
         self.assertEqual(self.said(again, own), FOREIGN)
 
     def test_shortened(self) -> None:
-        """A bootstrap node cannot shorten a certificate."""
+        """A bootstrap node cannot shorten the validity of a certificate."""
         old = self.word()
         self.team.days = 300
         good = self.renew(old, by=0)
@@ -258,7 +258,10 @@ class WideningTests(RenewalCase):
         self.assertEqual((self.said(good), self.end()), ("", self.read(good).not_after))
 
     def test_another_origin(self) -> None:
-        """A renewal with another name or admitting node than the admission is invalid and displaces none."""
+        """A renewal that states another name or admitting node than the admission is invalid.
+
+        It displaces no valid one.
+        """
         dog = self.team.move_in(self.successResultOf(self.knocked("pup", 2)))
         shown, own = dog.kept.membership.certificate, dog.kept.membership.identity
         self.team.days = 300
@@ -277,13 +280,13 @@ class WideningTests(RenewalCase):
         self.assertIn("pup-1", self.team.members(2))
 
     def knocked(self, name: str, uses: int) -> Deferred[Membership]:
-        """Return a newcomer that joins by a code with several uses."""
+        """Return a newcomer that joins with a code for several members."""
         knocked = self.team.knock(self.team.invite(name, uses))
         self.team.run(2.0)
         return knocked
 
     def test_ahead_of_time(self) -> None:
-        """A renewal that starts in the future is not valid earlier, and not for longer."""
+        """A renewal that starts in the future is not valid before its start, and not for longer than other renewals."""
         old = self.word()
         self.team.days = 300
         ahead = self.renew(old, -100 * DAY)
@@ -294,7 +297,7 @@ class WideningTests(RenewalCase):
 
 class RevivalTests(RenewalCase):
     def test_revoked_member(self) -> None:
-        """A revoked member stays rejected, for renewals by any node at any time, and no node offers a renewal."""
+        """A revoked member stays rejected, for renewals by any node at any time, and no node offers it a renewal."""
         dog = self.team.enlist("dog")
         shown, own = dog.kept.membership.certificate, dog.kept.membership.identity
         before = self.renew(shown, own=own, by=0)
@@ -307,7 +310,7 @@ class RevivalTests(RenewalCase):
         self.assertNotIn(own.public, [each.public for each in due])
 
     def test_temporary_guest(self) -> None:
-        """A bootstrap node cannot renew a member with a lifetime of less than a year, by grant or by code."""
+        """A bootstrap node cannot renew a member that was granted or invited for less than a year."""
         short = self.word(life=DEFAULT_LIFE_S - 1)
         code, packed, terms = self.team.signer.invite(
             "pup", ("device",), 1, self.team.wall(), 3600.0, self.team.dice, life=float(DAY)
@@ -324,7 +327,7 @@ class RevivalTests(RenewalCase):
             self.assertEqual(self.enter(self.renew(shown)), FOREIGN)
 
     def test_more_keys_than_the_code_has(self) -> None:
-        """Renewals cannot add more keys for a code than it has uses, even without a known admission."""
+        """Renewals cannot add more keys for a code than it has uses, even if the list contains no admission."""
         code = parse_code(self.team.invite("dog", uses=2))
         answers = []
         for number in range(1, 5):

@@ -46,7 +46,9 @@ class ShortPass(Gate):
 
 
 def init(ground: Ground, data: bytes) -> bytes:
-    """Return an INIT that contains ``data``; if the length of ``data`` is even, its last bytes replace the second MAC.
+    """Return an INIT with ``data`` as its content.
+
+    If the length of ``data`` is even, its last bytes replace the second MAC.
     """
     remote = derive_exchange_key(ground.contact.public)
     noise = Initiator(OWN.static, remote, random.Random(data[:1]).randbytes(32), PROLOGUE, OWN.psk)
