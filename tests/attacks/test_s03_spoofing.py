@@ -75,7 +75,7 @@ class Spoofing(RuleBasedStateMachine):
 
     @rule(source=st.sampled_from(PLACES), counter=st.integers(0, 2**64 - 1), size=st.integers(16, 200))
     def guessed_session(self, source: Address, counter: int, size: int) -> None:
-        """Send DATA with the real session number, which is sent unencrypted and so is known to the attacker."""
+        """Send DATA with the real session number, which the attacker knows because sessions send it unencrypted."""
         [index] = list(self.ground.target._sessions)[:1]
         head = bytes([DATA]) + index.to_bytes(4, "little") + counter.to_bytes(8, "little")
         self.fire(head + self.dice.randbytes(size), source)

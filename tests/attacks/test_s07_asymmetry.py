@@ -176,7 +176,7 @@ class FloodTests(FloodCase):
         self.assertNotEqual(draw_code(self.team.signer.public, dice).text, code.text)
 
     def test_hails(self) -> None:
-        """At most twenty PROBE datagrams per second are answered, and each reply is as long as its request."""
+        """At most twenty PROBE datagrams per second are answered, each with a reply of the same length."""
         self.flood(lambda number: pack_probe(number.to_bytes(16, "little")))
         answers = self.answers()
         self.assertLessEqual(len(answers), REPLIES_PER_S * (SECONDS + 1))

@@ -200,7 +200,10 @@ class RelayTests(SiegeCase):
         return Relay(session_of, send, clock, Counter()), clock, sent
 
     def test_quota_of_a_pair(self) -> None:
-        """One pair gets a burst and then 64 kbit/s, and if only one side sends, two minutes."""
+        """A pair of peers gets a burst and then 64 kbit/s.
+
+        If only one peer sends, the relay stops after two minutes.
+        """
         relay, clock, sent = self.relay()
         session: Any = OneSession(b"a" * 32)
         plain = bytes([RELAY_REQUEST]) + b"b" * 20 + bytes(1000)
@@ -227,7 +230,7 @@ class RelayTests(SiegeCase):
         self.assertLessEqual(len(relay), MAX_PAIRS)
 
     def test_no_carrying_in_circles(self) -> None:
-        """A relay does not forward datagrams that were relayed, are too long or empty, or address their sender."""
+        """A relay does not forward datagrams that were relayed before, are too long or empty, or are for the sender."""
         relay, _, sent = self.relay()
         session: Any = OneSession(b"a" * 32)
         far: Any = OneSession(b"c" * 32, relayed_address(b"d" * 20))

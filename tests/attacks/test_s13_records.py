@@ -49,7 +49,7 @@ class RecordCase(SiegeCase):
         return [h.name for h in among if any(h.node.store.get_slot(record.slot) is not None for record in records)]
 
     def read(self, records: list[Record], house: House) -> list[Record]:
-        """Return those of the given records that a node reads at the consistency level majority."""
+        """Return the given records that a node reads at the consistency level majority."""
         keys = dict.fromkeys(record.key for record in records)
         found = [self.outcome(self.team, house.node.get(key)) for key in keys]
         return [record for each in found for record in each if record in records]
@@ -156,7 +156,10 @@ class InventedKeyTests(RecordCase):
         self.assertEqual([self.read(self.records, house) for house in others], [[], [], []])
 
     def test_a_flood_of_junk(self) -> None:
-        """12,400 records under invented keys fill no store; afterwards records, tuples and invitations work."""
+        """12,400 records under invented keys fill no store.
+
+        Afterwards records, tuples and invitations can be written.
+        """
         team = self.team
         viewer, _ = self.insider(team, "eye", VIEWER)
         junk = [written(self.invented, OTHER, f"{number}") for number in range(JUNK)]
@@ -277,7 +280,7 @@ class FloodTests(RecordCase):
         self.assertEqual(self.outcome(team, asked), [0], "a full owner can still delete")
 
     def test_it_blocks_no_reads(self) -> None:
-        """A member whose share is full at all replicas except one cannot make reads of the key fail."""
+        """If a member's share is full at all replicas except one, reads of the key still succeed."""
         team = self.team
         bad, own = self.insider(team, "bad", OPERATOR)
         for house in team.houses[1:]:

@@ -56,7 +56,7 @@ class BackdatingTests(SiegeCase):
     def test_backdated_members(self) -> None:
         """Members admitted by a revoked bootstrap node are rejected, whatever their dates.
 
-        Members that the revocation keeps stay.
+        Members that the operator keeps stay.
         """
         kept, shown = self.mint(1, int(self.team.wall()))
         self.assertEqual(self.enter(kept, shown, 701), "")
@@ -70,7 +70,7 @@ class BackdatingTests(SiegeCase):
         self.assertNotIn("dog-2", self.team.members())
 
     def test_revoked_with_all(self) -> None:
-        """The revocation of a bootstrap node also revokes the members that it admitted, except those that it keeps."""
+        """A revocation without kept members also revokes the members that the bootstrap node admitted."""
         own, shown = self.mint(1, int(self.team.wall()))
         self.enter(own, shown, 701)
         self.assertIn("dog-1", self.team.members())

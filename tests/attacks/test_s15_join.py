@@ -131,7 +131,7 @@ class JoinTests(SiegeCase):
         self.check_true_team(self.give(signer, self.eye.kept.membership.certificate))
 
     def test_a_grant_of_another_node(self) -> None:
-        """The terms, a grant and the newcomer's certificate, known to every member, do not let another key sign."""
+        """Knowing the terms, a bootstrap node's grant and the newcomer's certificate is not enough to sign a reply."""
         self.team.knock(self.code.text, seed=NEWCOMER.seed)
         self.team.run(8.0)
         admission = self.eye.team.membership_list.find_admission(NEWCOMER.public)

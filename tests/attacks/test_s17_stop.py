@@ -139,7 +139,10 @@ class DisablingTests(StopCase):
         self.assertEqual(set(self.team.is_on().values()), {True})
 
     def test_thousands_of_stops_displace_none(self) -> None:
-        """An operator with thousands of stops fills only its own share; other operators' stops stay in force."""
+        """An operator that creates thousands of stops fills only its own share.
+
+        Stops of other operators stay in force.
+        """
         [stop] = self.only_stop(self.ann)
         _, own = self.insider(self.team, "thief", OPERATOR)
         dice = random.Random(1)
@@ -186,7 +189,7 @@ class RightsTests(StopCase):
         self.assertEqual(set(self.team.is_on().values()), {True})
 
     def test_a_revoked_operator_releases_nothing(self) -> None:
-        """A release that an operator signs after its own revocation has no effect, whichever node sends it."""
+        """A release that an operator signs after its own revocation has no effect, from any sender."""
         self.stop(self.ann)
         [stop] = self.stops(self.dogs[0])
         own = self.bob.kept.membership.identity

@@ -233,7 +233,10 @@ class TimestampTests(SiegeCase):
         self.assertEqual(self.house.node.endpoint.counters["replayed"], 0)
 
     def test_bounded(self) -> None:
-        """The table of newest INITs is limited, and an unverified later life does not block an earlier one."""
+        """The table of newest INITs is limited.
+
+        An unverified later incarnation does not block an earlier incarnation.
+        """
         timestamps, first, later = InitTimestamps(), Incarnation(1, b"1" * 8), Incarnation(2, b"2" * 8)
         answers = [
             timestamps.accept(b"a", incarnation, timestamp)

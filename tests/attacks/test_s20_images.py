@@ -167,7 +167,10 @@ class HeaderTests(BombCase):
             self.assertIsNotNone(taken)
 
     def test_real_pictures_are_decoded(self) -> None:
-        """Baseline and progressive pictures are searched; large ones are reduced to every second or fourth pixel."""
+        """Baseline and progressive pictures are searched.
+
+        Large pictures are reduced to every second or fourth pixel.
+        """
         for width, height in ((208, 156), (1920, 1080), (MAX_SIDE_PX, MAX_SIDE_PX)):
             for is_progressive in (0, 1) if width < MAX_SIDE_PX else (0,):
                 seen = find_target(encoded(width, height, cv2.IMWRITE_JPEG_PROGRESSIVE, is_progressive), SIZE)
@@ -249,7 +252,10 @@ class QueueTests(BombCase):
                 self.assertIsNotNone(behaviour.cost)
 
     def test_queue_of_one(self) -> None:
-        """While one picture is searched, newer ones replace each other; a failure does not stop the detector."""
+        """While one picture is searched, a newer picture replaces a waiting one.
+
+        A failure does not stop the detector.
+        """
         clock, found = PooledClock(), list[object]()
         detector = Detector(run_in_thread(clock))
         for number in range(50):

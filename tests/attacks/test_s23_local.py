@@ -33,7 +33,7 @@ class ControlSocketTests(SynchronousTestCase):
         self.me = os.getuid()
 
     def be_another(self) -> None:
-        """Continue as another user, who owns none of the existing files."""
+        """Continue as a different user, the owner of none of the existing files."""
         self.patch(os, "getuid", lambda: self.me + 1)
 
     def listening(self, name: str) -> Path:

@@ -40,7 +40,7 @@ def invited(signer: Operator, name: str = "dog", uses: int = 1, seed: int = 1) -
 def admitted(
     signer: Operator, name: str, bootstrap: str = "vaio", wish: str = "", now: int = NOW, seed: int = 1
 ) -> bytes:
-    """Return the certificate chain of a newcomer that the bootstrap node ``bootstrap`` admitted."""
+    """Return the certificate chain of a newcomer that the node ``bootstrap`` admitted."""
     code, packed, invite = invited(signer, name, seed=seed)
     public = identity(name).public
     grant = granted(signer, bootstrap, "bootstrap")

@@ -29,7 +29,7 @@ DOG = identity("dog")
 
 class CertificateTests(SynchronousTestCase):
     def test_granted_by_the_operator(self) -> None:
-        """A grant of the operator makes a member of the key that it names, and of no other key."""
+        """A grant of the operator makes the key in it a member, and no other key."""
         shown = wrap_grant(granted(OPERATOR, "dog", "device", "gateway"))
         member = verify_certificate(OPERATOR.public, DOG.public, shown)
         self.assertEqual((member.name, member.roles), ("dog", ("device", "gateway")))
@@ -37,14 +37,14 @@ class CertificateTests(SynchronousTestCase):
         self.assertRaises(Forged, verify_certificate, operator(2).public, DOG.public, shown)
 
     def test_let_in_by_a_bootstrap_node(self) -> None:
-        """Invitation, proof and admission together make a member with the roles and lifetime of the invitation."""
+        """Invitation, proof and admission together make a member that has the roles and lifetime of the invitation."""
         member = verify_certificate(OPERATOR.public, DOG.public, admitted(OPERATOR, "dog"))
         _, _, invite = invited(OPERATOR)
         expected = (DOG.public, "dog", ("device",), NOW, NOW + invite.life, invite.public, identity("vaio").public)
         self.assertEqual(member, Member(*expected, uses=1, since=NOW, life=invite.life))
 
     def test_renewed_by_a_bootstrap_node(self) -> None:
-        """A renewal moves the expiry of a certificate, granted or by code, and can itself be renewed."""
+        """A renewal postpones the expiry of a certificate, by grant or by code, and can itself be renewed."""
         vaio, grant = identity("vaio"), granted(OPERATOR, "vaio", "bootstrap")
         for shown in (wrap_grant(granted(OPERATOR, "dog")), admitted(OPERATOR, "dog")):
             before = verify_certificate(OPERATOR.public, DOG.public, shown)
@@ -65,7 +65,7 @@ class CertificateTests(SynchronousTestCase):
             self.assertLessEqual(len(shown), MAX_CERTIFICATE_BYTES)
 
     def test_it_takes_two(self) -> None:
-        """An admission without the code, or by a node without the role bootstrap, is forged."""
+        """An admission that is not signed with the code, or whose signer lacks the role bootstrap, is forged."""
         code, packed, invite = invited(OPERATOR)
         grant, plain = granted(OPERATOR, "vaio", "bootstrap"), granted(OPERATOR, "vaio", "device")
         vaio = identity("vaio")
@@ -88,7 +88,7 @@ class CertificateTests(SynchronousTestCase):
             self.assertRaises(Forged, verify_certificate, OPERATOR.public, DOG.public, shown)
 
     def test_admission_needs_a_living_invitation(self) -> None:
-        """An expired invitation admits no member, and no admission outlives the lifetime in its invitation."""
+        """An expired invitation admits no member, and no admission outlasts the lifetime in its invitation."""
         late = admitted(OPERATOR, "dog", now=NOW + int(LATER) + 1)
         self.assertRaises(Malformed, verify_certificate, OPERATOR.public, DOG.public, late)
         fields = msgpack.unpackb(admitted(OPERATOR, "dog"))
@@ -96,14 +96,14 @@ class CertificateTests(SynchronousTestCase):
         self.assertRaises(Malformed, verify_certificate, OPERATOR.public, DOG.public, msgpack.packb(fields))
 
     def test_it_has_its_time(self) -> None:
-        """A certificate is early before its start, with a tolerance for clock skew, and expired after its end."""
+        """A certificate is early before its start, minus a tolerance for clock skew, and expired after its end."""
         member = verify_certificate(OPERATOR.public, DOG.public, wrap_grant(granted(OPERATOR, "dog")))
         self.assertEqual(member.check_dates(NOW - MAX_CLOCK_SKEW_S - 1), "early")
         self.assertEqual(member.check_dates(NOW - MAX_CLOCK_SKEW_S), "")
         self.assertEqual(member.check_dates(member.not_after), "expired")
 
     def test_guest(self) -> None:
-        """A gateway vouches for a guest for one day; a member without that role cannot, nor can a guest."""
+        """A gateway can admit a guest for one day; a member without that role cannot, and a guest cannot."""
         page, phone, friend = identity("page"), identity("phone"), identity("friend")
         own = wrap_grant(granted(OPERATOR, "page", "gateway"))
         shown = issue_guest_certificate(page, own, phone.public, "phone", NOW)
@@ -120,7 +120,7 @@ class CertificateTests(SynchronousTestCase):
         self.assertEqual(mine.find_refusal(member, NOW), "revoked")
 
     def test_guest_of_one_who_came_by_code(self) -> None:
-        """A gateway that joined by code can vouch for a guest, unless all the names in its chain are long."""
+        """A gateway that joined by code can admit a guest, unless all names in the certificate chain are long."""
         page, phone = identity("page"), identity("phone")
         shown = issue_guest_certificate(page, admitted(OPERATOR, "page"), phone.public, "phone-of-a-visitor", NOW)
         voucher = verify_certificate(OPERATOR.public, phone.public, shown).gateway
@@ -135,7 +135,7 @@ class CertificateTests(SynchronousTestCase):
         self.assertRaises(Malformed, issue_guest_certificate, page, long, phone.public, "phone", NOW)
 
     def test_longest_fits(self) -> None:
-        """A chain with names of the maximum length, and its renewal, fit into the space for a chain."""
+        """A chain with names of the maximum length, and its renewal, do not exceed the maximum size of a chain."""
         long, boot = "n" * 40, "b" * 40
         shown = admitted(OPERATOR, long, bootstrap=boot, wish="w" * 40)
         member = verify_certificate(OPERATOR.public, identity(long).public, shown)
@@ -149,7 +149,7 @@ class CertificateTests(SynchronousTestCase):
     @given(st.data())
     @settings(max_examples=200, deadline=None)
     def test_reads_anything(self, data: st.DataObject) -> None:
-        """The decoder raises only ``Forged`` or ``Malformed`` for truncated, changed and random input."""
+        """For truncated, changed and random input the decoder raises only ``Forged`` or ``Malformed``."""
         old = data.draw(st.sampled_from((admitted(OPERATOR, "dog"), wrap_grant(granted(OPERATOR, "dog")))))
         member, grant = verify_certificate(OPERATOR.public, DOG.public, old), granted(OPERATOR, "vaio", "bootstrap")
         again = renew_certificate(identity("vaio"), grant, member, old, NOW + DEFAULT_LIFE_S)

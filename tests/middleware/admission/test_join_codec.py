@@ -33,12 +33,12 @@ HEARD = join_codec.JoinRequest(DOG, EPHEMERAL, "dog", b"")
 
 
 def signer(name: str = "vaio", role: str = "bootstrap", code: JoinCode = CODE) -> Signer:
-    """Return the node ``name``, which answers with the terms of ``code``."""
+    """Return a signer that replies as the node ``name``, with the terms of ``code``."""
     return Signer(identity(name), granted(OPERATOR, name, role), seal_terms(code, CONTENT, random.Random(3)))
 
 
 def welcomed(by: Signer | None = None) -> bytes:
-    """Return a join reply (JOIN_REPLY), valid unless ``by`` is another node."""
+    """Return a join reply (JOIN_REPLY); with a different ``by`` it is not valid."""
     return join_codec.make_reply(INVITE.public, HEARD, JOIN_REPLY, by or signer(), random.Random(2))
 
 
@@ -53,7 +53,7 @@ def knocked(wish: str = "dog") -> bytes:
 
 class JoinCodecTests(SynchronousTestCase):
     def test_knock_is_read_as_it_was_said(self) -> None:
-        """A bootstrap node that knows the invitation decodes the newcomer's key, wish and proof."""
+        """A bootstrap node that knows the invitation decodes the newcomer's key, requested name and proof."""
         said = knocked()
         found = join_codec.open_request(said, INVITE.public)
         self.assertEqual((found.public, found.ephemeral, found.requested_name), (DOG, EPHEMERAL, "dog"))
@@ -61,13 +61,19 @@ class JoinCodecTests(SynchronousTestCase):
         self.assertFalse(is_join_signature(INVITE.public, DOG, "cat", found.proof))
 
     def test_knock_hides_who_comes(self) -> None:
-        """A join request (JOIN_REQUEST) reveals neither key nor name, and always has the maximum size of a datagram."""
+        """A join request (JOIN_REQUEST) reveals neither the key nor the name.
+
+        Its size is always that of the largest datagram.
+        """
         said = knocked()
         self.assertNotIn(DOG, said)
         self.assertEqual({len(knocked(name)) for name in ("", "dog", "n" * 40)}, {1400})
 
     def test_welcome_is_read_as_it_was_given(self) -> None:
-        """The newcomer decodes the join reply; a full reply drops contacts to stay smaller than the request."""
+        """The newcomer decodes the join reply.
+
+        A full reply omits contacts so that it stays smaller than the request.
+        """
         said = welcomed()
         self.assertLessEqual(len(said), join_codec.JOIN_REQUEST_BYTES)
         found = read(said)
@@ -80,20 +86,23 @@ class JoinCodecTests(SynchronousTestCase):
         self.assertGreater(len(found.content.contacts), 1)
 
     def test_welcome_is_for_one(self) -> None:
-        """A join reply cannot be decrypted with another ephemeral key, code or newcomer."""
+        """A join reply cannot be decrypted with a different ephemeral key or code, or by a different newcomer."""
         other = invited(OPERATOR, seed=2)[0]
         self.assertRaises(Forged, read, welcomed(), CODE, b"x" * 32)
         self.assertRaises(Forged, read, welcomed(), other)
         self.assertRaises(Forged, join_codec.open_reply, welcomed(), CODE, identity("cat").public, SECRET)
 
     def test_only_a_bootstrap_node_answers(self) -> None:
-        """A reply from a member without the role bootstrap, or with the terms of another code, is forged."""
+        """A reply of a member without the role bootstrap, or with the terms of a different code, is forged."""
         self.assertRaises(Forged, read, welcomed(signer(role="device")))
         self.assertRaises(Forged, read, welcomed(signer(code=invited(OPERATOR, seed=2)[0])))
         self.assertRaises(Forged, read, welcomed(replace(signer(), identity=identity("eye"))))
 
     def test_refusals_have_names(self) -> None:
-        """A refusal arrives with its code, an unrecognized code as "unknown"; a hint is decoded as a hint."""
+        """A rejection arrives with its code, or with "unknown" for an unrecognized code.
+
+        A hint is decoded as a hint.
+        """
         for code, meant in (("used", "used"), ("silly", "unknown")):
             said = join_codec.make_refusal(INVITE.public, HEARD, code, signer(), random.Random(2))
             self.assertEqual(read(said), VerifiedReply(CONTENT, meant))
@@ -116,7 +125,7 @@ class JoinCodecTests(SynchronousTestCase):
     @given(st.recursive(st.integers(0, 99) | st.binary(max_size=70) | st.text(max_size=5), st.lists, max_leaves=20))
     @settings(max_examples=200, deadline=None)
     def test_a_bootstrap_node_may_sign_anything(self, body: object) -> None:
-        """A signed reply with any other content is a refusal or raises ``Malformed``."""
+        """A signed reply with any other content is decoded as a rejection or raises ``Malformed``."""
         whole = join_codec._sign_body(INVITE.public, HEARD, msgpack.packb(body), signer())
         said = join_codec._encrypt_reply(INVITE.public, EPHEMERAL, whole, random.Random(2))
         with contextlib.suppress(Malformed):

@@ -21,11 +21,11 @@ class MembershipTests(SynchronousTestCase):
         self.membership = operator().create_membership("vaio", ("device", "bootstrap"), NOW, random.Random(1))
 
     def refusal(self, path: Path) -> str:
-        """Return the error for the membership file at ``path``."""
+        """Return the error message for the membership file at ``path``."""
         return str(self.assertRaises(BadKeyFile, MembershipFile, path))
 
     def test_read_as_it_was_kept(self) -> None:
-        """A membership is unchanged after a write and a read, and its file is readable by its owner alone."""
+        """A membership is unchanged after writing and reading, and only the owner of the file can read it."""
         membership_file.create_membership_file(self.path, self.membership)
         self.assertEqual(MembershipFile(self.path).membership, self.membership)
         self.assertEqual(self.path.stat().st_mode & 0o777, 0o600)
@@ -42,13 +42,13 @@ class MembershipTests(SynchronousTestCase):
         self.assertIn(str(self.path), self.refusal(self.path))
 
     def test_nothing_is_overwritten(self) -> None:
-        """Creating a key file over an existing one is refused, which protects a team's key from a mistake."""
+        """A new key file never replaces an existing file, so a mistake cannot destroy a team's key."""
         operators.create_operator_file(self.path, operator())
         self.assertRaises(BadKeyFile, operators.create_operator_file, self.path, operator(2))
         self.assertEqual(operators.load_operator(self.path), operator())
 
     def test_replaced_whole(self) -> None:
-        """A new secret replaces the file and leaves no temporary file; an unwritable folder is reported."""
+        """A new secret replaces the file completely and leaves no temporary file; an unwritable folder is reported."""
         membership_file.create_membership_file(self.path, self.membership)
         kept = MembershipFile(self.path)
         kept.save(self.membership.with_secret(2, b"2" * 32, NOW + 60))

@@ -19,7 +19,7 @@ DOG, CAT, VAIO = (identity(name).public for name in ("dog", "cat", "vaio"))
 
 
 def entries() -> list[bytes]:
-    """Return statements of every kind, some of them about the same key."""
+    """Return statements of every kind, some of which concern the same key."""
     dice = random.Random(1)
     found = [granted(OPERATOR, "vaio", "bootstrap"), OPERATOR.grant(DOG, "dog", ("viewer",), NOW + 1)]
     found += [granted(OPERATOR, "dog"), invited(OPERATOR)[1], pack_admission(DOG, admitted(OPERATOR, "dog"))]
@@ -40,7 +40,7 @@ class MembershipListTests(SynchronousTestCase):
         self.assertEqual((len(mine), mine.digest), (0, bytes(8)))
 
     def test_known_is_not_new(self) -> None:
-        """Adding a known statement again returns None, which stops its propagation."""
+        """If a statement is already known, adding it again returns None, which stops its propagation."""
         mine = MembershipList(OPERATOR.public)
         self.assertIsNotNone(mine.add(ENTRIES[0], NOW))
         self.assertIsNone(mine.add(ENTRIES[0], NOW))
@@ -56,13 +56,13 @@ class MembershipListTests(SynchronousTestCase):
     @given(st.permutations(ENTRIES))
     @settings(max_examples=60, deadline=None)
     def test_order_does_not_matter(self, order: list[bytes]) -> None:
-        """Two lists with the same statements have the same digest, in any order of arrival."""
+        """Two lists with the same statements have the same digest, whatever the order of arrival."""
         self.assertEqual(make_list(OPERATOR, *order).digest, make_list(OPERATOR, *ENTRIES).digest)
 
     @given(st.permutations(range(7)))
     @settings(max_examples=60, deadline=None)
     def test_order_of_renewals(self, order: list[int]) -> None:
-        """Lists converge for any order of renewals, a later grant and a revocation, once they have been compared."""
+        """Lists converge for any order of renewals, a later grant and a revocation, after they were compared."""
         vaio, grant, later = identity("vaio"), granted(OPERATOR, "vaio", "bootstrap"), NOW + 300 * 86_400
         found = [grant, pack_admission(CAT, admitted(OPERATOR, "cat")), granted(OPERATOR, "dog")]
         for name, shown, moment in (
@@ -80,7 +80,7 @@ class MembershipListTests(SynchronousTestCase):
         self.assertEqual(mine.digest, make_list(OPERATOR, *found, *found, now=later).digest)
 
     def test_revoked_key(self) -> None:
-        """A revoked key stays refused, whatever is granted to it later."""
+        """A revoked key stays rejected, even if it gets a later grant."""
         shown = admitted(OPERATOR, "dog")
         member = verify_certificate(OPERATOR.public, DOG, shown)
         mine = make_list(OPERATOR, OPERATOR.revoke(DOG, "dog", NOW), OPERATOR.grant(DOG, "dog", ("device",), NOW + 9))
@@ -88,7 +88,7 @@ class MembershipListTests(SynchronousTestCase):
         self.assertEqual(mine.list_members(NOW + 9), [])
 
     def test_what_has_run_out_goes(self) -> None:
-        """An expired invitation is kept for a week, to name the reason of a refusal, and then deleted."""
+        """An expired invitation is kept for a week, as the reason for rejections, and then deleted."""
         _, packed, invite = invited(OPERATOR)
         mine = make_list(OPERATOR, packed)
         name = invitation_id(invite.public)
@@ -104,7 +104,7 @@ class MembershipListTests(SynchronousTestCase):
         self.assertEqual(numbers, [6, 5, 4, 3])
 
     def test_name_of_a_member(self) -> None:
-        """A member's roles come from the operator's latest grant, and its admission is kept."""
+        """A member's roles come from the operator's latest grant; its admission is kept."""
         mine = make_list(OPERATOR, pack_admission(DOG, admitted(OPERATOR, "dog")))
         mine.add(OPERATOR.grant(DOG, "dog", ("device", "bootstrap"), NOW + 1), NOW)
         [member] = mine.list_members(NOW + 2)

@@ -1,4 +1,4 @@
-"""Tests of the log of refusals in a closed team: peer, side, reason and remedy."""
+"""Tests of the log of rejections in a closed team: peer, side, reason and remedy."""
 
 from __future__ import annotations
 
@@ -11,12 +11,12 @@ from tests.middleware.admission.village import House, VillageCase
 
 class RejectionTests(VillageCase):
     def met(self, house: House, side: str) -> list[Rejection]:
-        """Return the refusals that ``house`` logged for ``side``."""
+        """Return the rejections that the node of ``house`` logged for ``side``."""
         now = house.node.endpoint.rejections.list_recent(1e9, 1e10)
         return [each for each in now if each.side == side]
 
     def test_revoked_member(self) -> None:
-        """A revoked member and the member that rejects it both log the refusal with its remedy."""
+        """A revoked member, and the member that rejects it, both log the rejection with its remedy."""
         village = self.village()
         dog = village.welcome("dog")
         village.run(3.0)
@@ -29,7 +29,7 @@ class RejectionTests(VillageCase):
             self.assertIn("; admit the node again with a new code", each.reason)
 
     def test_newcomers(self) -> None:
-        """A used code is logged with the newcomer's key; any number of unknown codes share one entry."""
+        """A used code is logged with the newcomer's key; all unknown codes share one log entry."""
         village = self.village()
         code = village.invite()
         others = [village.knock(self.village(seed=seed).invite(), timeout=3.0) for seed in (2, 3, 4)]
@@ -47,7 +47,7 @@ class RejectionTests(VillageCase):
         self.assertEqual(sum("rejected by the invitation" in formatEvent(event) for event in said), 1)
 
     def test_copy_of_a_store(self) -> None:
-        """A copy that starts later supersedes the first node; the first node and its peers log it."""
+        """If a copy of a node starts later, it supersedes the first node; the first node and its peers log this."""
         village = self.village()
         dog = village.welcome("dog")
         village.run(3.0)

@@ -10,20 +10,20 @@ from middleware.admission.statement import DEFAULT_LIFE_S
 from tests.middleware.admission.village import DAY, House, Village, VillageCase
 
 STEP_DAYS, STEP_S = 5, 12.0
-"""The wall clock advances by ``STEP_DAYS`` while the nodes run for ``STEP_S`` seconds."""
+"""The wall clock advances by ``STEP_DAYS`` each time that the nodes have run for ``STEP_S`` seconds."""
 
 
 class Years(Village):
     """A simulated team with a wall clock that advances faster than the nodes' monotonic clock."""
 
     def live(self, days: int) -> None:
-        """Let ``days`` pass while the nodes run."""
+        """Let ``days`` pass on the wall clock while the nodes run."""
         for _ in range(days // STEP_DAYS):
             self.days += STEP_DAYS
             self.run(STEP_S)
 
     def end_of(self, house: House, at: int = 0) -> int:
-        """Return the expiry of the certificate of ``house`` in the list of node number ``at``."""
+        """Return the expiry of the certificate of ``house`` in the membership list of the node with index ``at``."""
         member = self.houses[at].team.admission.find_member(house.public)
         assert member is not None
         return member.not_after
@@ -33,7 +33,7 @@ class YearsCase(VillageCase):
     """A test with a ``Years`` team."""
 
     def years(self, bootstraps: int = 2) -> Years:
-        """Return a team of five, the first ``bootstraps`` of them bootstrap nodes, stopped when the test ends."""
+        """Return a team of five, of which the first ``bootstraps`` are bootstrap nodes; it stops when the test ends."""
         years = self.kept(Years(bootstraps=bootstraps))
         for name in ("dog", "cat", "pig", "cow")[: 5 - bootstraps]:
             years.welcome(name)
@@ -43,7 +43,10 @@ class YearsCase(VillageCase):
 
 class YearAndAHalfTests(YearsCase):
     def test_nobody_attends(self) -> None:
-        """All five members renew; one that was off for 60 days returns, and a revoked one stays rejected."""
+        """All five members are renewed.
+
+        A member that was off for 60 days returns, and a revoked member stays rejected.
+        """
         years = self.years()
         vaio, boot, dog, cat, pig = years.houses
         publics = [house.public for house in years.houses]
@@ -76,7 +79,7 @@ class YearAndAHalfTests(YearsCase):
         self.assertEqual(years.houses[0].team.admission.me.renewer, years.houses[0].public)
 
     def test_a_bootstrap_node_is_gone_for_good(self) -> None:
-        """If one of two bootstrap nodes is lost, the other one renews all members and itself."""
+        """If one of two bootstrap nodes is lost, the other bootstrap node renews itself and all members."""
         years = self.years()
         years.live(200)
         years.close(years.houses[1], is_sudden=True)
@@ -105,7 +108,7 @@ class LargeTeamTests(YearsCase):
 
 class BatchTests(YearsCase):
     def test_a_few_at_once(self) -> None:
-        """A bootstrap node signs at most ``MAX_RENEWALS_PER_SCAN`` renewals at a time, until all are renewed."""
+        """A bootstrap node signs at most ``MAX_RENEWALS_PER_SCAN`` renewals per scan, until all members are renewed."""
         years = self.years(bootstraps=1)
         for number in range(MAX_RENEWALS_PER_SCAN + 3):
             years.tell(years.signer.grant(bytes([number]) * 32, f"p{number}", ("device",), years.wall()))
@@ -123,7 +126,7 @@ class BatchTests(YearsCase):
 
 class SleeperTests(YearsCase):
     def slept(self, years: Years, house: House) -> None:
-        """Keep ``house`` off from before its renewal until after its expiry."""
+        """Switch ``house`` off before its certificate is due for renewal, until it has expired."""
         years.live(230)
         years.close(house)
         years.live(160)
@@ -153,7 +156,7 @@ class SleeperTests(YearsCase):
         self.assertEqual(years.members(dog.place), years.members())
 
     def test_renewed_while_it_sleeps(self) -> None:
-        """A member that the operator renewed while it was off rejoins at once with its old certificate."""
+        """A member that the operator renewed while it was off can rejoin with its old certificate immediately."""
         years = self.years()
         vaio, _, dog, cat, _ = years.houses
         self.slept(years, dog)

@@ -1,4 +1,4 @@
-"""Tests of ``admission.roles``: the table covers all methods and slots of a node, and a team works under it."""
+"""Tests of ``admission.roles``: the table covers all methods and slots of a node, and a team works with it."""
 
 from __future__ import annotations
 
@@ -40,11 +40,14 @@ from tests.swarmnode.team import KEY, MemoryTeam
 from webnode import revocation
 
 ABSENT = ("roll.", "reach.")
-"""Prefixes of the methods that not every node exposes."""
+"""Prefixes of methods that only some nodes expose."""
 
 
 class RoleAdmission(OpenAdmission):
-    """Admits every node, with ``roles`` by public key; ``refusals`` collects the denied calls and writes."""
+    """Admits every node, and looks up the roles in ``roles`` by public key.
+
+    ``refusals`` collects denied calls and writes.
+    """
 
     def __init__(self, known: dict[bytes, tuple[str, ...]], refusals: list[tuple[tuple[str, ...], str]]) -> None:
         self._known = known
@@ -95,7 +98,7 @@ class TableTests(SynchronousTestCase):
         self.assertEqual(sorted(name for name in set(METHODS) - exposed if not name.startswith(ABSENT)), [])
 
     def test_roles_are_known(self) -> None:
-        """Every entry names at least one role, and only existing roles."""
+        """Every entry contains at least one role, and only existing roles."""
         for allowed in (*METHODS.values(), *KINDS.values(), roles.OTHER_METHODS):
             self.assertTrue(allowed)
             self.assertLessEqual(allowed, set(ROLES))
@@ -114,7 +117,7 @@ class TableTests(SynchronousTestCase):
                 self.assertEqual(classify_slot(slot(key, name)), kind)
 
     def test_presence_in_a_large_team(self) -> None:
-        """In a large team a viewer writes its presence under its own directory prefixes only."""
+        """In a large team a viewer can write its presence only under the directory prefixes of its own id."""
         own, other = Identity(bytes(32)), Identity(b"1" * 32)
         for depth in range(presence.MAX_DEPTH + 1):
             for key in compute_places(own.node_id, depth):
@@ -123,7 +126,7 @@ class TableTests(SynchronousTestCase):
         self.assertEqual([may_store([VIEWER], Slot(key, own.public, "phone")) for key in strange], [False] * 2)
 
     def test_kinds_by_name(self) -> None:
-        """The slots of tasks and modules are identified by their names; all others have the kind ``OTHER``."""
+        """The slots of tasks and modules are recognized by their names; all other slots have the kind ``OTHER``."""
         key = tasks.group_key("t")
         names = {
             tasks.MEMBER: roles.MEMBER,
@@ -140,7 +143,7 @@ class TableTests(SynchronousTestCase):
         self.assertEqual({name: classify_slot(slot(key, name)) for name in names}, names)
 
     def test_a_viewer_changes_nothing(self) -> None:
-        """A viewer publishes its presence and reads; it cannot act, order, bid or write anything else."""
+        """A viewer publishes its presence and reads; it cannot act, send orders, bid or write other records."""
         writes = {kind for kind, allowed in KINDS.items() if VIEWER in allowed}
         self.assertEqual(writes, {roles.PRESENCE})
         for method in ("find_value", "watch", "device.settings", "device.inventory", "stream.open"):
@@ -149,7 +152,10 @@ class TableTests(SynchronousTestCase):
             self.assertFalse(may_call((VIEWER,), method), method)
 
     def test_who_orders_and_who_acts(self) -> None:
-        """Operators and gateways order, devices and gateways act; the role bootstrap alone permits neither."""
+        """Operators and gateways can send orders, devices and gateways can act.
+
+        The role bootstrap alone permits neither.
+        """
         for method in (
             "device.halt",
             "device.tune",
@@ -166,7 +172,7 @@ class TableTests(SynchronousTestCase):
         self.assertTrue(may_store((BOOTSTRAP,), slot(hash_key("tuples/admission/2"))))
 
     def test_several_roles_add_up(self) -> None:
-        """A member with two roles has the rights of both; a member without roles has none."""
+        """A member with two roles has the rights of both roles; a member without roles has no rights."""
         self.assertTrue(may_call((VIEWER, OPERATOR), "device.halt"))
         self.assertFalse(may_call((), "ping"))
         self.assertFalse(may_store((), slot(presence.DEVICES)))
@@ -174,7 +180,7 @@ class TableTests(SynchronousTestCase):
 
 class TeamTests(SynchronousTestCase):
     def test_experiment_by_roles(self) -> None:
-        """Experiment 2 passes with a gateway, dogs as devices and a viewer, and no request is rejected."""
+        """Experiment 2 passes with a gateway, two dogs as devices and a viewer, and no request is rejected."""
         plain: Any = SwarmNode
         known: dict[bytes, tuple[str, ...]] = {}
         refusals: list[tuple[tuple[str, ...], str]] = []
@@ -186,6 +192,6 @@ class TeamTests(SynchronousTestCase):
 
         self.patch(assembly, "SwarmNode", make)
         outcome = run_trial(partial(SimulatedTeam, others=("looker",)), 2, 3)
-        # The council may include the viewer, and its role forbids this method.
+        # The council may include the viewer, whose role forbids this method.
         self.assertEqual(set(refusals) - {((VIEWER,), "lease.freed")}, set())
         self.assertEqual((outcome.broken, bool(outcome.found)), ([], True))

@@ -1,4 +1,4 @@
-"""Tests of the bootstrap node's side of admission, in isolation."""
+"""Tests of the admission server of a bootstrap node, in isolation."""
 
 from __future__ import annotations
 
@@ -52,7 +52,7 @@ class AdmissionServerTests(SynchronousTestCase):
         )
 
     def knocked(self, dice: int = 1, name: str = "dog", secret: bytes = SECRET) -> bytes:
-        """Return a valid join request (JOIN_REQUEST); another seed gives other bytes."""
+        """Return a valid join request (JOIN_REQUEST); the seed determines its bytes."""
         shared = bindings.crypto_scalarmult_base(secret)
         return join_codec.make_request(CODE.key, identity(name).public, shared, "", random.Random(dice))
 
@@ -72,15 +72,15 @@ class AdmissionServerTests(SynchronousTestCase):
         assert self.membership_list.find_admission(DOG) is not None
 
     def test_repeated_knock_costs_nothing(self) -> None:
-        """A repeated datagram gets the same reply, from any source address, and consumes no use of the code."""
+        """A repeated datagram gets the same reply, from any source address, and does not use the code again."""
         said = self.knocked()
         self.server.on_request(said, DOOR)
-        self.taken = Deferred()  # a request for another use would block on this
+        self.taken = Deferred()  # A request for a further use would wait for this Deferred.
         self.server.on_request(said, Address("10.0.0.3", 1))
         self.assertEqual(self.sent[0][0], self.sent[1][0])
 
     def test_answer_under_way(self) -> None:
-        """Requests of one newcomer wait while a use is taken; then the newcomer gets one reply."""
+        """While a use of the code is being taken, requests of the newcomer wait; then the newcomer gets one reply."""
         self.taken = Deferred()
         for dice in range(3):
             self.server.on_request(self.knocked(dice), DOOR)
@@ -89,7 +89,7 @@ class AdmissionServerTests(SynchronousTestCase):
         self.assertEqual(len(self.sent), 1)
 
     def test_nobody_can_tell(self) -> None:
-        """A newcomer is refused with "later" if too few peers are reachable or the membership list is full."""
+        """A newcomer is rejected with "later" if too few peers are reachable or the membership list is full."""
         self.taken = fail(NoAnswer("too few"))
         self.server.on_request(self.knocked(1), DOOR)
         self.assertEqual(self.answer(), "later")
@@ -106,7 +106,7 @@ class AdmissionServerTests(SynchronousTestCase):
         self.assertIsNone(self.membership_list.find_admission(DOG))
 
     def test_strangers_get_nothing(self) -> None:
-        """Forged requests for a known invitation get no reply, and do not delay a newcomer with the code."""
+        """Forged requests for a known invitation get no reply, and do not delay a newcomer that has the code."""
         said = self.knocked()
         for number in range(int(MAX_REQUESTS_PER_S) * 3):
             forged = bytearray(said)
@@ -135,7 +135,7 @@ class AdmissionServerTests(SynchronousTestCase):
         self.assertEqual(len(said), 1)
 
     def test_checks_are_few(self) -> None:
-        """The rate of checked requests is limited, even for newcomers with the code."""
+        """The rate of requests that are checked is limited, even for newcomers with the code."""
         for number in range(int(MAX_REQUESTS_PER_S) + 10):
             self.server.on_request(self.knocked(name=f"dog{number}"), DOOR)
         self.assertEqual(len(self.sent), int(MAX_REQUESTS_PER_S))
@@ -146,7 +146,7 @@ class AdmissionServerTests(SynchronousTestCase):
     @given(st.data())
     @settings(max_examples=150, deadline=None)
     def test_takes_anything(self, data: st.DataObject) -> None:
-        """Any datagram is handled without an exception, and its reply is not larger than the datagram."""
+        """Any datagram is handled without an exception, and the reply is not larger than the datagram."""
         said = bytearray(self.knocked())
         for place in data.draw(st.lists(st.integers(0, len(said) - 1), max_size=3)):
             said[place] ^= data.draw(st.integers(0, 255))

@@ -49,20 +49,20 @@ class StatementTests(SynchronousTestCase):
             self.assertRaises((Forged, Malformed), open_statement, self.operator.public, changed)
 
     def test_secret_opens_for_those_that_stay(self) -> None:
-        """The team's new secret can be decrypted only by the members for which it was sealed."""
+        """Only the members for which a new team secret was sealed can decrypt it."""
         self.assertEqual(self.secret.decrypt(DOG), b"s" * 32)
         self.assertIsNone(self.secret.decrypt(CAT))
         stolen = Secret(2, NOW, 60, NOW + 100, self.secret.fingerprint, ((CAT.public, self.secret.sealed[0][1]),))
         self.assertIsNone(stolen.decrypt(CAT))
 
     def test_secret_for_many(self) -> None:
-        """A secret sealed for the maximum number of members can be signed and read."""
+        """A secret that is sealed for the maximum number of members can be signed and read."""
         keys = [identity(str(number)).public for number in range(MAX_SECRET_RECIPIENTS)]
         secret = seal_secret(b"s" * 32, 2**40, keys, NOW, MAX_LIFE_S, random.Random(1))
         self.assertEqual(open_statement(self.operator.public, sign_statement(self.operator, secret)), secret)
 
     def test_unlawful_is_not_signed(self) -> None:
-        """Invalid statements are refused before signing: empty name, no role, no lifetime, too many uses."""
+        """A statement is rejected before signing if it has an empty name, no role, no lifetime or too many uses."""
         wrong: list[Any] = [
             Grant(DOG.public, "", ("device",), NOW, NOW + 1),
             Grant(DOG.public, "dog", (), NOW, NOW + 1),
@@ -76,7 +76,7 @@ class StatementTests(SynchronousTestCase):
             self.assertRaises(ValueError, sign_statement, self.operator, each)
 
     def test_one_form_only(self) -> None:
-        """A non-canonical encoding of a statement is malformed, otherwise one statement had two digests."""
+        """A non-canonical encoding of a statement is malformed, because a statement must have only one digest."""
         packed = sign_statement(self.operator, REVOKE)
         fields = msgpack.unpackb(packed)
         longer = b"\xdc" + len(fields).to_bytes(2) + packed[1:]
@@ -91,5 +91,5 @@ class StatementTests(SynchronousTestCase):
     )
     @settings(max_examples=400, deadline=None)
     def test_reads_anything(self, packed: bytes) -> None:
-        """Any bytes raise ``Malformed`` or ``Forged``, and no other error."""
+        """Any bytes are decoded or raise ``Malformed`` or ``Forged``, and no other exception."""
         self.assertRaises((Forged, Malformed), open_statement, operator().public, packed)

@@ -33,7 +33,7 @@ class JoiningTests(VillageCase):
         self.assertEqual(passes[0], passes[1])
 
     def test_expired_and_unknown_code(self) -> None:
-        """An expired code is refused as "expired", a code of another team as "unknown"."""
+        """An expired code is rejected as "expired", a code of another team as "unknown"."""
         village = self.village()
         code = village.invite(expires=10.0)
         village.run(10.0)
@@ -43,14 +43,14 @@ class JoiningTests(VillageCase):
         self.assertEqual(self.failureResultOf(foreign, NotWelcome).value.code, "unknown")
 
     def test_nobody_there(self) -> None:
-        """If no node answers, the newcomer's error names the address that it tried."""
+        """If no node replies, the newcomer's error contains the address that it tried."""
         village = self.village()
         knocked = village.knock(village.invite(), (77,), timeout=2.0)
         village.run(2.5)
         self.assertIn(str(village.address(77)), str(self.failureResultOf(knocked, NoAnswer).value))
 
     def test_second_bootstrap(self) -> None:
-        """If the first bootstrap node is down, the newcomer joins through the second."""
+        """If the first bootstrap node is down, the newcomer joins through the second bootstrap node."""
         village = self.village(bootstraps=3)
         code = village.invite()
         village.close(village.houses[1], is_sudden=True)
@@ -59,7 +59,10 @@ class JoiningTests(VillageCase):
         self.assertEqual(self.successResultOf(knocked).member.name, "dog")
 
     def test_member_that_is_no_bootstrap(self) -> None:
-        """A plain member refuses a newcomer with "role"; after a promotion it admits it without a restart."""
+        """A plain member rejects a newcomer with "role".
+
+        After its promotion it admits the newcomer without a restart.
+        """
         village = self.village()
         dog = village.welcome("dog")
         code = village.invite("cat")
@@ -87,7 +90,7 @@ class JoiningTests(VillageCase):
         self.assertEqual(names, ["pupil-1", "kim", "pupil-2", "used"])
 
     def test_code_made_while_the_others_are_gone(self) -> None:
-        """A node that suddenly lost all peers cannot publish a code; the one-line error names the time to wait."""
+        """A node that suddenly lost all peers cannot publish a code; the one-line error states how long to wait."""
         village = self.village(bootstraps=3)
         village.run(5.0)
         for house in village.houses[1:]:
@@ -100,7 +103,7 @@ class JoiningTests(VillageCase):
         self.assertEqual(len(text.splitlines()), 1)
 
     def test_uses_across_a_cut(self) -> None:
-        """A partition between bootstrap nodes does not allow more uses of a code than it grants."""
+        """During a partition between bootstrap nodes a code admits no more newcomers than it has uses."""
         village = self.village(bootstraps=5)
         village.run(5.0)
         code = village.invite(uses=2)
@@ -130,7 +133,7 @@ class JoiningTests(VillageCase):
 
 class RevocationTests(VillageCase):
     def test_revoked_invitation(self) -> None:
-        """Revoking an invitation revokes all members that joined by it, and the code itself."""
+        """Revoking an invitation revokes the code and all members that joined with it."""
         village = self.village()
         code = village.invite("pupil", uses=3)
         knocked = village.knock(code)
@@ -177,7 +180,7 @@ class RotationTests(VillageCase):
         self.assertEqual(self.slept(grace=600.0, seconds=5.0), 2)
 
     def test_who_came_meanwhile(self) -> None:
-        """A member for which the new secret was not sealed requests it from another member."""
+        """A member for which the new secret was not sealed requests the secret from another member."""
         village = self.village()
         dog = village.welcome("dog")
         village.run(2.0)
@@ -192,7 +195,10 @@ class RotationTests(VillageCase):
 
 class StrangersTests(VillageCase):
     def test_certificate_of_another_team(self) -> None:
-        """A node with the team's secret but another operator's certificate is refused, and both nodes log it once."""
+        """A node that has the team's secret but a certificate of another operator is rejected.
+
+        Both nodes log this once.
+        """
         village = self.village()
         first = village.houses[0].kept.membership
         stranger = operator(9).create_membership("spy", ("device",), village.wall(), village.dice, first.secrets[0][1])
@@ -206,7 +212,7 @@ class StrangersTests(VillageCase):
         self.assertEqual(village.members(), ["vaio"])
 
     def test_stranger_is_told_where_to_look(self) -> None:
-        """A node without the team's secret gets no answer, and logs once that ``swarm doctor`` finds the reason."""
+        """A node without the team's secret gets no reply, and logs once that ``swarm doctor`` finds the reason."""
         village = self.village()
         with capturedLogs() as said:
             village.move_in(operator(9).create_membership("spy", ("device",), village.wall(), village.dice))
@@ -232,7 +238,7 @@ class StrangersTests(VillageCase):
         self.assertEqual(self.refusal(village, village.houses[0].node.call, dog, 3.0), "expired")
 
     def test_expired_by_its_own_clock(self) -> None:
-        """A node with an expired certificate logs it at its start, with both remedies."""
+        """A node whose certificate has expired logs this at its start, with both remedies."""
         village = self.village()
         old = village.signer.create_membership("dog", ("device",), village.wall() - 366 * 86_400.0, village.dice)
         with capturedLogs() as events:

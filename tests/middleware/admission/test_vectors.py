@@ -30,7 +30,7 @@ NOW = 1_800_000_000
 
 
 class Counted(random.Random):
-    """A random generator that returns increasing bytes, for the ephemeral keys and nonces of the vectors."""
+    """A random generator that returns increasing bytes, for the ephemeral keys and nonces of the test vectors."""
 
     def randbytes(self, n: int) -> bytes:
         return bytes(range(n))

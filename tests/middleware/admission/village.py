@@ -45,7 +45,7 @@ class Tape:
 
 
 class House:
-    """One node, its team, and the membership that it keeps across restarts."""
+    """One node, the object for its team, and the membership that is kept when the node restarts."""
 
     def __init__(self, place: int, kept: MemoryMembership) -> None:
         self.place = place
@@ -63,9 +63,9 @@ class House:
 
 
 class Village(Simulation):
-    """A closed team; ``signer`` is its operator, and the first node publishes the operator's statements by default.
+    """A closed team; ``signer`` is its operator, and by default the first node publishes the operator's statements.
 
-    The wall clock is ``days`` ahead of the virtual clock; ``tape`` records the datagrams that nodes receive that are
+    The wall clock is ``days`` ahead of the virtual clock. ``tape`` records the datagrams that are received by nodes
     opened after it was set.
     """
 
@@ -84,7 +84,7 @@ class Village(Simulation):
             self.move_in(other if number else first)
 
     def wall(self) -> float:
-        """Return the time of the wall clock that all nodes share."""
+        """Return the time of the wall clock, which all nodes share."""
         return NOW + self.clock.seconds() + self.days * DAY
 
     def move_in(self, membership: Membership) -> House:
@@ -101,7 +101,7 @@ class Village(Simulation):
         return self.signer.create_membership(name, which or ("device",), self.wall(), self.dice, secret)
 
     def enlist(self, name: str, *which: str) -> House:
-        """Add a member to which the operator granted these roles."""
+        """Add a member to which the operator grants these roles."""
         return self.move_in(self.paper(name, *which))
 
     def open(self, house: House) -> None:
@@ -124,7 +124,7 @@ class Village(Simulation):
         if self.tape is not None:
             self.tape.tap(network_of(house))
         known = [self.address(0)] if place else []
-        # A rejected node may be closed before its join completes.
+        # A rejected node may be closed before it has joined.
         house.node.join(known).addErrback(lambda failure: failure.trap(NotRunning))
 
     def close(self, house: House, is_sudden: bool = False) -> None:
@@ -159,7 +159,7 @@ class Village(Simulation):
         return newcomer.join([self.address(door) for door in doors], timeout)
 
     def welcome(self, name: str = "dog", doors: Sequence[int] = (0,)) -> House:
-        """Add a member that joins by a new code."""
+        """Add a member that joins with a new code."""
         found: list[Membership] = []
         self.knock(self.invite(name), doors).addCallback(found.append)
         self.run(1.5)
@@ -196,20 +196,20 @@ class VillageCase(SynchronousTestCase):
         return self.kept(Village(seed, bootstraps=bootstraps))
 
     def kept(self, village: AnyVillage) -> AnyVillage:
-        """Stop ``village`` when the test ends."""
+        """Stop ``village`` when the test ends; return it."""
         self.addCleanup(self.left, village)
         self.addCleanup(village.stop)
         return village
 
     def outcome(self, village: Village, asked: Deferred[Any], within: float = 2.0) -> Any:
-        """Return the result of a request: its value, or its error."""
+        """Return the result of a request: its value or its error."""
         found: list[Any] = []
         asked.addCallbacks(found.append, lambda failure: found.append(failure.value))
         village.run(within)
         return found[0] if found else None
 
     def refusal(self, village: Village, ask: Callable[..., Deferred[Any]], house: House, within: float = 2.0) -> str:
-        """Return the code with which ``house`` refuses the node that owns ``ask``, or "" if it answers."""
+        """Return the code with which the node of ``house`` rejects the node that owns ``ask``, or "" if it answers."""
         answer = self.outcome(village, ask(village.contact(house), "ping", bytes(8), changes=True), within)
         if isinstance(answer, NotAdmitted):
             return str(answer.code)
@@ -217,7 +217,7 @@ class VillageCase(SynchronousTestCase):
         return ""
 
     def left(self, village: Village) -> None:
-        """Check that only datagrams are pending."""
-        village.run(1.0)  # deliver the datagrams in flight
+        """Check that no timer is pending, only datagrams in transit."""
+        village.run(1.0)  # deliver the datagrams in transit
         calls = village.clock.getDelayedCalls()
         self.assertEqual(calls, [], "a node left a timer behind")

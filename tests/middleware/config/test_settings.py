@@ -63,18 +63,18 @@ class SettingsTest(SynchronousTestCase):
         return path
 
     def refusal(self, table: str, key: str, value: object) -> str:
-        """Return the one-line error for a value; it names file, table and key, and the remedy."""
+        """Return the one-line error for a value, which must contain file, table and key, and the remedy."""
         mapping = {"node": {"name": "dog1"}}
         mapping.setdefault(table, {})[key] = value  # type: ignore[assignment]
         line: str = str(self.assertRaises(BadSetting, Settings.from_mapping, mapping, "dog1.toml"))
         self.assertEqual(line.splitlines(), [line])
-        self.assertLess(len(line), 400)  # a long value is truncated
+        self.assertLess(len(line), 400)  # an error contains a long value in truncated form
         self.assertTrue(line.startswith(f"dog1.toml: [{table}] {key}: "), line)
         self.assertIn("; ", line)
         return line
 
     def test_whole_file(self) -> None:
-        """Every key of a file is read, in the types that the program uses."""
+        """Every key of a file is read, with the type that the program uses."""
         path = self.file(WHOLE)
         read = Settings.load(path)
         node = read.node
@@ -100,7 +100,7 @@ class SettingsTest(SynchronousTestCase):
         self.assertEqual(read.origin, path)
 
     def test_defaults(self) -> None:
-        """With only a name, a node listens on loopback, stores in memory, and has no driver and no agent."""
+        """A node with only a name listens on loopback, stores in memory, and has no driver and no agent."""
         read = settings()
         self.assertEqual((read.node.host, read.node.port, read.node.store), ("127.0.0.1", 8484, ":memory:"))
         self.assertEqual((read.node.known_nodes, read.node.roles), ((), ("edge",)))
@@ -118,14 +118,14 @@ class SettingsTest(SynchronousTestCase):
         self.assertEqual(Settings.from_mapping(mapping, "/etc/swarm/a.toml").node.store, ":memory:")
 
     def test_team_key(self) -> None:
-        """The team key is hashed to 32 bytes, absent from ``repr``, and empty by default."""
+        """The team key is hashed to 32 bytes, is not part of ``repr``, and is empty by default."""
         self.assertEqual((settings().node.team_key, settings().node.membership), ("", ""))
         self.assertEqual(settings(team_key="horse").node.team_secret, hashlib.blake2s(b"horse").digest())
         self.assertNotEqual(settings(team_key="correct horse").node.team_secret, settings().node.team_secret)
         self.assertNotIn("correct horse", repr(settings(team_key="correct horse")))
 
     def test_examples_of_errors(self) -> None:
-        """An error is one line: file, table, key, the problem without secrets, and the remedy."""
+        """An error is one line with file, table, key, the problem without secrets, and the remedy."""
         problem, _, remedy = self.refusal("node", "port", "x").rpartition("; ")
         self.assertIn('is "x"', problem)
         self.assertIn("65535", remedy)
@@ -192,7 +192,7 @@ class SettingsTest(SynchronousTestCase):
                 self.refusal(table, key, value)
 
     def test_deployment_is_off_by_default(self) -> None:
-        """Deployment is disabled by default, and can be enabled in the file and by flags."""
+        """Deployment is disabled by default, and can be enabled in the file and by command-line flags."""
         off = settings().deployment
         self.assertEqual((off.allow, off.operators, off.modules), (False, (), ()))
         table = {"allow": True, "operators": ["ab" * 32], "modules": ["best", "spin"]}
@@ -203,7 +203,7 @@ class SettingsTest(SynchronousTestCase):
         self.assertRaises(BadSetting, settings().with_flags, deployment_allow="yes")
 
     def test_tunnels(self) -> None:
-        """By default port 443 of each remote known node is a tunnel; named tunnels come first."""
+        """By default each remote known node has a tunnel on port 443; configured tunnels come first."""
         known = ["10.0.0.7:7000", "127.0.0.1:7000", "10.0.0.7:7001", "[fe80::1]:7000"]
         found = [str(url) for url in settings(known_nodes=known).node.tunnel_urls]
         self.assertEqual(found, ["wss://10.0.0.7/swarm", "wss://[fe80::1]/swarm"])
@@ -216,7 +216,7 @@ class SettingsTest(SynchronousTestCase):
         self.assertEqual((flags.tunnel_port, flags.tunnels, flags.tunnel_tls), (443, ("wss://a",), False))
 
     def test_unknown_names(self) -> None:
-        """A misspelt table or key, a missing name and a value in place of a table are refused with the remedy."""
+        """A misspelt table or key, a missing name, and a value in place of a table raise an error with the remedy."""
         for mapping, meant in (
             ({"nod": {}}, "nearest table is [node]"),
             ({"store": "x"}, "store: is outside of any table; write it below [node]"),
@@ -231,7 +231,7 @@ class SettingsTest(SynchronousTestCase):
             self.assertIn(meant, str(error))
 
     def test_files_that_cannot_be_read(self) -> None:
-        """A missing file, a folder, non-UTF-8 bytes and broken TOML are each refused in one line with the reason."""
+        """A missing file, a folder, non-UTF-8 bytes and broken TOML each raise a one-line error with the reason."""
         folder = self.mktemp()
         os.mkdir(folder)
         for path, reason in (
@@ -249,7 +249,7 @@ class SettingsTest(SynchronousTestCase):
 
 class FlagsTest(SynchronousTestCase):
     def test_flags_win(self) -> None:
-        """Flags override the file; other values, and the original settings, are unchanged."""
+        """Flags override the file; all other values, and the original settings object, are unchanged."""
         before = settings(port=7001, kind="ers7")
         after = before.with_flags(port=7002, web_port="8081", agent_module="search", name=None)
         self.assertEqual((after.node.port, after.web.port, after.agent.module), (7002, 8081, "search"))
@@ -263,11 +263,11 @@ class FlagsTest(SynchronousTestCase):
         self.assertEqual(node.known_nodes, (Address("10.0.0.7", 7000),))
 
     def test_store_where_one_stands(self) -> None:
-        """A store path on the command line is relative to the working directory, like every other path there."""
+        """A store path on the command line is relative to the working directory."""
         self.assertEqual(settings(store="a.db").with_flags(store="b.db").node.store, "b.db")
 
     def test_bad_flags(self) -> None:
-        """The error for an unknown flag names the nearest one, the error for a bad value its flag."""
+        """The error for an unknown flag suggests the most similar flag; the error for a bad value contains its flag."""
         for flags, line in (
             ({"prot": 1}, "command line: --prot: is not a setting; the nearest is --port"),
             ({"web_port": "many"}, 'command line: --web-port: is "many"; write a number from 0 to 65535'),

@@ -1,4 +1,4 @@
-"""Tests of bidding between real nodes: bids are sent, confirmed, accepted and refused on their endpoints."""
+"""Tests of bidding between real nodes: their endpoints send, confirm, accept and reject bids."""
 
 from __future__ import annotations
 
@@ -29,12 +29,12 @@ WAITING = 0.5
 
 
 class AuctionCase(FleetCase):
-    """A team and one auction."""
+    """A test case with a team and one auction."""
 
     def prepared(
         self, n: int, seed: int = 1, weather: LinkConditions | None = None, strategy: str = "nearest"
     ) -> SwarmTeam:
-        """Return a team in which the three nodes nearest to the task are its council."""
+        """Return a team in which the council of the task consists of the three nodes nearest to the task's key."""
         fleet = self.swarm(n, seed) if weather is None else self.swarm(n, seed, weather)
         key = group_key("job")
         council = select_closest([node.entangled.contact for node in fleet.nodes], key, 3)
@@ -47,7 +47,7 @@ class AuctionCase(FleetCase):
         return Auction("job", 1, self.task.council, self.task.strategy, WAITING, **others)
 
     def enter(self, fleet: SwarmTeam, *costs: float) -> list[Bidding]:
-        """Let the nodes bid."""
+        """Let the nodes bid these costs, each with its own node."""
         biddings = []
         for place, cost in enumerate(costs):
             node = fleet.nodes[place]
@@ -57,7 +57,7 @@ class AuctionCase(FleetCase):
         return biddings
 
     def outsider(self, fleet: SwarmTeam) -> SwarmNode:
-        """Return a node that is not a member of the council."""
+        """Return a node that is not a member of the task's council."""
         council = {member.node_id for member in self.task.council}
         return next(node for node in fleet.nodes if node.entangled.identity.node_id not in council)
 
@@ -72,7 +72,7 @@ class AuctionServiceTests(AuctionCase):
     """Tests of ``SwarmNode.start_bidding``."""
 
     def test_all_agree(self) -> None:
-        """After the waiting period every bidder has the same reports, the cheapest first."""
+        """After the waiting period every bidder has the same reports, in the order of their costs."""
         fleet = self.prepared(4)
         self.enter(fleet, 3.0, 1.0, 2.0)
         fleet.run(WAITING - 0.1)
@@ -83,7 +83,7 @@ class AuctionServiceTests(AuctionCase):
             self.assertEqual(self.views[place][-1][0].agent, fleet.nodes[1].uuid)
 
     def tree(self) -> SwarmTeam:
-        """Return a team of twelve that sends its bids along the tree."""
+        """Return a team of twelve in which bids are sent along the tree."""
         fleet = self.prepared(12)
         for node in fleet.nodes:
             node.auction_service._path_choice.path = TREE
@@ -91,18 +91,18 @@ class AuctionServiceTests(AuctionCase):
         return fleet
 
     def assert_agreed(self, fleet: SwarmTeam) -> None:
-        """Let all twelve nodes bid, and check that they agree on the last one, which is the nearest."""
+        """Let all twelve nodes bid, and check that they all choose the last node, which is the nearest."""
         self.enter(fleet, *(float(12 - place) for place in range(12)))
         fleet.run(3.0)
         winners = {self.views[place][-1][0].agent for place in range(12)}
         self.assertEqual(winners, {fleet.nodes[11].uuid})
 
     def test_tree_of_real_nodes(self) -> None:
-        """Bids that are sent along the tree lead to agreement."""
+        """Bidders agree when their bids are sent along the tree."""
         self.assert_agreed(self.tree())
 
     def test_more_than_one_carries(self) -> None:
-        """If many nodes know the same single contact, those beyond its limit send to the council, and all agree."""
+        """A contact accepts a limited number of children; further nodes send to the council, and all bidders agree."""
         fleet = self.tree()
         council = {member.node_id for member in self.task.council}
         outside = [node for node in fleet.nodes if node.entangled.identity.node_id not in council]
@@ -122,7 +122,7 @@ class AuctionServiceTests(AuctionCase):
         self.assertEqual(sum("send their bids here" in text for text in refused), len(outside) - 1 - 2)
 
     def test_withdrawn_and_bid_anew(self) -> None:
-        """A withdrawn bid does not count, a new one does, and an equal bid sends nothing."""
+        """A withdrawn bid does not count, and a new bid does; an unchanged bid is not sent again."""
         fleet = self.prepared(4)
         biddings = self.enter(fleet, 3.0, 1.0, 2.0)
         fleet.run(1.0)
@@ -138,7 +138,7 @@ class AuctionServiceTests(AuctionCase):
         self.assertEqual(len(self.views[0]), before)
 
     def test_restarted_bidder(self) -> None:
-        """A restarted node can bid, although it had sent more revisions before the restart."""
+        """A restarted node can bid again, although it had sent more revisions of its bid before the restart."""
         fleet = self.prepared(4)
         biddings = self.enter(fleet, 3.0, 4.0, 5.0, 6.0)
         place = fleet.nodes.index(self.outsider(fleet))
@@ -157,7 +157,7 @@ class AuctionServiceTests(AuctionCase):
             self.assertEqual(costs[node.uuid], 9.0)
 
     def test_bad_bids_are_errors(self) -> None:
-        """A bid with an invalid cost or for another agent raises ``ValueError``."""
+        """A bid with an invalid cost, or for another agent, raises ``ValueError``."""
         fleet = self.prepared(3)
         [bidding] = self.enter(fleet, 3.0)
         for cost in (math.nan, math.inf, -1.0):
@@ -167,7 +167,7 @@ class AuctionServiceTests(AuctionCase):
             bidding.report(Report(fleet.nodes[1].uuid, 1.0))
 
     def test_listener_that_raises(self) -> None:
-        """A callback that raises does not affect other bidders."""
+        """A callback that raises an exception does not affect other bidders."""
         fleet = self.prepared(4)
         self.enter(fleet, 3.0, 1.0, 2.0)
         fleet.nodes[0].start_bidding(self.task, 1, lambda reports: 1 // 0)  # type: ignore[arg-type]
@@ -180,7 +180,7 @@ class HostileTests(AuctionCase):
     """Tests with a dishonest member of the team."""
 
     def test_announcement_of_a_stranger(self) -> None:
-        """An announcement of a node outside of the council is refused with a reason, and changes no view."""
+        """An announcement by a node outside the council is rejected with a reason, and changes no bidder's view."""
         fleet = self.prepared(5)
         self.enter(fleet, 3.0, 1.0, 2.0, 4.0, 5.0)
         liar = self.outsider(fleet)
@@ -210,7 +210,7 @@ class HostileTests(AuctionCase):
             node.auction_service._process_announcement(bidder, forged.pack())
 
     def test_bids_for_others(self) -> None:
-        """An offer with a bid that its agent did not sign for this auction is refused completely."""
+        """An offer is rejected completely if one of its bids is not signed by its agent for this auction."""
         fleet = self.prepared(4)
         liar, victim = fleet.nodes[3], fleet.nodes[0]
         auction, other = self.auction(), Auction("job", 2, self.task.council, "nearest", WAITING)
@@ -224,7 +224,7 @@ class HostileTests(AuctionCase):
             self.assertIsInstance(answer, Refused)
 
     def test_bids_of_those_who_may_not(self) -> None:
-        """A bid of an agent without the right to bid is ignored; an offer of such bids alone is refused."""
+        """A bid of an agent that may not bid is ignored; an offer that contains only such bids is rejected."""
         fleet = self.prepared(4)
         viewer, victim, good = fleet.nodes[3], fleet.nodes[0], fleet.nodes[1]
         public, auction = viewer.entangled.identity.public, self.auction()
@@ -243,7 +243,7 @@ class HostileTests(AuctionCase):
         self.assertIsNotNone(bidder.summary.get(good.uuid))
 
     def test_nonsense(self) -> None:
-        """Invalid arguments are refused in one line with the reason, and change nothing."""
+        """Invalid arguments are rejected with a one-line reason, and change nothing."""
         fleet = self.prepared(3)
         liar, victim = fleet.nodes[0], fleet.nodes[1]
         own, auction = liar.entangled.identity, self.auction()
@@ -284,14 +284,14 @@ class HostileTests(AuctionCase):
         self.assertEqual(self.views[1][-1][0].agent, victim.uuid)
 
     def test_unknown_strategy(self) -> None:
-        """A node without the task's strategy still transports its bids."""
+        """A node that does not have the task's strategy still forwards bids."""
         fleet = self.prepared(4, strategy="nobody-has-this")
         self.enter(fleet, 3.0, 1.0, 2.0)
         fleet.run(2.0)
         self.assertEqual(self.views[0][-1][0].agent, fleet.nodes[1].uuid)
 
     def test_vanished_council(self) -> None:
-        """A best-effort task is decided without its council; a stopped node leaves no timer behind."""
+        """A best-effort task is decided even if its council fails; a stopped node leaves no timer behind."""
         fleet = self.prepared(8)
         members = {member.node_id for member in self.task.council}
         for node in fleet.nodes:

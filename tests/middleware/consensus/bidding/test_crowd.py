@@ -1,4 +1,4 @@
-"""Tests of large teams on simulated links: messages, agreement, and failures of links and nodes."""
+"""Tests of bidding in large teams on simulated links: number of messages, agreement, and failing links and nodes."""
 
 from __future__ import annotations
 
@@ -15,14 +15,14 @@ AFTER = 4.0
 
 
 def outcome(crowd: AuctionSimulation, until: float = AFTER) -> Outcome:
-    """Run a crowd and return its outcome."""
+    """Run one auction of a simulated crowd and return its outcome."""
     crowd.run(until)
     return crowd.make_outcome()
 
 
 class SmallTests(SynchronousTestCase):
     def test_three_agents(self) -> None:
-        """Three agents agree with at most ten messages each at 10 % datagram loss."""
+        """At 10 % datagram loss three agents agree with at most ten messages each."""
         runs = [outcome(AuctionSimulation(3, seed, LinkFaults(0.1))) for seed in range(40)]
         self.assertEqual(min(run.right for run in runs), 1.0)
         self.assertLessEqual(sum(run.messages for run in runs) / len(runs), 10.0)
@@ -34,7 +34,7 @@ class SmallTests(SynchronousTestCase):
         self.assertEqual({p.announcement and p.announcement.number for p in crowd.parties}, {1})
 
     def test_first_member_is_dead(self) -> None:
-        """If the first member of the council is dead, the next member announces."""
+        """If the first member of the council has failed, the next member announces."""
         for seed in range(3):
             crowd = AuctionSimulation(12, seed, LinkFaults(0.1), way=DIRECT)
             crowd.dead.add(crowd._places[crowd.auction.council[0].node_id])
@@ -44,7 +44,7 @@ class SmallTests(SynchronousTestCase):
 
 class LargeTests(SynchronousTestCase):
     def test_hundred_agents(self) -> None:
-        """A hundred agents agree along the tree within 0.6 s, with at most six messages each, at 10 % loss."""
+        """At 10 % loss a hundred agents agree along the tree within 0.6 s, with at most six messages each."""
         runs = [outcome(AuctionSimulation(100, seed, LinkFaults(0.1))) for seed in range(5)]
         took = [t for run in runs for t in run.agreement_times]
         self.assertEqual(min(run.right for run in runs), 1.0)
@@ -52,7 +52,10 @@ class LargeTests(SynchronousTestCase):
         self.assertLessEqual(percentile(took, 0.95), 0.6)
 
     def test_thousand_agents(self) -> None:
-        """A thousand agents agree within 0.8 s, with at most six messages each; no node exceeds its limit."""
+        """A thousand agents agree within 0.8 s, with at most six messages each.
+
+        No node exceeds its limit of messages.
+        """
         run = outcome(AuctionSimulation(1_000, 3, LinkFaults(0.1)))
         self.assertEqual(run.right, 1.0)
         self.assertLessEqual(run.messages, 6.0)
@@ -60,7 +63,7 @@ class LargeTests(SynchronousTestCase):
         self.assertLessEqual(percentile(run.agreement_times, 0.95), 0.8)
 
     def test_branch_dies_with_what_it_holds(self) -> None:
-        """A relay that dies with unsent bids loses none of them for good: each bidder repeats its own bid."""
+        """If a relay fails with unsent bids, each bidder repeats its own bid, so no bid is lost."""
         for seed in range(3):
             crowd = AuctionSimulation(100, seed, LinkFaults(), spread=0.02)
             winner = crowd.costs.index(min(crowd.costs))
@@ -69,7 +72,7 @@ class LargeTests(SynchronousTestCase):
             def killing(place: int, message, crowd=crowd, winner=winner, carry=carry) -> None:  # type: ignore[no-untyped-def]
                 carry(place, message)
                 if place == winner and not crowd.dead:
-                    # The first relay of the winning bid confirms it and then dies.
+                    # The first relay of the winning bid confirms it, and then fails.
                     to = crowd._places[message.to.node_id]
                     if crowd.auction.find_rank(message.to.node_id) is None:
                         crowd.schedule(crowd.now + 0.1, crowd.dead.add, to)
@@ -80,7 +83,7 @@ class LargeTests(SynchronousTestCase):
             self.assertEqual(crowd.make_outcome().right, 1.0)
 
     def test_announcement_is_lost_for_a_branch(self) -> None:
-        """Bidders that receive no announcement query the council."""
+        """Bidders that receive no announcement send a query to the council."""
         crowd = AuctionSimulation(100, 4, LinkFaults())
         crowd.run(0.45)
         relays = [i for i, p in enumerate(crowd.parties) if len(p.recipients) and p._rank is None]
@@ -89,7 +92,7 @@ class LargeTests(SynchronousTestCase):
         self.assertEqual(outcome(crowd, 8.0).right, 1.0)
 
     def test_replayed(self) -> None:
-        """The same seed gives the same run, another seed another run."""
+        """The same seed gives the same run, a different seed a different run."""
         first, same, other = (outcome(AuctionSimulation(60, seed, LinkFaults(0.1, 0.02))).digest for seed in (5, 5, 6))
         self.assertEqual(first, same)
         self.assertNotEqual(first, other)
@@ -104,7 +107,7 @@ class CutOffTests(SynchronousTestCase):
 
 class CommandTests(SynchronousTestCase):
     def test_command(self) -> None:
-        """The command prints a table and returns 0 if the targets are reached."""
+        """The command prints a table, and returns 0 if the targets are met."""
         with contextlib.redirect_stdout(io.StringIO()) as printed:
             self.assertEqual(main(["--n", "3", "--loss", "0", "--dead", "0", "--runs", "1"]), 0)
         self.assertEqual(len(printed.getvalue().splitlines()), 2)

@@ -65,7 +65,7 @@ class RouteTests(SynchronousTestCase):
         self.assertEqual(find_hops(AUCTION, COUNCIL[0].node_id, []), list(COUNCIL[1:]))
 
     def test_council_is_the_goal(self) -> None:
-        """If the nearest contact is a council member, it is the next hop, followed by the other members."""
+        """If the nearest contact is a council member, it is the first hop, followed by the other members."""
         key = AUCTION.key
         member = min(CONTACTS, key=lambda c: distance(c.node_id, key))
         auction = Auction(AUCTION.task_id, 1, (CONTACTS[11], member))
@@ -92,7 +92,10 @@ class PathChoiceTests(SynchronousTestCase):
         self.assertEqual(path_choice.choose(MAX_DIRECT_BIDDERS), DIRECT)
 
     def test_team_size(self) -> None:
-        """A small team is counted; the size of a large team is estimated from the density of the nearest nodes."""
+        """In a small team all contacts are counted.
+
+        The size of a large team is estimated from the density of the nearest nodes.
+        """
         own = CONTACTS[0].node_id
         self.assertEqual(estimate_team_size(own, [], False), 1)
         self.assertEqual(estimate_team_size(own, CONTACTS[1:], False), len(CONTACTS))
@@ -103,14 +106,14 @@ class PathChoiceTests(SynchronousTestCase):
         self.assertTrue(1_500 < estimate_team_size(own, known, False) < 12_000)
         newcomer = near[:NEAREST_CONTACTS] + rng.sample(
             near[NEAREST_CONTACTS:], NEAREST_CONTACTS
-        )  # knows few contacts yet, but that there are many
+        )  # few known contacts of a team that is known to be large
         self.assertTrue(1_500 < estimate_team_size(own, newcomer, True) < 12_000)
         self.assertEqual(estimate_team_size(own, newcomer[: NEAREST_CONTACTS - 1], True), NEAREST_CONTACTS)
 
 
 class RecipientsTests(SynchronousTestCase):
     def test_told_once(self) -> None:
-        """A listener receives each announcement once; after losses it is repeated with increasing pauses."""
+        """A recipient gets each announcement once; after losses the announcement is repeated with increasing pauses."""
         recipients = Recipients()
         recipients.add(CONTACTS[5])
         one = announced(1, 0)
@@ -132,14 +135,14 @@ class RecipientsTests(SynchronousTestCase):
         self.assertEqual(len(recipients.take_due_notices(announced(2, 0), True, now)), 1)
 
     def test_shared_listeners(self) -> None:
-        """A bidder that sent to the whole council receives an announcement only from the member that made it."""
+        """A bidder that sent its bid to the whole council gets an announcement only from the member that made it."""
         recipients = Recipients()
         recipients.add(CONTACTS[5], is_shared=True)
         self.assertEqual(recipients.take_due_notices(announced(1, 1), False, 0.0), [])
         self.assertEqual(len(recipients.take_due_notices(announced(1, 1), True, 0.0)), 1)
 
     def test_room(self) -> None:
-        """The oldest listener is removed if there are too many."""
+        """If there are too many recipients, the oldest recipient is removed."""
         recipients = Recipients()
         for number in range(MAX_RECIPIENTS + 1):
             recipients.add(Contact(number.to_bytes(32), Address("10.0.0.1", 1)))
@@ -152,7 +155,7 @@ class BidderTests(SynchronousTestCase):
         self.participant = make_participant(5, on_summary=lambda reports: self.told.append([r.cost for r in reports]))
 
     def test_direct(self) -> None:
-        """In a small team a bid is sent to each member of the council, and repeated if it is not confirmed."""
+        """In a small team a bid is sent to each member of the council, and sent again if it is not confirmed."""
         self.participant.make_bid(bid(5, 2.0), DIRECT, 0.0)
         sent = offers(self.participant.take_due_messages(0.0))
         self.assertEqual([offer.to for offer in sent], list(COUNCIL))
@@ -164,7 +167,7 @@ class BidderTests(SynchronousTestCase):
         self.assertEqual([offer.to for offer in again], [COUNCIL[2]])
 
     def test_new_bid_while_the_old_one_is_under_way(self) -> None:
-        """A confirmation applies to the bid that was sent, not to a newer one."""
+        """A confirmation applies to the bid that was sent, not to a newer bid."""
         self.participant.make_bid(bid(5, 2.0), DIRECT, 0.0)
         sent = offers(self.participant.take_due_messages(0.0))
         self.participant.make_bid(bid(5, 1.0, 1), DIRECT, 0.01)
@@ -174,7 +177,7 @@ class BidderTests(SynchronousTestCase):
         self.assertEqual([offer.bids[0].revision for offer in newer], [1, 1, 1])
 
     def test_own_bid_beats_what_is_announced(self) -> None:
-        """A bidder with a better bid than the announced one sends it directly within half a waiting period."""
+        """A bidder whose bid is better than the announced bid sends it directly within half a waiting period."""
         self.participant.make_bid(bid(5, 2.0), TREE, 0.0)
         self.participant.on_announcement(announced(1, 0, bid(6, 3.0)), 0.6)
         due = self.participant.due
@@ -184,7 +187,7 @@ class BidderTests(SynchronousTestCase):
         self.assertEqual((straight.to, straight.bids), (COUNCIL[0], (bid(5, 2.0),)))
 
     def test_own_bid_that_does_not_matter(self) -> None:
-        """A bidder with a worse bid than the announced one does not contact the council."""
+        """A bidder whose bid is worse than the announced bid does not contact the council."""
         self.participant.make_bid(bid(5, 4.0), TREE, 0.0)
         self.participant.on_announcement(announced(1, 0, bid(6, 3.0)), 0.6)
         self.assertEqual(
@@ -192,7 +195,7 @@ class BidderTests(SynchronousTestCase):
         )
 
     def test_silence(self) -> None:
-        """A bidder that receives no announcement queries the council members in turn."""
+        """A bidder that receives no announcement sends queries to the council members in turn."""
         self.participant.make_bid(bid(5, 2.0), TREE, 0.0)
         asked: list[Contact] = []
         now = 0.0
@@ -210,7 +213,7 @@ class BidderTests(SynchronousTestCase):
         self.assertTrue(now < 5.0)
 
     def test_taken_back_but_still_announced(self) -> None:
-        """A bidder sends its withdrawal again while the council still announces its bid."""
+        """A bidder sends its withdrawal again as long as the council announces the withdrawn bid."""
         self.participant.make_bid(bid(5, 2.0), DIRECT, 0.0)
         for offer in offers(self.participant.take_due_messages(0.0)):
             self.participant.on_answer(offer, 0.0)
@@ -222,7 +225,7 @@ class BidderTests(SynchronousTestCase):
         self.assertEqual([offer.bids for offer in sent], [(bid(5, None, 1),)])
 
     def test_bid_of_a_former_life(self) -> None:
-        """A restarted bidder learns its last revision from the announcement."""
+        """A restarted bidder learns the last revision of its bid from the announcement."""
         self.participant.make_bid(bid(5, 9.0), DIRECT, 0.0)
         self.participant.on_announcement(announced(1, 0, bid(5, 1.0, 7)), 0.6)
         self.assertTrue(self.participant.is_superseded)
@@ -231,7 +234,7 @@ class BidderTests(SynchronousTestCase):
         self.assertGreater(self.participant.next_revision, 8)
 
     def test_later_announcements(self) -> None:
-        """Only an announcement with precedence is reported, in any order of arrival, and none is reported twice."""
+        """Only an announcement with precedence over the last one is reported, and no announcement is reported twice."""
         for announcement in (announced(2, 0, bid(6, 1.0)), announced(1, 0, bid(7, 0.5)), announced(2, 1, bid(8, 0.2))):
             self.participant.on_announcement(announcement, 1.0)
         self.participant.on_announcement(announced(3, 1, bid(6, 1.0)), 1.0)
@@ -251,7 +254,7 @@ class TreeNodeTests(SynchronousTestCase):
         self.assertEqual(up.to, find_hops(AUCTION, CONTACTS[5].node_id, CONTACTS)[0])
 
     def test_nearer_ones_wait_longer(self) -> None:
-        """Nodes nearer to the key wait longer for their children, up to half the waiting period."""
+        """Nodes nearer to the key wait longer for bids of their children, up to half the waiting period."""
         waits = []
         for contact in sorted(CONTACTS[3:], key=lambda c: count_shared_bits(c.node_id, AUCTION.key)):
             one = make_participant(CONTACTS.index(contact))
@@ -262,7 +265,7 @@ class TreeNodeTests(SynchronousTestCase):
         self.assertTrue(0.02 < waits[-1] <= AUCTION.waiting_period / 2)
 
     def test_next_nearest(self) -> None:
-        """If the parent does not answer, bids are sent to the next nearest contact, and finally to the council."""
+        """If the parent does not reply, bids are sent to the next nearest contact, and finally to the council."""
         self.participant.on_offer([bid(6, 1.0)], CONTACTS[6], 0.0, False, 0.0)
         expected = find_hops(AUCTION, CONTACTS[5].node_id, [c for c in CONTACTS if c is not CONTACTS[5]])
         self.assertEqual(len(expected), 4 + len(COUNCIL))
@@ -274,7 +277,7 @@ class TreeNodeTests(SynchronousTestCase):
         self.assertEqual(asked, expected)
 
     def test_confirmed_is_not_sent_again(self) -> None:
-        """Only bids that the parent lacks are sent; a duplicate from a child sends nothing."""
+        """Only bids that the parent does not have are forwarded; a child's duplicate bid causes no message."""
         self.participant.on_offer([bid(6, 1.0)], CONTACTS[6], 0.0, False, 0.0)
         [up] = offers(self.participant.take_due_messages(self.participant.due))
         self.participant.on_answer(up, 0.2)
@@ -284,7 +287,7 @@ class TreeNodeTests(SynchronousTestCase):
         self.assertEqual([b.report and b.report.cost for b in more.bids], [0.5])
 
     def test_announcement_goes_down(self) -> None:
-        """Each child receives the announcement, a late child in the answer to its offer."""
+        """Each child receives the announcement; a late child receives it in the answer to its offer."""
         for place in (6, 7):
             self.participant.on_offer([bid(place, 1.0)], CONTACTS[place], 0.0, False, 0.0)
         word = announced(1, 0, bid(6, 1.0))
@@ -294,7 +297,7 @@ class TreeNodeTests(SynchronousTestCase):
         self.assertEqual(notices(self.participant.take_due_messages(0.7)), [])
 
     def test_relay_asks_for_those_behind(self) -> None:
-        """A relay queries the council for its children if no announcement arrives, up to a limit."""
+        """If no announcement arrives, a relay sends queries to the council on behalf of its children, up to a limit."""
         self.participant.on_offer([bid(6, 1.0)], CONTACTS[6], 0.0, False, 0.0)
         straight = 0
         for step in range(600):
@@ -318,11 +321,11 @@ class AnnouncerTests(SynchronousTestCase):
     def take(
         self, member: Participant, place: int, cost: float | None, now: float, revision: int = 0, shared: bool = True
     ) -> None:
-        """Let a member of the council receive a bid."""
+        """Let a council member receive the bid of the agent at ``place``."""
         member.on_offer([bid(place, cost, revision)], CONTACTS[place], 0.0, shared, now)
 
     def test_closes_after_the_waiting_period(self) -> None:
-        """The first member announces at the end of the waiting period, counted from the first bid at any node."""
+        """The first member announces at the end of the waiting period, which starts with the first bid at any node."""
         self.first.on_offer([bid(5, 2.0)], CONTACTS[5], 0.2, True, 1.0)
         self.first.take_due_messages(1.29)
         self.assertIsNone(self.first.announcement)
@@ -333,14 +336,14 @@ class AnnouncerTests(SynchronousTestCase):
         self.assertTrue(self.first.announcement.is_genuine(AUCTION))
 
     def test_closes_when_all_have_bid(self) -> None:
-        """The waiting period ends early once every expected agent has bid or abstained."""
+        """The waiting period ends early when every expected agent has bid or abstained."""
         self.first.expect_bidders(2)
         self.take(self.first, 5, 2.0, 0.0)
         self.take(self.first, 6, None, 0.1)
         self.assertEqual(len(notices(self.first.take_due_messages(0.1))), 4)
 
     def test_next_member_stands_in(self) -> None:
-        """If the first member is silent the second announces; after an announcement of the first it does not."""
+        """If the first member is silent, the second member announces, except after an announcement of the first."""
         self.take(self.second, 5, 2.0, 0.0)
         self.second.take_due_messages(0.6)
         self.assertIsNone(self.second.announcement)
@@ -355,7 +358,7 @@ class AnnouncerTests(SynchronousTestCase):
         self.assertEqual(third.announcement, announced(1, 0, bid(5, 2.0)))
 
     def test_late_bid_that_matters(self) -> None:
-        """A late bid that changes the winner is announced; in a large team any other late bid is not."""
+        """A late bid is announced if it changes the winner; in a small team every late bid is announced."""
         for place in (5, 6, 7):
             self.take(self.first, place, float(place), 0.0, shared=False)
         self.first.take_due_messages(0.5)
@@ -369,7 +372,7 @@ class AnnouncerTests(SynchronousTestCase):
         self.assertEqual(self.first.announcement.reports[0].cost, 1.0)
 
     def test_fellows_share(self) -> None:
-        """A member forwards to other members the bids that only it received."""
+        """A member forwards to the other members those bids that only it received."""
         self.take(self.second, 5, 2.0, 0.0, shared=True)
         self.assertEqual(offers(self.second.take_due_messages(0.3)), [])
         self.take(self.second, 6, 1.0, 0.3, shared=False)
@@ -392,13 +395,13 @@ class FloodTests(SynchronousTestCase):
         return sent
 
     def test_only_best_effort(self) -> None:
-        """If no council member answers, bids are flooded to eight neighbours, except those for an exclusive task."""
+        """If no council member replies, bids are flooded to eight neighbours, except for an exclusive task."""
         floods = [e for e in self.cut_off(BEST_EFFORT) if isinstance(e, FloodedBids)]
         self.assertEqual(len({flood.to.node_id for flood in floods}), 8)
         self.assertEqual([e for e in self.cut_off(AUCTION) if isinstance(e, FloodedBids)], [])
 
     def test_each_change_once(self) -> None:
-        """A node forwards flooded bids once, and reports them at the end of the waiting period."""
+        """A node forwards each flooded bid once, and reports the bids at the end of the waiting period."""
         told: list[list[float]] = []
         one = make_participant(5, BEST_EFFORT, on_summary=lambda reports: told.append([r.cost for r in reports]))
         one.on_flood([bid(6, 1.0, auction=BEST_EFFORT)], CONTACTS[6], 0.0)
@@ -412,11 +415,11 @@ class FloodTests(SynchronousTestCase):
 
 class ParticipantTableTests(SynchronousTestCase):
     def made(self, number: int) -> Participant:
-        """Return a party in one of many auctions."""
+        """Return a participant in one of many auctions."""
         return make_participant(5, Auction(f"job {number}", 1, COUNCIL))
 
     def test_whoever_opens_most_makes_room(self) -> None:
-        """A peer that invents auctions displaces its own parties; other peers' parties stay."""
+        """If the table is full, a peer that invents auctions displaces its own entries; those of other peers stay."""
         participants = ParticipantTable()
         own, honest = self.made(0), self.made(1)
         participants.add(own, OWN_OPENER, 0.0)
@@ -428,7 +431,7 @@ class ParticipantTableTests(SynchronousTestCase):
         self.assertIs(participants.get(honest.auction.digest), honest)
 
     def test_idle_ones_are_forgotten(self) -> None:
-        """An idle party is removed when another is added; the parties of this node stay."""
+        """An idle entry is removed when another is added; entries of this node's own auctions stay."""
         participants = ParticipantTable()
         own, old, busy = self.made(0), self.made(1), self.made(2)
         participants.add(own, OWN_OPENER, 0.0)

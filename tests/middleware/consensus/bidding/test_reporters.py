@@ -1,4 +1,4 @@
-"""Tests of ``middleware.consensus.bidding.reporters``: the reporters of a large group, and when they write records."""
+"""Tests of ``middleware.consensus.bidding.reporters``: which agents of a large group write reports, and when."""
 
 from __future__ import annotations
 
@@ -33,11 +33,11 @@ class ReportersTests(SynchronousTestCase):
         self.turn = LISTENING_S + 0.5 * MANY * TURN_SPACING_S
 
     def full(self) -> None:
-        """Let enough records exist."""
+        """Simulate that enough records of other agents exist."""
         self.reporters.on_records(OTHERS, MANY, 0.1)
 
     def test_all_write_in_a_small_team(self) -> None:
-        """Up to ``MAX_SMALL_TEAM`` participants, each report is written at once, and each participant counts."""
+        """In a group of at most ``MAX_SMALL_TEAM`` participants each agent writes its report immediately."""
         self.reporters.on_records(OTHERS, MAX_SMALL_TEAM, 0.0)
         self.assertEqual((self.reporters.is_partial(0.0), self.reporters.is_known(0.0)), (False, True))
         self.assertEqual(self.reporters.compute_due(ME, 0.0), 0.0)
@@ -62,13 +62,13 @@ class ReportersTests(SynchronousTestCase):
         self.assertAlmostEqual(self.reporters.compute_due(ME, 10.0), 10.0 + self.turn)
 
     def test_small_group_of_a_large_team(self) -> None:
-        """If few records exist after all turns, the group is small and each agent writes at once."""
+        """If few records exist after all turns, the group is small, and each agent writes immediately."""
         over = LISTENING_S + MANY * TURN_SPACING_S + SETTLING_S
         self.assertEqual([self.reporters.is_partial(over - 0.01), self.reporters.is_partial(over)], [True, False])
         self.assertEqual(self.reporters.compute_due(ME, over), over)
 
     def test_who_is_announced_writes(self) -> None:
-        """An agent that the council announces writes at once, even if enough records exist."""
+        """An agent that the council announces writes immediately, even if enough records exist."""
         self.full()
         self.reporters.on_announcement(["a", "me"], 5.0)
         self.assertEqual(
@@ -77,18 +77,21 @@ class ReportersTests(SynchronousTestCase):
         )
 
     def test_who_acts_writes(self) -> None:
-        """An agent that acts, holds a token or is assigned writes at once."""
+        """An agent that acts, has a token or is assigned writes immediately."""
         self.full()
         for told in (replace(ME, status=EXECUTING), replace(ME, token=3), replace(ME, assigned="me")):
             self.assertEqual(self.reporters.compute_due(told, 5.0), 5.0)
 
     def test_record_of_a_former_life_is_replaced(self) -> None:
-        """A record of this agent from before a restart is replaced with the current state."""
+        """A record that this agent wrote before a restart is replaced by a record with the current state."""
         self.reporters.on_records({*OTHERS, "me"}, MANY, 1.0)
         self.assertEqual((self.reporters.compute_due(ME, 1.0), self.reporters.is_written), (1.0, True))
 
     def test_few_changes_are_written(self) -> None:
-        """A change of action is written at once, of the assigned agent after a pause, others only if needed."""
+        """The assigned agent writes a change of action immediately, other changes after a pause.
+
+        Others write only if needed.
+        """
         self.full()
         self.reporters.on_written(ME, 1.0)
         self.assertEqual(self.reporters.compute_due(ME, 9.0), math.inf)
@@ -114,7 +117,7 @@ class ReportersTests(SynchronousTestCase):
         )
 
     def test_places_are_spread(self) -> None:
-        """The agent farthest from the key has the first turn, the nearest the last."""
+        """The agent farthest from the key has the first turn, and the nearest agent the last."""
         key = bytes(20)
         self.assertEqual(make_reporters("00" * 20, key).place, 1.0)
         self.assertAlmostEqual(make_reporters("ff" * 20, key).place, 0.0)

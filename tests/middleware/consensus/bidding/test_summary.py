@@ -1,4 +1,4 @@
-"""Tests of the summary of bids: the join operation, and misbehaving strategies."""
+"""Tests of the summary of bids, including joins of two summaries and strategies that misbehave."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ batches = st.lists(st.lists(st.tuples(places, costs, st.integers(0, 2)), max_siz
 
 
 def unsigned(place: int, cost: float | None, revision: int) -> Bid:
-    """Return a bid without a signature; equal arguments give an equal bid."""
+    """Return a bid without a signature; bids from equal arguments are equal."""
     agent = AGENTS[place]
     return Bid(agent.public, None if cost is None else Report(agent.node_id.hex(), cost), revision)
 
@@ -39,7 +39,7 @@ class SummaryTests(SynchronousTestCase):
         self.summary = Summary(rule())
 
     def test_best_stand(self) -> None:
-        """If the strategy has no ``merge``, the cheapest bids are kept, in any order of arrival."""
+        """If the strategy has no ``merge``, the summary keeps the cheapest bids, in any order of arrival."""
         self.summary = Summary(MergeRule(Finding()))
         for place, cost in ((3, 4.0), (4, 1.0), (5, 9.0), (6, 2.0), (7, 3.0), (8, 8.0)):
             self.summary.join([bid(place, cost)])
@@ -47,7 +47,7 @@ class SummaryTests(SynchronousTestCase):
         self.assertEqual(len(self.summary.list_bids()), MAX_LEADING_REPORTS)
 
     def test_change_is_told(self) -> None:
-        """A join returns whether it changed anything; a duplicate changes nothing."""
+        """A join returns whether it changed the summary; a duplicate bid changes nothing."""
         self.assertTrue(self.summary.join([bid(3, 1.0)]))
         self.assertFalse(self.summary.join([bid(3, 1.0)]))
         self.assertFalse(self.summary.join([]))
@@ -55,7 +55,7 @@ class SummaryTests(SynchronousTestCase):
     @given(batches, st.randoms(use_true_random=False))
     @settings(max_examples=80, deadline=None)
     def test_join_is_idempotent_and_takes_any_order(self, batches: list[list[Spoken]], dice: random.Random) -> None:
-        """The summary is the same for any order and number of repetitions of the bids."""
+        """The summary does not depend on the order or number of repetitions of the bids."""
         batch = [[unsigned(*each) for each in one] for one in batches]
         straight, mixed = Summary(rule()), Summary(rule())
         for one in batch:
@@ -64,7 +64,7 @@ class SummaryTests(SynchronousTestCase):
         dice.shuffle(again)
         for one in again:
             mixed.join(one)
-        # Bids that were displaced return after the withdrawal of better ones: join each batch again before the
+        # A bid that was displaced returns after the withdrawal of a better bid, so join each batch again before the
         # comparison.
         for one in batch:
             straight.join(one)
@@ -72,7 +72,7 @@ class SummaryTests(SynchronousTestCase):
         self.assertEqual(straight.standing, mixed.standing)
 
     def test_late_copy_of_an_earlier_bid(self) -> None:
-        """A late duplicate of a withdrawn or superseded bid does not count again."""
+        """A late duplicate of a withdrawn or superseded bid does not become valid again."""
         self.summary.join([bid(3, 1.0)])
         self.summary.join([bid(3, None, 1)])
         self.summary.join([bid(3, 1.0)])
@@ -83,7 +83,7 @@ class SummaryTests(SynchronousTestCase):
         self.assertNotIn(1.0, [report.cost for report in self.summary.standing])
 
     def test_two_things_at_once(self) -> None:
-        """Two bids of one agent with the same revision give the same summary in either order."""
+        """Two different bids of one agent with the same revision give the same summary in either order."""
         other = Summary(rule())
         self.summary.join([bid(3, 1.0)])
         self.summary.join([bid(3, 5.0)])
@@ -110,7 +110,7 @@ class Raising(Nearest):
 
 class Lying(Nearest):
     def find(self, contacts: Sequence[Report]) -> Consensus:
-        """Choose an agent that did not bid."""
+        """Choose an agent that has not bid."""
         return Consensus("nobody")
 
     def merge(self, a: Sequence[Report], b: Sequence[Report]) -> tuple[Report, ...]:
@@ -135,7 +135,7 @@ class RuleTests(SynchronousTestCase):
         self.assertEqual(blamed, ["merge", "find"])
 
     def test_strategy_that_lies(self) -> None:
-        """Reports and winners that a strategy invents are dropped."""
+        """Reports and winners that a strategy invents are ignored."""
         lying = MergeRule(Lying())
         both = (Report("a", 2.0), Report("b", 1.0))
         self.assertEqual(lying.merge(both, ()), (both[1], both[0]))
@@ -143,7 +143,7 @@ class RuleTests(SynchronousTestCase):
         self.assertIsNone(lying.decide(())[0])
 
     def test_strategy_that_hoards(self) -> None:
-        """A summary is limited to ``MAX_REPORTS`` reports, and one report for each agent."""
+        """A summary contains at most ``MAX_REPORTS`` reports, and one report of each agent."""
         reports = [Report(f"{n:040}", float(n)) for n in range(MAX_REPORTS + 100)]
         self.assertEqual(len(MergeRule(Hoarding()).merge(reports, reports)), MAX_REPORTS)
         twice = MergeRule(Hoarding()).merge([Report("a", 1.0)], [Report("a", 2.0)])
@@ -152,7 +152,7 @@ class RuleTests(SynchronousTestCase):
     @given(*(st.lists(st.builds(Report, st.sampled_from("abcdefgh"), st.floats(0, 9))) for _ in range(3)))
     @settings(max_examples=60, deadline=None)
     def test_leading_is_a_join(self, a: list[Report], b: list[Report], c: list[Report]) -> None:
-        """The built-in summary is commutative, associative and idempotent."""
+        """The join of the built-in summary is commutative, associative and idempotent."""
         self.assertEqual(select_leading(a, b), select_leading(b, a))
         self.assertEqual(select_leading(select_leading(a, b), c), select_leading(a, select_leading(b, c)))
         self.assertEqual(select_leading(select_leading(a, b), b), select_leading(a, b))

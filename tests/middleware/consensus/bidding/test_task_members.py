@@ -1,4 +1,4 @@
-"""Tests of the group of a task that also sends bids to the council."""
+"""Tests of the group of a task whose agents also send bids to the council."""
 
 from __future__ import annotations
 
@@ -30,18 +30,21 @@ class TaskMembersTests(SynchronousTestCase):
         self.task_members.update_present([member("a", 3.0), member("b", None)])
 
     def test_announced_bids_count(self) -> None:
-        """A bid announced after the record counts; an agent that is not present has no bid."""
+        """A bid that is announced after the agent's record counts; an agent that is not present has no bid."""
         self.task_members.update_announced([Report("b", 1.0), Report("c", 0.5)])
         self.assertEqual(costs(self.task_members.list_members()), {"a": 3.0, "b": 1.0})
 
     def test_later_record_counts(self) -> None:
-        """A record that changed after the announcement wins, including a withdrawn bid."""
+        """A record that changes after the announcement overrides the announced bid, also by withdrawing it."""
         self.task_members.update_announced([Report("a", 2.0), Report("b", 1.0)])
         self.task_members.update_present([member("a", None), member("b", None)])
         self.assertEqual(costs(self.task_members.list_members()), {"a": None, "b": 1.0})
 
     def test_announced_bids_tell_all_that_is_read(self) -> None:
-        """All fields of an announced bid that the strategy reads count; a changed record overrides them."""
+        """All fields of an announced bid that the strategy reads are used.
+
+        A record that changes later overrides them.
+        """
         task_members = TaskMembers(ReportView(("choice", "weight")))
         task_members.update_present([member("a", 3.0), member("b", 2.0)])
         task_members.update_announced(
@@ -53,7 +56,7 @@ class TaskMembersTests(SynchronousTestCase):
         self.assertEqual(task_members.list_members()[0].choice, "blue")
 
     def test_who_left_bids_nothing(self) -> None:
-        """The announced bid of an agent is dropped when the agent leaves, and does not return with it."""
+        """The announced bid of an agent is dropped when the agent leaves, and does not count when the agent returns."""
         self.task_members.update_announced([Report("b", 1.0)])
         self.task_members.update_present([member("a", 3.0)])
         self.task_members.update_present([member("a", 3.0), member("b", None)])
@@ -63,7 +66,7 @@ class TaskMembersTests(SynchronousTestCase):
         self.assertEqual(self.task_members.list_awaited(), [])
 
     def test_announced_before_the_record(self) -> None:
-        """A bid announced before the agent's record counts when the record arrives, until the record changes."""
+        """A bid announced before the agent's record arrives counts from then on, until the record changes."""
         self.task_members.update_announced([Report("c", 0.5)])
         self.assertEqual(self.task_members.list_awaited(), [Report("c", 0.5)])
         here = [member("a", 3.0), member("b", None)]
@@ -73,7 +76,7 @@ class TaskMembersTests(SynchronousTestCase):
         self.assertEqual(costs(self.task_members.list_members())["c"], 0.7)
 
     def test_newest_announcement_alone_awaits(self) -> None:
-        """An agent that is missing in the newest announcement is not awaited, and its later record wins."""
+        """An agent that the newest announcement omits is not awaited; its later record counts."""
         self.task_members.update_announced([Report("c", 0.5), Report("d", 0.6)])
         self.task_members.update_present([member("a", 3.0), member("d", None)])
         self.task_members.update_announced([Report("a", 2.0)])
@@ -82,14 +85,14 @@ class TaskMembersTests(SynchronousTestCase):
 
 
 class GroupTests(FleetCase):
-    """Tests of a ``Group`` that bids."""
+    """Tests of a ``Group`` that also bids."""
 
     def setUp(self) -> None:
         super().setUp()
         self.heard: dict[int, list[dict[str, float | None]]] = {place: [] for place in range(3)}
 
     def groups(self, fleet: SwarmTeam) -> list[Group]:
-        """Return the groups of the first three nodes for a new task."""
+        """Return the groups of the first three nodes, for a new task."""
         task = Task("job", "find", "Find it", waiting_period=0.5)
         task = self.done(fleet, Deferred.fromCoroutine(fleet.nodes[0].submit(task)))
         self.assertEqual(len(task.council), 3)
@@ -100,7 +103,7 @@ class GroupTests(FleetCase):
         return groups
 
     def hearing(self, place: int) -> OnMembers:
-        """Return a callback that records the members that the node at ``place`` receives."""
+        """Return a callback that stores the members reported to the node at ``place``."""
 
         def heard(members: list[Member], outcome: Result | None) -> None:
             self.heard[place].append(costs(members))
@@ -108,7 +111,7 @@ class GroupTests(FleetCase):
         return heard
 
     def test_bids_come_by_the_council(self) -> None:
-        """A bid that is only announced by the council, without a record, counts."""
+        """A bid that the council announces counts even without a record of the agent."""
         fleet = self.swarm(4)
         groups = self.groups(fleet)
         uuid = fleet.nodes[1].uuid
@@ -119,7 +122,7 @@ class GroupTests(FleetCase):
         self.assertEqual([self.heard[place][-1][uuid] for place in range(3)], [2.5, 2.5, 2.5])
 
     def test_records_and_bids_agree(self) -> None:
-        """A report is written as a record and sent as a bid; withdrawing it removes both."""
+        """A report is written as a record and sent as a bid; withdrawing the report removes both."""
         fleet = self.swarm(4)
         groups = self.groups(fleet)
         uuids = [fleet.nodes[place].uuid for place in range(3)]
@@ -132,7 +135,7 @@ class GroupTests(FleetCase):
             self.assertEqual(self.heard[place][-1], {uuids[0]: None, uuids[1]: 2.0, uuids[2]: 3.0})
 
     def test_who_leaves_is_not_heard_of(self) -> None:
-        """A member that left is removed at the others, and receives nothing more."""
+        """When a member leaves, the others remove it, and it receives nothing more."""
         fleet = self.swarm(4)
         groups = self.groups(fleet)
         for place, group in enumerate(groups):

@@ -21,13 +21,13 @@ anything = st.recursive(leaves, lambda inner: st.lists(inner) | st.dictionaries(
 
 
 def sent(content: Any) -> Any:
-    """Return ``content`` after encoding and decoding."""
+    """Return ``content`` after it was encoded and decoded."""
     return msgpack.unpackb(msgpack.packb(content))
 
 
 class WireTests(SynchronousTestCase):
     def test_comes_as_it_went(self) -> None:
-        """An auction, a bid, its withdrawal and an announcement survive encoding, and their signatures are valid."""
+        """An auction, a bid, its withdrawal and an announcement survive encoding with valid signatures."""
         auction = parse_auction(sent(AUCTION.pack()))
         self.assertEqual((auction, auction and auction.digest), (AUCTION, AUCTION.digest))
         for one in (bid(3, 2.5), bid(3, 0), bid(3, None, 4)):
@@ -40,7 +40,7 @@ class WireTests(SynchronousTestCase):
 
 class AuctionTests(SynchronousTestCase):
     def test_council_is_part_of_it(self) -> None:
-        """Another council, epoch, strategy or waiting period gives an auction with another digest."""
+        """An auction with a different council, epoch, strategy or waiting period has a different digest."""
         others = [
             replace(AUCTION, council=COUNCIL[:2]),
             replace(AUCTION, epoch=2),
@@ -51,7 +51,7 @@ class AuctionTests(SynchronousTestCase):
         self.assertEqual(len({each.digest for each in [AUCTION, *others]}), 6)
 
     def test_unlawful_ones(self) -> None:
-        """An auction with an invalid council, epoch, strategy or waiting period is not decoded."""
+        """An auction with an invalid council, epoch, strategy or waiting period is rejected by the decoder."""
         lawful = AUCTION.pack()
         for place, wrong in ((0, ""), (0, 7), (1, -1), (2, []), (2, [CONTACTS[0].pack()] * 2), (3, "x" * 65)):
             self.assertIsNone(parse_auction([*lawful[:place], wrong, *lawful[place + 1 :]]), wrong)
@@ -74,7 +74,7 @@ class AuctionTests(SynchronousTestCase):
 
 class BidTests(SynchronousTestCase):
     def test_forged_ones(self) -> None:
-        """A bid with another cost, revision, key or auction than the signed one is not genuine."""
+        """A bid is not genuine if its cost, revision, key or auction differs from the signed bid."""
         one = bid(3, 2.5)
         assert one.report is not None
         forged = [
@@ -97,7 +97,7 @@ class BidTests(SynchronousTestCase):
 
 class AnnouncementTests(SynchronousTestCase):
     def test_only_of_the_council(self) -> None:
-        """An announcement signed by a node outside of the council is not genuine, whatever rank it claims."""
+        """An announcement signed by a node outside the council is not genuine, whatever rank it states."""
         stranger = AGENTS[7]
         one = announced(1, 0, bid(4, 1.5))
         for rank in (0, 1, 2, 3, 99):
@@ -113,11 +113,14 @@ class AnnouncementTests(SynchronousTestCase):
         self.assertFalse(one.is_genuine(replace(AUCTION, epoch=2)))
 
     def test_doubled_agents(self) -> None:
-        """An announcement with two reports of one agent is not decoded."""
+        """An announcement with two reports of one agent is rejected by the decoder."""
         one = announced(1, 0, bid(4, 1.5), bid(4, 2.5))
         self.assertIsNone(parse_announcement(sent(one.pack())))
 
     def test_precedence(self) -> None:
-        """The higher number has precedence; at equal numbers the member of lower rank."""
+        """The announcement with the higher number has precedence.
+
+        For equal numbers, that of the member with the lower rank.
+        """
         first, second, third = announced(1, 0), announced(1, 2), announced(2, 2)
         self.assertEqual(sorted([first, third, second], key=lambda a: a.precedence), [second, first, third])
