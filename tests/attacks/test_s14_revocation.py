@@ -70,7 +70,7 @@ class BackdatingTests(SiegeCase):
         self.assertNotIn("dog-2", self.team.members())
 
     def test_revoked_with_all(self) -> None:
-        """A revocation without kept members also revokes the members that the bootstrap node admitted."""
+        """The revocation of a bootstrap node also revokes the members that it admitted, if the operator keeps none."""
         own, shown = self.mint(1, int(self.team.wall()))
         self.enter(own, shown, 701)
         self.assertIn("dog-1", self.team.members())

@@ -79,7 +79,7 @@ class CertificateTests(SynchronousTestCase):
             self.assertRaises(Forged, verify_certificate, OPERATOR.public, DOG.public, shown)
 
     def test_bootstrap_node_chooses_no_other_name(self) -> None:
-        """A bootstrap node cannot admit a newcomer under a name that its invitation and its wish do not allow."""
+        """A bootstrap node cannot admit a newcomer under a name that neither the invitation nor the request allows."""
         vaio, grant = identity("vaio"), granted(OPERATOR, "vaio", "bootstrap")
         for uses, wish, name in ((1, "", "cat"), (2, "rex", "cat"), (2, "", "cat-1")):
             code, packed, invite = invited(OPERATOR, uses=uses)

@@ -46,7 +46,7 @@ class MembershipListTests(SynchronousTestCase):
         self.assertIsNone(mine.add(ENTRIES[0], NOW))
 
     def test_later_word_holds(self) -> None:
-        """The later of two grants for a key wins in either order; of two revocations the earlier time wins."""
+        """The later of two grants for a key wins, and the earlier of two revocations, in any order of arrival."""
         for order in (ENTRIES, ENTRIES[::-1]):
             mine = make_list(OPERATOR, *order)
             found, revocation = mine.find_grant(DOG), mine.find_revocation(DOG)

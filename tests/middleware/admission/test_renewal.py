@@ -90,7 +90,7 @@ class YearAndAHalfTests(YearsCase):
 
 class LargeTeamTests(YearsCase):
     def test_not_in_sight(self) -> None:
-        """In a large team the bootstrap node looks up a member that is not a contact, and requires its answer."""
+        """In a large team a bootstrap node renews a member that is not a contact only if it finds it by a lookup."""
         years = self.years(bootstraps=1)
         vaio, dog, cat = years.houses[:3]
         years.close(cat, is_sudden=True)
@@ -132,7 +132,7 @@ class SleeperTests(YearsCase):
         years.live(160)
 
     def test_renewed_by_the_operator(self) -> None:
-        """A member that was off until its certificate expired is rejected until the operator grants a new one."""
+        """A member with a certificate that expired while it was off is rejected until the operator grants a new one."""
         years = self.years()
         vaio, _, dog, cat, _ = years.houses
         before = dog.kept.membership

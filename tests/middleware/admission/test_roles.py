@@ -104,7 +104,10 @@ class TableTests(SynchronousTestCase):
             self.assertLessEqual(allowed, set(ROLES))
 
     def test_kinds_by_key(self) -> None:
-        """The kind of a slot follows from the keys of the middleware and the page, whatever the name of the slot."""
+        """The kind of a slot follows from its key, if the middleware or the page uses the key.
+
+        The name of such a slot does not matter.
+        """
         keys = {
             presence.DEVICES: roles.PRESENCE,
             tasks.TASKS: roles.TASKS,

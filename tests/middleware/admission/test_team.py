@@ -79,7 +79,7 @@ class JoiningTests(VillageCase):
         self.assertEqual((cat.team.admission.me.admitter, village.members()), (dog.public, ["cat", "dog", "vaio"]))
 
     def test_many_by_one_code(self) -> None:
-        """A code for three uses admits three newcomers, named by wish or numbered, without duplicate names."""
+        """A code for three uses admits three newcomers with distinct names: the requested names, or numbered names."""
         village = self.village()
         code = village.invite("pupil", uses=3)
         names: list[str] = []
@@ -163,7 +163,7 @@ class RotationTests(VillageCase):
         self.assertEqual(self.refusal(village, pig.node.call, houses[2]), "")
 
     def slept(self, grace: float, seconds: float) -> int:
-        """Return the number of the secret of a member that was off during a rotation and ``seconds`` after it."""
+        """Return the number of the secret of a member that was off from before a rotation to ``seconds`` after it."""
         village = self.village()
         dog = village.welcome("dog")
         village.run(2.0)

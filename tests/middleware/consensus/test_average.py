@@ -25,14 +25,14 @@ def paths(here: tuple[float, ...], points: list[tuple[float, float]]) -> float:
 
 class AverageTests(SynchronousTestCase):
     def test_mean_by_weight(self) -> None:
-        """The average is weighted, and the cheapest agent publishes it."""
+        """The average is weighted, and the agent with the lowest cost publishes it."""
         found = Average().find([Report("a", 2.0, value=(1.0,)), Report("b", 1.0, value=(4.0,), weight=2.0)])
         self.assertEqual((found.value, found.assigned_agent), ((3.0,), "b"))
 
     @settings(max_examples=100)
     @given(places, st.randoms(use_true_random=False))
     def test_identical_for_all(self, points: list[tuple[float, float]], dice: random.Random) -> None:
-        """In any order every strategy gives bit-identical numbers within the bounding box of the points."""
+        """In any order of reports every strategy gives bit-identical numbers within the bounding box of the points."""
         reports = [Report(f"a{n}", 1.0, value=p) for n, p in enumerate(points)]
         mixed = dice.sample(reports, len(reports))
         for strategy in (Average(), Rendezvous(), Centre(), Median()):
@@ -42,7 +42,7 @@ class AverageTests(SynchronousTestCase):
                 self.assertTrue(min(axis) <= number <= max(axis), (strategy.name, value, points))
 
     def test_newest_value(self) -> None:
-        """A newer value replaces an older one; a report without a value or weight does not count."""
+        """A newer value of an agent replaces its older value; a report without a value or weight does not count."""
         reports = [
             Report("a", 1.0, value=(9.0,)),
             Report("a", 1.0, value=(1.0,), sequence=1),
@@ -55,7 +55,7 @@ class AverageTests(SynchronousTestCase):
 
 class RendezvousTests(SynchronousTestCase):
     def test_centre(self) -> None:
-        """The centre minimizes the longest distance: no nearby point has a shorter one."""
+        """The centre minimizes the longest distance: no nearby point has a shorter longest distance."""
         for seed in range(200):
             dice = random.Random(seed)
             points = [(float(dice.randint(0, 9)), float(dice.randint(0, 9))) for _ in range(dice.randint(1, 7))]
@@ -67,7 +67,7 @@ class RendezvousTests(SynchronousTestCase):
                 self.assertLessEqual(longest, max(math.dist(near, p) for p in points) + 1e-9)
 
     def test_median(self) -> None:
-        """The median minimizes the sum of distances, also if it is one of the points."""
+        """The median minimizes the sum of distances, even if it is one of the points."""
         for seed in range(60):
             dice = random.Random(seed)
             points = [(float(dice.randint(0, 9)), float(dice.randint(0, 9))) for _ in range(dice.randint(1, 7))]
@@ -79,7 +79,7 @@ class RendezvousTests(SynchronousTestCase):
         self.assertEqual(median(corner, [1.0] * 4), (0.0, 0.0))
 
     def test_dimensions(self) -> None:
-        """Centres and medians also exist in one and three dimensions."""
+        """Centres and medians are also computed in one and three dimensions."""
         self.assertEqual(centre([(0.0,), (1.0,), (9.0,)]), (4.5,))
         here = centre([(0.0, 0.0, 0.0), (2.0, 0.0, 0.0), (1.0, 0.5, 0.0)])
         self.assertLess(math.dist(here, (1.0, 0.0, 0.0)), 0.02)

@@ -37,14 +37,17 @@ class BenchConsensusTests(SynchronousTestCase):
                 self.assertEqual(cost, least)
 
     def test_talk(self) -> None:
-        """The bidders agree on one owner for each task, also with message loss."""
+        """The bidders agree on one owner for each task, even with message loss."""
         for loss in (0.0, 0.3):
             found = run_cbba(Mission(12, 12, 1), loss=loss)
             self.assertEqual(sorted(map(len, found.owners.values())), [1] * 12)
             self.assertGreater(found.messages, 1.0)
 
     def test_rows(self) -> None:
-        """Each strategy has one row per size; no ratio is below 1, and ``group_optimal`` has exactly 1."""
+        """Each strategy has one row per size.
+
+        No cost ratio is below 1, and the ratio of ``group_optimal`` is exactly 1.
+        """
         rows = {row["strategy"]: row for row in measure_size(10, range(1, 4))}
         self.assertEqual(list(rows), list(DECIDERS))
         self.assertEqual({row["missions"] for row in rows.values()}, {3})
@@ -55,7 +58,7 @@ class BenchConsensusTests(SynchronousTestCase):
         self.assertGreater(rows["cbba"]["messages"], rows["cbba + exchange"]["messages"])
 
     def test_plot(self) -> None:
-        """The plot is drawn from JSON rows, with bars in proportion to the cost above the optimum."""
+        """The plot is drawn from JSON rows; its bars are proportional to the cost above the optimum."""
         row = {"agents": 3, "strategy": "a < b", "ratio": 1.1, "ratio_failed": 1.2}
         picture = draw_svg(json.loads(json.dumps([row])))
         self.assertIn("a &lt; b", picture)

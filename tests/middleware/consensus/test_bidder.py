@@ -1,4 +1,4 @@
-"""Tests of the bidders of the CBBA benchmark: on any network they reach the greedy assignment."""
+"""Tests of the bidders of the CBBA benchmark, which reach the greedy assignment on any network."""
 
 from __future__ import annotations
 
@@ -15,12 +15,12 @@ Costs = dict[str, dict[str, float]]
 
 
 def flat(row: dict[str, float]) -> Score:
-    """Return a score that does not depend on the bundle."""
+    """Return a score that does not depend on the tasks in the bundle."""
     return lambda bundle, task: 1000.0 - row[task]
 
 
 class Talk:
-    """Bidders on a graph that delivers messages late, repeatedly and in any order, but reliably."""
+    """Bidders on a graph that delivers messages late, repeatedly and in any order, but delivers each message."""
 
     def __init__(self, seed: int, edges: list[tuple[str, str]], bidders: dict[str, Bidder]) -> None:
         self.dice = random.Random(seed)
@@ -32,7 +32,7 @@ class Talk:
         self.delivered = 0
 
     def run(self) -> None:
-        """Deliver messages until no bidder has one to send."""
+        """Deliver messages until no bidder has a message to send."""
         while True:
             for name, bidder in self.bidders.items():
                 if self.dice.random() < 0.5 or not self.way:
@@ -41,7 +41,7 @@ class Talk:
                 return
             number = self.dice.randrange(len(self.way))
             sender, taker, said = self.way[number]
-            if self.dice.random() < 0.8:  # else it is delivered again
+            if self.dice.random() < 0.8:  # otherwise the message is delivered again later
                 del self.way[number]
             corrections = self.bidders[taker].receive(sender, said)
             if corrections:
@@ -49,7 +49,7 @@ class Talk:
             self.delivered += 1
 
     def owners(self) -> dict[str, list[str]]:
-        """Return the agents that believe to own each task."""
+        """Return for each task the agents that consider themselves its owner."""
         found: dict[str, list[str]] = {}
         for name, bidder in self.bidders.items():
             for task in bidder.bundle:
@@ -58,7 +58,7 @@ class Talk:
 
 
 def line(names: list[str], dice: random.Random) -> list[tuple[str, str]]:
-    """Return a line through all names and some additional edges."""
+    """Return a graph that is a line through all names, with some additional edges."""
     edges = set(zip(names, names[1:], strict=False))
     edges |= {tuple(sorted(dice.sample(names, 2))) for _ in range(dice.randrange(4)) if len(names) > 1}  # type: ignore[misc]
     return sorted(edges)
@@ -83,7 +83,7 @@ class BidderTests(SynchronousTestCase):
             self.assertEqual(winners, expected)
 
     def test_warped(self) -> None:
-        """With scores that grow with the bundle, bids do not rise within a bundle, and all bidders converge."""
+        """With scores that grow with the bundle, bids do not increase within a bundle, and all bidders converge."""
         for seed in range(40):
             dice = random.Random(seed)
             names, goals = [f"a{n}" for n in range(5)], [f"t{n}" for n in range(6)]

@@ -21,7 +21,7 @@ class CapabilityCostTests(SynchronousTestCase):
         self.strategy = CapabilityCost()
 
     def test_the_incapable_never_win(self) -> None:
-        """A device with an unmet requirement does not win at any cost."""
+        """A device with an unmet requirement does not win, whatever the costs."""
         for cost in (0.0, math.nan, math.inf, -1.0):
             unable = Report("dog1", cost, unmet=("has no camera",))
             found = self.strategy.find([unable, Report("dog2", 9e8)])
@@ -40,7 +40,10 @@ class CapabilityCostTests(SynchronousTestCase):
         self.assertGreater(self.strategy.weigh(replace(report, load=float(load + tasks))), weight)
 
     def test_terms(self) -> None:
-        """At equal distances the device with the fuller battery wins, then the one with fewer tasks."""
+        """At equal distances the device with the fuller battery wins.
+
+        At equal batteries the device with fewer tasks wins.
+        """
         tired, fresh, busy = Report("a", 5.0, battery=0.2), Report("b", 5.0), Report("c", 5.0, load=2.0)
         found = self.strategy.find([tired, fresh, busy])
         self.assertEqual((found.assigned_agent, found.standby), ("b", ("a", "c")))

@@ -1,4 +1,4 @@
-"""Every built-in strategy conforms, and the conformance kit finds violations."""
+"""Tests that every built-in strategy conforms, and that the conformance kit finds violations."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ for _name in BUILT_IN:
 
 
 class GuardedTests(Conformance, SynchronousTestCase):
-    """A guard around a conforming strategy conforms."""
+    """A guard around a conforming strategy also conforms."""
 
     @staticmethod
     def make() -> GuardedStrategy:
@@ -42,7 +42,7 @@ class GuardedTests(Conformance, SynchronousTestCase):
 
 
 def point(order: Sequence[Report]) -> Consensus:
-    """Return a consensus of reports in the order of their rank."""
+    """Return a consensus on these reports, in the order of their rank."""
     if not order:
         return Consensus(None)
     names = list(dict.fromkeys(r.agent for r in order))
@@ -54,7 +54,7 @@ class Unnamed(Nearest):
 
 
 class Remembers(Nearest):
-    """Excludes the previous winner."""
+    """Excludes the winner of the previous call."""
 
     def __init__(self) -> None:
         self.last: str | None = None
@@ -150,7 +150,7 @@ class Lazy(Cbba):
 
 
 class Peeks(CapabilityCost):
-    """Reads the battery without declaring it."""
+    """Reads the battery level without declaring it."""
 
     reads = ("load",)  # type: ignore[assignment]
 
@@ -169,12 +169,12 @@ BREACHES: dict[str, tuple[Callable[[], Any], ...]] = {
     "group": (Greedy, Lazy),
     "reads": (Peeks,),
 }
-"""Strategies that break each rule."""
+"""Strategies by the rule that each of them breaks."""
 
 
 class ConformanceTests(SynchronousTestCase):
     def test_every_built_in_says_its_name(self) -> None:
-        """The name of each built-in strategy is the name that selects it."""
+        """The name of each built-in strategy is the name by which it is loaded."""
         self.assertEqual({name: load_strategy(name).name for name in BUILT_IN}, {name: name for name in BUILT_IN})
 
     def test_each_breach_is_seen(self) -> None:
@@ -189,7 +189,7 @@ class ConformanceTests(SynchronousTestCase):
         self.assertEqual(unseen, [])
 
     def test_only_what_is_broken(self) -> None:
-        """A strategy that breaks one rule fails only its check."""
+        """A strategy that breaks one rule fails only the check of this rule."""
         self.assertEqual(list(broken(Unnamed)), ["name"])
         self.assertEqual(list(broken(Nervous)), ["improves"])
         self.assertEqual(list(broken(Concatenates)), ["merge"])
@@ -202,7 +202,7 @@ class ConformanceTests(SynchronousTestCase):
             self.assertEqual(broken(found[attribute]), {}, name)
 
     def test_same_in_every_process(self) -> None:
-        """Every strategy has the same result, digest included, for any hash seed of the process."""
+        """Every strategy gives the same result and digest, whatever the hash seed of the process."""
         replayed(
             self,
             "import random; from middleware.consensus.conformance import make_team\n"

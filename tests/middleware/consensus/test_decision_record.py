@@ -38,7 +38,10 @@ def member(number: int, cost: float | None, status: str = WAITING) -> Member:
 def decided(
     number: int, members: list[Member], epoch: int = 1, version: str = "1", assigned: int | None = None
 ) -> DecisionRecord:
-    """Return the decision record of dog ``number`` that knows ``members``; ``assigned`` overrides the winner."""
+    """Return the decision record of dog ``number``, which knows ``members``.
+
+    ``assigned`` replaces the computed winner.
+    """
     me = next(m for m in members if m.name == f"dog{number}")
     others = [m for m in members if m is not me]
     consensus = Nearest().find([Report(m.uuid, m.cost) for m in members if m.cost is not None])
@@ -60,7 +63,10 @@ THREE = [member(1, 1.5), member(2, 0.5), member(3, 1.0)]
 
 class DecisionRecordTests(SynchronousTestCase):
     def test_survives_the_wire(self) -> None:
-        """A packed and signed decision record is unpacked unchanged, with the agent from the key of the signature."""
+        """A packed and signed decision record is unpacked unchanged.
+
+        Its agent follows from the key of the signature.
+        """
         record = replace(decided(1, THREE), token=7)
         self.assertEqual(parse_decision_record(record_of(1, record)), record)
         self.assertEqual([r.name for r in record.reports], ["dog2", "dog3", "dog1"])
@@ -68,12 +74,15 @@ class DecisionRecordTests(SynchronousTestCase):
         self.assertEqual(record.standby, (THREE[2].uuid, THREE[0].uuid))
 
     def test_nobody_testifies_for_another(self) -> None:
-        """A copy of dog1's decision record in dog2's slot counts as dog2's."""
+        """If dog2 publishes a copy of dog1's decision record, it counts as a record of dog2."""
         copied = parse_decision_record(record_of(2, decided(1, THREE)))
         self.assertEqual(copied is not None and copied.agent, identity(2).node_id.hex())
 
     def test_many_reports_are_the_best_and_a_count(self) -> None:
-        """Up to thirty reports are all written, of more only the best eight and the count; the size is bounded."""
+        """A record contains up to thirty reports; of more reports it contains the best eight and the number.
+
+        The size of the record is limited.
+        """
         for n, written in ((MAX_REPORTS, MAX_REPORTS), (MAX_REPORTS + 1, MAX_BEST_REPORTS), (500, MAX_BEST_REPORTS)):
             members = [member(i, float(i)) for i in range(1, n + 1)]
             record = decided(1, members)
@@ -91,7 +100,7 @@ class DecisionRecordTests(SynchronousTestCase):
         self.assertLessEqual(len(packed), MAX_RECORD_BYTES)
 
     def test_what_counted_is_told(self) -> None:
-        """The record contains the values that the strategy read and the agreed value, and no others."""
+        """The record contains the values that the strategy read and the agreed value, but no other values."""
         members = [replace(member(1, 1.5), battery=0.4, load=3), replace(member(2, 0.5), choice="red", weight=2.0)]
         members.append(replace(member(3, 1.0), value=(1.0, 2.0)))
         found = Consensus(members[1].uuid, value=(1.0, 2.5), choice="red")
@@ -105,7 +114,7 @@ class DecisionRecordTests(SynchronousTestCase):
         self.assertEqual({r.more for r in make_decision_record(*given, ReportView()).reports}, {""})
 
     def test_hysteresis_is_told(self) -> None:
-        """The record explains the effect of hysteresis on the previously acting agent."""
+        """If hysteresis keeps the previous agent in action, the record explains this."""
         acting = [member(1, 1.0, EXECUTING), member(2, 0.95), member(3, None)]
         for assigned, words in (
             (1, "dog2 is the best, but not better by 10% than dog1, who acts"),
@@ -125,7 +134,7 @@ class DecisionRecordTests(SynchronousTestCase):
         self.assertEqual(decided(1, [member(1, None)]).hysteresis, "no report counts")
 
     def test_decoder_is_total(self) -> None:
-        """Any value of a record gives a decision record or None, and never raises."""
+        """Any value of a record is decoded as a decision record or None, without an exception."""
         good = decided(1, THREE)
         content = msgpack.unpackb(good.pack())
         bad: dict[str, list[object]] = {
@@ -158,14 +167,14 @@ class DecisionRecordTests(SynchronousTestCase):
             parse_decision_record(record_of(1, good, bytes(crafted)))
 
     def test_name_of_another_spoils_nothing(self) -> None:
-        """A member's name with terminal control characters is shown without them, and the record stays readable."""
+        """If a member's name contains control characters, they are omitted, and the record stays readable."""
         hostile = replace(member(2, 0.5), name="a\x1b[2J\ud800")
         record = parse_decision_record(record_of(1, decided(1, [hostile, member(1, 1.0)])))
         self.assertIsNotNone(record)
         self.assertEqual(record and record.reports[0].name, "a?[2J?")
 
     def test_of_many_the_best_tell(self) -> None:
-        """In a group of up to thirty all agents write records; in a larger one the best eight do."""
+        """In a group of at most thirty agents all write decision records; in a larger group the best eight do."""
         members = [member(i, float(i)) for i in range(1, MAX_REPORTS + 2)]
         self.assertTrue(all(decided(n, members[:MAX_REPORTS]).is_publisher for n in range(1, MAX_REPORTS + 1)))
         told = [record for n in range(1, MAX_REPORTS + 2) if (record := decided(n, members)).is_publisher]

@@ -1,4 +1,4 @@
-"""Tests of the strategies that assign several tasks: safety and quality of the assignments."""
+"""Tests of the strategies that assign several tasks: validity and cost of the assignments."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ Place = tuple[float, float]
 
 
 def square(agents: int, tasks: int, seed: int, capacity: int = 0) -> tuple[list[Report], list[Item]]:
-    """Return a mission in the unit square: all bids, and the items."""
+    """Return a random mission in the unit square: all bids, and the tasks."""
     dice = random.Random(f"square/{agents}/{tasks}/{seed}")
     starts = {f"a{n:03d}": (dice.random(), dice.random()) for n in range(agents)}
     items = [Item(f"t{n:03d}", (dice.random(), dice.random())) for n in range(tasks)]
@@ -40,7 +40,7 @@ def cost(points: tuple[Consensus, ...], reports: list[Report]) -> float:
 
 class MultiTaskTests(SynchronousTestCase):
     def test_one_of_several(self) -> None:
-        """``find`` on reports of several tasks returns the decision on the first one of the whole assignment."""
+        """For reports of several tasks ``find`` returns the decision on the first task of the joint assignment."""
         bids = {("a", "s"): 1.0, ("b", "s"): 2.0, ("a", "t"): 1.0, ("b", "t"): 10.0}
         reports = [Report(agent, cost, task=task) for (agent, task), cost in bids.items()]
         for strategy in (Cbba(), GroupOptimal()):
@@ -50,7 +50,7 @@ class MultiTaskTests(SynchronousTestCase):
 
 class GroupOptimalTests(SynchronousTestCase):
     def test_optimum(self) -> None:
-        """With all bids the cost is the minimum over all assignments."""
+        """If every agent bids for every task, the cost is the minimum over all assignments."""
         for seed in range(30):
             reports, items = square(3, 4, seed)
             known = {(r.agent, r.task): r.cost for r in reports}
@@ -63,7 +63,7 @@ class GroupOptimalTests(SynchronousTestCase):
             self.assertAlmostEqual(cost(GroupOptimal().find_group(reports, items), reports), best, 5)
 
     def test_twenty_bids(self) -> None:
-        """With 20 bids of each agent the cost is within 2 % of the optimum, and every task is assigned."""
+        """If each agent sends its best 20 bids, the cost is within 2 % of the optimum, and every task is assigned."""
         ratios = []
         for seed in range(4):
             reports, items = square(60, 60, seed)
@@ -75,7 +75,7 @@ class GroupOptimalTests(SynchronousTestCase):
         self.assertLessEqual(fmean(ratios), 1.02)
 
     def test_second_pass(self) -> None:
-        """A task outside of all agents' best bids is assigned from the remaining bids."""
+        """A task that is not among any agent's best bids is assigned from the remaining bids."""
         reports = [Report("a", float(n), task=f"t{n:02d}", capacity=30) for n in range(30)]
         found = GroupOptimal().find_group(reports, [Item(f"t{n:02d}") for n in range(30)])
         self.assertEqual({point.assigned_agent for point in found}, {"a"})
@@ -87,7 +87,7 @@ class GroupOptimalTests(SynchronousTestCase):
         self.assertEqual([point.assigned for point in found], [("a", "b"), ("a", "b")])
 
     def test_holes_say_why(self) -> None:
-        """An unassigned task has a reason, and no agent exceeds its capacity."""
+        """An unassigned task has a reason, and no agent gets more tasks than its capacity."""
         reports = [Report("a", 1.0, task="s"), Report("a", 2.0, task="t")]
         found = GroupOptimal().find_group(reports, [Item("s"), Item("t"), Item("u")])
         self.assertEqual([point.assigned_agent for point in found], ["a", None, None])
@@ -95,7 +95,7 @@ class GroupOptimalTests(SynchronousTestCase):
         self.assertEqual(found[2].reason, "no agent bid for it")
 
     def test_equal_optima(self) -> None:
-        """Among equal optima the same one is always chosen."""
+        """Of several optimal assignments the same one is always chosen."""
         reports = [Report(a, 1.0, task=t) for a in "abc" for t in "xyz"]
         found = GroupOptimal().find_group(reports, [Item(t) for t in "xyz"])
         self.assertEqual([point.assigned_agent for point in found], ["a", "b", "c"])
@@ -126,13 +126,13 @@ class CbbaTests(SynchronousTestCase):
         self.assertLessEqual(fmean(ratios), 1.05)
 
     def test_nothing_left_to_exchange(self) -> None:
-        """After the exchanges no single move or swap lowers the cost, and capacities are respected."""
+        """After the exchanges no single move or swap reduces the cost, and capacities are respected."""
         for seed in range(60):
             dice = random.Random(seed)
             tasks = [f"t{n}" for n in range(9)]
             costs = {f"a{n}": {t: dice.randrange(99) for t in tasks if dice.random() < 0.6} for n in range(6)}
             room = {agent: dice.randint(1, 3) for agent in costs}
-            # Greedy with inverted costs gives a bad start.
+            # The greedy assignment for inverted costs is a bad start.
             worst = assign_greedily({agent: {t: -c for t, c in row.items()} for agent, row in costs.items()}, room)
             owner = improve_assignment(worst, costs, room)
             held = Counter(owner.values())
@@ -158,7 +158,7 @@ class SequentialTests(SynchronousTestCase):
             self.assertEqual({p.task: p.assigned_agent for p in found}, {t: a for a, w in routes.items() for t in w})
 
     def test_twice_the_best_at_most(self) -> None:
-        """The sum of routes is at most twice the optimum, and on average at most 1.15 of it."""
+        """The total length of the routes is at most twice the optimum, and on average at most 1.15 times."""
         ratios = []
         for seed in range(25):
             reports, items = square(2, 5, seed, capacity=5)
@@ -171,7 +171,7 @@ class SequentialTests(SynchronousTestCase):
         self.assertLessEqual(fmean(ratios), 1.15)
 
     def best(self, starts: list[tuple[float, ...]], places: list[tuple[float, ...]]) -> float:
-        """Return the shortest sum of routes of two agents by exhaustive search."""
+        """Return the minimum total length of the routes of two agents, by exhaustive search."""
         shortest: dict[tuple[int, int], float] = {}
         for which, start in enumerate(starts):
             ends: dict[tuple[int, int], float] = {(1 << n, n): math.dist(start, p) for n, p in enumerate(places)}
@@ -190,13 +190,13 @@ class SequentialTests(SynchronousTestCase):
         return min(shortest[0, mask] + shortest[1, whole - mask] for mask in range(whole + 1))
 
     def test_without_places(self) -> None:
-        """Without positions, or with positions of different dimensions, only the bids count."""
+        """If positions are missing or have different dimensions, only the bids count."""
         reports = [Report("a", 2.0, task="t"), Report("b", 1.0, task="t", value=(1.0,))]
         for items in ([Item("t")], [Item("t", (1.0, 2.0))]):
             self.assertEqual([p.assigned_agent for p in Sequential().find_group(reports, items)], ["b"])
 
     def test_only_what_it_bid_for(self) -> None:
-        """An agent that bids for named tasks gets no other; an agent that names no task may get any."""
+        """An agent that bids for named tasks gets only these; an agent that names no task may get any task."""
         items = [Item("s", (0.0, 0.0)), Item("t", (1.0, 0.0))]
         near = Report("near", 0.0, task="s", value=(0.5, 0.0), capacity=2)
         self.assertEqual(plan_routes([near], items), {"near": ["s"]})

@@ -1,4 +1,4 @@
-"""Tests of the limits that a guard sets to a faulty strategy."""
+"""Tests of the limits that a guard imposes on a faulty strategy."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ class Raising(Nearest):
 
 
 class Lying(Nearest):
-    """Returns the given answer."""
+    """Returns the given result in every method."""
 
     name = "lying"
 
@@ -48,7 +48,7 @@ class Lying(Nearest):
 
 
 class Moody(Nearest):
-    """Chooses the nearest and the farthest agent in turn."""
+    """Chooses the nearest and the farthest agent alternately."""
 
     name = "moody"
     asked = 0
@@ -62,7 +62,7 @@ class Moody(Nearest):
 
 
 class OrderBound(Nearest):
-    """Chooses the first report."""
+    """Chooses the first report, whatever the order is."""
 
     name = "order_bound"
 
@@ -71,7 +71,7 @@ class OrderBound(Nearest):
 
 
 class Slow(Nearest):
-    """Always exceeds the timeout."""
+    """Exceeds the timeout in every call."""
 
     name = "slow"
     asked = 0
@@ -82,7 +82,7 @@ class Slow(Nearest):
 
 
 class Moments(Nearest):
-    """Exceeds the timeout in every call number ``pause``."""
+    """Exceeds the timeout in every call whose number is a multiple of ``pause``."""
 
     name = "moments"
     asked = 0
@@ -98,7 +98,7 @@ class Moments(Nearest):
 
 
 class Inventing(Nearest):
-    """Adds a report to each summary, and returns a text from ``improves``."""
+    """Adds a report to each summary, and returns a string from ``improves``."""
 
     name = "inventing"
 
@@ -111,7 +111,7 @@ class Inventing(Nearest):
 
 class GuardedStrategyTests(SynchronousTestCase):
     def assert_falls_back(self, guarded: GuardedStrategy, why: str) -> None:
-        """Check that the nearest agent wins, the reason names the failure, and an error is logged."""
+        """Check that the nearest agent wins, that the reason contains ``words``, and that an error is logged."""
         found = guarded.find(TEAM)
         self.assertEqual((found.assigned_agent, found.standby), ("b", ("c", "a")))
         self.assertEqual(found.strategy, "nearest")
@@ -121,7 +121,10 @@ class GuardedStrategyTests(SynchronousTestCase):
         self.assertTrue(self.flushLoggedErrors())
 
     def test_raising(self) -> None:
-        """A strategy that raises is replaced by ``Nearest``; the reason names the exception, which is logged once."""
+        """A strategy that raises is replaced by ``Nearest``.
+
+        The reason contains the exception, which is logged once.
+        """
         guarded = GuardedStrategy(Raising())
         found = guarded.find(TEAM)
         self.assertEqual(found.assigned_agent, "b")
@@ -142,7 +145,7 @@ class GuardedStrategyTests(SynchronousTestCase):
         self.assertEqual(len(self.flushLoggedErrors()), 2)
 
     def test_lying(self) -> None:
-        """Results with unknown, repeated or too many agents, too long texts or of another type are rejected."""
+        """A result is rejected if it has unknown, repeated or too many agents, too long strings or a wrong type."""
         for lie, why in (
             (Consensus("zorro"), "which did not report"),
             (Consensus("b", ("zorro",)), "which did not report"),
@@ -158,7 +161,7 @@ class GuardedStrategyTests(SynchronousTestCase):
             self.assert_falls_back(GuardedStrategy(Lying(lie)), why)
 
     def test_mutable_state(self) -> None:
-        """A strategy with two results for equal reports is detected, at once or at the next call."""
+        """A strategy that returns two results for equal reports is detected in the same or the next call."""
         self.assert_falls_back(GuardedStrategy(Moody(), twice=True), "two results")
         later = GuardedStrategy(Moody())
         self.assertEqual(later.find(TEAM).assigned_agent, "b")
@@ -166,7 +169,7 @@ class GuardedStrategyTests(SynchronousTestCase):
         self.flushLoggedErrors()
 
     def test_order(self) -> None:
-        """A strategy that depends on the order of reports is detected, or gets them in a fixed order."""
+        """A strategy that depends on the order of reports is detected, or always gets the reports in a fixed order."""
         self.assert_falls_back(GuardedStrategy(OrderBound(), twice=True), "two results")
         self.assertEqual(GuardedStrategy(OrderBound()).find(TEAM), GuardedStrategy(OrderBound()).find(TEAM[::-1]))
 
@@ -181,7 +184,7 @@ class GuardedStrategyTests(SynchronousTestCase):
         self.flushLoggedErrors()
 
     def test_late_now_and_then(self) -> None:
-        """A strategy stays in use only with fewer than ``MAX_LOSSES`` timeouts in ``LOSS_SPAN_CALLS`` calls."""
+        """A strategy stays in use as long as it has fewer than ``MAX_LOSSES`` timeouts in ``LOSS_SPAN_CALLS`` calls."""
         for pause, is_out in (
             (LOSS_SPAN_CALLS // (MAX_LOSSES - 1), False),
             (LOSS_SPAN_CALLS // (MAX_LOSSES - 1) - 1, True),
@@ -195,14 +198,14 @@ class GuardedStrategyTests(SynchronousTestCase):
         self.flushLoggedErrors()
 
     def test_inventing(self) -> None:
-        """A summary with unknown reports, and a result of ``improves`` that is no bool, are rejected."""
+        """A summary with unknown reports, and a result of ``improves`` that is not a bool, are rejected."""
         guarded = GuardedStrategy(Inventing())
         self.assertEqual(guarded.merge(TEAM, ()), Nearest().merge(TEAM, ()))
         self.assertTrue(guarded.improves(TEAM[0], TEAM[1], 0.1))
         self.assertEqual(len(self.flushLoggedErrors()), 2)
 
     def test_group(self) -> None:
-        """A valid group result is kept; one that omits a task or exceeds a capacity falls back."""
+        """A valid group result is kept; if it omits a task or exceeds a capacity, ``Nearest`` decides."""
         items = [Item("s"), Item("t")]
         bids = [Report(a, c, task=t) for a, c in (("a", 1.0), ("b", 2.0)) for t in "st"]
         good = Cbba().find_group(bids, items)
@@ -240,7 +243,7 @@ class GuardedStrategyTests(SynchronousTestCase):
             self.assertFalse(GuardedStrategy(Lying(None)).improves(TEAM[0], offer, 0.0))
 
     def test_by_name(self) -> None:
-        """Built-in strategies are guarded by name; an unknown name is an error."""
+        """Built-in strategies that are loaded by name have a guard; an unknown name raises an error."""
         self.assertIsInstance(load_guarded_strategy("nearest").strategy, Nearest)
         error = self.assertRaises(UnknownStrategy, load_guarded_strategy, "farthest")
         self.assertIn("nearest", str(error))
@@ -249,7 +252,10 @@ class GuardedStrategyTests(SynchronousTestCase):
 
 class StrategiesTests(SynchronousTestCase):
     def test_built_in(self) -> None:
-        """Each task gets a new instance of a built-in strategy, also after ``stop``; an unknown name is an error."""
+        """Each task gets a new instance of a built-in strategy, also after ``stop``.
+
+        An unknown name raises an error.
+        """
         strategies = StrategyRegistry()
         first, second = strategies.get("nearest", {}), strategies.get("nearest", {})
         self.assertIsInstance(first.strategy, Nearest)
@@ -259,7 +265,7 @@ class StrategiesTests(SynchronousTestCase):
         self.assertRaises(UnknownStrategy, strategies.get, "farthest", {})
 
     def test_deployed(self) -> None:
-        """Each task gets the version deployed last; an earlier instance keeps its version."""
+        """A new task gets the version that was deployed last; an earlier task keeps its version."""
         deployed: dict[tuple[str, str], Factory] = {("strategy", "best"): Nearest}
         strategies = StrategyRegistry()
         before = strategies.get("deployed:best", deployed)

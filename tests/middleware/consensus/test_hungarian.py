@@ -19,7 +19,10 @@ class HungarianTests(SynchronousTestCase):
         return [[dice.randint(0, high) for _ in range(columns)] for _ in range(rows)]
 
     def test_against_every_assignment(self) -> None:
-        """The assignment is the cheapest of all, the first among equals, also with huge costs."""
+        """The assignment has the lowest cost; of several such assignments it is the first.
+
+        This also applies to huge costs.
+        """
         dice = random.Random(1)
         for _ in range(400):
             costs = self.table(dice)
@@ -30,7 +33,10 @@ class HungarianTests(SynchronousTestCase):
             self.assertEqual(tuple(solve(costs)), best[1], costs)
 
     def test_prices_prove_it(self) -> None:
-        """The prices prove the optimum: each row has its cheapest column, and unassigned columns have price 0."""
+        """The prices prove that the assignment is optimal.
+
+        Each row has its cheapest column, and unassigned columns have price 0.
+        """
         dice = random.Random(2)
         for _ in range(200):
             costs = self.table(dice, 9)
@@ -42,7 +48,7 @@ class HungarianTests(SynchronousTestCase):
             self.assertTrue(all(p == 0 for c, p in enumerate(prices) if c not in columns))
 
     def test_edges(self) -> None:
-        """No rows, one cell and equal costs are handled."""
+        """No rows, a single cell and equal costs are handled."""
         self.assertEqual(solve([]), [])
         self.assertEqual(solve([[7]]), [0])
         self.assertEqual(solve([[5] * 4] * 3), [0, 1, 2])

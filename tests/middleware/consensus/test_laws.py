@@ -1,4 +1,4 @@
-"""Tests of the laws of ``find`` and ``merge`` for every strategy, over valid and invalid reports."""
+"""Tests of the laws of ``find`` and ``merge`` for every strategy, with valid and invalid reports."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Tests of the strategy of the thesis."""
+"""Tests of ``Nearest``, the strategy of the thesis."""
 
 from __future__ import annotations
 
@@ -20,19 +20,19 @@ class NearestTests(SynchronousTestCase):
         self.nearest = Nearest()
 
     def test_lowest_cost_wins(self) -> None:
-        """The nearest agent wins, and the others are standbys in the order of their distances."""
+        """The nearest agent wins, and the other agents are standbys in the order of their distances."""
         found = self.nearest.find([Report("a", 2.0), Report("b", 0.5), Report("c", 1.0)])
         self.assertEqual((found.assigned_agent, found.standby), ("b", ("c", "a")))
 
     def test_ties(self) -> None:
-        """Ties are broken by the id, which gives exactly one winner; 0 and -0 are equal."""
+        """The agent id breaks ties, so there is exactly one winner; 0 and -0 are equal."""
         self.assertEqual(self.nearest.find([Report("b", 1.0), Report("a", 1.0)]).assigned_agent, "a")
         self.assertEqual(self.nearest.find([Report("b", -0.0), Report("a", 0.0)]).assigned_agent, "a")
 
     @settings(max_examples=100)
     @given(reports, st.randoms(use_true_random=False))
     def test_order_and_repetition_do_not_matter(self, contacts: list[Report], rng: object) -> None:
-        """Any order and repetition of the reports gives the same consensus, digest included."""
+        """The consensus and its digest do not depend on the order or repetition of the reports."""
         found = self.nearest.find(contacts)
         mixed = [*contacts, *contacts[:2]]
         rng.shuffle(mixed)  # type: ignore[attr-defined]
@@ -43,7 +43,7 @@ class NearestTests(SynchronousTestCase):
         self.assertLessEqual(set(named), lawful)
 
     def test_improves(self) -> None:
-        """Only an offer that is nearer by more than the hysteresis improves; an invalid cost never wins."""
+        """An offer improves only if it is nearer by more than the hysteresis; an invalid cost never improves."""
         rows = [
             (1.0, 0.89, True),
             (1.0, 0.9, False),

@@ -1,4 +1,4 @@
-"""Tests of ``middleware.consensus.report_view``: the fields of members that a strategy reads."""
+"""Tests of ``middleware.consensus.report_view``, which selects the fields of members that a strategy reads."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ FULL = Member(
 
 class ReportViewTests(SynchronousTestCase):
     def test_only_what_is_read_is_shown(self) -> None:
-        """A strategy gets only the fields that it declares, or all fields if it declares none."""
+        """A strategy gets only the fields that it declares, or all fields if it declares no fields."""
         self.assertEqual(make_view(Nearest()).make_report(FULL), Report("a", 2.5))
         self.assertEqual(ReportView(("battery", "load")).make_report(FULL), Report("a", 2.5, battery=0.5, load=2.0))
         whole = Report("a", 2.5, value=(1.0, 2.0), choice="red", weight=2.0, electorate=5.0, battery=0.5, load=2.0)
@@ -51,7 +51,7 @@ class ReportViewTests(SynchronousTestCase):
         self.assertEqual(digest_of([coarse]), digest_of([fine]))
 
     def test_bid_that_is_unlawful_changes_nothing(self) -> None:
-        """A bid with an invalid number, position or text does not change the record's values."""
+        """A bid with an invalid number, position or text does not change the values of the record."""
         view = make_view(object())
         for bad in (
             Report("a", float("nan")),

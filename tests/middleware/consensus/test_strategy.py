@@ -23,14 +23,14 @@ class Broken:
 
 class StrategyTests(SynchronousTestCase):
     def test_dotted_only_on_demand(self) -> None:
-        """Only local settings may name a module to import; a task from a peer may not."""
+        """Only local settings may contain the name of a module to import; a task from a peer may not."""
         sys.modules.pop("this", None)
         self.assertRaises(UnknownStrategy, load_strategy, "this:s")
         self.assertNotIn("this", sys.modules)
         self.assertIsInstance(load_strategy("middleware.consensus.strategies.nearest:Nearest", dotted=True), Nearest)
 
     def test_what_cannot_be_loaded(self) -> None:
-        """A missing module, a missing class, an empty name and a broken class are unknown strategies."""
+        """A missing module, a missing class, an empty name and a broken class raise ``UnknownStrategy``."""
         broken = f"{__name__}:Broken"
         for name in (
             "no.such:X",
@@ -44,7 +44,7 @@ class StrategyTests(SynchronousTestCase):
             self.assertRaises(UnknownStrategy, load_strategy, name, dotted=True)
 
     def test_refused_by_name(self) -> None:
-        """Each invalid report is refused with the reason."""
+        """Each invalid report is rejected with the reason."""
         rows = [
             ({"cost": math.nan}, "cost is not a number"),
             ({"cost": math.inf}, "cost is infinite"),
@@ -75,13 +75,13 @@ class StrategyTests(SynchronousTestCase):
             self.assertEqual(refusal(good), "")
 
     def test_newest_epoch_stands(self) -> None:
-        """Bids of an earlier epoch do not count; within an epoch the lowest bid of an agent counts."""
+        """Bids of an earlier epoch do not count; of several bids of an agent in one epoch, the lowest counts."""
         old, first, later = Report("a", 0.0), Report("a", 5.0, epoch=2), Report("a", 4.0, epoch=2)
         other = Report("b", 9.0, epoch=2)
         self.assertEqual(standing([old, other, first, later]), (later, other))
 
     def test_what_counts_for_nothing_gives_way(self) -> None:
-        """A holder with an invalid report is replaced by any agent with a valid one, for every strategy."""
+        """An agent with a valid report replaces a holder with an invalid report, for every strategy."""
         strategies = [load_strategy(name) for name in BUILT_IN]
         nonsense: list[Any] = [None, "1", True, [], -1.0, math.nan, math.inf, 1e300, 10**400, 10**5000]
         for cost in nonsense:
@@ -91,7 +91,7 @@ class StrategyTests(SynchronousTestCase):
         self.assertTrue(Nearest().improves(Report("a", 1.0, unmet=("has no camera",)), Report("b", 9.0), 0.1))
 
     def test_digest(self) -> None:
-        """Equal reports have one digest in any order, with duplicates; another cost changes it."""
+        """The digest does not depend on the order of the reports; it changes with a cost or an agent."""
         a, b, c = Report("a", 1.0), Report("a", 2.0), Report("b", 1.0)
         self.assertEqual(digest_of([a, b, c]), digest_of([c, b, a]))
         self.assertEqual(len({digest_of(each) for each in ([a, c], [b, c], [a], [])}), 4)

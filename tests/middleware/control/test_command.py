@@ -24,7 +24,7 @@ RECORD = {"owner": "ab" * 32, "name": "", "sequence": 1, "lifetime": "team", "va
 
 class CommandTests(SynchronousTestCase):
     def setUp(self) -> None:
-        # The folders of trial are too deep for the path of a Unix socket.
+        # The folders of trial are too long for the path of a Unix socket.
         runtime = Path(tempfile.mkdtemp())
         self.addCleanup(shutil.rmtree, runtime)
         self.patch(os, "environ", {**os.environ, "XDG_RUNTIME_DIR": str(runtime)})
@@ -38,7 +38,7 @@ class CommandTests(SynchronousTestCase):
         yield from self.replies
 
     def run_command(self, line: str, *replies: dict[str, Any]) -> tuple[int, str]:
-        """Return the exit code and output of ``swarm LINE`` for these replies of the node."""
+        """Return the exit code and the output of ``swarm LINE`` if the node sends these replies."""
         self.replies = list(replies) or [{"answer": None}]
         group, *words = line.split()
         output, complaint = io.StringIO(), io.StringIO()
@@ -52,7 +52,7 @@ class CommandTests(SynchronousTestCase):
         return self.requests[-1]
 
     def test_requests(self) -> None:
-        """Each command line produces the corresponding request."""
+        """Each command line sends the corresponding request."""
         for line, verb, given in (
             ("dht get a", "dht get", {"key": "a", "concern": "majority"}),
             ("dht find id:00 --node a", "dht find", {"key": "id:00"}),
@@ -70,7 +70,7 @@ class CommandTests(SynchronousTestCase):
         self.assertEqual((put["lifetime"], put["concern"], put["expect"], put["value"]), ("leased", "all", 3, "red"))
 
     def test_value_from_a_file(self) -> None:
-        """``@FILE`` sends the bytes of a file; a missing file is exit code 2."""
+        """``@FILE`` sends the content of a file; a missing file gives exit code 2."""
         path = Path(self.mktemp())
         path.write_bytes(b"\xff")
         self.assertEqual(self.request(f"dht put a @{path}")["with"]["value"], {"base64": "/w=="})
@@ -115,12 +115,12 @@ class CommandTests(SynchronousTestCase):
             self.assertEqual(self.said.count("\n"), 1)
 
     def test_events_are_printed_as_they_come(self) -> None:
-        """A watch prints each change, followed by a blank line."""
+        """A watch prints each change when it arrives, followed by a blank line."""
         code, output = self.run_command("dht watch a", {"event": [RECORD]}, {"event": []}, {"answer": None})
         self.assertEqual((code, output), (0, "ababababab  -  red\n\n\n"))
 
     def test_exit_codes(self) -> None:
-        """Exit code 1 means not found or rejected, 2 an invalid command; the reason is one line."""
+        """Exit code 1 means not found or rejected, and 2 an invalid command line; the reason is one line."""
         self.assertEqual(self.run_command("dht get a", {"answer": []})[0], 1)
         self.assertEqual(self.run_command("tuple get _", {"answer": None})[0], 1)
         self.assertEqual(self.run_command("dht put a b", {"error": "Unavailable", "text": "1 of 3 answered"})[0], 1)
@@ -134,7 +134,7 @@ class CommandTests(SynchronousTestCase):
         self.assertEqual(self.run_command("dht get a", {"event": []})[0], 1)
 
     def test_wrong_command_lines(self) -> None:
-        """Invalid command lines end with exit code 2 before a request is sent."""
+        """An invalid command line gives exit code 2, and no request is sent."""
         complaint = io.StringIO()
         for line in ("dht", "dht fly", "dht get", "dht put a", "tuple get", "dht put a b --expect x", "rpc h:1"):
             group, *words = line.split()
@@ -145,7 +145,7 @@ class CommandTests(SynchronousTestCase):
         self.assertTrue(complaint.getvalue().endswith("the following arguments are required: method\n"))
 
     def test_node_that_does_not_answer(self) -> None:
-        """A socket without a server, and a server with another protocol, give an error that names the cause."""
+        """A socket without a server, and a server with another protocol, give an error with the cause."""
         path = prepare_path("gone")
         said = str(self.assertRaises(NoControl, list, send_request(path, {})))
         self.assertIn("does not answer (No such file or directory); start it, or remove that file", said)

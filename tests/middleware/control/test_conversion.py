@@ -17,7 +17,7 @@ FIELDS = st.none() | st.booleans() | st.integers() | st.floats(allow_nan=False, 
 class ConversionTests(SynchronousTestCase):
     @given(st.lists(FIELDS | st.binary()))
     def test_fields_come_back_from_json(self, fields: list[Any]) -> None:
-        """Every tuple, including bytes, survives a JSON round trip, and no text is converted to bytes."""
+        """Every tuple, including bytes, survives conversion to JSON and back, and no text becomes bytes."""
         there = json.loads(json.dumps(conversion.to_json(fields)))
         back = conversion.from_json(there)
         self.assertEqual(back, fields)
@@ -25,7 +25,7 @@ class ConversionTests(SynchronousTestCase):
 
     @given(FIELDS)
     def test_json_is_read_as_a_field(self, field: Any) -> None:
-        """A field written as JSON is parsed as the same field."""
+        """A field that was converted to JSON is parsed as the same field."""
         self.assertEqual(conversion.parse_field(json.dumps(field)), field)
 
     @given(st.text())
@@ -39,14 +39,14 @@ class ConversionTests(SynchronousTestCase):
             self.assertIsInstance(field, bool | int | float | str | dict | None)
 
     def test_words_that_are_no_json_are_text(self) -> None:
-        """A word that is not JSON is text; so are numbers that JSON does not have, such as NaN."""
+        """A word that is not JSON is text, even a number that JSON does not have, such as NaN."""
         for text in ("red", "dog 1", "", "007", "NaN", "[", "-"):
             self.assertEqual(conversion.parse_field(text), text)
         self.assertRaises(conversion.InvalidValue, conversion.parse_field, "[1, 2]")
         self.assertRaises(conversion.InvalidValue, conversion.parse_field, '{"a": 1}')
 
     def test_patterns(self) -> None:
-        """A template word is a wildcard, a type, a predicate or a value; a quoted word is always a value."""
+        """A word in a template is a wildcard, a type, a predicate or a value; a quoted word is always a value."""
         for text, meant in (
             ("_", {"any": True}),
             ("?int", {"kind": "int"}),
@@ -67,7 +67,7 @@ class ConversionTests(SynchronousTestCase):
 
     @given(st.text())
     def test_what_a_terminal_is_shown(self, text: str) -> None:
-        """Control characters in text become spaces; in JSON they become escapes that parse back to the original."""
+        """Control characters become spaces in text, and in JSON escapes that are parsed as the original characters."""
         self.assertTrue(conversion.remove_control_characters(text).isprintable())
         self.assertEqual(len(conversion.remove_control_characters(text)), len(text))
         written = conversion.format_json({text: [text]})

@@ -36,7 +36,7 @@ class LinkMetricsTests(FleetCase):
             self.assertGreater(each["for"], 2.0)
 
     def test_see_what_gets_worse(self) -> None:
-        """Loss that starts during the measurement is visible within ten seconds."""
+        """Loss that starts during the measurement is reported within ten seconds."""
         self.measured()
         self.team.run(3.0)
         self.team.switchboard.conditions = LinkConditions(delay_s=0.01, loss=0.3)
@@ -47,7 +47,7 @@ class LinkMetricsTests(FleetCase):
         self.assertEqual(losses[0] <= 0.5 and max(losses) > 0.1, True, losses)
 
     def test_end_when_nobody_looks(self) -> None:
-        """Without reports for ``IDLE_S`` seconds the measurement stops; the next report starts it again."""
+        """If no report is requested for ``IDLE_S`` seconds, the measurement stops; the next report starts it again."""
         asked: list[float] = []
 
         def answer(peer: object, said: bytes) -> bytes:
@@ -98,7 +98,7 @@ class HealthTests(FleetCase):
         self.assertEqual(said["address"], str(fleet.address(1)))
 
     def test_links(self) -> None:
-        """Each peer is timed with small requests; a failed peer answers none."""
+        """Small requests measure each peer's round-trip time; a failed peer does not answer."""
         fleet = self.fleet(3, weather=LinkConditions(delay_s=0.02))
         fleet.run(3.0)
         fleet.kill(2)
@@ -123,14 +123,14 @@ class LinkQualityTests(SynchronousTestCase):
         self.assertEqual((compute_quality([None], False).loss, compute_quality([None], False).round_trip), (1.0, None))
 
     def test_a_second_try_counts_as_a_loss(self) -> None:
-        """A reply after a retransmission counts as a loss and is excluded from the round-trip time."""
+        """A reply after a retransmission counts as a loss, and does not affect the round-trip time."""
         found = compute_quality([0.002] * 8 + [0.055, 0.11], False)
         self.assertEqual((found.loss, found.round_trip), (0.2, 0.002))
         found = compute_quality([0.1] * 8 + [0.26, None], False)
         self.assertEqual((round(found.loss, 3), found.round_trip), (0.2, 0.1))
 
     def test_each_trouble_costs(self) -> None:
-        """Loss, delay, jitter and a relay each lower the score, and more of each lowers it further."""
+        """Loss, delay, jitter and a relay each lower the score, and more of each lowers the score further."""
         best = compute_quality([0.002] * 10, False).score
         lossy = [compute_quality([0.002] * (10 - n) + [None] * n, False).score for n in (1, 2, 3)]
         late = [compute_quality([seconds] * 10, False).score for seconds in (0.05, 0.1, 0.2)]

@@ -1,4 +1,4 @@
-"""Tests of ``control.port`` and ``control.verb``: requests as lines of JSON to a simulated team."""
+"""Tests of ``control.port`` and ``control.verb``, with requests as lines of JSON to a simulated team."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ class Listener:
         self.factory: Any = None
 
     def listenUNIX(self, path: str, factory: Any, mode: int, wantPID: bool) -> Listener:  # noqa: N802, N803
-        """Listen, or raise an error like for a path in use."""
+        """Listen, or raise the same error as for a path that is in use."""
         if self.refuses:
             raise CannotListenError("unix", path, OSError("in use"))
         self.listening.append(path)
@@ -70,7 +70,7 @@ class ControlTests(SynchronousTestCase):
         return line["answer"]
 
     def refusal(self, verb: object, **given: Any) -> str:
-        """Return the text of the rejection of one invalid request."""
+        """Return the error message for one invalid request."""
         line = self.ask(verb, **given)
         self.assertEqual(line.get("error"), "BadRequest", line)
         return str(line["text"])
@@ -90,7 +90,7 @@ class ControlTests(SynchronousTestCase):
         self.assertEqual(self.answer("dht get", key=f"id:{key}"), [])
 
     def test_compare_and_set(self) -> None:
-        """A put that expects another sequence than the current one fails with ``Conflict``."""
+        """A put that expects a sequence other than the current sequence fails with ``Conflict``."""
         self.answer("dht put", key="a", value="1", expect=0)
         self.assertEqual(self.ask("dht put", key="a", value="2", expect=0)["error"], "Conflict")
 
@@ -109,7 +109,7 @@ class ControlTests(SynchronousTestCase):
         self.assertEqual(len(self.lines(transport)), told)
 
     def test_keywords(self) -> None:
-        """A published name is found by all of its words until it is removed."""
+        """A published name is found by each of its words until it is removed."""
         self.answer("keyword publish", name="red_target-3.jpg", value="here")
         self.assertEqual([m["value"] for m in self.answer("keyword search", words="target red")], ["here"])
         self.assertEqual(self.answer("keyword search", words="target blue"), [])
@@ -130,7 +130,7 @@ class ControlTests(SynchronousTestCase):
         self.assertEqual(self.ask("tuple read", template=every, wait=1)["error"], "NoTuple")
 
     def test_rpc(self) -> None:
-        """A method of a peer is called by the peer's address or the prefix of its id; errors name the cause."""
+        """A method is called at the peer with this address or id prefix; an error states the cause."""
         peer = self.fleet.nodes[2]
         peer.endpoint.expose("add", lambda _, a, b: [a + b, b"\xff"])
         where = f"{peer.contact.address.host}:{peer.contact.address.port}"
@@ -144,7 +144,7 @@ class ControlTests(SynchronousTestCase):
             self.assertTrue(told.endswith(": the port must be 1 to 65535"), told)
 
     def test_wrong_requests(self) -> None:
-        """An invalid request is rejected with the name of the argument."""
+        """An invalid request is rejected, and the error contains the name of the invalid argument."""
         for verb, given, said in (
             ("dht fly", {}, "dht get"),
             (None, {}, "no verb"),
@@ -169,7 +169,7 @@ class ControlTests(SynchronousTestCase):
         self.assertEqual(self.ask("keyword search", words="")["error"], "BadName")
 
     def test_lines_that_are_no_request(self) -> None:
-        """Input that is not a JSON object, or is too long, is rejected; bytes after a request are ignored."""
+        """A line that is too long or not a JSON object is rejected; bytes after a request are ignored."""
         for line in (b"\xff\n", b"[]\n", b"nonsense\n", b"[" * 100_000 + b"\n", b'{"verb": "dht get", "with": []}\n'):
             connection, transport = self.opened()
             connection.dataReceived(line)
@@ -189,7 +189,7 @@ class ControlTests(SynchronousTestCase):
         self.assertEqual(len(self.lines(transport)[0]["answer"]), 3)
 
     def test_connections_are_bounded(self) -> None:
-        """A connection beyond the limit gets the error ``Busy``; closed connections free their places."""
+        """A connection beyond the limit gets the error ``Busy``; when a connection is closed, a new one is accepted."""
         connections = [self.opened() for _ in range(MAX_CONNECTIONS)]
         _, transport = self.opened()
         self.assertEqual(self.lines(transport)[0]["error"], "Busy")
@@ -198,14 +198,17 @@ class ControlTests(SynchronousTestCase):
         self.assertEqual(len(self.answer("dht find", key="a")), 3)
 
     def test_verbs_are_made_when_somebody_asks(self) -> None:
-        """The verbs are loaded with the first request, and only once."""
+        """The verbs are created with the first request, and only once."""
         self.assertEqual(self.made, 0)
         self.answer("dht find", key="a")
         self.answer("dht find", key="b")
         self.assertEqual(self.made, 1)
 
     def test_node_lives_without_a_socket(self) -> None:
-        """If the path is in use, the node logs it and continues to run; a service that stops closes all connections."""
+        """If the path is in use, the node logs this and continues to run.
+
+        A stopped service closes all its connections.
+        """
         port = ControlServer(Listener(refuses=True), Path("/run/a.control"), self.verbs)
         port.startService()
         self.successResultOf(port.stopService())

@@ -14,17 +14,20 @@ from middleware.entangled.control.socket_path import NoControl, find_folder, fin
 
 class SocketPathTests(SynchronousTestCase):
     def setUp(self) -> None:
-        # The folders of trial are too deep for the path of a Unix socket.
+        # The folders of trial are too long for the path of a Unix socket.
         self.runtime = Path(tempfile.mkdtemp())
         self.addCleanup(shutil.rmtree, self.runtime)
         self.patch(os, "environ", {**os.environ, "XDG_RUNTIME_DIR": str(self.runtime)})
 
     def problem(self, name: str | None) -> str:
-        """Return the error message if no socket is found."""
+        """Return the error message when no socket is found."""
         return str(self.assertRaises(NoControl, find_socket, name))
 
     def test_only_node_needs_no_name(self) -> None:
-        """The only running node needs no name; with no node, several nodes or an unknown name, the error says so."""
+        """If only one node runs, its name can be omitted.
+
+        With no node, several nodes or an unknown name, the error states the problem.
+        """
         self.assertIn("no node runs", self.problem(None))
         self.assertIn("no node runs", self.problem("a"))
         prepare_path("a").touch()
@@ -48,7 +51,7 @@ class SocketPathTests(SynchronousTestCase):
         self.assertRaises(NoControl, prepare_path, "a")
 
     def test_path_that_is_too_long(self) -> None:
-        """A path that exceeds the length of a socket address is rejected before a socket is opened."""
+        """A path that is too long for a socket address is rejected before a socket is opened."""
         deep = self.runtime / ("x" * 100)
         self.patch(os, "environ", {**os.environ, "XDG_RUNTIME_DIR": str(deep)})
         self.assertIn("107", str(self.assertRaises(NoControl, prepare_path, "a")))

@@ -1,4 +1,4 @@
-"""Tests of the parts of a party: bidder, relay, council member, and the flooding of bids without a council."""
+"""Tests of a participant as bidder, relay and council member, and of bids that are flooded without a council."""
 
 from __future__ import annotations
 
@@ -50,7 +50,7 @@ def notices(messages: list[OutgoingMessage]) -> list[Notice]:
 
 class RouteTests(SynchronousTestCase):
     def test_each_hop_is_nearer(self) -> None:
-        """Next hops are nearer to the key than the node, the nearest first, followed by the council."""
+        """The next hops are the contacts nearer to the key than the node, nearest first, and then the council."""
         own = CONTACTS[5].node_id
         found = find_hops(AUCTION, own, CONTACTS)
         ahead = [c for c in found if c not in COUNCIL]
@@ -246,7 +246,7 @@ class TreeNodeTests(SynchronousTestCase):
         self.participant = make_participant(5)
 
     def test_one_message_for_many(self) -> None:
-        """Bids from several children within the wait are sent in one offer to one contact nearer to the key."""
+        """Bids that several children send during the wait are forwarded in one offer to one nearer contact."""
         for place in (6, 7, 8):
             self.participant.on_offer([bid(place, float(place))], CONTACTS[place], 0.0, False, 0.0)
         [up] = offers(self.participant.take_due_messages(self.participant.due))

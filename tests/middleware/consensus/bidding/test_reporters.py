@@ -45,7 +45,7 @@ class ReportersTests(SynchronousTestCase):
         self.assertEqual(self.reporters.compute_due(replace(ME, why="waits"), 0.1), 0.1)
 
     def test_turn_comes_while_there_are_few(self) -> None:
-        """Above that limit, an agent without a decision writes at its turn, unless enough others have written."""
+        """In a larger group, an agent without a decision writes at its turn, unless enough others have written."""
         self.reporters.on_records(OTHERS, MAX_SMALL_TEAM + 1, 0.0)
         self.assertEqual((self.reporters.is_partial(0.0), self.reporters.compute_due(ME, 0.0)), (True, math.inf))
         reporters = Reporters("me", 0.5)
@@ -88,9 +88,9 @@ class ReportersTests(SynchronousTestCase):
         self.assertEqual((self.reporters.compute_due(ME, 1.0), self.reporters.is_written), (1.0, True))
 
     def test_few_changes_are_written(self) -> None:
-        """The assigned agent writes a change of action immediately, other changes after a pause.
+        """A change of status, cost or availability is written immediately, a new assigned agent after a pause.
 
-        Others write only if needed.
+        Any other change is written only if the record of this agent is needed.
         """
         self.full()
         self.reporters.on_written(ME, 1.0)

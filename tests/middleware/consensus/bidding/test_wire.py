@@ -105,7 +105,7 @@ class AnnouncementTests(SynchronousTestCase):
             self.assertFalse(forged.is_genuine(AUCTION), rank)
 
     def test_forged_ones(self) -> None:
-        """An announcement with another number, rank, winner or auction than the signed one is not genuine."""
+        """An announcement is not genuine if its number, rank, winner or auction differs from the signed one."""
         one = announced(1, 0, bid(4, 1.5))
         other = announced(1, 0, bid(5, 1.5))
         for forged in (replace(one, number=2), replace(one, rank=1), replace(one, entries=other.entries)):

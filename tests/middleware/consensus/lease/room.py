@@ -1,4 +1,4 @@
-"""Provide a small team for tests of leases: agents 0, 1, 2 and a council of 3, 4, 5, all in virtual time."""
+"""Provide a small team for tests of leases, in virtual time: agents 0, 1 and 2, and a council of nodes 3, 4 and 5."""
 
 from __future__ import annotations
 
@@ -18,13 +18,16 @@ T = "t0"
 
 
 class LeaseCase(SynchronousTestCase):
-    """Agents and council members; new members grant nothing for one TTL, so ``made`` waits that long."""
+    """A test case with agents and council members.
+
+    A new member grants nothing for one TTL, so ``made`` waits for one TTL.
+    """
 
     def setUp(self) -> None:
         self.room = self.made()
 
     def made(self, stop_time: float = 0.0, rates: Sequence[float] = (1.0,) * 7, seed: str = "room") -> LeaseTeam:
-        """Return a team with a council that may grant."""
+        """Return a team with a council that can grant leases."""
         room = LeaseTeam(seed, rates, 3, TTL, stop_time)
         room.add_task(T, [3, 4, 5])
         room.clock.advance(TTL + 0.1)
@@ -50,7 +53,7 @@ class LeaseCase(SynchronousTestCase):
         self.room.clock.advance(seconds)
 
     def wanting(self, place: int, seconds: float = 0.1) -> LeaseClient:
-        """Return the lease client of an agent that has requested the lease ``seconds`` ago."""
+        """Return the lease client of an agent, ``seconds`` after the agent requested the lease."""
         client = self.client(place)
         client.claim()
         self.run_for(seconds)
@@ -65,7 +68,7 @@ class LeaseCase(SynchronousTestCase):
         self.room.radio.cut |= {pair for other in others for pair in ((place, other), (other, place))}
 
     def token(self, place: int) -> int:
-        """Return the token that an agent holds."""
+        """Return the token of the lease that an agent holds."""
         lease = self.client(place).lease
         assert lease is not None, f"{place} holds nothing"
         return lease.token

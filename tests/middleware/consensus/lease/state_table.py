@@ -10,11 +10,11 @@ PAGE = Path(__file__).parents[4] / "docs" / "explanation" / "choosing-a-robot.md
 BEGIN = "<!-- states: python -m tests.middleware.consensus.lease.state_table -->\n"
 END = "<!-- end of the states -->\n"
 UNDRAWN = (Event.RELEASE, Event.OUTRANK, Event.MOVE, Event.MOVED, Event.COMPLETED, Event.ENDED)
-"""Events with a transition from nearly every state; they are in the table, but not in the drawing."""
+"""Events with a transition from nearly every state; the table contains them, the drawing does not."""
 
 
 def write_states() -> str:
-    """Return the table of the states, the drawing of the transitions, and the table of the events."""
+    """Return three parts of the page: the table of states, the drawing of transitions, and the table of events."""
     states = "".join(f"| {state.name} | {state.value} |\n" for state in State)
     arrows: dict[str, list[str]] = {}
     for state, row in TABLE.items():
@@ -53,7 +53,7 @@ def _list(states: list[State]) -> str:
 
 
 def main() -> None:
-    """Replace the states in the page."""
+    """Replace the states between the markers of the page."""
     text = PAGE.read_text(encoding="utf-8")
     before, rest = text.split(BEGIN, 1)
     PAGE.write_text(before + write_states() + rest.split(END, 1)[1], encoding="utf-8")

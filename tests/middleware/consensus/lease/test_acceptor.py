@@ -46,7 +46,7 @@ class AcceptorTests(SynchronousTestCase):
         self.assertEqual(self.propose(2, "b", 2, 2.0).kind, ReplyKind.GRANTED)
 
     def test_promise_ends_no_lease(self) -> None:
-        """The holder renews its lease despite another's promise, also after its release, but cannot claim a new one."""
+        """A holder can renew its lease despite another proposer's promise, but cannot claim a new lease."""
         self.prepare(1, "a", 0.0)
         self.propose(1, "a", 1, 0.0)
         self.prepare(2, "b", 1.75)
@@ -91,7 +91,7 @@ class AcceptorTests(SynchronousTestCase):
         self.assertEqual(self.propose(2, "b", 2, 1.2).kind, ReplyKind.GRANTED)
 
     def test_change_by_the_holder(self) -> None:
-        """A holder that releases by a change keeps others away for a TTL, also at members of the next council."""
+        """A holder that changes the council keeps others away for one TTL, also at members of the next council."""
         self.prepare(1, "a", 0.0)
         self.propose(1, "a", 1, 0.0)
         self.prepare(2, "a", 0.1)
@@ -108,14 +108,14 @@ class AcceptorTests(SynchronousTestCase):
         self.assertEqual(self.acceptor.prepare("t", 2, ballot(5, "b"), TTL, 0.3 + TTL).kind, ReplyKind.GRANTED)
 
     def test_release_that_overtakes_its_proposal(self) -> None:
-        """A proposal that arrives after its own release is not granted."""
+        """If a release arrives before its proposal, the proposal is not granted."""
         self.prepare(1, "a", 0.0)
         self.acceptor.release_by_ballot("t", ballot(1, "a"), 0.1)
         self.assertEqual(self.propose(1, "a", 1, 0.2).kind, ReplyKind.OUTBID)
         self.assertEqual(self.prepare(2, "a", 0.3).kind, ReplyKind.GRANTED)
 
     def test_release_of_an_older_ballot_too(self) -> None:
-        """The release of the latest ballot also releases all older ballots of the agent, in any order of arrival."""
+        """The release of an agent's latest ballot also releases all its older ballots, in any order of arrival."""
         for proposes_first in (True, False):
             self.setUp()
             self.prepare(1, "a", 0.0)
@@ -129,7 +129,7 @@ class AcceptorTests(SynchronousTestCase):
             self.assertEqual(self.prepare(3, "b", 0.6)[:4:3], (ReplyKind.GRANTED, 0.0))
 
     def test_freed(self) -> None:
-        """A released lease is accepted from other members only with the holder and its token."""
+        """A notice from another member that a lease was released is accepted only with the holder and its token."""
         self.prepare(1, "a", 0.0)
         self.propose(1, "a", 1, 0.0)
         for agent, token in (("b", 1), ("a", 0), ("a", 2)):
@@ -141,7 +141,7 @@ class AcceptorTests(SynchronousTestCase):
         self.assertEqual(self.acceptor.release_by_token("u", "a", 1, 0.5), [])
 
     def test_listeners_are_bounded(self) -> None:
-        """The number of waiting proposers is limited, and the most recent ones are notified."""
+        """The number of waiting proposers is limited; the most recent ones are notified."""
         self.prepare(1, "a", 0.0)
         self.propose(1, "a", 1, 0.0)
         for number in range(3 * MAX_LISTENERS):
@@ -150,7 +150,7 @@ class AcceptorTests(SynchronousTestCase):
         self.assertEqual((len(told), told[-1]), (MAX_LISTENERS, f"b{3 * MAX_LISTENERS - 1:03d}"))
 
     def test_no_room(self) -> None:
-        """An acceptor that cannot store more tasks answers QUIET and grants nothing."""
+        """An acceptor that has no space for a further task answers QUIET and grants nothing."""
         self.patch(acceptor_log, "MAX_REGISTERS", 1)
         self.prepare(1, "a", 0.0)
         for reply in (
@@ -176,7 +176,7 @@ class AcceptorTests(SynchronousTestCase):
         self.assertEqual(self.acceptor.close("t", "b", 1, 4, 1.0).kind, ReplyKind.OVER)
 
     def test_close_under_a_token_of_others(self) -> None:
-        """An acceptor that did not grant a token does not sign an end under it."""
+        """An acceptor that did not grant a token does not sign that a task ended under this token."""
         self.propose(1, "a", 3, 0.0)
         self.acceptor.accept("t", 1, ballot(2, "b"), MEMBERS, 3.0, 5)
         self.assertEqual(
@@ -184,7 +184,7 @@ class AcceptorTests(SynchronousTestCase):
         )
 
     def test_close(self) -> None:
-        """After a close nothing is granted or renewed; the reply contains the remaining time of the lease."""
+        """After a close the acceptor grants and renews nothing; the reply contains the remaining time of the lease."""
         self.prepare(1, "a", 0.0)
         self.propose(1, "a", 3, 0.0)
         self.assertEqual(self.acceptor.close("t", "b", 1, 2, 0.5).kind, ReplyKind.OUTBID)
@@ -195,7 +195,10 @@ class AcceptorTests(SynchronousTestCase):
         self.assertEqual(self.prepare(9, "b", 99.0).kind, ReplyKind.OVER)
 
     def test_change(self) -> None:
-        """An accepted change seals the council; a reply contains the change, and after its decision the new council."""
+        """An accepted change seals the council.
+
+        A reply contains the change, and after the decision the new council.
+        """
         self.prepare(1, "a", 0.0)
         changed = self.acceptor.accept("t", 1, ballot(1, "a"), MEMBERS[:3], 0.0, 4)
         self.assertEqual(changed.kind, ReplyKind.GRANTED)
@@ -214,7 +217,7 @@ class AcceptorTests(SynchronousTestCase):
         self.assertEqual(self.propose(3, "b", 5, 0.4, configuration=2).kind, ReplyKind.GRANTED)
 
     def test_promise_survives_a_restart(self) -> None:
-        """A promise survives a restart; an acceptor with a corrupt store entry grants nothing."""
+        """A promise survives a restart; an acceptor with a corrupt stored entry grants nothing."""
         store = MemoryStore()
         LeaseAcceptor(store, -math.inf).prepare("t", 1, ballot(2, "a"), TTL, 0.0)
         self.acceptor = LeaseAcceptor(store, 50.0)
@@ -227,7 +230,7 @@ class AcceptorTests(SynchronousTestCase):
         self.assertEqual(self.prepare(1, "b", 51.0).kind, ReplyKind.QUIET)
 
     def test_forgotten(self) -> None:
-        """An evicted task leaves a lower bound for ballots and tokens, also after a restart."""
+        """An evicted task leaves a lower bound for later ballots and tokens, also after a restart."""
         self.patch(acceptor_log, "MAX_REGISTERS", 1)
         store = MemoryStore()
         self.acceptor = LeaseAcceptor(store, -math.inf)

@@ -63,7 +63,7 @@ class CharterTests(LeaseCase):
         self.assertFalse(self.chartered([3]).is_genuine(T))
 
     def test_judge(self) -> None:
-        """A council pinned by a node without the right to publish tasks is rejected."""
+        """A charter is rejected if its first council was chosen by a node that may not publish tasks."""
         pinned = create_charter(self.room.identities[0], T, tuple(self.room.contacts[:3]))
         verifier = self.room.charter_verifier
         self.assertIsNone(verifier.parse(T, pinned.packed))
@@ -71,7 +71,7 @@ class CharterTests(LeaseCase):
         self.assertIsNone(verifier.parse(T, self.chartered([3, 4, 6], signers=1).packed))
 
     def test_bounded(self) -> None:
-        """The number of links of a charter and its token are limited."""
+        """The number of links of a charter, and its token, are limited."""
         charter = self.chartered([3, 4, 6])
         full = replace(charter, changes=charter.changes * MAX_CHANGES)
         self.assertRaises(Refused, full.with_change, charter.members, charter.ballot, ())
@@ -102,7 +102,7 @@ class CharterTests(LeaseCase):
     @settings(max_examples=100)
     @given(st.recursive(st.none() | st.integers() | st.binary(max_size=70) | st.text(), st.lists, max_leaves=20))
     def test_anything_from_the_wire(self, content: object) -> None:
-        """Any input is a charter or None, and never raises."""
+        """Any input is decoded as a charter or as None, without an exception."""
         try:
             packed = bytes(msgpack.packb(content))
         except OverflowError:
@@ -112,7 +112,7 @@ class CharterTests(LeaseCase):
         self.assertIsNone(self.room.charter_verifier.parse(T, content))
 
     def test_signatures_are_apart(self) -> None:
-        """A signature of a change is not valid for an end, and the reverse."""
+        """A signature of a council change is not valid for the end of a task, and the reverse."""
         members = tuple(self.room.contacts[:3])
         identity = self.room.identities[3]
         self.assertNotEqual(sign_change(identity, T, 1, Ballot(7, "a"), members, 7), sign_end(identity, T, 1, "a", 7))
@@ -120,7 +120,7 @@ class CharterTests(LeaseCase):
 
 class NumberTests(LeaseCase):
     def test_believed(self) -> None:
-        """A high number that a single member of three reports does not count."""
+        """If only one of three members reports a high number, the number is not believed."""
         self.assertEqual(highest_credible([5, 7, 3], 3), 7)
         self.assertEqual(highest_credible([2**61, 7, 3], 3), 7)
         self.assertEqual(highest_credible([2**61, 2**60], 3), 2**60)

@@ -32,7 +32,7 @@ OWN = (Event.KEPT, Event.OUTBID)
 
 
 def explore() -> dict[tuple[State, bool], tuple[Event, ...]]:
-    """Return every reachable state, with and without a granted lease, and the events of a shortest path to it."""
+    """Return each reachable state, with and without a granted lease, and the events of a shortest path to it."""
     begin = (State.IDLE, False)
     found: dict[tuple[State, bool], tuple[Event, ...]] = {begin: ()}
     left = deque([begin])
@@ -55,10 +55,10 @@ def _is_granted(before: bool, event: Event, actions: tuple[Action, ...]) -> bool
 
 
 class ClientStatesTests(SynchronousTestCase):
-    """The table is complete, and no path through it violates a rule of leases."""
+    """Tests that the table is complete, and that no path through the states violates a rule of leases."""
 
     def test_every_pair_is_decided(self) -> None:
-        """Each pair of state and event is exactly one of: a transition, ignored, or impossible."""
+        """Each pair of state and event has a transition, is ignored, or is impossible."""
         pairs = {(state, event) for state in State for event in Event}
         transitions = {(state, event) for state, row in TABLE.items() for event in row}
         self.assertEqual(set(TABLE), set(State))
@@ -73,14 +73,14 @@ class ClientStatesTests(SynchronousTestCase):
         self.assertEqual({state for state, _ in explore()}, set(State))
 
     def test_only_a_majority_grants(self) -> None:
-        """Each path to a state that holds the lease contains the grants of a majority."""
+        """Each path to a state in which the client has the lease contains the grants of a majority."""
         for (state, is_granted), path in explore().items():
             if state in (State.HOLDING, State.OUTBID):
                 self.assertTrue(is_granted, (state, path))
                 self.assertTrue(set(GRANTED) & set(path), (state, path))
 
     def test_release_ends_every_claim(self) -> None:
-        """In each state RELEASE cancels round and timer, and ends the claim; OVER stays OVER."""
+        """In each state RELEASE cancels the round and the timer and leads to IDLE; only OVER stays OVER."""
         for state, _ in explore():
             target, actions = next_step(state, Event.RELEASE)
             self.assertEqual(target, State.OVER if state is State.OVER else State.IDLE)
@@ -90,7 +90,10 @@ class ClientStatesTests(SynchronousTestCase):
                 self.assertEqual(next_step(State.OVER, event).state, State.OVER)
 
     def test_nothing_is_asked_in_vain(self) -> None:
-        """A state with a round is entered with its request, one with a timer with its timer, except for MOVE."""
+        """A transition to a state with a round sends its request, and one to a state with a timer starts it.
+
+        The event MOVE is an exception: it starts no timer.
+        """
         for state, row in TABLE.items():
             for event, (target, actions) in row.items():
                 entered = target is not state or event in (Event.RECONFIGURED, Event.OUTRANK)
@@ -100,7 +103,7 @@ class ClientStatesTests(SynchronousTestCase):
                     self.assertTrue(TIMERS & set(actions), (state, event))
 
     def test_a_client_goes_on(self) -> None:
-        """From each active state some path leads to holding the lease."""
+        """From each active state some path leads to the state HOLDING."""
         for begin in ACTIVE:
             found: set[State] = {begin}
             left: list[State] = [begin]

@@ -11,7 +11,7 @@ from tests.middleware.consensus.lease.room import TTL, LeaseCase, T
 
 class LeaseClientTests(LeaseCase):
     def test_release_by_the_listener(self) -> None:
-        """A callback that releases when the lease is lost ends the claim: no further request is sent."""
+        """If a callback releases when the lease is lost, the claim ends and no further request is sent."""
         for lose in ("outrank", "cut"):
             self.room = self.made(seed=f"listener {lose}")
             client = self.wanting(0)
@@ -26,7 +26,7 @@ class LeaseClientTests(LeaseCase):
             self.assertIs(client.state, State.IDLE, lose)
 
     def test_first_in_line_is_ready(self) -> None:
-        """The first standby gets the lease as soon as it expires at a majority, and never earlier."""
+        """The first standby gets the lease as soon as the lease expires at a majority, and never earlier."""
         for seed in range(5):
             self.room = self.made(seed=f"ready {seed}")
             self.wanting(0)
@@ -41,7 +41,7 @@ class LeaseClientTests(LeaseCase):
             self.assertIsNotNone(self.client(1).lease, seed)
 
     def test_ready_for_a_lease_that_is_renewed(self) -> None:
-        """A standby with a promise does not take over if the holder returns in time."""
+        """A standby that has a promise does not take over if the holder returns before the lease ends."""
         self.wanting(0)
         self.client(1).stand_by(1)
         self.run_for(TTL)
@@ -53,7 +53,7 @@ class LeaseClientTests(LeaseCase):
         self.assertEqual((self.holders(), self.token(0)), ([0], 1))
 
     def test_place_in_the_line_that_changes(self) -> None:
-        """A standby with a rank that changes shortly before the end of the lease claims at the time of its new rank."""
+        """If a standby's rank changes shortly before the lease ends, it claims at the time of the new rank."""
         for seed in range(5):
             self.room = self.made(seed=f"moved {seed}")
             self.wanting(0)
@@ -68,7 +68,7 @@ class LeaseClientTests(LeaseCase):
             self.assertEqual(self.holders()[-1:], [2], seed)
 
     def test_place_in_the_line_that_changes_after_a_release(self) -> None:
-        """A standby that does not know the remaining time from a majority claims after a release, at any new rank."""
+        """A standby that has not heard from a majority claims after a release, even if its rank changes."""
         self.cut(1, 4, 5)
         self.client(1).stand_by(3)
         self.run_for(1.5 * TTL)
@@ -80,7 +80,7 @@ class LeaseClientTests(LeaseCase):
         self.assertEqual(self.holders(), [1])
 
     def test_council_that_moved(self) -> None:
-        """A standby that learns of a new council polls it at once, and is notified of a release there."""
+        """A standby that learns of a new council polls it immediately, and is notified of a release there."""
         self.wanting(0)
         self.client(1).stand_by(1)
         moved = self.client(0).change_council([self.room.contacts[place] for place in (3, 4, 6)])
@@ -92,7 +92,7 @@ class LeaseClientTests(LeaseCase):
         self.assertEqual(self.holders(), [1])
 
     def test_second_in_line_lets_the_first_try(self) -> None:
-        """Of two standbys that find the lease free at the same time, the first in rank gets it."""
+        """Of two standbys that find the lease free at the same time, the one with the first rank gets it."""
         for seed in range(5):
             self.room = self.made(seed=f"free {seed}")
             for place, rank in ((2, 2), (1, 1)):
@@ -114,7 +114,7 @@ class LeaseClientTests(LeaseCase):
             self.assertEqual(self.holders(), [1], seed)
 
     def test_member_that_keeps_silent(self) -> None:
-        """A holder keeps its ballot while a restarted member cannot grant yet, because another would not help."""
+        """A holder keeps its ballot while a restarted member grants nothing, because a new ballot would not help."""
         self.room.kill(3)
         self.room.stores[3] = MemoryStore()
         self.room.nodes[3] = self.room.start_life(3)
@@ -125,7 +125,7 @@ class LeaseClientTests(LeaseCase):
             self.assertEqual(self.room.nodes[place].acceptor.log.get(T).holder, first)  # type: ignore[union-attr]
 
     def test_stand_by_that_is_named(self) -> None:
-        """A standby that then wants the lease gets it; a holder that is given a rank keeps its lease."""
+        """A standby that then claims the lease gets it; a holder that gets a rank as standby keeps its lease."""
         self.client(0).stand_by(3)
         self.client(0).claim()
         self.run_for(2 * TTL)
@@ -135,7 +135,7 @@ class LeaseClientTests(LeaseCase):
         self.assertEqual(self.holders(), [0])
 
     def test_outranked_while_it_holds(self) -> None:
-        """If the device has obeyed a higher token, the holder's lease is void and it claims a higher token."""
+        """If the device has obeyed a higher token, the holder's lease is void, and the holder claims a higher token."""
         client = self.wanting(0)
         client.on_higher_token(1)
         self.assertEqual(self.token(0), 1)
@@ -145,7 +145,7 @@ class LeaseClientTests(LeaseCase):
         self.assertEqual(self.token(0), 8)
 
     def test_want_again_while_a_claim_is_under_way(self) -> None:
-        """Replies to a request from before a release are ignored; the next claim has a new token."""
+        """Replies to requests from before a release are ignored; the next claim has a new token."""
         client = self.client(0)
         for _ in range(5):
             client.claim()
@@ -156,7 +156,7 @@ class LeaseClientTests(LeaseCase):
         self.assertEqual(self.holders(), [0])
 
     def test_claim_that_is_dropped_holds_nobody_up(self) -> None:
-        """A cancelled claim is released, whatever the members had granted by then."""
+        """A claim that its client cancels is released at all members, whatever they have granted by then."""
         for steps in range(1, 12):
             self.room = self.made(seed=f"dropped {steps}")
             self.wanting(0, 0.001 * steps)
@@ -177,7 +177,7 @@ class LeaseClientTests(LeaseCase):
         self.assertEqual(self.token(0), 2)
 
     def test_member_that_promised_to_another_is_won_back(self) -> None:
-        """A holder keeps its lease and token, although a member promised a higher ballot while it was unreachable."""
+        """A holder keeps its lease and token although a member, while unreachable, promised a higher ballot."""
         self.wanting(0)
         self.cut(0, 3)
         self.client(1).stand_by()
@@ -195,7 +195,7 @@ class LeaseClientTests(LeaseCase):
         self.assertEqual(self.holders(), [])
 
     def test_claim_that_is_dropped_shortens_no_rest(self) -> None:
-        """Cancelling a later claim does not shorten the stopping time of the released lease, despite a fast clock."""
+        """Cancelling a later claim does not shorten the stopping time after a release, even with a fast clock."""
         self.room = self.made(stop_time=0.3, rates=(1.01, 1.0, 1.0, 1.0, 1.0, 1.0, 1.0))
         self.wanting(0, 1.0)
         self.client(0).release()
@@ -210,7 +210,7 @@ class LeaseClientTests(LeaseCase):
             self.assertGreaterEqual(until, stopped + 0.3)
 
     def test_rest_after_the_deadline_counts_on_the_clock_of_the_device(self) -> None:
-        """A holder with a fast clock that resumes after its deadline releases only when its robot stands still."""
+        """If a holder with a fast clock resumes after its deadline, it releases only when its robot stands still."""
         self.room = self.made(stop_time=0.3, rates=(1.01, 1.0, 1.0, 1.0, 1.0, 1.0, 1.0))
         self.wanting(0, 1.0)
         machine, lease = self.room.nodes[0].machine, self.client(0).lease
@@ -227,7 +227,7 @@ class LeaseClientTests(LeaseCase):
             self.assertGreaterEqual(until, obeyed_until + 0.3)
 
     def test_rough_weather(self) -> None:
-        """At 50 % loss, with duplicates and delays, there is never more than one holder, and often one."""
+        """At 50 % loss, with duplicates and delays, there is never more than one holder, and often there is one."""
         self.room.radio.quality = LinkQuality(0.02, 0.05, 0.5, 0.3, 5.0)
         for place in range(3):
             self.client(place).claim()
@@ -242,11 +242,11 @@ class LeaseClientTests(LeaseCase):
 
 class DurationTests(LeaseCase):
     def test_takeover(self) -> None:
-        """Of two hundred takeovers at 10 % loss, half take less than 1.5 s, and 99 of 100 less than 2 s."""
+        """Of two hundred takeovers at 10 % loss, half take less than 1.5 s, and 99 % less than 2 s."""
         seconds = sorted(measure_takeover(seed) for seed in range(200))
         self.assertLess(seconds[100], 1.5)
         self.assertLess(seconds[198], 2.0)
 
     def test_upkeep(self) -> None:
-        """Keeping a lease takes at most twelve datagrams per second."""
+        """Holding a lease takes at most twelve datagrams per second."""
         self.assertLessEqual(measure_upkeep(), 12.0)

@@ -33,7 +33,7 @@ ANYTHING = st.recursive(
 
 class BallotTests(SynchronousTestCase):
     def test_lives(self) -> None:
-        """Ballots of one run of an agent are kin; ballots of another agent or after a restart are not."""
+        """Ballots of one process of an agent belong together; ballots of other agents, or after a restart, do not."""
         one = Ballot(3 * BALLOT_MODULUS + 7, "a")
         self.assertTrue(one.is_same_life(Ballot(9 * BALLOT_MODULUS + 7, "a"), BALLOT_MODULUS))
         self.assertFalse(one.is_same_life(Ballot(3 * BALLOT_MODULUS + 7, "b"), BALLOT_MODULUS))
@@ -57,7 +57,7 @@ class ReplyTests(SynchronousTestCase):
             self.assertEqual(read.remaining, 0.0)
 
     def test_unlawful(self) -> None:
-        """Any other content is not a reply."""
+        """Any other content is not decoded as a reply."""
         good = pack_reply(Reply(ReplyKind.GRANTED, Ballot(5, "a"), 3, 1.25, 2))
         for place, bad in (
             (0, "yes"),
@@ -77,7 +77,7 @@ class ReplyTests(SynchronousTestCase):
             self.assertIsNone(parse_reply(other))
 
     def test_councils(self) -> None:
-        """A council consists of a limited number of distinct contacts."""
+        """A council is decoded if it consists of a limited number of distinct contacts."""
         packed = [member.pack() for member in MEMBERS]
         self.assertEqual(parse_members(packed[:MAX_COUNCIL]), MEMBERS[:MAX_COUNCIL])
         for bad in (packed, [packed[0], packed[0]], [[b"k", "h", 1]], [1], None, b"x"):
@@ -86,7 +86,7 @@ class ReplyTests(SynchronousTestCase):
     @settings(max_examples=300)
     @given(ANYTHING)
     def test_total(self, answer: object) -> None:
-        """Any answer of a peer is a reply or None, and never raises."""
+        """Any answer of a peer is decoded as a reply or as None, without an exception."""
         read = parse_reply(answer)
         self.assertTrue(read is None or read.remaining >= 0.0)
         parse_members(answer)
@@ -111,7 +111,7 @@ class NoteTests(SynchronousTestCase):
         self.assertEqual(codec.bucket_of("t"), f"lease/{zlib.crc32(b't') % 64}")
 
     def test_old_floors(self) -> None:
-        """The lower bounds of both earlier versions are read, with one number or two."""
+        """The lower bounds of both earlier versions are read: one number, or one each for ballots and tokens."""
         self.assertEqual(CODEC.unpack_floor(msgpack.packb([40, 2.0])), Floor(40, 40, 2.0))
         self.assertEqual(CODEC.unpack_floor(msgpack.packb([40, 2.0, 7])), Floor(40, 7, 2.0))
         self.assertEqual(CODEC.pack_floor(Floor(40, 7, 2.0)), msgpack.packb([40, 2.0, 7]))

@@ -12,12 +12,12 @@ from tests.middleware.consensus.lease.room import TTL, LeaseCase, T
 
 class LeaseProposerTests(LeaseCase):
     def change(self, place: int, *members: int) -> object:
-        """Return the result of a change requested by an agent: None, or the error."""
+        """Return the result of a council change that an agent requests: None, or the error."""
         council = self.client(place).proposer
         return self.outcome(council.change_members([self.room.contacts[n] for n in members]))
 
     def places(self, place: int) -> list[int]:
-        """Return the council as an agent knows it."""
+        """Return the indexes of the council members, as known by an agent."""
         return [self.room.get_place(member) for member in self.client(place).proposer.members]
 
     def test_change(self) -> None:
@@ -33,7 +33,7 @@ class LeaseProposerTests(LeaseCase):
         self.assertEqual(self.token(1), 2)
 
     def test_who_knows_the_old_council_is_told(self) -> None:
-        """A client with an old council record is redirected by any member, including departed ones."""
+        """Any member, even one that has left the council, redirects a client that has an old council record."""
         self.assertIsNone(self.change(1, 0, 1, 2))
         self.assertEqual(self.places(2), [0, 1, 2])
         self.room.charters[T] = replace(self.room.charters[T], changes=())
@@ -43,7 +43,7 @@ class LeaseProposerTests(LeaseCase):
         self.assertEqual((self.places(0), self.holders()), ([0, 1, 2], [0]))
 
     def test_member_that_was_away_is_told(self) -> None:
-        """A new member that was unreachable at the change learns of it from the next client that claims."""
+        """A new member that was unreachable during the change learns of the change from the next claiming client."""
         self.cut(6, *range(6))
         self.assertIsNone(self.change(1, 3, 4, 6))
         self.room.radio.cut.clear()
@@ -72,7 +72,7 @@ class LeaseProposerTests(LeaseCase):
             self.assertEqual((self.holders(), self.places(1), self.room.recorder.violations), ([1], [3, 4, 6], []))
 
     def test_move_that_fails(self) -> None:
-        """If the change of the council fails, the holder claims the lease again at the old council."""
+        """If a change of the council fails, the holder claims the lease again at the old council."""
         self.wanting(0)
         self.run_for(TTL)
         moved = self.client(0).change_council([self.room.contacts[n] for n in (1, 2, 6)])
@@ -84,7 +84,7 @@ class LeaseProposerTests(LeaseCase):
         self.assertEqual(self.holders(), [0])
 
     def test_silent_members_are_known(self) -> None:
-        """The holder knows the time since the last answer of each member; an answer resets it."""
+        """The holder knows for each member the time since its last answer; an answer resets this time."""
         self.wanting(0)
         self.cut(4, *range(4), 5, 6)
         self.run_for(4.0)
@@ -105,7 +105,7 @@ class LeaseProposerTests(LeaseCase):
         self.assertEqual(council.find_silent_members(3.0), (self.room.contacts[5],))
 
     def test_learnt_from_the_record(self) -> None:
-        """A newer configuration in the task's record is adopted, an older one is ignored."""
+        """A newer configuration in the task's record is adopted, and an older configuration is ignored."""
         council = self.client(0).proposer
         council.learn_charter(self.chartered([4, 5, 6], [0, 1, 2]).packed)
         for packed in (self.chartered([4, 5, 6]).packed, b"", b"?"):
@@ -113,7 +113,7 @@ class LeaseProposerTests(LeaseCase):
             self.assertEqual((council.configuration, self.places(0)), (3, [0, 1, 2]))
 
     def test_two_changes_at_once(self) -> None:
-        """Two concurrent changes to different councils end with the same council at both clients."""
+        """After two concurrent changes to different councils both clients have the same council."""
         for seed in range(12):
             self.room = self.made(seed=f"two {seed}")
             for place, members in ((0, (3, 4, 6)), (1, (5, 6, 2))):
@@ -127,7 +127,7 @@ class LeaseProposerTests(LeaseCase):
             self.assertEqual(self.places(0), self.places(1))
 
     def test_change_that_was_half_done_is_completed(self) -> None:
-        """A client that finds an accepted but unfinished change completes it before it claims the lease."""
+        """A client that finds a change that was accepted but not finished completes it before it claims the lease."""
         self.cut(1, 6, 0, 2)
         council = self.client(1).proposer
         error = self.outcome(council.change_members([self.room.contacts[n] for n in (0, 2, 6)]))
@@ -136,7 +136,7 @@ class LeaseProposerTests(LeaseCase):
         self.assertEqual((self.places(0), self.holders()), ([0, 2, 6], [0]))
 
     def test_change_of_the_highest_ballot_is_completed(self) -> None:
-        """Of two changes with one acceptance each, the one with the higher ballot may be decided, and is completed."""
+        """Of two changes that one member each accepted, the one with the higher ballot is completed."""
         for place, council in ((4, (0, 2, 6)), (3, (1, 2, 6))):
             members = tuple(self.room.contacts[n] for n in council)
             acceptor, now = self.room.nodes[place].acceptor, self.room.nodes[place].machine.seconds()
@@ -146,7 +146,7 @@ class LeaseProposerTests(LeaseCase):
         self.assertEqual(self.places(0), [1, 2, 6])
 
     def test_another_change_came_first(self) -> None:
-        """A change of a council that has changed meanwhile fails with ``Superseded``."""
+        """A change fails with ``Superseded`` if another change of the council was decided first."""
         self.client(2)
         self.assertIsNone(self.change(1, 3, 4, 6))
         self.assertIsInstance(self.change(2, 3, 5, 6), Superseded)
@@ -172,14 +172,14 @@ class LeaseProposerTests(LeaseCase):
         self.assertEqual(self.holders(), [])
 
     def test_holder_closes_at_once(self) -> None:
-        """A holder that stands still closes the task without waiting for its own lease."""
+        """A holder whose robot stands still closes the task without waiting for the end of its own lease."""
         client = self.wanting(0)
         self.assertIsNone(self.outcome(client.proposer.close(self.token(0)), 0.05))
         self.wanting(1, 1.0)
         self.assertEqual((self.holders(), self.client(1).is_over), ([], True))
 
     def test_close_by_who_missed_a_change(self) -> None:
-        """A client with an old council is redirected on close, and waits for the lease that the new council granted."""
+        """A client with an old council is redirected when it closes, and waits for the lease of the new council."""
         stale = self.client(0)
         self.assertIsNone(self.change(1, 3, 6, 2))
         self.wanting(1)
@@ -198,7 +198,7 @@ class LeaseProposerTests(LeaseCase):
         self.assertIsInstance(self.outcome(self.client(0).proposer.close()), NoMajority)
 
     def test_change_after_the_end(self) -> None:
-        """The council of a closed task cannot change."""
+        """The council of a closed task cannot be changed."""
         self.outcome(self.client(0).proposer.close())
         error = self.change(1, 3, 4, 6)
         self.assertIsInstance(error, Refused)

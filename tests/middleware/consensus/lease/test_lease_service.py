@@ -19,7 +19,7 @@ TASK = Task("t1", "search", "Find it")
 
 
 class SlowStore(MemoryStore):
-    """A store that writes only on request."""
+    """A store that completes writes only when the test calls ``write``."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -27,7 +27,7 @@ class SlowStore(MemoryStore):
         self.is_slow = False
 
     def wait_for_write(self) -> Deferred[None]:
-        """Return a Deferred that fires at once, or with the next ``write``."""
+        """Return a Deferred that fires immediately, or with the next ``write``."""
         if not self.is_slow:
             return super().wait_for_write()
         self.owed.append(Deferred())
@@ -42,7 +42,7 @@ class SlowStore(MemoryStore):
 
 class LeaseServiceTests(FleetCase):
     def team(self, n: int = 4) -> tuple[SwarmTeam, Task, list[LeaseClient]]:
-        """Return nodes that may grant, a task, and the lease client of each node."""
+        """Return a team that can grant leases, a task, and the lease client of each node."""
         fleet = self.swarm(n)
         fleet.run(TASK.lease_ttl)
         task = self.done(fleet, Deferred.fromCoroutine(fleet.nodes[0].submit(TASK)), 1.0)
@@ -53,7 +53,7 @@ class LeaseServiceTests(FleetCase):
         return [place for place, client in enumerate(clients) if client.lease is not None]
 
     def end(self, fleet: SwarmTeam, clients: Sequence[LeaseClient]) -> None:
-        """Release all claims, which removes the timers."""
+        """Release all claims, which cancels the timers."""
         for client in clients:
             client.release()
         fleet.run(2.0)
@@ -72,7 +72,7 @@ class LeaseServiceTests(FleetCase):
         self.end(fleet, clients)
 
     def test_heirs_are_told_by_the_holder(self) -> None:
-        """The holder notifies the named standbys of its release, even if they never polled the council."""
+        """The holder notifies its first standbys of its release, even if they have never polled the council."""
         fleet, _, clients = self.team()
         clients[1].claim()
         fleet.run(0.3)
@@ -83,7 +83,7 @@ class LeaseServiceTests(FleetCase):
         self.end(fleet, clients)
 
     def test_answers_wait_for_the_disk(self) -> None:
-        """A member sends a promise only after it is stored durably."""
+        """A member sends a promise only after the promise is stored durably."""
         fleet = self.swarm(4)
         stores = [SlowStore() for _ in range(4)]
         for node, store in zip(fleet.nodes, stores, strict=True):
@@ -121,7 +121,7 @@ class LeaseServiceTests(FleetCase):
         self.end(fleet, clients)
 
     def test_news_for_nobody(self) -> None:
-        """A release notification for an unknown or forgotten claim is ignored."""
+        """A notice of a release for an unknown or deleted claim is ignored."""
         fleet, task, clients = self.team()
         to = fleet.nodes[2].entangled.contact
         self.assertIsNone(
@@ -138,12 +138,12 @@ class InTimeTests(SynchronousTestCase):
         self.until = 1.0
 
     def proposed(self) -> Reply:
-        """Return the reply of a member that grants from ``until`` on."""
+        """Return the reply of a member that grants no lease before ``until``."""
         left = self.until - self.clock.seconds()
         return Reply(ReplyKind.HELD, remaining=left) if left > 0.0 else Reply(ReplyKind.GRANTED)
 
     def test_answers_when_the_lease_ends(self) -> None:
-        """A proposal shortly before the end of a lease is granted at that time instead of refused."""
+        """A proposal shortly before the end of a lease waits for this end and is granted, instead of rejected."""
         self.clock.advance(1.0 - MAX_WAIT_S + 0.01)
         answer = propose_when_free(self.proposed, self.clock)
         self.clock.advance(MAX_WAIT_S - 0.02)
@@ -160,7 +160,7 @@ class InTimeTests(SynchronousTestCase):
         self.assertEqual(self.successResultOf(answer).kind, ReplyKind.HELD)
 
     def test_answers_at_once(self) -> None:
-        """A reply that needs no short wait is returned at once."""
+        """Any other reply is returned immediately."""
         for reply in (
             Reply(ReplyKind.GRANTED),
             Reply(ReplyKind.OUTBID),
@@ -169,7 +169,7 @@ class InTimeTests(SynchronousTestCase):
             self.assertEqual(self.successResultOf(propose_when_free(lambda reply=reply: reply, self.clock)), reply)  # type: ignore[misc]
 
     def test_nobody_waits_any_more(self) -> None:
-        """A cancelled answer leaves no timer and grants nothing."""
+        """A cancelled wait leaves no timer and grants nothing."""
         self.clock.advance(0.95)
         answer = propose_when_free(self.proposed, self.clock)
         answer.addErrback(lambda _: None)

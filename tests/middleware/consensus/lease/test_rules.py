@@ -1,4 +1,4 @@
-"""Tests of the rules of leases and fencing, each named after its rule."""
+"""Tests of the rules of leases and fencing tokens; the name of each test contains the number of its rule."""
 
 from __future__ import annotations
 
@@ -52,7 +52,7 @@ class RuleTests(LeaseCase):
         self.assertEqual((council.configuration, list(council.members)), (2, following))
 
     def test_rule_3_durations_travel_never_times(self) -> None:
-        """Nodes with different clocks work together, and no message contains a time of a clock."""
+        """Nodes with different clocks work together, because messages contain durations and never times of a clock."""
         sent: list[float] = []
         for bidder in self.room.nodes:
             answer = bidder.answer
@@ -71,7 +71,7 @@ class RuleTests(LeaseCase):
         self.assertLessEqual(max(sent), TTL)
 
     def test_rule_4_token_outlives_restarts(self) -> None:
-        """Each lease has a higher token than all earlier ones, although every member is restarted in between."""
+        """Each lease has a higher token than all earlier leases, although every member is restarted in between."""
         tokens = []
         for place in (0, 1, 2, 0):
             self.wanting(place)
@@ -85,7 +85,10 @@ class RuleTests(LeaseCase):
         self.assertEqual(tokens, sorted(set(tokens)))
 
     def test_rule_4_restarted_member_keeps_silent(self) -> None:
-        """A member that lost its store grants nothing for the maximum TTL; with its store it grants at once."""
+        """A member that lost its store grants nothing for the maximum TTL.
+
+        A member with its store grants immediately.
+        """
         for is_lost in (True, False):
             self.room = self.made(seed=f"silent {is_lost}")
             self.wanting(0)
@@ -102,7 +105,10 @@ class RuleTests(LeaseCase):
             self.assertEqual(self.holders(), [1])
 
     def test_rule_5_deadline_counts_from_the_sending(self) -> None:
-        """The deadline is the send time + TTL x (1 - 2 rho) - the stopping time, however late the answers arrive."""
+        """The deadline counts from the sending of the request, not from its answers.
+
+        It is the send time + TTL x (1 - 2 rho) - the stopping time.
+        """
         self.room = self.made(stop_time=0.3)
         client = self.client(0)
         self.wanting(0)
@@ -138,7 +144,7 @@ class RuleTests(LeaseCase):
             self.assertEqual(self.room.recorder.violations, [])
 
     def test_rule_6_stand_by_asks_when_pushes_are_lost(self) -> None:
-        """A standby takes over without a notification of the release, because it polls three times per TTL."""
+        """A standby takes over without a notice of the release, because it polls the council three times per TTL."""
         self.wanting(0)
         self.client(1).stand_by()
         self.run_for(TTL)
@@ -148,7 +154,7 @@ class RuleTests(LeaseCase):
         self.assertEqual(self.holders(), [1])
 
     def test_rule_6_renewed_three_times_a_ttl(self) -> None:
-        """Two lost rounds of renewal do not lose the lease."""
+        """A lease survives two lost rounds of renewal."""
         self.wanting(0)
         for _ in range(20):
             lease = self.client(0).lease
@@ -175,7 +181,7 @@ class RuleTests(LeaseCase):
         self.assertEqual(self.room.recorder.violations, [])
 
     def test_rule_7_clock_that_stands_still_is_not_enough(self) -> None:
-        """With a clock that stops during a suspension the holder would wrongly trust its old lease."""
+        """With a clock that stops during a suspension, a holder would wrongly assume that its old lease is valid."""
         self.patch(Machine, "COUNTS_SUSPENSION", False)
         client = self.wanting(0, 1.0)
         self.room.nodes[0].machine.freeze(is_suspended=True)
@@ -183,7 +189,7 @@ class RuleTests(LeaseCase):
         self.assertIsNotNone(client.lease)
 
     def test_rule_8_device_refuses_lower_tokens_and_stops_by_itself(self) -> None:
-        """The device rejects lower tokens from any sender, and its gate ends a motion at its deadline."""
+        """A device rejects a lower token from any sender, and its gate ends a motion at the deadline."""
         gate = Gate()
         gate.admit(Permit(2, 5.0), 4.0)
         self.assertRaises(StaleCommand, gate.admit, Permit(1, 9.0), 4.1)
@@ -191,7 +197,10 @@ class RuleTests(LeaseCase):
         self.assertEqual((gate.is_motion_over(4.9), gate.is_motion_over(5.0)), (False, True))
 
     def test_rule_9_the_end_carries_the_token(self) -> None:
-        """A former holder cannot close the task under its old token; of two results the higher token wins."""
+        """A former holder cannot close the task under its old token.
+
+        Of two results the one with the higher token wins.
+        """
         self.wanting(0)
         self.client(0).release()
         self.wanting(1)
@@ -209,7 +218,7 @@ class RuleTests(LeaseCase):
             self.assertEqual(find_outcome(Task(T, "search", "Find it"), told), results[0])
 
     def test_rule_10_graceful_leave(self) -> None:
-        """After a release the first standby acts within 0.2 s, not counting the stopping time."""
+        """After a release the first standby acts within 0.2 s plus the stopping time."""
         for stop_time in (0.0, 0.4):
             self.room = self.made(stop_time)
             self.wanting(0)
@@ -224,7 +233,7 @@ class RuleTests(LeaseCase):
             self.assertEqual(self.room.recorder.violations, [])
 
     def test_rule_11_suspicion_shortens_no_lease(self) -> None:
-        """Suspicion by a standby does not shorten the lease; when it ends, the standby is ready."""
+        """If a standby suspects the holder, the lease does not end earlier; the standby is ready when it ends."""
         self.wanting(0)
         self.client(1).stand_by()
         for _ in range(40):

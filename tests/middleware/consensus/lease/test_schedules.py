@@ -1,4 +1,4 @@
-"""Short tests of the workload of leases: schedules, their replay, and seeded bugs."""
+"""Short tests of the lease workload: random schedules, their replay, and seeded bugs."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from tests.invariants.run import run
 
 class ScheduleTests(SynchronousTestCase):
     def test_no_violation(self) -> None:
-        """Twenty schedules with faults pass, with many leases won and councils changed."""
+        """Twenty schedules with faults violate no invariant; many leases are won and councils changed."""
         wins = changes = 0
         for seed in range(1, 21):
             schedule = Leases(seed)
@@ -22,13 +22,13 @@ class ScheduleTests(SynchronousTestCase):
         self.assertGreater(changes, 0)
 
     def test_replay(self) -> None:
-        """The same seed gives the same datagrams, another seed different ones."""
+        """The same seed gives the same datagrams, and another seed gives different datagrams."""
         digests = [run(seed, ("leases",)).digest for seed in (3, 3, 4)]
         self.assertEqual(digests[0], digests[1])
         self.assertNotEqual(digests[0], digests[2])
 
     def test_bugs_show(self) -> None:
-        """Seeded bugs of safety, liveness and the device are each found within a few schedules."""
+        """The schedules find seeded bugs of safety, of liveness and of the device within a few runs."""
         for bug in (
             "a clock that stands still while suspended",
             "the council is whoever is closest now",
