@@ -9,10 +9,10 @@ ROOM = 640
 
 
 class Gate(OpenAdmission):
-    """Admit a peer if its pass begins with ``pass`` and its key is not in ``refused``.
+    """Admit a peer if its credential begins with ``pass`` and its key is not in ``refused``.
 
-    ``forbidden`` contains pairs of a public key and a method, ``unwritable`` pairs of a public key and the name of a
-    slot.
+    ``forbidden`` contains pairs of a public key and a method that it may not call. ``unwritable`` contains pairs of a
+    public key and the name of a slot that it may not write.
     """
 
     fingerprint = b"the team"
@@ -43,7 +43,7 @@ class Gate(OpenAdmission):
         return self.may_store(slot)
 
     def find_authority(self, owner: bytes) -> Authority:
-        """Return the result of ``judge`` for this owner with a valid pass."""
+        """Return the authority of this owner, as if the owner had a valid credential."""
         return Authority(self.refused.get(owner, ""))
 
     def find_certificate(self, owner: bytes) -> bytes:

@@ -13,7 +13,7 @@ from tests.middleware.admission.village import VillageCase
 
 class JoiningTests(VillageCase):
     def test_join_by_code(self) -> None:
-        """A newcomer with a code gets certificate, secret and contacts, and can then exchange messages with members."""
+        """A newcomer with a code gets a certificate, the secret and contacts, and then exchanges messages."""
         village = self.village()
         dog = village.welcome("dog")
         self.assertEqual((dog.name, dog.team.admission.me.roles), ("dog", ("device",)))
@@ -22,7 +22,7 @@ class JoiningTests(VillageCase):
         self.assertEqual(self.refusal(village, village.houses[0].node.call, dog), "")
 
     def test_same_newcomer_again(self) -> None:
-        """A newcomer that repeats its request at another bootstrap node gets the same certificate for the same use."""
+        """A newcomer that repeats its request at a different bootstrap node gets the same certificate again."""
         village = self.village(bootstraps=2)
         code, seed = village.invite(), b"d" * 32
         passes = []

@@ -25,7 +25,10 @@ class BenchConsensusTests(SynchronousTestCase):
         self.assertEqual(after.capacity, 2)
 
     def test_nobody_beats_the_oracle(self) -> None:
-        """No strategy costs less than the optimum, each assigns every task, and ``group_optimal`` costs the optimum."""
+        """No strategy costs less than the optimum, and ``group_optimal`` costs the optimum.
+
+        Each strategy assigns every task.
+        """
         mission = Mission(8, 8, 3)
         least = solve_assignment(mission)[0]
         for name, decide in DECIDERS.items():

@@ -103,7 +103,7 @@ class GroupOptimalTests(SynchronousTestCase):
 
 class CbbaTests(SynchronousTestCase):
     def test_exchange_never_costs(self) -> None:
-        """Exchanges never raise the cost, respect capacity, and bring the mean to within 5 % of the optimum."""
+        """Exchanges never increase the cost, respect capacities, and reduce the mean to within 5 % of the optimum."""
         ratios = []
         for seed in range(12):
             agents = random.Random(seed).choice([5, 20, 40])

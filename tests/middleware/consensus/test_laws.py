@@ -53,7 +53,7 @@ class LawTests(SynchronousTestCase):
         laws()
 
     def test_short_summaries(self) -> None:
-        """A summary with only the best reports gives the same result as all reports, in any grouping."""
+        """Merging summaries of only the best reports gives the same result as all reports, in any grouping."""
         for name in ("nearest", "capability_cost"):
             strategy = load_strategy(name)
             for seed in range(20):

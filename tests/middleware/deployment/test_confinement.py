@@ -1,4 +1,7 @@
-"""Tests of ``middleware.deployment.confinement``: the filter of system calls, evaluated as the kernel does."""
+"""Tests of ``middleware.deployment.confinement``.
+
+The tests evaluate the filter of system calls in the same way as the kernel.
+"""
 
 from __future__ import annotations
 
@@ -41,7 +44,7 @@ class ConfinementTests(SynchronousTestCase):
             self.assertEqual(verdict(program, 0x40000003, numbers[0]), KILL)
 
     def test_dangerous_calls_are_none_of_them(self) -> None:
-        """No listed call opens, connects, starts, traces or signals anything."""
+        """No listed call opens a file, connects, starts a process, traces a process or sends a signal."""
         for call in ("open", "openat", "socket", "connect", "clone", "fork", "execve", "ptrace", "kill", "bpf"):
             self.assertNotIn(call, ALLOWED_CALLS)
         self.assertNotIn("ioctl", ALLOWED_CALLS)

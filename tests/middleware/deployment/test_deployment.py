@@ -1,4 +1,4 @@
-"""Tests of ``middleware.deployment.deployment``: acceptance by one node of a team in memory."""
+"""Tests of ``middleware.deployment.deployment``: a node of a simulated team accepts or rejects modules."""
 
 from __future__ import annotations
 
@@ -52,7 +52,7 @@ class DeploymentTests(FleetCase):
     def allow(
         self, module_store: ModuleStore | None = None, node: SwarmNode | None = None, **more: object
     ) -> Deployment:
-        """Let the dog (or ``node``) accept "best" from the operator."""
+        """Allow the dog (or ``node``) to accept the module "best" from the operator."""
         node = self.dog if node is None else node
         key = self.operator.entangled.identity.public.hex()
         allowed = replace(DeploymentSettings(True, (key,), ("best",)), **more)  # type: ignore[arg-type]
@@ -73,7 +73,7 @@ class DeploymentTests(FleetCase):
         return made
 
     def push(self, manifest: Manifest, source: bytes | None = SOURCE, by: SwarmNode | None = None) -> None:
-        """Publish a manifest, and a source under the key that it names."""
+        """Publish a manifest, and store a source under the key in the manifest."""
         node = self.operator if by is None else by
         if source is not None:
             self.done(self.world, node.entangled.put(hash_key(source_key(manifest.digest)), "source", source), 1.0)
@@ -86,12 +86,12 @@ class DeploymentTests(FleetCase):
 
     @property
     def running(self) -> int:
-        """Return the version that runs, or 0."""
+        """Return the version of the module that runs, or 0."""
         held = self.deployment.running_manifests.get("best")
         return 0 if held is None else held.version
 
     def assert_refused(self, words: str, runs: int = 0) -> None:
-        """Check that the dog logs ``words``, did not run the code, and still runs version ``runs``."""
+        """Check that the dog logs ``words``, has not run the rejected code, and runs version ``runs``."""
         said = " | ".join(text for _, text in self.dog.presence.device.messages)
         self.assertIn(words, said)
         self.assertEqual(self.running, runs)
@@ -99,7 +99,7 @@ class DeploymentTests(FleetCase):
             self.assertNotIn(CANARY, sys.modules)
 
     def test_accepts_and_reports(self) -> None:
-        """A listed module of a listed operator runs under its name, and the device publishes version and digest."""
+        """A listed module of a listed operator runs under its name, and the device publishes its version and digest."""
         manifest, source = self.version(1)
         self.push(manifest, source)
         self.assertEqual(self.running, 1)
@@ -125,7 +125,7 @@ class DeploymentTests(FleetCase):
         self.assert_refused(f"has {MAX_SOURCE_BYTES + 1} bytes, more than {MAX_SOURCE_BYTES}")
 
     def test_bad_signature_is_refused(self) -> None:
-        """A record in the operator's name without its signature is refused, even if a watcher receives it."""
+        """A record in the operator's name without its signature is rejected, even if a watch delivers it."""
         manifest, source = self.version(1)
         self.done(self.world, self.operator.entangled.put(hash_key(source_key(manifest.digest)), "source", source))
         owner = self.operator.entangled.identity.public
@@ -135,7 +135,7 @@ class DeploymentTests(FleetCase):
         self.assert_refused("is not signed by its operator")
 
     def test_wrong_kind_is_refused(self) -> None:
-        """A strategy pushed as a behaviour is refused, and a name keeps its kind."""
+        """A strategy that is pushed as a behaviour is rejected, and a name keeps its kind."""
         source = SOURCE + b"#"
         self.push(make_next_manifest("best", BEHAVIOUR, source, None, 1), source)
         said = " ".join(text for _, text in self.dog.presence.device.messages)
@@ -146,7 +146,7 @@ class DeploymentTests(FleetCase):
         self.assert_refused("is a strategy here, not a behaviour", runs=2)
 
     def test_lower_version_and_other_content_are_refused(self) -> None:
-        """An older version, and the same version with other content, do not replace the current version."""
+        """Neither an older version, nor the same version with different content, replaces the current version."""
         second, source = self.version(2)
         self.push(second, source)
         first, source = self.version(1)
@@ -158,7 +158,7 @@ class DeploymentTests(FleetCase):
         self.assertEqual(self.deployment.running_manifests["best"], second)
 
     def test_going_back_and_old_word_again(self) -> None:
-        """After a rollback the withdrawn version is refused, even if its record arrives again."""
+        """After a rollback the withdrawn version is rejected, even if its record arrives again."""
         first, source = self.version(1)
         self.push(first, source)
         second, source = self.version(2, first)
@@ -171,7 +171,7 @@ class DeploymentTests(FleetCase):
         self.assert_refused("version 2 is older than the 1 held (2 was taken back)", runs=1)
 
     def test_source_may_come_late(self) -> None:
-        """A source that is missing, or differs from the signed digest, is requested again until it arrives."""
+        """If the source is missing or differs from the signed digest, it is requested again until it arrives."""
         manifest, source = self.version(1)
         wrong = source[:-2] + b"2\n"
         key = hash_key(source_key(manifest.digest))
@@ -185,7 +185,7 @@ class DeploymentTests(FleetCase):
         self.assertEqual(self.running, 1)
 
     def test_nonsense_under_the_key(self) -> None:
-        """Values that are not manifests are refused once each, without other effects."""
+        """Each value that is not a manifest is rejected once, without other effects."""
         for value in (b"", b"\xc1", msgpack.packb({"name": "best"}), bytes(5000)):
             self.done(self.world, self.operator.entangled.put(manifests_key(), "best", value), 1.0)
             self.done(self.world, self.stranger.entangled.put(manifests_key(), "x\x1b", value), 1.0)
@@ -193,7 +193,7 @@ class DeploymentTests(FleetCase):
         self.assertNotIn("\x1b", "".join(text for _, text in self.dog.presence.device.messages))
 
     def test_restart_loads_from_the_shelf(self) -> None:
-        """After a restart the accepted version runs without any peer, and two editions are stored."""
+        """After a restart the accepted version runs without any peer; the store contains two editions."""
         held = None
         for number in (1, 2, 3):
             held, source = self.version(number, held)
@@ -205,7 +205,7 @@ class DeploymentTests(FleetCase):
         self.assertEqual(self.running, 3)
 
     def test_restart_checks_again(self) -> None:
-        """A stored module does not run after a restart if its operator or its name was removed from the settings."""
+        """A stored module does not run after a restart if the settings no longer list its operator or its name."""
         manifest, source = self.version(1)
         self.push(manifest, source)
         sys.modules.pop(CANARY)
@@ -215,7 +215,7 @@ class DeploymentTests(FleetCase):
             self.assertNotIn(CANARY, sys.modules)
 
     def test_damaged_files_never_run(self) -> None:
-        """A truncated or changed file is skipped, and the previous edition runs."""
+        """A truncated or changed file is skipped, and the previous edition runs instead."""
         folder = Path(self.mktemp())
         self.deployment = self.allow(FileModuleStore(folder))
         first, source = self.version(1)
@@ -238,7 +238,7 @@ class DeploymentTests(FleetCase):
         self.assertEqual(self.running, 1)
 
     def test_full_disk_is_told(self) -> None:
-        """A module that cannot be stored still runs, and the device reports the full disk."""
+        """A module that cannot be stored still runs, and the device reports that its disk is full."""
 
         def full(source: Path, target: Path) -> None:
             raise OSError(28, "No space left on device")

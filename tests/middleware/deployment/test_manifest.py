@@ -1,4 +1,4 @@
-"""Tests of ``middleware.deployment.manifest``: the order of an operator's manifests."""
+"""Tests of ``middleware.deployment.manifest``: encoding and precedence of an operator's manifests."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ def versions(n: int) -> list[Manifest]:
 
 class ManifestTests(SynchronousTestCase):
     def test_survives_the_wire(self) -> None:
-        """A packed manifest is unpacked unchanged, with its history, and fits into a record."""
+        """A packed manifest is unpacked unchanged, with its history; its size does not exceed that of a record."""
         for manifest in (*versions(9), make_rollback(versions(9)[-1])):
             assert manifest is not None
             self.assertEqual(parse_manifest(record_of(manifest)), manifest)
@@ -53,7 +53,7 @@ class ManifestTests(SynchronousTestCase):
         self.assertEqual(len(versions(9)[-1].before), MAX_PREVIOUS_EDITIONS)
 
     def test_newest_word_holds_in_any_order(self) -> None:
-        """After pushes and rollbacks in any order of arrival, the last manifest wins."""
+        """The last manifest wins, whatever the order in which pushes and rollbacks arrive."""
         first = make_next_manifest("best", STRATEGY, b"1", None)
         second = make_next_manifest("best", STRATEGY, b"2", first)
         back = make_rollback(second)
@@ -69,7 +69,7 @@ class ManifestTests(SynchronousTestCase):
         self.assertIsNone(make_rollback(again))
 
     def test_decoder_is_total(self) -> None:
-        """No value of a record, however crafted, raises; a value that is not a manifest gives None."""
+        """No value of a record raises an exception; a value that is not a manifest gives None."""
         good = versions(2)[-1]
         content = msgpack.unpackb(good.pack())
         bad: dict[str, list[object]] = {
@@ -94,7 +94,7 @@ class ManifestTests(SynchronousTestCase):
             parse_manifest(record_of(good, bytes(crafted)))
 
     def test_given_version(self) -> None:
-        """A version number may be given; the previous edition is remembered by its digest."""
+        """The caller may choose the version number; the manifest contains the digest of the previous edition."""
         first = make_next_manifest("best", STRATEGY, b"1", None, 4)
         second = make_next_manifest("best", STRATEGY, b"2", first, 9)
         self.assertEqual((first.version, second.version), (4, 9))

@@ -1,4 +1,4 @@
-"""Tests of ``middleware.deployment.module_channel``: messages to and from a module's process."""
+"""Tests of ``middleware.deployment.module_channel``: messages between a node and a module's process."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from middleware.deployment.module_channel import (
 
 class ModuleChannelTests(SynchronousTestCase):
     def test_stream_is_split(self) -> None:
-        """Messages are decoded whole, however the stream is split."""
+        """Messages are decoded completely, however the stream is split into chunks."""
         messages = [pack([number, True, b"x" * number]) for number in range(20)]
         stream, dice, splitter, found = b"".join(messages), random.Random(1), FrameSplitter(MAX_REPLY_BYTES), []
         while stream:
@@ -28,11 +28,11 @@ class ModuleChannelTests(SynchronousTestCase):
         self.assertEqual([parse_reply(each)[0] for each in found], list(range(20)))
 
     def test_too_large_is_refused_unread(self) -> None:
-        """A length above the limit is refused before the content arrives."""
+        """A message length above the limit is rejected before the content arrives."""
         self.assertRaises(BadFrame, FrameSplitter(10).feed, b"\0\0\0\x0b")
 
     def test_nonsense(self) -> None:
-        """Any bytes are a message or raise ``BadFrame``."""
+        """Any bytes are decoded as messages or raise ``BadFrame``."""
         dice = random.Random(2)
         for _ in range(2000):
             data = dice.randbytes(dice.randint(0, 30))

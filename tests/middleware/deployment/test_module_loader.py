@@ -1,4 +1,4 @@
-"""Tests of ``middleware.deployment.module_loader``: loading an operator's source, or the reason why it is refused."""
+"""Tests of ``middleware.deployment.module_loader``, which loads an operator's source or rejects it with a reason."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ class ModuleTests(SynchronousTestCase):
         self.addCleanup(lambda: [sys.modules.pop(name) for name in sorted(set(sys.modules) - before)])
 
     def refusal(self, source: str | bytes, kind: str = STRATEGY) -> str:
-        """Return the reason why a source is refused, and check that it leaves no module."""
+        """Return the reason why a source is rejected, and check that no module remains."""
         data = source.encode() if isinstance(source, str) else source
         before = set(sys.modules)
         error = self.assertRaises(Undeployable, load_module, make_next_manifest("best", kind, data, None), data)
@@ -54,7 +54,7 @@ class ModuleTests(SynchronousTestCase):
         return str(error.problem)
 
     def test_strategy_decides_under_its_name_and_version(self) -> None:
-        """Each call creates a new strategy, which decides and names its deployed name and version."""
+        """Each call creates a new strategy, whose decisions contain its deployed name and version."""
         source = GOOD.encode()
         manifest = make_next_manifest("best", STRATEGY, source, None)
         strategy = load_module(manifest, source)()
@@ -63,13 +63,13 @@ class ModuleTests(SynchronousTestCase):
         self.assertIsNot(load_module(manifest, source)(), strategy)
 
     def test_behaviour_takes_parameters(self) -> None:
-        """A behaviour is created from a task's parameters."""
+        """A behaviour is created with a task's parameters."""
         source = SPIN.encode()
         made = load_module(make_next_manifest("spin", BEHAVIOUR, source, None), source)({"cost": 2}, None)
         self.assertEqual(made.cost, 2.0)
 
     def test_what_cannot_run_is_refused(self) -> None:
-        """A source that does not parse, raises, does not terminate or is of another kind is refused with its reason."""
+        """A source is rejected with the reason if it does not parse, raises, does not end or is of a different kind."""
         for source, reason in (
             ("def f(:\n", "line 1: "),
             (b"\xff\xfe", ""),
@@ -105,7 +105,7 @@ class ModuleTests(SynchronousTestCase):
             self.assertIn(reason, self.refusal(f"{BASE}class Strategy(Nearest):\n{indented}"))
 
     def test_other_source_than_signed_never_runs(self) -> None:
-        """A source with another digest or size than in the manifest is refused before it runs."""
+        """A source whose digest or size differs from the manifest is rejected before it runs."""
         source = b"import sys; sys.modules['swarm_canary'] = sys"
         manifest = make_next_manifest("best", STRATEGY, b"x" * len(source), None)
         error = self.assertRaises(Undeployable, load_module, manifest, source)
@@ -113,7 +113,7 @@ class ModuleTests(SynchronousTestCase):
         self.assertNotIn("swarm_canary", sys.modules)
 
     def test_tracer_of_others_is_put_back(self) -> None:
-        """A trace function (coverage, a debugger) is restored after a module was loaded."""
+        """If a trace function (coverage, a debugger) was set, it is restored after a module was loaded."""
         before = sys.gettrace()
         self.refusal("while True: pass")
         self.assertIs(sys.gettrace(), before)

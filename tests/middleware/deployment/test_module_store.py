@@ -1,4 +1,4 @@
-"""Tests of ``middleware.deployment.module_store``: a stored file is complete or absent."""
+"""Tests of ``middleware.deployment.module_store``, in which a file is complete or absent."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ class FileModuleStoreTests(SynchronousTestCase):
         self.folder = Path(self.mktemp()) / "deployed"
 
     def test_keeps_and_drops(self) -> None:
-        """Both implementations list the stored entries in the order of their names, without the dropped ones."""
+        """Both implementations list the stored entries in the order of their names, except those that were dropped."""
         stores: list[ModuleStore] = [FileModuleStore(self.folder), MemoryModuleStore()]
         for store in stores:
             self.assertEqual(store.list_modules(), [])
@@ -27,7 +27,7 @@ class FileModuleStoreTests(SynchronousTestCase):
             self.assertEqual(store.list_modules(), [("b", b"3")])
 
     def test_crash_in_the_middle_leaves_the_old(self) -> None:
-        """After a crash during a write, the old file is read and the temporary file is removed."""
+        """After a crash during a write the old file can be read, and the temporary file is removed."""
         FileModuleStore(self.folder).save("a", b"old")
         self.assertEqual(self.folder.stat().st_mode & 0o077, 0)
 

@@ -1,4 +1,4 @@
-"""Tests of ``middleware.deployment.runner``: a module's process from the side of its node, in virtual time."""
+"""Tests of ``middleware.deployment.runner``, the node's side of a module's process, in virtual time."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ ONE = [0, "find", []]
 
 
 class Scripted:
-    """A process with scripted answers."""
+    """A process that replies as a script determines."""
 
     has_unsent = False
 
@@ -59,7 +59,7 @@ class RunnerTests(SynchronousTestCase):
         self.flushed = False
 
     def runner(self, answer: Callable[[int, str], bytes], kind: str = STRATEGY) -> Runner:
-        """Return the started runner of a module with this scripted ``answer``."""
+        """Return the started runner of a module whose process replies with ``answer``."""
 
         def spawn() -> Scripted:
             self.processes.append(Scripted(answer))
@@ -73,18 +73,18 @@ class RunnerTests(SynchronousTestCase):
         return runner
 
     def good(self, number: int, verb: str) -> bytes:
-        """Load successfully and return the same result for each call."""
+        """Reply that the module is loaded, and reply to each call with the same result."""
         return well(number, {"limits": ["seccomp"], "reads": ["load"], "told": []} if verb != "call" else 7)
 
     def test_ready_and_asked(self) -> None:
-        """After loading, the runner knows the limits and the fields read, and forwards calls."""
+        """After loading, the runner knows the limits and the fields that the module reads, and forwards calls to it."""
         runner = self.runner(self.good)
         self.assertEqual((runner.state, runner.limits, runner.reads), (State.READY, ("seccomp",), ("load",)))
         self.assertEqual(runner.call("call", ONE), 7)
         self.assertEqual(PushedStrategy(runner).name, "deployed:best")
 
     def test_may_not_run(self) -> None:
-        """An objection prevents the start of a process, including a restart."""
+        """An objection prevents the start of the process, and its restart."""
         self.objection = "is revoked"
         runner = self.runner(self.good)
         self.assertEqual((runner.state, runner.why, self.processes), (State.OUT, "is revoked", []))
@@ -96,7 +96,10 @@ class RunnerTests(SynchronousTestCase):
         self.assertEqual((lost.state, len(self.processes)), (State.OUT, 1))
 
     def test_silence_costs_the_process(self) -> None:
-        """A process that does not answer is killed; after ``MAX_LOSSES`` of them no other is started."""
+        """A process that does not reply is killed.
+
+        After ``MAX_LOSSES`` lost processes no further process is started.
+        """
         runner = self.runner(lambda number, verb: self.good(number, verb) if verb == "load" else b"")
         for _ in range(MAX_LOSSES):
             self.assertRaises(StrategyLost, runner.call, "call", ONE)
@@ -113,7 +116,7 @@ class RunnerTests(SynchronousTestCase):
         self.assertEqual((runner.state, self.processes[0].is_ended), (State.LOST, True))
 
     def test_hostile_answers(self) -> None:
-        """An invalid answer ends the process and raises only ``StrategyError``."""
+        """An invalid reply ends the process, and raises only ``StrategyError``."""
         for nonsense in (
             module_channel.pack(7),
             module_channel.pack([1]),
@@ -132,14 +135,17 @@ class RunnerTests(SynchronousTestCase):
             self.assertIs(runner.state, State.LOST)
 
     def test_hostile_facts(self) -> None:
-        """Invalid facts in the answer to "load" are ignored or refused, and never raise."""
+        """Invalid facts in the reply to "load" are ignored or rejected, without an exception."""
         for facts in (None, 7, {}, {"limits": 7, "reads": 7}, {"limits": [None] * 99, "reads": [[], {}, 1]}):
             runner = self.runner(lambda number, verb, facts=facts: well(number, facts))  # type: ignore[misc]
             self.assertIs(runner.state, State.READY if isinstance(facts, dict) else State.OUT)
             self.assertLessEqual(len(runner.limits), 16)
 
     def test_instances(self) -> None:
-        """An instance of a behaviour is created, called and dropped; it ends with its process and has its reason."""
+        """An instance of a behaviour is created, called and dropped.
+
+        If its process ends, the instance ends with the same reason.
+        """
         runner = self.runner(self.good, BEHAVIOUR)
         instance = runner.create({"turns": 1}, random.Random(1))
         answers: list[tuple[bool, Any]] = []
@@ -156,7 +162,7 @@ class RunnerTests(SynchronousTestCase):
         self.assertRaises(UnknownTask, runner.create, {}, random.Random(1))
 
     def test_late_behaviour_is_ended(self) -> None:
-        """A behaviour that exceeds the timeout is killed, and its pending calls fail."""
+        """If a behaviour exceeds the timeout, its process is killed and its pending calls fail."""
         runner = self.runner(lambda number, verb: b"" if verb == "call" else self.good(number, verb), BEHAVIOUR)
         instance = runner.create({}, random.Random(1))
         answers: list[bool] = []
@@ -176,7 +182,7 @@ class RunnerTests(SynchronousTestCase):
         self.assertRaises(module_channel.ProcessEnded, runner.send_request, "call", [], lambda is_well, content: None)
 
     def test_twin(self) -> None:
-        """The in-memory runner loads, decides and refuses like a process."""
+        """The runner without a process loads, decides and rejects like the runner with a process."""
         runner = Runner(make_next_manifest("best", STRATEGY, NEAREST, None), NEAREST, make_memory_channel, lambda: 0.0)
         runner.start()
         runner.poll()

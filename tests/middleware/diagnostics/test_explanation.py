@@ -1,4 +1,4 @@
-"""Tests of ``middleware.diagnostics.explanation``: one explanation from the agents' decision records."""
+"""Tests of ``middleware.diagnostics.explanation``, which combines the agents' decision records."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ OWN = [decided(n, THREE) for n in (1, 2, 3)]
 
 class ExplanationTests(SynchronousTestCase):
     def test_all_agree(self) -> None:
-        """Three agents with the same reports agree without differences."""
+        """If three agents have the same reports, they agree, and the explanation lists no differences."""
         (ruling,) = explain_decisions([decided(n, THREE) for n in (1, 2, 3)]).epochs
         self.assertEqual((ruling.chosen, ruling.agree, ruling.of), ("dog2", ("dog1", "dog2", "dog3"), 3))
         self.assertEqual(ruling.differ, ())
@@ -56,13 +56,13 @@ class ExplanationTests(SynchronousTestCase):
         self.assertEqual([d.what for d in ruling.differ], ["knew dog2 with nothing more"])
 
     def test_silent_agent_is_named(self) -> None:
-        """An agent that reported without a decision record does not count as agreeing."""
+        """An agent that reported but has no decision record does not count as agreeing."""
         (ruling,) = explain_decisions([decided(1, THREE), decided(3, THREE)]).epochs
         self.assertEqual((len(ruling.agree), ruling.of), (2, 3))
         self.assertEqual([(d.name, d.what) for d in ruling.differ], [("dog2", "has no decision record")])
 
     def test_order_does_not_matter(self) -> None:
-        """Any order of the decision records gives the same explanation, with the newest epoch first."""
+        """The explanation does not depend on the order of the decision records; the newest epoch comes first."""
         records = [decided(n, THREE, epoch) for epoch in (1, 2, 3) for n in (1, 2, 3)]
         records[4] = decided(2, THREE[:1] + [THREE[1]], 2)
         expected = explain_decisions(records)
@@ -73,7 +73,7 @@ class ExplanationTests(SynchronousTestCase):
             self.assertEqual(explain_decisions(records), expected)
 
     def test_most_decide_whoever_dissents(self) -> None:
-        """Two agents that agree outvote the third, for each of the three."""
+        """Two agents that agree outvote the third agent, whichever agent this is."""
         for lone in (1, 2, 3):
             records = [decided(n, THREE, assigned=1 if n == lone else None) for n in (1, 2, 3)]
             (ruling,) = explain_decisions(records).epochs
@@ -81,20 +81,20 @@ class ExplanationTests(SynchronousTestCase):
             self.assertEqual([(d.name, d.what) for d in ruling.differ], [(f"dog{lone}", "names dog1")])
 
     def test_even_votes_give_the_lowest(self) -> None:
-        """If two agents choose each other, the lower uuid wins and the other agent differs."""
+        """If two agents choose each other, the agent with the lower uuid wins, and the other is listed as different."""
         first, second = decided(1, THREE, assigned=1), decided(2, THREE, assigned=2)
         (ruling,) = explain_decisions([first, second]).epochs
         self.assertEqual(ruling.winner, min(first.winner, second.winner))
         self.assertEqual(len(ruling.agree), 1)
 
     def test_nothing_decided(self) -> None:
-        """No decision record gives an empty explanation, and an epoch without a winner names ``nobody``."""
+        """Without decision records the explanation is empty; an epoch without a winner has the winner ``nobody``."""
         self.assertEqual(format_explanation(explain_decisions([])), "")
         (ruling,) = explain_decisions([decided(1, [member(1, None)])]).epochs
         self.assertEqual((ruling.winner, ruling.chosen), ("", "nobody"))
 
     def test_of_many_the_best_are_asked(self) -> None:
-        """In a group of more than thirty, only the eight agents that write their records are counted."""
+        """In a group of more than thirty agents only the eight agents that write decision records are counted."""
         members = [member(i, float(i)) for i in range(1, MAX_REPORTS + 2)]
         told = [record for n in range(1, MAX_REPORTS + 2) if (record := decided(n, members)).is_publisher]
         (ruling,) = explain_decisions(told).epochs

@@ -1,6 +1,6 @@
 """Tests of the directory while a team grows, shrinks, is partitioned and heals: each device is listed once.
 
-Most tests simulate many devices over one table of records with expiring leases; the last ones use real nodes.
+Most tests simulate many devices over one table of records with expiring leases. The last tests use real nodes.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ REVIEW = 10.0
 
 
 class Table:
-    """The records of all replicas on one side of a partition; keys in ``silent`` get no answer."""
+    """The records of all replicas on one side of a partition; reads of the keys in ``silent`` fail."""
 
     def __init__(self, clock: HeapClock) -> None:
         self.clock = clock
@@ -57,13 +57,13 @@ class Table:
 
 
 class Members:
-    """The part of a member table that the directory reads."""
+    """The part of a member table that the directory uses."""
 
     is_full = False
 
 
 class Neighbour:
-    """A device with its directory over a table, and the contacts that a node of its network would have."""
+    """A device with its directory over a table, and the contacts that its node would have in a real network."""
 
     def __init__(self, town: Town, number: int) -> None:
         self.town = town
@@ -81,7 +81,7 @@ class Neighbour:
 
     @property
     def is_large(self) -> bool:
-        """Whether the team is too large to know every member."""
+        """Whether the team is too large for the node to know every member."""
         return len(self.seen()) >= MAX_UNDIVIDED
 
     @property
@@ -92,7 +92,7 @@ class Neighbour:
         return [n.contact for n in self.town.neighbours if n.table is self.table and n is not self]
 
     def contacts(self) -> list[Contact]:
-        """Return the nearest contacts; in a small team all."""
+        """Return the nearest contacts, or in a small team all contacts."""
         seen = self.seen()
         if len(seen) < MAX_UNDIVIDED:
             return seen
@@ -102,7 +102,7 @@ class Neighbour:
         return self.table.get(key, concern)
 
     def put(self, key: bytes, name: str, value: bytes, lifetime: str, lease: float) -> Deferred[None]:
-        """Write a record, and renew its lease from now on."""
+        """Write a record, or renew its lease from now on."""
         self.sequence += 1
         slot = Slot(key, self.identity.public, name)
         record = Record(key, name, self.identity.public, self.sequence, "leased", lease, value, bytes(64))
@@ -119,14 +119,14 @@ class Neighbour:
         self.directory.announce("d", device.pack(), device.depth)
 
     def enter(self) -> None:
-        """Join, and review the depth periodically."""
+        """Join the team, and check the depth periodically."""
         Deferred.fromCoroutine(self.directory.choose_initial_depth())
         self.say()
         self.background.later(self.town.dice.uniform(0.0, REVIEW), self.review)
         self.background.every(0.8 * self.lease, self.beat)
 
     def review(self) -> None:
-        """Move if the size of the team has changed."""
+        """Change the depth if the size of the team requires this."""
         self.background.later(REVIEW, self.review)
         before = self.directory.depth
         if self.directory.update_depth() != before:
@@ -141,7 +141,7 @@ class Neighbour:
 
 
 class Town:
-    """Neighbours that join and leave, on one clock and one table, or two tables during a partition."""
+    """Neighbours that join and leave, on one clock and with one table, or with two tables during a partition."""
 
     def __init__(self, seed: int = 1) -> None:
         self.seed = seed
@@ -152,7 +152,7 @@ class Town:
         self.number = 0
 
     def come(self, count: int, pause: float) -> None:
-        """Let ``count`` neighbours join, one after the other."""
+        """Let ``count`` neighbours join one after the other."""
         for _ in range(count):
             self.number += 1
             self.neighbours.append(Neighbour(self, self.number))
@@ -160,7 +160,7 @@ class Town:
             self.clock.advance(pause)
 
     def go(self, gone: Iterable[Neighbour]) -> None:
-        """Remove neighbours without a farewell."""
+        """Remove neighbours without a goodbye."""
         for neighbour in list(gone):
             neighbour.background.stop()
             self.neighbours.remove(neighbour)
@@ -184,13 +184,13 @@ class Town:
 
 
 def result(case: FleetCase, work: Any) -> Any:
-    """Return the result of a coroutine or Deferred that is ready."""
+    """Return the result of a coroutine or Deferred that has completed."""
     return case.successResultOf(work if isinstance(work, Deferred) else Deferred.fromCoroutine(work))
 
 
 class DirectoryTests(FleetCase):
     def listed(self, reader: Neighbour) -> list[bytes]:
-        """Return the ids that ``reader`` lists, with duplicates."""
+        """Return the ids that ``reader`` lists, without removing duplicates."""
         listing: Listing = result(self, reader.directory.list_devices())
         self.assertTrue(listing.is_complete)
         return [parse_device(record).uuid for record in listing.records]  # type: ignore[union-attr, misc]
@@ -206,13 +206,16 @@ class DirectoryTests(FleetCase):
             self.assertEqual(set(listed) - here - late, set(), "somebody is listed who left")
 
     def all_stay(self, town: Town, readers: int = 2, times: int = 12, pause: float = 5.0) -> None:
-        """Repeat ``all_there`` ``times`` times, ``pause`` seconds apart."""
+        """Repeat ``all_there`` ``times`` times, every ``pause`` seconds."""
         for _ in range(times):
             town.clock.advance(pause)
             self.all_there(town, readers)
 
     def test_growth_and_back(self) -> None:
-        """From 3 devices to 300 and back, each device is always listed once, and at the end there is one key."""
+        """While the team grows from 3 devices to 300 and shrinks again, each device is listed once.
+
+        In the end there is one key.
+        """
         town = Town()
         town.come(3, 1.0)
         self.assertEqual(set(town.table.keys()), {DEVICES})
@@ -233,7 +236,10 @@ class DirectoryTests(FleetCase):
         self.assertEqual(town.table.keys(), {DEVICES: len(town.neighbours)})
 
     def test_partition_and_healing(self) -> None:
-        """Both sides of a partition list themselves; after it heals, all devices list all others at once."""
+        """Each side of a partition lists its own devices.
+
+        After the partition ends, all devices are listed immediately.
+        """
         town = Town(4)
         town.come(240, 0.1)
         town.clock.advance(60.0)
@@ -249,7 +255,10 @@ class DirectoryTests(FleetCase):
         self.all_stay(town)
 
     def test_a_place_whose_holders_are_lost(self) -> None:
-        """A newcomer reads one prefix of its neighbourhood; an unanswered prefix makes the list incomplete."""
+        """A newcomer reads one prefix of its neighbourhood.
+
+        If no replica of the prefix replies, the listing is incomplete.
+        """
         town = Town(7)
         town.come(150, 0.1)
         town.clock.advance(60.0)
@@ -269,7 +278,7 @@ class DirectoryTests(FleetCase):
             self.assertTrue(neighbour.identity.public in seen or is_missed)
 
     def test_some(self) -> None:
-        """A page is the whole team if there is one prefix, else a few prefixes; successive pages cover the team."""
+        """With one prefix a page lists the whole team, otherwise a few prefixes; successive pages cover the team."""
         town = Town(9)
         town.come(30, 0.1)
         reader, before = town.neighbours[7], town.table.reads
@@ -290,7 +299,7 @@ class DirectoryTests(FleetCase):
             seen |= {record.owner for record in page.records}
         self.assertIsNone(page.next_id)
         self.assertEqual(seen, {n.identity.public for n in town.neighbours})
-        # A search continues until the device is found, and ends at the end of the directory or the read limit.
+        # A search continues until the device is found, the directory ends or the limit of reads is reached.
         sought = town.neighbours[120].identity.node_id.hex()
         page = result(self, reader.directory.find_devices(1, lambda device: device.uuid == sought))
         self.assertEqual([device.uuid for device, _ in parse_devices(page.records)], [sought])
@@ -302,7 +311,7 @@ class DirectoryTests(FleetCase):
 
 class TeamTests(FleetCase):
     def names(self, fleet: SwarmTeam, place: int) -> list[str]:
-        """Return the names of all devices that one node lists."""
+        """Return the names of all devices that a node lists."""
         listing = self.done(fleet, fleet.nodes[place].list_devices(), 1.0)
         self.assertTrue(listing.is_complete)
         return sorted(device.name for device, _ in listing.devices)

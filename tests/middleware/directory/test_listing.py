@@ -1,4 +1,4 @@
-"""Tests of the traversal of the directory: it lists each device once, and reports unread prefixes."""
+"""Tests of a listing of the directory: it contains each device once, and reports prefixes that it could not read."""
 
 from __future__ import annotations
 
@@ -24,13 +24,13 @@ def owners(count: int, seed: int = 1) -> list[bytes]:
 
 
 def record(key: bytes, owner: bytes, depth: int, sequence: int = 1) -> Record:
-    """Return the record of a device at ``depth``, as written under ``key``."""
+    """Return the record that a device at ``depth`` writes under ``key``."""
     value = Device(derive_node_id(owner).hex(), "d", depth=depth).pack()
     return Record(key, "d", owner, sequence, "leased", 1.0, value, bytes(64))
 
 
 def announced(depths: Mapping[bytes, int]) -> Places:
-    """Return the records under each key if every owner is at its depth."""
+    """Return the records under each key, for devices that announce themselves at the depths in ``depths``."""
     places: Places = {}
     for owner, depth in depths.items():
         for key in compute_places(derive_node_id(owner), depth):
@@ -39,7 +39,7 @@ def announced(depths: Mapping[bytes, int]) -> Places:
 
 
 def listed(places: Places, listing: Listing, silent: frozenset[bytes] = frozenset()) -> Listing:
-    """Run ``listing`` to its end; the keys in ``silent`` get no answer."""
+    """Run ``listing`` to its end; reads of the keys in ``silent`` fail."""
     seen: list[bytes] = []
     while (place := listing.take_next()) is not None:
         seen.append(place.key)
@@ -53,7 +53,7 @@ def listed(places: Places, listing: Listing, silent: frozenset[bytes] = frozense
 
 class ListingTests(SynchronousTestCase):
     def test_everybody_once(self) -> None:
-        """All devices are listed once, with one read for each prefix, whatever depth the reader expects."""
+        """All devices are listed once, with one read per prefix, whatever depth the reader assumes."""
         depths = dict.fromkeys(owners(600), 5)
         for floor in (0, 3, 5):
             listing = listed(announced(depths), Listing(floor))
@@ -66,14 +66,14 @@ class ListingTests(SynchronousTestCase):
     @settings(max_examples=60, deadline=None)
     @given(st.integers(2, 6), st.integers(0, 2**32))
     def test_neighbours_disagree(self, depth: int, seed: int) -> None:
-        """All devices are found if each is randomly at one of two adjacent depths."""
+        """All devices are found if each device is randomly at one of two adjacent depths."""
         dice = random.Random(seed)
         depths = {owner: depth + dice.randint(0, 1) for owner in owners(24 << depth, seed)}
         listing = listed(announced(depths), Listing(max(0, depth - 1)))
         self.assertEqual(len(listing.records), len(depths))
 
     def test_one_that_is_ahead_or_behind(self) -> None:
-        """A single device one depth below all others is found, and so is a device at any depth above them."""
+        """A single device that is one depth below all others, or at any depth above them, is found."""
         team = owners(400)
         for odd in team[:40]:
             for depth in (5, 3, 1, 0):
@@ -87,14 +87,14 @@ class ListingTests(SynchronousTestCase):
             self.assertEqual(len(listed(announced(depths), Listing(floor)).records), 620)
 
     def test_some_know_sooner_that_the_team_is_small(self) -> None:
-        """If most of 40 devices have returned to the root key, those up to two depths below are listed, too."""
+        """If most of 40 devices have returned to the root key, the others, up to two depths below, are still listed."""
         team = owners(40)
         for deep in (1, 2):
             depths = {owner: deep if derive_node_id(owner)[0] >> 7 != DEVICES[0] >> 7 else 0 for owner in team}
             self.assertEqual(len(listed(announced(depths), Listing()).records), 40, deep)
 
     def test_a_place_that_does_not_answer(self) -> None:
-        """An unread prefix makes the listing incomplete, and the listing names it."""
+        """A prefix that cannot be read makes the listing incomplete, and the listing reports this prefix."""
         depths = dict.fromkeys(owners(600), 5)
         lost = compute_prefix(derive_node_id(next(iter(depths))), 5)
         listing = listed(announced(depths), Listing(), frozenset([lost.key]))
@@ -106,7 +106,7 @@ class ListingTests(SynchronousTestCase):
         self.assertTrue(absent and all(missed.has(derive_node_id(owner)) for owner in absent))
 
     def test_wrong_places(self) -> None:
-        """A device under a prefix that does not match its id is not listed and causes no further reads."""
+        """A device under a prefix that does not match its id is not listed, and causes no further reads."""
         team, liars = owners(20), owners(200, 9)
         places = announced(dict.fromkeys(team, 0))
         places[DEVICES] += [record(DEVICES, liar, 9) for liar in liars]
@@ -121,7 +121,7 @@ class ListingTests(SynchronousTestCase):
             self.assertEqual(select_listed(DEVICES, [crafted]), [], strange)
 
     def test_a_liar_costs_little(self) -> None:
-        """A device that claims the maximum depth costs a reader at most one read for each depth."""
+        """A device that states the maximum depth causes a reader at most one additional read per depth."""
         seed = next(s for s in range(10**6) if DEVICES[:2] == derive_node_id(owners(1, s)[0])[:2])
         (liar,) = owners(1, seed)
         places = announced({**dict.fromkeys(owners(20), 0), liar: MAX_DEPTH})
@@ -137,7 +137,7 @@ class ListingTests(SynchronousTestCase):
         self.assertLessEqual({o for o in depths if under.has(derive_node_id(o))}, {r.owner for r in listing.records})
 
     def test_what_is_open_is_not_over(self) -> None:
-        """While an answer is pending, the listing is neither over nor complete."""
+        """As long as an answer is pending, the listing is neither over nor complete."""
         listing = Listing(1)
         self.assertFalse(listing.is_over)
         self.assertEqual(listing.take_next(), ROOT)

@@ -1,4 +1,4 @@
-"""Tests of the prefixes of the directory: their keys, the prefixes of a device, and its lease."""
+"""Tests of the prefixes of the directory: their keys, the prefixes of a device, and the duration of its lease."""
 
 from __future__ import annotations
 
@@ -32,13 +32,13 @@ def ids(count: int, seed: int = 1) -> list[bytes]:
 
 class PrefixTests(SynchronousTestCase):
     def test_depth_zero_is_the_old_key(self) -> None:
-        """At depth 0 every device is under the root key, the only key of a small team."""
+        """At depth 0 every device is under the root key, which is the only key of a small team."""
         self.assertEqual(ROOT.key, DEVICES)
         for node_id in ids(20):
             self.assertEqual(compute_places(node_id, 0), [DEVICES])
 
     def test_a_key_begins_as_its_devices_do(self) -> None:
-        """The key of a prefix starts with the bits of its devices' ids, which places it near their nodes."""
+        """The key of a prefix starts with the same bits as its devices' ids, so the key is near their nodes."""
         for node_id in ids(20):
             for depth in range(MAX_DEPTH + 1):
                 place = compute_prefix(node_id, depth)
@@ -46,7 +46,10 @@ class PrefixTests(SynchronousTestCase):
                 self.assertTrue(place.has(place.first) and place.first <= node_id)
 
     def test_halves(self) -> None:
-        """One half of a prefix has the same key, the other another, and each id is in exactly one half."""
+        """One half of a prefix has the same key as the prefix, the other half a new key.
+
+        Each id is in exactly one half.
+        """
         for node_id in ids(20):
             place = compute_prefix(node_id, 5)
             self.assertEqual(place.same_key_half.key, place.key)
@@ -54,7 +57,7 @@ class PrefixTests(SynchronousTestCase):
             self.assertNotEqual(place.same_key_half.has(node_id), place.other_key_half.has(node_id))
 
     def test_two_places_and_one_stays(self) -> None:
-        """A device that moves by one depth keeps one of its keys."""
+        """A device whose depth changes by one keeps one of its keys."""
         for node_id in ids(50):
             for depth in range(MAX_DEPTH):
                 before, after = compute_places(node_id, depth), compute_places(node_id, depth + 1)
@@ -62,7 +65,7 @@ class PrefixTests(SynchronousTestCase):
                 self.assertLessEqual(len(after), 3 if depth < ROOT_LISTED_DEPTH else 2)
 
     def test_small_team_is_never_split(self) -> None:
-        """The depth is 0 up to ``MAX_UNDIVIDED`` members, and returns to 0 only at ``UNDIVIDED_AGAIN`` members."""
+        """The depth is 0 for up to ``MAX_UNDIVIDED`` members, and is 0 again only at ``UNDIVIDED_AGAIN`` members."""
         self.assertEqual([choose_depth(size, 0) for size in (1, 8, 48, MAX_UNDIVIDED)], [0] * 4)
         self.assertEqual([choose_depth(size) for size in (1, 8, 48, MAX_UNDIVIDED)], [0] * 4)
         self.assertEqual(choose_depth(MAX_UNDIVIDED + 1, 0), 1)
@@ -70,7 +73,7 @@ class PrefixTests(SynchronousTestCase):
         self.assertEqual(choose_depth(UNDIVIDED_AGAIN, 1), 0)
 
     def test_hysteresis(self) -> None:
-        """From any depth the next depths converge to the right one, and small changes of the size move no device."""
+        """From any depth the depth converges to the right one, and small changes of the team size change no depth."""
         for exponent in range(1, MAX_DEPTH):
             size = MIN_DEVICES_PER_PLACE * 2.0**exponent * 1.4
             if size <= MAX_UNDIVIDED:
@@ -83,18 +86,21 @@ class PrefixTests(SynchronousTestCase):
                 self.assertEqual(choose_depth(size / 1.1, depth), depth)
         border = MIN_DEVICES_PER_PLACE * 2.0**6
         self.assertEqual([choose_depth(border * 1.05, 5), choose_depth(border / 1.05, 6)], [5, 6])
-        # A device moves by at most one depth at a time, and never beyond the maximum.
+        # A device changes its depth by at most one at a time, and never exceeds the maximum.
         self.assertEqual([choose_depth(1e9, 0), choose_depth(3, 9), choose_depth(1, 0)], [1, 8, 0])
         self.assertEqual([choose_depth(1e30, MAX_DEPTH), choose_depth(1e30)], [MAX_DEPTH, MAX_DEPTH])
 
     def test_lease_grows_with_the_depth(self) -> None:
-        """A team with one prefix keeps its lease; each depth doubles it up to a minute, and never shortens it."""
+        """A team with one prefix uses the normal lease; each depth doubles the lease, up to a minute."""
         self.assertEqual([compute_lease(depth, 1.0) for depth in (0, 1, 2, 5)], [1.0, 2.0, 4.0, 32.0])
         self.assertEqual(compute_lease(MAX_DEPTH, 1.0), MAX_LEASE_S)
         self.assertEqual([compute_lease(0, 90.0), compute_lease(4, 90.0)], [90.0, 90.0])
 
     def test_size(self) -> None:
-        """A few contacts are counted; in a large team the nearest ones estimate the size within a factor of two."""
+        """If there are few contacts, they are counted.
+
+        In a large team the nearest contacts give the size within a factor of two.
+        """
         contacts = [Contact(random.Random(n).randbytes(32), Address("10.0.0.1", 7000)) for n in range(3000)]
         self.assertEqual(estimate_size(contacts[0].node_id, contacts[1:7]), 7)
         right = 0

@@ -45,7 +45,7 @@ DEVICE = Device(
 
 
 def record(value: object, owner: Identity = DOG, name: str = "dog") -> Record:
-    """Return a record with this value in the slot ``name``; any value but bytes is packed."""
+    """Return a record with this value in the slot ``name``; a value that is not bytes is packed."""
     packed = value if isinstance(value, bytes) or value is None else bytes(msgpack.packb(value))
     return Record(DEVICES, name, owner.public, 1, "leased", 1.0, packed, bytes(64))
 
@@ -66,7 +66,7 @@ class DeviceTests(SynchronousTestCase):
         self.assertEqual({"pages", "position"} & set(msgpack.unpackb(DEVICE.pack())), set())
 
     def test_crafted(self) -> None:
-        """A record of another node, or with a wrong type, an invalid number or no name, gives no device."""
+        """A record of another node, or with a wrong type, an invalid number or no name, is not decoded as a device."""
         bad: dict[str, list[object]] = {
             "uuid": [None, 5, ""],
             "name": [5, None, b"dog"],
@@ -112,14 +112,14 @@ class DeviceTests(SynchronousTestCase):
         )
     )
     def test_total(self, value: object) -> None:
-        """Any record gives a device or None, and never raises."""
+        """Any record is decoded as a device or as None, without an exception."""
         one = record(value)
         self.assertIsInstance(parse_device(one), Device | None)
         if isinstance(value, dict):
             parse_device(record({**content(), **value}))
 
     def test_order_of_joining(self) -> None:
-        """Devices are listed in the order of joining, ties by uuid; records that are not devices are skipped."""
+        """Devices are listed in the order of joining, then by uuid; records that are not devices are skipped."""
         cat = Device(CAT.node_id.hex(), "cat", joined=1)
         records = [record(DEVICE.pack()), record(cat.pack(), CAT, "cat"), record(b"?")]
         self.assertEqual([d.name for d, _ in parse_devices(records)], ["cat", "dog"])
@@ -127,7 +127,7 @@ class DeviceTests(SynchronousTestCase):
         self.assertEqual(parse_devices([record(cat.pack(), CAT, "dog")]), [])
 
     def test_one_name_twice(self) -> None:
-        """Devices of the same name get a part of their ids as a suffix; two records of one device do not."""
+        """Devices with the same name get a part of their ids as a suffix; two records of one device get no suffix."""
         cat = Device(CAT.node_id.hex(), "dog", joined=1)
         records = [record(DEVICE.pack()), record(cat.pack(), CAT)]
         self.assertEqual([d.name for d, _ in parse_devices(records)], [f"dog-{d.uuid[:6]}" for d in (cat, DEVICE)])
@@ -143,7 +143,10 @@ class DeviceTests(SynchronousTestCase):
         self.assertEqual(len(device.messages), MAX_MESSAGES)
 
     def test_too_large_gives_way(self) -> None:
-        """A record that is too large drops old messages first, then the description; the rest must fit."""
+        """A record that is too large drops old messages first, then the description.
+
+        If it is still too large, it raises an error.
+        """
         device = Device(DEVICE.uuid, "dog", description="d" * 600)
         for n in range(5):
             device = device.with_message(float(n), f"{n}" * 70)
@@ -170,14 +173,14 @@ class PresenceTests(SynchronousTestCase):
         self.calls.append((delay, work))
 
     def test_silent_before_it_appears(self) -> None:
-        """Changes before the first announcement are not announced, and are part of it."""
+        """A change before the first announcement is not announced separately, but contained in this announcement."""
         self.presence.change(status=IDLE)
         self.assertEqual((self.told, self.calls), ([], []))
         self.presence.appear(7)
         self.assertEqual([(d.joined, d.status) for d in self.told if d], [(7, IDLE)])
 
     def test_changes_are_gathered(self) -> None:
-        """Several changes within ``PAUSE_S`` are announced once; a change without effect is not announced."""
+        """Several changes within ``PAUSE_S`` are announced together; a change without effect is not announced."""
         self.presence.appear(7)
         self.presence.change(status=IDLE)
         self.presence.change(task="t2")

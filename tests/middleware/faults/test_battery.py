@@ -35,7 +35,7 @@ class _Robot(SimDriver):
 
 class LowBatteryTests(SynchronousTestCase):
     def test_only_the_battery_reads_low(self) -> None:
-        """The fault lowers the battery level, if the robot reports one, and changes no other value."""
+        """The fault lowers the battery level, if the robot reports a level, and changes no other value."""
         robot = _Robot()
         driver = LowBattery(robot)
         seen: list[Any] = []
@@ -52,7 +52,7 @@ class LowBatteryTests(SynchronousTestCase):
         self.assertIs(driver.observe(), robot.shown)
 
     def test_all_else_is_the_robot(self) -> None:
-        """Description, state, token and actions are passed through to the robot."""
+        """Description, state, token and actions are passed to and from the robot unchanged."""
         robot = _Robot()
         driver = LowBattery(robot)
         self.assertIs(driver.description, robot.description)

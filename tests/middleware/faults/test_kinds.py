@@ -15,20 +15,20 @@ from middleware.faults.takeover import OBSERVATION_S, Takeover, find_executing
 
 class FaultTests(SynchronousTestCase):
     def test_usual(self) -> None:
-        """Each kind has a default fault, and its default amount is valid."""
+        """Each kind of fault has a default amount, which is valid."""
         for kind, rule in KINDS.items():
             self.assertEqual(parse_fault(kind), Fault(kind, 15.0, rule.amount))
         self.assertEqual(parse_fault("loss", 3, 0.5), Fault("loss", 3.0, 0.5))
         self.assertEqual(parse_fault("kill", None, 0), Fault("kill"))
 
     def test_begins(self) -> None:
-        """A device answers with the start of its fault; an invalid answer counts as at once."""
+        """A device answers with the start time of its fault; an invalid answer means that it starts immediately."""
         self.assertEqual(parse_delay(0.5), 0.5)
         for answer in (None, "soon", True, -1.0, 3600.0, math.nan, math.inf, [0.5]):
             self.assertEqual(parse_delay(answer), 0.0)
 
     def test_unlawful(self) -> None:
-        """An invalid fault is refused with the name of the field, for any input from the network."""
+        """Any invalid fault from the network is rejected, and the error contains the name of the invalid field."""
         wrong: list[tuple[tuple[Any, ...], str]] = [
             (("fly",), "kind"),
             ((None,), "kind"),
@@ -49,7 +49,7 @@ class FaultTests(SynchronousTestCase):
 
 class TakeoverTests(SynchronousTestCase):
     def test_time_the_first_other(self) -> None:
-        """The timer stops at the first other device that acts on the same task, and does not change afterwards."""
+        """The takeover time ends when the first other device acts on the same task, and does not change after that."""
         clock = Takeover("a", "t1", 10.0, 14.0)
         clock.observe({"a": "t1", "b": "t2"}, 10.5)
         self.assertIsNone(clock.seconds)
@@ -58,7 +58,7 @@ class TakeoverTests(SynchronousTestCase):
         self.assertEqual((clock.seconds, clock.to), (1.5, "b"))
 
     def test_end(self) -> None:
-        """The timer does not start without a task, and ends a limited time after the fault."""
+        """The measurement does not start without a task, and ends a limited time after the fault."""
         self.assertFalse(Takeover("a", "", 10.0, 14.0).is_open(10.1))
         clock = Takeover("a", "t1", 10.0, 14.0)
         self.assertTrue(clock.is_open(14.0))
@@ -66,6 +66,6 @@ class TakeoverTests(SynchronousTestCase):
         self.assertIsNone(clock.seconds)
 
     def test_acting(self) -> None:
-        """A device acts if it executes a task, not if it searches."""
+        """A device counts as acting when it executes a task, but not when it searches."""
         devices = [Device("a", "dog1", task="t", status=EXECUTING), Device("b", "dog2", task="t", status=SEARCHING)]
         self.assertEqual(find_executing(devices), {"a": "t"})

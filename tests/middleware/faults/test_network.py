@@ -23,7 +23,7 @@ class FaultyNetworkTests(SynchronousTestCase):
         self.other.listen(lambda datagram, source: self.answers.append(datagram))
 
     def exchange(self, seconds: float = 0.01, times: int = 1) -> tuple[int, int]:
-        """Return the numbers of datagrams received and sent, of ``times`` in each direction."""
+        """Send ``times`` datagrams in each direction; return the numbers that the node received and sent."""
         before = len(self.came), len(self.answers)
         for _ in range(times):
             self.other.send(b"in", self.network.address)
@@ -37,7 +37,7 @@ class FaultyNetworkTests(SynchronousTestCase):
         self.assertEqual(self.exchange(0.0, 20), (20, 20))
 
     def test_deaf_and_mute(self) -> None:
-        """A deaf node only sends, a mute node only receives, and a node that is both is disconnected."""
+        """A deaf node only sends, a mute node only receives, and a node that is deaf and mute is disconnected."""
         for deaf, mute, passes in ((True, False, (0, 1)), (False, True, (1, 0)), (True, True, (0, 0))):
             self.network.is_receive_blocked, self.network.is_send_blocked = deaf, mute
             self.assertEqual(self.exchange(), passes)
@@ -45,7 +45,10 @@ class FaultyNetworkTests(SynchronousTestCase):
         self.assertEqual(self.exchange(), (1, 1))
 
     def test_loss(self) -> None:
-        """A lossy node loses the configured share of datagrams in each direction; the rest arrives at once."""
+        """A node with the fault loss loses the configured share of datagrams in each direction.
+
+        The rest arrives immediately.
+        """
         self.network.conditions = LinkConditions(loss=0.2)
         came, went = self.exchange(times=1000)
         self.assertTrue(750 < came < 850 and 750 < went < 850, (came, went))
@@ -57,7 +60,7 @@ class FaultyNetworkTests(SynchronousTestCase):
         self.assertEqual(self.exchange(0.12)[0], 2)
 
     def test_delay(self) -> None:
-        """A delayed datagram arrives late by the delay; a datagram in flight when the port closes is lost."""
+        """A delayed datagram arrives after the delay; a datagram that is in transit when the port closes is lost."""
         self.network.conditions = LinkConditions(delay_s=0.3)
         self.assertEqual(self.exchange(0.29), (0, 0))
         self.clock.advance(0.02)
@@ -69,7 +72,7 @@ class FaultyNetworkTests(SynchronousTestCase):
         self.assertEqual((len(self.came), len(self.answers)), (1, 1))
 
     def test_cut_catches_what_is_on_its_way(self) -> None:
-        """A node that is disconnected while datagrams are in flight neither receives nor sends them."""
+        """If a node is disconnected, datagrams in transit are neither received nor sent."""
         self.network.conditions = LinkConditions(delay_s=0.3)
         self.exchange(0.1)
         self.network.is_receive_blocked = self.network.is_send_blocked = True

@@ -1,1 +1,1 @@
-"""Tests of the read interface of a user interface."""
+"""Tests of the interface from which a user interface reads the team."""

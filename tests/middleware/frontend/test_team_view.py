@@ -1,4 +1,4 @@
-"""Tests of ``TeamView`` over records that a test wrote."""
+"""Tests of ``TeamView`` with records that the test writes."""
 
 from __future__ import annotations
 
@@ -47,7 +47,7 @@ class TeamViewTests(SynchronousTestCase):
         self.assertEqual((outcome.outcome, outcome.by), (CANCELLED, "vaio"))
 
     def test_progress_has_the_agents_and_the_newest_order(self) -> None:
-        """A task is paused from the order to pause until a newer order or its result."""
+        """A task is paused from the order to pause until a newer order or the result of the task."""
         self.write(group_key("old"), MEMBER, Member(UUID, "dog1", "searching").pack())
         self.write(group_key("old"), ORDER, Order(PAUSE, "vaio", 1.0).pack())
         progress = self.view.find_progress(OLD)
@@ -63,7 +63,7 @@ class TeamViewTests(SynchronousTestCase):
         self.assertEqual(self.view.find_unable_devices(NEW), {})
 
     def test_absent_device_has_the_beginning_of_its_uuid_as_name(self) -> None:
-        """A device that left has no record, and its name is the first 8 characters of its uuid."""
+        """A device that has left has no record, so its name is the first 8 characters of its uuid."""
         self.assertEqual(self.view.find_name(UUID), "dog1")
         self.assertEqual(self.view.find_name("ab" * 32), "abababab")
         self.assertIsNone(self.view.find_record("ab" * 32))

@@ -1,4 +1,4 @@
-"""Sites behind routers, with nodes at the sites and one public bootstrap node, in virtual time."""
+"""Provide nodes at sites behind routers, and one public bootstrap node, in virtual time."""
 
 from __future__ import annotations
 
@@ -19,14 +19,14 @@ from middleware.entangled.node import EntangledNode
 
 TEAM = b"t" * 32
 LINK = LinkConditions(delay_s=0.015)
-"""One crossing of a site's uplink: two sites are 60 ms apart, there and back."""
+"""The delay of one crossing of a site's uplink; a round trip between two sites takes 60 ms."""
 
 
 class Sites:
     """A network of sites.
 
-    ``conditions`` applies to the uplink of each site; ``nets`` are the address prefixes of the public and the private
-    nets.
+    ``conditions`` applies to the uplink of each site. ``nets`` contains the address prefixes of the public and the
+    private networks.
     """
 
     def __init__(
@@ -49,14 +49,14 @@ class Sites:
         self.node("pub", self.public)
 
     def site(self, name: str, kind: str) -> None:
-        """Create a site behind a router of this NAT type ("none": on the public net)."""
+        """Create a site behind a router of this NAT type; for "none" the site is in the public network."""
         if kind != "none":
             host, rng = f"{self.outside}.{10 + len(self.routers)}", random.Random(f"{self.seed}/{name}")
             nat: NatKind = kind  # type: ignore[assignment]
             self.routers[name] = self.switchboard.add_router(NatRouter(nat, host, rng, self.lifetime), self.conditions)
 
     def node(self, name: str, address: Address, site: str = "") -> EntangledNode:
-        """Create and start a node at a site or on the public net; it joins through the public node."""
+        """Create and start a node at a site or in the public network; the node joins through the public node."""
         identity = Identity(random.Random(f"{self.seed}/{name}").randbytes(32))
         network = self.switchboard.make_network(*address, home=self.routers.get(site))
         rng = random.Random(f"{self.seed}/{name}/dice")
@@ -68,7 +68,10 @@ class Sites:
         return node
 
     def at(self, site: str, kind: str, host: int = 2) -> EntangledNode:
-        """Create the node ``site`` + ``host`` at a new or existing site; it joins within half a second."""
+        """Create the node ``host`` at the site ``site``, which is created if necessary.
+
+        The node joins within half a second.
+        """
         if site not in self.routers:
             self.site(site, kind)
         name = f"{site}{host}"
@@ -80,7 +83,7 @@ class Sites:
         return self.node(name, address)
 
     def met_at(self, of: EntangledNode) -> Contact:
-        """Return the contact of a node as the public node sees it."""
+        """Return the contact of a node as the public node observes it."""
         peer = self.nodes["pub"].endpoint.peers.get(of.identity.public)
         assert peer is not None and peer.session is not None
         return peer.session.contact
@@ -116,7 +119,7 @@ class Sites:
 
 
 class SitesCase(SynchronousTestCase):
-    """A test case with sites that checks that no node leaves a timer after its stop."""
+    """A test case with sites, which checks that no node leaves a timer after its stop."""
 
     def sites(
         self,

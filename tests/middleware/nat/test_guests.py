@@ -1,4 +1,4 @@
-"""Tests of the limits of introductions between nodes, and of nodes that need none."""
+"""Tests of the limits of introductions, and of nodes that need no introductions."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ class QuietTests(SitesCase):
     """Nodes with direct paths cause no traffic for introductions."""
 
     def test_neighbours_ask_nobody(self) -> None:
-        """Nodes on one LAN use no introduction, address probe, relay or timer, even if a node fails."""
+        """Nodes on one LAN use no introduction, address request, relay or timer, even if a node fails."""
         sites = self.sites(conditions=LinkConditions(delay_s=0.001))
         asked: list[bytes] = []
         sites.nodes["pub"].stop_silently()
@@ -42,7 +42,7 @@ class QuietTests(SitesCase):
             self.assertEqual(len(node.nat.relay), 0)
 
     def test_answered_at_once(self) -> None:
-        """A node that replies at once is never introduced, at any distance."""
+        """A node that replies immediately is never introduced, at any distance."""
         sites = self.sites()
         a = sites.at("a", "none")
         b = sites.at("b", "none")
@@ -86,7 +86,7 @@ class HostileTests(SitesCase):
         self.assertEqual(self.asked("echo", 3), 3)
 
     def test_liars_are_outdone(self) -> None:
-        """An introducer with false addresses does not prevent a connection through other introducers."""
+        """An introducer that returns false addresses does not prevent a connection through other introducers."""
         made_up = [[f"203.0.114.{n}", 7000] for n in range(20)]
         self.a.endpoint.expose(INTRODUCE, lambda peer, *rest: [made_up, [], True], changes=True)
         c = self.g.at("c", "port")
@@ -98,7 +98,7 @@ class HostileTests(SitesCase):
         self.assertEqual(self.g.call(c, contact)[0], 7)
 
     def test_nobody_to_ask(self) -> None:
-        """A call to an unknown relayed node fails like any call without a reply and leaves no state."""
+        """A call to a relayed node fails like any unanswered call if no peer knows this node; it leaves no state."""
         stranger = Identity(b"s" * 32)
         answer, seconds = self.g.call(self.a, Contact(stranger.public, relayed_address(stranger.node_id)))
         self.assertIn("no answer", str(answer))
@@ -124,12 +124,12 @@ class IntroductionLimitsTests(SynchronousTestCase):
     """Tests of ``IntroductionLimits``."""
 
     def setUp(self) -> None:
-        """Create an unused allowance."""
+        """Create introduction limits of which nothing is used."""
         self.clock = HeapClock()
         self.allowance = IntroductionLimits(self.clock)
 
     def test_each_peer_has_its_own(self) -> None:
-        """A peer that used its introductions waits for the next one; other peers are not affected."""
+        """A peer that has used up its introductions must wait for the next; other peers are not affected."""
         granted = [self.allowance.may_introduce(ASKER) for _ in range(int(2 * INTRODUCTIONS_PER_S) + 1)]
         self.assertEqual((sum(granted), granted[-1]), (2 * INTRODUCTIONS_PER_S, False))
         self.assertTrue(self.allowance.may_introduce(OTHER))
@@ -138,7 +138,10 @@ class IntroductionLimitsTests(SynchronousTestCase):
         self.assertEqual([self.allowance.may_introduce(ASKER) for _ in range(2)], [True, False])
 
     def test_who_is_met_does_not_count(self) -> None:
-        """Each peer that answers restores one use of its introducer; other uses return at a fixed rate."""
+        """If an introduced peer replies, its introducer gets one introduction back.
+
+        Others come back at a fixed rate.
+        """
         while self.allowance.may_meet(ASKER):
             self.allowance.record_introducer(STRANGER, ASKER)
         for public, again in ((OTHER, False), (STRANGER, True), (STRANGER, False)):
@@ -160,7 +163,7 @@ class CandidateTests(SynchronousTestCase):
         self.assertEqual(parse_candidates([list(address) for address in many]), many[:MAX_CANDIDATES])
 
     def test_what_no_peer_can_have(self) -> None:
-        """Multicast, wildcard, broadcast, host name and relay addresses, invalid ports and other input are dropped."""
+        """Multicast, wildcard, broadcast, host name and relay addresses, invalid ports and other input are ignored."""
         hosts = ["224.0.0.1", "ff02::1", "0.0.0.0", "::", "255.255.255.255", "localhost", "~" + "0" * 40, "", "1" * 99]
         for host in hosts:
             self.assertEqual(parse_candidates([[host, 7000]]), [], host)
@@ -170,7 +173,7 @@ class CandidateTests(SynchronousTestCase):
         self.assertEqual(parse_candidates([["203.0.113.1", 65536], [b"203.0.113.1", 1], ["203.0.113.1", True]]), [])
 
     def test_near(self) -> None:
-        """Hosts on one machine or one private network are near; public hosts and other networks are not."""
+        """Hosts on one machine or in one private network are near; public hosts and other networks are not near."""
         near = [("127.0.0.1", "192.168.1.2"), ("192.168.1.9", "192.168.1.2"), ("10.0.7.1", "10.0.9.1")]
         near += [("203.0.113.1", "203.0.113.1"), ("fe80::1", "fe80::2"), ("fd00::1", "fd00::2")]
         far = [("203.0.113.1", "203.0.113.2"), ("192.168.1.2", "10.0.0.1"), ("192.168.1.2", "192.169.1.2")]

@@ -43,7 +43,10 @@ class NatTests(SynchronousTestCase):
             )
 
     def test_symmetric_ports_differ(self) -> None:
-        """A symmetric router maps each destination to another, stable port; other types use one port for all."""
+        """A symmetric router uses a different port for each destination, and keeps it.
+
+        Other types use one port for all.
+        """
         kinds: list[tuple[NatKind, int]] = [("sym", 2), ("port", 1)]
         for kind, count in kinds:
             router = nat(kind)
@@ -51,7 +54,7 @@ class NatTests(SynchronousTestCase):
             self.assertEqual((a, len({a, b})), (again, count))
 
     def test_mappings_end(self) -> None:
-        """Traffic in either direction keeps a mapping alive; after a restart the router creates a new mapping."""
+        """Traffic in either direction keeps a mapping open; after a restart the router creates a new mapping."""
         router = NatRouter("port", HOST, random.Random(3), 10.0)
         outside = router.translate_outgoing(INSIDE, A, 0.0)
         assert outside is not None
@@ -73,7 +76,7 @@ class NatTests(SynchronousTestCase):
         self.assertEqual(router.translate_outgoing(INSIDE, A, 1.0), before)
 
     def test_on_the_board(self) -> None:
-        """Nodes behind one router reach each other by their private addresses, but not by the public one."""
+        """Nodes behind one router reach each other at their private addresses, but not at the public address."""
         clock = HeapClock()
         switchboard = Switchboard(clock, random.Random(1))
         router = switchboard.add_router(nat("full"), LinkConditions(delay_s=0.5))
@@ -95,7 +98,10 @@ class NatTests(SynchronousTestCase):
         self.assertEqual((switchboard.counters["blocked"], switchboard.counters["unheard"]), (1, 1))
 
     def test_further_ports_on_the_board(self) -> None:
-        """An additional port has a separate mapping; replies to a source that used this port leave from it."""
+        """An additional port has a separate mapping.
+
+        Replies to a source that sent to this port are sent from this port.
+        """
         clock = HeapClock()
         switchboard = Switchboard(clock, random.Random(1))
         router = switchboard.add_router(nat("full"))

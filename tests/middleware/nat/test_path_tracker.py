@@ -45,7 +45,7 @@ class PathTests(SitesCase):
     """The path between each pair of router types."""
 
     def test_punchable_pairs_are_direct(self) -> None:
-        """13 of the 15 pairs of router types are punched within a second and use direct paths after that."""
+        """In 13 of the 15 pairs of router types hole punching succeeds within a second, and the path stays direct."""
         for one in KINDS:
             for other in KINDS:
                 if frozenset({one, other}) not in UNPUNCHABLE:
@@ -54,7 +54,7 @@ class PathTests(SitesCase):
                     self.assertLess(seconds, 1.0, f"{one} and {other}")
 
     def test_other_pairs_are_carried(self) -> None:
-        """If hole punching is impossible, the public node relays, after at most 1.5 s."""
+        """If hole punching is impossible, the public node relays after at most 1.5 s."""
         for one, other in (("port", "sym"), ("sym", "port"), ("sym", "sym")):
             sites = self.sites()
             path, seconds = paths(sites, one, other)
@@ -69,7 +69,7 @@ class LossyLinkTests(SitesCase):
     """Paths under loss and behind difficult routers."""
 
     def test_lossy_links(self) -> None:
-        """At 30 % loss on both links, at least 38 of 40 pairs connect within 5 s, punched or relayed."""
+        """At 30 % loss on both links at least 38 of 40 pairs connect within 5 s, by hole punching or a relay."""
         late = []
         pairs = [("port", "port"), ("full", "addr"), ("port", "sym"), ("none", "port")]
         for seed in range(10):
@@ -81,7 +81,7 @@ class LossyLinkTests(SitesCase):
         self.assertLessEqual(len(late), 2, late)
 
     def test_leaky_routers(self) -> None:
-        """Routers that block a port after early datagrams are punched within 5 s from fresh ports."""
+        """Nodes behind routers that block a port after an early datagram connect within 5 s from newly opened ports."""
         for one, other in (("leaky", "leaky"), ("leaky", "port"), ("port", "leaky")):
             for delay_s in (0.015, 0.25):
                 sites = self.sites()
@@ -95,7 +95,7 @@ class LossyLinkTests(SitesCase):
                     self.assertEqual((one, other, path), (one, other, "direct"))
 
     def test_late_words(self) -> None:
-        """If one side is notified half a second late, the pair is relayed at first and has a direct path later."""
+        """If one side is notified half a second late, the pair is relayed at first, and later has a direct path."""
         for one, other in (("leaky", "port"), ("port", "leaky")):
             for late in "ab":
                 sites = self.sites()
@@ -115,7 +115,7 @@ class LossyLinkTests(SitesCase):
                 self.assertEqual((one, other, late, ways_seen), (one, other, late, {"direct"}))
 
     def test_routers_within_a_private_net(self) -> None:
-        """Routers with a public side in a private network with the same prefix are punched like others."""
+        """Hole punching also works if the public side of the routers is in a private network with the same prefix."""
         for one, other, path in (("port", "port", "direct"), ("sym", "full", "direct"), ("sym", "sym", "carried")):
             sites = self.sites(nets=("10.0.9", "10.0"))
             self.assertEqual((one, other, paths(sites, one, other)[0]), (one, other, path))
@@ -132,7 +132,7 @@ class LossyLinkTests(SitesCase):
             self.assertLess(_reached_again(sites, a, b), 5.0, f"{one} and {other}")
 
     def test_mappings_are_held(self) -> None:
-        """Behind routers with a mapping lifetime of 15 s two idle nodes keep their path open."""
+        """If routers keep a mapping for 15 s, two idle nodes keep their path open."""
         for one, other in (("port", "port"), ("sym", "sym")):
             sites = self.sites(lifetime=15.0)
             a, b = sites.at("a", one), sites.at("b", other)
@@ -144,7 +144,7 @@ class LossyLinkTests(SitesCase):
             self.assertLess(seconds, 0.2)
 
     def test_everybody_hears_of_it(self) -> None:
-        """In a large team, too, all members have the new address of an idle node after 5 s."""
+        """In a large team all members also have the new address of an idle node after 5 s."""
         sites = self.sites()
         others = [sites.node(f"x{n}", Address(f"203.0.113.{150 + n}", 7000)) for n in range(32)]
         a = sites.at("a", "port")
@@ -156,7 +156,10 @@ class LossyLinkTests(SitesCase):
         self.assertNotEqual(seen, {Address(sites.routers["a"].host, 7000)})
 
     def test_fresh_ports_are_quiet(self) -> None:
-        """Two nodes that met at fresh ports keep their session, and their ports do not count as new addresses."""
+        """If two nodes connected from newly opened ports, their session stays open.
+
+        These ports do not count as new addresses.
+        """
         sites = self.sites()
         paths(sites, "leaky", "leaky")
         a, b = sites.nodes["a2"], sites.nodes["b2"]
@@ -176,7 +179,7 @@ class LossyLinkTests(SitesCase):
         self.assertEqual(sites.networks["a2"].source_address(at_b).port, port)
 
     def test_direct_before_carried(self) -> None:
-        """A relayed session does not replace a working direct one, but replaces a dead one."""
+        """A relayed session does not replace a direct session that works, but replaces one that has failed."""
         sites = self.sites()
         a, b = sites.at("a", "none"), sites.at("b", "none")
         sites.run(3.0)
@@ -217,7 +220,7 @@ class RelayedTests(SitesCase):
         return a, b
 
     def test_direct_as_soon_as_it_can_be(self) -> None:
-        """A relayed pair can exchange large messages, and gets a direct path when its routers permit it."""
+        """A relayed pair can exchange large messages, and gets a direct path when its routers permit this."""
         sites = self.sites()
         a, b = self.carried(sites)
         session = a.endpoint.peers.find_session(b.identity.public)
@@ -236,7 +239,7 @@ class RelayedTests(SitesCase):
         self.assertEqual(sites.nodes["pub"].endpoint.counters["carried"], carried)
 
     def test_any_member_carries(self) -> None:
-        """If the relay fails at any moment, another member relays within 5 s."""
+        """If the relay fails at any time, another member relays within 5 s."""
         for moment in range(8):
             sites = self.sites()
             sites.node("other", Address("203.0.113.200", 7000))
@@ -251,7 +254,7 @@ class RelayedTests(SitesCase):
             self.assertLess(sites.clock.seconds() - began, 5.0)
 
     def test_who_hears_of_it_reaches_it(self) -> None:
-        """Other nodes reach a relayed peer directly if possible, otherwise through a relay."""
+        """Other nodes reach a relayed peer directly if this is possible, otherwise through a relay."""
         sites = self.sites()
         _, b = self.carried(sites)
         for site, kind, path in (("c", "none", "direct"), ("d", "sym", "carried")):
@@ -288,7 +291,7 @@ def _peer(of: EntangledNode, other: EntangledNode) -> Peer | None:
 
 
 def _listening(node: EntangledNode, asked: list[bytes]) -> Any:
-    """Return the node's method, wrapped to record its calls."""
+    """Return a wrapper of the node's method that records its calls."""
     answer = node.nat.introducer.answer_introduce
 
     def introduce(peer: Contact, wanted: bytes, candidates: list[object], order: int) -> Any:
@@ -313,7 +316,7 @@ class AdditionalPortsTests(SitesCase):
     """Tests of ``AdditionalPorts`` on a node that does not need them."""
 
     def test_so_many_and_no_more(self) -> None:
-        """At the limit a new port is opened only in place of the oldest one, after its hold time."""
+        """At the limit a new port is opened only if the oldest port can be closed, which is after its hold time."""
         sites = self.sites()
         ports = sites.at("a", "none").nat._additional_ports
         opened = [ports.open() for _ in range(MAX_PORTS)]
@@ -326,7 +329,7 @@ class AdditionalPortsTests(SitesCase):
         self.assertEqual([port in ports for port in opened], [False] + [True] * (MAX_PORTS - 1))
 
     def test_unused_ones_are_shut(self) -> None:
-        """A fresh port without a session is closed after ``UNUSED_PORT_S`` seconds."""
+        """A newly opened port without a session is closed after ``UNUSED_PORT_S`` seconds."""
         sites = self.sites()
         reach = sites.at("a", "none").nat
         reach._open_port()
@@ -343,7 +346,10 @@ class KindTests(SynchronousTestCase):
     """Tests of ``kind_of``."""
 
     def test_each_kind_of_address(self) -> None:
-        """The address shows relayed, tunnelled and loopback paths; an introduced distant address counts as punched."""
+        """The address determines relayed, tunnelled and loopback paths.
+
+        A distant address from an introduction counts as punched.
+        """
         kinds = {
             "carried": relayed_address(bytes(20)),
             "tunnel": Address("~wss-0123456789ab", 1),
@@ -384,7 +390,7 @@ class PathKindTests(SitesCase):
             self.assertEqual(self.passage(a, sites.nodes["pub"]).kind, "direct")
 
     def test_since(self) -> None:
-        """The age of a path includes successive sessions; a lost path is removed."""
+        """The age of a path continues when a new session replaces the old session; a lost path is removed."""
         sites = self.sites()
         a, pub = sites.nodes["pub"], sites.at("b", "none")
         began = sites.clock.seconds()

@@ -1,4 +1,4 @@
-"""Tests of the relay: permitted pairs of peers, rates and limits; and of upgrades to direct paths."""
+"""Tests of the relay (permitted pairs of peers, rates and limits) and of upgrades to direct paths."""
 
 from __future__ import annotations
 
@@ -46,18 +46,18 @@ class RelayTests(SynchronousTestCase):
         return Session(Contact(public, Address("203.0.113.1", 1 + number)), number, number, keys, 0.0, True)
 
     def send(self, session: Session, plain: bytes) -> None:
-        """Record a sent message, which must fit into a datagram."""
+        """Record a datagram that the relay sends, and check its size."""
         self.assertLessEqual(len(session.seal(plain)), MAX_RELAYED_BYTES)
         self.sent.append((session.contact.node_id, plain))
 
     def carry(self, sender: bytes, to: bytes, inner: bytes = b"inner") -> int:
-        """Return the number of datagrams that the relay forwards for one from ``sender``."""
+        """Return the number of datagrams that the relay forwards for one datagram from ``sender``."""
         before = len(self.sent)
         self.relay.on_request(self.sessions[sender], bytes([RELAY_REQUEST]) + to + inner, Address("203.0.113.1", 1))
         return len(self.sent) - before
 
     def test_carries(self) -> None:
-        """A forwarded datagram, up to the full size, carries the id of its sender."""
+        """A forwarded datagram, up to the maximum size, contains the id of its sender."""
         self.assertEqual(self.carry(self.a, self.b, bytes(MAX_DATAGRAM_BYTES)), 1)
         self.assertEqual(self.sent, [(self.b, bytes([RELAYED_DATAGRAM]) + self.a + bytes(MAX_DATAGRAM_BYTES))])
 
@@ -74,7 +74,7 @@ class RelayTests(SynchronousTestCase):
         self.assertEqual(self.counters["uncarried"] + self.counters["malformed"], 6)
 
     def test_a_pair_has_its_share(self) -> None:
-        """A pair gets its burst at once and its rate in the long run, without an effect on other pairs."""
+        """A pair can send a burst immediately and then at a limited rate, without an effect on other pairs."""
         full = bytes(MAX_DATAGRAM_BYTES)
         self.assertEqual(sum(self.carry(self.a, self.b, full) for _ in range(200)), PAIR_BURST // MAX_DATAGRAM_BYTES)
         self.assertEqual(self.carry(self.b, self.a, full), 0)
@@ -96,7 +96,7 @@ class RelayTests(SynchronousTestCase):
         self.assertEqual(self.carry(self.a, self.b), 1)
 
     def test_pairs_are_bounded(self) -> None:
-        """At the limit of pairs a new pair is rejected until others are idle."""
+        """If the table of pairs is full, a new pair is rejected until another pair is idle."""
         many = [self.session(number) for number in range(3, 4 + MAX_PAIRS)]
         self.sessions.update({session.contact.node_id: session for session in many})
         carried = [self.carry(self.a, session.contact.node_id) for session in many]
@@ -121,7 +121,7 @@ class UpgradeTests(SynchronousTestCase):
         self.upgrades = PathUpgrades(peers)
 
     def tried(self, until: float) -> list[float]:
-        """Return the times of the attempts while the peer is heard continuously, in steps of half a second."""
+        """Return the times of upgrade attempts while the peer is heard every half second."""
         moments = []
         for step in range(int(2 * until) + 1):
             self.session.last_received_at = now = step / 2
@@ -129,9 +129,9 @@ class UpgradeTests(SynchronousTestCase):
         return moments
 
     def test_more_and_more_rarely(self) -> None:
-        """The pauses grow up to the last one; after a change of the local address they start at the first."""
+        """The pauses between attempts increase up to the last one; a change of the local address starts them again."""
         self.upgrades.add(self.public, False, 0.0)
-        self.upgrades.add(self.public, False, 0.9)  # already known
+        self.upgrades.add(self.public, False, 0.9)  # this address was already known
         moments = self.tried(150.0)
         pauses = [after - before for before, after in zip([0.0, *moments], moments, strict=False)]
         self.assertEqual(pauses, [*RETRY_INTERVALS_S, RETRY_INTERVALS_S[-1]])
@@ -147,7 +147,7 @@ class UpgradeTests(SynchronousTestCase):
         self.assertEqual(self.tried(10.0)[0], now + RETRY_INTERVALS_S[1] + TURN_DELAY_S)
 
     def test_no_longer_than_needed(self) -> None:
-        """A peer that is reached directly or silent for long is removed."""
+        """A peer that is reached directly, or that is silent for long, is removed."""
         self.upgrades.add(self.public, False, 0.0)
         self.upgrades.drop(self.public)
         self.assertEqual(len(self.upgrades), 0)

@@ -1,4 +1,7 @@
-"""Acceptors with the codec and terms of each user of Paxos (tuple takes and leases), for tests that apply to both."""
+"""Provide acceptors for tests that apply to both users of Paxos, tuple takes and leases.
+
+A use consists of the codec and the terms of such a user.
+"""
 
 from __future__ import annotations
 
@@ -21,7 +24,7 @@ TTL = 10.0
 
 @dataclass(frozen=True)
 class Use:
-    """The register key, the proposers and the values of one user."""
+    """The register key, the proposers and the values of one user of Paxos."""
 
     key: Any
     codec: Codec[Any]
@@ -30,7 +33,7 @@ class Use:
     values: tuple[Any, ...]
 
     def ballot(self, number: int, name: int) -> Ballot:
-        """Return the ballot of a proposer that never restarted."""
+        """Return the ballot of a proposer that was never restarted."""
         return Ballot(number * self.codec.lives, self.names[name])
 
 
@@ -51,7 +54,7 @@ LEASE = Use(
 
 
 class Member:
-    """An acceptor of one user, with a store that survives restarts."""
+    """An acceptor for one use, with a store that survives restarts."""
 
     def __init__(self, use: Use) -> None:
         self.use = use

@@ -1,4 +1,4 @@
-"""Tests of ``middleware.entangled.quorum.acceptor``: each row of its state table, and all reachable states."""
+"""Tests of ``middleware.entangled.quorum.acceptor`` for each row of its state table, and for all reachable states."""
 
 from __future__ import annotations
 
@@ -32,12 +32,12 @@ RECIPES: dict[BallotRelation, tuple[dict[str, Any], Any, float, int]] = {
 }
 """What a register holds, and the ballot, moment and configuration that then stand so to it."""
 GIVEN_BACK = {"promised": MID, "released": HIGH}
-"""What a release of a ballot finds that was given back before."""
+"""The fields of a register in which a later ballot than the released ballot was already released."""
 
 
 class TableTests(SynchronousTestCase):
     def test_every_row(self) -> None:
-        """Each combination of state, event and relation of the ballot gives the reply and next state of its row."""
+        """Each combination of state, event and ballot relation gives the reply and the next state in its row."""
         for (state, event, stand), (kind, after) in TABLE.items():
             if state is State.UNKNOWN:
                 continue
@@ -61,7 +61,7 @@ class TableTests(SynchronousTestCase):
             self.assertEqual((reply.kind, find_state(register)), (kind, after), (state, event, stand))
 
     def test_unknown(self) -> None:
-        """An unprepared register rejects an accept that needs a promise, and a release, and takes no space."""
+        """An unprepared register rejects a release, and an accept that needs a promise, and takes no space."""
         for use in (TAKE, LEASE):
             member = Member(use)
             ballot = use.ballot(1, 0)
@@ -73,7 +73,7 @@ class TableTests(SynchronousTestCase):
             self.assertEqual(Member(use).prepare(ballot, 0.0).kind, ReplyKind.GRANTED)
 
     def test_no_row_is_missing(self) -> None:
-        """The table has a row for each state, event and possible relation of a ballot."""
+        """The table has a row for each state, each event and each relation that the ballot can have."""
         found = {stand for _, event, stand in TABLE if event is not Event.RELEASE}
         released = {BallotRelation.FOREIGN, BallotRelation.LOWER, BallotRelation.HELD, BallotRelation.FREE}
         wanted = {(s, e, st) for s in State for e in Event for st in (released if e is Event.RELEASE else found)}
@@ -82,14 +82,14 @@ class TableTests(SynchronousTestCase):
 
 
 class ReachableTests(SynchronousTestCase):
-    """Invariants in all states that a few proposers can reach."""
+    """Tests of the invariants in all states that a few proposers can reach."""
 
     def test_take(self) -> None:
-        """For two takers with three ballots, promises and acceptances never decrease and never conflict."""
+        """With two takers and three ballots, promises and acceptances never decrease and never conflict."""
         self.assertGreater(self.explore(TAKE, tuple(self.questions(TAKE))), 300)
 
     def test_lease(self) -> None:
-        """For two holders with restarts there is one lease at a time, no lower token, and no grant after a change."""
+        """With two holders and restarts there is one lease at a time, no lower token, and no grant after a change."""
         self.assertGreater(self.explore(LEASE, tuple(self.questions(LEASE))), 2000)
 
     def questions(self, use: Use) -> Iterator[tuple[str, Any, int]]:
@@ -107,7 +107,7 @@ class ReachableTests(SynchronousTestCase):
                     yield "lease", ballot, token
 
     def explore(self, use: Use, questions: tuple[tuple[str, Any, int], ...]) -> int:
-        """Send all requests in all states reachable in five time steps; return the number of states."""
+        """Send every request in every state that is reachable in five time steps; return the number of states."""
         start = (Member(use).acceptor.log.make_register(0.0), 0)
         states, seen = [start], {self.digest(*start)}
         for register, step in states:
@@ -128,7 +128,7 @@ class ReachableTests(SynchronousTestCase):
         return len(states)
 
     def digest(self, register: Register, step: int) -> tuple[Any, ...]:
-        """Return the distinguishing features of a state; periods that have ended are equal."""
+        """Return the features by which states are distinguished; all periods that have ended count as equal."""
         now = step * 0.4 * TTL
         told = (
             register.promised,
@@ -141,7 +141,7 @@ class ReachableTests(SynchronousTestCase):
         return (*told, max(0.0, register.lease_until - now), max(0.0, register.reserved_until - now), step)
 
     def ask(self, member: Member, event: str, ballot: Any, token: int, now: float) -> Reply:
-        """Send one request; the accepted value depends on the ballot."""
+        """Send one request; a value to accept depends on the ballot."""
         match event:
             case "prepare":
                 return member.prepare(ballot, now)
@@ -164,7 +164,10 @@ class ReachableTests(SynchronousTestCase):
         now: float,
         reply: Reply,
     ) -> None:
-        """Check the invariants of one step, with the names of ``docs/explanation/quorum.md``."""
+        """Check the invariants of one step.
+
+        The labels in the comments are those of ``docs/explanation/quorum.md``.
+        """
         case = event, ballot, token, now, before
         lives = use.codec.lives
         is_held = before.lease_until > now and not ballot.is_same_life(before.holder, lives)
@@ -216,7 +219,7 @@ class NumberTests(SynchronousTestCase):
         self.assertEqual(member.prepare(MID._replace(counter=MID.counter + 1), 1.0).kind, ReplyKind.HELD)
 
     def test_restart(self) -> None:
-        """A restarted acceptor keeps its promises, leases and accepted values (D1, R2)."""
+        """A restarted acceptor keeps its promises, leases and accepted values (invariants D1 and R2)."""
         for use in (TAKE, LEASE):
             member, first, second = Member(use), use.ballot(1, 0), use.ballot(2, 1)
             member.prepare(second, 0.0)

@@ -1,4 +1,4 @@
-"""Tests of ``middleware.entangled.quorum.acceptor_log``, with the codecs of both users."""
+"""Tests of ``middleware.entangled.quorum.acceptor_log`` with the codecs of tuple takes and leases."""
 
 from __future__ import annotations
 
@@ -37,11 +37,11 @@ class LogTests(SynchronousTestCase):
         self.log = self.opened()
 
     def opened(self, now: float = 0.0) -> RegisterLog[str]:
-        """Open the log of a new process on the same store."""
+        """Open the log on the same store, as a new process does."""
         return RegisterLog(self.store, CODEC, may_evict, now)
 
     def test_first_life_may_lack_something(self) -> None:
-        """A log without stored votes may have lost them and is not whole; a log that finds them is whole."""
+        """If a log finds no stored votes, votes may be lost and the log is not whole; otherwise it is whole."""
         self.assertFalse(self.log.is_complete)
         self.assertTrue(self.opened().is_complete)
 
@@ -60,13 +60,13 @@ class LogTests(SynchronousTestCase):
         self.assertEqual(back and back.lease_until, 0.0)
 
     def test_longest_ttl_is_remembered(self) -> None:
-        """The longest TTL ever granted survives a restart, as a forgotten lease may last that long."""
+        """The longest TTL ever granted survives a restart, because a lost lease may last that long."""
         granted(self.log, "t", 1, 0.0, ttl=9.0)
         granted(self.log, "u", 1, 0.0, ttl=2.0)
         self.assertEqual(self.opened().floor.longest, 9.0)
 
     def test_rotten_notes(self) -> None:
-        """If a stored vote is unreadable, the log uses the others and is not whole."""
+        """If a stored vote is unreadable, the log uses the other votes and is not whole."""
         granted(self.log, "t", 7, 0.0)
         for corrupt in (b"\xc1", msgpack.packb([1]), msgpack.packb({"t": [1]}), msgpack.packb({"t": 5})):
             for name in filter(self.store.get_note, CODEC.names):
@@ -102,7 +102,7 @@ class LogTests(SynchronousTestCase):
     @settings(max_examples=200)
     @given(ANYTHING)
     def test_rows_are_total(self, row: object) -> None:
-        """Decoding any row returns a register or None, without an exception."""
+        """Any row is decoded as a register or as None, without an exception."""
         self.assertIsNone(parse_row(row))
         parse_row([1, row, 1, 1.0, row, False])
         parse_row([row, [0, ""] * 4, row, row, [], row])

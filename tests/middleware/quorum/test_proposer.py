@@ -1,4 +1,4 @@
-"""Tests of ``middleware.entangled.quorum.proposer``: the outcome of a round, and the decision under any schedule."""
+"""Tests of ``middleware.entangled.quorum.proposer``: the outcome of a round, and decisions under any schedule."""
 
 from __future__ import annotations
 
@@ -24,7 +24,10 @@ def reply(kind: ReplyKind, counter: int = 9, accepted: Ballot = NO_BALLOT, value
 
 class ConcludeTests(SynchronousTestCase):
     def test_conclude(self) -> None:
-        """The replies make a round won, decided, held, outbid or silent; the highest accepted value is completed."""
+        """The replies determine whether a round is won, decided, held, outbid or silent.
+
+        A value that was accepted under the highest ballot is completed.
+        """
         yes, held = reply(ReplyKind.GRANTED), Reply(ReplyKind.HELD, Ballot(4, b""), remaining=2.5)
         old, new = reply(ReplyKind.GRANTED, 9, LOW, b"old"), reply(ReplyKind.GRANTED, 9, MID, b"new")
         outbid = reply(ReplyKind.OUTBID, 9, LOW, b"x")
@@ -35,7 +38,7 @@ class ConcludeTests(SynchronousTestCase):
             ([yes, old], Outcome(Result.WON, b"old", 9)),
             ([outbid, outbid], Outcome(Result.DECIDED, b"x", 9)),
             ([old, old], Outcome(Result.DECIDED, b"old", 9)),
-            # Two acceptors accepted the same value under two ballots, which is no decision.
+            # Two acceptors accepted the same value under two different ballots, which is not a decision.
             ([outbid, reply(ReplyKind.OUTBID, 9, MID, b"x")], Outcome(Result.OUTBID, None, 9)),
             ([held], None),
             ([held, None], Outcome(Result.HELD, None, 4, 2.5)),
@@ -52,7 +55,7 @@ class ConcludeTests(SynchronousTestCase):
 
 class DecideTests(SynchronousTestCase):
     def decide(self, seed: int, use: Use) -> set[Any]:
-        """Return the values that three proposers learn for one register under lost requests and restarts."""
+        """Return the values that three proposers learn for one register, with lost requests and restarts."""
         rng, now = random.Random(seed), 0.0
         members = [Member(use) for _ in range(3)]
         waiting: list[Deferred[None]] = []
@@ -96,7 +99,7 @@ class DecideTests(SynchronousTestCase):
                 self.assertEqual(len(self.decide(seed, use)), 1, (use.key, seed))
 
     def test_nothing_to_propose(self) -> None:
-        """A proposer without a value proposes none, and completes an accepted value of another proposer."""
+        """A proposer without a value proposes nothing, but completes an accepted value of another proposer."""
         for use in (TAKE, LEASE):
             member = Member(use)
 

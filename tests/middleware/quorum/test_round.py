@@ -18,7 +18,7 @@ YES, NO = Reply(ReplyKind.GRANTED), Reply(ReplyKind.HELD, remaining=1.0)
 
 
 def decoded(place: int, answer: object) -> list[Reply] | None:
-    """Decode a reply like the proposer of a lease."""
+    """Decode a reply as the proposer of a lease does."""
     reply = parse_reply(answer)
     return None if reply is None else [reply]
 
@@ -39,7 +39,7 @@ class RoundTests(SynchronousTestCase):
         self.asked[number][2].callback(pack_reply(reply))
 
     def test_decided_by_a_majority(self) -> None:
-        """The second grant or second rejection of three decides the round; a round without members is lost."""
+        """The second grant or second rejection of three members decides the round; a round without members is lost."""
         for reply, is_won in ((YES, True), (NO, False)):
             asked = self.round()
             self.answer(-3, reply)
@@ -50,7 +50,7 @@ class RoundTests(SynchronousTestCase):
         self.assertFalse(self.successResultOf(self.round(0).outcome).tally.is_won)
 
     def test_members_about_to_be_free_are_asked_again(self) -> None:
-        """A member with a lease that ends within 100 ms is queried again at its end; others count as rejections."""
+        """A member whose lease ends within 100 ms gets the request again at the end; later ends count as rejections."""
         asked = self.round()
         self.answer(0, Reply(ReplyKind.HELD, remaining=0.03))
         self.answer(1, NO)
@@ -62,7 +62,7 @@ class RoundTests(SynchronousTestCase):
         self.assertTrue(self.successResultOf(asked.outcome).tally.is_won)
 
     def test_news_that_a_member_has_not_heard(self) -> None:
-        """After a release, members that still report a lease are queried again soon, except if ``short`` is 0."""
+        """After a release, members that still report a lease soon get the request again, except if ``short`` is 0."""
         asked = self.round(short=math.inf)
         self.answer(0, NO)
         self.answer(1, NO)
@@ -79,7 +79,10 @@ class RoundTests(SynchronousTestCase):
         self.assertFalse(self.successResultOf(looked.outcome).tally.is_won)
 
     def test_who_is_silent(self) -> None:
-        """A member with any reply counts as present; a member without one counts as silent after three requests."""
+        """A member with any reply counts as present.
+
+        A member that has not replied to three requests counts as silent.
+        """
         asked = self.round()
         self.answer(1, NO)
         self.assertEqual((asked.answered_places, asked.silent_places), ([1], []))
@@ -89,7 +92,7 @@ class RoundTests(SynchronousTestCase):
         self.assertEqual((asked.answered_places, asked.silent_places), ([1, 0], [2]))
 
     def test_silent_members_are_asked_again(self) -> None:
-        """A silent member is queried every 100 ms until the decision, and at least three times; others once."""
+        """A silent member gets the request every 100 ms until the decision, and at least three times."""
         self.round()
         self.answer(1, YES)
         self.answer(2, YES)
@@ -120,7 +123,7 @@ class RoundTests(SynchronousTestCase):
         self.assertFalse(self.successResultOf(asked.outcome).tally.is_won)
 
     def test_sent_at_counts_the_latest_majority(self) -> None:
-        """The grants count from the earliest request of the latest majority."""
+        """The grants count from the time of the earliest request in the latest majority."""
         asked = self.round()
         self.answer(0, YES)
         self.clock.advance(0.25)
@@ -155,12 +158,12 @@ class RoundTests(SynchronousTestCase):
             self.assertEqual(self.successResultOf(asked.outcome).tally.is_won, is_won)
 
     def test_free_in(self) -> None:
-        """``free_in`` is the time until the second shortest lease ends, by the members' clocks."""
+        """``free_in`` is the time until the second of the members' leases ends, by the members' clocks."""
         asked = self.round()
         self.clock.advance(0.04)
         self.answer(0, Reply(ReplyKind.HELD, remaining=0.2))
         self.answer(1, Reply(ReplyKind.HELD, remaining=0.9))
-        # The third member did not reply, so the second is needed; its lease counts from the middle of 0.00 and 0.04.
+        # The third member did not reply, so the second is needed. Its lease counts from the middle of 0.00 and 0.04.
         self.assertAlmostEqual(asked.estimate_wait(), 0.88)
         unheard = self.round()
         self.clock.advance(0.6)

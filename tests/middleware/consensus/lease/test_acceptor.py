@@ -35,7 +35,7 @@ class AcceptorTests(SynchronousTestCase):
         return self.acceptor.lease("t", configuration, ballot(number, agent), token, TTL, now)
 
     def test_promise_for_the_time_after_a_lease(self) -> None:
-        """Near the end of a lease a proposer gets a promise for the time after it, but no earlier grant."""
+        """Near the end of a lease another proposer gets a promise for the time after it, but no earlier grant."""
         self.prepare(1, "a", 0.0)
         self.propose(1, "a", 1, 0.0)
         self.assertEqual(self.prepare(2, "b", 1.5).kind, ReplyKind.HELD)
@@ -59,7 +59,7 @@ class AcceptorTests(SynchronousTestCase):
         self.assertEqual(self.prepare(3, "b", 4.3).kind, ReplyKind.GRANTED)
 
     def test_former_life_is_another(self) -> None:
-        """A restarted agent must wait for the end of its earlier lease, because its robot may still move."""
+        """A restarted agent must wait for the end of its previous lease, because its robot may still move."""
         self.prepare(1, "a", 0.0)
         self.propose(1, "a", 1, 0.0)
         self.assertEqual(
@@ -67,7 +67,10 @@ class AcceptorTests(SynchronousTestCase):
         )
 
     def test_release(self) -> None:
-        """A released lease is free at once, waiting proposers are notified, and a late proposal does not restore it."""
+        """After a release the lease is free immediately and waiting proposers are notified.
+
+        A late proposal does not restore the lease.
+        """
         self.prepare(1, "a", 0.0)
         self.propose(1, "a", 1, 0.0)
         self.prepare(2, "b", 0.5)
@@ -78,7 +81,7 @@ class AcceptorTests(SynchronousTestCase):
         self.assertEqual(self.prepare(2, "b", 1.0).kind, ReplyKind.GRANTED)
 
     def test_release_before_the_robot_rests(self) -> None:
-        """A release while the robot still moves gives a promise at once, and a grant when the robot stands still."""
+        """If the robot still moves at a release, others get a promise immediately, and a grant when it stands still."""
         self.prepare(1, "a", 0.0)
         self.propose(1, "a", 1, 0.0)
         self.prepare(2, "b", 0.5)

@@ -36,7 +36,10 @@ class CharterTests(LeaseCase):
         self.assertEqual((charter.configuration, charter.token, charter.ballot), (3, 7, Ballot(2, "agent")))
 
     def test_anything_changed(self) -> None:
-        """A charter with a changed task, member, order, ballot, token or signer, or too few signers, is not genuine."""
+        """A charter is not genuine if any part of it was changed, or if it has too few signers.
+
+        The parts are the task, the members, their order, the ballot, the token and the signers.
+        """
         charter = self.chartered([3, 4, 6], [0, 4, 6])
         first, second = charter.changes
         forged = self.room.identities[6]
@@ -81,7 +84,7 @@ class CharterTests(LeaseCase):
         self.assertEqual(replace(charter, changes=(change,)).token, MAX_TOKEN)
 
     def test_ending(self) -> None:
-        """A majority of the current council proves the agent that ended the task, and its token."""
+        """The signatures of a majority of the current council prove which agent ended the task, and its token."""
         pinned = self.room.charters[T]
         for charter, positions in ((pinned, [3, 4, 5]), (self.chartered([0, 4, 6]), [0, 4, 6])):
             votes = [

@@ -21,7 +21,7 @@ class LeaseProposerTests(LeaseCase):
         return [self.room.get_place(member) for member in self.client(place).proposer.members]
 
     def test_change(self) -> None:
-        """A change installs the new council with configuration + 1, which grants the next lease with a higher token."""
+        """A change installs the new council with the next configuration number; its next lease has a higher token."""
         self.wanting(0)
         self.client(0).release()
         self.run_for(0.1)
@@ -53,7 +53,7 @@ class LeaseProposerTests(LeaseCase):
         self.assertEqual(self.holders(), [1])
 
     def test_moved_by_the_holder(self) -> None:
-        """A holder that moves its council reacquires the lease there under a higher token, with no holder between."""
+        """A holder that changes its council gets the next lease there, with a higher token."""
         for stop_time in (0.0, 0.3):
             self.room = self.made(stop_time)
             self.wanting(0)

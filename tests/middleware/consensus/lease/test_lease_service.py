@@ -152,7 +152,7 @@ class InTimeTests(SynchronousTestCase):
         self.assertEqual(self.successResultOf(answer).kind, ReplyKind.GRANTED)
 
     def test_a_lease_that_is_renewed(self) -> None:
-        """If the lease is renewed meanwhile, the waiting proposal is refused at the time of its expected end."""
+        """If the holder renews its lease, a waiting proposal is rejected when the lease would have ended."""
         self.clock.advance(0.95)
         answer = propose_when_free(self.proposed, self.clock)
         self.until = 2.0

@@ -20,7 +20,10 @@ from tests.middleware.consensus.lease.room import TTL, LeaseCase, T
 
 class PinnedTests(FleetCase):
     def test_rule_1_council_is_pinned(self) -> None:
-        """The council is the three nodes closest to the task's key at its creation, even if closer nodes join later."""
+        """The council of a task is the three nodes closest to its key at its creation.
+
+        It stays the same if closer nodes join later.
+        """
         fleet = self.swarm(4)
         task = self.done(fleet, Deferred.fromCoroutine(fleet.nodes[0].submit(Task("t1", "search", "Find it"))), 1.0)
         key = group_key("t1")
@@ -38,7 +41,10 @@ class PinnedTests(FleetCase):
 
 class RuleTests(LeaseCase):
     def test_rule_2_council_changes_by_a_majority_of_the_old_one(self) -> None:
-        """The old council decides a change by a majority, with configuration + 1, and never during an open claim."""
+        """A majority of the old council decides a change, never during an open claim.
+
+        The new council has the next configuration number.
+        """
         council = self.client(1).proposer
         following = [self.room.contacts[n] for n in (0, 1, 2)]
         self.wanting(0)
