@@ -49,10 +49,10 @@ from tests.middleware.test_endpoint import DELAY, TEAM, EndpointCase, Tap
 
 
 class LogCase(SynchronousTestCase):
-    """A test case that reads the log."""
+    """A test case that collects log messages."""
 
     def listened(self) -> list[str]:
-        """Return the list that receives all later warnings of the log."""
+        """Return a list that will contain all later warnings of the log."""
         lines: list[str] = []
 
         @implementer(ILogObserver)
@@ -94,7 +94,7 @@ class ClosedCase(EndpointCase, LogCase):
 
 
 class PassTests(ClosedCase):
-    """The pass in a handshake, and its check."""
+    """Tests of the credential in a handshake, and of its check."""
 
     def test_first_answer_still_takes_one_round_trip(self) -> None:
         """With passes of maximum size the first request fits into the INIT; the reply has the INIT's source."""
@@ -108,7 +108,7 @@ class PassTests(ClosedCase):
         self.assertEqual(seen, [(self.to_b, self.to_a.address)])
 
     def test_refused_by_the_responder(self) -> None:
-        """A node without a valid pass gets the reason, its request does not run, and no session is left."""
+        """A node without a valid credential gets the reason; its request does not run, and no session is left."""
         self.at_b.refused[self.to_a.public] = EXPIRED
         self.b.expose("look", lambda peer: self.runs.append(peer), early=True)
         text = self.refused(self.a.ask(self.to_b, "look"), EXPIRED, 2 * DELAY)
@@ -116,7 +116,7 @@ class PassTests(ClosedCase):
         self.assertEqual((self.runs, self.a._sessions, self.b._sessions), ([], {}, {}))
 
     def test_refused_by_the_initiator(self) -> None:
-        """The initiator sends its rejection in the first DATA; neither side counts the other as met."""
+        """The initiator sends its rejection in the first DATA; neither side reports the other as a contact."""
         self.at_a.refused[self.to_b.public] = REVOKED
         met: list[Contact] = []
         refusals: list[tuple[Contact, str]] = []
@@ -129,7 +129,7 @@ class PassTests(ClosedCase):
         self.assertEqual(len(self.kept(self.to_b, DATA)), 1)
 
     def test_said_once(self) -> None:
-        """Each side logs each rejection once, with a remedy; a node with a new pass is admitted."""
+        """Each side logs each rejection once, with a remedy; a node with a new credential is admitted."""
         for count, code in enumerate((REVOKED, EXPIRED), start=1):
             self.at_b.refused[self.to_a.public] = code
             for _ in range(5):
@@ -140,7 +140,7 @@ class PassTests(ClosedCase):
         self.assertEqual(self.got(self.a.ask(self.to_b, "echo", 2)), 2)
 
     def test_foreign_passes(self) -> None:
-        """A missing pass and an oversized one are rejected as foreign, the oversized one without a check."""
+        """A missing and an oversized credential are rejected as foreign, the oversized credential without a check."""
         self.at_a.own_pass += b"!"
         self.refused(self.a.ask(self.to_b, "echo", 1), FOREIGN)
         self.assertEqual(self.at_b.judged, [])
@@ -148,7 +148,7 @@ class PassTests(ClosedCase):
         self.refused(stranger.ask(self.to_b, "echo", 1), FOREIGN)
 
     def test_a_repeated_init_is_refused_without_a_key_exchange(self) -> None:
-        """A repeated INIT gets the same rejection again without another check."""
+        """A repeated INIT gets the same rejection again, without a new check."""
         self.at_b.refused[self.to_a.public] = REVOKED
         self.refused(self.a.ask(self.to_b, "echo", 1), REVOKED)
         (init, source), judged = self.kept(self.to_b, INIT)[0], len(self.at_b.judged)
@@ -159,7 +159,7 @@ class PassTests(ClosedCase):
         self.assertEqual(first, second)
 
     def test_a_forged_init_reaches_no_door(self) -> None:
-        """An INIT with a wrong team secret, or without room for a pass, is dropped before the check."""
+        """An INIT with a wrong team secret, or without space for a credential, is dropped before the check."""
         for secret, hello in (
             (b"x" * 32, HandshakeFields(self.at_a.incarnation, self.at_a.own_pass, ROOM)),
             (TEAM, HandshakeFields()),
@@ -184,10 +184,10 @@ class PassTests(ClosedCase):
 
 
 class EvictionTests(ClosedCase):
-    """Members that were evicted."""
+    """Tests of members that were evicted."""
 
     def test_evicted_at_runtime(self) -> None:
-        """An evicted node gets the reason, its running requests are cancelled, and later ones are rejected."""
+        """An evicted node gets the reason, its running requests are cancelled, and its later requests are rejected."""
         never: Deferred[None] = Deferred()
         stopped: list[object] = []
         self.b.expose("wait", lambda peer: Deferred(lambda _: stopped.append(1)), changes=True)
@@ -206,7 +206,7 @@ class EvictionTests(ClosedCase):
         self.assertEqual(len(self.log), 2)
 
     def test_evicted_in_the_middle_of_a_parcel(self) -> None:
-        """An eviction ends a large request in transfer, and both sides release its fragments."""
+        """An eviction ends the transfer of a large request, and both sides free its fragments."""
         asked = self.a.ask(self.to_b, "echo", bytes(500_000))
         self.clock.advance(6 * DELAY)
         self.b.evict(self.to_a.public)
@@ -227,7 +227,7 @@ class EvictionTests(ClosedCase):
 
 
 class IncarnationTests(ClosedCase):
-    """Two nodes with one identity."""
+    """Tests with two nodes that have one identity."""
 
     def life(self, number: int, nonce: int) -> tuple[Endpoint, Contact]:
         """Create another node with the identity of ``a``."""
@@ -236,7 +236,10 @@ class IncarnationTests(ClosedCase):
         return end, contact
 
     def test_the_older_one_is_told(self) -> None:
-        """A later incarnation is admitted; the earlier one is rejected as superseded, in its session and later."""
+        """A later incarnation is admitted.
+
+        The earlier incarnation is rejected as superseded, in its session and later.
+        """
         self.got(self.a.ask(self.to_b, "echo", 1))
         later, _ = self.life(2, 2)
         self.got(later.ask(self.to_b, "echo", 2))
@@ -257,7 +260,7 @@ class IncarnationTests(ClosedCase):
         self.assertEqual(self.got(self.a.ask(self.to_b, "echo", 3)), 3)
 
     def test_a_copy_that_answers(self) -> None:
-        """A request that reaches a copy is rejected; the session with the first node stays open."""
+        """A request that reaches a copy of the node is rejected; the session with the first node stays open."""
         self.equip(self.a)
         self.got(self.a.ask(self.to_b, "echo", 1))
         copy, to_copy = self.life(1, 2)
@@ -292,7 +295,10 @@ class IncarnationTests(ClosedCase):
         self.assertEqual(self.got(later.ask(self.to_b, "echo", 4)), 4)
 
     def test_lives(self) -> None:
-        """The latest incarnation is valid, the previous one superseded, others doubled; number 0 is always valid."""
+        """The latest incarnation is valid, the previous one superseded, and others doubled.
+
+        Number 0 is always valid.
+        """
         incarnations, one, two = Incarnations(), Incarnation(1, b"1" * 8), Incarnation(2, b"2" * 8)
         self.assertFalse(incarnations.record(b"a", one))
         self.assertEqual(incarnations.find_refusal(b"a", two), "")
@@ -319,13 +325,13 @@ class IncarnationTests(ClosedCase):
         self.assertTrue(noted.should_log(0.0, b"\x00", EXPIRED))
 
     def test_the_log_is_no_target(self) -> None:
-        """Rejections of invented keys are logged at a limited rate; skipped ones are logged later."""
+        """Rejections of invented keys are logged at a limited rate; those that were skipped are logged later."""
         noted = LogLimiter()
         self.assertEqual(sum(noted.should_log(0.0, number, FOREIGN) for number in range(1000)), LOG_BURST)
         self.assertEqual(sum(noted.should_log(3.0, number, FOREIGN) for number in range(1000)), 3)
 
     def test_next_life(self) -> None:
-        """An incarnation number exceeds the last one and is at least the Unix time of the start."""
+        """An incarnation number is higher than the last number and at least the Unix time of the start."""
         self.assertEqual([next_incarnation(0, 0.0), next_incarnation(7, 5.0), next_incarnation(7, 1e9)], [1, 8, 10**9])
 
 
@@ -335,7 +341,7 @@ class SecretTests(ClosedCase):
     NEW, NEWER = b"n" * 32, b"N" * 32
 
     def test_both_are_good_for_a_while(self) -> None:
-        """While the old secret is valid, nodes with the old and the new secret reach each other."""
+        """As long as the old secret is valid, nodes with the old and nodes with the new secret reach each other."""
         self.assertRaises(ValueError, self.b.replace_secrets, b"short")
         self.b.replace_secrets(self.NEW, TEAM)
         self.assertEqual(self.got(self.a.ask(self.to_b, "echo", 1), 4 * DELAY), 1)
@@ -348,7 +354,7 @@ class SecretTests(ClosedCase):
         self.assertEqual(self.got(new.ask(self.to_b, "echo", 4), 4 * DELAY), 4)
 
     def test_cookies_under_each_secret(self) -> None:
-        """Under load a member can read its cookie with only the old or only the new secret."""
+        """Under load a member can decrypt its cookie if it has only the old or only the new secret."""
         self.b.replace_secrets(self.NEW, TEAM)
         new, _ = self.endpoint(8, team=self.NEW)
         for requester in (self.a, new):
@@ -356,7 +362,7 @@ class SecretTests(ClosedCase):
             self.assertEqual(self.got(requester.ask(self.to_b, "echo", 1), 4 * DELAY), 1)
 
     def test_nobody_is_remembered_by_an_old_one(self) -> None:
-        """A peer is contacted under the secret of its last handshake, and under the new one when only that is valid."""
+        """A peer is contacted under the secret of its last handshake, until only the new secret is valid."""
         self.equip(self.a)
         self.b.replace_secrets(self.NEW, TEAM)
         self.assertEqual(self.got(self.b.discover(self.to_a.address), 1.0), self.to_a)
@@ -368,7 +374,7 @@ class SecretTests(ClosedCase):
 
 
 class RoleTests(ClosedCase):
-    """Methods that a role forbids."""
+    """Tests of methods that a role forbids."""
 
     def test_a_method_that_is_not_for_it(self) -> None:
         """A call that the caller's role forbids is rejected in every form, does not run, and is logged once."""
@@ -389,10 +395,10 @@ class RoleTests(ClosedCase):
 
 
 class RouteTests(EndpointCase):
-    """Datagrams of other kinds."""
+    """Tests of datagrams of other kinds."""
 
     def test_a_kind_has_one_receiver(self) -> None:
-        """Datagrams of a routed kind go to their receiver; a kind in use cannot be routed."""
+        """Datagrams of a routed kind go to their receiver; a kind that is already in use cannot be routed."""
         got: list[tuple[bytes, Address]] = []
         self.b.route(0x17, lambda datagram, source: got.append((datagram, source)))
         self.a.send_datagram(b"\x17 knock", self.to_b.address)
@@ -415,7 +421,7 @@ class AddressTests(SynchronousTestCase):
         self.assertEqual(parse_address(pack_address(Address("fe80::1%eth0", 7))), Address("fe80::1", 7))
 
     def test_what_is_no_address(self) -> None:
-        """Host names and invalid input are encoded as no address, and truncated bytes decode to None."""
+        """Host names and invalid input are encoded as an empty address, and truncated bytes are decoded as None."""
         for host, port in (
             ("robot.local", 1),
             ("~0102", 1),
@@ -430,7 +436,7 @@ class AddressTests(SynchronousTestCase):
 
 
 class GatedFleet(EntangledTeam):
-    """A simulated closed team; ``gates`` are its admission checks by node number."""
+    """A simulated closed team; ``gates`` contains the admission checks by node number."""
 
     def __init__(self, n: int) -> None:
         self.gates: dict[int, Gate] = {}
@@ -454,7 +460,7 @@ KEY = hash_key("somewhere")
 
 
 class MemberTests(FleetCase, LogCase):
-    """Nodes with an admission check."""
+    """Tests of whole nodes with an admission check."""
 
     def gated(self, n: int) -> GatedFleet:
         """Return a team that is stopped after the test."""
@@ -463,17 +469,17 @@ class MemberTests(FleetCase, LogCase):
         return fleet
 
     def test_the_last_one_left_does_not_look_for_it(self) -> None:
-        """A node that evicted the only other member does not try to reach it."""
+        """A node that evicted the only other member does not try to reach this member."""
         fleet = self.gated(2)
         fleet.evict(1, by=(0,))
         fleet.kill(1)
-        fleet.run(3.0)  # until pending traffic has ended
+        fleet.run(3.0)  # until the pending traffic has ended
         sent = fleet.switchboard.counters["sent"]
         fleet.run(30.0)
         self.assertEqual(fleet.switchboard.counters["sent"], sent)
 
     def test_a_copy_of_a_member(self) -> None:
-        """A copy that is rejected, or that replaces the first node, does not remove the member at others."""
+        """If a copy of a member is rejected, or replaces the first node, other nodes do not remove the member."""
         for number, is_in in ((0, False), (99, True)):
             fleet = self.gated(3)
             public, life = fleet.identity(2).public, fleet.gates[2].incarnation
@@ -492,7 +498,7 @@ class MemberTests(FleetCase, LogCase):
             self.assertEqual(bool(copy._sessions), is_in)
 
     def test_a_slot_that_is_not_for_it(self) -> None:
-        """A write that the node's role forbids is rejected at once, and nothing is sent."""
+        """A write that the node's role forbids is rejected immediately, and nothing is sent."""
         fleet = self.gated(2)
         fleet.gates[1].unwritable.add((fleet.identity(1).public, "order"))
         sent = fleet.switchboard.counters["sent"]
@@ -500,7 +506,7 @@ class MemberTests(FleetCase, LogCase):
         self.assertEqual((error.code, fleet.switchboard.counters["sent"]), (ROLE, sent))
 
     def test_the_evicted_one_is_no_majority_by_itself(self) -> None:
-        """A node that all members reject counts them as absent, and has no majority alone."""
+        """If all members reject a node, it considers them absent, and has no majority by itself."""
         fleet = self.gated(4)
         fleet.evict(3, by=(0, 1, 2))
         fleet.run(5.0)
@@ -510,7 +516,7 @@ class MemberTests(FleetCase, LogCase):
         self.failureResultOf(stored, NoAnswer)
 
     def test_a_recording_parts_nobody(self) -> None:
-        """A recorded INIT with an expired pass is rejected; its sender keeps its membership and leases."""
+        """A recorded INIT with an expired credential is rejected; its sender keeps its membership and leases."""
         fleet = self.gated(3)
         init = [d for d, to in self.recorded(fleet, 2) if d[0] == INIT][0]
         self.done(fleet, fleet.nodes[2].put(KEY, "here", b"2", "leased"))
@@ -556,7 +562,10 @@ class RejectionTests(SynchronousTestCase):
         self.rejections.record(who, "10.0.0.1:7000", "we", code, "why; what to do", now)
 
     def test_count_what_happens_again(self) -> None:
-        """Equal rejections of one key are merged, with the first and last time; another code is a separate entry."""
+        """Equal rejections of one key are one entry with the first and last time.
+
+        A different code has a separate entry.
+        """
         for now in (1.0, 2.0, 5.0):
             self.met(b"a", now)
         self.met(b"a", 6.0, "expired")
@@ -564,14 +573,14 @@ class RejectionTests(SynchronousTestCase):
         self.assertEqual(found, [("expired", 6.0, 6.0, 1), ("revoked", 1.0, 5.0, 3)])
 
     def test_forget_after_an_hour(self) -> None:
-        """A rejection older than an hour is not returned, and a later one starts at one again."""
+        """A rejection older than an hour is not returned; if it occurs again, its count starts at one."""
         self.met(b"a", 0.0)
         self.assertEqual(self.rejections.list_recent(HOUR_S + 1.0), [])
         self.met(b"a", HOUR_S + 1.0)
         self.assertEqual([each.count for each in self.rejections.list_recent(HOUR_S + 1.0)], [1])
 
     def test_invented_keys_take_no_room(self) -> None:
-        """Only the latest rejections are stored, for any number of invented keys."""
+        """Only the latest rejections are stored, whatever the number of invented keys."""
         for number in range(10 * MAX_REJECTIONS):
             self.met(number.to_bytes(32), float(number))
         self.assertEqual((len(self.rejections), self.rejections.list_recent(700.0)[0].last_at), (MAX_REJECTIONS, 639.0))

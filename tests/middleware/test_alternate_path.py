@@ -41,7 +41,7 @@ class Site:
 
 
 class TunnelWorld(Simulation):
-    """A bootstrap node that serves tunnels, and other nodes."""
+    """A bootstrap node that accepts tunnels, and other nodes."""
 
     def __init__(self) -> None:
         super().__init__(1)
@@ -49,15 +49,15 @@ class TunnelWorld(Simulation):
         self.sites: list[Site] = []
 
     def address(self, place: int) -> Address:
-        """Return the address of this node; each node is in a separate network."""
+        """Return the address of a node; each node is in a separate network."""
         return Address(f"198.18.{place}.1", 7000)
 
     def url(self, place: int = BOOTSTRAP) -> Url:
-        """Return the tunnel URL of this node."""
+        """Return the tunnel URL of a node."""
         return Url("wss", f"10.2.0.{place}", 443)
 
     def add(self, place: int, is_blocked: bool = False, is_served: bool = False) -> tuple[Site, Deferred[None]]:
-        """Create a node that joins through the bootstrap node, by UDP or tunnel."""
+        """Create a node that joins through the bootstrap node, by UDP or by tunnel."""
         site = Site(self, place, [] if is_served else [self.url()], is_served)
         site.block(is_blocked)
         known = [] if is_served else [self.address(BOOTSTRAP)]
@@ -85,14 +85,14 @@ class AlternatePathsTests(SynchronousTestCase):
         self.assertEqual(self.world.clock.getDelayedCalls(), [])
 
     def call(self, requester: Site, asked: Site) -> object:
-        """Return the reply of ``asked`` to a call from ``requester``, which knows it by any address."""
+        """Return the answer of ``asked`` to a call from ``requester``, at an address that ``requester`` knows."""
         (contact,) = (c for c in requester.node.overlay.contacts() if c.public == asked.node.identity.public)
         answer = requester.node.call(contact, "who")
         self.world.run(2.0)
         return self.successResultOf(answer)
 
     def test_enter_by_tunnel(self) -> None:
-        """A node with blocked UDP joins within 2.5 s and exchanges large messages; other nodes dial no tunnel."""
+        """A node with blocked UDP joins within 2.5 s and exchanges large messages; other nodes open no tunnel."""
         _, joined = self.world.add(2)
         self.world.run(0.2)
         self.successResultOf(joined)
@@ -129,7 +129,7 @@ class AlternatePathsTests(SynchronousTestCase):
             self.assertEqual(Contact(public, Address(host, 1)).pack(), [public, *relayed_address(told.node_id)])
 
     def test_everybody_reaches_everybody(self) -> None:
-        """Two blocked members and two others all reach each other 4 s after the last one started to join."""
+        """Two blocked members and two others all reach each other 4 s after the last of them started to join."""
         sites = [self.bootstrap]
         for place, is_blocked in ((1, True), (2, False), (3, True), (4, False)):
             sites.append(self.world.add(place, is_blocked)[0])
@@ -141,11 +141,11 @@ class AlternatePathsTests(SynchronousTestCase):
                     self.assertEqual(self.call(requester, asked), self.sites_place(asked))
 
     def sites_place(self, site: Site) -> int:
-        """Return the number of a site."""
+        """Return the index of a site."""
         return [self.world.identity(place).public for place in range(5)].index(site.node.identity.public)
 
     def test_leave_the_tunnel(self) -> None:
-        """When UDP works again, the session moves to it within 16 s, and the tunnel closes a minute later."""
+        """When UDP works again, the session uses UDP within 16 s, and the tunnel is closed a minute later."""
         site, _ = self.world.add(1, is_blocked=True)
         self.world.run(10.0)
         site.block(False)
@@ -160,7 +160,7 @@ class AlternatePathsTests(SynchronousTestCase):
         self.assertEqual(self.call(self.bootstrap, site), 1)
 
     def test_fall_back_when_contact_is_lost(self) -> None:
-        """A member with UDP blocked later returns through a tunnel after it lost all contacts."""
+        """If UDP is blocked after a member joined, the member loses all contacts and then returns through a tunnel."""
         site, _ = self.world.add(1)
         self.world.run(5.0)
         site.block()
@@ -170,7 +170,7 @@ class AlternatePathsTests(SynchronousTestCase):
         self.assertEqual(self.call(self.bootstrap, site), 1)
 
     def test_bootstrap_restarts(self) -> None:
-        """A restarted bootstrap node does not wait for tunnelled members; they and new nodes join within 15 s."""
+        """A restarted bootstrap node does not wait for tunnelled members; these and new nodes join within 15 s."""
         site, _ = self.world.add(1, is_blocked=True)
         self.world.run(40.0)
         self.bootstrap.node.stop_silently()
@@ -186,7 +186,7 @@ class AlternatePathsTests(SynchronousTestCase):
             self.assertEqual(self.call(each, self.bootstrap), BOOTSTRAP)
 
     def test_tunnel_alone(self) -> None:
-        """A node that knows only a tunnel joins through it at once and never starts a team of one."""
+        """A node that knows only a tunnel joins through it immediately, and never starts a team of its own."""
         site = Site(self.world, 3, [self.world.url()])
         site.block()
         self.world.sites.append(site)

@@ -29,7 +29,7 @@ class BackgroundTests(SynchronousTestCase):
         self.assertEqual(self.runs, ["a"])
 
     def test_every_survives_an_accident(self) -> None:
-        """A periodic call that raises an error runs again at the next interval."""
+        """A periodic call that raises an error is called again at the next interval."""
 
         def work() -> None:
             self.runs.append(1)
@@ -42,7 +42,10 @@ class BackgroundTests(SynchronousTestCase):
         self.assertEqual(len(self.runs), 3)
 
     def test_stop_leaves_nothing(self) -> None:
-        """``sleep`` ends on time; after ``stop`` no timer is left, no new call is scheduled and no sleep ends."""
+        """``sleep`` ends on time.
+
+        After ``stop`` no timer is left, no new call is scheduled and a pending ``sleep`` never ends.
+        """
         self.background.every(2.0, lambda: self.runs.append(1))
         sleep = self.background.sleep(1.0)
         self.clock.advance(0.9)
@@ -73,7 +76,7 @@ class FirstTests(SynchronousTestCase):
         return Deferred.fromCoroutine(gather_first(needed, [wait(d) for d in self.asked]))
 
     def test_enough(self) -> None:
-        """``first`` returns the needed number of results in the order of arrival and ignores later results."""
+        """``first`` returns the required number of results in the order of arrival, and ignores later results."""
         result = self.begin(2)
         self.asked[2].callback(2)
         self.assertNoResult(result)
@@ -83,7 +86,7 @@ class FirstTests(SynchronousTestCase):
         self.assertEqual(results, [2, 0])
 
     def test_too_few(self) -> None:
-        """If too many calls fail, ``first`` returns the successful results; without calls it returns at once."""
+        """If too many calls fail, ``first`` returns the results of the others; without calls it returns immediately."""
         result = self.begin(3)
         self.asked[0].errback(NoAnswer("x"))
         self.asked[1].callback(1)

@@ -1,4 +1,4 @@
-"""Tests of the shipper, which sends a node's records to their replicas in batches."""
+"""Tests of the batcher, which sends a node's records to their replicas in batches."""
 
 from __future__ import annotations
 
@@ -46,7 +46,7 @@ class RecordBatcherTests(FleetCase):
         self.world.nodes[1].endpoint.expose("store", counted, changes=True, idempotent=True)
 
     def test_a_flood_shares_questions(self) -> None:
-        """The first of forty records is sent alone at once; the others share requests of one datagram each."""
+        """The first of forty records is sent alone and immediately; the others share requests of one datagram each."""
         self.count_questions()
         replies = self.stored(*[self.record(number) for number in range(FLOOD)])
         self.world.run(0.1)
@@ -93,7 +93,7 @@ class RecordBatcherTests(FleetCase):
         self.assertEqual(self.batcher._waiting, {})
 
     def test_a_long_record_holds_up_nobody(self) -> None:
-        """A record that needs fragments is sent alone and does not delay a later short record."""
+        """A record that needs fragments is sent alone, and does not delay a short record after it."""
         self.count_questions()
         replies = self.stored(self.record(0, size=50_000), self.record(1))
         self.world.run(0.5)

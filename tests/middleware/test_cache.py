@@ -1,4 +1,4 @@
-"""Tests of the cached copies that a node holds in addition to its records: on lookup paths and for its watches."""
+"""Tests of the copies that a node caches in addition to its records, on lookup paths and for its watches."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from middleware.entangled.replication.watched_copy import WatchedCopies
 
 
 def copied(key: bytes, size: int = 1) -> list[Record]:
-    """Return one record of ``key``; the cache does not verify signatures."""
+    """Return one record of ``key``; the cache does not verify signatures, so the record has an invalid signature."""
     return [Record(key, "a", bytes(32), 1, "team", 60.0, bytes(size), bytes(64))]
 
 
@@ -30,7 +30,7 @@ class PathCacheTests(SynchronousTestCase):
             self.assertIsNone(self.cache.get(self.key, lives))
 
     def test_what_is_not_kept(self) -> None:
-        """A copy without a positive finite TTL or over the size limit is not stored and removes the previous copy."""
+        """A copy without a positive finite TTL or over the size limit is not stored, and removes the previous copy."""
         for ttl, size in ((0.0, 1), (-1.0, 1), (float("nan"), 1), (9.0, MAX_BYTES)):
             self.cache.put(self.key, copied(self.key), 9.0, 0.0)
             self.cache.put(self.key, copied(self.key, size), ttl, 0.0)
@@ -65,7 +65,7 @@ class PathCacheTests(SynchronousTestCase):
         self.assertIsNotNone(self.cache.get(self.key, 9.0))
 
     def held(self, keys: list[bytes]) -> list[int]:
-        """Return the numbers of the cached ``keys``, and read each in order."""
+        """Return the numbers of those ``keys`` that are cached, and read each of them in order."""
         return [number for number, key in enumerate(keys) if self.cache.get(key, 0.0) is not None]
 
 
@@ -91,7 +91,7 @@ class WatchedCopiesTests(SynchronousTestCase):
         self.copies = WatchedCopies(self.store)
 
     def test_what_is_held_is_left_alone(self) -> None:
-        """A slot that the node holds as a replica is neither copied nor released."""
+        """If the node stores a slot as a replica, this slot is neither copied nor released."""
         self.store.put(record("a"), 5.0)
         self.copies.replace(KEY, [record("a", 2)], 0.0)
         self.copies.replace(KEY, [], 0.0)
@@ -100,7 +100,7 @@ class WatchedCopiesTests(SynchronousTestCase):
         self.assertEqual(self.store.expire(5.0), [record("a")])
 
     def test_full_store(self) -> None:
-        """A full store limits the number of copies; the records of a replica are kept."""
+        """In a full store the number of copies is limited, and the records of a replica are kept."""
         self.store.put(record("z"), 5.0)
         self.copies.replace(KEY, [record(name) for name in "abc"], 0.0)
         self.assertEqual([r.name for r in self.store.get(KEY)], ["a", "b", "z"])
@@ -108,7 +108,7 @@ class WatchedCopiesTests(SynchronousTestCase):
         self.assertEqual([r.name for r in self.store.get(KEY)], ["z"])
 
     def test_closed_store(self) -> None:
-        """A closed store raises no error while the copies are cleared."""
+        """A closed store raises no error when the copies are cleared."""
         copies = WatchedCopies(ClosedStore())
         copies.replace(KEY, [record("a")], 0.0)
         copies.clear()

@@ -28,7 +28,7 @@ class HeapClockTests(SynchronousTestCase):
         self.assertTrue(verifyObject(IDelayedCall, self.clock.callLater(1, self.called.append, 1)))
 
     def test_call_sees_its_own_moment(self) -> None:
-        """A call sees the time for which it was scheduled, and calls that it schedules run in the same advance."""
+        """A call runs at its scheduled time; calls that it schedules run in the same advance."""
 
         def again() -> None:
             self.called.append(self.clock.seconds())
@@ -59,7 +59,7 @@ class HeapClockTests(SynchronousTestCase):
         self.assertEqual(self.clock.getDelayedCalls(), [])
 
     def test_exception_passes(self) -> None:
-        """An exception in a call propagates to the caller of ``advance``, and the clock stops at that call."""
+        """An exception in a call reaches the caller of ``advance``, and the clock stops at that call."""
         self.clock.callLater(1, int, "x")
         self.clock.callLater(2, self.called.append, "next")
         self.assertRaises(ValueError, self.clock.advance, 5)
@@ -68,7 +68,7 @@ class HeapClockTests(SynchronousTestCase):
         self.assertEqual(self.called, ["next"])
 
     def test_agrees_with_a_sorted_list(self) -> None:
-        """Under random scheduling, rescheduling and cancelling the calls run in sorted order."""
+        """If calls are scheduled, rescheduled and cancelled at random, they run in the order of their times."""
         rng = random.Random(7)
         expected: dict[int, tuple[float, int]] = {}
         calls = []
@@ -105,11 +105,11 @@ class MonotonicTests(SynchronousTestCase):
         before = find_boot_clock()()
         self.assertLessEqual(before, ReactorBase.seconds())
         self.assertLess(ReactorBase.seconds(), before + 1.0)
-        if hasattr(time, "CLOCK_BOOTTIME"):  # CLOCK_BOOTTIME includes suspended time
+        if hasattr(time, "CLOCK_BOOTTIME"):  # CLOCK_BOOTTIME also advances while the system is suspended
             self.assertAlmostEqual(find_boot_clock()(), time.clock_gettime(time.CLOCK_BOOTTIME), 1)
 
     def test_leap(self) -> None:
-        """After a suspension, overdue calls run once, at the new time."""
+        """After a suspension each overdue call runs once, at the new time."""
         clock = HeapClock()
         called: list[float] = []
         clock.callLater(1.0, lambda: called.append(clock.seconds()))

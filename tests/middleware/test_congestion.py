@@ -22,14 +22,14 @@ from middleware.entangled.wire.session import INIT
 from tests.middleware.test_endpoint import DELAY, EndpointCase
 
 FAR = 0.12
-"""Seconds one way: longer there and back than the first guess and its first try."""
+"""The delay in one direction in seconds; a round trip takes longer than the initial timeout of the first try."""
 
 
 class RoundTripTests(SynchronousTestCase):
     """Tests of ``RoundTrip``."""
 
     def test_an_answer_to_the_second_try(self) -> None:
-        """A reply after a retransmission is ambiguous: it is not measured, and the timeout grows within limits."""
+        """A reply after a retransmission is ambiguous, so it is not measured; the timeout grows within limits."""
         for seconds, wait in ((0.0, INITIAL_TIMEOUT_S * BACKOFF_FACTOR), (0.4, 0.4), (60.0, MAX_TIMEOUT_S)):
             unknown = RoundTrip()
             unknown.lengthen(seconds)
@@ -42,7 +42,7 @@ class RoundTripTests(SynchronousTestCase):
 
 
 class LongWayTests(EndpointCase):
-    """A first contact over a path with a longer delay than the initial estimate."""
+    """Tests of a first contact over a path with a longer delay than the initial estimate."""
 
     def setUp(self) -> None:
         """Set a long delay between the two endpoints."""
@@ -51,7 +51,7 @@ class LongWayTests(EndpointCase):
         self.switchboard.conditions = LinkConditions(FAR)
 
     def test_one_handshake_is_enough(self) -> None:
-        """Concurrent requests in both directions wait for one handshake; no second one is started."""
+        """Concurrent requests in both directions wait for one handshake; no second handshake is started."""
         self.got(self.a.ask(self.to_b, "add", 1))
         self.got(self.b.ask(self.to_a, "add", 2))
         self.got(self.a.ask(self.to_b, "add", 3))
@@ -68,7 +68,7 @@ class LongWayTests(EndpointCase):
 
 
 def heard(share: float, count: int, rng: random.Random) -> LossRate:
-    """Simulate ``count`` datagrams with this loss rate and return the estimate."""
+    """Simulate ``count`` datagrams with this loss rate, and return the estimate."""
     loss, ahead = LossRate(), 1
     for _ in range(count):
         if rng.random() < share:
@@ -83,13 +83,13 @@ class LossTests(SynchronousTestCase):
     """Tests of ``LossRate``."""
 
     def test_the_share_is_what_gets_lost(self) -> None:
-        """After 500 datagrams the mean estimate over 100 receivers is within 0.02 of the loss rate."""
+        """After 500 datagrams the mean estimate of 100 receivers is within 0.02 of the loss rate."""
         for share in (0.0, 0.1, 0.3):
             shares = [heard(share, 500, random.Random(seed)).rate for seed in range(100)]
             self.assertLess(abs(sum(shares) / 100 - share), 0.02)
 
     def test_as_many_tries_as_it_takes(self) -> None:
-        """The number of tries limits the probability that all of them fail to ``TOLERATED_FAILURES``."""
+        """The number of tries keeps the probability that all of them fail below ``TOLERATED_FAILURES``."""
         for share in (0.02, 0.1, 0.2):
             loss = LossRate()
             loss.rate = share
@@ -98,7 +98,7 @@ class LossTests(SynchronousTestCase):
             self.assertGreater(fails ** (loss.tries - 1), TOLERATED_FAILURES)
 
     def test_none_where_nothing_is_lost_and_bounded_where_all_is(self) -> None:
-        """Without loss one try is enough; with high loss the number of tries is bounded."""
+        """Without loss one try is enough; with high loss the number of tries is limited."""
         loss = LossRate()
         self.assertEqual(loss.tries, 1)
         loss.rate = 0.95
@@ -122,10 +122,10 @@ class LossTests(SynchronousTestCase):
 
 
 class RoughWeatherTests(EndpointCase):
-    """Requests under high loss."""
+    """Tests of requests under high loss."""
 
     def answered(self, count: int, timeout: float) -> int:
-        """Return the number of ``count`` sequential requests that are answered in time."""
+        """Return how many of ``count`` sequential requests are answered in time."""
         answers = 0
         for number in range(count):
             asked = self.a.ask(self.to_b, "echo", number, timeout=timeout)
@@ -139,10 +139,10 @@ class RoughWeatherTests(EndpointCase):
         self.switchboard.conditions = LinkConditions(DELAY, loss=0.3)
         self.answered(100, 1.0)
         self.assertGreater(self.a.peers.tries, MAX_TRIES)
-        self.assertGreaterEqual(self.answered(500, 1.0), 498)  # with four tries about 466
+        self.assertGreaterEqual(self.answered(500, 1.0), 498)  # with four tries about 466 requests are answered
 
     def test_the_first_contact_as_well(self) -> None:
-        """Handshakes, too, are retransmitted according to the loss rate."""
+        """Handshakes are also retransmitted according to the loss rate."""
         strangers = [self.endpoint(seed) for seed in range(3, 103)]
         for stranger, _ in strangers:
             self.equip(stranger)
@@ -151,10 +151,10 @@ class RoughWeatherTests(EndpointCase):
         asked = [self.a.ask(to, "echo", 1) for _, to in strangers]
         self.clock.advance(3.0)
         answers = [one.addErrback(lambda failure: None) for one in asked]
-        self.assertGreaterEqual(sum(self.successResultOf(one) == 1 for one in answers), 97)  # with four tries 94
+        self.assertGreaterEqual(sum(self.successResultOf(one) == 1 for one in answers), 97)  # with four tries 94 handshakes succeed
 
     def test_few_tries_are_in_vain(self) -> None:
-        """With variable round-trip times at most one reply in eight arrives after the next retransmission."""
+        """With variable round-trip times at most one reply in eight arrives after an unnecessary retransmission."""
         dice, path = random.Random(1), RoundTrip()
         took = [0.04 + dice.expovariate(100.0) + dice.expovariate(100.0) for _ in range(400)]
         self.a.peers.loss.rate = 0.5

@@ -24,7 +24,7 @@ KEY = hash_key("task")
 
 
 class ConsistencyCase(FleetCase):
-    """Helpers of these tests."""
+    """A test case with helpers for these tests."""
 
     def cut(self, fleet: EntangledTeam, *places: int) -> None:
         fleet.switchboard.partition([fleet.address(place) for place in places])
@@ -41,7 +41,7 @@ class ConsistencyCase(FleetCase):
         return results[0] if results else None
 
     def values(self, fleet: EntangledTeam, place: int, concern: Any = "majority") -> Any:
-        """Return the values of a read at a node, or the type of its error."""
+        """Return the values that a node reads, or the type of its error."""
         found = self.outcome(fleet, fleet.nodes[place].get(KEY, concern))
         return [record.value for record in found] if isinstance(found, list) else type(found)
 
@@ -74,7 +74,7 @@ class WriteConsistencyTests(ConsistencyCase):
         self.assertEqual(self.done(fleet, fleet.nodes[3].put(KEY, "c", b"x", "team", "one")) >= 1, True)
 
     def test_one_after_the_other_may_die(self) -> None:
-        """A majority continues after failures, one after the other, until two of five nodes are left and can write."""
+        """Nodes fail one after the other; the team still writes with a majority when two of five nodes are left."""
         fleet = self.fleet(5)
         for place in (4, 3, 2):
             fleet.nodes[place].stop_silently()
@@ -84,7 +84,7 @@ class WriteConsistencyTests(ConsistencyCase):
 
 class CompareAndSetTests(ConsistencyCase):
     def test_only_what_was_expected_is_replaced(self) -> None:
-        """The first write expects sequence 0, the next one the last sequence; any other number is a conflict."""
+        """The first write expects sequence 0, and the next write the last sequence; any other number is a conflict."""
         fleet = self.fleet(3)
         first = self.done(fleet, fleet.nodes[0].put(KEY, "a", b"1", expect=0))
         conflict = self.failure(fleet, fleet.nodes[0].put(KEY, "a", b"2", expect=0), Conflict)
@@ -95,7 +95,7 @@ class CompareAndSetTests(ConsistencyCase):
         self.assertEqual(self.values(fleet, 1), [])
 
     def test_two_at_once(self) -> None:
-        """Of two concurrent writes that expect the same sequence one succeeds."""
+        """Of two concurrent writes that expect the same sequence, one succeeds."""
         fleet = self.fleet(3)
         works = [fleet.nodes[0].put(KEY, "a", value, expect=0) for value in (b"1", b"2")]
         fleet.run(1.0)
@@ -104,7 +104,7 @@ class CompareAndSetTests(ConsistencyCase):
         self.assertEqual(self.values(fleet, 1), [b"1"])
 
     def test_a_former_life_is_not_overwritten(self) -> None:
-        """A node that lost its store does not overwrite its earlier records by compare-and-set."""
+        """A compare-and-set of a node that lost its store does not overwrite the node's earlier records."""
         fleet = self.fleet(3)
         old = self.done(fleet, fleet.nodes[2].put(KEY, "a", b"old"))
         fleet.nodes[2].stop_silently()
@@ -129,7 +129,7 @@ class ReadConsistencyTests(ConsistencyCase):
         return self.world.switchboard.counters["sent"]
 
     def test_fast_costs_two_datagrams(self) -> None:
-        """If all members are known, a fast read is one request and one reply, a write eight of each."""
+        """If all members are known, a fast read takes one request and one reply, and a write eight of each."""
         put = self.reader.put(KEY, "a", b"x")
         self.world.run(0.001)
         self.successResultOf(put)
@@ -155,7 +155,7 @@ class ReadConsistencyTests(ConsistencyCase):
         self.failure(self.world, self.reader.get(KEY), Unavailable)
 
     def test_read_repair(self) -> None:
-        """A majority read stores its result at a majority, even if a single replica had the record before."""
+        """A majority read stores its result at a majority, even if only one replica had the record."""
         writer = self.world.nodes[self.order[0]]
         made = Record(KEY, "a", writer.identity.public, 7, "team", 6000.0, b"x").sign(writer.identity)
         self.world.nodes[self.order[1]].replica.store_locally(made)
@@ -175,7 +175,7 @@ class ReadConsistencyTests(ConsistencyCase):
 
 class NewcomerTests(ConsistencyCase):
     def test_second_node_reads_as_soon_as_it_has_joined(self) -> None:
-        """In a team of two a node can read with certainty as soon as it has joined."""
+        """In a team of two a node can read by majority as soon as it has joined."""
 
         async def joined_and_read(fleet: EntangledTeam) -> list[Record]:
             fleet.nodes.append(fleet.make_node(1))
@@ -191,7 +191,7 @@ class NewcomerTests(ConsistencyCase):
 
 class AbsenceTests(ConsistencyCase):
     def test_a_delete_stays_one(self) -> None:
-        """A node that was offline during a deletion does not restore the record."""
+        """A node that was offline during a deletion does not restore the deleted record."""
         fleet = self.fleet(5)
         self.done(fleet, fleet.nodes[0].put(KEY, "a", b"x", "team", "all"))
         fleet.nodes[3].stop_silently()
@@ -207,7 +207,10 @@ class AbsenceTests(ConsistencyCase):
             self.assertEqual(fleet.stores[place].get(KEY), [])
 
     def test_long_absence_means_empty(self) -> None:
-        """A node that was offline longer than the TTL of tombstones rejoins empty; a shorter absence loses nothing."""
+        """A node that was offline for longer than the TTL of tombstones rejoins empty.
+
+        After a shorter absence nothing is lost.
+        """
         self.assertGreater(TOMBSTONE_TTL_S, TOLERATED_ABSENCE_S)
         for away, kept in ((TOLERATED_ABSENCE_S - 60.0, 1), (TOLERATED_ABSENCE_S + 60.0, 0)):
             fleet = self.fleet(1)
@@ -222,7 +225,7 @@ class AbsenceTests(ConsistencyCase):
                 moment[0] += away
 
     def life(self, fleet: EntangledTeam, moment: list[float]) -> EntangledNode:
-        """Run the node of place 0 once, with a wall clock."""
+        """Run the node with index 0 once, with a wall clock."""
         network = fleet.switchboard.make_network(*fleet.address(0))
         node = EntangledNode(
             fleet.identity(0),
@@ -242,7 +245,7 @@ class AbsenceTests(ConsistencyCase):
 
 class WatchNumberTests(ConsistencyCase):
     def test_a_gap_is_noticed_and_filled(self) -> None:
-        """A watcher detects a missed push by the next push number and requests the records at once."""
+        """A watcher detects a lost push by the number of the next push, and requests the records immediately."""
         fleet = self.fleet(2)
         told: list[list[bytes | None]] = []
         watch = fleet.nodes[1].watch(KEY, lambda records: told.append([r.value for r in records]))
@@ -261,7 +264,7 @@ class WatchNumberTests(ConsistencyCase):
 
 class SecondHandTests(ConsistencyCase):
     def test_only_the_second_hand_is_verified(self) -> None:
-        """A replica verifies the signature of a record from another node than its owner, not in the owner's session."""
+        """A replica verifies the signature of a record only if another node than the record's owner sends it."""
         fleet = self.fleet(3)
         owner, other = fleet.identity(1), fleet.nodes[2]
         unsigned = Record(KEY, "x", owner.public, 9, "team", 60.0, b"x", bytes(64))
@@ -276,7 +279,7 @@ class SecondHandTests(ConsistencyCase):
 
 class WalkTests(ConsistencyCase):
     def test_copies_on_the_path(self) -> None:
-        """A fast read in a large network leaves cached copies on its path, which never count as a replica."""
+        """A fast read in a large network leaves cached copies on its path, which never count as replicas."""
         fleet = self.fleet(30, seed=5)
         self.done(fleet, fleet.nodes[0].put(KEY, "a", b"x"))
         for node in fleet.nodes:
@@ -304,7 +307,7 @@ class WalkTests(ConsistencyCase):
 
 
 class Replaced(MemoryStore):
-    """A store that replaced a corrupted file and kept its notes."""
+    """A store that replaced a corrupted file and kept the notes of this file."""
 
     origin = "replaced"
 
@@ -314,14 +317,14 @@ class Replaced(MemoryStore):
 
 
 class CutTests(ConsistencyCase):
-    """A minority behind a partition, with new nodes, against the majority."""
+    """Tests of a minority behind a partition, with new nodes, against the majority."""
 
     def test_newcomers_make_no_majority_of_a_minority(self) -> None:
-        """For any number of joins in the minority, majority reads and writes fail there."""
+        """Majority reads and writes fail in a minority, however many new nodes join it."""
         for count, small, newcomers, wait in ((3, (2,), 2, 3.0), (5, (3, 4), 3, 12.0), (4, (2, 3), 3, 0.0)):
             fleet = self.fleet(count)
             self.cut(fleet, *small, *range(count, count + newcomers))
-            fleet.run(wait)  # before or after the majority is known as absent
+            fleet.run(wait)  # new nodes join before or after the majority is known to be absent
             has_majority = 2 * len(small) < count
             stored = self.outcome(fleet, fleet.nodes[0].put(KEY, "a", b"x"))
             self.assertEqual(type(stored) is NotAcknowledged, not has_majority)
@@ -338,14 +341,14 @@ class CutTests(ConsistencyCase):
             self.assertEqual(sorted(self.values(fleet, len(fleet.nodes) - 1)), [b"x", b"y"])
 
     def test_a_lost_memory_was_a_vote(self) -> None:
-        """A node with a lost store is not synced while only nodes answer that may have missed its records."""
+        """A node that lost its store is not synced as long as only nodes reply that may lack its records."""
         fleet = self.fleet(3)
         self.cut(fleet, 2)
         self.outcome(fleet, fleet.nodes[0].put(KEY, "a", b"x"))
         fleet.switchboard.heal()
         self.cut(fleet, 0)
         fleet.nodes[1].stop_silently()
-        for _ in range(2):  # the same after another restart
+        for _ in range(2):  # the same result after another restart
             former = fleet.stores[1]
             assert isinstance(former, MemoryStore)
             fleet.stores[1] = Replaced(former)
@@ -387,7 +390,10 @@ class CutTests(ConsistencyCase):
         self.assertEqual([node.replica.is_synced() for node in fleet.nodes], [True] * 4)
 
     def test_the_unsure_hold_without_a_vote(self) -> None:
-        """A replica that is not synced stores records without a vote; the writer waits briefly for its vote."""
+        """A replica that is not synced stores records without a vote.
+
+        The writer waits briefly until the replica is synced and votes.
+        """
         fleet = self.fleet(2)
         unsure = fleet.nodes[1].replica
         genuine, unsure.is_synced = unsure.is_synced, lambda: False
@@ -417,7 +423,7 @@ class CutTests(ConsistencyCase):
         self.assertIsInstance(self.outcome(fleet, second), NotAcknowledged)
 
     def test_a_later_record_at_the_sure(self) -> None:
-        """A write is acknowledged if a majority has the next one."""
+        """A write is acknowledged if a majority stores the next version of its record."""
         fleet = self.fleet(3)
         fleet.switchboard.conditions = LinkConditions(delay_s=0.02, jitter_s=0.02, reorder=0.5)
         for _ in range(10):
@@ -425,7 +431,7 @@ class CutTests(ConsistencyCase):
             self.assertEqual([type(self.outcome(fleet, put, 0.5)) for put in puts], [Stored] * 3)
 
     def test_who_comes_back_behind_a_cut(self) -> None:
-        """A node that has not met its team does not report a key as empty on the replies of a few members."""
+        """A node that has not met its team does not report a key as empty because of the replies of a few members."""
         fleet = self.fleet(3)
         self.cut(fleet, 2)
         self.assertEqual(self.outcome(fleet, fleet.nodes[0].put(KEY, "a", b"x")), 2)
@@ -437,7 +443,7 @@ class CutTests(ConsistencyCase):
 
 class StartTests(ConsistencyCase):
     def test_a_liar_makes_no_members_up(self) -> None:
-        """A new node counts a member as absent only if several of the nodes that it queries name it."""
+        """A new node counts a member as absent only if several of the queried nodes list this member."""
         fleet = self.fleet(3)
         ghosts = [[[Identity(bytes([n]) * 32).public, "10.9.9.9", n], 0] for n in range(200, 204)]
         fleet.nodes[1].endpoint.expose("known", lambda peer: ghosts)
@@ -457,7 +463,7 @@ class StartTests(ConsistencyCase):
         self.assertEqual([node.replica.is_synced() for node in fleet.nodes], [True] * 5)
 
     def test_a_power_cut(self) -> None:
-        """After a restart from disk of all members but one the team is synced and writes within seconds."""
+        """If all members except one restart from disk, the team is synced and can write within seconds."""
         fleet = self.fleet(5)
         self.outcome(fleet, fleet.nodes[0].put(KEY, "a", b"x"))
         for node in fleet.nodes:
@@ -472,7 +478,7 @@ class StartTests(ConsistencyCase):
         fleet.nodes[4].stop()
 
     def test_after_the_longest_cut(self) -> None:
-        """Half of a team continues alone after the maximum duration of a partition, not before."""
+        """After the maximum duration of a partition half of a team continues alone, but not earlier."""
         fleet = self.fleet(2)
         fleet.nodes[1].stop_silently()
         fleet.run(MAX_ABSENT_S - 10.0)

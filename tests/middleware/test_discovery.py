@@ -52,7 +52,7 @@ class CookieTests(EndpointCase):
         return answers
 
     def test_above_the_rate_comes_a_cookie(self) -> None:
-        """Up to the rate limit INITs get a RESP, above it a cookie that creates no session."""
+        """Up to the rate limit an INIT gets a RESP, above the limit a cookie, which creates no session."""
         answers = self.flood(300)
         kinds = [answer[0] for answer in answers]
         self.assertEqual(kinds, [RESP] * int(MAX_HANDSHAKES_PER_S) + [COOKIE] * (300 - int(MAX_HANDSHAKES_PER_S)))
@@ -95,7 +95,7 @@ TOKEN = b"0123456789abcdef"
 
 
 class ProbeTests(EndpointCase):
-    """Tests of ``Endpoint.probe`` and of its replies."""
+    """Tests of ``Endpoint.probe`` and of the replies to probes."""
 
     def test_who_is_there(self) -> None:
         """A reply, also of another team, contains fingerprint, version and clock, and the address of the prober."""
@@ -110,7 +110,7 @@ class ProbeTests(EndpointCase):
         self.assertEqual((found.fingerprint, found.unix_time_s), (bytes(8), 0.0))
 
     def test_nobody_is_there(self) -> None:
-        """A probe without a reply fails after its timeout, and a cancelled probe leaves no state."""
+        """A probe without a reply fails after its timeout; a cancelled probe leaves no state."""
         self.failed(self.a.probe(HOME, 1.0), NoAnswer, 1.0)
         self.a.probe(HOME, 1.0).addErrback(lambda failure: None).cancel()
         self.assertEqual(self.a.prober._pending, {})
@@ -137,7 +137,7 @@ class ProbeTests(EndpointCase):
         self.assertRaises(Malformed, parse_reply, pack_probe(TOKEN))
 
     def test_an_echo_from_elsewhere(self) -> None:
-        """A reply from another address than the probed one is ignored."""
+        """A reply from an address other than the probed address is ignored."""
         sent: list[bytes] = []
         prober = Prober(lambda datagram, to: sent.append(datagram), self.clock, random.Random(1))
         asked = prober.probe(HOME)

@@ -23,7 +23,7 @@ class CallTests(EndpointCase):
         self.got(self.a.ask(self.to_b, "echo", 1))
 
     def equip(self, endpoint: Any) -> None:
-        """Register slow methods and a method that takes the deadline."""
+        """Register slow methods, and a method that gets the deadline."""
         super().equip(endpoint)
         endpoint.expose("slow", self.slow)
         endpoint.expose("slow change", self.slow, changes=True)
@@ -52,7 +52,7 @@ class CallTests(EndpointCase):
             raise
 
     def when(self, peer: Contact, *, deadline: float) -> float:
-        """Return the time that the caller still waits, in seconds."""
+        """Return the time in seconds for which the caller still waits."""
         return deadline - self.clock.seconds()
 
     def occupied(self, peer: Contact) -> None:
@@ -60,7 +60,10 @@ class CallTests(EndpointCase):
         raise Refused("with a bone", self.code)
 
     def test_cancelling_reaches_the_method(self) -> None:
-        """Cancelling the Deferred of ``ask`` cancels the method's Deferred or coroutine after the one-way delay."""
+        """If the caller cancels the Deferred of ``ask``, the Deferred or coroutine of the method is cancelled, too.
+
+        This takes the delay of one direction.
+        """
         for name, how in (("slow", "CancelledError"), ("slow change", "CancelledError"), ("crawl", "coroutine")):
             asked = self.a.ask(self.to_b, name, timeout=60.0, changes=name == "slow change")
             self.clock.advance(1.0)
@@ -93,7 +96,7 @@ class CallTests(EndpointCase):
         self.assertEqual(self.got(asked), "done")
 
     def test_deadline_is_carried(self) -> None:
-        """A method gets the caller's remaining time, less the network delay, in milliseconds as 32 bits."""
+        """A method gets the remaining time of its caller, less the network delay, in milliseconds as 32 bits."""
         for seconds, milliseconds in ((1.5, 1500), (-1.0, 0), (1e9, NO_LIMIT_MS)):
             aged_one = decode(set_remaining_time(encode(Request(1, "m", (), 7)), seconds))
             self.assertEqual(aged_one, Request(1, "m", (), milliseconds))
@@ -102,7 +105,7 @@ class CallTests(EndpointCase):
             self.assertTrue(least <= left <= most, left)
 
     def test_what_is_too_late_stops(self) -> None:
-        """The deadline cancels a running method; a request that arrives after its deadline never runs."""
+        """A running method is cancelled at the deadline; a request that arrives after its deadline never runs."""
         asked = self.a.ask(self.to_b, "slow", timeout=2.0)
         self.clock.advance(1.9)
         self.assertEqual(self.ended, [])
@@ -114,7 +117,7 @@ class CallTests(EndpointCase):
         self.assertEqual((self.runs, self.b.counters["late"]), ([], 2))
 
     def test_refusals_have_a_code(self) -> None:
-        """A rejection carries its code and text; an invalid code is replaced by ``refused``."""
+        """A rejection contains its code and text; an invalid code is replaced by ``refused``."""
         for code, arrives in (("dog.busy", "dog.busy"), ("", "refused"), ("x" * 65, "refused"), ("a\nb", "refused")):
             self.code = code
             asked = self.a.ask(self.to_b, "busy")

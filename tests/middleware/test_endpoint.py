@@ -22,11 +22,11 @@ from middleware.entangled.wire.peer import SESSION_END_S, SESSION_SILENCE_S
 from middleware.entangled.wire.session import DATA, INIT, MAX_PLAIN_BYTES, RESP, InitiatorHandshake
 
 TEAM = b"k" * 32
-DELAY = 1 / 64  # a power of two, so sums are exact
+DELAY = 1 / 64  # a power of two, so sums of delays are exact
 
 
 class Tap:
-    """A ``Network`` that records received datagrams and forwards them."""
+    """A ``Network`` that records the received datagrams and forwards them."""
 
     def __init__(self, network: SwitchboardNetwork) -> None:
         self.network = network
@@ -120,7 +120,10 @@ class AskTests(EndpointCase):
     """Requests and replies."""
 
     def test_change_waits_for_the_session(self) -> None:
-        """A changing request takes two round trips for the first time, then one; it never runs from an INIT."""
+        """The first request that changes state takes two round trips, later requests one.
+
+        It never runs from an INIT.
+        """
         self.assertEqual(self.got(self.a.ask(self.to_b, "add", 1, changes=True), 4 * DELAY), 1)
         self.assertEqual(self.got(self.a.ask(self.to_b, "add", 2, changes=True), 2 * DELAY), 2)
         self.assertEqual(self.switchboard.counters["sent"], 6)
@@ -131,7 +134,10 @@ class AskTests(EndpointCase):
         self.assertEqual((self.got(asked), self.runs), (5, [1, 2, 5]))
 
     def test_long_questions(self) -> None:
-        """A request too long for an INIT waits for the session; one that cannot be encoded fails at once."""
+        """A request that is too long for an INIT waits for the session.
+
+        A request that cannot be encoded fails immediately.
+        """
         self.assertEqual(len(self.got(self.a.ask(self.to_b, "echo", bytes(1330)))), 1330)
 
         self.failureResultOf(self.a.ask(self.to_b, "echo", object()), TypeError)
@@ -159,7 +165,7 @@ class AskTests(EndpointCase):
         self.assertEqual(len(self.flushLoggedErrors(ZeroDivisionError)), 1)
 
     def test_slow_methods(self) -> None:
-        """Asynchronous methods reply when they are done, run once, and may take longer than one retransmission."""
+        """Asynchronous methods reply when they have finished, run once, and may take longer than one retransmission."""
         waiting: list[Deferred[int]] = []
 
         async def slow(peer: Contact) -> int:
@@ -179,7 +185,7 @@ class AskTests(EndpointCase):
             self.assertEqual(self.got(asked, 0.1), 42)
 
     def test_no_answer(self) -> None:
-        """Without a reply a request fails in 1.5 s after four tries, and sooner for a peer known to be near."""
+        """Without a reply a request fails in 1.5 s after four tries, and earlier if the peer is known to be near."""
         asked = self.a.ask(Contact(self.to_b.public, Address("127.0.0.1", 9)), "echo", 1)
         self.clock.advance(1.4)
         self.assertNoResult(asked)
@@ -205,7 +211,7 @@ class AskTests(EndpointCase):
         self.assertEqual(self.a.counters["unasked"], 1)
 
     def test_both_open_at_once(self) -> None:
-        """If both endpoints start a handshake at the same time, both get their replies, then and later."""
+        """If both endpoints start a handshake at the same time, both get replies to this and to later requests."""
         self.equip(self.a)
         both = [self.a.ask(self.to_b, "add", 1, changes=True), self.b.ask(self.to_a, "add", 2, changes=True)]
         self.clock.advance(1)
@@ -215,7 +221,7 @@ class AskTests(EndpointCase):
         self.assertEqual([self.successResultOf(one) for one in both], [3, 4])
 
     def test_contacts_are_reported_when_proved(self) -> None:
-        """The caller reports its peer with the reply, the callee reports its peer with the confirmed session."""
+        """The caller reports its peer as a contact at the reply, the callee at the confirmation of the session."""
         seen: list[tuple[float, str, Contact]] = []
         self.a.on_contact.add(lambda contact: seen.append((self.clock.seconds(), "a", contact)))
         self.b.on_contact.add(lambda contact: seen.append((self.clock.seconds(), "b", contact)))
@@ -228,7 +234,7 @@ class NotifyTests(EndpointCase):
     """One-way messages, key requests, start and stop."""
 
     def test_tells_open_a_session_and_arrive_once(self) -> None:
-        """One-way messages sent before the session arrive in order after the handshake, each once."""
+        """One-way messages that are sent before the session exists arrive in order after the handshake, each once."""
         self.switchboard.conditions = LinkConditions(DELAY, duplicate=1.0)
         for number in range(5):
             self.a.notify(self.to_b, "add", number)
@@ -241,7 +247,7 @@ class NotifyTests(EndpointCase):
         self.assertEqual((self.b.counters["unknown method"], self.b.counters["refused"]), (1, 1))
 
     def test_tells_that_cannot_arrive_are_counted(self) -> None:
-        """One-way messages to an unreachable peer are dropped and counted, and their queue is bounded."""
+        """One-way messages to an unreachable peer are dropped and counted, and the length of their queue is limited."""
         for number in range(100):
             self.a.notify(Contact(self.to_b.public, Address("127.0.0.1", 9)), "add", number)
         self.clock.advance(5)
@@ -249,7 +255,7 @@ class NotifyTests(EndpointCase):
         self.assertEqual(self.clock.getDelayedCalls(), [])
 
     def test_greeting(self) -> None:
-        """``greet`` learns the key at an address, also under loss; the reply is no larger than the request."""
+        """``greet`` learns the key at an address, also under loss; the reply is not larger than the request."""
         self.switchboard.conditions = LinkConditions(DELAY, loss=0.3)
         self.assertEqual(self.got(self.a.discover(self.to_b.address)), self.to_b)
         sizes = {len(datagram) for tap in self.taps.values() for datagram, _ in tap.kept}
@@ -271,7 +277,7 @@ class NotifyTests(EndpointCase):
 
 
 class WeatherTests(EndpointCase):
-    """Loss, duplication, restarts and address changes."""
+    """Tests with loss, duplication, restarts and address changes."""
 
     def test_restarted_peer_answers_again(self) -> None:
         """A peer that lost its sessions or changed its address answers the next request within half a second."""
@@ -288,13 +294,13 @@ class WeatherTests(EndpointCase):
         self.switchboard.kill(self.to_b.address)
         self.b, self.to_b = self.endpoint(6, port=self.to_b.address.port, identity=2)
         self.equip(self.b)
-        for number in range(10):  # one-way messages reveal a restart, too
+        for number in range(10):  # one-way messages also reveal a restart
             self.a.notify(self.to_b, "add", 10 + number)
             self.clock.advance(1)
         self.assertIn(19, self.runs)
 
     def test_address_follows_the_key(self) -> None:
-        """Replies go to the source of a peer's newest datagram; a replayed datagram does not change the address."""
+        """Replies go to the source of a peer's newest datagram; a replayed datagram does not change this address."""
         self.got(self.a.ask(self.to_b, "echo", 1))
         old = self.taps[self.to_a.address]
         moved = self.switchboard.make_network("127.0.0.1", 40000)
@@ -323,7 +329,10 @@ class WeatherTests(EndpointCase):
         self.assertTrue(self.a.has_session(self.to_b))
 
     def test_keys_of_an_idle_session_are_forgotten(self) -> None:
-        """An idle session sends nothing; at its end both sides delete its keys, and a request opens a new session."""
+        """An idle session sends nothing.
+
+        When it ends, both sides delete its keys, and a request opens a new session.
+        """
         self.got(self.a.ask(self.to_b, "echo", 1))
         sent = self.switchboard.counters["sent"]
         self.clock.advance(SESSION_END_S - 4.0)
@@ -337,7 +346,7 @@ class WeatherTests(EndpointCase):
         self.assertEqual(len(self.kept(self.to_b, INIT)), 2)
 
     def test_used_session_is_renewed(self) -> None:
-        """A used session is renewed every 120 s by one handshake, and each reply still takes one round trip."""
+        """A session in use is renewed every 120 s by one handshake, and each reply still takes one round trip."""
         for seconds in range(600):
             requester, to = (self.a, self.to_b) if seconds % 2 else (self.b, self.to_a)
             requester.notify(to, "echo", seconds)
@@ -353,7 +362,7 @@ class WeatherTests(EndpointCase):
         self.assertIn(sum(inits), (5, 6, 7))
 
     def test_session_that_cannot_be_renewed_is_dropped(self) -> None:
-        """Without a reply from the peer nothing is sent under keys that expired by age or by use."""
+        """If the peer does not reply, nothing is sent under keys that expired by age or by use."""
         for tells, seconds in ((200, 1.0), (30, 0.0)):
             self.got(self.a.ask(self.to_b, "echo", 1))
             self.switchboard.cut(self.to_a.address, self.to_b.address)
@@ -366,7 +375,7 @@ class WeatherTests(EndpointCase):
             self.clock.advance(10.0)
 
     def test_worn_session_is_renewed(self) -> None:
-        """A session is renewed after its limit of datagrams, and is not used after twice the limit."""
+        """A session is renewed after its limit of datagrams, and is not used for more than twice the limit."""
         self.patch(peer, "SESSION_DATAGRAMS", 20)
         worn = 0
         for number in range(100):
@@ -379,7 +388,7 @@ class WeatherTests(EndpointCase):
 
 
 class AttackTests(EndpointCase):
-    """Datagrams that must have no effect."""
+    """Tests of datagrams that must have no effect."""
 
     def send_raw(self, datagram: bytes, source: Address = Address("127.0.0.1", 666)) -> int:  # noqa: B008
         """Deliver a datagram to ``b`` and return the number of datagrams that ``b`` sends in response."""
@@ -389,7 +398,7 @@ class AttackTests(EndpointCase):
         return self.switchboard.counters["sent"] - before
 
     def test_response_counts_only_from_where_it_was_asked(self) -> None:
-        """A RESP from another address, or a repeated one, opens no session."""
+        """A RESP from an address other than that of the INIT's receiver, or a repeated RESP, opens no session."""
         asked = self.a.ask(self.to_b, "echo", 1)
         self.clock.advance(1.5 * DELAY)
         tap = self.taps[self.to_a.address]
@@ -431,7 +440,10 @@ class AttackTests(EndpointCase):
         self.assertEqual((self.b.counters, self.b._sessions), ({"forged": 2}, {}))
 
     def test_peers_stay_bounded(self) -> None:
-        """The number of peers is bounded; the longest idle one is removed with its sessions and may return."""
+        """The number of peers is limited.
+
+        The peer that has been idle longest is removed with its sessions, and may return.
+        """
         self.patch(peer, "MAX_PEERS", 5)
         contacts = []
         for seed in range(20, 30):

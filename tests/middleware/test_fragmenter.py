@@ -33,7 +33,7 @@ LARGE = random.Random(5).randbytes(MIB)
 
 
 class FragmenterCase(EndpointCase):
-    """``b`` accepts and returns large values."""
+    """A test case in which ``b`` accepts and returns large values."""
 
     def equip(self, endpoint: Any) -> None:
         """Register the methods."""
@@ -47,7 +47,7 @@ class FragmenterCase(EndpointCase):
         return len(value)
 
     def part(self, number: int, total: int = MAX_MESSAGE_BYTES, id_: int = 77, data: bytes | None = None) -> bytes:
-        """Return a fragment of a request as a malicious member may create it."""
+        """Return a fragment of a request, with fields that a malicious member chooses."""
         data = bytes(min(FRAGMENT_BYTES, total - number * FRAGMENT_BYTES)) if data is None else data
         return (
             bytes([PART, 2])
@@ -74,10 +74,10 @@ class FragmenterCase(EndpointCase):
 
 
 class FragmenterTests(FragmenterCase):
-    """Large requests and replies."""
+    """Tests of large requests and replies."""
 
     def test_every_size(self) -> None:
-        """A value of up to 1 MiB arrives unchanged in both directions; one above the limit fails before it is sent."""
+        """A value of up to 1 MiB arrives unchanged in both directions; a larger value fails before it is sent."""
         self.failureResultOf(self.a.ask(self.to_b, "size", bytes(MAX_MESSAGE_BYTES)), TooLarge)
         self.assertEqual(self.switchboard.counters["sent"], 0)
         self.assertEqual(self.got(self.a.ask(self.to_b, "size", bytes(MIB + 4000), changes=True), 9), MIB + 4000)
@@ -101,7 +101,7 @@ class FragmenterTests(FragmenterCase):
         self.assertEqual(self.runs, [3000 + number for number in range(30)])
 
     def test_silence_in_the_middle(self) -> None:
-        """If a peer fails during a transfer, the request fails in time, and both sides release all buffers."""
+        """If a peer fails during a transfer, the request fails at its timeout, and both sides free all buffers."""
         asked = self.a.ask(self.to_b, "echo", LARGE)
         self.clock.advance(1.5 * DELAY)
         self.assertEqual([len(d) for d, _ in self.kept(self.to_b, INIT)], [MIN_INIT_BYTES])
@@ -143,7 +143,7 @@ class FragmenterTests(FragmenterCase):
         self.assertLessEqual(most, fragmenter.RECEIVE_FRAGMENTS + 2)
 
     def test_small_talk_goes_on(self) -> None:
-        """During transfers of 4 MiB a small request to the same peer is answered at once."""
+        """During transfers of 4 MiB a small request to the same peer is answered immediately."""
         self.got(self.a.ask(self.to_b, "echo", 1))
         asked = [self.a.ask(self.to_b, "size", LARGE, changes=True) for _ in range(4)]
         self.clock.advance(4 * DELAY)
@@ -152,7 +152,7 @@ class FragmenterTests(FragmenterCase):
         self.assertEqual([self.successResultOf(one) for one in asked], [MIB] * 4)
 
     def test_room_is_reserved(self) -> None:
-        """A large request beyond the limit for one peer fails at once with ``Crowded``; finished ones free space."""
+        """A large request that exceeds the limit for one peer fails with ``Crowded``; finished requests free space."""
         fitting = MAX_OUT_PER_PEER_BYTES // (MIB + 60)
         asked = [self.a.ask(self.to_b, "size", LARGE, changes=True) for _ in range(fitting)]
         self.failureResultOf(self.a.ask(self.to_b, "size", LARGE, changes=True), Crowded)
@@ -175,7 +175,7 @@ class FragmenterTests(FragmenterCase):
 
 
 class HostileTests(FragmenterCase):
-    """Fragments that a malicious member creates."""
+    """Tests of fragments that a malicious member creates."""
 
     def setUp(self) -> None:
         """Open a session."""
@@ -183,7 +183,7 @@ class HostileTests(FragmenterCase):
         self.got(self.a.ask(self.to_b, "echo", 1))
 
     def test_late_parts_begin_nothing(self) -> None:
-        """A fragment of a completed request, or of a reply without a request, starts no assembly."""
+        """A fragment of a completed request, or of a reply to no request, starts no message."""
         self.got(self.a.ask(self.to_b, "echo", LARGE[:5000]))
         key = next(iter(self.b._fragmenter._completed))[1]
         got = self.fire(self.part(1, 5030, key.id))
@@ -193,7 +193,7 @@ class HostileTests(FragmenterCase):
         self.assertEqual((counted, self.b._fragmenter._incoming), ([1, 1], {}))
 
     def test_a_parcel_must_be_what_it_says(self) -> None:
-        """A request with another id than its fragments is dropped and does not run."""
+        """If a request contains an id that differs from that of its fragments, it is dropped and not executed."""
         message = encode(Request(5, "add", (b"x" * 2000,)))
         for number in range(2):
             data = message[number * FRAGMENT_BYTES : (number + 1) * FRAGMENT_BYTES]

@@ -20,7 +20,7 @@ HOUR = 3600.0
 
 
 def counted(node: EntangledNode) -> Counter[str]:
-    """Return a counter of the later requests of ``node`` by method, and of the records that it stores."""
+    """Return a counter of later requests of ``node`` by method, and of the records in its store requests."""
     seen: Counter[str] = Counter()
     ask = node.overlay.ask
 
@@ -34,16 +34,19 @@ def counted(node: EntangledNode) -> Counter[str]:
 
 
 class LifeTests(FleetCase):
-    """The remaining TTL of records that other nodes than their owner forwarded."""
+    """Tests of the remaining TTL of records that a node other than their owner has forwarded."""
 
     def left(self, fleet: EntangledTeam, place: int, name: str = "a") -> float:
-        """Return the remaining seconds of a record of node 0 at another node."""
+        """Return the remaining seconds of a record of node 0 at the node with index ``place``."""
         slot = Record(KEY, name, fleet.identity(0).public, 1, "team", 1.0, b"").slot
         expiry = fleet.stores[place].find_expiry(slot)
         return 0.0 if expiry is None else expiry - fleet.clock.seconds()
 
     def newcomer_that_meets_a_liar(self, told: float) -> EntangledTeam:
-        """Return five nodes; the last joined through node 1 alone, which forwards records with a TTL of ``told``."""
+        """Return five nodes, of which node 1 states a remaining TTL of ``told`` for all records.
+
+        The last node joined through node 1 only.
+        """
         fleet = self.fleet(4)
         for number in range(40):
             fleet.nodes[0].put(KEY, "a" if not number else f"other {number}", b"x", "team", "all")
@@ -58,13 +61,13 @@ class LifeTests(FleetCase):
         return fleet
 
     def test_a_liar_shortens_no_life(self) -> None:
-        """A new node that received a record with a false, short TTL learns the longer one from an honest replica."""
+        """If a new node received a record with a false, short TTL, it learns the longer TTL from an honest replica."""
         fleet = self.newcomer_that_meets_a_liar(2 * HOUR)
         fleet.run(30.0)
         self.assertGreater(self.left(fleet, 4), TEAM_TTL_S - 60.0)
 
     def test_nor_behind_records_of_its_own(self) -> None:
-        """Records of the malicious node with long TTLs do not hide the TTLs that it shortened."""
+        """If the malicious node has records with long TTLs, they do not hide the TTLs that it shortened."""
         fleet = self.newcomer_that_meets_a_liar(2 * HOUR)
         liar = fleet.identity(1)
         for number in range(60):
@@ -86,7 +89,7 @@ class LifeTests(FleetCase):
             self.assertLess(self.left(fleet, place) + fleet.clock.seconds() - began, TEAM_TTL_S + 1.0)
 
     def test_a_life_names_the_very_record(self) -> None:
-        """A TTL for another record of the slot is ignored, and one beyond the record's TTL is reduced to it."""
+        """A TTL for a different record of the slot is ignored; a TTL beyond the maximum for the record is reduced."""
         fleet = self.fleet(2)
         self.done(fleet, fleet.nodes[0].put(KEY, "a", b"x", "team", "all"), 1.0)
         handover: Any = fleet.nodes[1]._handover
@@ -99,10 +102,10 @@ class LifeTests(FleetCase):
 
 
 class GivingTests(FleetCase):
-    """Records that a node hands over to their holders."""
+    """Tests of records that a node hands over to their holders."""
 
     def test_only_what_is_lacking(self) -> None:
-        """A node hands over only missing records, each once, and then sends no more."""
+        """A node hands over each missing record once, and then sends nothing more."""
         fleet = self.fleet(12)
         stranger = fleet.identity(99)
         made = [Record(hash_key(str(n)), "a", stranger.public, 1, "team", HOUR, b"x").sign(stranger) for n in range(60)]
@@ -122,7 +125,7 @@ class GivingTests(FleetCase):
         seen = counted(giver)
         self.reconcile(fleet, handover, peer)
         self.assertEqual((seen["records"], seen["lacking"]), (0, 0))
-        # An additional record is handed over alone.
+        # A further record is handed over alone.
         more = Record(there[0].key, "b", stranger.public, 1, "team", HOUR, b"x").sign(stranger)
         giver.replica.store_locally(more)
         self.reconcile(fleet, handover, peer)
@@ -135,10 +138,10 @@ class GivingTests(FleetCase):
 
 
 class ManyTests(FleetCase):
-    """Thousands of own records at once, and reads of many records."""
+    """Tests of thousands of records of one owner, and of reads of many records."""
 
     def test_a_holder_reads_no_record_again(self) -> None:
-        """A majority read at a replica transfers only digests if the replicas agree, otherwise records."""
+        """In a majority read by a replica only digests are transferred if the replicas agree, otherwise records."""
         fleet = self.fleet(5)
         for number in range(300):
             fleet.nodes[0].put(KEY, str(number), b"x" * 100, "team", "all")
@@ -155,11 +158,11 @@ class ManyTests(FleetCase):
         for place in (0, 2, 3, 4):
             fleet.nodes[place].replica.store_locally(newer)
         self.assertGreater(cost(301), 60)
-        fleet.run(40.0)  # the replicas reconcile in this time
+        fleet.run(40.0)  # the replicas reconcile during this time
         self.assertLess(cost(301), 25)
 
     def test_newcomers_get_all_leases(self) -> None:
-        """Two thousand leased records reach each new node, and none is dropped because of congestion."""
+        """Two thousand leased records reach each new node; no record is dropped because of congestion."""
         fleet = self.fleet(1)
         owner = fleet.nodes[0]
         for number in range(MANY):
@@ -174,7 +177,7 @@ class ManyTests(FleetCase):
         self.assertEqual(owner.endpoint.counters["crowded"], 0)
 
     def test_what_is_owed_is_paced(self) -> None:
-        """Two thousand records that were written during a partition are replicated soon after it heals."""
+        """Two thousand records that were written during a partition are replicated soon after the partition ends."""
         fleet = self.fleet(3)
         owner = fleet.nodes[0]
         fleet.switchboard.partition([fleet.address(0)])
@@ -189,7 +192,10 @@ class ManyTests(FleetCase):
         self.assertEqual(owner.endpoint.counters["crowded"], 0)
 
     def test_paced(self) -> None:
-        """``paced`` runs a limited number of coroutines; an error does not stop the others, and none starts early."""
+        """``paced`` runs a limited number of coroutines at a time.
+
+        An error does not stop the others, and no coroutine starts early.
+        """
         begun: list[int] = []
         waiting: dict[int, Deferred[None]] = {}
 
@@ -228,7 +234,7 @@ class ComparisonTests(FleetCase):
         return self.done(self.whole, self.whole.nodes[1].endpoint.ask(to, method, *arguments), 0.1)
 
     def places(self, group: int) -> list[list[Any]]:
-        """Return all places of a group, page by page."""
+        """Return the entries of all records of a group, page by page."""
         found: list[list[Any]] = []
         while True:
             page = self.ask("places", group, found[-1][:3] if found else [])
@@ -247,7 +253,7 @@ class ComparisonTests(FleetCase):
         self.assertEqual(self.places(-1), [])
 
     def test_who_pages_sees_one_moment(self) -> None:
-        """Records stored after a digest request are listed after the next request, or when the list is old."""
+        """Pages are a snapshot: a record that was stored later is listed when the snapshot is renewed or too old."""
         late = hash_key("late")
         group = late[0] * GROUPS >> 8
         self.ask("digests", 7, 2)
@@ -258,7 +264,7 @@ class ComparisonTests(FleetCase):
         self.assertIn(late, [place[0] for place in self.places(group)])
 
     def test_records_come_in_pages(self) -> None:
-        """A page contains records up to its size limit, at least one, and None for each missing record."""
+        """A page contains records up to its size limit, at least one record, and None for each missing record."""
         node = self.whole.nodes[0]
         large = hash_key("large")
         for name in "abc":
@@ -291,10 +297,10 @@ class ComparisonTests(FleetCase):
 
 
 class JoinTests(FleetCase):
-    """The cost of joining until the first read, and the hand-over afterwards."""
+    """Tests of joining: the cost until the first read, and the hand-over after it."""
 
     def test_a_newcomer_reads_at_once(self) -> None:
-        """In a team of 20 the first read of a new node needs few datagrams, for any bootstrap node."""
+        """In a team of 20 the first read of a new node takes few datagrams, whichever the bootstrap node is."""
         fleet = self.fleet(20)
         keys = [hash_key(str(number)) for number in range(6)]
         for key in keys:
@@ -313,7 +319,7 @@ class JoinTests(FleetCase):
             fleet.run(3.0)
 
     def test_a_newcomer_takes_over(self) -> None:
-        """Within a second a new node knows all members, is synced and holds its records."""
+        """Within a second a new node knows all members, is synced and stores its share of the records."""
         fleet = self.fleet(10)
         keys = [hash_key(str(number)) for number in range(60)]
         for key in keys:
@@ -328,7 +334,7 @@ class JoinTests(FleetCase):
         self.assertEqual([key for key in keys if newcomer.replica.get_held(key)], belongs)
 
     def test_a_newcomer_writes_to_the_right_nodes(self) -> None:
-        """A majority write directly after joining is found by a majority read at another node."""
+        """A majority write immediately after joining is found by a majority read at another node."""
         fleet = self.fleet(20)
         for number in range(6):
             newcomer = fleet.make_node(len(fleet.nodes))

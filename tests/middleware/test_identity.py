@@ -25,13 +25,13 @@ class IdentityTest(SynchronousTestCase):
         self.assertEqual(identity.sign(b"\x72").hex(), signature)
 
     def test_id_follows_from_the_key(self) -> None:
-        """The node id is the 160-bit hash of the public key; a node cannot choose it or use another node's id."""
+        """The node id is the 160-bit hash of the public key, so a node cannot choose it or use another node's id."""
         self.assertEqual(DOG.node_id, derive_node_id(DOG.public))
         self.assertEqual(len(DOG.node_id), ID_BYTES)
         self.assertNotEqual(DOG.node_id, CAT.node_id)
 
     def test_signatures(self) -> None:
-        """A signature is valid for one message of one node; other input of any length is rejected."""
+        """A signature is valid only for one message of one node; other input of any length is rejected."""
         signature = DOG.sign(b"sit")
         self.assertTrue(is_signature_valid(DOG.public, b"sit", signature))
         self.assertFalse(is_signature_valid(DOG.public, b"run", signature))
@@ -41,7 +41,7 @@ class IdentityTest(SynchronousTestCase):
         self.assertFalse(is_signature_valid(b"short", b"sit", signature))
 
     def test_both_ends_of_an_exchange_agree(self) -> None:
-        """The exchange keys of two nodes yield the same shared secret at both nodes."""
+        """The exchange keys of two nodes give the same shared secret at both nodes."""
         here = bindings.crypto_scalarmult(DOG.exchange_secret, derive_exchange_key(CAT.public))
         there = bindings.crypto_scalarmult(CAT.exchange_secret, derive_exchange_key(DOG.public))
         self.assertEqual(here, there)

@@ -1,4 +1,7 @@
-"""Some schedules of ``tests.invariants`` and the seeded bugs that they find; ``make schedules`` runs 2,000."""
+"""Tests of some schedules of ``tests.invariants``, and of the seeded bugs that they find.
+
+``make schedules`` runs 2,000 schedules.
+"""
 
 from __future__ import annotations
 
@@ -20,15 +23,18 @@ BITING = {
     "the window moves before the tag is checked": (1, "R1"),
     "no tie-break": (1, "C1"),
 }
-"""A seed that shows each of some quick bugs, and the invariant that it breaks; ``make bugs`` has all."""
+"""Some bugs that are found quickly, each with a seed and the invariant that it violates.
+
+``make bugs`` tests all bugs.
+"""
 ALL = tuple(WORKLOADS)
 SHRUNK = 16
-"""The seed of a schedule that a bug fails."""
+"""The seed of a schedule that fails because of a seeded bug."""
 DIGEST = "from tests.middleware.test_invariants import digests; print(digests())"
 
 
 def digests() -> list[str]:
-    """Return the digests of all datagrams and events of one run of every workload, of tasks and of leases."""
+    """Return the digests of all datagrams and events, for one run of every workload, of tasks and of leases."""
     schedule, tasks, leases = Schedule(1, SqliteTeam), Tasks(3), Leases(3)
     schedule.run([workload(schedule) for workload in WORKLOADS.values()])
     tasks.run()
@@ -52,14 +58,17 @@ class InvariantTests(SynchronousTestCase):
         self.assertEqual({seed: found for seed in (7,) if (found := run(seed, ALL).found)}, {})
 
     def test_whole_agents(self) -> None:
-        """Fifteen schedules of agents that join, leave, fail, pause and cancel violate none of E4 to E7 and differ."""
+        """Fifteen schedules of whole agents violate none of the invariants E4 to E7, and differ.
+
+        The agents join, leave, fail, pause and cancel.
+        """
         outcomes = [run(seed, ("tasks",)) for seed in range(7001, 7016)]
         self.assertEqual({outcome.seed: outcome.found for outcome in outcomes if outcome.found}, {})
         self.assertGreater(len({outcome.digest for outcome in outcomes}), 13)
         self.assertEqual(outcomes[0], run(7001, ("tasks",)))
 
     def test_bugs_have_their_places(self) -> None:
-        """Every seeded bug replaces an existing attribute of the code."""
+        """Every seeded bug replaces an attribute that exists in the code."""
         for bug in FINDERS:
             with self.subTest(bug=bug), seeded(bug):
                 pass

@@ -33,7 +33,10 @@ def verdict(program: bytes, architecture: int, number: int) -> int:
 
 class ConfinementTests(SynchronousTestCase):
     def test_exactly_the_listed_calls(self) -> None:
-        """The filter allows exactly the listed calls, refuses all others, and kills on another architecture."""
+        """The filter allows exactly the listed calls.
+
+        It rejects all other calls, and kills the process on another architecture.
+        """
         for machine, architecture in MACHINES.items():
             program = build_filter(machine)
             _, _, numbers = confinement._NUMBERS[machine]

@@ -24,7 +24,7 @@ class ExplanationTests(SynchronousTestCase):
         self.assertTrue(text.startswith("epoch 1: dog2, 3 of 3 agree\n  by nearest 1 from reports "), text)
 
     def test_who_differs_and_in_what(self) -> None:
-        """An agent with another winner, other reports or another version is listed with the difference."""
+        """The explanation lists each agent whose winner, reports or version differ, with the difference."""
         missed = [THREE[0], THREE[2]]
         moved = [THREE[0], THREE[1], member(3, 1.25)]
         for other, what in (
@@ -41,7 +41,10 @@ class ExplanationTests(SynchronousTestCase):
         self.assertIn("dog3 differs: names dog3; knew no report of dog2", text)
 
     def test_agreement_is_told(self) -> None:
-        """The explanation contains the agreed choice; an agent that agreed on another value is listed with it."""
+        """The explanation contains the agreed choice.
+
+        It lists each agent that agreed on a different value, with that value.
+        """
         known = [
             replace(each, reports=(replace(each.reports[0], more="battery 40%"), *each.reports[1:])) for each in OWN
         ]

@@ -196,7 +196,7 @@ class DirectoryTests(FleetCase):
         return [parse_device(record).uuid for record in listing.records]  # type: ignore[union-attr, misc]
 
     def all_there(self, town: Town, readers: int = 3, also: Iterable[Neighbour] = ()) -> None:
-        """Check that ``readers`` list each present device once, and of the departed ones only those in ``also``."""
+        """Check that ``readers`` list each present device once, and no departed device except those in ``also``."""
         here = {n.identity.node_id.hex() for n in town.neighbours}
         late = {n.identity.node_id.hex() for n in also}
         for reader in town.dice.sample(town.neighbours, min(readers, len(town.neighbours))):

@@ -81,7 +81,7 @@ class ListingTests(SynchronousTestCase):
                 self.assertEqual(len(listed(announced(depths), Listing(3)).records), len(team), depth)
 
     def test_two_networks_become_one(self) -> None:
-        """After a partition of 20 and 600 devices all are found, although the 20 are under the root key only."""
+        """After a partition into 20 and 600 devices all are found, although the 20 are under the root key only."""
         depths = {**dict.fromkeys(owners(600), 5), **dict.fromkeys(owners(20, 2), 0)}
         for floor in (0, 4):
             self.assertEqual(len(listed(announced(depths), Listing(floor)).records), 620)

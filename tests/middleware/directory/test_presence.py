@@ -143,10 +143,7 @@ class DeviceTests(SynchronousTestCase):
         self.assertEqual(len(device.messages), MAX_MESSAGES)
 
     def test_too_large_gives_way(self) -> None:
-        """A record that is too large drops old messages first, then the description.
-
-        If it is still too large, it raises an error.
-        """
+        """A record that is too large drops old messages first, then the description, and then the deployed modules."""
         device = Device(DEVICE.uuid, "dog", description="d" * 600)
         for n in range(5):
             device = device.with_message(float(n), f"{n}" * 70)

@@ -22,7 +22,7 @@ class FaultTests(SynchronousTestCase):
         self.assertEqual(parse_fault("kill", None, 0), Fault("kill"))
 
     def test_begins(self) -> None:
-        """A device answers with the start time of its fault; an invalid answer means that it starts immediately."""
+        """A device answers with the delay until its fault starts; an invalid answer counts as no delay."""
         self.assertEqual(parse_delay(0.5), 0.5)
         for answer in (None, "soon", True, -1.0, 3600.0, math.nan, math.inf, [0.5]):
             self.assertEqual(parse_delay(answer), 0.0)

@@ -32,7 +32,10 @@ class FaultyNetworkTests(SynchronousTestCase):
         return len(self.came) - before[0], len(self.answers) - before[1]
 
     def test_changes_nothing_as_made(self) -> None:
-        """Without a fault all datagrams pass both ways, at once, at the address of the network below."""
+        """Without a fault all datagrams pass immediately in both directions.
+
+        The address is that of the network below.
+        """
         self.assertEqual(self.network.address.host, "127.0.0.1")
         self.assertEqual(self.exchange(0.0, 20), (20, 20))
 

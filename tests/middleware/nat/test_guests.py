@@ -109,7 +109,7 @@ class HostileTests(SitesCase):
         self.assertEqual(len(self.a.endpoint.peers._handshakes), 0)
 
     def test_outside(self) -> None:
-        """Behind a symmetric router two peers see two ports, behind other types the same port."""
+        """Behind a symmetric router two peers observe two different ports, behind other types the same port."""
         for site, kind, ports in (("c", "port", 1), ("d", "sym", 2)):
             c = self.g.at(site, kind)
             self.g.run(2.0)

@@ -25,7 +25,7 @@ UNPUNCHABLE = {frozenset({"port", "sym"}), frozenset({"sym"})}
 def paths(sites: Sites, one: str, other: str) -> tuple[str, float]:
     """Return the first path between nodes behind routers of these types, and its delay after they met.
 
-    The nodes join one after the other and learn of each other from the member list of the public node.
+    The nodes join one after the other, and learn of each other from the member list of the public node.
     """
     a = sites.at("a", one)
     sites.run(2.0)
@@ -371,7 +371,7 @@ class PathKindTests(SitesCase):
         return a.nat.paths.find_path(b.contact)
 
     def test_kinds(self) -> None:
-        """Nodes behind cone routers are punched, behind symmetric routers relayed, and at one site use their LAN."""
+        """Nodes behind cone routers use hole punching, behind symmetric routers a relay, and at one site their LAN."""
         relay = self.sites().nodes["pub"].identity.node_id
         for one, other, site, kind in (
             ("port", "port", "b", "punched"),

@@ -139,7 +139,7 @@ class UpgradeTests(SynchronousTestCase):
         self.assertEqual([step for _, step in self.upgrades.due(151.0)], [0])
 
     def test_only_one_of_the_two(self) -> None:
-        """Of two peers the one that ``is_behind`` tries later, and waits longer while the other one tries."""
+        """The peer for which ``is_behind`` is true tries later, and waits longer if the other peer tries."""
         self.upgrades.add(self.public, True, 0.0)
         self.assertEqual(self.tried(RETRY_INTERVALS_S[0] + TURN_DELAY_S), [RETRY_INTERVALS_S[0] + TURN_DELAY_S])
         now = RETRY_INTERVALS_S[0] + 2 * TURN_DELAY_S

@@ -30,7 +30,7 @@ RECIPES: dict[BallotRelation, tuple[dict[str, Any], Any, float, int]] = {
     BallotRelation.FOREIGN: ({"promised": OTHER}, MID, 1.0, FIRST_CONFIGURATION),
     BallotRelation.FREE: ({"promised": LOW}, MID, 1.0, FIRST_CONFIGURATION),
 }
-"""What a register holds, and the ballot, moment and configuration that then stand so to it."""
+"""For each ballot relation: the fields of the register, the ballot, the time and the configuration."""
 GIVEN_BACK = {"promised": MID, "released": HIGH}
 """The fields of a register in which a later ballot than the released ballot was already released."""
 
@@ -202,7 +202,7 @@ class ReachableTests(SynchronousTestCase):
 
 class NumberTests(SynchronousTestCase):
     def test_numbers_are_bounded(self) -> None:
-        """The highest ballots and tokens get no promise, which leaves room for other proposers (N1)."""
+        """Ballots and tokens above the ceiling are rejected, so no proposer can use up all numbers (invariant N1)."""
         for use in (TAKE, LEASE):
             member, huge = Member(use), use.ballot(INITIAL_CEILING + 1, 0)
             self.assertEqual(member.prepare(huge, 0.0).kind, ReplyKind.OUTBID)
@@ -212,7 +212,10 @@ class NumberTests(SynchronousTestCase):
             self.assertEqual(member.prepare(huge, 1.0).kind, ReplyKind.GRANTED)
 
     def test_another_life(self) -> None:
-        """A restarted proposer waits for the end of its earlier lease, because its device may still act (L2)."""
+        """A restarted proposer waits for the end of its earlier lease, as invariant L2 requires.
+
+        The device of the proposer may still act under this lease.
+        """
         member = Member(LEASE)
         member.lease(LOW, 1, 0.0)
         self.assertEqual(member.prepare(MID, 1.0).kind, ReplyKind.GRANTED)

@@ -76,7 +76,7 @@ class LogTests(SynchronousTestCase):
         self.assertFalse(self.opened().is_complete)
 
     def test_bounded(self) -> None:
-        """A full log removes old ended registers, keeps their highest numbers as a floor and rejects new registers."""
+        """A full log removes old ended registers, keeps their highest numbers as a bound, and rejects new registers."""
         self.patch(module, "MAX_REGISTERS", 3)
         granted(self.log, "old", 40, 0.0)
         granted(self.log, "done", 30, 0.0).is_closed = True
@@ -94,7 +94,10 @@ class LogTests(SynchronousTestCase):
         self.assertEqual(again.floor[:2], (40, 40))
 
     def test_changed_councils_are_not_forgotten(self) -> None:
-        """The register of a changed council is kept while its task is open, or the old council could decide again."""
+        """The register of a changed council is kept while its task is open.
+
+        Otherwise the old council could decide again.
+        """
         self.patch(module, "MAX_REGISTERS", 1)
         granted(self.log, "t", 1, 0.0).configuration = FIRST_CONFIGURATION + 1
         self.assertIsNone(entered(self.log, "u", 1e9))

@@ -92,7 +92,10 @@ class RoundTests(SynchronousTestCase):
         self.assertEqual((asked.answered_places, asked.silent_places), ([1, 0], [2]))
 
     def test_silent_members_are_asked_again(self) -> None:
-        """A silent member gets the request every 100 ms until the decision, and at least three times."""
+        """A silent member gets the request every 100 ms until the decision, and at least three times.
+
+        A member that has replied gets it once.
+        """
         self.round()
         self.answer(1, YES)
         self.answer(2, YES)
@@ -115,7 +118,7 @@ class RoundTests(SynchronousTestCase):
         self.assertEqual(self.clock.getDelayedCalls(), [])
 
     def test_a_member_that_is_down_holds_nobody_up(self) -> None:
-        """If the majority replied without a decision, the round does not wait its full timeout for the last member."""
+        """If a majority has replied without a decision, the round waits only briefly for the last member."""
         asked = self.round()
         self.answer(0, YES)
         self.answer(1, NO)

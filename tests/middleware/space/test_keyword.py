@@ -27,7 +27,7 @@ class WordsTests(SynchronousTestCase):
     @settings(max_examples=200)
     @given(text=st.text(max_size=30))
     def test_stable(self, text: str) -> None:
-        """Splitting any text yields unique words."""
+        """Splitting any text gives unique words."""
         found = words(text)
         self.assertEqual(len(set(found)), len(found))
 

@@ -1,4 +1,4 @@
-"""Tests of the acceptors of tuple takes, of stored tuples, and of the completion of takes."""
+"""Tests of the acceptors of tuple takes, of stored tuples, and of the completion of unfinished takes."""
 
 from __future__ import annotations
 
@@ -77,7 +77,7 @@ class TakeAcceptorTests(SynchronousTestCase):
         self.acceptor = self.made()
 
     def made(self, seed: int = 1) -> TakeAcceptor:
-        """Create the member again on the same store, as after a restart."""
+        """Create the member again with the same store, as after a restart."""
         return TakeAcceptor(Exposed(), self.store, self.clock, random.Random(seed))
 
     def claim(self, where: TupleId, counter: int = 1, taker: bytes = b"a", lease: float = 2.0) -> ReplyKind:
@@ -132,7 +132,7 @@ class TakeAcceptorTests(SynchronousTestCase):
         self.assertEqual(len(self.acceptor), 0)
 
     def test_nothing_is_promised_about_what_is_over(self) -> None:
-        """A tuple that its publisher removed, or replaced by another one in its slot, cannot be claimed."""
+        """A tuple cannot be claimed after its publisher removed it, or replaced it by another tuple in its slot."""
         self.store.put(tuple_record(place(1)), 99.0)
         self.assertEqual(self.claim(place(1)), ReplyKind.GRANTED)
         self.store.put(tuple_record(place(2)), 99.0)
@@ -143,7 +143,7 @@ class TakeAcceptorTests(SynchronousTestCase):
         self.assertEqual(self.claim(old), ReplyKind.OUTBID)
 
     def test_bounded(self) -> None:
-        """A full member removes only registers of removed tuples, and keeps a floor for their ballots."""
+        """A full member removes only registers of removed tuples, and keeps a lower bound for their ballots."""
         self.patch(module, "MAX_REGISTERS", 4)
         for number in range(4):
             self.claim(place(number), counter=number + 1, lease=100.0)
@@ -189,7 +189,7 @@ class TakeAcceptorTests(SynchronousTestCase):
         self.assertEqual(self._kind(self.successResultOf(answer), Event.PREPARE), ReplyKind.GRANTED)
 
     def test_what_was_accepted_is_told(self) -> None:
-        """A later claim returns the accepted value, one second after the first taker could have completed it."""
+        """A later claim gets the accepted value, one second after the first taker could have completed its take."""
         self.claim(place(1), 1, b"a", lease=100.0)
         self.assertEqual([self.confirm(place(1)) for _ in range(2)], [ReplyKind.GRANTED] * 2)
         self.assertEqual(self.claim(place(1), 2, b"b"), ReplyKind.HELD)
@@ -203,7 +203,7 @@ class TakeAcceptorTests(SynchronousTestCase):
     @settings(max_examples=300)
     @given(foreign=FOREIGN, noise=st.binary(max_size=60))
     def test_notes_are_decoded_totally(self, foreign: Any, noise: bytes) -> None:
-        """A corrupted stored vote decodes to None, without an exception."""
+        """A corrupted stored vote is decoded as None, without an exception."""
         good = [KEY, place(1).pack(), 1, b"a", 1.0, None]
         self.assertEqual(CODEC.unpack(CODEC.pack({})), ({}, True))
         rows = [[foreign], [[*good[:5], foreign]], [[*good[:5], [1, b"a", foreign]]], foreign]
@@ -220,14 +220,14 @@ class TakeAcceptorTests(SynchronousTestCase):
 
 class TupleRecordTests(SynchronousTestCase):
     def test_round_trip(self) -> None:
-        """A tuple and the note of its taking survive encoding and decoding."""
+        """A tuple, and the note that it was taken, survive encoding and decoding."""
         council = (Member(PEER, b"i" * 8),)
         value = pack_tuple(place(1).mark, ("x", 1, None), council)
         self.assertEqual(parse_record(record(place(1).name, value)), StoredTuple(place(1), ("x", 1, None), council))
         self.assertEqual(parse_record(record("n", pack_taken(place(1), b"taker"))), TakenNote(place(1), b"taker"))
 
     def test_standing(self) -> None:
-        """A taken tuple is no longer available; another tuple in the same slot is."""
+        """A taken tuple is no longer available; a different tuple in the same slot is available."""
         note = record("n", pack_taken(place(1), b"taker"))
         stored, taken = parse_records([tuple_record(place(1)), tuple_record(place(2)), note])
         self.assertEqual([one.tuple_id for one in stored], [place(2)])
@@ -239,7 +239,7 @@ class TupleRecordTests(SynchronousTestCase):
             self.assertEqual([one.tuple_id for one in stored], [newer])
 
     def test_unlawful(self) -> None:
-        """A record that is not a tuple record decodes to None."""
+        """A record that is not a tuple record is decoded as None."""
         member = [*PEER.pack(), b"i" * 8]
         for fields in (
             [1, b"short", ["x"], [member]], [1, b"m" * 8, [], [member]], [1, b"m" * 8, ["x"], []],
@@ -254,7 +254,7 @@ class TupleRecordTests(SynchronousTestCase):
     @settings(max_examples=300)
     @given(foreign=FOREIGN, noise=st.binary(max_size=60))
     def test_total(self, foreign: Any, noise: bytes) -> None:
-        """Any record decodes to a stored tuple or None, without an exception."""
+        """Any record is decoded as a stored tuple or as None, without an exception."""
         self.assertIsInstance(parse_record(record("t", noise)), StoredTuple | TakenNote | None)
         for fields in (foreign, [1, b"m" * 8, foreign, [foreign]], [1, b"m" * 8, ["x"], foreign], [2, foreign, b"t"]):
             try:
@@ -286,7 +286,7 @@ class ResolveTests(SynchronousTestCase):
         return maybeDeferred(getattr(self.acceptors[number], method.replace("decree.", "answer_")), PEER, *arguments)
 
     def begin(self, number: int, counter: int, taker: bytes) -> None:
-        """Let one member accept a take, as if the taker failed afterwards."""
+        """Let one member accept a take, as if the taker then failed."""
         acceptor = self.acceptors[number]
         places: list[object] = [place(1).pack()]
         acceptor.answer_claim(PEER, KEY, places, acceptor.incarnation, counter, taker, 1.0)
@@ -299,20 +299,26 @@ class ResolveTests(SynchronousTestCase):
         return found[0]
 
     def test_own_value_gives_way(self) -> None:
-        """A take that one member accepted may be decided; the caller completes it and drops its value."""
+        """A take that only one member accepted may have been decided.
+
+        A later caller completes it and drops its own value.
+        """
         self.begin(0, 1, b"a")
         self.silent.add(2)
         self.assertEqual(self.resolve(OWN), b"a")
 
     def test_highest_ballot(self) -> None:
-        """Of two incomplete takes the one with the higher ballot is completed."""
+        """Of two unfinished takes the take with the higher ballot is completed."""
         self.begin(0, 2, b"b")
         self.begin(1, 1, b"a")
         self.silent.add(2)
         self.assertEqual(self.resolve(None), b"b")
 
     def test_nothing_was_begun(self) -> None:
-        """Without an accepted value the caller's value is decided; without either, nothing is decided or held."""
+        """Without an accepted value the caller's value is decided.
+
+        If there is no value at all, nothing is decided or held.
+        """
         self.assertIsNone(self.resolve(None))
         self.assertEqual(self.resolve(OWN), OWN)
         self.assertEqual(self.resolve(b"late"), OWN)

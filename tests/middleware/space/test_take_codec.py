@@ -1,4 +1,4 @@
-"""Tests of ``middleware.entangled.space.take_codec``: received replies, and stored votes of the previous version."""
+"""Tests of ``middleware.entangled.space.take_codec``: received replies, and votes stored by the previous version."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ class WireTests(SynchronousTestCase):
             self.assertEqual(unpack_reply(pack_reply(reply, event), event), reply)
 
     def test_codes(self) -> None:
-        """A reply to one type of request is invalid for another type."""
+        """A reply to one type of request is invalid as a reply to another type."""
         codes = [
             pack_reply(Reply(ReplyKind.GRANTED), event)[0] for event in (Event.PREPARE, Event.ACCEPT, Event.RELEASE)
         ]
@@ -51,7 +51,7 @@ class WireTests(SynchronousTestCase):
     @settings(max_examples=300)
     @given(foreign=FOREIGN, accepted=FOREIGN)
     def test_total(self, foreign: Any, accepted: Any) -> None:
-        """Any other input decodes to None without an exception."""
+        """Any other input is decoded as None, without an exception."""
         for fields in (foreign, [0, 1, 0.5, accepted], [0, 1, 0.5, [1, b"a", foreign]], [foreign, 1, 0.5, None]):
             reply = unpack_reply(fields, Event.PREPARE)
             self.assertTrue(reply is None or isinstance(reply.kind, ReplyKind))

@@ -1,4 +1,4 @@
-"""Tests of concurrent takers: each tuple is confirmed at most once and none is lost, even if nodes fail."""
+"""Tests of concurrent takers: each tuple is confirmed at most once and no tuple is lost, even if nodes fail."""
 
 from __future__ import annotations
 
@@ -28,11 +28,11 @@ class TakesTests(SynchronousTestCase):
             self._checked(SharedStoreTrial(seed, TUPLES, loss, is_churning))
 
     def test_whole_nodes(self) -> None:
-        """Each tuple is taken once if whole nodes replicate the records, datagrams are lost and some nodes die."""
+        """Each tuple is taken once if whole nodes replicate the records, datagrams are lost and some nodes fail."""
         self._checked(TakingTrial(1, 15, 0.1, True, nodes=10))
 
     def test_members_that_lost_their_memory_keep_silent(self) -> None:
-        """A member that restarts without its votes does not vote on older tuples; no tuple is confirmed twice."""
+        """A member that restarts without its votes does not vote on older tuples, so no tuple is confirmed twice."""
         for seed in range(30, 32):
             trial = ForgottenLife(seed, TUPLES, 0.1, True)
             trial.finish_limit_s = 20.0

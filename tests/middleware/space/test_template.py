@@ -38,13 +38,13 @@ FOREIGN = st.recursive(
 
 class TemplateTests(SynchronousTestCase):
     def test_values_match_their_like_only(self) -> None:
-        """1, 1.0, True and None are four distinct values and match only themselves."""
+        """1, 1.0, True and None are four different values, and each matches only itself."""
         self.assertTrue(make_template(["a", 1, None, b"x"]).matches(("a", 1, None, b"x")))
         for other in (1.0, True, "1", None):
             self.assertFalse(make_template([1]).matches((other,)))
 
     def test_types_and_wildcards(self) -> None:
-        """A type matches only its values, ANY matches each value, and a template only matches tuples of its length."""
+        """A type matches only values of this type, ANY matches any value, and a template only tuples of its length."""
         self.assertTrue(make_template([int, str, ANY]).matches((1, "a", None)))
         self.assertFalse(make_template([int]).matches((True,)))
         self.assertFalse(make_template([float]).matches((1,)))
@@ -74,7 +74,7 @@ class TemplateTests(SynchronousTestCase):
             self.assertRaises(BadTuple, where, operator, operand)
 
     def test_wrong_fields(self) -> None:
-        """Invalid tuples and templates raise ``BadTuple``, and the message names the field."""
+        """Invalid tuples and templates raise ``BadTuple``, and the message states the index of the invalid field."""
         for wrong in ([], [1] * 33, "text", b"bytes", [object()], [[1]], [2**64], ["\ud800"], [float("nan")], 5):
             self.assertRaises(BadTuple, make_tuple, wrong)
             self.assertRaises(BadTuple, make_template, wrong)
@@ -83,7 +83,7 @@ class TemplateTests(SynchronousTestCase):
         self.assertIn("field 1", str(self.assertRaises(BadTuple, make_tuple, [1, object()])))
 
     def test_too_large(self) -> None:
-        """A tuple that does not fit into a record raises ``TooLarge``."""
+        """A tuple that exceeds the size of a record raises ``TooLarge``."""
         self.assertRaises(TooLarge, make_tuple, ["x" * 700])
         self.assertRaises(TooLarge, make_template, [b"x" * 700])
 
@@ -98,7 +98,7 @@ class TemplateTests(SynchronousTestCase):
     @settings(max_examples=300)
     @given(operator=st.sampled_from([*OPERATORS, "=", "like"]), foreign=FOREIGN | st.lists(FOREIGN, max_size=4))
     def test_total(self, operator: str, foreign: Any) -> None:
-        """Any input decodes to a tuple or raises ``Malformed``; any operand is valid or raises ``BadTuple``."""
+        """Any input is decoded as a tuple or raises ``Malformed``; any operand is valid or raises ``BadTuple``."""
         with contextlib.suppress(Malformed):
             self.assertIsInstance(parse_tuple(foreign), tuple)
         with contextlib.suppress(BadTuple):

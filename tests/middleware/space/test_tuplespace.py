@@ -26,7 +26,7 @@ class SpaceCase(FleetCase):
     made: list[TupleSpace]
 
     def spaces(self, n: int, weather: LinkConditions = DELAY, seed: int = 1) -> tuple[EntangledTeam, list[TupleSpace]]:
-        """Return a simulated team and a space on each node; the spaces are stopped before the team."""
+        """Return a simulated team and a space on each node; the spaces are stopped before the team is stopped."""
         fleet = self.fleet(n, seed, weather)
         spaces = [TupleSpace(node, fleet.clock, fleet.make_life_rng(place)) for place, node in enumerate(fleet.nodes)]
         self.made = spaces
@@ -42,13 +42,13 @@ class SpaceCase(FleetCase):
         super().tearDown()
 
     def posted(self, fleet: EntangledTeam) -> list[StoredTuple]:
-        """Return every tuple that some node stores, without duplicates."""
+        """Return every tuple that at least one node stores, without duplicates."""
         said = [parse_record(record) for node in fleet.nodes for record in node.store.records()]
         return list({one.tuple_id: one for one in said if isinstance(one, StoredTuple)}.values())
 
     def called_up(self, node: EntangledNode, answer: Callable[..., object]) -> None:
-        """Let ``node`` give this reply to an invitation to a council."""
-        node.take_acceptor.load()  # otherwise the acceptor would register its method later
+        """Let ``node`` give this reply when it is asked to be a member of a council."""
+        node.take_acceptor.load()  # otherwise the acceptor would register its own method later
         node.endpoint.expose("decree.enrol", answer)
 
     def moment(self, fleet: EntangledTeam, work: Deferred[Any]) -> list[float]:
@@ -65,7 +65,7 @@ class SpaceCase(FleetCase):
 
 class TupleSpaceTests(SpaceCase):
     def test_put_read_and_get(self) -> None:
-        """A tuple can be read by all nodes by template; after one node took it, it is gone for all."""
+        """All nodes can read a tuple by a template; after one node took the tuple, no node can read it."""
         fleet, (a, b, c) = self.spaces(3)
         for number in (2, 1, 3):
             self.done(fleet, a.put(("job", number, None)), 1.0)
@@ -81,7 +81,7 @@ class TupleSpaceTests(SpaceCase):
             self.assertEqual(len(self.done(fleet, space.read_all(("job", ANY, ANY)))), 2)
 
     def test_equal_tuples_are_several(self) -> None:
-        """A space is a bag: each of several equal tuples is taken once; other spaces and lengths do not match."""
+        """A space is a bag, so each of several equal tuples is taken once; other spaces and lengths do not match."""
         fleet, (a, b, _) = self.spaces(3)
         for space in (a, a, b):
             self.done(fleet, space.put(("same",)), 1.0)
@@ -92,7 +92,7 @@ class TupleSpaceTests(SpaceCase):
         self.assertEqual(self.done(fleet, b.get_many(("same",), 5)), [("same",)] * 3)
 
     def test_stopped_while_several_are_confirmed(self) -> None:
-        """If a space stops before the council confirmed its takes, the call fails, and no error is left unhandled."""
+        """If a space stops before the council confirmed its takes, the call fails, and no unhandled error is logged."""
         fleet, (a, b, _) = self.spaces(3)
         for _ in range(3):
             self.done(fleet, a.put(("same",)), 1.0)
@@ -112,7 +112,7 @@ class TupleSpaceTests(SpaceCase):
         self.assertEqual(self.flushLoggedErrors(), [])
 
     def test_wakes_who_waits(self) -> None:
-        """A blocked read and a blocked get return within a second of the put, and each tuple ends one get."""
+        """A blocked read and a blocked get return within a second of the put; each tuple ends only one get."""
         fleet, spaces = self.spaces(6)
         reading = self.moment(fleet, spaces[1].read(("go", int)))
         gets = [space.get(("go", int)) for space in spaces[2:5]]
@@ -138,13 +138,16 @@ class TupleSpaceTests(SpaceCase):
             fleet.nodes[place].stop_silently()
         fleet.run(12.0)
         began = fleet.clock.seconds()
-        # Half of the members are missing, so the put cannot be confirmed, but the blocked read returns.
+        # Half of the members have failed, so the put cannot be confirmed; the blocked read still returns.
         spaces[5].put(("go",)).addErrback(lambda failure: failure.trap(NoAnswer))
         fleet.run(1.5)
         self.assertLess(waiting[0] - began, 1.0)
 
     def test_a_council_is_whole(self) -> None:
-        """A put waits for silent members, as a smaller council would tolerate no failure; finally it fails."""
+        """A put waits for silent members, because a smaller council would tolerate no failure.
+
+        If they stay silent, it fails.
+        """
         fleet, (a, *_) = self.spaces(4)
         for node in fleet.nodes[1:]:
             self.called_up(node, lambda peer: Deferred())
@@ -164,7 +167,7 @@ class TupleSpaceTests(SpaceCase):
         self.assertEqual(len(self.posted(fleet)), 1)
 
     def test_a_council_without_those_who_refuse(self) -> None:
-        """A put does not wait for nodes that reject membership; the council is as large as possible."""
+        """A put does not wait for nodes that refuse to be council members; the council is as large as possible."""
         fleet, (a, *_) = self.spaces(3)
 
         def refuse(peer: object) -> bytes:
@@ -183,7 +186,7 @@ class TupleSpaceTests(SpaceCase):
             self.failureResultOf(call, NoTuple)
 
     def test_cancel(self) -> None:
-        """A cancelled get takes no tuple; the next tuple goes to the next caller."""
+        """A cancelled get takes no tuple; the next caller gets the next tuple."""
         fleet, (a, b, c) = self.spaces(3)
         get = a.get(("job",))
         fleet.run(1.0)
@@ -193,7 +196,7 @@ class TupleSpaceTests(SpaceCase):
         self.assertEqual(self.done(fleet, c.get_if_exists(("job",))), ("job",))
 
     def test_cancelled_too_late(self) -> None:
-        """A get that is cancelled during the confirmation of its take puts the tuple back."""
+        """If a get is cancelled while its take is being confirmed, the tuple is put back."""
         fleet, (a, b, c) = self.spaces(3)
         for pause in (0.005, 0.012, 0.02, 0.03, 0.04, 0.05):
             self.done(fleet, b.put(("job", pause)), 1.0)
@@ -215,7 +218,7 @@ class TupleSpaceTests(SpaceCase):
         self.assertIsNone(self.done(fleet, b.get_if_exists(("short",)), 1.0))
 
     def test_tuples_that_nobody_can_take_do_not_keep_the_others(self) -> None:
-        """``get`` skips tuples with a council that lost its majority and takes other tuples."""
+        """If the council of a tuple has lost its majority, ``get`` skips this tuple and takes other tuples."""
         fleet, spaces = self.spaces(8)
         for number in range(4):
             self.done(fleet, spaces[0].put(("stuck", number)), 0.5)
@@ -232,7 +235,7 @@ class TupleSpaceTests(SpaceCase):
             self.assertEqual(self.done(fleet, space.get((str, int)), 20.0)[0], "good")
 
     def test_slots_are_used_again(self) -> None:
-        """Slots of taken tuples are reused, which bounds their number."""
+        """Slots of taken tuples are used again, which limits the number of slots."""
         fleet, (a, b, _) = self.spaces(3)
         for number in range(150):
             self.done(fleet, a.put(("n", number)), 0.1)
@@ -248,7 +251,7 @@ class TupleSpaceTests(SpaceCase):
         self.assertEqual(self.done(fleet, a.get(("x",))), ("x",))
 
     def test_wrong_use(self) -> None:
-        """An invalid tuple raises at once, and a stopped space raises ``NotRunning``."""
+        """An invalid tuple raises immediately, and a stopped space raises ``NotRunning``."""
         fleet, (a, b) = self.spaces(2)
         fleet.run(1.0)
         for wrong in ([], [object()], "text"):
@@ -270,7 +273,7 @@ class ClaimTests(SpaceCase):
         return claim
 
     def test_confirm(self) -> None:
-        """A claimed tuple cannot be taken by others, and is taken after the confirmation."""
+        """Other nodes cannot take a claimed tuple; after the confirmation it is taken."""
         fleet, (a, b, c) = self.spaces(3)
         self.done(fleet, a.put(("job", 1)), 1.0)
         claim = self._claimed(fleet, b, lease=10.0)
@@ -282,7 +285,7 @@ class ClaimTests(SpaceCase):
         self.failureResultOf(claim.confirm(), ClaimLost)
 
     def test_a_dead_taker_gives_back(self) -> None:
-        """The claim of a failed taker ends with its lease, even if the publisher has failed."""
+        """The claim of a failed taker ends with its lease, even if the publisher has failed, too."""
         fleet, spaces = self.spaces(6)
         self.done(fleet, spaces[1].put(("job", 1)), 1.0)
         self._claimed(fleet, spaces[2], lease=3.0)
@@ -294,7 +297,7 @@ class ClaimTests(SpaceCase):
         self.assertEqual(len(got), 1)
 
     def test_release(self) -> None:
-        """A released claim makes the tuple available at once."""
+        """When a claim is released, the tuple is available immediately."""
         fleet, (a, b, c) = self.spaces(3)
         self.done(fleet, a.put(("job", 1)), 1.0)
         claim = self._claimed(fleet, b, lease=60.0)
@@ -306,7 +309,7 @@ class ClaimTests(SpaceCase):
         self.assertEqual(self.done(fleet, waiting, 1.0), ("job", 1))
 
     def test_get_behind_another_call_of_the_same_node(self) -> None:
-        """A blocked get takes a tuple after another call of the same node tried to take it and failed."""
+        """A blocked get takes a tuple after another call of the same node has failed to take it."""
         fleet, (a, b, c) = self.spaces(3)
         b.read(("bell", int)).addErrback(lambda failure: failure.trap(NotRunning))  # keeps the tuple cache of b open
         self.done(fleet, a.put(("job", 1)), 1.0)
@@ -316,7 +319,7 @@ class ClaimTests(SpaceCase):
         self.assertEqual(self.done(fleet, waiting, 5.0), ("job", 1))
 
     def test_renew(self) -> None:
-        """A renewed claim lasts beyond its first lease; a confirmed claim cannot be renewed."""
+        """A renewed claim lasts longer than its first lease; a confirmed claim cannot be renewed."""
         fleet, (a, b, c) = self.spaces(3)
         self.done(fleet, a.put(("job", 1)), 1.0)
         claim = self._claimed(fleet, b)
@@ -344,7 +347,7 @@ class ClaimTests(SpaceCase):
 
 class RestartTests(SpaceCase):
     def test_a_restarted_member_knows_what_it_accepted(self) -> None:
-        """After a restart of all members with their stores a taken tuple stays taken."""
+        """A taken tuple stays taken after a restart of all members with their stores."""
         fleet, spaces = self.spaces(3)
         self.done(fleet, spaces[0].put(("job", 1)), 1.0)
         self.done(fleet, spaces[1].get(("job", ANY)), 1.0)

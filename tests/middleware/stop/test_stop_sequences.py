@@ -1,4 +1,4 @@
-"""Tests with random sequences of ``tests.invariants.stops``, and a check that they find seeded bugs."""
+"""Tests with random sequences of events (``tests.invariants.stops``), and a check that they find seeded bugs."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ BITING = 40
 
 class SequenceTests(SynchronousTestCase):
     def test_stop_holds(self) -> None:
-        """A robot that acknowledged a stop stays stopped until a release names that stop."""
+        """A robot that acknowledged a stop stays still until a release with the id of that stop."""
         counts: Counter[str] = Counter()
         for seed in range(1, SEQUENCES + 1):
             run(seed, counts)
@@ -25,7 +25,7 @@ class SequenceTests(SynchronousTestCase):
             self.assertGreater(counts[name], SEQUENCES // 4, name)
 
     def found(self) -> bool:
-        """Return whether a few sequences show a violation."""
+        """Return whether a violation occurs in a few sequences."""
         for seed in range(1, BITING + 1):
             try:
                 run(seed, Counter())

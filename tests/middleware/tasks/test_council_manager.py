@@ -10,7 +10,7 @@ from tests.middleware.consensus.lease.test_lease_codec import MEMBERS
 
 class VacancyTests(SynchronousTestCase):
     def filled(self, council: str, silent: str, candidates: str, size: int = 3) -> str | None:
-        """Return the next council, with its members by number."""
+        """Return the indexes of the members of the next council."""
         members, gone, others = ([MEMBERS[int(number)] for number in group] for group in (council, silent, candidates))
         following = choose_successors(members, gone, others, size)
         return None if following is None else "".join(str(MEMBERS.index(member)) for member in following)
@@ -21,14 +21,14 @@ class VacancyTests(SynchronousTestCase):
         self.assertEqual(self.filled("01234", "13", "0265", 5), "02465")
 
     def test_nothing_to_gain(self) -> None:
-        """A council stays unchanged if all members answer, no candidate answers, or a change improves nothing."""
+        """A council stays unchanged if all members reply, no candidate replies, or a change would improve nothing."""
         self.assertIsNone(self.filled("012", "", "345"))
         self.assertIsNone(self.filled("012", "1", "02"))
         self.assertIsNone(self.filled("012", "", "3", 5))
         self.assertIsNone(self.filled("0", "", "1"))
 
     def test_grows(self) -> None:
-        """A council of a team that was small grows to its full size when enough nodes are reachable."""
+        """The council of a team that was small grows to its full size when enough nodes are reachable."""
         self.assertEqual(self.filled("0", "", "12"), "012")
         self.assertEqual(self.filled("012", "", "34", 5), "01234")
 

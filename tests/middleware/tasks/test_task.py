@@ -1,4 +1,4 @@
-"""Tests of tasks, reports, results and orders as records, and of the capabilities that tasks require."""
+"""Tests of tasks, reports, results and orders as records, and of the capabilities that a task requires."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ DONE = Result(COMPLETED, "dog", 12.5, 3, (("dog", 1.5),))
 
 
 def record(name: str, value: object, owner: Identity = DOG) -> Record:
-    """Return a record with this value; any value but bytes is packed."""
+    """Return a record with this value; a value that is not bytes is packed."""
     packed = value if isinstance(value, bytes) or value is None else bytes(msgpack.packb(value))
     return Record(hash_key("any"), name, owner.public, 1, "team", 1.0, packed, bytes(64))
 
@@ -79,13 +79,13 @@ class DecoderTests(SynchronousTestCase):
         self.assertEqual(parse_member(record(MEMBER, bare.pack())), bare)
 
     def test_in_another_slot(self) -> None:
-        """A task, report or result in a slot with another name is ignored."""
+        """A task, report or result is ignored if the name of its slot belongs to another record."""
         self.assertIsNone(parse_task(record("t2", TASK.pack())))
         self.assertIsNone(parse_member(record(RESULT, REPORT.pack())))
         self.assertIsNone(parse_result(record(MEMBER, DONE.pack())))
 
     def test_nobody_reports_for_another(self) -> None:
-        """A report in the name of another node is ignored."""
+        """A report that states the id of another node is ignored."""
         self.assertIsNone(parse_member(record(MEMBER, REPORT.pack(), CAT)))
 
     def test_crafted_tasks(self) -> None:
@@ -120,7 +120,7 @@ class DecoderTests(SynchronousTestCase):
             self.assertIsNone(parse_task(record("t1", value)), value)
 
     def test_crafted_reports(self) -> None:
-        """A report with a wrong type is ignored; a report with an invalid cost has no cost."""
+        """A report with a wrong type is ignored; a report with an invalid cost is read without a cost."""
         bad: dict[str, list[object]] = {
             "name": [5],
             "status": [5],
@@ -155,13 +155,16 @@ class DecoderTests(SynchronousTestCase):
             self.assertIsNone(parse_member(record(MEMBER, nothing)), nothing)
 
     def test_report_that_is_stale_when_it_comes(self) -> None:
-        """A report that is older than its validity has no cost; a report without a validity counts."""
+        """A report that is older than its validity is read without a cost.
+
+        A report without a validity is never too old.
+        """
         for age, valid_for, cost in ((2.0, 1.0, None), (1.0, 2.0, 1.5), (9.0, 0.0, 1.5)):
             report = parse_member(record(MEMBER, changed(REPORT.pack(), age=age, valid_for=valid_for)))
             self.assertEqual(report and report.cost, cost, (age, valid_for))
 
     def test_usual_fields_take_no_room(self) -> None:
-        """Default values are omitted from a record, and restored when it is read."""
+        """Default values are omitted from a record, and restored when the record is read."""
         plain = Task("t1", "search", "Find it")
         self.assertEqual(
             sorted(msgpack.unpackb(plain.pack())), ["kind", "parameters", "requirements", "task_id", "title"]
@@ -189,7 +192,7 @@ class DecoderTests(SynchronousTestCase):
     @settings(max_examples=250)
     @given(st.binary(max_size=60) | st.dictionaries(st.sampled_from(NAMES), anything, max_size=4) | anything)
     def test_total(self, value: object) -> None:
-        """Any record gives a valid object or None, and never raises."""
+        """Any record is decoded as a valid object or as None, without an exception."""
         values = [value]
         if isinstance(value, dict) and all(isinstance(name, str) for name in value):
             values += [changed(one, **value) for one in (TASK.pack(), REPORT.pack(), DONE.pack())]
@@ -204,7 +207,10 @@ class DecoderTests(SynchronousTestCase):
 
 class OutcomeTests(SynchronousTestCase):
     def test_highest_token_holds(self) -> None:
-        """Of several results the one with the highest token wins, in any order; without any the task is open."""
+        """Of several results the result with the highest token wins, in any order.
+
+        Without a result the task is open.
+        """
         late = Result(FAILED, "cat", 1.0, 7)
         records = [record(RESULT, DONE.pack()), record(RESULT, late.pack(), CAT), record(MEMBER, REPORT.pack())]
         self.assertEqual(find_outcome(TASK, records), late)
@@ -219,7 +225,10 @@ class OutcomeTests(SynchronousTestCase):
 
 class RefusalTests(SynchronousTestCase):
     def test_reasons(self) -> None:
-        """A device can perform a task if it has all required capabilities; otherwise each missing one is named."""
+        """A device can perform a task if it has all required capabilities.
+
+        Otherwise the reasons list each missing capability.
+        """
         has: Capabilities = {"camera": {"width": 208, "colour": "rgb"}, "legs": {}}
         rows: list[tuple[Capabilities, list[str]]] = [
             ({}, []),
@@ -237,13 +246,16 @@ class RefusalTests(SynchronousTestCase):
             self.assertEqual(find_unmet_requirements(has, requirements), reasons)
 
     def test_a_number_that_is_none_is_not_enough(self) -> None:
-        """A capability of NaN meets no requirement."""
+        """A capability with the value NaN meets no requirement."""
         self.assertEqual(len(find_unmet_requirements({"camera": {"width": float("nan")}}, {"camera": {"width": 1}})), 1)
 
 
 class OrderTests(SynchronousTestCase):
     def test_newest_holds(self) -> None:
-        """Of several orders the newest wins, in any order of the records; ties are broken deterministically."""
+        """Of several orders the newest order wins, whatever the order of the records.
+
+        Ties are broken deterministically.
+        """
         resumed = replace(PAUSED, word=RESUME, at=6.0)
         records = [record(ORDER, PAUSED.pack()), record(ORDER, resumed.pack())]
         self.assertEqual(find_newest_order(records), resumed)
