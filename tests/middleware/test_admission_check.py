@@ -97,7 +97,7 @@ class PassTests(ClosedCase):
     """Tests of the credential in a handshake, and of its check."""
 
     def test_first_answer_still_takes_one_round_trip(self) -> None:
-        """With passes of maximum size the first request fits into the INIT; the reply has the INIT's source."""
+        """With credentials of the maximum size a first request still fits into the INIT and takes one round trip."""
         answer = bytes(MIN_ANSWER_BYTES - 20)
         seen: list[tuple[Contact, Address]] = []
         self.a.on_seen.add(lambda contact, address: seen.append((contact, address)))
@@ -274,7 +274,7 @@ class IncarnationTests(ClosedCase):
         self.assertEqual(len(self.log), 2)
 
     def test_two_that_knock_at_once(self) -> None:
-        """Of two nodes with one incarnation number and concurrent INITs only the first to confirm is admitted."""
+        """If two nodes with one incarnation number send INITs at the same time, the first to confirm is admitted."""
         copy, _ = self.life(1, 2)
         first, second = self.a.ask(self.to_b, "add", 1, changes=True), copy.ask(self.to_b, "add", 2, changes=True)
         self.clock.advance(3)

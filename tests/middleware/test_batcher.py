@@ -84,7 +84,7 @@ class RecordBatcherTests(FleetCase):
         self.assertEqual([self.successResultOf(reply) for reply in replies], [0] * 5)
 
     def test_a_silent_replica_is_not_asked_in_turn(self) -> None:
-        """If the first request gets no reply, all waiting records are sent at once and fail at the same time."""
+        """If the first request gets no reply, all waiting records are sent immediately and fail at the same time."""
         self.world.kill(1)
         replies = self.stored(*[self.record(number) for number in range(FLOOD)])
         self.world.run(2 * TIMEOUT_S + 0.1)

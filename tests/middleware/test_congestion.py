@@ -59,7 +59,7 @@ class LongWayTests(EndpointCase):
         self.assertEqual((len(inits), self.runs), (1, [1, 2, 3]))
 
     def test_who_was_asked_knows_the_way(self) -> None:
-        """The confirmation of a session gives its responder a round-trip time, and its next request is sent once."""
+        """The confirmation of a session gives the responder a round-trip time; its next request is sent only once."""
         self.got(self.a.ask(self.to_b, "echo", 1))
         self.assertEqual(self.b.round_trip(self.to_a), 2 * FAR)
         sent = self.switchboard.counters["sent"]
@@ -135,11 +135,11 @@ class RoughWeatherTests(EndpointCase):
         return answers
 
     def test_at_30_percent_lost_hardly_any_question_fails(self) -> None:
-        """At 30 % loss a request gets more tries within its timeout than the usual four, and hardly any fails."""
+        """At 30 % loss a request gets more tries within its timeout than the usual four, and rarely fails."""
         self.switchboard.conditions = LinkConditions(DELAY, loss=0.3)
         self.answered(100, 1.0)
         self.assertGreater(self.a.peers.tries, MAX_TRIES)
-        self.assertGreaterEqual(self.answered(500, 1.0), 498)  # with four tries about 466 requests are answered
+        self.assertGreaterEqual(self.answered(500, 1.0), 498)  # about 466 with four tries
 
     def test_the_first_contact_as_well(self) -> None:
         """Handshakes are also retransmitted according to the loss rate."""
@@ -151,7 +151,7 @@ class RoughWeatherTests(EndpointCase):
         asked = [self.a.ask(to, "echo", 1) for _, to in strangers]
         self.clock.advance(3.0)
         answers = [one.addErrback(lambda failure: None) for one in asked]
-        self.assertGreaterEqual(sum(self.successResultOf(one) == 1 for one in answers), 97)  # with four tries 94 handshakes succeed
+        self.assertGreaterEqual(sum(self.successResultOf(one) == 1 for one in answers), 97)  # 94 with four tries
 
     def test_few_tries_are_in_vain(self) -> None:
         """With variable round-trip times at most one reply in eight arrives after an unnecessary retransmission."""

@@ -64,7 +64,10 @@ class WriteConsistencyTests(ConsistencyCase):
             self.assertGreaterEqual(stored, least)
 
     def test_named_error_says_how_many(self) -> None:
-        """With two of five nodes cut off ``all`` fails with three acknowledgements; the minority fails ``majority``."""
+        """If two of five nodes are cut off, ``all`` fails with three acknowledgements.
+
+        The two nodes fail with ``majority``.
+        """
         fleet = self.fleet(5)
         self.cut(fleet, 3, 4)
         error = self.failure(fleet, fleet.nodes[0].put(KEY, "a", b"x", "team", "all"), NotAcknowledged)
@@ -363,7 +366,7 @@ class CutTests(ConsistencyCase):
         self.assertEqual([self.values(fleet, place) for place in range(3)], [[b"x"]] * 3)
 
     def test_a_newcomer_and_a_lost_memory(self) -> None:
-        """A new node that joins through a node with a lost store learns the members from it and is not synced."""
+        """A new node that joins through a node without its store learns the members from it, but is not synced."""
         fleet = self.fleet(3)
         self.cut(fleet, 2, 3)
         fleet.nodes[2].stop_silently()

@@ -61,7 +61,7 @@ class CookieTests(EndpointCase):
         self.assertEqual({len(answer) for answer in answers if answer[0] == COOKIE}, {COOKIE_BYTES})
 
     def test_a_cookie_is_bound_to_its_address_and_time(self) -> None:
-        """A cookie is valid from its address for at most four minutes, and at a limited rate of handshakes."""
+        """A cookie is valid only for its address and for at most four minutes; the rate of handshakes is limited."""
         cookies = CookieCheck(b"c" * 32, random.Random(1))
         cookie = cookies._make_cookie(HOME, int(1000 / 120))
         paid = self.invitation(1, cookie)
@@ -98,7 +98,7 @@ class ProbeTests(EndpointCase):
     """Tests of ``Endpoint.probe`` and of the replies to probes."""
 
     def test_who_is_there(self) -> None:
-        """A reply, also of another team, contains fingerprint, version and clock, and the address of the prober."""
+        """A reply, also of another team, contains fingerprint, version and clock, and the address of the requester."""
         self.b.probe_responder.unix_time = lambda: 1_700_000_000.25
         self.b.probe_responder._fingerprint = lambda: Gate.fingerprint
         found = self.got(self.a.probe(self.to_b.address), 2 * DELAY)

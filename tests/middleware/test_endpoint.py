@@ -316,7 +316,7 @@ class WeatherTests(EndpointCase):
         self.assertEqual(seen, [Contact(self.to_a.public, Address("127.0.0.1", 40000))])
 
     def test_nobody_is_asked_on_a_session_that_may_be_gone(self) -> None:
-        """In a wide network a request after a long silence takes one round trip, even if the peer's session ended."""
+        """In a large network a request after a long silence takes one round trip, even if the peer's session ended."""
         self.a.peers.is_large = self.b.peers.is_large = True
         self.got(self.a.ask(self.to_b, "echo", 1))
         self.clock.advance(SESSION_SILENCE_S - 3.5)

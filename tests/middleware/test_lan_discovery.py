@@ -25,7 +25,7 @@ class Lan(EntangledTeam):
     def on(
         self, place: int, *known: Address, segment: SimulatedLan | None = None, team: bytes = TEAM_KEY
     ) -> EntangledNode:
-        """Create and start the node of this number on ``segment``."""
+        """Create and start the node with this number on ``segment``."""
         group = (segment or self.segment).join()
         network = self.switchboard.make_network(*self.address(place))
         identity, store, rng = self.identity(place), self.store(place), self.make_life_rng(place)
@@ -51,7 +51,7 @@ class DiscoveryTests(FleetCase):
         return lan
 
     def test_two_find_each_other(self) -> None:
-        """Two nodes without known nodes join within 0.5 s; a node that lost all peers soon searches again."""
+        """Two nodes without known nodes join within 0.5 s; a node that lost all its peers soon searches again."""
         lan = self.lan()
         a, b = lan.on(0), lan.on(1)
         lan.run(0.5)
@@ -78,7 +78,7 @@ class DiscoveryTests(FleetCase):
         self.assertEqual(len(newcomer.overlay.contacts()), 6)
 
     def test_first_of_a_network_waits_a_moment(self) -> None:
-        """A node without replies starts a team as its first node after ``LISTEN_S`` seconds, not before."""
+        """A node that gets no reply starts a team as its first node after ``LISTEN_S`` seconds, but not earlier."""
         lan = self.lan()
         lan.nodes.append(node := lan.make_node(0))
         node.stop()
@@ -90,7 +90,7 @@ class DiscoveryTests(FleetCase):
         self.assertTrue(alone.overlay.has_all_members)
 
     def test_storm_of_a_hundred_stays_small(self) -> None:
-        """A hundred nodes that start at the same time form one network, with few replies to each query."""
+        """A hundred nodes that start at the same time form one network; each query gets few replies."""
         lan = self.lan()
         for place in range(100):
             lan.on(place)
@@ -129,7 +129,7 @@ class DiscoveryTests(FleetCase):
         self.assertEqual({len(node.overlay.contacts()) for node in lan.nodes}, {5})
 
     def test_new_interface_is_called_at_once(self) -> None:
-        """A node that is connected to another LAN sends a discovery query there at once."""
+        """A node that is connected to a different LAN sends a discovery query there immediately."""
         lan = self.lan()
         lan.segment.is_blocked = True
         a, b = lan.on(0), lan.on(1)
@@ -167,7 +167,7 @@ class DiscoveryTests(FleetCase):
         self.assertLessEqual(a.discovery.counters["greeted"], 2)
 
     def test_known_node_that_is_gone_is_no_bar(self) -> None:
-        """If the known node of a node is dead, the node joins through another one on the LAN."""
+        """If the configured known node has failed, a node joins through another node on the LAN."""
         lan = self.lan()
         first = lan.on(0)
         lan.run(1.0)

@@ -1,4 +1,4 @@
-"""Tests of networks that are too large for a member table, with a limit of twelve members."""
+"""Tests of networks that are too large for a member table, here with a limit of twelve members."""
 
 from __future__ import annotations
 
@@ -48,7 +48,7 @@ class LargeTests(FleetCase):
         return fleet
 
     def pings(self, node: EntangledNode) -> Counter[bytes]:
-        """Return a counter of the later pings of a node by target."""
+        """Return a counter of later pings of a node by target."""
         asked: Counter[bytes] = Counter()
         ask, greet = node.overlay.ask, node.endpoint.discover
 
@@ -74,19 +74,22 @@ class LargeTests(FleetCase):
         return self.done(fleet, node.find_node(target), 2.0)
 
     def test_a_lookup_finds_who_let_go_of_the_session(self) -> None:
-        """Lookups over slow paths are exact, also if some nodes have closed sessions that their peers still have."""
+        """Lookups over slow paths are exact even if some nodes have closed sessions that their peers still use."""
         fleet = self.large(weather=LinkConditions(0.08))
         node, target = fleet.nodes[0], self.far(fleet.nodes[0]).node_id
         others = [other.contact for other in fleet.nodes[1:]]
         self.assertEqual(self.found(fleet, node, target), select_closest(others, target, K))
-        self.patch(node.endpoint, "forget_silent", lambda seconds: None)  # prevents the periodic cleanup by this node
+        self.patch(node.endpoint, "forget_silent", lambda seconds: None)  # disables the periodic cleanup by this node
         fleet.run(SESSION_S)
         for other in fleet.nodes[1:]:
             other.endpoint.forget_silent(SESSION_S)
         self.assertEqual(self.found(fleet, node, target), select_closest(others, target, K))
 
     def far_from(self, fleet: EntangledTeam, key: bytes) -> tuple[EntangledNode, EntangledNode]:
-        """Return the node farthest from a key, with no holder as a contact, and the contact that it queries first."""
+        """Return the node farthest from a key and the first contact that it queries.
+
+        The contacts of the farthest node contain no holder of the key.
+        """
         order = select_closest([node.contact for node in fleet.nodes], key, len(fleet.nodes))
         reader, first = (fleet.nodes[contact.address.port - 7000] for contact in (order[-1], order[K]))
         for contact in order[:K]:
@@ -103,11 +106,11 @@ class LargeTests(FleetCase):
             self.done(fleet, node.put(key, "x", b"here", "leased", lease=30.0))
         reader, first = self.far_from(fleet, key)
         own = Record(key, "x", first.identity.public, 1, "leased", 30.0, b"here").sign(first.identity)
-        first.replica.store_locally(own)  # from a time when the node was one of the closest
+        first.replica.store_locally(own)  # stored when the node was one of the closest
         self.assertEqual(len(self.done(fleet, reader.get(key, "fast"))), len(fleet.nodes))
 
     def test_a_fast_read_takes_what_is_left(self) -> None:
-        """A fast read returns a record that only a node outside the k closest still has."""
+        """A fast read returns a record that only one node outside the k closest nodes still stores."""
         fleet = self.large()
         key = hash_key("left behind")
         reader, first = self.far_from(fleet, key)
@@ -120,7 +123,7 @@ class LargeTests(FleetCase):
         fleet = self.large()
         node, dice = fleet.nodes[0], random.Random(4)
         others = [other.contact for other in fleet.nodes[1:]]
-        for other in others[::3]:  # a request has time for one such round trip, not for two
+        for other in others[::3]:  # a request can wait for one such round trip, but not for two
             fleet.switchboard.set_conditions(node.contact.address, other.address, LinkConditions(0.13))
         for each in fleet.nodes:
             each.endpoint.forget_silent(0.0)
@@ -146,7 +149,7 @@ class LargeTests(FleetCase):
         far = [contact.node_id for contact in node.overlay.contacts() if contact.node_id not in near]
         self.assertTrue(far and all(asked[node_id] <= 5 for node_id in far), asked)
         self.assertGreater(sum(asked[node_id] for node_id in far), 0)
-        self.assertFalse(any(each.overlay.is_complete for each in fleet.nodes))  # the contacts are not the team
+        self.assertFalse(any(each.overlay.is_complete for each in fleet.nodes))  # the contacts are only a part of the team
         routed = self.far(node)
         node._membership.prober.needs_keep_alive = lambda contact: contact == routed
         asked.clear()
@@ -154,7 +157,7 @@ class LargeTests(FleetCase):
         self.assertGreater(asked[routed.node_id], 1)  # a path through a NAT stays open only while it is used
 
     def test_the_dead_cost_no_handshakes(self) -> None:
-        """A failed far contact is removed after one request, without a handshake."""
+        """A far contact that failed is removed after one unanswered request, without a handshake."""
         fleet = self.large()
         node = fleet.nodes[0]
         far = self.far(node)
@@ -172,7 +175,7 @@ class LargeTests(FleetCase):
         self.assertNotIn(far.address, knocked)
 
     def test_one_without_a_radio_keeps_its_contacts(self) -> None:
-        """A node that hears no other node keeps its contacts, because it counts as disconnected."""
+        """A node that hears no other node keeps its contacts, because it considers itself disconnected."""
         fleet = self.large()
         before = len(fleet.nodes[5].overlay.contacts())
         fleet.nodes[5]._membership.prober.interval.silence_s = 1.0
@@ -186,7 +189,7 @@ class LargeTests(FleetCase):
         self.assertEqual(self.found(fleet, fleet.nodes[5], target), select_closest(others, target, K))
 
     def test_silent_sessions_are_let_go_and_come_back(self) -> None:
-        """A session without traffic for a long time is closed; the next request opens a new one and is answered."""
+        """A session without traffic for a long time is closed; the next request opens a new session and is answered."""
         fleet = self.large()
         node = fleet.nodes[0]
         fleet.run(INITIAL_SILENCE_S)
@@ -202,7 +205,7 @@ class LargeTests(FleetCase):
         self.assertTrue(node.endpoint.has_session(far))
 
     def test_a_stranger_without_a_place_is_let_be(self) -> None:
-        """A node does not ping a stranger that would find no place in the routing table."""
+        """A node does not ping an unknown node that cannot enter the routing table."""
         fleet = self.large()
         node = fleet.nodes[0]
         asked = self.pings(node)
@@ -215,7 +218,7 @@ class LargeTests(FleetCase):
         self.assertIn(stranger.node_id, asked)
 
     def test_a_newcomer_says_what_it_was_told(self) -> None:
-        """A node forwards the remaining time for which the network counts as large; a new node learns it at once."""
+        """A node states for how many seconds the network still counts as large; a new node uses this immediately."""
         fleet = self.large()
         node = fleet.nodes[3]
         answer = node._membership._answer_members
@@ -231,12 +234,12 @@ class LargeTests(FleetCase):
         self.assertEqual((newcomer.overlay.is_large, newcomer.overlay.has_found_neighbours), (True, False))
 
     def test_who_failed_a_lookup_is_asked_at_once(self) -> None:
-        """A far contact that failed in a lookup is excluded, and included again as soon as it answers."""
+        """A far contact that failed in a lookup is excluded, and is included again as soon as it replies."""
         fleet = self.large()
         node = fleet.nodes[0]
         far = self.far(node)
         for bucket in node.overlay.table._buckets:
-            bucket.replacements.clear()  # otherwise a waiting contact would replace it
+            bucket.replacements.clear()  # otherwise a waiting contact would replace the failed contact
         node.overlay.record_miss(far)
         self.assertNotIn(far, node.overlay.table.closest(far.node_id))
         fleet.run(3.0)
@@ -244,7 +247,7 @@ class LargeTests(FleetCase):
         self.assertIn(far, node.overlay.table.closest(far.node_id))
 
     def test_strangers_are_given_the_time_that_others_take(self) -> None:
-        """In a slow network a request to a stranger is not retransmitted before the usual round-trip time."""
+        """In a slow network a request to an unknown node is not retransmitted before the usual round-trip time."""
         fleet = self.large()
         node, stranger = fleet.nodes[0], Contact(fleet.identity(99).public, Address("10.0.0.9", 9))
         for _ in range(9):
@@ -269,7 +272,7 @@ class LargeTests(FleetCase):
         self.assertEqual({len(node.overlay.members) for node in fleet.nodes[:8]}, {7})
 
     def test_values_are_kept(self) -> None:
-        """After a quarter of the nodes failed, a stored record is readable and held by the new closest nodes."""
+        """After a quarter of the nodes failed, a stored record is readable, and the new closest nodes store it."""
         fleet = self.large()
         key = fleet.nodes[2].identity.node_id
         self.assertGreaterEqual(self.done(fleet, fleet.nodes[1].put(key, "a", b"1"), 2.0), 5)
@@ -300,7 +303,7 @@ class ProbeIntervalTests(SynchronousTestCase):
         self.assertEqual(self.pace.silence_s, MIN_SILENCE_S)
 
     def test_it_follows_what_is_seen(self) -> None:
-        """For usual session lengths the interval adapts until about one in twenty pinged contacts is gone."""
+        """For usual session lengths the interval adapts until about one in twenty pinged contacts has failed."""
         dice = random.Random(1)
         for stay in (600.0, 1500.0, 4000.0):
             gone = asked = 0

@@ -1,4 +1,4 @@
-"""Tests of leased records with different TTLs, and of the interval of their renewals."""
+"""Tests of leased records with different TTLs, and of the renewal interval."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ class LeaseTests(FleetCase):
         return [record.name for record in fleet.nodes[place].store.get(key, tombstones=True)]
 
     def told(self, fleet: EntangledTeam, place: int, seconds: float) -> list[float]:
-        """Return the TTLs of the renewals that the node at ``place`` receives in this time."""
+        """Return the TTLs in the renewals that the node with index ``place`` receives in this time."""
         told: list[float] = []
         replica = fleet.nodes[place].replica
         answer = replica.answer_alive
@@ -51,7 +51,10 @@ class LeaseTests(FleetCase):
         self.assertEqual(self.told(fleet, 0, 60.0), [60.0] * 3)
 
     def test_the_shorter_one_is_told(self) -> None:
-        """A node with a long and a short lease renews the short one; after its release it renews the long one again."""
+        """A node with a long and a short lease renews at the short interval.
+
+        After the release of the short lease, at the long one.
+        """
         fleet = self.fleet(2)
         fleet.nodes[1].put(KEY, "long", b"x", "leased", lease=60.0)
         fleet.nodes[1].put(OTHER, "short", b"x", "leased")
@@ -80,7 +83,7 @@ class LeaseTests(FleetCase):
         self.assertEqual(self.told(fleet, place, 60.0), [60.0] * 3)
 
     def test_a_short_one_comes_later(self) -> None:
-        """A short lease that starts between two renewals of a long one is renewed from its start."""
+        """A short lease that starts between two renewals of a long lease is renewed from its start."""
         fleet = self.fleet(3)
         fleet.nodes[1].put(KEY, "long", b"x", "leased", lease=60.0)
         fleet.run(25.0)
@@ -90,9 +93,9 @@ class LeaseTests(FleetCase):
             self.assertEqual(sorted(self.names(fleet)), ["long", "short"])
 
     def test_release(self) -> None:
-        """A released record disappears at its owner at once and at the replicas within its lease.
+        """A released record disappears at its owner immediately, and at the replicas within its lease.
 
-        Other records stay, and the slot can be used again at once.
+        Other records stay, and the slot can be used again immediately.
         """
         fleet = self.fleet(3)
         fleet.nodes[1].put(KEY, "stays", b"x", "leased", lease=6.0)
@@ -118,7 +121,7 @@ class LeaseTests(FleetCase):
         self.assertEqual(self.names(fleet), ["kept"])
 
     def test_the_nodes_lease_changes(self) -> None:
-        """A record is kept for the longer one of its lease and the node's lease, which can change."""
+        """A record stays for the longer of its own lease and the node's lease, which can change."""
         fleet = self.fleet(2)
         fleet.nodes[1].put(OTHER, "short", b"x", "leased", lease=0.1)
         fleet.run(5.0)

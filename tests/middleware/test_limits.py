@@ -44,10 +44,10 @@ PATCHED = (
     ),
 )
 
-# These tables have separate limits, larger than ``CROWD``.
+# These tables have separate limits, which are larger than ``CROWD``.
 OTHERS: tuple[str, ...] = ("_members", "_listed_at", "_requests", "_peers", "sessions", "_responses", "_unconfirmed")
 OTHERS += ("_contacts", "_store", "_entries", "_live", "_absent")
-OTHERS += ("_switchboard._names", "_switchboard._untraced")  # Tables of the simulation.
+OTHERS += ("_switchboard._names", "_switchboard._untraced")  # These tables belong to the simulation.
 
 
 class PageTests(FleetCase):
@@ -64,7 +64,7 @@ class CrowdTests(FleetCase):
     """An open team with a member that invents identities."""
 
     def test_tables_stay_small(self) -> None:
-        """No table of a node exceeds its limit while a member invents identities and sends all types of request."""
+        """If a member invents identities and sends all types of request, no table of a node exceeds its limit."""
         for module, name in PATCHED:
             self.patch(module, name, SMALL)
         team = self.swarm(1)
@@ -84,7 +84,7 @@ class CrowdTests(FleetCase):
         self.assertGreater(max(sizes.values()), SMALL)
 
     def visit(self, team: Any, node: Any, number: int) -> None:
-        """Send each type of request once from an invented identity, then stop it."""
+        """Send each type of request once as an invented identity, then stop this identity's endpoint."""
         own = Identity(random.Random(f"crowd {number}").randbytes(32))
         network = team.switchboard.make_network(f"10.9.{number}.1", 7)
         crowd = Endpoint(own, TEAM_KEY, network, team.clock, random.Random(number))

@@ -27,7 +27,7 @@ CROWD = select_closest([contact(i) for i in range(40)], TARGET, 40)
 
 class LookupTest(SynchronousTestCase):
     def test_asks_the_closest_first(self) -> None:
-        """At most alpha contacts are queried at the same time, closest first, each once."""
+        """At most alpha contacts are queried at the same time, the closest first, and each only once."""
         lookup = Lookup(TARGET, 8, 3, reversed(CROWD[:8]))
         self.assertEqual(lookup.take_next(), CROWD[:3])
         self.assertEqual(lookup.take_next(), [])
@@ -36,7 +36,7 @@ class LookupTest(SynchronousTestCase):
         self.assertFalse(lookup.is_finished)
 
     def test_follows_what_it_hears(self) -> None:
-        """Closer contacts from a reply are queried before the contacts known so far."""
+        """Closer contacts from a reply are queried before the contacts that were known earlier."""
         lookup = Lookup(TARGET, 2, 1, CROWD[10:12])
         lookup.take_next()
         lookup.record_answer(CROWD[10], [CROWD[0], CROWD[5], CROWD[10]])
@@ -54,7 +54,7 @@ class LookupTest(SynchronousTestCase):
         self.assertEqual(lookup.closest(), CROWD[:2])
 
     def test_failed_is_replaced(self) -> None:
-        """The next closest contact replaces a failed one, which is not in the result."""
+        """The next closest contact replaces a failed contact, which is not in the result."""
         lookup = Lookup(TARGET, 2, 3, CROWD[:3])
         lookup.take_next()
         lookup.record_failure(CROWD[0])
@@ -66,7 +66,7 @@ class LookupTest(SynchronousTestCase):
         self.assertEqual(lookup.closest(), CROWD[1:3])
 
     def test_all_fail(self) -> None:
-        """A lookup without contacts, or with only failed ones, ends with an empty result."""
+        """A lookup without contacts, or with only failed contacts, ends with an empty result."""
         for seeds in ([], CROWD[:2]):
             lookup = Lookup(TARGET, 8, 3, seeds)
             for known in lookup.take_next():
@@ -75,7 +75,10 @@ class LookupTest(SynchronousTestCase):
             self.assertEqual((lookup.take_next(), lookup.closest()), ([], []))
 
     def test_slow_frees_its_place(self) -> None:
-        """A slow contact permits further queries; the lookup still waits for it, and replaces it after a failure."""
+        """A slow contact permits further queries.
+
+        The lookup still waits for this contact, and replaces it if it fails.
+        """
         for is_lost in (False, True):
             lookup = Lookup(TARGET, 2, 2, CROWD[:4])
             self.assertEqual(lookup.take_next(), CROWD[:2])
@@ -93,7 +96,7 @@ class LookupTest(SynchronousTestCase):
             self.assertEqual(lookup.closest(), CROWD[1:3] if is_lost else CROWD[:2])
 
     def test_late_answer_counts(self) -> None:
-        """A reply of a contact that counted as failed is accepted."""
+        """A reply is accepted from a contact that already counted as failed."""
         lookup = Lookup(TARGET, 2, 2, CROWD[:1])
         lookup.take_next()
         lookup.record_failure(CROWD[0])
@@ -133,7 +136,7 @@ class LookupTest(SynchronousTestCase):
     @settings(max_examples=30)
     @given(st.integers(0, 2**32), st.integers(2, 60), st.binary(min_size=20, max_size=20))
     def test_exact(self, seed: int, size: int, target: bytes) -> None:
-        """In a network without loss and with complete tables, the lookup finds exactly the k closest nodes."""
+        """In a network without loss and with complete tables the lookup finds exactly the k closest nodes."""
         rng = random.Random(seed)
         nodes = [contact(i) for i in range(size)]
         tables = {node.node_id: RoutingTable(node.node_id, 4) for node in nodes}
@@ -157,7 +160,7 @@ IDS = st.binary(min_size=ID_BYTES, max_size=ID_BYTES)
 class DistanceTest(SynchronousTestCase):
     @given(IDS, IDS, IDS)
     def test_metric(self, a: bytes, b: bytes, c: bytes) -> None:
-        """The distance is a metric: zero only for equal ids, symmetric, and with the triangle inequality."""
+        """The distance is a metric: it is zero only for equal ids, symmetric, and satisfies the triangle inequality."""
         self.assertEqual(distance(a, b) == 0, a == b)
         self.assertEqual(distance(a, b), distance(b, a))
         self.assertLessEqual(distance(a, c), distance(a, b) + distance(b, c))
@@ -171,11 +174,11 @@ class DistanceTest(SynchronousTestCase):
             self.assertLess(distance(own, other), 2 ** (index + 1))
 
     def test_no_bucket_for_oneself(self) -> None:
-        """The node's own id has no bucket."""
+        """No bucket contains the node's own id."""
         self.assertRaises(ValueError, bucket_index, b"\1" * ID_BYTES, b"\1" * ID_BYTES)
 
     def test_closest_first(self) -> None:
-        """``closest`` returns at most the requested number of contacts, closest first, for any input order."""
+        """``closest`` returns at most the requested number of contacts, closest first, whatever the input order."""
         contacts = [contact(i) for i in range(30)]
         target = contacts[7].node_id
         found = select_closest(contacts, target, 5)

@@ -34,7 +34,10 @@ class MemberTableTests(SynchronousTestCase):
             self.assertEqual(self.members.closest(key, 4, ME), select_closest(everybody, key, 4))
 
     def test_coming_and_going(self) -> None:
-        """A lost member is absent until it is heard, a member that left is removed; the digest covers the members."""
+        """A lost member is absent until it is heard, and a member that left is removed.
+
+        The digest covers the members.
+        """
         self.fill(3)
         before = self.members.digest()
         self.assertTrue(self.members.mark_absent(contact(2).node_id, 1.0))
@@ -48,7 +51,7 @@ class MemberTableTests(SynchronousTestCase):
         self.assertEqual((len(self.members), self.members.list_absent()), (2, []))
 
     def test_a_majority_strikes_soon(self) -> None:
-        """Absent members are removed early if a majority is in touch, and in a minority only after ``MAX_ABSENT_S``."""
+        """A majority in touch removes absent members early, a minority only after ``MAX_ABSENT_S``."""
         for lost, wait in ((2, ABSENT_WITH_MAJORITY_S), (3, MAX_ABSENT_S)):
             self.members = MemberTable(ME.node_id)
             self.fill(4)
@@ -59,7 +62,7 @@ class MemberTableTests(SynchronousTestCase):
             self.assertEqual(self.members.list_absent(), [])
 
     def test_in_touch(self) -> None:
-        """A node is in touch if it recently heard a majority of all members, including the absent ones."""
+        """A node is in touch if it recently heard a majority of all members, including absent members."""
         self.assertTrue(self.members.is_majority_alive(0.0, 10.0))
         self.fill(4)
         self.assertTrue(self.members.is_majority_alive(10.0, 10.0))
@@ -69,7 +72,7 @@ class MemberTableTests(SynchronousTestCase):
         self.assertTrue(self.members.is_majority_alive(11.0, 10.0))
 
     def test_full(self) -> None:
-        """A full member table accepts a new member only if it can remove an absent one."""
+        """A full member table accepts a new member only if it can remove an absent member."""
         self.fill(MAX_MEMBERS)
         self.assertTrue(self.members.is_full)
         self.assertFalse(self.members.mark_alive(contact(1000), 0.0))

@@ -76,7 +76,7 @@ class MessageTests(SynchronousTestCase):
         ),
     )
     def test_decoded_reads_as_the_table_says(self, kind: Any, fields: list[Any]) -> None:
-        """``decoded`` accepts exactly the messages of the table in ``docs/reference/wire-protocol.md``."""
+        """``decode`` accepts exactly the messages in the table of ``docs/reference/wire-protocol.md``."""
         try:
             found: Message | None = decode(msgpack.packb([kind, *fields]))
         except Malformed:
@@ -84,7 +84,7 @@ class MessageTests(SynchronousTestCase):
         self.assertEqual(found, by_the_table(kind, fields))
 
     def test_refuses_what_is_out_of_shape(self) -> None:
-        """Deep nesting, extension types, false lengths, map keys other than text and other input are rejected."""
+        """Deep nesting, extension types, false lengths, map keys that are not text, and other input are rejected."""
         deep: object = 1
         deep_maps: object = 1
         for _ in range(40):
@@ -114,6 +114,6 @@ class MessageTests(SynchronousTestCase):
             self.assertRaises(Malformed, decode, data)
 
     def test_encoded_refuses_what_cannot_be_packed(self) -> None:
-        """``encoded`` raises ``TypeError`` for an object and ``OverflowError`` for a number beyond 64 bits."""
+        """``encode`` raises ``TypeError`` for an object and ``OverflowError`` for a number beyond 64 bits."""
         self.assertRaises(TypeError, encode, Answer(1, object()))
         self.assertRaises(OverflowError, encode, Answer(1, 2**64))

@@ -1,4 +1,4 @@
-"""Tests of the request history, which stores the replies to requests that must run at most once."""
+"""Tests of the request history, which stores the replies to requests that may run only once."""
 
 from __future__ import annotations
 
@@ -25,7 +25,10 @@ class KindTests(SynchronousTestCase):
     """Tests of the argument types that a ``Method`` accepts."""
 
     def test_annotations(self) -> None:
-        """Builtin types are checked, as types, names and unions; any other annotation accepts all values."""
+        """Builtin types are checked, whether written as types, names or unions.
+
+        Any other annotation accepts all values.
+        """
         rows: list[tuple[object, tuple[object, ...], tuple[object, ...]]] = [
             ("dict[str, list[int | None]] | None", ({}, None), (1, [])),
             ("list[object]|float", ([], 1, 1.5), ("x", {})),
@@ -54,13 +57,13 @@ class RequestHistoryTests(SynchronousTestCase):
         self.history = RequestHistory()
 
     def run_one(self, public: bytes, number: int, oldest: int, now: float) -> None:
-        """Begin and end a request at once."""
+        """Begin a request and end it immediately."""
         self.history.forget_before(public, oldest, now)
         self.assertIsNotNone(self.history.begin(public, number, None, now, False))
         self.history.finish(public, number, b"done", now)
 
     def test_what_the_asker_has_is_forgotten(self) -> None:
-        """Finished requests older than the caller's oldest open one are removed at once; later ones stay."""
+        """Finished requests that are older than the caller's oldest open request are removed; later requests stay."""
         for number in range(10):
             self.run_one(ANN, number, 0, 1.0)
         self.run_one(BOB, 3, 3, 1.0)
@@ -77,7 +80,7 @@ class RequestHistoryTests(SynchronousTestCase):
         self.assertTrue(self.history.is_settled(ANN, 5))
 
     def test_runs_on_though_given_up(self) -> None:
-        """A running request that its caller gave up is removed when it ends."""
+        """A running request that its caller has given up is removed when it ends."""
         self.history.begin(ANN, 1, None, 1.0, False)
         self.history.forget_before(ANN, 5, 1.0)
         self.assertIsNotNone(self.history.get(ANN, 1))
@@ -85,7 +88,10 @@ class RequestHistoryTests(SynchronousTestCase):
         self.assertEqual((self.history.get(ANN, 1), len(self.history)), (None, 0))
 
     def test_another_life(self) -> None:
-        """A restarted caller may use lower request numbers; its earlier settled requests stay settled."""
+        """A restarted caller may use lower request numbers.
+
+        The settled requests from before the restart stay settled.
+        """
         self.run_one(ANN, 9 * LIFE + 5, 9 * LIFE + 5, 1.0)
         self.run_one(ANN, 2 * LIFE + 1, 2 * LIFE, 2.0)
         self.assertFalse(self.history.is_settled(ANN, 2 * LIFE + 1))
@@ -93,14 +99,14 @@ class RequestHistoryTests(SynchronousTestCase):
         self.assertIsNotNone(self.history.get(ANN, 9 * LIFE + 5))
 
     def test_lives_are_bounded(self) -> None:
-        """The request history remembers a bounded number of restarts per caller."""
+        """The request history stores a limited number of restarts per caller."""
         for life in range(100):
             self.history.forget_before(ANN, life * LIFE + 7, 1.0)
         known = [life for life in range(100) if self.history.is_settled(ANN, life * LIFE)]
         self.assertEqual(known, list(range(100 - MAX_INCARNATIONS, 100)))
 
     def test_nothing_is_kept_for_ever(self) -> None:
-        """Entries of silent peers are removed step by step with each request, except those with running requests."""
+        """Each request removes some entries of silent peers, except those with running requests."""
         rng = random.Random(3)
         for _ in range(50):
             self.run_one(rng.randbytes(32), 1, 1, 1.0)
@@ -112,10 +118,10 @@ class RequestHistoryTests(SynchronousTestCase):
 
 
 class OnceTests(EndpointCase):
-    """Requests that run once, requests that may run repeatedly, and the limit on their number."""
+    """Tests of requests that run once, of requests that may run repeatedly, and of the limit on their number."""
 
     def equip(self, endpoint: Any) -> None:
-        """Register a change that may run twice."""
+        """Register a method that changes state and may run twice."""
         super().equip(endpoint)
         endpoint.expose("note", self.add, changes=True, idempotent=True)
 
@@ -150,7 +156,7 @@ class OnceTests(EndpointCase):
         self.assertFalse(any(self.a._requester._requests))
 
     def test_a_question_that_was_given_up_does_not_run(self) -> None:
-        """A retransmitted change that arrives after its caller has the reply is dropped."""
+        """A retransmitted change that arrives after its caller got the reply is dropped."""
         self.assertEqual([self.got(self.a.ask(self.to_b, "add", n, changes=True)) for n in (1, 2)], [1, 2])
         session = self.a._peers.get(self.to_b.public).session  # type: ignore[union-attr]
         assert session is not None

@@ -22,13 +22,13 @@ ROUGH = LinkConditions(delay_s=0.01, jitter_s=0.01, loss=0.3, duplicate=0.05, re
 
 
 class NodeCase(FleetCase):
-    """Helpers of these tests."""
+    """A test case with helpers for these tests."""
 
     def values(self, fleet: EntangledTeam, place: int, key: bytes = KEY, within: float = 3.0) -> list[bytes | None]:
         return [record.value for record in self.done(fleet, fleet.nodes[place].get(key), within)]
 
     def watched(self, node: EntangledNode, **options: Any) -> list[list[bytes | None]]:
-        """Return the list that receives all notifications of a watch."""
+        """Return a list that will contain all notifications of a watch."""
         told: list[list[bytes | None]] = []
         node.watch(KEY, lambda records: told.append([r.value for r in records]), **options)
         return told
@@ -59,7 +59,7 @@ class VerbTests(NodeCase):
         self.assertEqual(told, [[b"one"]])
 
     def test_wrong_calls_fly(self) -> None:
-        """An invalid record raises at once, and a stopped node raises ``NotRunning``."""
+        """An invalid record raises immediately, and a stopped node raises ``NotRunning``."""
         fleet = self.fleet(1)
         node = fleet.nodes[0]
         self.assertRaises(TooLarge, node.put, KEY, "state", bytes(MAX_VALUE_BYTES + 1))
@@ -74,7 +74,7 @@ class VerbTests(NodeCase):
             self.assertRaises(NotRunning, call)
 
     def test_the_largest_record(self) -> None:
-        """Records of maximum size with the longest names are read in pages, together with many small ones."""
+        """Records of maximum size with the longest names are read in pages, together with many small records."""
         fleet = self.fleet(2)
         for place in range(12):
             name = f"{place:02}" + "ä" * (MAX_NAME_BYTES // 2 - 1)
@@ -83,7 +83,7 @@ class VerbTests(NodeCase):
         self.assertEqual(len(self.values(fleet, 1)), 12)
 
     def test_earlier_life_is_stepped_over(self) -> None:
-        """A node that lost its store overwrites its earlier records, even at the same sequence number."""
+        """A node that lost its store can overwrite its earlier records, even if they have the same sequence number."""
         for writes in (1, 3):
             fleet = self.fleet(3, seed=writes)
             for number in range(writes):
@@ -101,7 +101,7 @@ class VerbTests(NodeCase):
 
 class LeaseTests(NodeCase):
     def test_vanish_with_the_owner(self) -> None:
-        """A leased record exists while its owner lives, and expires within one lease and a sweep after its failure."""
+        """A leased record exists as long as its owner runs; after a failure it expires within one lease and a sweep."""
         fleet = self.fleet(4)
         fleet.nodes[3].put(KEY, "state", b"here", "leased")
         fleet.run(30.0)
@@ -116,7 +116,7 @@ class LeaseTests(NodeCase):
         self.assertEqual(self.values(fleet, 0), [])
 
     def test_two_die_at_once(self) -> None:
-        """A failed replica does not keep the leased record of an owner that failed at the same time."""
+        """If a replica fails at the same time as the owner of a leased record, the record still expires."""
         fleet = self.fleet(4)
         for node in fleet.nodes[2:]:
             node.put(KEY, "state", b"here", "leased")
@@ -128,7 +128,7 @@ class LeaseTests(NodeCase):
         self.assertEqual(told[-1], [])
 
     def test_goodbye(self) -> None:
-        """A goodbye removes the leased records of a node at once; the node can store them again later."""
+        """A goodbye removes the leased records of a node immediately; the node can store them again later."""
         fleet = self.fleet(3)
         fleet.nodes[2].put(KEY, "state", b"here", "leased")
         told = self.watched(fleet.nodes[0])
@@ -150,7 +150,7 @@ class LeaseTests(NodeCase):
         self.assertEqual([r.value for r in fleet.stores[0].get(KEY)], [b"here"])
 
     def test_replica_lets_go_of_what_it_holds_in_vain(self) -> None:
-        """A replica removes a leased record that its owner no longer knows within a few renewals."""
+        """A replica removes a leased record within a few renewals if the owner no longer has this record."""
         fleet = self.fleet(3)
         old = Record(KEY, "old", fleet.nodes[2].identity.public, 1, "leased", 1.0, b"old").sign(fleet.identity(2))
         fleet.nodes[2].put(KEY, "state", b"here", "leased")
@@ -159,7 +159,10 @@ class LeaseTests(NodeCase):
         self.assertEqual([r.value for r in fleet.stores[0].get(KEY)], [b"here"])
 
     def test_short_silence_ends_no_lease(self) -> None:
-        """A partition of half a lease removes no leased record; a longer one does, and they return after it."""
+        """A partition of half a lease removes no leased record.
+
+        A longer partition does, and the records return after it.
+        """
         fleet = self.fleet(3)
         fleet.nodes[2].put(KEY, "state", b"here", "leased")
         told = self.watched(fleet.nodes[0])
@@ -175,7 +178,7 @@ class LeaseTests(NodeCase):
 
 class TeamRecordTests(NodeCase):
     def test_pass_from_hand_to_hand(self) -> None:
-        """A record and a tombstone outlive all their first replicas, which leave one after the other."""
+        """A record and a tombstone remain although all their first replicas leave one after the other."""
         fleet = self.fleet(3)
         self.done(fleet, fleet.nodes[0].put(KEY, "task", b"do it"))
         self.done(fleet, fleet.nodes[0].put(KEY, "gone", b"no"))
@@ -185,14 +188,14 @@ class TeamRecordTests(NodeCase):
             fleet.start_node(fleet.nodes[-1], [fleet.address(place)])
             fleet.run(2.0)
             fleet.nodes[place].stop_silently()
-            fleet.run(40.0)  # until the other nodes remove it from the member table
+            fleet.run(40.0)  # until the other nodes remove the node from the member table
         self.assertEqual(self.values(fleet, 5), [b"do it"])
         self.assertEqual(len(fleet.stores[5].get(KEY, tombstones=True)), 2)
 
 
 class WatchTests(NodeCase):
     def test_changes_are_pushed(self) -> None:
-        """A watcher receives each change at once, without another request."""
+        """A watcher receives each change immediately, without a further request."""
         fleet = self.fleet(3)
         told = self.watched(fleet.nodes[2])
         fleet.run(0.5)
@@ -204,7 +207,7 @@ class WatchTests(NodeCase):
         self.assertEqual(told, [[b"one"], [b"two"], []])
 
     def test_end_of_the_node_is_no_news(self) -> None:
-        """A node that stops does not notify its subscribers of removed records."""
+        """A node that stops does not notify its subscribers that records were removed."""
         fleet = self.fleet(3)
         told = self.watched(fleet.nodes[2])
         fleet.nodes[0].put(KEY, "state", b"one", "leased")
@@ -224,7 +227,7 @@ class WatchTests(NodeCase):
         self.assertEqual(len(self.flushLoggedErrors(IndexError)), 1)
 
     def test_push_by_a_stranger(self) -> None:
-        """Pushes from replicas without a subscription and invalid pushes are ignored."""
+        """Pushes from replicas without a subscription, and invalid pushes, are ignored."""
         fleet = self.fleet(3)
         told = self.watched(fleet.nodes[2])
         fleet.run(0.5)
@@ -243,9 +246,9 @@ class WatchTests(NodeCase):
         self.assertEqual(told, [])
 
     def test_rough_weather(self) -> None:
-        """At 30 % loss each value arrives at all nodes, and leased records of live nodes stay visible.
+        """At 30 % loss each value arrives at all nodes, and leased records of running nodes stay visible.
 
-        The leases are 1 s and renewed three times in this time; about one in some hundred still expires, and is visible
+        The leases last 1 s and are renewed three times per second. One in several hundred still expires, and is visible
         again within 2 s.
         """
         for seed in range(3):
@@ -277,7 +280,7 @@ class WatchTests(NodeCase):
 
 class RpcTests(NodeCase):
     def test_decorated_function_is_called(self) -> None:
-        """A decorated function answers calls; its arguments are checked, and its rejections carry a code."""
+        """A decorated function answers calls; its arguments are checked, and its rejections contain a code."""
         fleet = self.fleet(2)
         server, client = fleet.nodes
         counted: list[int] = []
@@ -316,7 +319,7 @@ class KeepTests(NodeCase):
         self.page, self.dog = self.order[-1], self.order[-2]
 
     def test_copies_follow_what_is_seen(self) -> None:
-        """A node outside the holders of a key has its records in its store while it watches with ``keep``."""
+        """As long as it watches with ``keep``, a node that is not a holder has the key's records in its store."""
         store = self.page.store
         self.dog.put(KEY, "state", b"here", "leased")
         self.world.run(1.0)
@@ -337,7 +340,7 @@ class KeepTests(NodeCase):
         self.assertEqual(store.get(KEY), [])
 
     def test_copies_are_nobodys_opinion(self) -> None:
-        """Watched copies are not returned to other nodes and are removed when the node stops."""
+        """Watched copies are not returned to other nodes, and are removed when the node stops."""
         self.dog.put(KEY, "state", b"here", "leased")
         self.page.watch(KEY, lambda records: None, keep=True)
         self.world.run(3.0)
@@ -381,7 +384,7 @@ class LargeFleetTests(NodeCase):
                 self.assertEqual(self.values(fleet, place, hash_key("task 13")), [b"do it"])
 
     def test_no_chatter_about_leases(self) -> None:
-        """When all records are at their holders, no replica reports missing leases."""
+        """If all records are at their holders, no replica reports missing leases."""
         fleet = self.fleet(14, seed=5)
         complaints: list[str] = []
         for node in fleet.nodes:
@@ -394,7 +397,7 @@ class LargeFleetTests(NodeCase):
         self.assertEqual(complaints, [])
 
     def test_the_next_in_line_inherits(self) -> None:
-        """When a holder leaves, the next closest node receives its records at once."""
+        """When a holder leaves, the next closest node receives its records immediately."""
         fleet = self.fleet(14, seed=7)
         self.done(fleet, fleet.nodes[13].put(KEY, "task", b"do it"))
         fleet.nodes[13].stop_silently()
@@ -407,7 +410,7 @@ class LargeFleetTests(NodeCase):
         self.assertEqual([r.value for r in heir.store.get(KEY)], [b"do it"])
 
     def test_former_replicas_do_not_count(self) -> None:
-        """When new nodes take over a key, watchers discard the reports of its former holders."""
+        """When new nodes become holders of a key, watchers discard the reports of its former holders."""
         fleet = self.fleet(10, seed=8)
         self.done(fleet, fleet.nodes[0].put(KEY, "task", b"do it"))
         told = self.watched(fleet.nodes[0])
@@ -423,7 +426,7 @@ class LargeFleetTests(NodeCase):
 
 class JoinTests(NodeCase):
     def test_bootstrap_comes_later(self) -> None:
-        """A node retries to join until its bootstrap node is available."""
+        """A node repeats its join until its bootstrap node is available."""
         fleet = self.fleet(1)
         fleet.nodes[0].stop_silently()
         node = fleet.make_node(1)
@@ -437,7 +440,7 @@ class JoinTests(NodeCase):
         self.assertEqual(len(fleet.nodes[0].overlay.table), 1)
 
     def test_known_to_oneself_only(self) -> None:
-        """A bootstrap node with its own address as the known node is the first node of its network."""
+        """If the only known node of a bootstrap node is its own address, it is the first node of its network."""
         fleet = self.fleet(1)
         node = fleet.make_node(1)
         fleet.nodes.append(node)
@@ -456,7 +459,7 @@ class JoinTests(NodeCase):
             self.failureResultOf(joined, NotRunning)
 
     def test_rejoin_through_remembered_contacts(self) -> None:
-        """A restarted node rejoins through stored contacts if its bootstrap node is dead."""
+        """A restarted node rejoins through stored contacts if its bootstrap node has failed."""
         fleet = self.fleet(4)
         fleet.run(31.0)
         fleet.nodes[3].stop_silently()
@@ -469,7 +472,7 @@ class JoinTests(NodeCase):
         )
 
     def test_first_node_does_not_wait_for_the_dead(self) -> None:
-        """A bootstrap node with only dead stored contacts starts without them."""
+        """If all stored contacts of a bootstrap node have failed, it starts without them."""
         fleet = self.fleet(2)
         fleet.nodes[0].stop()
         fleet.nodes[1].stop_silently()
@@ -491,7 +494,7 @@ class WireTests(NodeCase):
     METHODS = ("store", "find_value", "watch", "alive", "let_go", "goodbye!", "push", "missing", "find_node", "ping")
 
     def test_malformed_questions_change_nothing(self) -> None:
-        """Invalid arguments to any method are rejected, without a log entry or a change."""
+        """Invalid arguments to any method are rejected, without a log entry and without a change."""
         fleet = self.fleet(3)
         self.done(fleet, fleet.nodes[0].put(KEY, "state", b"one"))
         rng = random.Random(5)
@@ -520,7 +523,7 @@ class WireTests(NodeCase):
         self.assertEqual(fleet.stores[0].get(KEY), [])
 
     def test_lying_replica(self) -> None:
-        """A replica with invalid replies does not affect the results of the others."""
+        """A replica that sends invalid replies does not affect the results of other replicas."""
         fleet = self.fleet(4)
         answers: list[Any] = [None, 5, [], [[]], [[], []], [[5], None], [2**63 - 1], [True], [[None] * 3, [b"", ""]]]
         for answer in answers:

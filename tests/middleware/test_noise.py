@@ -71,7 +71,7 @@ class NoiseTests(SynchronousTestCase):
         self.assertRaises(Forged, stranger.read, initiator.write(b"secret"))
 
     def test_every_flipped_byte_is_noticed(self) -> None:
-        """Both sides reject a handshake message with a flipped byte at any position."""
+        """If any byte of a handshake message is flipped, both sides reject the message."""
         vector = self.vectors[1]
         initiator, responder = _sides(vector, self._psk(vector))
         first = initiator.write(b"hello")
@@ -88,7 +88,7 @@ class NoiseTests(SynchronousTestCase):
             self.assertRaises(Forged, initiator.copy().read, bytes(damaged))
 
     def test_short_and_weak_messages(self) -> None:
-        """Truncated messages and keys of small order raise ``Forged``."""
+        """A truncated message, and a key of small order, raise ``Forged``."""
         vector = self.vectors[1]
         initiator, responder = _sides(vector, self._psk(vector))
         self.assertRaises(Forged, responder.copy().read, bytes(95))

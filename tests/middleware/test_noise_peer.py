@@ -1,4 +1,4 @@
-"""Differential tests of ``noise`` against an independent implementation (noiseprotocol), byte for byte."""
+"""Differential tests of ``noise`` and an independent implementation (noiseprotocol), which must give the same bytes."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from middleware.entangled.wire.noise import (
 )
 
 RUNS = 100
-"""Of each protocol in each role; also the seeds."""
+"""The number of runs for each protocol in each role; the run number is also the seed."""
 MESSAGES = 4
 MAX_PAYLOAD = 1200
 
@@ -66,19 +66,19 @@ class Run:
 
 
 class DifferentialTests(SynchronousTestCase):
-    """Each side of a handshake against the reference implementation on the other side."""
+    """Tests of each side of a handshake, with the reference implementation as the other side."""
 
-    suppress = (util.suppress(message="One of ephemeral keypairs"),)  # fixed, for equal bytes on both sides
+    suppress = (util.suppress(message="One of ephemeral keypairs"),)  # a fixed value gives equal bytes on both sides
 
     def check_transport(self, run: Run, keys: TransportKeys, other: Any) -> None:
-        """Check that both sides have the same handshake hash and decrypt each other's messages."""
+        """Check that both sides have the same handshake hash and can decrypt each other's messages."""
         self.assertEqual(keys.handshake_hash, other.get_handshake_hash())
         for counter, payload in enumerate(run.payloads[2:]):
             self.assertEqual(other.decrypt(seal(keys.sending, counter, payload, b"")), payload)
             self.assertEqual(open_sealed(keys.receiving, counter, other.encrypt(payload), b""), payload)
 
     def initiate(self, run: Run) -> None:
-        """Run our initiator against the reference responder."""
+        """Run the initiator of this project with the reference responder."""
         ours = Initiator(run.initiator, run.responder.public, run.ephemerals[0], run.prologue, run.psk)
         twin, other = run.other(True), run.other(False)
         first = ours.write(run.payloads[0])
@@ -89,7 +89,7 @@ class DifferentialTests(SynchronousTestCase):
         self.check_transport(run, keys, other)
 
     def respond(self, run: Run) -> None:
-        """Run our responder against the reference initiator."""
+        """Run the responder of this project with the reference initiator."""
         ours = Responder(run.responder, run.ephemerals[1], run.prologue, run.psk)
         twin, other = run.other(False), run.other(True)
         first = bytes(other.write_message(run.payloads[0]))
@@ -101,13 +101,13 @@ class DifferentialTests(SynchronousTestCase):
         self.check_transport(run, keys, other)
 
     def test_initiator(self) -> None:
-        """Our initiator sends the same bytes as the reference initiator and agrees with the reference responder."""
+        """The initiator sends the same bytes as the reference initiator, and agrees with the reference responder."""
         for seed in range(RUNS):
             for has_psk in (False, True):
                 self.initiate(Run(seed, has_psk))
 
     def test_responder(self) -> None:
-        """Our responder sends the same bytes as the reference responder and agrees with the reference initiator."""
+        """The responder sends the same bytes as the reference responder, and agrees with the reference initiator."""
         for seed in range(RUNS):
             for has_psk in (False, True):
                 self.respond(Run(seed, has_psk))

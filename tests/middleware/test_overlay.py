@@ -33,7 +33,7 @@ from tests.fleet import TEAM_KEY, FleetCase
 
 class OverlayTests(FleetCase):
     def test_who_has_not_met_its_team_has_no_majority(self) -> None:
-        """A new node that has not met its team has no majority, even if all members that it knows agree."""
+        """A node that has not yet contacted its team has no majority, even if all members that it knows agree."""
         node = self.fleet(5).nodes[4]
         key, few = hash_key("a"), [node.contact, node.overlay.members.list_live()[0]]
         self.assertEqual(node.overlay.find_voters(key, few).size, 2)
@@ -57,7 +57,7 @@ class OverlayTests(FleetCase):
                     self.assertLessEqual(others, {c.node_id for c in node.overlay.find_possible_replicas(key)})
 
     def test_one_sign_of_life_is_as_good_as_many(self) -> None:
-        """A repeated message from a fresh contact changes nothing, unless the contact is doubted or has moved."""
+        """A repeated message from a contact changes nothing, unless the contact is suspected or has moved."""
         fleet = self.fleet(3)
         overlay, other = fleet.nodes[0].overlay, fleet.nodes[1].contact
         seen: list[Contact] = []
@@ -76,7 +76,7 @@ class OverlayTests(FleetCase):
         self.assertEqual(seen, [other] * 3 + [moved])
 
     def test_the_found_are_kept_in_mind(self) -> None:
-        """A contact in the routing table that is offline does not displace holders that a lookup found."""
+        """A contact in the routing table that is offline does not displace holders that a lookup has found."""
         fleet = self.fleet(14, seed=2)
         node, key = fleet.nodes[0], hash_key("a")
         node.overlay.has_all_members = False
@@ -90,7 +90,7 @@ class OverlayTests(FleetCase):
         self.assertLessEqual(others, {c.node_id for c in node.overlay.find_possible_replicas(key)})
 
     def test_the_silent_go(self) -> None:
-        """A node that fails is removed from every table after a while, a node that stops at once."""
+        """A node that fails is removed from every table after a while, a node that stops immediately."""
         fleet = self.fleet(4)
         fleet.nodes[3].stop_silently()
         fleet.nodes[2].stop()
@@ -100,7 +100,7 @@ class OverlayTests(FleetCase):
         self.assertEqual([len(node.overlay.table) for node in fleet.nodes[:2]], [1, 1])
 
     def test_return_after_a_cut(self) -> None:
-        """Nodes behind a partition of any length rejoin soon after it heals."""
+        """Nodes behind a partition of any duration rejoin soon after the partition ends."""
         for places, seconds, after in (((3,), 2.0, 6.0), ((3,), 6.0, 6.0), ((3,), 60.0, 6.0), ((0, 1), 3.0, 12.0)):
             fleet = self.fleet(4)
             fleet.switchboard.partition([fleet.address(place) for place in places])
@@ -111,7 +111,7 @@ class OverlayTests(FleetCase):
 
 
 class NewcomerTests(SynchronousTestCase):
-    """A node without contacts, which sends no requests."""
+    """Tests of a node without contacts, which sends no requests."""
 
     def setUp(self) -> None:
         self.clock = HeapClock()
@@ -146,11 +146,11 @@ class NewcomerTests(SynchronousTestCase):
         return Deferred.fromCoroutine(self.overlay.lookup_replicas(hash_key("a")))
 
     def met(self) -> Deferred[None]:
-        """Wait for the team."""
+        """Wait until the node has met the team."""
         return Deferred.fromCoroutine(self.overlay.wait_for_members())
 
     def look(self, work: Deferred[Any], news: Callable[[], None], step: float) -> bool:
-        """Return whether ``work``, which waits, ends at the first check after ``news``."""
+        """Return whether ``work``, which is waiting, ends at the first check after ``news``."""
         self.clock.advance(3.5 * step)
         self.assertNoResult(work)
         news()
@@ -171,7 +171,10 @@ class NewcomerTests(SynchronousTestCase):
         self.assertEqual(self.successResultOf(alone), [self.me])
 
     def test_meeting_waits_for_the_team(self) -> None:
-        """``met`` waits until the team is completely known or known to be large; one member is not enough."""
+        """``met`` waits until all members are known, or the team is known to be large.
+
+        A single member is not enough.
+        """
         for news in (self.knows_all, self.knows_many):
             self.forget()
             self.assertTrue(self.look(self.met(), news, MEMBERS_WAIT_STEP_S))

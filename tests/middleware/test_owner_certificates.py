@@ -22,7 +22,10 @@ from middleware.entangled.wire.admission_check import FOREIGN, Authority, OpenAd
 
 
 class KnownOwnersAdmission(OpenAdmission):
-    """An admission check that accepts learned owners; in these tests a valid certificate equals the owner's key."""
+    """An admission check that accepts an owner after it learned the certificate.
+
+    In these tests a valid certificate equals the owner's key.
+    """
 
     def __init__(self) -> None:
         self.known: set[bytes] = set()
@@ -56,7 +59,7 @@ class Endpoint:
 
 
 def made() -> Any:
-    """Return the endpoint stub."""
+    """Return a stub of the endpoint."""
     return Endpoint()
 
 
@@ -79,7 +82,7 @@ class CertificateTests(SynchronousTestCase):
         self.successResultOf(Deferred.fromCoroutine(self.certificates.fetch_missing(contact(peer), which)))
 
     def test_asked_once_for_each(self) -> None:
-        """Each unknown owner is requested once, several in one request."""
+        """The certificate of each unknown owner is requested once, several certificates in one request."""
         self.admission.known.update(owners(3))
         self.learn(owners(20) * 2)
         self.assertEqual(self.endpoint.asked, [owners(20)[3 : 3 + MAX_OWNERS], owners(20)[3 + MAX_OWNERS :]])
@@ -87,7 +90,7 @@ class CertificateTests(SynchronousTestCase):
         self.assertEqual(len(self.endpoint.asked), 2)
 
     def test_a_peer_that_cannot_show_one(self) -> None:
-        """After an invalid, empty or missing reply a peer is not queried for a time; other peers still are."""
+        """A peer that sent an invalid, empty or no reply gets no request for a time; other peers still get requests."""
         junk: list[Any] = [
             lambda asked: fail(NoAnswer("silent")),
             lambda asked: succeed(None),
@@ -108,20 +111,23 @@ class CertificateTests(SynchronousTestCase):
         self.assertEqual(self.admission.known, set(owners(2)))
 
     def test_only_those_that_were_asked_for(self) -> None:
-        """A certificate counts only for the requested owner; certificates before the first invalid one are kept."""
+        """A certificate counts only for the requested owner.
+
+        Certificates before the first invalid certificate are used.
+        """
         self.endpoint.answer = lambda asked: succeed([asked[0], b"", *asked[2:]])
         self.learn(owners(3))
         self.assertEqual(self.admission.known, {owners(3)[0]})
 
     def test_bounded(self) -> None:
-        """The table of peers that replied with invalid certificates is bounded."""
+        """The table of peers that sent invalid certificates is limited."""
         self.endpoint.answer = lambda asked: succeed(None)
         for peer in range(MAX_FAILED_PEERS + 10):
             self.learn(owners(1), peer)
         self.assertEqual(len(self.certificates._retry_at), MAX_FAILED_PEERS)
 
     def test_answer(self) -> None:
-        """A node returns known certificates for up to ``MAX_OWNERS`` owners, and an empty entry for an invalid key."""
+        """A node returns certificates for up to ``MAX_OWNERS`` owners, and an empty entry for an invalid key."""
         self.admission.known.update(owners(2))
         answer = self.endpoint.exposed(contact(1), [*owners(3), b"short", 7])
         self.assertEqual(answer, [*owners(2), b"", b"", b""])

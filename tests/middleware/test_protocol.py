@@ -55,7 +55,7 @@ class ShortPassGate(Gate):
 
 
 def exchange() -> dict[str, Any]:
-    """Run ``alice`` and ``bob`` through a probe, a handshake and four calls, one of them under load."""
+    """Let ``alice`` and ``bob`` exchange a probe, a handshake and four calls, one of them under load."""
     clock = HeapClock()
     switchboard = Switchboard(clock, random.Random(0), LinkConditions(0.01))
     team = bytes(range(32))
@@ -124,7 +124,7 @@ class ProtocolTests(SynchronousTestCase):
     """The test vectors."""
 
     def test_whole_exchange(self) -> None:
-        """Fixed keys and a fixed random generator produce exactly the datagrams of the vectors."""
+        """Fixed keys and a fixed random generator give exactly the datagrams of the vectors."""
         self.assertEqual(exchange(), json.loads(VECTORS.read_text(encoding="utf-8")))
 
     def test_every_kind_is_there(self) -> None:

@@ -30,7 +30,7 @@ ANYTHING = st.recursive(
 
 class RecordTest(SynchronousTestCase):
     def test_which_holds(self) -> None:
-        """The higher sequence number wins; for equal numbers all replicas choose the same record."""
+        """The higher sequence number wins; of two records with equal numbers all replicas choose the same record."""
         one, other = record(value=b"1"), record(value=b"2")
         self.assertTrue(record(sequence=2).supersedes(one))
         self.assertFalse(one.supersedes(record(sequence=2)))
@@ -39,7 +39,7 @@ class RecordTest(SynchronousTestCase):
         self.assertTrue(one.supersedes(None))
 
     def test_signature_covers_all(self) -> None:
-        """A record with any field changed after signing has no valid signature."""
+        """The signature of a record is invalid if any field was changed after signing."""
         self.assertTrue(record().is_genuine())
         changes: list[dict[str, object]] = [
             {"key": hash_key("tasks")},
@@ -57,7 +57,7 @@ class RecordTest(SynchronousTestCase):
             self.assertFalse(replace(record(), **change).is_genuine(), change)  # type: ignore[arg-type]
 
     def test_good_signatures_are_remembered(self) -> None:
-        """A valid signature is verified once; a changed record is verified separately."""
+        """A valid signature is verified only once; a changed record is verified separately."""
         signed = SignatureCache()
         self.assertTrue(signed.is_genuine(record()))
         for change in ({"value": b"there"}, {"sequence": 2}, {"signature": bytes(64)}, {"owner": CAT.public}):
@@ -81,13 +81,13 @@ class RecordTest(SynchronousTestCase):
             self.assertEqual(parse_record(msgpack.unpackb(msgpack.packb(one.pack()))), one)
 
     def test_message_bytes(self) -> None:
-        """``message_bytes`` is an upper bound of the packed size, by less than 40 bytes."""
+        """``message_bytes`` is an upper bound of the packed size, and exceeds it by less than 40 bytes."""
         for one in (record(), record(value=None), record("ä" * 64, sequence=2**63 - 1), record(value=bytes(20_000))):
             taken = len(msgpack.packb(one.pack()))
             self.assertTrue(taken <= one.message_bytes < taken + 40, (taken, one.message_bytes))
 
     def test_limits(self) -> None:
-        """A field with a value out of range or of another type makes the record invalid."""
+        """A field that is out of range or of a wrong type makes the record invalid."""
         bad: dict[int, list[object]] = {
             0: [KEY[:-1], KEY + b"\0", "key", None],
             1: ["n" * (MAX_NAME_BYTES + 1), b"name", None],
@@ -109,11 +109,11 @@ class RecordTest(SynchronousTestCase):
 
     @given(ANYTHING | st.lists(ANYTHING, min_size=8, max_size=8))
     def test_total(self, fields: object) -> None:
-        """Any input decodes to a record or None, without an exception."""
+        """Any input is decoded as a record or as None, without an exception."""
         self.assertTrue(parse_record(fields) is None or isinstance(parse_record(fields), Record))
 
     def test_slots(self) -> None:
-        """A slot survives packing as a list; anything but a list of key, owner and name is rejected."""
+        """A slot survives packing as a list; anything except a list of key, owner and name is rejected."""
         self.assertEqual(parse_slot(list(record().slot)), record().slot)
         wrong: list[object] = [
             [],

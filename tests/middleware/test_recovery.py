@@ -47,7 +47,10 @@ class CorruptFileTest(SynchronousTestCase):
             file.write(what)
 
     def opened_anew(self, number: int = 1) -> SqliteStore:
-        """Open the new store that replaces the corrupted one, which must be kept unchanged under another name."""
+        """Open the new store that replaces the corrupted file.
+
+        The corrupted file must be kept unchanged under a different name.
+        """
         corrupt = Path(self.path).read_bytes()
         store = SqliteStore.open(self.path, 0.0)
         self.addCleanup(store.close)
@@ -81,9 +84,9 @@ class CorruptFileTest(SynchronousTestCase):
             (lambda: self.overwrite(68, b"\1\2\3\4"), saved),  # the header has another application id
             (lambda: self.overwrite(4096 * 12, b"\xff" * 4096 * 4), saved),
             (lambda: os.truncate(self.path, os.path.getsize(self.path) // 2), ""),
-            (lambda: Path(self.path).write_bytes(bytes(40_960)), lost),  # a card that lost its pages leaves zeros
+            (lambda: Path(self.path).write_bytes(bytes(40_960)), lost),  # an SD card that lost power before it wrote the pages leaves zeros there
             (self.drop_table, ""),
-            (self.rot_index, saved),  # reads would succeed, but writes would damage the file
+            (self.rot_index, saved),  # reads would still succeed, but writes would damage the file
         )
         for damage, said in damages:
             self.fill()
@@ -95,7 +98,7 @@ class CorruptFileTest(SynchronousTestCase):
                 self.assertEqual(store.get_note("identity"), DOG.seed if said == saved else None)
 
     def test_again(self) -> None:
-        """A second corrupted file gets another name than the first one, and the notes are kept."""
+        """A second corrupted file gets a name different from that of the first, and the notes are kept."""
         self.overwrite(68, b"\1\2\3\4")
         self.opened_anew().close()
         self.overwrite(68, b"\1\2\3\4")
@@ -133,7 +136,7 @@ class CorruptFileTest(SynchronousTestCase):
             self.assertFalse(Path(path + part).exists())
 
     def test_anywhere(self) -> None:
-        """A file overwritten at any position opens without false records, or is set aside."""
+        """A file that is overwritten at any position is opened without false records, or is set aside."""
         whole = Path(self.path).read_bytes()
         rng = random.Random(5)
         put = {record(str(number)).slot for number in range(200)}
@@ -148,7 +151,7 @@ class CorruptFileTest(SynchronousTestCase):
                 self.assertEqual([r for r in store.records() if r.value != bytes(500)], [])
                 self.assertIn(store.get_note("identity"), (DOG.seed, None))
                 seen.add(f"{store.origin}, {store.corrupt_rows > 0}")
-                # A record that is lost without a report would look as if it had never been written.
+                # If a record were lost without a report, it would seem that it had never been written.
                 lost = 200 - len(store)
                 self.assertTrue(
                     not lost or store.origin == "replaced" or store.corrupt_rows >= lost, (lost, store.corrupt_rows)
@@ -193,7 +196,7 @@ class OldSchemaTest(SynchronousTestCase):
         self.assertEqual(names, [("notes",), ("records",), ("rotten",)])
 
     def test_all_or_nothing(self) -> None:
-        """A migration that runs out of space leaves the old file unchanged and can be repeated."""
+        """A migration that runs out of disk space leaves the old file unchanged, and can be repeated."""
         with closing(sqlite3.connect(self.path, isolation_level=None)) as connection:
             connection.text_factory = bytes
             connection.execute("PRAGMA max_page_count = 1")

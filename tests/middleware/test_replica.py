@@ -1,4 +1,4 @@
-"""Tests of one replica, which stores records for other nodes."""
+"""Tests of a single replica, which stores records for other nodes."""
 
 from __future__ import annotations
 
@@ -87,7 +87,7 @@ class ReplicaTests(SynchronousTestCase):
         return answers
 
     def test_the_stronger_record_is_kept(self) -> None:
-        """A newer record and a repeated one are accepted; an older one is rejected with the current sequence number."""
+        """A newer and a repeated record are accepted; an older record is rejected with the current sequence number."""
         self.assertEqual(self.stored(record(sequence=5)), [0])
         self.assertEqual(self.stored(record(sequence=5)), [0])
         self.assertEqual(self.stored(record(sequence=4)), [5])
@@ -97,7 +97,7 @@ class ReplicaTests(SynchronousTestCase):
         self.assertEqual(self.stored(weaker), [1])
 
     def test_holds(self) -> None:
-        """``holds`` is true for exactly the stored record, not for an older one, a cached copy or a watched copy."""
+        """``holds`` is true only for the stored record, not for an older record, a cached copy or a watched copy."""
         self.stored(record(sequence=5))
         self.assertTrue(self.replica.holds(record(sequence=5)))
         self.assertFalse(self.replica.holds(record(sequence=4)))
@@ -109,13 +109,13 @@ class ReplicaTests(SynchronousTestCase):
         self.assertEqual([held.name for held in self.replica.get_held(KEY)], [record(sequence=5).name])
 
     def test_who_may_store(self) -> None:
-        """A leased record is accepted from its owner only; a record from another node needs a valid signature."""
+        """A leased record is accepted only from its owner; a record from another node needs a valid signature."""
         forged = Record(KEY, "f", DOG.public, 1, "team", 1.0, b"v", bytes(64))
         self.assertEqual(self.stored(record(lifetime="leased"), record("t"), forged, peer=self.cat), [-1, 0, -1])
         self.assertEqual(self.stored(record(lifetime="leased"), forged), [0, 0])
 
     def test_acknowledged_once_written(self) -> None:
-        """A store request is answered after the record is written, and is rejected with the reason if that fails."""
+        """A store request is answered after the record is written; if this fails, it is rejected with the reason."""
         writing: list[Deferred[None]] = []
         self.store.wait_for_write = lambda: writing.append(Deferred()) or writing[-1]  # type: ignore[method-assign,func-returns-value]
         peer = Contact(ME.public, Address("10.0.0.1", 1))
@@ -134,7 +134,10 @@ class ReplicaTests(SynchronousTestCase):
                 self.assertIn("the disk is full", str(self.failureResultOf(answer, Refused).value))
 
     def test_lease_runs_out(self) -> None:
-        """A leased record expires one TTL after its last renewal; only the end of a lease marks its owner as silent."""
+        """A leased record expires one TTL after its last renewal.
+
+        Its owner is marked as silent only by the end of a lease.
+        """
         self.stored(record(lifetime="leased"), record("t"))
         self.clock.advance(0.8)
         self.replica.answer_alive(self.dog, 1.0, digest_of([record(lifetime="leased")]))
@@ -144,7 +147,7 @@ class ReplicaTests(SynchronousTestCase):
         self.assertEqual(self.told[3:], [("gone", "state"), ("silent", DOG.public)])
 
     def test_strange_leases(self) -> None:
-        """The duration of a lease is bounded, and an invalid duration in a renewal has no effect."""
+        """The duration of a lease is limited, and an invalid duration in a renewal has no effect."""
         self.stored(record(lifetime="leased"))
         for lease in (float("nan"), -5.0, 5, float("inf")):
             self.replica.answer_alive(self.dog, lease, b"")
@@ -161,7 +164,10 @@ class ReplicaTests(SynchronousTestCase):
         self.assertEqual(self.told[2:], [("gone", "state"), ("silent", DOG.public)])
 
     def test_missing(self) -> None:
-        """An owner with a different digest gets the held leases after its second renewal, or at once if all expired."""
+        """If the owner's digest differs, it gets the list of held leases after its second renewal.
+
+        If all its leases have expired, it gets the list immediately.
+        """
         held = record(lifetime="leased")
         self.stored(held)
         for told in ([], [("missing", [digest_of([held])])]):
@@ -175,7 +181,7 @@ class ReplicaTests(SynchronousTestCase):
         self.assertEqual(self.heard[1:], [("missing", [])])
 
     def test_let_go(self) -> None:
-        """Only the owner can remove a leased record from a replica; a team record is not removed."""
+        """Only the owner can make a replica drop a leased record; a team record is not dropped."""
         held, team = record(lifetime="leased"), record("t")
         self.stored(held, team)
         marks: list[object] = [digest_of([held]), digest_of([team]), 5, None]
@@ -214,7 +220,7 @@ class ReplicaTests(SynchronousTestCase):
         self.assertEqual(list(split_pages([])), [])
 
     def test_bad_cursors_and_keys(self) -> None:
-        """An invalid cursor and a key of wrong length are rejected."""
+        """An invalid cursor, and a key of the wrong length, are rejected."""
         self.stored(record())
         for after in ([], [1, 2], ["x", "y"], [b"x"], [b"x", "y", 1]):
             self.assertRaises(Refused, self.replica.answer_find_value, self.dog, KEY, after)
@@ -261,7 +267,7 @@ class StoreReplyTests(SynchronousTestCase):
 
     @given(st.integers() | st.booleans() | st.none() | st.floats() | st.text() | st.binary())
     def test_total(self, foreign: Any) -> None:
-        """Any other reply, such as a lower sequence than the record's, decodes to None."""
+        """Any other reply is decoded as None, for instance if its sequence is lower than that of the record."""
         reply = decode_reply(foreign, RECORD)
         is_valid = type(foreign) is int and (-4 <= foreign <= 0 or 7 <= foreign < MAX_SEQUENCE)
         self.assertEqual(reply is not None, is_valid)

@@ -58,7 +58,10 @@ class TurnTests(EndpointCase):
         self.assertEqual(self.places(), (0, 0, 0))
 
     def test_a_dead_peer(self) -> None:
-        """For a dead peer sent requests fail with ``NoAnswer``, queued ones with ``Crowded``; no state remains."""
+        """If a peer has failed, sent requests fail with ``NoAnswer`` and queued requests with ``Crowded``.
+
+        No state remains.
+        """
         self.switchboard.kill(self.to_b.address)
         asked = self.flood(20 * MAX_IN_FLIGHT)
         self.clock.advance(30.0)
@@ -76,7 +79,7 @@ class TurnTests(EndpointCase):
             one.addErrback(lambda failure: failure.trap(NoAnswer, Crowded))
 
     def test_cancelled_in_the_queue(self) -> None:
-        """A request cancelled in the queue is never sent; cancelling a sent one lets the next one be sent."""
+        """A queued request that is cancelled is never sent; cancelling a sent request lets the next request be sent."""
         asked = self.flood(MAX_IN_FLIGHT + 2)
         asked[-1].cancel()
         asked[0].cancel()
@@ -125,25 +128,25 @@ class TurnTests(EndpointCase):
         self.assertEqual([self.successResultOf(one) for one in asked], list(range(4 * MAX_IN_FLIGHT)))
 
     def places(self) -> tuple[int, int, int]:
-        """Return the number of requests in flight, in the peer's queue and in all queues."""
+        """Return three numbers: requests in flight, in the peer's queue and in all queues."""
         at = self.a._peers.get(self.to_b.public)
         assert at is not None
         return at.in_flight, len(at.queue), self.a._requester._queued
 
 
 class GivenUpTests(EndpointCase):
-    """Handshakes that outlast their requests."""
+    """Tests of handshakes that last longer than the requests that started them."""
 
     def inits(self) -> int:
         """Return the number of INITs that arrived at ``b``, including retransmissions."""
         return sum(datagram[0] == INIT for datagram, _ in self.taps[self.to_b.address].kept)
 
     def give_up(self, timeout: float) -> None:
-        """Send a request that times out."""
+        """Send a request, and wait until it times out."""
         self.failed(self.a.ask(self.to_b, "echo", 1, timeout=timeout), NoAnswer, timeout)
 
     def test_nothing_more_is_sent_for_nobody(self) -> None:
-        """After all its requests ended, a handshake is not retransmitted, and is soon removed."""
+        """After all its requests have ended, a handshake is not retransmitted, and is soon removed."""
         self.switchboard.kill(self.to_b.address)
         sent = self.switchboard.counters["sent"]
         self.give_up(INITIAL_TIMEOUT_S / 2)
@@ -152,14 +155,14 @@ class GivenUpTests(EndpointCase):
         self.assertEqual(self.a.peers.get_or_create(self.to_b).handshake, None)
 
     def test_a_late_answer_opens_the_session(self) -> None:
-        """A late handshake reply still opens the session for the next request."""
+        """A late reply to a handshake still opens the session for the next request."""
         self.switchboard.conditions = LinkConditions(0.3)
         self.give_up(0.2)
         self.clock.advance(1.0)
         self.assertTrue(self.a.has_session(self.to_b))
 
     def test_who_asks_meanwhile_need_not_wait(self) -> None:
-        """A new request during a paused handshake retransmits it at once."""
+        """A new request during a paused handshake retransmits the handshake immediately."""
         self.switchboard.conditions = LinkConditions(DELAY, loss=1.0)
         self.give_up(INITIAL_TIMEOUT_S / 2)
         self.clock.advance(INITIAL_TIMEOUT_S)

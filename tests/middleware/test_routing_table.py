@@ -39,7 +39,7 @@ class RoutingTableTest(SynchronousTestCase):
         self.near = of_bucket(157, 4)
 
     def fill(self) -> None:
-        """Fill a bucket with far contacts, and add k nearer ones, which are the neighbours of the node."""
+        """Fill a bucket with far contacts, and add k nearer contacts, which are the neighbours of the node."""
         for near in self.near:
             self.table.record_contact(near, 0.0)
         for moment, known in enumerate(self.old[:4]):
@@ -63,14 +63,17 @@ class RoutingTableTest(SynchronousTestCase):
         self.assertIsNone(self.table.get(OWN.node_id))
 
     def test_address_moves(self) -> None:
-        """A contact with a verified new address is listed once, at that address, and its failures are cleared."""
+        """A contact with a verified new address is listed once, at this address, and its failures are cleared."""
         self.table.record_contact(contact(1), 0.0)
         self.table.record_contact(contact(1, port=7001), 1.0)
         self.miss(contact(1), DROPPED_AFTER)
         self.assertEqual((len(self.table), self.table.list_contacts()), (1, [contact(1, port=7001)]))
 
     def test_full_bucket_keeps_the_old(self) -> None:
-        """A new contact does not displace one of a full bucket; the least recently seen one is returned for a ping."""
+        """A new contact displaces no contact of a full bucket.
+
+        The least recently heard contact is returned for a ping.
+        """
         self.fill()
         self.assertEqual(self.table.record_contact(self.new[0], 10.0), self.old[0])
         self.assertEqual(self.far(), self.old[:4])
@@ -88,7 +91,7 @@ class RoutingTableTest(SynchronousTestCase):
         self.assertEqual(self.table.record_contact(self.new[0], 10.0 + PING_INTERVAL_S), self.old[0])
 
     def test_replaced_from_the_cache(self) -> None:
-        """After ``STALE_AFTER`` failures in a row the most recent waiting contact replaces the old one."""
+        """After ``STALE_AFTER`` consecutive failures the most recent waiting contact replaces the old contact."""
         self.fill()
         for newcomer in self.new[:2]:
             self.table.record_contact(newcomer, 10.0)
@@ -99,7 +102,7 @@ class RoutingTableTest(SynchronousTestCase):
         self.assertEqual(len(self.table), 8)
 
     def test_cache_is_bounded(self) -> None:
-        """At most k contacts wait; the least recently seen ones leave the queue."""
+        """At most k contacts wait in the cache; the least recently heard contact leaves the cache first."""
         self.fill()
         for newcomer in self.new:
             self.table.record_contact(newcomer, 10.0)
@@ -108,7 +111,7 @@ class RoutingTableTest(SynchronousTestCase):
         self.assertEqual(sorted(self.far(), key=self.old.index), self.new[4:])
 
     def test_silent_newcomer_leaves_the_cache(self) -> None:
-        """A waiting contact that fails is removed from the queue."""
+        """A waiting contact that fails is removed from the cache."""
         self.fill()
         self.table.record_contact(self.new[0], 10.0)
         self.table.record_miss(self.new[0], 11.0)
@@ -125,7 +128,7 @@ class RoutingTableTest(SynchronousTestCase):
         self.assertEqual(len(self.table), 8)
 
     def test_dropped_after_five(self) -> None:
-        """A contact is dropped after five failures in a row; a message from it resets the count."""
+        """A contact is dropped after five consecutive failures; a message from the contact resets the count."""
         for moment in (0.0, 200.0):
             self.table.record_contact(contact(1), moment)
             self.miss(contact(1), DROPPED_AFTER - 1)
@@ -182,7 +185,7 @@ class RoutingTableTest(SynchronousTestCase):
 
     @given(st.integers(0, 159), st.integers())
     def test_refresh_target_lies_in_its_bucket(self, index: int, seed: int) -> None:
-        """The lookup target for a bucket lies in it and is determined by the seed."""
+        """The lookup target for a bucket is in this bucket, and the seed determines it."""
         table = RoutingTable(OWN.node_id)
         target = table.refresh_target(index, random.Random(seed))
         self.assertEqual(bucket_index(OWN.node_id, target), index)

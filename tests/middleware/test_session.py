@@ -25,7 +25,7 @@ class SessionTests(SynchronousTestCase):
         self.b = Session(contact, 8, 7, TransportKeys(two, one, b""), 0.0, True)
 
     def test_carries_messages_both_ways(self) -> None:
-        """Each end decrypts the other's messages; the overhead is at most 36 bytes; the largest message fits."""
+        """Each end decrypts the other's messages, even the largest; the overhead is at most 36 bytes."""
         datagram = self.a.seal(b"hello")
         self.assertEqual(self.b.open(datagram), (b"hello", 1))
         self.assertEqual(self.a.open(self.b.seal(b"")), (b"", 1))
@@ -34,7 +34,7 @@ class SessionTests(SynchronousTestCase):
         self.assertEqual(len(self.a.seal(bytes(MAX_PLAIN_BYTES))), MAX_DATAGRAM_BYTES)
 
     def test_opens_each_once_in_any_order(self) -> None:
-        """Datagrams within the replay window decrypt exactly once, in any order."""
+        """Each datagram within the replay window is accepted exactly once, in any order."""
         datagrams = [self.a.seal(b"%d" % number) for number in range(WINDOW)]
         shuffled = datagrams[:]
         random.Random(1).shuffle(shuffled)
@@ -44,14 +44,14 @@ class SessionTests(SynchronousTestCase):
             self.assertRaises(Forged, self.b.open, datagram)
 
     def test_refuses_what_fell_out_of_the_window(self) -> None:
-        """A datagram older than the replay window is rejected; the oldest one inside it is accepted."""
+        """A datagram older than the replay window is rejected; the oldest datagram in the window is accepted."""
         datagrams = [self.a.seal(b"") for _ in range(WINDOW + 1)]
         self.b.open(datagrams[-1])
         self.assertTrue(self.b.is_replay(datagrams[0]))
         self.assertEqual(self.b.open(datagrams[1]), (b"", 1 - WINDOW))
 
     def test_window_survives_a_leap(self) -> None:
-        """After a gap larger than the window, older datagrams are rejected and later ones are accepted."""
+        """After a gap larger than the window, older datagrams are rejected and later datagrams are accepted."""
         early = self.a.seal(b"early")
         self.b.open(self.a.seal(b""))
         self.a._sent = 2**40
@@ -62,7 +62,7 @@ class SessionTests(SynchronousTestCase):
         self.assertEqual(self.b.open(self.a.seal(b"next"))[0], b"next")
 
     def test_forged_datagram_changes_nothing(self) -> None:
-        """A datagram with a flipped byte is rejected, and the original is accepted afterwards."""
+        """A datagram with a flipped byte is rejected, and the original datagram is accepted after that."""
         datagram = self.a.seal(b"hello")
         for place in range(5, len(datagram)):
             damaged = bytearray(datagram)

@@ -58,7 +58,7 @@ class ReopenTest(SynchronousTestCase):
         return self.reopened(now)
 
     def after_a_kill(self, durable: Durability, late: str = "") -> SqliteStore:
-        """Return the store of a process that was killed after it flushed 300 records and ran ``late``."""
+        """Return the store of a process that was killed after it had flushed 300 records and run ``late``."""
         self.store.close()
         child = (
             "import os, sys\n"
@@ -90,23 +90,26 @@ class ReopenTest(SynchronousTestCase):
         self.assertEqual(store.expire(160.0), kept)
 
     def test_what_left_stays_away(self) -> None:
-        """A record that expired or lost is absent after a restart; one that was put again is present."""
+        """A record that expired, or lost against another record, is absent after a restart.
+
+        A record that was put again is present.
+        """
         for name in "ac":
             self.store.put(record(name), 1.0)
         self.store.put(record("b"), FOREVER)
         self.store.put(record("b", sequence=2), FOREVER)
         self.store.expire(1.0)
-        self.store.put(record("c"), FOREVER)  # before the first write
+        self.store.put(record("c"), FOREVER)  # the store is closed before its first write
         self.assertEqual(self.after_restart().get(KEY), [record("b", sequence=2), record("c")])
 
     def test_many_changes(self) -> None:
-        """Changes that exceed one commit are all written."""
+        """Changes that are too many for one commit are all written."""
         for number in range(1000):
             self.store.put(record(str(number), value=None), FOREVER)
         self.assertEqual(len(self.after_restart()), 1000)
 
     def test_rotten_rows(self) -> None:
-        """A changed row is counted, moved to another table and not returned; the other rows are loaded."""
+        """A corrupted row is counted, moved to a separate table and not returned; the other rows are loaded."""
         changes = (
             "sequence = 'x'",
             "sequence = sequence + 1",
@@ -138,7 +141,7 @@ class ReopenTest(SynchronousTestCase):
         self.assertEqual((store.corrupt_rows, store.records()), (0, [whole, record("r0")]))
 
     def test_rotten_rows_do_not_pile_up(self) -> None:
-        """The table of corrupted rows is bounded and keeps the last ones."""
+        """The table of corrupted rows is limited, and keeps the newest rows."""
         for number in range(MAX_CORRUPT_ROWS + 5):
             self.store.put(record(str(number)), FOREVER)
         self.store.close()
@@ -161,7 +164,7 @@ class ReopenTest(SynchronousTestCase):
         )
 
     def test_epoch(self) -> None:
-        """The epoch of a file is constant and differs from the epoch of another file."""
+        """The epoch of a file is constant, and differs from the epoch of any other file."""
         epoch = self.store.epoch
         store = self.after_restart()
         self.assertEqual((store.epoch, store.origin), (epoch, "kept"))
@@ -171,7 +174,7 @@ class ReopenTest(SynchronousTestCase):
             self.assertEqual(told.epoch, b"12345678")
 
     def test_large_values(self) -> None:
-        """Values of the maximum size survive a restart, and their bytes are counted."""
+        """Values of the maximum size survive a restart, and are included in the byte count."""
         owners = (DOG, DOG, CAT, CAT)
         kept = [record(str(n), value=bytes([n]) * MAX_VALUE_BYTES, owner=owner) for n, owner in enumerate(owners)]
         for one in kept:
@@ -181,7 +184,7 @@ class ReopenTest(SynchronousTestCase):
         self.assertEqual(store.usage.bytes, sum(map(count_bytes, kept)))
 
     def test_killed_in_the_middle(self) -> None:
-        """Flushed records survive a kill during later writes, at each durability level."""
+        """At each durability level flushed records survive if the process is killed during later writes."""
         late = "for number in range(300): store.put(record('late' + str(number), value=None), 9e9)\n"
         levels: tuple[Durability, ...] = ("power", "crash")
         for durable in levels:
@@ -204,7 +207,7 @@ class ReopenTest(SynchronousTestCase):
         self.after_restart()
 
     def test_only_for_its_owner(self) -> None:
-        """Only the owner can read the file and its log, as they contain the seed of the identity."""
+        """Only the owner can read the file and its log, because they contain the seed of the identity."""
         self.store.put(record(), FOREVER)
         self.store.flush()
         for path in (self.path, self.path + "-wal", self.path + "-shm"):
@@ -217,13 +220,13 @@ class ReopenTest(SynchronousTestCase):
 
 class FullDiskTest(SynchronousTestCase):
     def setUp(self) -> None:
-        # Only a flush commits, which prevents a commit between two changes.
+        # Only a flush commits, so no commit comes between two changes.
         self.patch(writer_thread, "COMMIT_AFTER_S", 60.0)
         self.store = SqliteStore.open(self.mktemp(), 0.0)
         self.addCleanup(self.store.close)
         self.store.put(record("a"), FOREVER)
         self.store.flush()
-        # With no free page SQLite reports a full disk.
+        # Without a free page SQLite reports a full disk.
         self.limit(1)
         for number in range(40):
             self.store.put(record(str(number), value=bytes(900)), FOREVER)
@@ -241,7 +244,7 @@ class FullDiskTest(SynchronousTestCase):
         self.store._connection.execute(f"PRAGMA max_page_count = {pages}").fetchone()
 
     def test_refuses_by_name(self) -> None:
-        """On a full disk a node rejects new records with the reason, and still reads, extends and expires records."""
+        """On a full disk a node rejects new records with the reason, but still reads, renews and expires records."""
         error = self.assertRaises(Unwritable, self.store.put, record("b"), FOREVER)
         self.assertIn("full", str(error))
         self.assertFalse(self.store.put(record("a"), FOREVER))
@@ -250,7 +253,10 @@ class FullDiskTest(SynchronousTestCase):
         self.limit(10_000)
 
     def test_who_waits_is_told(self) -> None:
-        """A pending acknowledgement fails with the first failed commit, and new ones fail until a commit succeeds."""
+        """The first failed commit fails the pending acknowledgement.
+
+        New acknowledgements fail until a commit succeeds.
+        """
         self.failureResultOf(self.store.wait_for_write(), Unwritable)
         self.limit(10_000)
         self.store.flush()
@@ -265,7 +271,7 @@ class FullDiskTest(SynchronousTestCase):
         self.store.flush()
         self.assertEqual(self.store.write_error, "")
         self.successResultOf(self.store.wait_for_write())
-        self.assertEqual(len(read_records(self.store._path, KEY)), 61)  # including the pending changes
+        self.assertEqual(len(read_records(self.store._path, KEY)), 61)  # including the changes that were pending
 
     def test_read_only(self) -> None:
         """A file that becomes read-only rejects records like a full disk, and recovers."""
@@ -315,12 +321,12 @@ class BadFileTest(SynchronousTestCase):
         self.assertIn("not a database", self.refusal(path))
         self.assertEqual(Path(path).read_text(), text)
         self.assertEqual(stat.S_IMODE(os.stat(path).st_mode), 0o640)
-        os.remove(path)  # the test leaves no lock on it
+        os.remove(path)  # the test must not leave a lock on the file
         with closing(SqliteStore.open(path, 0.0)) as store:
             self.assertEqual((store.origin, len(store)), ("new", 0))
 
     def test_of_another_program(self) -> None:
-        """A database of another program is rejected by its application id, version or tables."""
+        """A database of another program is recognized by its application id, version or tables, and rejected."""
         for statement in ("PRAGMA application_id = 7", "PRAGMA user_version = 1", "CREATE TABLE letters(text)"):
             path = self.mktemp()
             with closing(sqlite3.connect(path)) as connection:
@@ -338,7 +344,7 @@ class BadFileTest(SynchronousTestCase):
 
 class ReadRecordsTest(SynchronousTestCase):
     def test_beside_a_running_node(self) -> None:
-        """``read_records`` returns the live records of a key in order while a node has the file open."""
+        """``read_records`` returns the valid records of a key in order, even if a node has the file open."""
         path = Path(self.mktemp() + " what?#")
         store = SqliteStore.open(path, 0.0)
         self.addCleanup(store.close)
@@ -370,7 +376,7 @@ class SlowDiskTest(SynchronousTestCase):
         self.other.execute("BEGIN IMMEDIATE")
 
     def test_nobody_waits_for_a_commit(self) -> None:
-        """During a blocked commit reads, puts and expiry work, but nothing is acknowledged before its end."""
+        """During a blocked commit reads, puts and expiry work, but nothing is acknowledged before the commit ends."""
         self.store.put(record("a"), FOREVER)
         first = self.store.wait_for_write()
         for number in range(500):
@@ -387,7 +393,7 @@ class SlowDiskTest(SynchronousTestCase):
         self.successResultOf(later)
 
     def test_news_are_delivered(self) -> None:
-        """An acknowledgement fires in the caller's thread, through ``deliver``."""
+        """An acknowledgement fires in the thread of the caller, through ``deliver``."""
         self.store.put(record("a"), FOREVER)
         waiting = self.store.wait_for_write()
         self.other.execute("COMMIT")

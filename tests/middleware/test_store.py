@@ -38,7 +38,7 @@ def record(
 
 
 class StoreContract(_Case):
-    """The contract of every store; a test case mixes it in and creates the store."""
+    """The contract of every store; a test case inherits it and creates the store."""
 
     store: Store
 
@@ -77,7 +77,7 @@ class StoreContract(_Case):
     def test_put_and_remove(self) -> None:
         """A record is found by its key and slot; a tombstone hides it from readers and wins over older records.
 
-        Changing a returned list does not change the store.
+        If a caller changes a returned list, the store does not change.
         """
         self.assertTrue(self.store.put(record(), FOREVER))
         self.store.get(KEY, tombstones=True).clear()
@@ -92,7 +92,7 @@ class StoreContract(_Case):
         self.assertFalse(self.store.put(record(), FOREVER))
 
     def test_loser_extends_nothing(self) -> None:
-        """A record that loses against the stored one does not extend its lifetime."""
+        """A record that loses against the stored record does not extend the TTL of the stored record."""
         self.store.put(record(sequence=2), 1.0)
         self.store.put(record(sequence=1), 5.0)
         self.store.put(replace(record(sequence=2), value=b"else"), 5.0)
@@ -121,7 +121,7 @@ class StoreContract(_Case):
         self.assertTrue(store.put(record("c"), FOREVER))
 
     def test_delete_always_fits(self) -> None:
-        """A full store accepts a limited number of tombstones, also for new slots."""
+        """A full store accepts a limited number of tombstones, even for new slots."""
         store = self.make(1)
         store.put(record("a"), FOREVER)
         self.assertTrue(store.put(record("b", value=None), FOREVER))
@@ -145,7 +145,7 @@ class StoreContract(_Case):
         self.assertEqual(self.store.usage[::2], (0, 0))
 
     def test_full_of_bytes(self) -> None:
-        """The byte quota is exact for new and growing records; a shrinking record always fits."""
+        """The byte quota is exact for new records and records that grow; a record that shrinks is always accepted."""
         small, large = record("b", value=b""), record("a", value=bytes(500))
         store = self.make(100, count_bytes(large) + count_bytes(small))
         store.put(large, FOREVER)
@@ -183,7 +183,7 @@ class StoreContract(_Case):
         self.assertTrue(store.put(record("y"), FOREVER))
 
     def fill(self, store: Store, owner: Identity, value: bytes) -> int:
-        """Put records of an owner until one is rejected; return the number of accepted ones."""
+        """Put records of an owner until a record is rejected; return the number of accepted records."""
         for number in range(100_000):
             try:
                 store.put(replace(record("", value=value), name=str(number), owner=owner.public), FOREVER)
@@ -192,7 +192,7 @@ class StoreContract(_Case):
         return -1
 
     def test_order_of_eviction(self) -> None:
-        """Old tombstones are evicted first, oldest first; other records are not evicted."""
+        """Old tombstones are evicted first, the oldest first; other records are not evicted."""
         store = self.make(3, hold=30.0)
         old, older = record("old", value=None), record("older", value=None)
         store.put(older, 60.0)
@@ -235,7 +235,7 @@ class StoreContract(_Case):
         self.assertEqual(store.get_slot(record("b").slot), record("b", value=None))
 
     def test_written(self) -> None:
-        """A put is acknowledged after the write, and at once if nothing is pending."""
+        """A put is acknowledged after the write, or immediately if no write is pending."""
         self.store.put(record(), FOREVER)
         acknowledged = self.store.wait_for_write()
         self.settle(self.store)

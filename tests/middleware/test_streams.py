@@ -14,7 +14,7 @@ CAMERA = "camera"
 
 
 class StreamsTests(EndpointCase):
-    """``b`` publishes, ``a`` views."""
+    """Tests of streams that ``b`` publishes and ``a`` views."""
 
     def setUp(self) -> None:
         super().setUp()
@@ -35,7 +35,7 @@ class StreamsTests(EndpointCase):
         self.viewer._answer_part(self.to_publisher, CAMERA, sequence, number, count, part, age_ms)
 
     def test_frames_arrive_whole(self) -> None:
-        """A frame of many fragments arrives intact at every viewer until it stops; no timer is left."""
+        """A frame of many fragments arrives unchanged at every viewer until the viewer stops; no timer is left."""
         others: list[int] = []
         stop = self.viewer.view(self.to_publisher, CAMERA, self.see)
         stop_other = self.viewer.view(self.to_publisher, CAMERA, lambda sequence, frame, age: others.append(sequence))
@@ -57,7 +57,7 @@ class StreamsTests(EndpointCase):
         self.assertEqual(self.clock.getDelayedCalls(), [])
 
     def test_age_counts_from_the_camera(self) -> None:
-        """The age of a frame is its age when sent plus its transfer time, without synchronized clocks."""
+        """The age of a frame is its age when it was sent plus its transfer time, without synchronized clocks."""
         self.viewer.view(self.to_publisher, CAMERA, self.see)
         self.clock.advance(0.1)
         self.publisher.publish(CAMERA, 1, bytes(2 * PART_BYTES), 0.25)
@@ -86,7 +86,10 @@ class StreamsTests(EndpointCase):
         self.assertEqual(self.switchboard.counters["sent"], sent)
 
     def test_lost_part_drops_the_frame(self) -> None:
-        """A frame with a lost fragment is dropped, as is a late older frame; no frame is shown twice."""
+        """A frame with a lost fragment is dropped, and so is an older frame that arrives late.
+
+        No frame is shown twice.
+        """
         self.viewer.view(self.to_publisher, CAMERA, self.see)
         self.part(1, 0, 2, b"a")
         self.part(2, 1, 2, b"d")
@@ -96,7 +99,7 @@ class StreamsTests(EndpointCase):
         self.assertEqual(self.frames, [(2, b"cd")])
 
     def test_publisher_begins_anew(self) -> None:
-        """After a camera restarts its sequence numbers, its frames are accepted within about a second."""
+        """After a camera restarts with its sequence numbers, its frames are accepted within about a second."""
         self.viewer.view(self.to_publisher, CAMERA, self.see)
         self.part(500, 0, 1, b"old")
         self.part(1, 0, 1, b"too soon")

@@ -31,7 +31,7 @@ ROUGH = LinkConditions(delay_s=0.01, jitter_s=0.01, loss=0.3)
 
 class SwarmNodeTests(FleetCase):
     def names(self, fleet: SwarmTeam, place: int = 0) -> list[tuple[str, int]]:
-        """Return the names and numbers of the devices as seen by one node."""
+        """Return the names and numbers of the devices, as one node lists them."""
         records = self.done(fleet, fleet.nodes[place].entangled.get(DEVICES), 2.0)
         return [(device.name, device.joined) for device, _ in parse_devices(records)]
 
@@ -72,7 +72,7 @@ class SwarmNodeTests(FleetCase):
         self.assertEqual((device.joined, device.messages, device.address), (2, ((5.0, "hello"),), "10.0.0.1:7001"))
 
     def test_vanish_and_leave(self) -> None:
-        """A device disappears at once if its node stops, and within its lease if its node fails."""
+        """A device disappears immediately if its node stops, and within its lease if its node fails."""
         fleet = self.swarm(4)
         told: list[list[Record]] = []
         fleet.nodes[0].watch_devices(told.append)
@@ -85,7 +85,7 @@ class SwarmNodeTests(FleetCase):
         self.assertEqual(len(told[-1]), 2)
 
     def test_task_and_its_end(self) -> None:
-        """All nodes see a task with its council; reports disappear with their nodes, the result stays."""
+        """All nodes see a task with its council; reports disappear with their nodes, but the result stays."""
         fleet = self.swarm(4)
         task = self.submitted(fleet)
         self.assertEqual(len(task.council), 3)
@@ -217,7 +217,7 @@ class SwarmNodeTests(FleetCase):
         self.assertIsNone(node.find_contact(replace(record, value=b"?")))
 
     def test_too_much_to_say(self) -> None:
-        """A presence that exceeds a record is logged as an error, and the node continues to run."""
+        """A presence that exceeds the size of a record is logged as an error, and the node continues to run."""
         fleet = self.swarm(1)
         fleet.nodes[0].presence.change(capabilities={"arm": {"kind": "x" * 2000}})
         fleet.run(1.0)

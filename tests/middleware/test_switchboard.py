@@ -45,7 +45,10 @@ class SwitchboardTests(SynchronousTestCase):
         self.clock.advance(1)
 
     def test_delivers_later_and_in_order(self) -> None:
-        """Datagrams arrive asynchronously and in order; an oversized one, and one to an unused address, are dropped."""
+        """Datagrams arrive asynchronously and in order.
+
+        An oversized datagram, or one to an unused address, is dropped.
+        """
         network: Network = self.a
         self.a.send(bytes(MAX_RELAYED_BYTES + 1), self.b.address)
         self.a.send(b"x", Address("127.0.0.1", 9))
@@ -85,7 +88,7 @@ class SwitchboardTests(SynchronousTestCase):
             self.assertEqual(len(self.got), 2)
 
     def test_partition(self) -> None:
-        """Groups are isolated from each other; addresses without a group form another group."""
+        """Groups are isolated from each other; all addresses without a group form one further group."""
         c = self.switchboard.make_network()
         c.listen(self._receive)
         self.switchboard.partition([self.a.address], [self.b.address])
@@ -98,7 +101,7 @@ class SwitchboardTests(SynchronousTestCase):
         self.assertEqual(len(self.got), 1)
 
     def test_killed_network_is_deaf_and_mute(self) -> None:
-        """A killed network neither sends nor receives, and another network can use its address."""
+        """A killed network neither sends nor receives, and a new network can use its address."""
         self.switchboard.kill(self.b.address)
         self._send(1)
         self.b.send(b"ghost", self.a.address)
@@ -110,7 +113,10 @@ class SwitchboardTests(SynchronousTestCase):
         self.assertEqual(len(self.got), 1)
 
     def test_port_is_held_once(self) -> None:
-        """A second network on an address in use is rejected; after ``close``, which can be repeated, it can listen."""
+        """A second network cannot listen on an address in use.
+
+        After ``close``, which can be repeated, it can listen.
+        """
         twin = self.switchboard.make_network(*self.b.address)
         self.assertRaises(PortInUse, twin.listen, self._receive)
         self.b.close()
@@ -118,7 +124,7 @@ class SwitchboardTests(SynchronousTestCase):
         twin.listen(self._receive)
 
     def test_link_says_how_long_everything_takes(self) -> None:
-        """A link sets the delay of each datagram, except in a direction that has a separate ``LinkConditions``."""
+        """A link sets the delay of each datagram, except in a direction that has separate ``LinkConditions``."""
         link = self.switchboard.link_model = _Far()
         self.clock.advance(5)
         self.a.send(b"far", self.b.address)
@@ -149,7 +155,7 @@ class SwitchboardTests(SynchronousTestCase):
         self.assertEqual((self.a.traffic.sent, self.a.traffic.sent_bytes), (5, 8))
 
     def test_digest_is_that_of_every_delivery(self) -> None:
-        """A seed determines the digest, which does not depend on earlier queries of it."""
+        """The seed determines the digest of all deliveries, which does not depend on earlier queries of the digest."""
 
         def run(seed: int, is_asked_often: bool) -> str:
             clock = HeapClock()

@@ -65,7 +65,7 @@ class Dribbler(Protocol):
 
 
 class Relay(Protocol):
-    """An HTTP proxy that accepts one CONNECT request and forwards the bytes after it."""
+    """An HTTP proxy that accepts one CONNECT request and forwards all later bytes."""
 
     def __init__(self, pipes: PipeNetwork, answer: bytes = b"HTTP/1.1 200 Connection established\r\n\r\n") -> None:
         self.pipes = pipes
@@ -103,7 +103,7 @@ class TunnelCase(SynchronousTestCase):
         self.assertEqual(self.clock.getDelayedCalls(), [])
 
     def made(self, host: str = HOST, *urls: Url, port: int = 443, **options: Any) -> tuple[TunnelNetwork, Heard]:
-        """Create an end, which is a server if it has no URL, and the list of datagrams that it receives."""
+        """Return a new end, and the list of datagrams that it receives; an end without a URL is a server."""
         heard: Heard = []
         stream = self.pipes.make_transport(host, port)
         tunnel = TunnelNetwork(stream, self.clock, random.Random(host), urls, not urls, **options)
@@ -136,7 +136,10 @@ class TunnelCase(SynchronousTestCase):
 
 class TunnelTests(TunnelCase):
     def test_carry_both_ways(self) -> None:
-        """Sending to the address of a URL dials it; datagrams arrive in both directions, with and without TLS."""
+        """A datagram to the address of a URL opens a tunnel.
+
+        Datagrams arrive in both directions, with and without TLS.
+        """
         for url in (URL, PLAIN):
             dialled = len(self.pipes.dialled)
             client, came, server, served = self.pair(url)
@@ -166,7 +169,7 @@ class TunnelTests(TunnelCase):
         self.assertEqual(client.counters["unsent"], 5)
 
     def test_back_off(self) -> None:
-        """An unreachable URL is dialled again for later datagrams, with increasing intervals."""
+        """If a URL is unreachable, later datagrams try it again at increasing intervals."""
         client, _ = self.made("10.0.0.2", URL)
         moments = []
         for _ in range(1200):
@@ -182,7 +185,7 @@ class TunnelTests(TunnelCase):
         self.assertLess(len(moments), 15)
 
     def test_reconnect(self) -> None:
-        """After a restart of its server a tunnel is dialled again and carries datagrams within a second."""
+        """After a restart of its server a tunnel is opened again, and transfers datagrams within a second."""
         client, _, server, _ = self.pair(URL)
         self.clock.advance(11.0)
         server.close()
@@ -195,7 +198,7 @@ class TunnelTests(TunnelCase):
         self.assertIn(b"again", [datagram for datagram, _ in served])
 
     def test_let_go_unused(self) -> None:
-        """The client closes a tunnel without traffic for a minute, and keeps one in use."""
+        """The client closes a tunnel that had no traffic for a minute, and keeps a tunnel in use."""
         client, _, server, served = self.pair()
         for _ in range(10):
             self.clock.advance(20.0)
@@ -208,7 +211,7 @@ class TunnelTests(TunnelCase):
         self.assertEqual(len(self.pipes.dialled), 1)
 
     def test_notice_half_open(self) -> None:
-        """A half-open connection is detected: soon by an end that sends datagrams, otherwise by pings."""
+        """A half-open connection is detected, soon by an end that sends datagrams, otherwise by pings."""
         client, _, server, served = self.pair()
         self.clock.advance(1.0)
         self.pipes.cut(HOST)
@@ -231,7 +234,7 @@ class TunnelTests(TunnelCase):
         self.assertIsNone(udp.receiver)
 
     def test_through_a_proxy(self) -> None:
-        """With an HTTP proxy the tunnel uses CONNECT and the login of the proxy."""
+        """If an HTTP proxy is configured, the tunnel uses CONNECT and the credentials for the proxy."""
         _, served = self.made()
         relay = Relay(self.pipes)
         self.pipes.make_transport("10.0.0.200", 3128).listen(lambda host: relay)
@@ -243,7 +246,7 @@ class TunnelTests(TunnelCase):
         self.assertIn(b"Proxy-Authorization: Basic bWU6c2VjcmV0\r\n", relay.asked)
 
     def test_proxy_says_no(self) -> None:
-        """A rejection by a proxy, or an invalid reply, sets a fault and does not open the tunnel."""
+        """If the proxy rejects the request or sends an invalid reply, the tunnel sets a fault and does not open."""
         for answer in (
             b"HTTP/1.1 407 Proxy Authentication Required\r\n\r\n",
             b"SSH-2.0-box\r\n\r\n",
@@ -258,10 +261,10 @@ class TunnelTests(TunnelCase):
 
 
 class QueueLimitTests(TunnelCase):
-    """The load on a tunnel server by slow readers, incomplete handshakes and strangers."""
+    """Tests of the load on a tunnel server by slow readers, incomplete handshakes and strangers."""
 
     def test_slow_reader(self) -> None:
-        """For a peer that does not read, at most 64 KiB are queued and the newest datagrams are dropped."""
+        """For a peer that does not read, at most 64 KiB are queued, and the newest datagrams are dropped."""
         client, came, server, _ = self.pair()
         (address,) = server.peers
         reader = self.pipes.streams[0]
@@ -297,7 +300,7 @@ class QueueLimitTests(TunnelCase):
         self.assertEqual(server.peers, [])
 
     def test_heartbeats_pass_bulk(self) -> None:
-        """On a saturated link of 50 kB/s short datagrams overtake long ones and arrive within half a second."""
+        """On a saturated link of 50 kB/s, short datagrams overtake long ones and arrive within half a second."""
         client, came, server, served = self.pair()
         self.pipes.rate = 50_000.0
         late: list[float] = []
@@ -318,7 +321,7 @@ class QueueLimitTests(TunnelCase):
         self.assertGreater(client.counters["dropped"], 500)
 
     def test_garbage_is_let_go(self) -> None:
-        """A peer without TLS or WebSocket is disconnected at once; an incomplete handshake ends by a timeout."""
+        """A peer without TLS or WebSocket is disconnected immediately; an incomplete handshake ends by a timeout."""
         server, _ = self.made()
         idle, half = self.dribble(), self.dribble(b"\x16\x03\x01")
         self.clock.advance(ACCEPT_TIMEOUT_S - 1.0)
@@ -338,7 +341,7 @@ class QueueLimitTests(TunnelCase):
         self.assertTrue(page.is_lost and page.heard.startswith(b"HTTP/1.1 400"))
 
     def test_bear_one_address(self) -> None:
-        """The number of connections per address is bounded; other addresses are served."""
+        """The number of connections per address is limited; other addresses can still connect."""
         server, _ = self.made()
         crowd = [self.dribble() for _ in range(100)]
         self.clock.advance(0.1)
@@ -349,7 +352,7 @@ class QueueLimitTests(TunnelCase):
         self.assertEqual(len(client.peers), 1)
 
     def test_bear_many_addresses(self) -> None:
-        """The number of incomplete handshakes is bounded for all addresses; a member still connects."""
+        """The total number of incomplete handshakes is limited, but a member can still connect."""
         server, served = self.made()
         crowd = [self.dribble(host=f"10.7.{n // 250}.{n % 250}") for n in range(500)]
         self.assertEqual(sum(not one.is_lost for one in crowd), MAX_HANDSHAKES)
@@ -371,7 +374,7 @@ class QueueLimitTests(TunnelCase):
         self.assertFalse(any(each.is_lost for each in others))
 
     def test_strangers_are_let_go(self) -> None:
-        """A peer that the node never answers is disconnected; an answered one stays."""
+        """A peer to which the node never replies is disconnected; a peer that gets replies stays connected."""
         client, _, server, served = self.pair()
         stranger, _ = self.made("10.0.0.3", PLAIN)
         for second in range(int(UNANSWERED_TIMEOUT_S) + 2):
@@ -429,7 +432,7 @@ class JointTests(TunnelCase):
         plain.send(b"back", joint.address)
         self.clock.advance(0.1)
         self.assertEqual(sorted(heard), [(b"back", plain.address), (b"back", URL.address)])
-        self.assertEqual(joint.counters["sent"], 1)  # the switchboard has one counter for all its ports
+        self.assertEqual(joint.counters["sent"], 1)  # the switchboard counts the datagrams of all its ports together
         self.assertEqual(joint.counters["tunnel opened"], 1)
         joint.close()
         joint.close()
@@ -443,7 +446,7 @@ class CertificateTests(SynchronousTestCase):
         skip = "the certificate is not read by another library: no cryptography"
 
     def test_others_read_it(self) -> None:
-        """Another library reads the key and the certificate, which match, and verifies the signature."""
+        """A different library can read the key and the certificate, which match, and can verify the signature."""
         from cryptography import x509
         from cryptography.hazmat.primitives.serialization import Encoding, PublicFormat, load_pem_private_key
 
@@ -482,7 +485,7 @@ class TlsTests(SynchronousTestCase):
             self.assertEqual(came, b"in the clear" * 3000)
 
     def test_fault(self) -> None:
-        """Input other than TLS, and a modified record, set a fault and raise no exception."""
+        """Input that is not TLS, and a modified record, set a fault and raise no exception."""
         self.server.decode(b"GET / HTTP/1.1\r\n\r\n")
         self.assertIn("TLS", self.server.fault)
         self.assertEqual(self.server.decode(b"more")[0], b"")

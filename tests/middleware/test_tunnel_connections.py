@@ -26,7 +26,7 @@ WHOLE = GREETING.replace(b"\r\n\r\n", b"\r\n" + TOKEN_HEADER.encode() + b": %s\r
 
 class TunnelConnectionsTests(TunnelCase):
     def talk(self, client: TunnelNetwork, served: Heard, seconds: float, size: int = 100) -> tuple[list[float], float]:
-        """Send ten datagrams per second; return the copies per arrived datagram and the longest gap."""
+        """Send ten datagrams per second; return the number of copies per arrived datagram, and the longest gap."""
         number, last, gap = 0, self.clock.seconds(), 0.0
         served.clear()
         seen: dict[bytes, int] = {}
@@ -42,7 +42,7 @@ class TunnelConnectionsTests(TunnelCase):
         return [float(times) for times in seen.values()], max(gap, self.clock.seconds() - last)
 
     def three(self) -> tuple[TunnelNetwork, Heard, TunnelNetwork, Heard, Pipe]:
-        """Return two ends with three connections, after a stall of the first one, and that connection."""
+        """Return two ends that have three connections because the first connection stalled, and this connection."""
         client, came, server, served = self.pair()
         (first,) = self.pipes.streams
         first.is_stalled = True
@@ -55,7 +55,7 @@ class TunnelConnectionsTests(TunnelCase):
         return client, came, server, served, first
 
     def test_one_while_all_is_well(self) -> None:
-        """A tunnel over a link with delay but no loss uses one connection and sends each datagram once."""
+        """On a link with delay but no loss a tunnel uses one connection, and sends each datagram once."""
         client, _, _, served = self.pair()
         self.pipes.delay_s = 0.4
         self.talk(client, served, 1.0)
@@ -65,7 +65,7 @@ class TunnelConnectionsTests(TunnelCase):
         self.assertLess(gap, 2 * STEP)
         self.assertEqual((len(self.pipes.dialled), len(self.pipes.streams)), (1, 1))
         (only,) = self.pipes.streams
-        for _ in range(5):  # a short wait for one retransmission after an idle period needs no other connection
+        for _ in range(5):  # a short wait for one retransmission after an idle period causes no second connection
             self.clock.advance(5.0)
             only.is_stalled = True
             client.send(b"x", PLAIN.address)
@@ -75,7 +75,7 @@ class TunnelConnectionsTests(TunnelCase):
         self.assertEqual(len(self.pipes.dialled), 1)
 
     def test_stream_that_stands_still(self) -> None:
-        """If a stream stalls, two more are dialled; within 0.5 s all datagrams go over two working streams."""
+        """If a stream stalls, two more are opened; within 0.5 s all datagrams use the two new streams."""
         client, _, server, served = self.pair()
 
         (address,) = server.peers
@@ -90,7 +90,10 @@ class TunnelConnectionsTests(TunnelCase):
         self.assertEqual((server.peers, client.peers), ([address], [PLAIN.address]))
 
     def test_dial_the_dead_anew(self) -> None:
-        """A connection that stalls while another works is soon replaced; a stall of all connections replaces none."""
+        """A stalled connection is soon replaced if another connection works.
+
+        If all connections stall, none is replaced.
+        """
         client, _, server, served = self.pair()
         (first,) = self.pipes.streams
         first.is_stalled = True
@@ -104,7 +107,7 @@ class TunnelConnectionsTests(TunnelCase):
         self.assertEqual(len(self.pipes.dialled), dialled)
 
     def test_way_back(self) -> None:
-        """The server, too, sends over two connections and avoids a stalled one."""
+        """The server also sends over two connections, and avoids a stalled connection."""
         client, came, server, served, first = self.three()
         (address,) = server.peers
         first.other.is_stalled = True
@@ -125,7 +128,7 @@ class TunnelConnectionsTests(TunnelCase):
         self.assertEqual((set(times), len(times)), ({1.0}, 50))
 
     def test_little_waits_in_what_stands_still(self) -> None:
-        """A stalled stream queues few datagrams and drops the others, which would arrive too late."""
+        """Few datagrams wait in a stalled stream; others, which would arrive too late, are dropped."""
         client, _, _, served = self.pair()
         (only,) = self.pipes.streams
         self.pipes.cut(HOST)
@@ -135,7 +138,7 @@ class TunnelConnectionsTests(TunnelCase):
         self.assertGreater(client.counters["dropped"], 20)
 
     def test_open_by_another(self) -> None:
-        """If a connection does not open, another one is dialled and opens the tunnel."""
+        """If a connection does not open, a second connection is tried and opens the tunnel."""
         _, served = self.made(is_plain=True)
         client, _ = self.made("10.0.0.2", PLAIN)
         self.pipes.cut(HOST)
@@ -164,7 +167,7 @@ class TunnelConnectionsTests(TunnelCase):
         self.assertEqual(len(self.pipes.streams), MAX_CONNECTIONS)
 
     def test_tokens(self) -> None:
-        """Up to three connections with the same token are one peer; those without a token are separate peers."""
+        """Up to three connections with the same token are one peer; connections without a token are separate peers."""
         server, served = self.made(is_plain=True)
         one, other = b"a" * 32, b"b" * 32
         crowd = [self.dribble(WHOLE % (1, token)) for token in (one, one, other, b"", b"", b"a" * 31)]
@@ -176,7 +179,10 @@ class TunnelConnectionsTests(TunnelCase):
         self.assertFalse(crowd[-1].is_lost)
 
     def test_caps_allow_for_it(self) -> None:
-        """A team behind one address has three connections per member; they are reduced before a new one is rejected."""
+        """Each member of a team behind one address may have three connections.
+
+        At the limit these are reduced before a new connection is rejected.
+        """
         server, served = self.made()
         members = [self.member(server, served, "10.0.0.2") for _ in range(MAX_PER_HOST)]
         for member in members:
@@ -191,7 +197,7 @@ class TunnelConnectionsTests(TunnelCase):
         self.assertEqual(len(server.peers), MAX_TOTAL_CONNECTIONS - (MAX_CONNECTIONS - 1) * MAX_PER_HOST + 10)
 
     def member(self, server: TunnelNetwork, served: Heard, host: str) -> TunnelNetwork:
-        """Create a member and let the server answer it."""
+        """Create a member to which the server replies."""
         member, _ = self.made(host, URL)
         member._rng = random.Random(len(self.ends))
         member.send(b"m", URL.address)

@@ -26,7 +26,7 @@ class WebSocketTests(SynchronousTestCase):
         self.assertTrue(self.client.is_open and self.server.is_open, (self.client.fault, self.server.fault))
 
     def test_carry_datagrams_cut_anyhow(self) -> None:
-        """Datagrams of every length arrive in order in both directions, for any segmentation of the byte stream."""
+        """Datagrams of every length arrive in order in both directions, however the byte stream is split."""
         sizes = [0, 1, 125, 126, 127, 1399, 1400, 1452, MAX_PAYLOAD_BYTES]
         sent = [random.Random(size).randbytes(size) for size in sizes]
         for is_cut in (True, False):
@@ -40,7 +40,7 @@ class WebSocketTests(SynchronousTestCase):
                 self.assertEqual(sink.fault, "")
 
     def test_refuse_garbage(self) -> None:
-        """A text message and a message longer than a datagram close the connection."""
+        """A text message, and a message longer than a datagram, close the connection."""
         masked = bytes(4)
         garbage = {
             "text": b"\x81\x80" + masked,
@@ -60,7 +60,7 @@ class WebSocketTests(SynchronousTestCase):
             self.assertEqual(self.server.receive_data(self.client.encode_binary(b"x")), ([], b""), name)
 
     def test_refuse_other_requests(self) -> None:
-        """A request for another path, version or subprotocol gets an HTTP error and closes the connection."""
+        """A request for a different path, version or subprotocol gets an HTTP error and closes the connection."""
         lawful = self.client.opening()
         for stream, status in (
             (lawful.replace(b"/swarm", b"/admin"), b"404"),
@@ -73,7 +73,7 @@ class WebSocketTests(SynchronousTestCase):
             self.assertEqual(reply.split(b" ")[1], status)
 
     def test_refuse_other_answers(self) -> None:
-        """A client rejects a web page, a cached response and the WebSocket of another service."""
+        """A client rejects a web page, a cached response, and the WebSocket of a different service."""
         for old, new, why in (
             (b"101 Switching Protocols", b"403 Forbidden", "403"),
             (b"swarm-tunnel-1", b"chat", "chat"),
@@ -88,7 +88,7 @@ class WebSocketTests(SynchronousTestCase):
             self.assertFalse(client.is_open)
 
     def test_hear_for_whom_a_proxy_speaks(self) -> None:
-        """The last address in X-Forwarded-For is used, as the proxy itself adds it."""
+        """The last address in X-Forwarded-For is used, because the proxy itself adds this address."""
         head = self.client.opening().replace(b"Upgrade: w", b"X-Forwarded-For: 6.6.6.6, 10.0.0.9\r\nUpgrade: w")
         self.server.receive_data(head)
         self.assertEqual(self.server.forwarded, "10.0.0.9")
@@ -96,7 +96,7 @@ class WebSocketTests(SynchronousTestCase):
 
 class UrlTests(SynchronousTestCase):
     def test_read(self) -> None:
-        """Host, port and path are parsed, with defaults for omitted parts, and converted back to text."""
+        """Host, port and path are parsed, with defaults for omitted parts, and are converted back to text."""
         for text, parts, again in (
             ("wss://a.example", ("wss", "a.example", 443, "/swarm"), "wss://a.example/swarm"),
             ("ws://127.0.0.1:8000/x", ("ws", "127.0.0.1", 8000, "/x"), "ws://127.0.0.1:8000/x"),

@@ -20,7 +20,7 @@ KEY = hash_key("devices")
 
 
 def record(owner: Identity, sequence: int = 1, value: bytes | None = b"v", lifetime: Lifetime = "leased") -> Record:
-    """Return a record of ``owner``; views do not verify signatures."""
+    """Return a record of ``owner``, unsigned because views do not verify signatures."""
     return Record(KEY, "state", owner.public, sequence, lifetime, 1.0, value, bytes(64))
 
 
@@ -29,7 +29,7 @@ class ViewTests(SynchronousTestCase):
         self.view = View(ME.node_id)
 
     def test_any_replica_suffices(self) -> None:
-        """A slot is visible while at least one replica reports it."""
+        """A slot is visible as long as at least one replica reports it."""
         self.view.replace(CAT.node_id, [record(DOG)])
         self.view.add(ME.node_id, record(DOG))
         self.view.remove(CAT.node_id, record(DOG).slot)
@@ -38,7 +38,7 @@ class ViewTests(SynchronousTestCase):
         self.assertEqual(self.view.merge(), [])
 
     def test_the_stronger_record_holds(self) -> None:
-        """The record with the higher sequence wins in any order of arrival; a replica never returns to a lower one."""
+        """The record with the higher sequence wins in any order of arrival; a replica's lower sequence is ignored."""
         for order in ((1, 2), (2, 1)):
             view = View()
             for replica, sequence in zip((CAT, ME), order, strict=True):
@@ -55,7 +55,7 @@ class ViewTests(SynchronousTestCase):
         self.assertEqual(self.view.merge(), [])
 
     def test_nobody_testifies_for_its_own_lease(self) -> None:
-        """The report of an owner does not count for its leased record, but counts for its team record."""
+        """The report of an owner does not count for its own leased record, but counts for its team record."""
         self.view.replace(DOG.node_id, [record(DOG)])
         self.assertEqual(self.view.merge(), [])
         self.view.replace(DOG.node_id, [record(DOG, lifetime="team")])
@@ -102,7 +102,7 @@ COUNT = 10
 
 class SubscriberTests(FleetCase):
     def asked(self, fleet: EntangledTeam) -> list[tuple[int, float | None]]:
-        """Return a list that receives the holder and the optional TTL of each later watch request."""
+        """Return a list that will contain the holder and the optional TTL of each later watch request."""
         asked: list[tuple[int, float | None]] = []
         for place, node in enumerate(fleet.nodes):
 
@@ -114,7 +114,7 @@ class SubscriberTests(FleetCase):
         return asked
 
     def large(self, fleet: EntangledTeam, seconds: float) -> None:
-        """Advance the clock with all nodes set to a large network."""
+        """Advance the clock while all nodes assume a large network."""
         for _ in range(round(seconds / 0.5)):
             for node in fleet.nodes:
                 node.overlay.is_large = True
@@ -132,7 +132,7 @@ class SubscriberTests(FleetCase):
         self.assertEqual({ttl for _, ttl in asked}, {None})
 
     def test_large_network(self) -> None:
-        """In a large network a watcher subscribes rarely and at three holders, which differ between watchers."""
+        """In a large network a watcher subscribes rarely, and only at three holders, which differ between watchers."""
         fleet = self.fleet(COUNT)
         self.large(fleet, 3.0)
         asked = self.asked(fleet)
@@ -148,7 +148,7 @@ class SubscriberTests(FleetCase):
         self.assertEqual([mine[-1][0].value for mine in told if mine], [b"x"] * COUNT)
 
     def test_a_holder_dies_in_a_large_network(self) -> None:
-        """If the holders that push fail, the watcher subscribes at others, and new records arrive."""
+        """If the holders that push changes fail, the watcher subscribes at other holders, and gets new records."""
         fleet = self.fleet(COUNT)
         self.large(fleet, 3.0)
         asked = self.asked(fleet)
@@ -165,7 +165,7 @@ class SubscriberTests(FleetCase):
         self.assertEqual(sorted(r.value or b"" for r in told[-1]), [b"x", b"y"])
 
     def test_where_all_are_full(self) -> None:
-        """A watcher beyond the limit of a key reads it every two seconds instead."""
+        """A watcher that exceeds the limit of a key reads the key every two seconds instead."""
         fleet = self.fleet(COUNT)
         fleet.run(3.0)
         dice = random.Random(1)
@@ -181,7 +181,7 @@ class SubscriberTests(FleetCase):
         self.assertEqual([record.value for record in told[-1]], [b"x"])
 
     def test_many_changes_for_many_watchers(self) -> None:
-        """For a key with many watchers simultaneous changes are sent together, with the latest record of each slot."""
+        """Simultaneous changes for many watchers of a key are sent together, with the latest record of each slot."""
         fleet = self.fleet(3)
         fleet.run(3.0)
         dice = random.Random(1)

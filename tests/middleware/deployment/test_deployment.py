@@ -114,7 +114,7 @@ class DeploymentTests(FleetCase):
         self.assertRaises(UnknownStrategy, load_strategy, "deployed:best")
 
     def test_objections(self) -> None:
-        """Modules of a stranger, unlisted modules and oversized modules are refused before they are fetched."""
+        """A module that is unlisted, oversized or from an unlisted operator is rejected before the download."""
         manifest, source = self.version(1)
         self.push(manifest, source, self.stranger)
         self.assert_refused(f"comes from {self.stranger.entangled.identity.public.hex()[:8]}")

@@ -91,7 +91,7 @@ class ModuleTests(SynchronousTestCase):
         self.assertIn("a behaviour has to define look", self.refusal("class Behaviour: pass", BEHAVIOUR))
 
     def test_what_is_no_strategy_is_refused(self) -> None:
-        """A strategy that loops, names an unknown agent, depends on the order or prefers equal reports is refused."""
+        """A strategy is rejected if it loops, returns an unknown agent, depends on the order or breaks another rule."""
         for body, reason in (
             ("def find(self, c):\n  while True: pass", "takes more than"),
             ("def find(self, c): return Consensus('x' * 40 if c else None)", "did not report"),

@@ -121,7 +121,7 @@ class LossyLinkTests(SitesCase):
             self.assertEqual((one, other, paths(sites, one, other)[0]), (one, other, path))
 
     def test_a_router_restarts(self) -> None:
-        """A node behind a router that restarts with new ports is reachable again within 5 s, also without traffic."""
+        """If a router restarts with new ports, the node behind it is reachable within 5 s, even without traffic."""
         for one, other in (("port", "port"), ("full", "addr"), ("sym", "sym"), ("port", "none"), ("leaky", "port")):
             sites = self.sites()
             a = sites.at("a", one)
@@ -263,7 +263,7 @@ class RelayedTests(SitesCase):
             self.assertEqual((kind, sites.way(c, b)), (kind, path))
 
     def test_who_named_it_is_asked(self) -> None:
-        """For a peer with a relay address only, the caller asks the node that announced it for an introduction."""
+        """If a node has only a relay address of a peer, it asks the announcing node for an introduction."""
         sites = self.sites()
         others = [sites.node(f"x{n}", Address(f"203.0.113.{150 + n}", 7000)) for n in range(16)]
         a = sites.at("a", "sym")

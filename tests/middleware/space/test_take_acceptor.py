@@ -97,7 +97,10 @@ class TakeAcceptorTests(SynchronousTestCase):
         return reply.kind
 
     def test_lost_memory_is_another_life(self) -> None:
-        """A member with an empty or corrupted store has a new incarnation and rejects requests to the old one."""
+        """A member with an empty or corrupted store has a new incarnation.
+
+        It rejects requests to its old incarnation.
+        """
         incarnation = self.acceptor.incarnation
         self.claim(place(1))
         note = CODEC.bucket_of(place(1))

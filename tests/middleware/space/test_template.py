@@ -51,7 +51,10 @@ class TemplateTests(SynchronousTestCase):
         self.assertFalse(make_template([ANY]).matches(("a", "b")))
 
     def test_predicates(self) -> None:
-        """Each operator gives its specified result, compares int with float, and is false for incomparable values."""
+        """Each operator gives its specified result, and is false for incomparable values.
+
+        An int can be compared with a float.
+        """
         rows: list[tuple[str, Any, Any, bool]] = [
             ("<", 5, 4.5, True), ("<", 5, 5, False), ("<", 5, "a", False), ("<", 5, None, False), ("<", 5, True, False),
             ("<=", 5, 5.0, True), ("<=", "b", "b", True), (">", b"a", b"b", True), (">", b"a", "b", False),

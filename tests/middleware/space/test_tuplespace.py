@@ -330,7 +330,10 @@ class ClaimTests(SpaceCase):
         self.failureResultOf(claim.renew(), ClaimLost)
 
     def test_late_confirm(self) -> None:
-        """A confirm after the end of a claim succeeds if no other node took the tuple, else raises ``ClaimLost``."""
+        """A late confirm succeeds if no other node has taken the tuple, otherwise it raises ``ClaimLost``.
+
+        It is late if the lease of the claim has ended.
+        """
         fleet, (a, b, c) = self.spaces(3)
         self.done(fleet, a.put(("job", 1)), 1.0)
         claim = self._claimed(fleet, b, lease=1.0)

@@ -34,7 +34,7 @@ class SequenceTests(SynchronousTestCase):
         return False
 
     def test_they_bite(self) -> None:
-        """The sequences find a release of unnamed stops, a release by any sender, and stops that are not stored."""
+        """The sequences find three bugs: a release ends other stops, any sender can release, stops are not stored."""
         merge = StopSet.merge
 
         def ends_all(self: StopSet, sender: bytes, order: Statement, may_release: bool = True) -> bool:

@@ -33,6 +33,6 @@ class VacancyTests(SynchronousTestCase):
         self.assertEqual(self.filled("012", "", "34", 5), "01234")
 
     def test_shrinks(self) -> None:
-        """A council of five with two lost members and no candidate shrinks to three, which tolerate one loss."""
+        """A council of five that lost two members and has no candidate shrinks to three, and tolerates one failure."""
         self.assertEqual(self.filled("01234", "13", "024", 5), "024")
         self.assertEqual(self.filled("0123456", "012", "7", 7), "34567")
