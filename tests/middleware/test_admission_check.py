@@ -140,7 +140,7 @@ class PassTests(ClosedCase):
         self.assertEqual(self.got(self.a.ask(self.to_b, "echo", 2)), 2)
 
     def test_foreign_passes(self) -> None:
-        """A missing and an oversized credential are rejected as foreign, the oversized credential without a check."""
+        """A missing or oversized credential is rejected as foreign; only a missing credential is checked."""
         self.at_a.own_pass += b"!"
         self.refused(self.a.ask(self.to_b, "echo", 1), FOREIGN)
         self.assertEqual(self.at_b.judged, [])
@@ -325,7 +325,7 @@ class IncarnationTests(ClosedCase):
         self.assertTrue(noted.should_log(0.0, b"\x00", EXPIRED))
 
     def test_the_log_is_no_target(self) -> None:
-        """Rejections of invented keys are logged at a limited rate; those that were skipped are logged later."""
+        """Rejections of invented keys are logged at a limited rate; skipped rejections are logged later."""
         noted = LogLimiter()
         self.assertEqual(sum(noted.should_log(0.0, number, FOREIGN) for number in range(1000)), LOG_BURST)
         self.assertEqual(sum(noted.should_log(3.0, number, FOREIGN) for number in range(1000)), 3)
@@ -341,7 +341,7 @@ class SecretTests(ClosedCase):
     NEW, NEWER = b"n" * 32, b"N" * 32
 
     def test_both_are_good_for_a_while(self) -> None:
-        """As long as the old secret is valid, nodes with the old and nodes with the new secret reach each other."""
+        """Until the old secret expires, nodes with the old and nodes with the new secret reach each other."""
         self.assertRaises(ValueError, self.b.replace_secrets, b"short")
         self.b.replace_secrets(self.NEW, TEAM)
         self.assertEqual(self.got(self.a.ask(self.to_b, "echo", 1), 4 * DELAY), 1)

@@ -186,7 +186,7 @@ class AlternatePathsTests(SynchronousTestCase):
             self.assertEqual(self.call(each, self.bootstrap), BOOTSTRAP)
 
     def test_tunnel_alone(self) -> None:
-        """A node that knows only a tunnel joins through it immediately, and never starts a team of its own."""
+        """A node that knows only a tunnel joins through it immediately, and never starts a separate team."""
         site = Site(self.world, 3, [self.world.url()])
         site.block()
         self.world.sites.append(site)

@@ -125,7 +125,7 @@ class RoughWeatherTests(EndpointCase):
     """Tests of requests under high loss."""
 
     def answered(self, count: int, timeout: float) -> int:
-        """Return how many of ``count`` sequential requests are answered in time."""
+        """Return the number of ``count`` sequential requests that are answered in time."""
         answers = 0
         for number in range(count):
             asked = self.a.ask(self.to_b, "echo", number, timeout=timeout)

@@ -147,7 +147,7 @@ class ReadConsistencyTests(ConsistencyCase):
         self.assertEqual(self.sent() - before, 2 * K)
 
     def test_a_dead_replica_is_not_waited_for(self) -> None:
-        """Reads are hedged: with half of the holders dead, a fast read is answered within 60 ms."""
+        """A fast read ends within 60 ms even if half of the holders have failed, because it queries others early."""
         self.done(self.world, self.reader.put(KEY, "a", b"x", "team", "all"))
         for place in self.order[:4]:
             self.world.nodes[place].stop_silently()
@@ -327,7 +327,7 @@ class CutTests(ConsistencyCase):
         for count, small, newcomers, wait in ((3, (2,), 2, 3.0), (5, (3, 4), 3, 12.0), (4, (2, 3), 3, 0.0)):
             fleet = self.fleet(count)
             self.cut(fleet, *small, *range(count, count + newcomers))
-            fleet.run(wait)  # new nodes join before or after the majority is known to be absent
+            fleet.run(wait)  # new nodes join before or after the minority learns that the majority is absent
             has_majority = 2 * len(small) < count
             stored = self.outcome(fleet, fleet.nodes[0].put(KEY, "a", b"x"))
             self.assertEqual(type(stored) is NotAcknowledged, not has_majority)
@@ -344,7 +344,7 @@ class CutTests(ConsistencyCase):
             self.assertEqual(sorted(self.values(fleet, len(fleet.nodes) - 1)), [b"x", b"y"])
 
     def test_a_lost_memory_was_a_vote(self) -> None:
-        """A node that lost its store is not synced as long as only nodes reply that may lack its records."""
+        """A node that lost its store is not synced if only nodes reply that may lack its records."""
         fleet = self.fleet(3)
         self.cut(fleet, 2)
         self.outcome(fleet, fleet.nodes[0].put(KEY, "a", b"x"))

@@ -185,7 +185,7 @@ class AskTests(EndpointCase):
             self.assertEqual(self.got(asked, 0.1), 42)
 
     def test_no_answer(self) -> None:
-        """Without a reply a request fails in 1.5 s after four tries, and earlier if the peer is known to be near."""
+        """Without a reply a request fails in 1.5 s after four tries, and earlier for a peer that is near."""
         asked = self.a.ask(Contact(self.to_b.public, Address("127.0.0.1", 9)), "echo", 1)
         self.clock.advance(1.4)
         self.assertNoResult(asked)
@@ -398,7 +398,7 @@ class AttackTests(EndpointCase):
         return self.switchboard.counters["sent"] - before
 
     def test_response_counts_only_from_where_it_was_asked(self) -> None:
-        """A RESP from an address other than that of the INIT's receiver, or a repeated RESP, opens no session."""
+        """A RESP from an address to which no INIT was sent, or a repeated RESP, opens no session."""
         asked = self.a.ask(self.to_b, "echo", 1)
         self.clock.advance(1.5 * DELAY)
         tap = self.taps[self.to_a.address]

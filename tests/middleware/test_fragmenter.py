@@ -193,7 +193,7 @@ class HostileTests(FragmenterCase):
         self.assertEqual((counted, self.b._fragmenter._incoming), ([1, 1], {}))
 
     def test_a_parcel_must_be_what_it_says(self) -> None:
-        """If a request contains an id that differs from that of its fragments, it is dropped and not executed."""
+        """If a request contains a different id from its fragments, it is dropped and not executed."""
         message = encode(Request(5, "add", (b"x" * 2000,)))
         for number in range(2):
             data = message[number * FRAGMENT_BYTES : (number + 1) * FRAGMENT_BYTES]

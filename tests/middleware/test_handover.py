@@ -300,7 +300,7 @@ class JoinTests(FleetCase):
     """Tests of joining: the cost until the first read, and the hand-over after it."""
 
     def test_a_newcomer_reads_at_once(self) -> None:
-        """In a team of 20 the first read of a new node takes few datagrams, whichever the bootstrap node is."""
+        """In a team of 20 the first read of a new node takes few datagrams, for any bootstrap node."""
         fleet = self.fleet(20)
         keys = [hash_key(str(number)) for number in range(6)]
         for key in keys:

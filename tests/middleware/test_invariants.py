@@ -93,7 +93,7 @@ class InvariantTests(SynchronousTestCase):
         self.assertEqual([run(seed, only) for seed, only in reversed(wanted)], outcomes[::-1])
 
     def test_shrunk(self) -> None:
-        """A failing schedule is reduced to the necessary faults, and the printed command line reproduces it."""
+        """A failing schedule is reduced to the necessary faults; the printed command line reproduces the failure."""
         bug = "votes forgotten by a restart"
         whole = run(SHRUNK, ("tuples", "deciders"), bug)
         left = least(whole, bug)

@@ -64,7 +64,7 @@ class DiscoveryTests(FleetCase):
         self.assertIn(c.contact, a.overlay.contacts())
 
     def test_newcomer_is_not_whole_before_it_met_all(self) -> None:
-        """The member table of a node that joins through the LAN is whole only after the node met all members."""
+        """If a node joins through the LAN, its member table is complete only after contact with all members."""
         lan = self.lan()
         for place in range(6):
             lan.on(place)

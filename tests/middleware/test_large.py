@@ -99,7 +99,10 @@ class LargeTests(FleetCase):
         return reader, first
 
     def test_a_fast_read_goes_past_who_wrote(self) -> None:
-        """A fast read of a key with many writers is complete although the first queried node has one old record."""
+        """A fast read of a key with many writers is complete.
+
+        It does not end at the first queried node, which stores only one old record.
+        """
         fleet = self.large()
         key = hash_key("all write here")
         for node in fleet.nodes:
@@ -149,7 +152,7 @@ class LargeTests(FleetCase):
         far = [contact.node_id for contact in node.overlay.contacts() if contact.node_id not in near]
         self.assertTrue(far and all(asked[node_id] <= 5 for node_id in far), asked)
         self.assertGreater(sum(asked[node_id] for node_id in far), 0)
-        self.assertFalse(any(each.overlay.is_complete for each in fleet.nodes))  # the contacts are only a part of the team
+        self.assertFalse(any(each.overlay.is_complete for each in fleet.nodes))  # a node has only some nodes as contacts
         routed = self.far(node)
         node._membership.prober.needs_keep_alive = lambda contact: contact == routed
         asked.clear()
@@ -218,7 +221,10 @@ class LargeTests(FleetCase):
         self.assertIn(stranger.node_id, asked)
 
     def test_a_newcomer_says_what_it_was_told(self) -> None:
-        """A node states for how many seconds the network still counts as large; a new node uses this immediately."""
+        """A node sends the remaining seconds for which the network counts as large.
+
+        A new node applies the answer immediately.
+        """
         fleet = self.large()
         node = fleet.nodes[3]
         answer = node._membership._answer_members
@@ -293,7 +299,10 @@ class ProbeIntervalTests(SynchronousTestCase):
         self.pace = ProbeInterval()
 
     def test_within_bounds(self) -> None:
-        """Without failures the ping interval grows up to its maximum, with only failures it falls to its minimum."""
+        """Without failures the ping interval increases to its maximum.
+
+        With only failures it decreases to its minimum.
+        """
         self.assertEqual(self.pace.silence_s, INITIAL_SILENCE_S)
         for _ in range(100):
             self.pace.record_answer()

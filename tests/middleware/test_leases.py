@@ -28,7 +28,10 @@ class LeaseTests(FleetCase):
         return told
 
     def test_each_its_own(self) -> None:
-        """After their owner fails, a record with a 1 s lease expires within 1.2 s, one with 12 s after 12 s."""
+        """After its owner fails, a record with a 1 s lease expires within 1.2 s.
+
+        A record with a 12 s lease takes 12 s.
+        """
         fleet = self.fleet(3)
         fleet.nodes[2].put(KEY, "short", b"x", "leased")
         fleet.nodes[1].put(KEY, "long", b"x", "leased", lease=12.0)
@@ -121,7 +124,7 @@ class LeaseTests(FleetCase):
         self.assertEqual(self.names(fleet), ["kept"])
 
     def test_the_nodes_lease_changes(self) -> None:
-        """A record stays for the longer of its own lease and the node's lease, which can change."""
+        """A record stays for the longer of the record's lease and the node's lease, which can change."""
         fleet = self.fleet(2)
         fleet.nodes[1].put(OTHER, "short", b"x", "leased", lease=0.1)
         fleet.run(5.0)

@@ -50,7 +50,7 @@ def deep(value: object) -> int:
 
 
 class MessageTests(SynchronousTestCase):
-    """Tests of ``encoded`` and ``decoded``."""
+    """Tests of ``encode`` and ``decode``."""
 
     @settings(max_examples=150)
     @given(number=st.integers(0, 2**64 - 1), value=_VALUES)

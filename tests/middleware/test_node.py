@@ -319,7 +319,7 @@ class KeepTests(NodeCase):
         self.page, self.dog = self.order[-1], self.order[-2]
 
     def test_copies_follow_what_is_seen(self) -> None:
-        """As long as it watches with ``keep``, a node that is not a holder has the key's records in its store."""
+        """If a node watches with ``keep``, it has the key's records in its store even if it is not a holder."""
         store = self.page.store
         self.dog.put(KEY, "state", b"here", "leased")
         self.world.run(1.0)
@@ -351,7 +351,7 @@ class KeepTests(NodeCase):
         self.assertEqual(self.page.store.get(KEY), [])
 
     def test_copy_that_comes_to_be_held(self) -> None:
-        """A watched copy that is then stored as a replica is treated like any other record, and its lease can end."""
+        """If a watched copy is later stored as a replica, it is treated like any other record; its lease can end."""
         self.dog.put(KEY, "state", b"here", "leased")
         self.page.watch(KEY, lambda records: None, keep=True)
         self.world.run(3.0)

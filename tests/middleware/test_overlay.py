@@ -158,7 +158,7 @@ class NewcomerTests(SynchronousTestCase):
         return bool(work.called)
 
     def test_holders_wait_for_anybody(self) -> None:
-        """A node without contacts delays a store until it hears a member, knows that it is alone, or times out."""
+        """A node without contacts stores nothing until it hears a member, knows that it is alone, or times out."""
         for news in (self.meet, self.knows_all):
             self.forget()
             self.assertTrue(self.look(self.holders(), news, CONTACT_WAIT_STEP_S))
@@ -171,9 +171,9 @@ class NewcomerTests(SynchronousTestCase):
         self.assertEqual(self.successResultOf(alone), [self.me])
 
     def test_meeting_waits_for_the_team(self) -> None:
-        """``met`` waits until all members are known, or the team is known to be large.
+        """``met`` waits for the complete member list, or the knowledge that the team is large.
 
-        A single member is not enough.
+        One member is not enough.
         """
         for news in (self.knows_all, self.knows_many):
             self.forget()

@@ -25,7 +25,7 @@ LARGE = bytes(range(256)) * 6
 
 
 class Dice(random.Random):
-    """A random generator with fixed output: bytes that count up from ``start``, and numbers made of them."""
+    """A random generator with fixed output: bytes that count up from ``start``, and numbers made of these bytes."""
 
     def __init__(self, start: int) -> None:
         super().__init__(0)

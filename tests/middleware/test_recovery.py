@@ -84,7 +84,7 @@ class CorruptFileTest(SynchronousTestCase):
             (lambda: self.overwrite(68, b"\1\2\3\4"), saved),  # the header has another application id
             (lambda: self.overwrite(4096 * 12, b"\xff" * 4096 * 4), saved),
             (lambda: os.truncate(self.path, os.path.getsize(self.path) // 2), ""),
-            (lambda: Path(self.path).write_bytes(bytes(40_960)), lost),  # an SD card that lost power before it wrote the pages leaves zeros there
+            (lambda: Path(self.path).write_bytes(bytes(40_960)), lost),  # as an SD card does after a power failure
             (self.drop_table, ""),
             (self.rot_index, saved),  # reads would still succeed, but writes would damage the file
         )
@@ -98,7 +98,7 @@ class CorruptFileTest(SynchronousTestCase):
                 self.assertEqual(store.get_note("identity"), DOG.seed if said == saved else None)
 
     def test_again(self) -> None:
-        """A second corrupted file gets a name different from that of the first, and the notes are kept."""
+        """A second corrupted file gets a different name from the first corrupted file, and the notes are kept."""
         self.overwrite(68, b"\1\2\3\4")
         self.opened_anew().close()
         self.overwrite(68, b"\1\2\3\4")

@@ -174,7 +174,7 @@ class RoutingTableTest(SynchronousTestCase):
         self.assertLess(len(self.table), 40)
 
     def test_buckets_to_refresh(self) -> None:
-        """``stale_buckets`` returns buckets without a recent lookup, also empty ones beyond the nearest contact."""
+        """``stale_buckets`` returns buckets without a recent lookup, also empty buckets beyond the nearest contact."""
         self.table.record_contact(of_bucket(156, 1)[0], 0.0)
         self.table.record_contact(self.old[0], 50.0)
         self.assertEqual(self.table.find_stale(60.0, 60.0), [156, 157, 158])

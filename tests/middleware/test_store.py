@@ -109,7 +109,10 @@ class StoreContract(_Case):
         self.assertEqual(self.store.drop_leased(DOG.public), [])
 
     def test_full(self) -> None:
-        """A full store rejects new slots, accepts new records for existing slots, and has room after expiry."""
+        """A full store rejects new slots, but accepts new records for existing slots.
+
+        After records expired it accepts new slots.
+        """
         store = self.make(2)
         store.put(record("a"), 1.0)
         store.put(record("b"), FOREVER)
@@ -169,7 +172,7 @@ class StoreContract(_Case):
             self.assertTrue(store.put(record("1", sequence=2, value=b""), FOREVER))
 
     def test_room_of_an_owner_comes_back(self) -> None:
-        """Tombstones count for their owner; only the owner's old tombstones make room for its new records."""
+        """Tombstones count for their owner; only the owner's old tombstones are evicted for its new records."""
         store = self.make(1000, hold=30.0)
         store.put(record("old", value=None, owner=CAT), 60.0)
         for number in range(499):

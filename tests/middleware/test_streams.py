@@ -70,7 +70,10 @@ class StreamsTests(EndpointCase):
         self.assertLess(abs(self.ages[1] - 0.8 - DELAY), 0.0005)
 
     def test_nothing_is_sent_unseen(self) -> None:
-        """A publisher sends nothing without viewers, or soon after the last one, and no empty or oversized frames."""
+        """A publisher sends nothing without viewers, or soon after the last viewer left.
+
+        It never sends an empty or oversized frame.
+        """
         self.assertFalse(self.publisher.has_viewers(CAMERA))
         stop = self.viewer.view(self.to_publisher, CAMERA, self.see)
         self.clock.advance(10.0)
@@ -99,7 +102,7 @@ class StreamsTests(EndpointCase):
         self.assertEqual(self.frames, [(2, b"cd")])
 
     def test_publisher_begins_anew(self) -> None:
-        """After a camera restarts with its sequence numbers, its frames are accepted within about a second."""
+        """If a camera starts its sequence numbers again, its frames are accepted after about a second."""
         self.viewer.view(self.to_publisher, CAMERA, self.see)
         self.part(500, 0, 1, b"old")
         self.part(1, 0, 1, b"too soon")
@@ -123,7 +126,10 @@ class StreamsTests(EndpointCase):
         self.assertEqual(self.frames, [])
 
     def test_viewers_are_bounded(self) -> None:
-        """The number of viewers is bounded, existing viewers can renew, and expired entries free their places."""
+        """The number of viewers is limited.
+
+        Existing viewers can renew, and a new viewer can replace an expired viewer.
+        """
         peers = [Contact(bytes([n]) * 32, Address("10.0.0.1", 9)) for n in range(MAX_VIEWERS + 1)]
         for number, peer in enumerate(peers[:-1]):
             self.assertTrue(self.publisher._answer_open(peer, f"channel {number}"))

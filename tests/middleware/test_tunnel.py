@@ -1,4 +1,4 @@
-"""Tests of ``middleware.entangled.network.tunnel``, ``link``, ``layer``, ``joint`` and ``pipes``, in virtual time."""
+"""Tests of tunnels and of the layers below tunnels, in virtual time."""
 
 from __future__ import annotations
 
@@ -386,7 +386,7 @@ class QueueLimitTests(TunnelCase):
         self.assertEqual((len(client.peers), len(server.peers)), (1, 1))
 
     def test_full_house(self) -> None:
-        """When all places are taken, a new connection replaces a stranger and never a member."""
+        """If all connections are in use, a new connection replaces the connection of a stranger, never of a member."""
         server, served = self.made(is_plain=True)
         members = []
         for n in range(MAX_TOTAL_CONNECTIONS - 1):
@@ -476,7 +476,10 @@ class TlsTests(SynchronousTestCase):
         self.server.decode(said)
 
     def test_carry(self) -> None:
-        """After the handshake bytes arrive unchanged in any segmentation, and are encrypted in transit."""
+        """After the handshake, bytes are encrypted in transit and arrive unchanged.
+
+        This does not depend on how the bytes are split into segments.
+        """
         self.shake()
         for source, sink in ((self.client, self.server), (self.server, self.client)):
             wrapped = source.encode(b"in the clear" * 3000)

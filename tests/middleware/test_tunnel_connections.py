@@ -75,7 +75,7 @@ class TunnelConnectionsTests(TunnelCase):
         self.assertEqual(len(self.pipes.dialled), 1)
 
     def test_stream_that_stands_still(self) -> None:
-        """If a stream stalls, two more are opened; within 0.5 s all datagrams use the two new streams."""
+        """If a stream stalls, two more are opened; within 0.5 s all datagrams use two working streams."""
         client, _, server, served = self.pair()
 
         (address,) = server.peers
@@ -151,7 +151,7 @@ class TunnelConnectionsTests(TunnelCase):
         self.assertEqual(len(self.pipes.streams), 1)
 
     def test_hard_to_open(self) -> None:
-        """A client with a retransmitted greeting uses three connections from the start."""
+        """If the first message of a client had to be retransmitted, the client starts with three connections."""
         self.made(is_plain=True)
         client, _ = self.made("10.0.0.2", PLAIN)
         measured = client._transport.read_state

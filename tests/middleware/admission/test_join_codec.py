@@ -61,10 +61,7 @@ class JoinCodecTests(SynchronousTestCase):
         self.assertFalse(is_join_signature(INVITE.public, DOG, "cat", found.proof))
 
     def test_knock_hides_who_comes(self) -> None:
-        """A join request (JOIN_REQUEST) reveals neither the key nor the name.
-
-        Its size is always that of the largest datagram.
-        """
+        """A join request (JOIN_REQUEST) reveals neither key nor name, and always has the maximum size of a datagram."""
         said = knocked()
         self.assertNotIn(DOG, said)
         self.assertEqual({len(knocked(name)) for name in ("", "dog", "n" * 40)}, {1400})

@@ -62,7 +62,7 @@ class MembershipTests(SynchronousTestCase):
         )
 
     def test_old_secrets_run_out(self) -> None:
-        """After a rotation the previous secret is accepted for its grace period, whichever secret arrives first."""
+        """After a rotation the previous secret is accepted for its grace period, in any order of arrival."""
         first = self.membership.secrets[0][1]
         second, third = (2, b"2" * 32, NOW + 60), (3, b"3" * 32, NOW + 90)
         for order in ((second, third), (third, second)):

@@ -120,7 +120,7 @@ class TableTests(SynchronousTestCase):
                 self.assertEqual(classify_slot(slot(key, name)), kind)
 
     def test_presence_in_a_large_team(self) -> None:
-        """In a large team a viewer can write its presence only under the directory prefixes of its own id."""
+        """In a large team a viewer can write its presence only under the directory prefixes of the viewer's id."""
         own, other = Identity(bytes(32)), Identity(b"1" * 32)
         for depth in range(presence.MAX_DEPTH + 1):
             for key in compute_places(own.node_id, depth):

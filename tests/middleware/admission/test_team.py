@@ -90,7 +90,7 @@ class JoiningTests(VillageCase):
         self.assertEqual(names, ["pupil-1", "kim", "pupil-2", "used"])
 
     def test_code_made_while_the_others_are_gone(self) -> None:
-        """A node that suddenly lost all peers cannot publish a code; the one-line error states how long to wait."""
+        """A node that suddenly lost all peers cannot publish a code; the one-line error states the time to wait."""
         village = self.village(bootstraps=3)
         village.run(5.0)
         for house in village.houses[1:]:
@@ -238,7 +238,7 @@ class StrangersTests(VillageCase):
         self.assertEqual(self.refusal(village, village.houses[0].node.call, dog, 3.0), "expired")
 
     def test_expired_by_its_own_clock(self) -> None:
-        """A node whose certificate has expired logs this at its start, with both remedies."""
+        """A node with an expired certificate logs this at its start, with both remedies."""
         village = self.village()
         old = village.signer.create_membership("dog", ("device",), village.wall() - 366 * 86_400.0, village.dice)
         with capturedLogs() as events:

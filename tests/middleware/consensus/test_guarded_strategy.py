@@ -82,7 +82,7 @@ class Slow(Nearest):
 
 
 class Moments(Nearest):
-    """Exceeds the timeout in every call whose number is a multiple of ``pause``."""
+    """Exceeds the timeout in the ``pause``-th call and in each multiple of it."""
 
     name = "moments"
     asked = 0
@@ -184,7 +184,7 @@ class GuardedStrategyTests(SynchronousTestCase):
         self.flushLoggedErrors()
 
     def test_late_now_and_then(self) -> None:
-        """A strategy stays in use as long as it has fewer than ``MAX_LOSSES`` timeouts in ``LOSS_SPAN_CALLS`` calls."""
+        """A strategy stays in use with fewer than ``MAX_LOSSES`` timeouts in ``LOSS_SPAN_CALLS`` calls."""
         for pause, is_out in (
             (LOSS_SPAN_CALLS // (MAX_LOSSES - 1), False),
             (LOSS_SPAN_CALLS // (MAX_LOSSES - 1) - 1, True),

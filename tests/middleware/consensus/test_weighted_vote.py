@@ -22,7 +22,7 @@ class WeightedVoteTests(SynchronousTestCase):
     def test_majority(self) -> None:
         """More than half of the total weight decides immediately.
 
-        Of the agents that voted for it, the one with the lowest cost acts.
+        Of the agents that voted for the decision, the agent with the lowest cost acts.
         """
         votes = [vote("a", "red"), vote("b", "red")]
         self.assertEqual(self.vote.find(votes).choice, "")
@@ -49,7 +49,7 @@ class WeightedVoteTests(SynchronousTestCase):
         self.assertEqual(self.vote.find([*changed, vote("c", "red", sequence=2)]).choice, "red")
 
     def test_digest_of_all_votes(self) -> None:
-        """The digest covers all counted votes, including those of the losing side."""
+        """The digest covers all counted votes, including the votes of the losing side."""
         red = [vote("a", "red", 2.0), vote("b", "red")]
         digests = {self.vote.find([*red, vote("c", choice)]).digest for choice in ("blue", "green")}
         self.assertEqual(len(digests), 2)

@@ -1,4 +1,4 @@
-"""Tests of ``control.word``, which converts values to and from shell words and JSON."""
+"""Tests of ``control.conversion``, which converts values to and from shell words and JSON."""
 
 from __future__ import annotations
 

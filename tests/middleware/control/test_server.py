@@ -1,4 +1,7 @@
-"""Tests of ``control.port`` and ``control.verb``, with requests as lines of JSON to a simulated team."""
+"""Tests of ``control.server`` and ``control.request_handler``.
+
+The tests send requests as lines of JSON to a simulated team.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Tests of ``control.place``, which finds the paths of control sockets."""
+"""Tests of ``control.socket_path``, which finds the paths of control sockets."""
 
 from __future__ import annotations
 

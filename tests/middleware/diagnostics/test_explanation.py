@@ -76,7 +76,7 @@ class ExplanationTests(SynchronousTestCase):
             self.assertEqual(explain_decisions(records), expected)
 
     def test_most_decide_whoever_dissents(self) -> None:
-        """Two agents that agree outvote the third agent, whichever agent this is."""
+        """If two agents agree, they outvote the third agent; this holds for each of the three agents."""
         for lone in (1, 2, 3):
             records = [decided(n, THREE, assigned=1 if n == lone else None) for n in (1, 2, 3)]
             (ruling,) = explain_decisions(records).epochs
@@ -91,7 +91,7 @@ class ExplanationTests(SynchronousTestCase):
         self.assertEqual(len(ruling.agree), 1)
 
     def test_nothing_decided(self) -> None:
-        """Without decision records the explanation is empty; an epoch without a winner has the winner ``nobody``."""
+        """Without decision records the explanation is empty; if an epoch has no winner, ``nobody`` is its winner."""
         self.assertEqual(format_explanation(explain_decisions([])), "")
         (ruling,) = explain_decisions([decided(1, [member(1, None)])]).epochs
         self.assertEqual((ruling.winner, ruling.chosen), ("", "nobody"))

@@ -166,7 +166,7 @@ class ReachableTests(SynchronousTestCase):
     ) -> None:
         """Check the invariants of one step.
 
-        The labels in the comments are those of ``docs/explanation/quorum.md``.
+        ``docs/explanation/quorum.md`` explains the labels in the comments.
         """
         case = event, ballot, token, now, before
         lives = use.codec.lives

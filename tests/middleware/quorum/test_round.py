@@ -118,7 +118,7 @@ class RoundTests(SynchronousTestCase):
         self.assertEqual(self.clock.getDelayedCalls(), [])
 
     def test_a_member_that_is_down_holds_nobody_up(self) -> None:
-        """If a majority has replied without a decision, the round waits only briefly for the last member."""
+        """If a majority has replied without a decision, a silent last member delays the end only briefly."""
         asked = self.round()
         self.answer(0, YES)
         self.answer(1, NO)

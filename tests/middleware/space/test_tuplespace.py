@@ -47,7 +47,7 @@ class SpaceCase(FleetCase):
         return list({one.tuple_id: one for one in said if isinstance(one, StoredTuple)}.values())
 
     def called_up(self, node: EntangledNode, answer: Callable[..., object]) -> None:
-        """Let ``node`` give this reply when it is asked to be a member of a council."""
+        """Let ``node`` give this reply to the request to join a council."""
         node.take_acceptor.load()  # otherwise the acceptor would register its own method later
         node.endpoint.expose("decree.enrol", answer)
 

@@ -106,7 +106,7 @@ class PathChoiceTests(SynchronousTestCase):
         self.assertTrue(1_500 < estimate_team_size(own, known, False) < 12_000)
         newcomer = near[:NEAREST_CONTACTS] + rng.sample(
             near[NEAREST_CONTACTS:], NEAREST_CONTACTS
-        )  # few known contacts of a team that is known to be large
+        )  # few contacts, but the team counts as large
         self.assertTrue(1_500 < estimate_team_size(own, newcomer, True) < 12_000)
         self.assertEqual(estimate_team_size(own, newcomer[: NEAREST_CONTACTS - 1], True), NEAREST_CONTACTS)
 
@@ -177,7 +177,7 @@ class BidderTests(SynchronousTestCase):
         self.assertEqual([offer.bids[0].revision for offer in newer], [1, 1, 1])
 
     def test_own_bid_beats_what_is_announced(self) -> None:
-        """A bidder whose bid is better than the announced bid sends it directly within half a waiting period."""
+        """A bidder with a better bid than the announced bid sends it directly within half a waiting period."""
         self.participant.make_bid(bid(5, 2.0), TREE, 0.0)
         self.participant.on_announcement(announced(1, 0, bid(6, 3.0)), 0.6)
         due = self.participant.due
@@ -187,7 +187,7 @@ class BidderTests(SynchronousTestCase):
         self.assertEqual((straight.to, straight.bids), (COUNCIL[0], (bid(5, 2.0),)))
 
     def test_own_bid_that_does_not_matter(self) -> None:
-        """A bidder whose bid is worse than the announced bid does not contact the council."""
+        """A bidder with a worse bid than the announced bid does not contact the council."""
         self.participant.make_bid(bid(5, 4.0), TREE, 0.0)
         self.participant.on_announcement(announced(1, 0, bid(6, 3.0)), 0.6)
         self.assertEqual(
@@ -213,7 +213,7 @@ class BidderTests(SynchronousTestCase):
         self.assertTrue(now < 5.0)
 
     def test_taken_back_but_still_announced(self) -> None:
-        """A bidder sends its withdrawal again as long as the council announces the withdrawn bid."""
+        """A bidder repeats its withdrawal until the council no longer announces the withdrawn bid."""
         self.participant.make_bid(bid(5, 2.0), DIRECT, 0.0)
         for offer in offers(self.participant.take_due_messages(0.0)):
             self.participant.on_answer(offer, 0.0)
@@ -419,7 +419,7 @@ class ParticipantTableTests(SynchronousTestCase):
         return make_participant(5, Auction(f"job {number}", 1, COUNCIL))
 
     def test_whoever_opens_most_makes_room(self) -> None:
-        """If the table is full, a peer that invents auctions displaces its own entries; those of other peers stay."""
+        """If the table is full, a peer that invents auctions displaces its own entries; entries of other peers stay."""
         participants = ParticipantTable()
         own, honest = self.made(0), self.made(1)
         participants.add(own, OWN_OPENER, 0.0)

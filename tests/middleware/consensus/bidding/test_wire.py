@@ -118,9 +118,6 @@ class AnnouncementTests(SynchronousTestCase):
         self.assertIsNone(parse_announcement(sent(one.pack())))
 
     def test_precedence(self) -> None:
-        """The announcement with the higher number has precedence.
-
-        For equal numbers, that of the member with the lower rank.
-        """
+        """The higher number has precedence; for equal numbers, the lower rank of the member has precedence."""
         first, second, third = announced(1, 0), announced(1, 2), announced(2, 2)
         self.assertEqual(sorted([first, third, second], key=lambda a: a.precedence), [second, first, third])

@@ -172,7 +172,7 @@ class LeaseProposerTests(LeaseCase):
         self.assertEqual(self.holders(), [])
 
     def test_holder_closes_at_once(self) -> None:
-        """A holder whose robot stands still closes the task without waiting for the end of its own lease."""
+        """A holder whose robot stands still closes the task without waiting for the end of the lease."""
         client = self.wanting(0)
         self.assertIsNone(self.outcome(client.proposer.close(self.token(0)), 0.05))
         self.wanting(1, 1.0)
