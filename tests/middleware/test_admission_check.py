@@ -140,7 +140,10 @@ class PassTests(ClosedCase):
         self.assertEqual(self.got(self.a.ask(self.to_b, "echo", 2)), 2)
 
     def test_foreign_passes(self) -> None:
-        """A missing or oversized credential is rejected as foreign; only a missing credential is checked."""
+        """Missing and oversized credentials are rejected as foreign.
+
+        The admission check never sees an oversized one.
+        """
         self.at_a.own_pass += b"!"
         self.refused(self.a.ask(self.to_b, "echo", 1), FOREIGN)
         self.assertEqual(self.at_b.judged, [])

@@ -152,7 +152,7 @@ class LargeTests(FleetCase):
         far = [contact.node_id for contact in node.overlay.contacts() if contact.node_id not in near]
         self.assertTrue(far and all(asked[node_id] <= 5 for node_id in far), asked)
         self.assertGreater(sum(asked[node_id] for node_id in far), 0)
-        self.assertFalse(any(each.overlay.is_complete for each in fleet.nodes))  # a node has only some nodes as contacts
+        self.assertFalse(any(each.overlay.is_complete for each in fleet.nodes))  # the contacts are only some nodes
         routed = self.far(node)
         node._membership.prober.needs_keep_alive = lambda contact: contact == routed
         asked.clear()

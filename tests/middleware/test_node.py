@@ -101,7 +101,10 @@ class VerbTests(NodeCase):
 
 class LeaseTests(NodeCase):
     def test_vanish_with_the_owner(self) -> None:
-        """A leased record exists as long as its owner runs; after a failure it expires within one lease and a sweep."""
+        """A leased record stays until its owner stops renewing.
+
+        After a failure it expires within one lease and a sweep.
+        """
         fleet = self.fleet(4)
         fleet.nodes[3].put(KEY, "state", b"here", "leased")
         fleet.run(30.0)

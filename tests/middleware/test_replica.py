@@ -267,7 +267,7 @@ class StoreReplyTests(SynchronousTestCase):
 
     @given(st.integers() | st.booleans() | st.none() | st.floats() | st.text() | st.binary())
     def test_total(self, foreign: Any) -> None:
-        """Any other reply is decoded as None, for instance if its sequence is lower than that of the record."""
+        """Any other reply is decoded as None, for instance a sequence lower than the sequence of the record."""
         reply = decode_reply(foreign, RECORD)
         is_valid = type(foreign) is int and (-4 <= foreign <= 0 or 7 <= foreign < MAX_SEQUENCE)
         self.assertEqual(reply is not None, is_valid)

@@ -476,10 +476,7 @@ class TlsTests(SynchronousTestCase):
         self.server.decode(said)
 
     def test_carry(self) -> None:
-        """After the handshake, bytes are encrypted in transit and arrive unchanged.
-
-        This does not depend on how the bytes are split into segments.
-        """
+        """After the handshake, bytes are encrypted in transit and arrive unchanged, for any split into segments."""
         self.shake()
         for source, sink in ((self.client, self.server), (self.server, self.client)):
             wrapped = source.encode(b"in the clear" * 3000)

@@ -29,7 +29,7 @@ class ViewTests(SynchronousTestCase):
         self.view = View(ME.node_id)
 
     def test_any_replica_suffices(self) -> None:
-        """A slot is visible as long as at least one replica reports it."""
+        """A slot is visible if at least one replica reports it."""
         self.view.replace(CAT.node_id, [record(DOG)])
         self.view.add(ME.node_id, record(DOG))
         self.view.remove(CAT.node_id, record(DOG).slot)

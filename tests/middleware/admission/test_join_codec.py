@@ -61,7 +61,7 @@ class JoinCodecTests(SynchronousTestCase):
         self.assertFalse(is_join_signature(INVITE.public, DOG, "cat", found.proof))
 
     def test_knock_hides_who_comes(self) -> None:
-        """A join request (JOIN_REQUEST) reveals neither key nor name, and always has the maximum size of a datagram."""
+        """A join request (JOIN_REQUEST) hides the key and the name, and always has the maximum datagram size."""
         said = knocked()
         self.assertNotIn(DOG, said)
         self.assertEqual({len(knocked(name)) for name in ("", "dog", "n" * 40)}, {1400})

@@ -91,7 +91,7 @@ class ExplanationTests(SynchronousTestCase):
         self.assertEqual(len(ruling.agree), 1)
 
     def test_nothing_decided(self) -> None:
-        """Without decision records the explanation is empty; if an epoch has no winner, ``nobody`` is its winner."""
+        """Without decision records the explanation is empty; for an epoch without a winner it returns ``nobody``."""
         self.assertEqual(format_explanation(explain_decisions([])), "")
         (ruling,) = explain_decisions([decided(1, [member(1, None)])]).epochs
         self.assertEqual((ruling.winner, ruling.chosen), ("", "nobody"))
