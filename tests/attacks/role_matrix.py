@@ -132,9 +132,9 @@ class Trial:
             self.insider.roles = ()
 
     def run(self) -> Counts:
-        """Try the forbidden attempts, compare the state of the team, try the allowed ones, and return the counts.
+        """Try the forbidden attempts, compare the state of the team, try the allowed attempts, and return the counts.
 
-        Records are sent directly and through an accomplice with the role device.
+        Records are sent directly, and through an accomplice with the role device.
         """
         before = self._state()
         for name, node in self.nodes.items():

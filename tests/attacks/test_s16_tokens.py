@@ -317,7 +317,7 @@ class LogTests(SynchronousTestCase):
 
 class RebindingTests(SynchronousTestCase):
     def test_rebind_a_local_name(self) -> None:
-        """A Host header with an unknown local name is refused; the node's and the configured names are accepted."""
+        """A Host header with an unknown local name is rejected; the node's and the configured names are accepted."""
         services, state = Services(MemoryTeamControl(), OpenSessions()), format_state([], [], {}, node="vaio")
         client = create_app(lambda: state, services, hosts=("vaio", "vaio.local", "robots.lan")).test_client()
 

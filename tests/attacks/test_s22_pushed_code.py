@@ -193,7 +193,7 @@ class PushedCodeTests(SynchronousTestCase):
         self.assertEqual((self.pose(), dict(dog.deployed)), (before, {}))
 
     def test_author_and_digest_are_shown(self) -> None:
-        """The page shows the author's name and key and the digest of a running and of a refused module."""
+        """The page shows the author's name and key, and the digest, of a running and of a rejected module."""
         author = self.join("author", "operator")
         dog = self.allow(author)
         self.push(author)

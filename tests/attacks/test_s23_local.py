@@ -61,7 +61,7 @@ class ControlSocketTests(SynchronousTestCase):
         self.assertRaises(NoControl, list_pages)
 
     def test_folder_that_others_write(self) -> None:
-        """A folder that other users can write is refused."""
+        """A folder to which other users can write is rejected."""
         prepare_path("vaio").touch()
         find_folder().chmod(0o777)
         for use in (find_socket, prepare_path):

@@ -260,7 +260,7 @@ class WideningTests(RenewalCase):
     def test_another_origin(self) -> None:
         """A renewal that states another name or admitting node than the admission is invalid.
 
-        It displaces no valid one.
+        It does not displace a valid renewal.
         """
         dog = self.team.move_in(self.successResultOf(self.knocked("pup", 2)))
         shown, own = dog.kept.membership.certificate, dog.kept.membership.identity

@@ -142,7 +142,7 @@ class PassTests(ClosedCase):
     def test_foreign_passes(self) -> None:
         """Missing and oversized credentials are rejected as foreign.
 
-        The admission check never sees an oversized one.
+        The admission check is not called for an oversized credential.
         """
         self.at_a.own_pass += b"!"
         self.refused(self.a.ask(self.to_b, "echo", 1), FOREIGN)

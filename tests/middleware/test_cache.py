@@ -13,7 +13,7 @@ from middleware.entangled.replication.watched_copy import WatchedCopies
 
 
 def copied(key: bytes, size: int = 1) -> list[Record]:
-    """Return one record of ``key``; the cache does not verify signatures, so the record has an invalid signature."""
+    """Return one record of ``key``, with an invalid signature because the cache does not verify signatures."""
     return [Record(key, "a", bytes(32), 1, "team", 60.0, bytes(size), bytes(64))]
 
 

@@ -60,10 +60,7 @@ class CallTests(EndpointCase):
         raise Refused("with a bone", self.code)
 
     def test_cancelling_reaches_the_method(self) -> None:
-        """If the caller cancels the Deferred of ``ask``, the Deferred or coroutine of the method is cancelled, too.
-
-        This takes the delay of one direction.
-        """
+        """Cancelling the Deferred of ``ask`` cancels the method's Deferred or coroutine after the one-way delay."""
         for name, how in (("slow", "CancelledError"), ("slow change", "CancelledError"), ("crawl", "coroutine")):
             asked = self.a.ask(self.to_b, name, timeout=60.0, changes=name == "slow change")
             self.clock.advance(1.0)

@@ -120,9 +120,9 @@ class AskTests(EndpointCase):
     """Requests and replies."""
 
     def test_change_waits_for_the_session(self) -> None:
-        """The first request that changes state takes two round trips, later requests one.
+        """The first request that changes state takes two round trips, because it must not run from an INIT.
 
-        It never runs from an INIT.
+        Later requests take one round trip.
         """
         self.assertEqual(self.got(self.a.ask(self.to_b, "add", 1, changes=True), 4 * DELAY), 1)
         self.assertEqual(self.got(self.a.ask(self.to_b, "add", 2, changes=True), 2 * DELAY), 2)

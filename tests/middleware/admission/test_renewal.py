@@ -132,7 +132,7 @@ class SleeperTests(YearsCase):
         years.live(160)
 
     def test_renewed_by_the_operator(self) -> None:
-        """A member with a certificate that expired while it was off is rejected until the operator grants a new one."""
+        """If a member's certificate expired while the member was off, it is rejected until the operator renews it."""
         years = self.years()
         vaio, _, dog, cat, _ = years.houses
         before = dog.kept.membership
@@ -156,7 +156,7 @@ class SleeperTests(YearsCase):
         self.assertEqual(years.members(dog.place), years.members())
 
     def test_renewed_while_it_sleeps(self) -> None:
-        """A member that the operator renewed while it was off can rejoin with its old certificate immediately."""
+        """A member that the operator renewed while it was off rejoins at once with its old certificate."""
         years = self.years()
         vaio, _, dog, cat, _ = years.houses
         self.slept(years, dog)

@@ -80,7 +80,7 @@ class AdmissionServerTests(SynchronousTestCase):
         self.assertEqual(self.sent[0][0], self.sent[1][0])
 
     def test_answer_under_way(self) -> None:
-        """While a use of the code is being taken, requests of the newcomer wait; then the newcomer gets one reply."""
+        """If the use of a code is not decided yet, further requests of the newcomer wait; then it gets one reply."""
         self.taken = Deferred()
         for dice in range(3):
             self.server.on_request(self.knocked(dice), DOOR)

@@ -41,7 +41,7 @@ class StatementTests(SynchronousTestCase):
             self.assertEqual(open_statement(self.operator.public, sign_statement(self.operator, each)), each)
 
     def test_only_this_operator_counts(self) -> None:
-        """Statements of another operator, and statements with any changed bit, are refused."""
+        """Statements of another operator, and statements with any changed bit, are rejected."""
         packed = sign_statement(self.operator, GRANT)
         self.assertRaises(Forged, open_statement, operator(2).public, packed)
         for place in range(len(packed)):

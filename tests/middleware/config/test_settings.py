@@ -137,7 +137,7 @@ class SettingsTest(SynchronousTestCase):
         self.assertIn('"camera.fps"', self.refusal("node", "capabilities", {"camera": {"fps": True}}))
 
     def test_wrong_values(self) -> None:
-        """Every key refuses values of a wrong type or out of range."""
+        """For every key a value of a wrong type or out of range raises an error."""
         wrong: dict[tuple[str, str], list[object]] = {
             ("node", "name"): ["", "x" * 41, "dog 1", "dög", 1, "dog\n"],
             ("node", "kind"): [1, "x" * 41, "two\nlines"],

@@ -49,7 +49,7 @@ class CapabilityCostTests(SynchronousTestCase):
         self.assertEqual((found.assigned_agent, found.standby), ("b", ("a", "c")))
 
     def test_own_reports(self) -> None:
-        """Of two reports of one device the one with the lower weight counts, not the one with the shorter distance."""
+        """Of two reports of one device the lower weight counts, not the shorter distance."""
         tired, fresh = Report("a", 5.0, battery=0.2), Report("a", 6.0)
         self.assertEqual(self.strategy.merge([tired], [fresh]), (fresh,))
         self.assertEqual(self.strategy.find([tired, fresh, Report("b", 10.0)]).assigned_agent, "a")

@@ -112,7 +112,7 @@ class HealthTests(FleetCase):
 
 class LinkQualityTests(SynchronousTestCase):
     def test_scores(self) -> None:
-        """A stable peer on the same LAN has score 100, a barely reachable one 1, an unreachable one 0."""
+        """A stable peer on the same LAN has score 100, a barely reachable peer 1, and an unreachable peer 0."""
         rows: list[tuple[list[float | None], bool, int]] = [
             ([0.002, 0.0021, 0.0019, 0.002], False, 100),
             ([0.4, 0.9, None, None, None, None], True, 1),

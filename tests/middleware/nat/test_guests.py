@@ -138,10 +138,7 @@ class IntroductionLimitsTests(SynchronousTestCase):
         self.assertEqual([self.allowance.may_introduce(ASKER) for _ in range(2)], [True, False])
 
     def test_who_is_met_does_not_count(self) -> None:
-        """If an introduced peer replies, its introducer gets one introduction back.
-
-        Others come back at a fixed rate.
-        """
+        """If an introduced peer replies, its introducer gets one introduction back; the rest return at a fixed rate."""
         while self.allowance.may_meet(ASKER):
             self.allowance.record_introducer(STRANGER, ASKER)
         for public, again in ((OTHER, False), (STRANGER, True), (STRANGER, False)):

@@ -431,7 +431,7 @@ class ParticipantTableTests(SynchronousTestCase):
         self.assertIs(participants.get(honest.auction.digest), honest)
 
     def test_idle_ones_are_forgotten(self) -> None:
-        """An idle entry is removed when another is added; entries of this node's own auctions stay."""
+        """An idle entry is removed when a new entry is added; entries of this node's own auctions stay."""
         participants = ParticipantTable()
         own, old, busy = self.made(0), self.made(1), self.made(2)
         participants.add(own, OWN_OPENER, 0.0)

@@ -114,7 +114,7 @@ class Lying(Nearest):
         return Consensus("nobody")
 
     def merge(self, a: Sequence[Report], b: Sequence[Report]) -> tuple[Report, ...]:
-        """Return an invented bid and all others."""
+        """Return an invented bid and all given bids."""
         return (Report("nobody", 0.0), *a, *b)
 
 

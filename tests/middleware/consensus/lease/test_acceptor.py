@@ -144,7 +144,7 @@ class AcceptorTests(SynchronousTestCase):
         self.assertEqual(self.acceptor.release_by_token("u", "a", 1, 0.5), [])
 
     def test_listeners_are_bounded(self) -> None:
-        """The number of waiting proposers is limited; the most recent ones are notified."""
+        """The number of waiting proposers is limited; the most recent proposers are notified."""
         self.prepare(1, "a", 0.0)
         self.propose(1, "a", 1, 0.0)
         for number in range(3 * MAX_LISTENERS):

@@ -90,9 +90,9 @@ class ClientStatesTests(SynchronousTestCase):
                 self.assertEqual(next_step(State.OVER, event).state, State.OVER)
 
     def test_nothing_is_asked_in_vain(self) -> None:
-        """A transition to a state with a round sends its request, and one to a state with a timer starts it.
+        """A transition to a state with a round sends the request of the round.
 
-        The event MOVE is an exception: it starts no timer.
+        A transition to a state with a timer starts the timer, except for the event MOVE.
         """
         for state, row in TABLE.items():
             for event, (target, actions) in row.items():

@@ -92,7 +92,7 @@ class LeaseClientTests(LeaseCase):
         self.assertEqual(self.holders(), [1])
 
     def test_second_in_line_lets_the_first_try(self) -> None:
-        """Of two standbys that find the lease free at the same time, the one with the first rank gets it."""
+        """Of two standbys that find the lease free at the same time, the standby with the first rank gets it."""
         for seed in range(5):
             self.room = self.made(seed=f"free {seed}")
             for place, rank in ((2, 2), (1, 1)):

@@ -111,7 +111,7 @@ class NoteTests(SynchronousTestCase):
         self.assertEqual(codec.bucket_of("t"), f"lease/{zlib.crc32(b't') % 64}")
 
     def test_old_floors(self) -> None:
-        """The lower bounds of both earlier versions are read: one number, or one each for ballots and tokens."""
+        """The lower bounds of both earlier versions are read, as one number or as two."""
         self.assertEqual(CODEC.unpack_floor(msgpack.packb([40, 2.0])), Floor(40, 40, 2.0))
         self.assertEqual(CODEC.unpack_floor(msgpack.packb([40, 2.0, 7])), Floor(40, 7, 2.0))
         self.assertEqual(CODEC.pack_floor(Floor(40, 7, 2.0)), msgpack.packb([40, 2.0, 7]))

@@ -33,7 +33,7 @@ class LeaseProposerTests(LeaseCase):
         self.assertEqual(self.token(1), 2)
 
     def test_who_knows_the_old_council_is_told(self) -> None:
-        """Any member, even one that has left the council, redirects a client that has an old council record."""
+        """Any member, even a former member, redirects a client that has an old council record."""
         self.assertIsNone(self.change(1, 0, 1, 2))
         self.assertEqual(self.places(2), [0, 1, 2])
         self.room.charters[T] = replace(self.room.charters[T], changes=())
@@ -136,7 +136,7 @@ class LeaseProposerTests(LeaseCase):
         self.assertEqual((self.places(0), self.holders()), ([0, 2, 6], [0]))
 
     def test_change_of_the_highest_ballot_is_completed(self) -> None:
-        """Of two changes that one member each accepted, the one with the higher ballot is completed."""
+        """Of two changes that one member each accepted, the change with the higher ballot is completed."""
         for place, council in ((4, (0, 2, 6)), (3, (1, 2, 6))):
             members = tuple(self.room.contacts[n] for n in council)
             acceptor, now = self.room.nodes[place].acceptor, self.room.nodes[place].machine.seconds()
@@ -153,7 +153,7 @@ class LeaseProposerTests(LeaseCase):
         self.assertEqual(self.places(2), [3, 4, 6])
 
     def test_strange_councils(self) -> None:
-        """A council without members, or with too many, raises ``ValueError``."""
+        """A council without members, or with too many members, raises ``ValueError``."""
         for members in ([], [self.room.contacts[0]] * 8):
             self.assertRaises(ValueError, self.client(0).proposer.change_members, members)
 

@@ -203,10 +203,7 @@ class RuleTests(LeaseCase):
         self.assertEqual((gate.is_motion_over(4.9), gate.is_motion_over(5.0)), (False, True))
 
     def test_rule_9_the_end_carries_the_token(self) -> None:
-        """A former holder cannot close the task under its old token.
-
-        Of two results the one with the higher token wins.
-        """
+        """A former holder cannot close the task under its old token; of two results the higher token wins."""
         self.wanting(0)
         self.client(0).release()
         self.wanting(1)
