@@ -60,7 +60,10 @@ class CallTests(EndpointCase):
         raise Refused("with a bone", self.code)
 
     def test_cancelling_reaches_the_method(self) -> None:
-        """Cancelling the Deferred of ``ask`` cancels the method's Deferred or coroutine after the one-way delay."""
+        """Cancelling the Deferred of ``ask`` also cancels the method's work, after the one-way delay.
+
+        The method may have returned a Deferred or a coroutine.
+        """
         for name, how in (("slow", "CancelledError"), ("slow change", "CancelledError"), ("crawl", "coroutine")):
             asked = self.a.ask(self.to_b, name, timeout=60.0, changes=name == "slow change")
             self.clock.advance(1.0)

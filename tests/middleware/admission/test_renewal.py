@@ -156,7 +156,7 @@ class SleeperTests(YearsCase):
         self.assertEqual(years.members(dog.place), years.members())
 
     def test_renewed_while_it_sleeps(self) -> None:
-        """A member that the operator renewed while it was off rejoins at once with its old certificate."""
+        """A member that the operator renewed while it was off rejoins immediately with its old certificate."""
         years = self.years()
         vaio, _, dog, cat, _ = years.houses
         self.slept(years, dog)
