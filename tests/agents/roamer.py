@@ -127,9 +127,7 @@ class Roamer:
         return values
 
     def touched(self) -> float | None:
-        """Return the bearing in radians (left is positive) of an object in contact with the robot's front half, or
-        None.
-        """
+        """Return the bearing in radians (left is positive) of an object that the front half touches, or None."""
         dog, radius = self.dog, self.description.radius
         width, height = self.world.scene.width, self.world.scene.height
         others = [(d.x, d.y, 0.12) for d in self.world.dogs.values() if d is not dog]

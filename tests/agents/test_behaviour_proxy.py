@@ -72,8 +72,9 @@ class BehaviourProxyTests(SynchronousTestCase):
         self.assertEqual(connection.asked, asked)
 
     def test_never_waits(self) -> None:
-        """Until a reply arrives, the previous action stays valid for at most ``ACTION_TTL_S`` seconds; then the robot
-        stands.
+        """Until a reply arrives, the previous action stays valid for at most ``ACTION_TTL_S`` seconds.
+
+        Then the robot stands.
         """
         behaviour, connection = guarded(Spin())
         self.assertEqual(behaviour.search(1.0), GO)
@@ -130,7 +131,9 @@ class BehaviourProxyTests(SynchronousTestCase):
             self.assertEqual((behaviour.search(0.0), behaviour.has_failed), (STAND, True), answer)
 
     def test_what_it_may_have_beside(self) -> None:
-        """Optional attributes of a behaviour are passed on; if an attribute is missing or raises, its default is used.
+        """Optional attributes of a behaviour are passed on.
+
+        If an attribute is missing or raises, its default is used.
         """
         spin = Spin()
         spin.value, spin.choice = (1.0,), "left"  # type: ignore[attr-defined]
@@ -164,8 +167,9 @@ class BehaviourProxyTests(SynchronousTestCase):
             self.assertIsNone(guarded(spin)[0].cost)
 
     def test_behaviour_by_its_deployed_name(self) -> None:
-        """The kind ``deployed:x`` selects the deployed behaviour ``x``; the error for an unknown name lists the known
-        names.
+        """The kind ``deployed:x`` selects the deployed behaviour ``x``.
+
+        The error for an unknown name lists the known names.
         """
         deployed: dict[tuple[str, str], Factory] = {
             ("behaviour", "spin"): Loopback.of(Spin),

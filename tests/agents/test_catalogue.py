@@ -23,9 +23,7 @@ class CatalogueTests(SynchronousTestCase):
             load_strategy(task.strategy)
 
     def test_yards_dog_can_do_what_it_is_made_for(self) -> None:
-        """A simulated dog meets the requirements of the demonstration, but lacks the gripper that fetching the ball
-        requires.
-        """
+        """A simulated dog can do the demonstration, but lacks the gripper that fetching the ball requires."""
         capabilities = describe("sim", {}, "dog1").capabilities
         self.assertEqual(find_unmet_requirements(capabilities, TASKS[DEMO_TASK].requirements), [])
         self.assertEqual(find_unmet_requirements(capabilities, TASKS["turn-around"].requirements), [])

@@ -51,7 +51,9 @@ class PeerReportsTests(SynchronousTestCase):
         self.assertEqual(self.costs(peer_reports, 2.0), {"b": 1.0})
 
     def test_who_left_is_forgotten_after_a_while(self) -> None:
-        """A late report of a departed member is ignored; ``DEPARTED_MEMORY_S`` later, a restarted member is accepted.
+        """A late report of a departed member is ignored.
+
+        ``DEPARTED_MEMORY_S`` later, a restarted member is accepted.
         """
         peer_reports = PeerReports("a")
         peer_reports.update([B], 0.0)
@@ -63,8 +65,9 @@ class PeerReportsTests(SynchronousTestCase):
         self.assertEqual(len(peer_reports), 1)
 
     def test_stale_report_is_no_bid(self) -> None:
-        """A bid expires after its validity period minus its age on arrival; a report with a newer serial number renews
-        it.
+        """A bid expires after its validity period minus its age on arrival.
+
+        A report with a newer serial number renews it.
         """
         peer_reports = PeerReports("a")
         bid = replace(B, valid_for=3.0, age=1.0)
@@ -76,7 +79,9 @@ class PeerReportsTests(SynchronousTestCase):
         self.assertEqual(self.costs(peer_reports, 12.3), {"b": 2.0})
 
     def test_own_report_comes_back(self) -> None:
-        """An agent does not count its own report from an earlier run as a member; it only continues the numbers in it.
+        """An agent does not count its own report from an earlier run as a member.
+
+        It only continues the numbers in it.
         """
         peer_reports = PeerReports("b")
         peer_reports.update([B], 0.0)

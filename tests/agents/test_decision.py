@@ -48,8 +48,9 @@ class ReadingTests(SynchronousTestCase):
     """Strategies that use reported values in addition to the cost."""
 
     def test_charged_one_is_preferred(self) -> None:
-        """Of equally distant robots, the robot with more battery charge is assigned; at equal charge, the one with
-        fewer tasks.
+        """Of equally distant robots, the robot with more battery charge is assigned.
+
+        At equal charge, the one with fewer tasks.
         """
         low, full = replace(member("a", 5.0), battery=0.2), replace(member("b", 5.0), battery=0.9)
         self.assertEqual(by("capability_cost", low, full).assigned, "b")
@@ -75,7 +76,9 @@ class DecisionTests(SynchronousTestCase):
         self.assertEqual(decision.why, "dog-b, 1.00, best of 3")
 
     def test_waiting_period_holds_for_those_who_are_missing(self) -> None:
-        """During the waiting period no agent is assigned if a report is missing; the reason lists the missing agents.
+        """During the waiting period no agent is assigned if a report is missing.
+
+        The reason lists the missing agents.
         """
         members = member("a", 2.0), member("c", None, SEARCHING), member("b", None, SEARCHING)
         early = decided(*members, since=7.9)
@@ -130,8 +133,9 @@ class DecisionTests(SynchronousTestCase):
     @settings(max_examples=60)
     @given(REPORTS)
     def test_assigned_agent_has_reported_and_is_good_enough(self, entries: list[tuple[int, float | None, str]]) -> None:
-        """After the waiting period an agent with a report is assigned; no agent is better than it by more than the
-        hysteresis.
+        """After the waiting period an agent with a report is assigned.
+
+        No agent is better than it by more than the hysteresis.
         """
         members = [member(f"{number:x}", cost, status) for number, cost, status in entries]
         costs = {m.uuid: m.cost for m in members if m.cost is not None}
@@ -148,8 +152,9 @@ class ReportersTests(SynchronousTestCase):
     """Decisions from the reports of a subset of the agents (the reporters)."""
 
     def panelled(self, since: float, has_word: bool, *members: Member) -> str | None:
-        """Return the agent that is assigned according to these reports; ``has_word``: the council has announced its
-        bids.
+        """Return the agent that is assigned according to these reports.
+
+        ``has_word``: the council has announced its bids.
         """
         return decide(members, Nearest(), 0.1, 8.0, since, has_word).assigned
 

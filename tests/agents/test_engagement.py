@@ -209,9 +209,7 @@ class EngagementTests(SynchronousTestCase):
         self.assertEqual(self.step().action, GO)
 
     def test_states_follow_the_thesis(self) -> None:
-        """The status of an agent is ASSIGNED, SEARCHING, WAITING after its report, EXECUTING with the lease, and
-        finally DONE.
-        """
+        """A status is ASSIGNED, SEARCHING, WAITING after the report, EXECUTING with the lease, and finally DONE."""
         self.assertEqual(self.engagement.me.status, ASSIGNED)
         self.hear(self.report(2, None))
         self.assertEqual(self.step().action, LOOK)
@@ -226,8 +224,7 @@ class EngagementTests(SynchronousTestCase):
         self.assertEqual(statuses, [SEARCHING, WAITING, EXECUTING, DONE])
 
     def test_nothing_is_executed_without_a_lease(self) -> None:
-        """The assigned agent does not move until the quorum grants the lease, and stops again when the lease expires.
-        """
+        """The assigned agent does not move before the quorum grants the lease, and stops when the lease expires."""
         self.hear(self.report(2, 2.0))
         self.see(1.0)
         for _ in range(5):
@@ -278,8 +275,9 @@ class EngagementTests(SynchronousTestCase):
         self.assertEqual(self.lease_client.places, [2, 1])
 
     def test_who_is_not_let_insists(self) -> None:
-        """An assigned agent without a lease repeats its report every second, so other agents do not consider it
-        failed.
+        """An assigned agent without a lease repeats its report every second.
+
+        Otherwise other agents would consider it failed.
         """
         self.hear(self.report(2, 2.0))
         self.see(1.0)
@@ -335,8 +333,9 @@ class EngagementTests(SynchronousTestCase):
         self.assertEqual(self.events, ["halted", "moved to 3"])
 
     def test_moved_target_is_reported_again(self) -> None:
-        """A larger cost is reported again in every state; a smaller cost is reported only by an agent that does not
-        act.
+        """A larger cost is reported again in every state.
+
+        A smaller cost is reported only by an agent that does not act.
         """
         self.see(1.0)
         self.see(1.1)

@@ -52,8 +52,9 @@ class PostTests(SynchronousTestCase):
                 self.assertAlmostEqual(apart(placed[name], angle), 0.0, 6)
 
     def test_sectors_share_the_circle(self) -> None:
-        """Each of three robots searches a third of the circle; when one leaves, each of the other two searches half of
-        it.
+        """Each of three robots searches a third of the circle.
+
+        When one leaves, each of the other two searches half of it.
         """
         self.assertEqual(assign_sector("b", {"a", "b", "c"}), (math.pi, math.tau / 3))
         self.assertEqual(assign_sector("b", {"a", "b"}), (math.remainder(1.5 * math.pi, math.tau), math.pi))
@@ -78,8 +79,9 @@ class FormationTests(SynchronousTestCase):
         self.others = [Member("b", "dog2", "WAITING", 1.0, angle=0.2), Member("c", "dog3", "WAITING", 1.0, angle=2.0)]
 
     def test_rests_until_somebody_leaves(self) -> None:
-        """The robots rest until a robot leaves; then the remaining robots, and any that join later, get evenly spaced
-        posts.
+        """The robots rest until a robot leaves.
+
+        Then the remaining robots, and any that join later, get evenly spaced posts.
         """
         self.assertEqual(self.formation.update_members(self.others), [])
         self.assertIsNone(self.formation.assign_post(self.me, self.others, None))
@@ -111,7 +113,9 @@ class FormationTests(SynchronousTestCase):
 
 class PostPathTests(SynchronousTestCase):
     def walk(self, radius: float, post: float, ahead: float = math.nan, seconds: float = 60.0) -> tuple[float, float]:
-        """Move a robot to its post around a target at (0, 0); return its final direction and distance from the target.
+        """Move a robot to its post around a target at (0, 0).
+
+        Return its final direction and distance from the target.
         """
         x, y, yaw = radius, 0.0, math.pi
         circling = PostPath()

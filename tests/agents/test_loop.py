@@ -102,8 +102,7 @@ class LoopTests(SynchronousTestCase):
         self.assertIsNot(self.agent_of("dog3").engagement, None)
 
     def test_switched_off_robot_takes_no_part(self) -> None:
-        """A robot with disabled motors still sends observations, but takes no task until the motors are enabled again.
-        """
+        """A robot with disabled motors still sends observations, but takes no task until they are enabled again."""
         self.submit(kind="find-target")
         self.team.clock.advance(3.0)
         driver = self.team.services["dog1"].assembly.driver

@@ -68,8 +68,9 @@ class DescriptionTests(SynchronousTestCase):
 
 class MissingAxesTests(SynchronousTestCase):
     def test_rest_on_an_axis_that_is_not_there_is_left_out(self) -> None:
-        """A zero velocity on an axis that the robot lacks is removed; other velocities remain, and the driver refuses
-        them.
+        """A zero velocity on an axis that the robot lacks is removed.
+
+        Other velocities remain, and the driver refuses them.
         """
         self.assertEqual(MotionCapabilities(WHEELS).remove_missing_axes(STAND), {"base.vx": 0.0, "base.wz": 0.0})
         self.assertEqual(MotionCapabilities().remove_missing_axes(STAND), STAND)
@@ -119,8 +120,9 @@ class LearningTests(SynchronousTestCase):
         self.assertEqual(motion.spin(0.0), STAND)
 
     def test_creep_that_was_too_slow_is_tried_faster(self) -> None:
-        """If a walk was too slow to move the robot, the next walk is faster; after a long step the robot stops
-        earlier.
+        """If a walk was too slow to move the robot, the next walk is faster.
+
+        After a long step the robot stops earlier.
         """
         motion = MotionCapabilities(WHEELS)
         before = motion.stop_distance

@@ -69,8 +69,9 @@ class CouncilMaintainerTests(SynchronousTestCase):
             self.assertLessEqual(len(self.moving()), 1)
 
     def test_who_acts_fills_the_council(self) -> None:
-        """The acting agent replaces dead council members and continues; if the agent itself fails, another completes
-        the task.
+        """The acting agent replaces dead council members and continues.
+
+        If the agent itself fails, another completes the task.
         """
         self.given("witness1", "witness2", "dog1", turns=12.0)
         self.run_for(3.0)

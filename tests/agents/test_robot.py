@@ -40,9 +40,7 @@ class RobotTests(SynchronousTestCase):
         self.assertTrue(self.body.perform(RobotCommand(action, Permit(1, 1.0))))
 
     def test_robot_is_asked_for_nothing_that_it_has_not(self) -> None:
-        """A robot without a sideways gait receives no sideways velocity, which its driver would refuse as an unknown
-        key.
-        """
+        """A robot without a sideways gait receives no sideways velocity, which its driver would refuse."""
         self.do(vx=0.1)
         self.assertEqual(self.robot.asked, [{"base.vx": 0.1, "base.wz": 0.0}])
 

@@ -39,17 +39,13 @@ def with_gaits(gaits: dict[str, Velocity], seed: int) -> Roamer:
 
 class RobotKindTests(SynchronousTestCase):
     def arrived(self, robot: Roamer, limit: float = 60.0) -> None:
-        """Check that the robot reaches the target, stops close to it, and has bumped into nothing faster than at a
-        slow walk.
-        """
+        """Check that the robot stops close to the target, and bumped into nothing faster than at a slow walk."""
         self.assertTrue(robot.reach(limit), "never done")
         self.assertLessEqual(robot.gap, 0.15)
         self.assertLessEqual(robot.hardest, max(WALK_SPEED_MPS, robot.motion.walk) + 0.01)
 
     def test_robots_that_feel_their_way_find_it_too(self) -> None:
-        """A robot without a ranger bumps into nothing faster than at a slow walk within a minute, and then reaches the
-        target.
-        """
+        """A robot without a ranger bumps into nothing faster than at a slow walk, and reaches the target."""
         for kind in ("create2", "bittle"):
             with self.subTest(kind=kind):
                 robot = roamer(kind, 1)
@@ -70,9 +66,7 @@ class RobotKindTests(SynchronousTestCase):
                 self.assertLess(robot.reversals, 10)
 
     def test_robot_that_turns_only_as_it_walks_gets_there(self) -> None:
-        """A robot that cannot turn on the spot searches on arcs, and backs off from a target inside its turning
-        circle.
-        """
+        """A robot that cannot turn on the spot searches on arcs, and leaves a target inside its turning circle."""
         for seed in (1, 2):
             with self.subTest(seed=seed):
                 robot = with_gaits(ARCS, seed)

@@ -102,9 +102,7 @@ class RangerTests(SynchronousTestCase):
         self.assertLess(abs(self.measure_cost({"range.near": math.nan, "range.far": 0.86}) * 0.9 - 0.94), 0.02)
 
     def test_ranger_that_reads_something_else_is_not_believed(self) -> None:
-        """If a dog in between, a wall behind the target or a missing echo disturbs the range, the camera gives the
-        cost.
-        """
+        """If another dog, a wall behind the target or a missing echo falsifies the range, the camera gives the cost."""
         for wrong in (0.2, 0.45, 1.4, math.nan):
             self.assertLess(abs(self.measure_cost({"range.near": math.nan, "range.far": wrong}) - 1), 0.08, wrong)
 
@@ -190,8 +188,9 @@ class HiddenTests(SynchronousTestCase):
         return walk
 
     def test_report_stays_for_a_while(self) -> None:
-        """A target hidden by another robot keeps its cost for ``HIDDEN_TARGET_MEMORY_S`` seconds; then the cost is
-        None.
+        """A target hidden by another robot keeps its cost for ``HIDDEN_TARGET_MEMORY_S`` seconds.
+
+        Then the cost is None.
         """
         walk = self.hidden()
         started_at = walk.now

@@ -78,8 +78,9 @@ class TableTests(SynchronousTestCase):
 
 
 class Rig:
-    """An agent in a task, with stubs of the robot, the lease client, the other agent and the clock; it checks
-    invariants.
+    """An agent in a task, with stubs of the robot, the lease client, the other agent and the clock.
+
+    It checks invariants.
     """
 
     def __init__(self) -> None:

@@ -73,9 +73,7 @@ class TaskGroupTests(SynchronousTestCase):
             self.assertAlmostEqual(total, best)
 
     def test_one_digest_of_all_reports(self) -> None:
-        """The decisions on all tasks contain the same digest of all reports, and their reasons describe the
-        assignment.
-        """
+        """The decisions on all tasks have the same digest of all reports, and their reasons describe the assignment."""
         costs: Costs = {"t1": {"a": 1.0, "b": 2.0}, "t2": {"a": 1.5, "b": 5.0}}
         first = self.decided(costs)
         self.assertEqual(first["t1"].digest, first["t2"].digest)
@@ -95,16 +93,18 @@ class TaskGroupTests(SynchronousTestCase):
         self.assertEqual(found["t2"].why, "all bidders have reached their capacity")
 
     def test_who_acts_counts_for_its_task_alone(self) -> None:
-        """An acting agent gets no other task of the group, even if it is the nearest agent; a free agent gets the
-        task.
+        """An acting agent gets no other task of the group, even if it is the nearest agent.
+
+        A free agent gets the task.
         """
         costs: Costs = {"t1": {"a": 1.0, "b": 9.0}, "t2": {"a": 0.1, "b": 9.0}}
         self.assertEqual(self.assigned(costs, t1="a"), {"t1": "a", "t2": "b"})
         self.assertEqual(self.assigned({"t1": costs["t1"], "t2": {"a": 0.1}}, t1="a"), {"t1": "a", "t2": None})
 
     def test_who_acts_keeps_it_within_the_hysteresis(self) -> None:
-        """A free agent takes over a task only if its cost is lower by the hysteresis; otherwise it gets a different
-        task.
+        """A free agent takes over a task only if its cost is lower by the hysteresis.
+
+        Otherwise it gets a different task.
         """
         for cost, given in ((0.95, "a"), (0.85, "b")):
             self.assertEqual(self.assigned({"t1": {"a": 1.0, "b": cost}}, t1="a"), {"t1": given})
@@ -137,8 +137,9 @@ class TaskGroupTests(SynchronousTestCase):
         self.assertEqual(self.decided(costs, since=7.9, t2="a")["t1"].assigned, "b")
 
     def test_what_is_divided_together(self) -> None:
-        """Tasks with the same group, strategy and requirements are assigned jointly; a task without a group is
-        assigned alone.
+        """Tasks with the same group, strategy and requirements are assigned jointly.
+
+        A task without a group is assigned alone.
         """
         one = task("t1", requirements={"camera": {"width": 1, "colour": "rgb"}, "legs": {}})
         two = task("t2", requirements={"legs": {}, "camera": {"colour": "rgb", "width": 1}})

@@ -55,8 +55,7 @@ class VisionTests(SynchronousTestCase):
             self.assertLess(max(map(abs, errors)), 0.12, (distance, errors))
 
     def test_lens_is_reckoned_with(self) -> None:
-        """For a lens with half the field of view, the same frame gives about twice the distance and a smaller bearing.
-        """
+        """With half the field of view, the same frame gives about twice the distance and a smaller bearing."""
         studio = Studio()
         studio.target(0.9, 0.2)
         picture = studio.camera.render_jpeg(studio.world.dogs["dog1"])
@@ -67,7 +66,9 @@ class VisionTests(SynchronousTestCase):
         self.assertLess(narrow.bearing, 0.6 * wide.bearing)
 
     def test_picture_that_is_all_target_says_so(self) -> None:
-        """A target that fills the frame from edge to edge has ``is_filling`` set; a target at a single edge does not.
+        """A target that fills the frame from edge to edge has ``is_filling`` set.
+
+        A target at a single edge does not.
         """
         for width, is_filling in ((64, True), (40, False)):
             picture = np.full((48, 64, 3), 128, np.uint8)

@@ -56,8 +56,9 @@ class PhoneTests(SynchronousTestCase):
         self.assertEqual(phone.behaviour.cost, 0.5)
 
     def test_cost_goes_with_the_target(self) -> None:
-        """The cost survives a short loss of sight; after a longer loss it is None until there are enough new
-        detections.
+        """The cost survives a short loss of sight.
+
+        After a longer loss it is None until there are enough new detections.
         """
         phone = Phone()
         phone.live(0.5, MIN_DETECTIONS)
@@ -160,8 +161,9 @@ class DogTests(SynchronousTestCase):
         self.assertTrue(1.8 < cost / walk.distance() < 2.5)
 
     def test_watches_with_a_camera_alone(self) -> None:
-        """A fixed camera without motors watches the target: the behaviour detects the target in the frames; all
-        actions are empty.
+        """A fixed camera without motors watches the target: the behaviour detects the target in the frames.
+
+        All actions are empty.
         """
         walk = Walk()
         watch = WatchTarget({}, random.Random(1))
