@@ -113,9 +113,7 @@ class DecisionTests(SynchronousTestCase):
                 self.assertEqual(decision.assigned, "a", (cost, hysteresis))
 
     def test_two_acting_members_come_down_to_one(self) -> None:
-        """If two agents report that they act, all agents choose the cheaper one of the two, or at equal cost the lower
-        uuid.
-        """
+        """If two agents report that they act, all agents choose the cheaper one, or at equal cost the lower uuid."""
         self.assertEqual(decided(member("a", 1.02, EXECUTING), member("b", 1.0, EXECUTING)).assigned, "b")
         self.assertEqual(decided(member("b", 1.0, EXECUTING), member("a", 1.0, EXECUTING)).assigned, "a")
 
@@ -159,8 +157,7 @@ class ReportersTests(SynchronousTestCase):
         return decide(members, Nearest(), 0.1, 8.0, since, has_word).assigned
 
     def test_council_is_waited_for(self) -> None:
-        """Complete reports of the subset lead to a decision only after the council's announcement, or after a timeout.
-        """
+        """Complete reports of the subset suffice only after the council's announcement, or after a timeout."""
         reporters = member("a", 2.0), member("b", 1.0)
         self.assertIsNone(self.panelled(0.0, False, *reporters))
         self.assertIsNone(self.panelled(8.0 + ANNOUNCEMENT_TIMEOUT_S - 0.1, False, *reporters))

@@ -242,8 +242,7 @@ class EngagementTests(SynchronousTestCase):
         self.assertEqual(self.events, ["halted"])
 
     def test_looking_around_is_permitted_for_a_moment_only(self) -> None:
-        """A search motion without a lease carries the highest token that the robot has accepted, and a short deadline.
-        """
+        """A search motion without a lease carries the highest token that the robot accepted, and a short deadline."""
         permit = self.step().permit
         self.assertEqual((permit.token, permit.deadline), (4, self.clock.seconds() + SEARCH_TTL_S))
 
@@ -447,9 +446,7 @@ class EngagementTests(SynchronousTestCase):
         self.assertEqual(len(self.results), int(lowest is ME))
 
     def test_deadline_is_told_by_who_holds_the_task(self) -> None:
-        """An agent that ends a task on which no agent acts first claims the lease, because the outcome needs its
-        token.
-        """
+        """An agent that ends a task on which no agent acts claims the lease first: the outcome needs its token."""
         self.begin(replace(TASK, deadline=5.0))
         self.patch(self.engagement._decider, "is_first", lambda now: True)
         self.acting()
@@ -472,8 +469,7 @@ class EngagementTests(SynchronousTestCase):
         self.assertIsNotNone(self.engagement.step(self.clock.seconds()))
 
     def test_no_progress_gives_the_task_to_another(self) -> None:
-        """An agent that makes no progress within the stall limit returns the lease, and for the same time does not bid
-        again.
+        """An agent without progress within the stall limit returns the lease, and bids again only after the same time.
         """
         self.begin(replace(TASK, stall_limit=1.0))
         self.dog.progress = 0.5
@@ -537,9 +533,7 @@ class EngagementTests(SynchronousTestCase):
         self.assertEqual(self.engagement.result, Result(COMPLETED, "dog2", 1.0, 9))
 
     def test_older_life_is_counted_on(self) -> None:
-        """After a restart the agent continues the round and serial numbers of its previous run, which the others
-        report.
-        """
+        """After a restart the agent continues the round and serial numbers of its previous run."""
         self.hear(Member(ME.node_id.hex(), "dog1", WAITING, 9.0, epoch=4, serial=3))
         self.see(1.0)
         self.assertGreater((self.reports[-1].epoch, self.reports[-1].serial), (4, 3))
@@ -557,7 +551,7 @@ class EngagementTests(SynchronousTestCase):
         self.assertEqual(self.lease_client.standbys, [contacts[3], contacts[2]])
 
     def test_each_decision_is_accounted_for_once(self) -> None:
-        """A new decision is recorded immediately, changed reports at most once per second, an unchanged decision
+        """New decisions are recorded immediately, changed reports at most once per second, and unchanged decisions
         never.
         """
         records = self.outputs.decision_records

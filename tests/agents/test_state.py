@@ -232,9 +232,7 @@ INPUTS: dict[str, Callable[[Rig, Engagement, float], object]] = {
 
 class ReachableTests(SynchronousTestCase):
     def test_invariants_hold_in_each_state_that_is_reached(self) -> None:
-        """Every input in every reachable state preserves the invariants, for example that no agent acts without a
-        lease.
-        """
+        """Every input in every reachable state preserves the invariants, such as no action without a lease."""
         first = Rig()
         shared = {id(each): each for each in (first.engagement.task, CONTACT)}
         known: dict[tuple[object, ...], tuple[str, ...]] = {first.key: ()}

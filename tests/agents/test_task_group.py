@@ -127,9 +127,7 @@ class TaskGroupTests(SynchronousTestCase):
         self.assertEqual((held.assigned, len(held.digest)), ("a", 8))
 
     def test_missing_reports_on_other_tasks_are_waited_for(self) -> None:
-        """During the waiting period no agent is assigned as long as an agent has not reported on every task of the
-        group.
-        """
+        """During the waiting period no agent is assigned until all have reported on every task of the group."""
         costs: Costs = {"t1": {"a": 1.0, "b": 2.0}, "t2": {"a": 1.0, "b": None}}
         found = self.decided(costs, since=7.9)
         self.assertEqual((found["t1"].assigned, found["t1"].why), (None, "waiting for dog-b"))
@@ -163,18 +161,14 @@ class SelectParticipationTests(SynchronousTestCase):
         return SimpleNamespace(engagement=SimpleNamespace(me=me, is_acting=is_acting, can_yield_robot=is_free))
 
     def test_given_task_has_it(self) -> None:
-        """The robot works on the agent's assigned task, unless the agent acts on, or records the outcome of, a
-        different task.
-        """
+        """The robot works on its agent's assigned task, unless the agent acts on another or records its outcome."""
         other, given = self.part(None), self.part(assigned="a")
         self.assertIs(select_participation([other, given], other), given)
         for holder in (self.part(is_acting=True), self.part(is_free=False)):
             self.assertIs(select_participation([given, holder], holder), holder)
 
     def test_else_what_it_cannot_tell_yet(self) -> None:
-        """Without an assigned task the robot measures the cost of a task with unknown cost, or else keeps its present
-        task.
-        """
+        """Without an assigned task the robot measures a task of unknown cost, or else keeps its present task."""
         reported, unknown, also = self.part(), self.part(None), self.part(None, assigned="b")
         self.assertIs(select_participation([reported, unknown, also], reported), unknown)
         self.assertIs(select_participation([reported, unknown, also], also), also)

@@ -123,8 +123,7 @@ class PhoneTests(SynchronousTestCase):
 
 class DogTests(SynchronousTestCase):
     def test_turns_to_the_target_and_keeps_it_in_view(self) -> None:
-        """A dog with the target behind it turns to the target, measures the distance, and watches without approaching.
-        """
+        """A dog with the target behind it turns to the target, measures its distance, and watches from there."""
         walk = Walk()
         watch = WatchTarget({"seconds": 3.0, "target_radius": 0.08}, random.Random(1))
         walk.behaviour = watch  # type: ignore[assignment]
