@@ -469,8 +469,7 @@ class EngagementTests(SynchronousTestCase):
         self.assertIsNotNone(self.engagement.step(self.clock.seconds()))
 
     def test_no_progress_gives_the_task_to_another(self) -> None:
-        """An agent without progress within the stall limit returns the lease, and bids again only after the same time.
-        """
+        """An agent without progress within the stall limit returns the lease, and does not bid for the same time."""
         self.begin(replace(TASK, stall_limit=1.0))
         self.dog.progress = 0.5
         self.acting()
@@ -551,9 +550,7 @@ class EngagementTests(SynchronousTestCase):
         self.assertEqual(self.lease_client.standbys, [contacts[3], contacts[2]])
 
     def test_each_decision_is_accounted_for_once(self) -> None:
-        """New decisions are recorded immediately, changed reports at most once per second, and unchanged decisions
-        never.
-        """
+        """Record a new decision immediately, changed reports at most once per second, an unchanged decision never."""
         records = self.outputs.decision_records
         self.step()
         self.assertEqual(records, [])

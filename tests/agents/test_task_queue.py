@@ -45,8 +45,7 @@ class TaskQueueTests(SynchronousTestCase):
 
 class SelectTaskTests(SynchronousTestCase):
     def test_who_gets_the_body(self) -> None:
-        """The first task in the queue gets the robot, unless the present task must not stop or acts at this priority.
-        """
+        """The first task in the queue gets the robot, unless the present task must not stop or acts at its priority."""
         every = [NEW, OLD, URGENT]
         self.assertIs(select_task(every, None, True), URGENT)
         self.assertIs(select_task(every, OLD, True), URGENT)
