@@ -22,9 +22,7 @@ def good(part: str = PLAIN) -> list[Outcome]:
 
 class OutcomeTests(SynchronousTestCase):
     def test_thirteen_of_fifteen_pairs_can_be_punched(self) -> None:
-        """Hole punching must work for all pairs except symmetric with symmetric or port restricted, and those without
-        UDP.
-        """
+        """All pairs can be punched except symmetric with symmetric or port restricted, and those without UDP."""
         pairs = [(a, b) for n, a in enumerate(MATRIX) for b in MATRIX[n:] if NatKind.NOUDP not in (a, b)]
         self.assertEqual(len(pairs), 15)
         closed = [(a.value, b.value) for a, b in pairs if not is_punchable(a, b)]

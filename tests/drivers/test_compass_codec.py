@@ -1,5 +1,4 @@
-"""Tests of ``drivers.compass.codec`` with sentences of real compasses (whole, split and with errors) and random bytes.
-"""
+"""Tests of ``drivers.compass.codec`` with sentences of real compasses (whole, split, with errors) and random bytes."""
 
 from __future__ import annotations
 
@@ -13,7 +12,7 @@ from drivers.errors import BadFrame
 
 class HeadingTests(SynchronousTestCase):
     def test_reads_what_compasses_send(self) -> None:
-        """Sentences of real compasses give a heading, corrected by an easterly deviation, and whether it is true or
+        """A sentence of a real compass gives a heading, corrected by the deviation, and whether it is true or
         magnetic.
         """
         for line, degrees, is_true in (

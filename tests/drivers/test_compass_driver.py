@@ -46,8 +46,7 @@ class CompassDriverTests(Conformance, RobotCase):
             self.assertTrue(abs(math.remainder(self.heading(driver) - degrees, 360.0)) < 0.06, degrees)
 
     def test_counts_from_the_yards_axis(self) -> None:
-        """Degrees clockwise from north become radians counter-clockwise from the x axis, which by default points east.
-        """
+        """Degrees clockwise from north become radians counter-clockwise from the x axis, which by default is east."""
         north = self.make_driver()
         turned = self.make_driver(mounted_deg=30)
         other = self.make_driver(x_axis_deg=0)

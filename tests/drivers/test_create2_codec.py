@@ -112,9 +112,7 @@ class StreamTests(SynchronousTestCase):
         self.assertEqual(reader.bad_frames, 0)
 
     def test_fed_one_byte_at_a_time_with_heads_within(self) -> None:
-        """Reading starts in the middle of a frame, byte by byte: later frames are found, even with header bytes in
-        their data.
-        """
+        """Frames are found byte by byte from the middle of a frame, even with header bytes in their data."""
         values = {"left_encoder": 19 * 256 + 78, "right_encoder": 19 * 256 + 78, "charge": 19 * 256 + 78}
         data = encode_stream_frame(PACKET_IDS, values)
         reader = StreamReader(PACKET_IDS)
@@ -229,9 +227,7 @@ class OdometryTests(SynchronousTestCase):
         self.assertAlmostEqual(abs(where.yaw), math.pi, places=2)
 
     def test_jumps_move_nothing(self) -> None:
-        """A counter step that exceeds the wheel's speed, for example after a reboot, counts as a jump and moves
-        nothing.
-        """
+        """A counter step beyond the wheel's speed, such as after a reboot, counts as a jump and moves nothing."""
         where = Odometry()
         where.update(20_000, 20_000, 0.0)
         where.update(0, 0, 0.015)

@@ -174,9 +174,7 @@ class Create2DriverTests(Conformance, Create2Case):
         self.failureResultOf(driver.invoke("fly"), Unsupported)
 
     def test_starts_a_rebooted_robot_again(self) -> None:
-        """After a reboot during a drive, the driver starts the robot again: it is at rest, and its odometry does not
-        jump.
-        """
+        """After a reboot during a drive, the driver starts the robot again, at rest and without an odometry jump."""
         driver = self.ready()
         driver.act({"base.vx": 0.2}, self.permit(seconds=9.0))
         self.pass_time(1.0)
@@ -226,8 +224,7 @@ class Create2DriverTests(Conformance, Create2Case):
         self.assertGreater(driver.diagnostics()["bad_frames"], 2)
 
     def test_lives_with_a_foul_wire(self) -> None:
-        """With a tenth of the frames lost and a tenth invalid, delayed and split, the driver works and counts errors.
-        """
+        """With a tenth of the frames lost and a tenth invalid, delayed and split, the driver works and counts them."""
         driver = self.ready()
         self.faults.drop = self.faults.garbage = 0.1
         self.faults.split, self.faults.delay = True, 0.02

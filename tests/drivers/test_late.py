@@ -50,8 +50,7 @@ class LateTests(RobotCase):
         return driver
 
     def freeze(self, driver: Driver, permitted: float, before: float = 0.0) -> None:
-        """Permit a motion, pause the process beyond the deadline, and check that the robot gets only zero velocities.
-        """
+        """Permit a motion, pause the process beyond the deadline, and check that only zero velocities follow."""
         driver.act({"base.vx": 0.1}, self.permit(seconds=permitted))
         self.pass_time(before)
         self.watched.told.clear()

@@ -28,9 +28,7 @@ class PhoneDriverTests(Conformance, RobotCase):
                 driver.process_picture(JPEG, 208, 156, {})
 
     def test_says_what_it_has(self) -> None:
-        """The capabilities contain the camera, and orientation and position if the browser reports them, but no
-        motion.
-        """
+        """The capabilities are the camera, and orientation and position if the browser reports them, but no motion."""
         everything = describe("phone", {"orientation": True, "position": True})
         self.assertEqual(sorted(everything.capabilities), ["camera", "orientation", "position"])
         self.assertEqual(everything.limits, {})

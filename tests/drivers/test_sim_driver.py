@@ -167,8 +167,7 @@ class SimDriverAloneTests(SynchronousTestCase):
         self.assertIn(encode_message(Motors(True)), self.robots[0].heard)
 
     def test_answers_every_switch(self) -> None:
-        """If a switch of the motors is requested while another one fails, all requests get the result of the last one.
-        """
+        """If a motor switch is requested while another one fails, all requests get the result of the last one."""
         again: list[Deferred[bool]] = []
         self.driver.enable().addErrback(lambda _: again.append(self.driver.enable()))
         last = self.driver.disable()
