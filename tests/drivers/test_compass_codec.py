@@ -12,9 +12,7 @@ from drivers.errors import BadFrame
 
 class HeadingTests(SynchronousTestCase):
     def test_reads_what_compasses_send(self) -> None:
-        """A sentence of a real compass gives a heading, corrected by the deviation, and whether it is true or
-        magnetic.
-        """
+        """Sentences of real compasses give a heading with its deviation applied, and whether it is true or magnetic."""
         for line, degrees, is_true in (
             (b"$HCHDG,98.3,0.0,E,12.6,W*57", 85.7, True),
             (b"$HCHDG,101.1,,,7.1,W*3C", 94.0, True),

@@ -284,8 +284,7 @@ class RosbridgeDriverTests(Conformance, RobotCase):
         self.assertEqual(driver.state, "ready")
 
     def test_is_described_by_its_options(self) -> None:
-        """The description lists the sensors of the topics, and a sideways limit if the options permit sideways motion.
-        """
+        """The description lists the topics' sensors, and a sideways limit if the options permit sideways motion."""
         holonomic = describe("rosbridge", {"max_vy": 0.3, "model": "Omni", "imu_topic": "/imu"})
         self.assertEqual(holonomic.limits["base.vy"], (-0.3, 0.3))
         self.assertIn("imu", holonomic.capabilities)

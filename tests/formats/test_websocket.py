@@ -77,8 +77,7 @@ class FrameTests(SynchronousTestCase):
         self.assertEqual((one.encode_close(), one.encode_ping(), one.encode_text(b"x")), (b"", b"", b""))
 
     def test_refuses_what_the_rfc_forbids(self) -> None:
-        """Masked frames from a server, extensions, unknown opcodes, invalid fragments and too large sizes are faults.
-        """
+        """Masked frames from a server, extensions, unknown opcodes, bad fragments and excessive sizes are faults."""
         part = b"\x7f" + (LONGEST // 2 + 1).to_bytes(8, "big") + bytes(LONGEST // 2 + 1)
         for said in (
             framed(TEXT, b"x", MASK),

@@ -102,8 +102,9 @@ class RobotsTests(SimulatorCase):
         self.assertIn("reached as a robot of another kind", self.failureResultOf(failed).getErrorMessage())
 
     def test_refuses_what_it_cannot_play(self) -> None:
-        """The error for an unknown dog, a kind without emulator, an unknown dialect or an invalid option contains its
-        name.
+        """An unknown dog, a kind without emulator, an unknown dialect and invalid options are rejected.
+
+        The error contains the invalid name.
         """
         aibo = {"kind": "aibo", "options": {"host": "127.0.0.1"}}
         cases: list[tuple[dict[str, Any], str]] = [

@@ -55,8 +55,7 @@ class SensorsTests(SynchronousTestCase):
         self.assertTrue(all(math.isnan(x) for x in self.run_for(0.1)["range.far"]))
 
     def test_sees_the_floor_with_the_chest(self) -> None:
-        """The range sensor on the chest measures 0.20 m to the floor, and less if an obstacle is in front of the feet.
-        """
+        """The range sensor on the chest measures 0.20 m to the floor, and less if an obstacle is at the feet."""
         self.assertLess(abs(statistics.fmean(self.run_for(0.4)["range.chest"]) - 0.204), 0.003)
         self.assertLess(self.mean_range("range.chest", 0.12), 0.15)
 

@@ -193,8 +193,7 @@ class SimulatorTests(SynchronousTestCase):
         self.assertEqual(told, [("dog1", 7, 2, 2), ("dog2", 0, 0, 0), ("dog3", 0, 0, 0)])
 
     def test_gives_up_a_silent_client(self) -> None:
-        """A driver that falls silent, and a client that never sends hello, are disconnected after ``SILENCE_LIMIT_S``.
-        """
+        """A driver that falls silent and a client that never sends hello are disconnected after ``SILENCE_LIMIT_S``."""
         stranger = Client(self.simulator)
         lively = Client(self.simulator)
         for _ in range(round(SILENCE_LIMIT_S / TICK_S) + 3):

@@ -145,9 +145,7 @@ class TaskTests(TeamCase):
         self.assertEqual(set(self.statuses(team).values()), {"IDLE"})
 
     def test_moved_target_is_reached(self) -> None:
-        """If the target moves while a dog walks to the target, a dog still reaches it, and only then does the task
-        complete.
-        """
+        """If the target moves while a dog walks to it, the task completes only when a dog has reached the target."""
         team = self.start_team()
         team.run_demo()
         self.until(team, lambda: bool(self.executing(team)))

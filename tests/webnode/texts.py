@@ -1,4 +1,4 @@
-"""The catalogues of the page's texts."""
+"""Load the catalogues of the page's texts."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ ROOM = Path(__file__).parents[2] / "webnode"
 
 
 def catalogue(language: str) -> dict[str, Any]:
-    """The texts of a language by key; a text with plural forms is a mapping."""
+    """Return the texts of a language by key; a text with plural forms is a mapping."""
     source = (ROOM / "static" / "texts" / f"{language}.js").read_text()
     found = re.fullmatch(r"export default (\{.*\});\n", source, re.DOTALL)
     assert found is not None, f"texts/{language}.js is not one object in JSON"

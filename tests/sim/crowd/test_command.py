@@ -28,8 +28,9 @@ from sim.robots.crowd.simulator import CrowdSimulator
 
 
 class PlayedTeam:
-    """A stub team: agents know their distance to the target and choose the nearest agent, which then reaches the
-    target.
+    """A stub team whose agents know their distance to the target.
+
+    They choose the nearest agent, which then reaches the target.
     """
 
     def __init__(
@@ -52,9 +53,7 @@ class PlayedTeam:
         self.switchboard.counters["sent"] += 10
 
     def get_statuses(self) -> Mapping[str, AgentStatus]:
-        """Return the status of each agent: no cost before the target is placed, then its distance and the chosen
-        agent.
-        """
+        """Return the status of each agent. There is no cost before the target is placed."""
         crowd, target = self.simulator.crowd, self.simulator.crowd.target
         if target is None:
             return {name: AgentStatus(None, "") for name in self.simulator.names}
@@ -81,9 +80,7 @@ class ImpatientTeam(PlayedTeam):
 
 class SearchTests(SynchronousTestCase):
     def test_moments_are_noted(self) -> None:
-        """``search`` records when agents first take part, see the target, agree and arrive, and whether the agent was
-        right.
-        """
+        """``search`` records when agents take part, see the target, agree and arrive, and whether the right one did."""
         outcome = run_search(PlayedTeam(1, 4, make_square_scene(9)), 1, 60.0, lambda: 0.0)
         self.assertEqual((outcome.engaged, outcome.first, outcome.found), (0.5, 5.0, 4))
         self.assertEqual((outcome.agree, outcome.reach, outcome.right), (6.5, 7.5, True))

@@ -173,8 +173,7 @@ class ControllerTests(SynchronousTestCase):
         self.assertGreater(int((speed > 0.1).sum()), 10)
 
     def test_sight(self) -> None:
-        """A robot sees a target that is close ahead, but not one that is behind, far away or hidden by another robot.
-        """
+        """A robot sees a target close ahead, but not a target that is behind, far away or hidden by another robot."""
         crowd = Crowd(1, CrowdScene(5, 12.0, 12.0))
         for body, (x, y, heading) in enumerate(
             (

@@ -38,9 +38,7 @@ def twin(crowd: Crowd) -> World:
 
 
 def one_by_one(world: World, crowd: Crowd, body: int) -> list[float]:
-    """Return the distances from ``body`` that ``segment_query_first`` measures, one ray at a time, in the rays'
-    directions.
-    """
+    """Return the lengths of the rays from ``body`` that ``segment_query_first`` measures one by one."""
     x, y, heading = (float(row[body]) for row in (crowd.x, crowd.y, crowd.heading))
     dog, found = world.dogs[f"dog{body}"], []
     for ray in range(RAYS):

@@ -105,8 +105,7 @@ class DrivenTests(SynchronousTestCase):
         self.assertEqual(self.simulator.driven_robots, [])
 
     def test_ranges(self) -> None:
-        """The near and far rangers measure from the robot's front to the obstacle, and return NaN beyond their range.
-        """
+        """The near and far rangers measure from the robot's front to an obstacle, and return NaN beyond their range."""
         driver = self.driver()
         for gap, near in ((0.3, True), (1.0, False)):
             self.crowd.place_target(1.0 + NOSE_M + gap + 0.08, 2.0)

@@ -81,9 +81,7 @@ class TrialTests(SynchronousTestCase):
         self.assertEqual((outcome.by, outcome.killed, outcome.digest), ("dog1", "", "digest 2"))
 
     def test_second_experiment_loses_the_dog_on_its_way(self) -> None:
-        """In experiment 2 the acting dog is killed once, the takeover time is measured, and each phase is drawn as a
-        PNG.
-        """
+        """In experiment 2 the acting dog is killed once, the takeover is timed, and each phase is drawn as a PNG."""
         folder = Path(self.mktemp())
         folder.mkdir()
         outcome = run_trial(PlayedTeam, 2, 2, folder)

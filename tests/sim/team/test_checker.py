@@ -1,5 +1,4 @@
-"""Tests of the invariant checker with handmade histories: a violation of each invariant, and similar valid histories.
-"""
+"""Tests of the invariant checker with handmade histories: violations of each invariant, and similar valid histories."""
 
 from __future__ import annotations
 

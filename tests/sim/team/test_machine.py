@@ -37,7 +37,7 @@ class MachineTests(SynchronousTestCase):
         """A timer that is repeatedly set for the remaining time reaches its deadline despite rounding."""
         rng = random.Random(1)
         for _ in range(300):
-            self.world = HeapClock(1e6 + rng.random())  # a clock that starts at a large value has a coarser resolution than a clock that starts at 0
+            self.world = HeapClock(1e6 + rng.random())  # floats are coarser here than near 0
             rate = rng.uniform(0.99, 1.01)
             machine = Machine(self.world, rate, -rate * self.world.seconds())
             turns: list[int] = []
