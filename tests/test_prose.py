@@ -51,7 +51,7 @@ def read_terms(text: str) -> dict[str, str]:
 
 
 def read_python(text: str) -> Iterator[tuple[int, str]]:
-    """Yield the docstrings and comments of a Python file, each with its line."""
+    """Yield the docstrings and comments of a Python file, each with its line number."""
     for node in ast.walk(ast.parse(text)):
         if isinstance(node, ast.Expr) and isinstance(node.value, ast.Constant) and isinstance(node.value.value, str):
             yield node.lineno, node.value.value
@@ -61,7 +61,7 @@ def read_python(text: str) -> Iterator[tuple[int, str]]:
 
 
 def read_markdown(text: str) -> Iterator[tuple[int, str]]:
-    """Yield the lines of a Markdown file without its code blocks and the targets of its links."""
+    """Yield the lines of a Markdown file, excluding its code blocks and the targets of its links."""
     is_code = False
     for number, line in enumerate(text.split("\n"), 1):
         if line.lstrip().startswith("```"):
@@ -124,7 +124,7 @@ class ProseTest(SynchronousTestCase):
         )
 
     def test_tree_breaks_no_rule(self) -> None:
-        """No file under version control has a phrase that a rule replaces."""
+        """No file under version control contains a phrase for which a rule has a replacement."""
         rules = RULES | read_terms(GLOSSARY.read_text())
         listed = subprocess.run(["git", "ls-files", "-z"], cwd=ROOT, capture_output=True, text=True, check=True)
         names = [name for name in listed.stdout.split("\0") if Path(name).suffix in READERS and (ROOT / name).exists()]

@@ -1,4 +1,4 @@
-"""Run schedules from the command line; see the package."""
+"""Run schedules from the command line; the docstring of the package explains the options."""
 
 from __future__ import annotations
 
@@ -75,7 +75,7 @@ def main() -> int:
 
 
 def numbers(told: str | None) -> tuple[int, ...] | None:
-    """Return the numbers of faults in ``--keep``."""
+    """Return the numbers of the faults in ``--keep``."""
     if told in (None, "none"):
         return None if told is None else ()
     named = str(told).split(",")
@@ -95,7 +95,7 @@ class Session:
         self._failed = self._ran = 0
 
     def run(self, seeds: range) -> int:
-        """Run all seeds; return 1 if one failed, or if none detected the seeded bug."""
+        """Run all seeds; return 1 if a schedule failed or, with a seeded bug, if none detected the bug."""
         args = self._args
         signal.signal(signal.SIGINT, self._interrupt)
         if not args.log:
@@ -119,12 +119,12 @@ class Session:
                 raise KeyboardInterrupt
 
     def _interrupt(self, *_: object) -> None:
-        """End after the present schedule: inside one, a Deferred would catch the interrupt as its failure."""
+        """End after the present schedule. During a schedule, a Deferred would catch the interrupt as its failure."""
         self._is_interrupted = True
         signal.signal(signal.SIGINT, signal.default_int_handler)
 
     def _print_failure(self, outcome: Outcome) -> None:
-        """Print the failure, and the line that replays its smallest variant."""
+        """Print the failure, and the command that replays its smallest variant."""
         say(f"FAILED  {line(outcome.seed, self._trim, self._args.bug)}")
         say(f"        {outcome.title}")
         for violation in outcome.found[:6]:
@@ -139,7 +139,7 @@ class Session:
         say(f"        {kept} of {whole.faults} faults are left, after {left.runs} runs: {left.outcome.found[0]}")
 
     def _log(self, seeds: range) -> None:
-        """Run the seeds in stretches, and log each one, also if it is interrupted."""
+        """Run the seeds in stretches; log each finished seed, even if the run is interrupted."""
         args, what = self._args, "+".join(self._trim.only)
         text = Path(args.log).read_text(encoding="utf-8") if os.path.exists(args.log) else ""
         logged = seed_log.parse_entries(text, args.log)
@@ -165,12 +165,12 @@ class Session:
 
 
 def until_then(moment: float) -> Callable[[], bool]:
-    """Return a function that tells whether ``moment`` has passed."""
+    """Return a function that returns whether ``moment`` has passed."""
     return lambda: time.monotonic() > moment
 
 
 def commit_of(tree: Path) -> str:
-    """Return the commit of the tree, with + if it has changes, or an empty string outside a repository."""
+    """Return the commit of the working tree, with + if it has changes; an empty string outside a repository."""
     asked = subprocess.run(
         ["git", "describe", "--always", "--dirty=+", "--exclude=*"], cwd=tree, capture_output=True, text=True
     )
@@ -178,7 +178,7 @@ def commit_of(tree: Path) -> str:
 
 
 def show_bugs(seeds: range, jobs: int, scheduler: str) -> int:
-    """Print for each bug the schedule that detected it, the number of schedules, and the violations."""
+    """Print, for each bug, the schedule that detected it, the number of schedules, and the violations."""
     hidden, started_at = 0, time.monotonic()
     say(f"{'bug':48s} {'workloads':16s} {'seed':>5s}  {'needed':>6s}  shows as")
     for bug, only, number, outcome in hunt_all(seeds, jobs, scheduler):
@@ -193,7 +193,7 @@ def show_bugs(seeds: range, jobs: int, scheduler: str) -> int:
 
 
 def say(text: str) -> None:
-    """Write a line at once."""
+    """Write a line and flush it immediately."""
     sys.stdout.write(text + "\n")
     sys.stdout.flush()
 

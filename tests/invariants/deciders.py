@@ -21,14 +21,14 @@ LINE = 12
 
 
 class Deciders(Workload):
-    """Reports of random teams, and bidders in a line, in addition to the schedule of ``schedule.seed``."""
+    """Lets random teams decide, and bidders in a line bid; independent of the faults in the schedule."""
 
     def __init__(self, schedule: Schedule) -> None:
         self._rng = random.Random(f"deciders/{schedule.seed}")
         self._found: list[str] = []
 
     def step(self) -> None:
-        """Let a small team decide."""
+        """Let a small team decide on random reports."""
         contacts = [Report(f"agent-{n:03d}", self._rng.choice([1.0, 1.0, 2.0])) for n in range(4)]
         views = [self._rng.sample(contacts, len(contacts)) for _ in contacts]
         assigned = sorted({str(Nearest().find(view).assigned_agent) for view in views})
@@ -54,7 +54,7 @@ class Deciders(Workload):
 
 
 def stopped(mission: Mission) -> dict[str, list[str]]:
-    """Return the owners of each task, for bidders in a line that each stop independently."""
+    """Return the owners of each task after bidders in a line have bid; each bidder stops independently."""
     names = mission.alive
     near = {a: [names[m] for m in (n - 1, n + 1) if 0 <= m < len(names)] for n, a in enumerate(names)}
     bidders = {}

@@ -1,4 +1,4 @@
-"""The workload of stores: full and corrupt disks, and S-a to S-c for nodes that lose power."""
+"""The workload of stores: full and corrupt disks; it checks S-a to S-c for nodes that lose power."""
 
 from __future__ import annotations
 
@@ -37,21 +37,21 @@ class Stores(Workload):
         schedule.team.watch_lives(self._born, lambda place, node: None)
         voters = min(schedule.n, 8)
         deaths = sum(len(fault.places) for fault in schedule.faults if fault.kind == "die")
-        # A corrupt store is one replica less; the invariants hold only while a majority remains.
+        # A corrupt store removes a replica; the invariants hold only if a majority of the replicas remains.
         if deaths + 1 <= voters // 2:
             killed = [place for fault in schedule.faults if fault.kind.startswith("kill") for place in fault.places]
             if killed:
                 schedule.team.planned_corruption[self._rng.choice(killed)] = self._rng.choice(["row", "file"])
 
     def step(self) -> None:
-        """Fill a disk, probe a full one, or free space."""
+        """Fill a disk, probe a full disk, or free space."""
         if self._full is None:
             alive = self._schedule.alive()
             if alive and self._rng.random() < 0.1:
                 place = self._rng.choice(alive)
                 self._full = (place, self._fleet.get_store(place))
                 self._full[1].writer.fault = FULL
-                # It may last longer than the other faults, but not longer than the repair interval.
+                # The fault may last longer than the other faults, but not longer than the repair interval.
                 self._fleet.clock.callLater(self._rng.choice([1.0, 4.0, 8.0]), self._make_room)
             return
         place, store = self._full
@@ -59,7 +59,7 @@ class Stores(Workload):
             self._probe(place, store)
 
     def make_final_requests(self) -> None:
-        """Check that all data is written by now."""
+        """Check that all data has been written by now."""
         for place in self._schedule.alive():
             store = self._fleet.get_store(place)
             if store.write_error:
@@ -68,7 +68,7 @@ class Stores(Workload):
             written.addErrback(self._unwritten, place)
 
     def find_violations(self) -> list[str]:
-        """Return the violations, after a comparison of memory and files."""
+        """Compare the data in memory with the files; return all violations."""
         for line in self._fleet.lost:
             self._say("S-a", line)
         for line in self._fleet.undetected:
@@ -92,7 +92,7 @@ class Stores(Workload):
                 self._fleet.clock.callLater(moment, self._read_early, place, node)
 
     def _read_early(self, place: int, node: EntangledNode) -> None:
-        """Read at a node with a corrupt store: it must not deny records that a majority holds."""
+        """Read at a node with a corrupt store, which must not deny records that a majority stores."""
         if place not in self._schedule.alive() or self._schedule.node(place) is not node:
             return
         for key in KEYS:
@@ -121,7 +121,7 @@ class Stores(Workload):
             self._say("S-c", f"node {place} does not write {RECOVERY:.0f} s after there was room: {store.write_error}")
 
     def _probe(self, place: int, store: CheckedStore) -> None:
-        """Write to the node with the full disk locally and from another node."""
+        """Write twice to the node whose disk is full: once locally, once from another node."""
         self._number += 1
         node = self._schedule.node(place)
         record = self._record(node)

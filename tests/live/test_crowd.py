@@ -32,7 +32,9 @@ CHANGE = """async () => {
 
 class CrowdTests(PageCase):
     def test_show_two_thousand(self) -> None:
-        """Two thousand devices are shown in time, a changed one is updated fast, and a filter finds some of them."""
+        """Two thousand devices are shown in time, a changed device is updated quickly, and a filter finds some
+        devices.
+        """
         self.team.order(f"crowd {COUNT}")
         for screen in (PHONE, DESK):
             page = self.tab(screen)
@@ -46,7 +48,7 @@ class CrowdTests(PageCase):
             page.context.close()
 
     def find(self, page: Any) -> None:
-        """Filter the devices by words, and by words without a match."""
+        """Filter the devices by words that match, and by words that do not."""
         page.locator("#filter").fill("gripper turtle")
         page.locator("#count", has_text=f"40 of {COUNT}").wait_for()
         self.assertEqual(page.locator("#devices > li").count(), 40)

@@ -116,8 +116,7 @@ class AdmissionTests(SynchronousTestCase):
         self.assertEqual(MembershipFile(Path(node.membership)).membership.member.roles, ("operator", "gateway"))
 
     def test_newcomer_hears_more_than_its_own_machine(self) -> None:
-        """A node that joins through another machine listens on all interfaces, any other node on the loopback address.
-        """
+        """A node that joins through another machine listens on all interfaces, other nodes on the loopback address."""
         found = self.done(invite.main, "dog9")
 
         def elsewhere(*knock: Any) -> Membership:
@@ -130,8 +129,7 @@ class AdmissionTests(SynchronousTestCase):
         self.assertEqual(Settings.load(near["settings"]).node.host, "127.0.0.1")
 
     def test_invite_and_join(self) -> None:
-        """With an invitation from the laptop a new member joins, and the verb writes files with which its node starts.
-        """
+        """With an invitation from the laptop a node joins, and the verb writes files with which the node starts."""
         code, output = self.run_verb(invite.main, "dog9")
         self.assertEqual(code, 0, self.said)
         self.assertIn("admits dog9, once, within 24 h", output)

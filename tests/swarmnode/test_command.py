@@ -46,8 +46,7 @@ class CommandTests(SynchronousTestCase):
         self.assertIn("pip install 'swarm-node[all]'", child.stderr)
 
     def test_help_of_a_node_verb_needs_no_twisted(self) -> None:
-        """Verbs that query a running node print their help without importing Twisted or msgpack, which would be slow.
-        """
+        """Verbs that query a running node print their help without importing Twisted or msgpack, to save time."""
         program = (
             "import sys\nfrom swarmnode import command as swarm\n"
             "try: swarm.main(['dht', '--help'])\n"

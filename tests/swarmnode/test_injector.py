@@ -49,9 +49,7 @@ class InjectorTests(SynchronousTestCase):
         return clock
 
     def test_takeover(self) -> None:
-        """An acting device that is killed, frozen, disconnected, muted or has a drained battery is replaced within 2
-        s.
-        """
+        """An acting device that is killed, frozen, disconnected, muted or without battery is replaced within 2 s."""
         for kind in ("kill", "freeze", "radio", "one-way", "battery"):
             self.assertTrue(KINDS[kind].is_lost)
             clock = self.takeover(Fault(kind, 4.0, KINDS[kind].amount))

@@ -52,9 +52,7 @@ class AuthorityTests(SynchronousTestCase):
         self.assertNotEqual(other.certificate.subject, first.certificate.subject)
 
     def test_vouch_for_the_local_network_alone(self) -> None:
-        """A client accepts the authority's certificates for private addresses and local names, but not for public
-        sites.
-        """
+        """A client accepts the authority's certificates for private addresses and local names, not for public sites."""
         signer = make_authority(SECRET, "vaio")
         for name in ("192.168.0.7", "10.1.2.3", "127.0.0.1", "fd00::7", "vaio.local", "vaio.home.arpa", "localhost"):
             self.assertTrue(

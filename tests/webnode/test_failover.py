@@ -62,8 +62,7 @@ class TeamFallbacksTests(FleetCase):
         return swarm, webs
 
     def test_know_each_other(self) -> None:
-        """Each web node lists its own page first and then the page of the other, and accepts requests from that page.
-        """
+        """Each web node lists its own page first, then the page of the other, and accepts requests from that page."""
         _, (first, second) = self.web_nodes()
         self.assertEqual([page.url for page in first.list_pages()], ["http://127.0.0.1:8080", "http://127.0.0.1:8081"])
         self.assertEqual([page.is_self for page in second.list_pages()], [True, False])
@@ -73,8 +72,7 @@ class TeamFallbacksTests(FleetCase):
         self.assertFalse(first.is_allowed_origin("http://192.168.0.9:8081"))
 
     def test_vouch_in_an_open_team(self) -> None:
-        """In an open team a node may vouch for sessions if it serves the page, or has served it within the last hour.
-        """
+        """In an open team a node may vouch for sessions if it serves the page, or has served it in the last hour."""
         swarm = self.swarm(3)
         first, second = (TeamFallbacks(node, swarm.clock.seconds) for node in swarm.nodes[:2])
         for place, web in enumerate((first, second)):

@@ -121,8 +121,7 @@ class EventStreamsTests(SynchronousTestCase):
         self.assertEqual(events_in(program.taken()), [("state", {"resync": False, "n": 1})])
 
     def test_resume(self) -> None:
-        """A page that reconnects with its last id, in a header or the query, receives only the changes that it missed.
-        """
+        """A page that reconnects with its last id, in a header or the query, receives only the changes it missed."""
         self.state["more"] = MORE
         page = self.connected()
         heard = last_id(page.taken())
@@ -239,9 +238,7 @@ class EventStreamsTests(SynchronousTestCase):
         self.assertGreaterEqual([words for name, words in told if name == "beat"][-1]["skipped"], 5)
 
     def test_spare_slow_pages_the_past(self) -> None:
-        """A page that has missed too many changes, or more data than the state, receives the state, marked as a
-        resync.
-        """
+        """A page that has missed too many changes, or more data than the state, receives the state as a resync."""
         for more, missed in ((MORE, MAX_CHANGES + 2), ("", 4)):
             self.state.update({"more": more, "n": 0})
             slow = self.connected()

@@ -29,9 +29,7 @@ class StateCacheTests(SynchronousTestCase):
 
 class StopViewTests(SynchronousTestCase):
     def test_more_stops_than_a_robot_reports(self) -> None:
-        """If a robot reports as many stops as fit into its record, it is shown as stopped, even if more stops are in
-        force.
-        """
+        """A robot that reports as many stops as fit into its record is shown as stopped, even if more are in force."""
         stops = {f"{number:032x}": "ann" for number in range(MAX_STOPS + 1)}
         for count, is_halted in ((MAX_STOPS, True), (MAX_STOPS - 1, False)):
             robot = {"name": "dog1", "capabilities": {"base2d": {}}, "status": "IDLE", "obeys": STANDS_STILL}

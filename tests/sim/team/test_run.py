@@ -68,8 +68,7 @@ class RunTests(SynchronousTestCase):
         return run, [(round(now - began, 6), event, place) for now, event, place in events if now >= began]
 
     def test_workloads_act_while_it_lasts(self) -> None:
-        """Workloads step at the scenario's interval, are told when the repair ends, and are compared with the targets.
-        """
+        """Workloads step at the scenario's interval, are told when the repair ends, and are compared to the targets."""
         run = Run(replace(BASE, repair=5.0, targets=(("steps", Bound(19)),)), 1, KINDS)
         outcome = run.run()
         workload = run.workloads[0][1]
