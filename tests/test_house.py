@@ -415,8 +415,7 @@ class PackagingTests(SynchronousTestCase):
         self.assertEqual(list((ROOT / "twisted").rglob("__init__.py")), [])
 
     def test_nobody_else_owns_our_names(self) -> None:
-        """No other installed distribution has a top-level package with the name of ours, because the files would mix.
-        """
+        """No other installed distribution has a top-level package with the same name as ours: the files would mix."""
         owners = packages_distributions()
         foreign = {
             room: others

@@ -1,8 +1,14 @@
-"""Deciders: agents that receive the same reports decide the same, for each order of the reports.
+"""Check that agents that receive the same reports reach the same decision, in any order of the reports.
 
-C1  agents with the same reports in any order assign the same agent            (E7, S3) C2  an invalid report is never
-assigned, and does not change the assignment    (S4) C3  among 300 agents the cheapest is found, as among three C4  if
-bidders stop by the stopping rule, no task has two owners
+Invariants (in brackets: the invariants of a whole team that follow from them):
+
+C1: agents with the same reports in any order assign the same agent (E7, S3).
+
+C2: an invalid report is never assigned, and does not change the assignment (S4).
+
+C3: among 300 agents the agent with the lowest cost is found, as among three.
+
+C4: if bidders stop by the stopping rule, no task has two owners.
 """
 
 from __future__ import annotations

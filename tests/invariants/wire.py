@@ -125,7 +125,7 @@ class Wire(Workload):
                 self._history.record(TableSize, place, what, size, cap)
         return []
 
-    # -- injected datagrams (R1, R3) --------------------------------------------------------------------------------
+    # -- injected datagrams (invariants R1, R3) ---------------------------------------------------------------------
 
     def _shoot(self, place: int) -> None:
         """Inject a datagram that the node must drop; compare the node's state before and after."""
@@ -202,7 +202,7 @@ class Wire(Workload):
         half_open = len(node.endpoint._half_open._unconfirmed)
         self._history.record(TableSize, place, "handshakes with who showed no cookie", half_open, FLOOD * 4 // 5)
 
-    # -- requests (R2) ----------------------------------------------------------------------------------------------
+    # -- requests (invariant R2) ------------------------------------------------------------------------------------
 
     def _born(self, place: int, node: EntangledNode) -> None:
         self._born_at[self._schedule.team.address(place)] = self._schedule.team.clock.seconds()
@@ -226,7 +226,7 @@ class Wire(Workload):
         asking = self._schedule.node(requester).endpoint.ask(contact, "run", number, changes=True)
         record_outcome(self._history, asked, asking, shown)
 
-    # -- tables (R4) ------------------------------------------------------------------------------------------------
+    # -- tables (invariant R4) --------------------------------------------------------------------------------------
 
     def _tables(self, node: EntangledNode) -> list[tuple[str, int, int]]:
         """Return all tables that peers can fill, with their sizes and limits."""

@@ -32,9 +32,7 @@ class Puppet(LineReceiver):
         self._driver = driver
 
     def lineReceived(self, line: bytes) -> None:  # noqa: N802 (Twisted's)
-        """Execute a command: walk for some seconds and print the deadline, or print the state of the dead man's
-        switch.
-        """
+        """Walk for some seconds and print the deadline, or print the state of the dead man's switch."""
         word, *numbers = line.decode().split()
         if word == "walk":
             deadline = REACTOR.seconds() + float(numbers[0])

@@ -184,8 +184,7 @@ class ActionPageTests(PageCase):
         self.assertEqual(self.faults, [])
 
     def test_be_accessible(self) -> None:
-        """On phone and desktop, in light and dark colours, the page of a stopped team has no accessibility violation.
-        """
+        """On phone and desktop, in light and dark, the page of a stopped team has no accessibility violation."""
         for screen in (PHONE, DESK):
             page = self.opened(screen)
             page.locator(".preview li").first.wait_for(state="attached")

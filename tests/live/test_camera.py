@@ -49,8 +49,9 @@ class LiveCameraTests(TestCase):
     timeout = 30
 
     async def test_camera_never_holds_the_reactor_up(self) -> None:
-        """A blocking camera blocks only its own thread, a lost camera is opened again, and ``disconnect`` ends the
-        thread.
+        """A blocking camera blocks only its own thread.
+
+        A lost camera is opened again; ``disconnect`` ends the thread.
         """
         lens = SlowLens()
         film = ThreadedStream(lens, reactor.callFromThread)
@@ -72,8 +73,7 @@ class LiveCameraTests(TestCase):
         self.assertEqual(lens.closed, 2)
 
     def test_shows_a_video_by_the_clock(self) -> None:
-        """The frames of a video are complete, are scaled to the requested size, and repeat after the end of the video.
-        """
+        """The frames of a video are complete, have the requested size, and repeat after the end of the video."""
         import cv2
         import numpy
 

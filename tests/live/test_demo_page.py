@@ -57,8 +57,7 @@ class DemonstrationPageTests(DemonstrationPageCase):
         self.look(self.opened(DESK))
 
     def drive(self, page: Any) -> None:
-        """Run the demo, stop and release the team, then open a device, message it, disconnect it, and move the target.
-        """
+        """Run the demo, stop and release the team; open, message and disconnect a device, and move the target."""
         self.fits(page)
         page.locator("#demo").tap()
         self.stop(page)

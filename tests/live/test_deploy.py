@@ -141,8 +141,9 @@ class DeployTests(NamespaceCase):
             self.assertEqual(self.run_line(net, "w2", "dog1", command).strip(), "200")
 
     def test_over_the_internet(self) -> None:
-        """The page's lines work for a rented computer with a firewall and laptops behind routers, one of them without
-        UDP.
+        """The page's lines work for a rented computer with a firewall and laptops behind routers.
+
+        One of the laptops has no UDP.
         """
         sites = [Site("o", NatKind.PORT), Site("h", NatKind.PORT), Site("u", NatKind.NOUDP)]
         with Internet(sites) as net:

@@ -18,8 +18,9 @@ WORDS = (b"red target", b"EXECUTING", b"capabilities", b"camera")
 
 
 class ExperimentsBehindRoutersTests(NamespaceCase):
-    """dog1 is behind a port restricted router, dog2 behind a symmetric router, and dog3 on the LAN of the bootstrap
-    node.
+    """dog1 is behind a port restricted router, dog2 behind a symmetric router.
+
+    dog3 is on the LAN of the bootstrap node.
     """
 
     def test_both_experiments_hold(self) -> None:

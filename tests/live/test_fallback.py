@@ -69,9 +69,7 @@ class FallbackTests(BrowserCase):
         self.page.locator(".device[data-state=IDLE]", has_text="dog3").wait_for()
 
     def test_go_on_after_a_freeze(self) -> None:
-        """After a SIGSTOP, although the frozen node still accepts connections, the page sends the request to the other
-        node.
-        """
+        """After a SIGSTOP, when the frozen node still accepts connections, the page uses the other node."""
         self.opened()
         os.kill(self.pid(0), signal.SIGSTOP)
         self.page.locator("#demo").click()

@@ -46,9 +46,7 @@ class FaultPageTests(PageCase):
         self.assertEqual(page.locator("#place-device .fault").count(), 1)
 
     def test_be_accessible(self) -> None:
-        """On phone, tablet and desktop, in light and dark, axe finds no violation, and no button is too small or cut
-        off.
-        """
+        """On phone, tablet and desktop, light and dark, axe finds no violation, and no button is small or cut off."""
         for screen in (PHONE, TABLET, DESK):
             page = self.opened(screen)
             if screen is PHONE:

@@ -99,9 +99,7 @@ class HttpsTests(NodeCase):
         self.assertIn(b"vaio", asked(node.secure, self.trusting(node, maximum_version=ssl.TLSVersion.TLSv1_2)))
 
     def keep_the_guard(self, node: SecureNode) -> None:
-        """Check that requests that the plain port refuses, such as for a different host or origin, are refused over
-        TLS.
-        """
+        """Check that requests that the plain port refuses, such as for another host, are also refused over TLS."""
         trust = self.trusting(node)
         for path, headers, body, status in (
             ("/api/v1/state", {}, None, 401),
@@ -132,9 +130,7 @@ class HttpsTests(NodeCase):
         self.assertEqual(ssl.get_server_certificate(("127.0.0.1", again.port)), before)
 
     def let_go_who_dribbles_a_handshake(self, node: SecureNode) -> None:
-        """Check that forty clients with slow, silent or invalid handshakes are closed in time, while others are
-        served.
-        """
+        """Check that forty clients with slow, silent or invalid handshakes are closed, while others are served."""
         began = time.monotonic()
         slow = [socket.create_connection(("127.0.0.1", node.port), 5.0) for _ in range(40)]
         for client in slow:

@@ -41,9 +41,7 @@ class PathsTests(PageCase):
         self.sound_by_day_and_night(page)
 
     def test_tell_who_was_turned_away(self) -> None:
-        """If several nodes report the same rejection, one line shows the peer, the reporters, the reason and the
-        remedy.
-        """
+        """A rejection that several nodes report is one line with the peer, the reporters, the reason and the remedy."""
         page = self.open_network(DESK)
         told = [item.inner_text().split("\n") for item in page.locator("#refusals li").all()]
         self.assertEqual(

@@ -129,8 +129,7 @@ class ChannelTests(SynchronousTestCase):
         self.assertTrue(self.is_closed(idle))
 
     def test_abort_who_does_not_hang_up(self) -> None:
-        """A rejected client that does not close the connection is soon disconnected, and its further data is ignored.
-        """
+        """A rejected client that does not close the connection is soon disconnected; its further data is ignored."""
         connection = self.opened()
         connection.send(b"GET / HTTP/1.1\r\n")
         self.clock.advance(HEADERS_LIMIT_S)
