@@ -140,7 +140,7 @@ LAYERS: dict[str, Layer] = {
     ),
     "swarmnode": Layer("settings in, a running node out; the `swarm` command", TOP),
 }
-"""From the bottom to the top.  A module belongs to the longest matching name."""
+"""The layers from bottom to top.  A module belongs to the layer with the longest matching name."""
 
 
 def layer_of(module: str) -> str:

@@ -28,7 +28,7 @@ RULES = {
     r"on purpose|might well|as it were|so to speak|for good and all": "deliberately, can",
     r"(?<=[.:] )What (?:is|was|are|were|has|had|it|they|a|the)\b[^?\n]*(?=[.\n])": "name the thing, not 'what ...'",
 }
-"""Regular expressions of phrases that have to be read twice, and their replacement."""
+"""Regular expressions of phrases that have to be read twice, each with its replacement."""
 
 EXCEPTIONS = {
     ("CHANGELOG.md", "*"): "tells the history, with the names of its time",

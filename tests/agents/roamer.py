@@ -88,7 +88,7 @@ class Roamer:
         self.behaviour.embody(self.motion)
         self.now = 0.0
         self.hardest = 0.0
-        """The highest speed in m/s at a contact with an object."""
+        """The highest speed in m/s at which the robot has touched an object."""
         self.done: Action = {}
         self.reversals = 0
         self._kind = kind

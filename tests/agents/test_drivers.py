@@ -32,7 +32,7 @@ STEPS = 2
 TICK_S = 0.048
 FPS = {"bittle": 5.0}
 TOUCH = 0.15
-"""The largest distance to the target, in metres, that counts as reached."""
+"""The largest distance to the target, in metres, at which the target counts as reached."""
 
 
 class DogBody:

@@ -15,7 +15,7 @@ from sim.robots.emulator.bittle import BEHAVIOUR_S, UNSUPPORTED_TOKENS, Bittle
 from tests.drivers.contract import KeptLink, RobotCase
 
 GAITS = {"wkF": [0.1, 0.0], "trF": [0.15, 0.0], "bk": [-0.05, 0.0], "vtL": [0.0, 0.5], "vtR": [0.0, -0.5]}
-"""Measured gaits: the conformance tests command 0.1 m/s, which these contain exactly."""
+"""Measured gaits, one of which has exactly the 0.1 m/s that the conformance tests command."""
 
 
 class BittleCase(RobotCase):

@@ -45,7 +45,7 @@ class Part(BaseDriver):
         )
         self.opened = self.closed = 0
         self.t = 100.0
-        """The part's clock has another origin."""
+        """The time of the part, whose clock has a different origin."""
 
     def tell(self, frame: Frame | None = None, **values: Value) -> None:
         if not self._is_up:

@@ -39,11 +39,11 @@ class Deciders(Workload):
         views = [self._rng.sample(contacts, len(contacts)) for _ in contacts]
         assigned = sorted({str(Nearest().find(view).assigned_agent) for view in views})
         if len(assigned) > 1:
-            self._found.append(f"C1: {' and '.join(assigned)} are assigned by equal reports")
+            self._found.append(f"C1: {' and '.join(assigned)} are assigned from equal reports")
         bad = Report("agent-bad", self._rng.choice([math.nan, math.inf, -math.inf, -1.0]))
         view = self._rng.sample([*contacts, bad], len(contacts) + 1)
         if str(Nearest().find(view).assigned_agent) not in assigned:
-            self._found.append(f"C2: a cost of {bad.cost} makes {Nearest().find(view).assigned_agent} win")
+            self._found.append(f"C2: a cost of {bad.cost} gets {Nearest().find(view).assigned_agent} assigned")
 
     def make_final_requests(self) -> None:
         """Let a large team decide once, and a line of bidders bid until all have stopped."""

@@ -27,7 +27,7 @@ from middleware.tasks.task import ORDER, RESULT, TASKS, Member, Result, Task, gr
 PRESENCE = 1.0
 REPEAT = 0.5
 OPERATOR = 0
-"""The place of the node without a robot."""
+"""The place of the operator's node, which has no robot."""
 
 
 @dataclass
@@ -57,7 +57,7 @@ class Ether:
         self.rng = rng
         self.conditions = NetworkConditions()
         self.side: dict[int, int] = {}
-        """Nodes with different numbers cannot reach each other."""
+        """The partition of each node; nodes in different partitions cannot reach each other."""
         self.replicas = [Replica() for _ in range(n + 1)]
         self.nodes: dict[int, Node] = {}
         self.acknowledged: dict[str, tuple[Result, float]] = {}

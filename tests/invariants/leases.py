@@ -25,9 +25,9 @@ from sim.team.shrinking import NO_REDUCTION, Reduction
 
 TTL = 1.5
 SLACK = 0.8
-"""E3: the maximum time beyond the TTL until another agent executes, if only the executor has failed."""
+"""The maximum time in seconds beyond the TTL until another agent executes, if only the executor has failed (E3)."""
 LEAVE = 0.2
-"""The maximum time until a standby holds a returned lease, beyond the time to stop."""
+"""The maximum time in seconds, beyond the time to stop, until a standby gets a returned lease."""
 
 
 KINDS = (
@@ -159,7 +159,7 @@ class Leases(LeaseTeam):
                 lease_client.claim()
         # A restarted member is silent for one TTL, and a device may have to report its token first.
         since, most = self.clock.seconds(), 2 * self.ttl + SLACK + 1.0
-        if not self._wait_for_command(task_id, f"all is well with {task_id}", 0, since, most, most):
+        if not self._wait_for_command(task_id, f"there are no faults, task {task_id}", 0, since, most, most):
             return
         self.clock.advance(self._schedule_rng.uniform(0.7, 1.3) * self.ttl)
         _, token, holder = self.recorder.accepted[task_id][-1]
@@ -173,7 +173,7 @@ class Leases(LeaseTeam):
         left_at = self.clock.seconds()
         self.nodes[holder].leave(task_id)
         within = self.stop_time + LEAVE + 0.1 + 0.1 * len(self.agents)
-        self._wait_for_command(task_id, f"{holder} gives {task_id} back", token, left_at, within, 2 * self.ttl + SLACK)
+        self._wait_for_command(task_id, f"{holder} returns {task_id}", token, left_at, within, 2 * self.ttl + SLACK)
         self.nodes[holder].get_lease_client(task_id).stand_by(len(self.agents))
 
     def _depart_suddenly(self, task_id: str, token: int, holder: int) -> None:
@@ -199,7 +199,7 @@ class Leases(LeaseTeam):
             # A robot that this agent has moved must stop first.
             within += self.stop_time if self.nodes[fickle].has_lease(task_id) else 0.0
             self.nodes[fickle].leave(task_id)
-        why = f"{holder} of {task_id} is gone ({how})"
+        why = f"{holder}, holder of {task_id}, has failed ({how})"
         self._wait_for_command(task_id, why, token, gone_at, within, 3 * self.ttl + SLACK)
         self._heal()
 

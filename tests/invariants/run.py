@@ -50,9 +50,9 @@ WORKLOADS: dict[str, Callable[[Schedule], Workload]] = {
 }
 """The workloads that share a world, in the order in which they act."""
 ALONE: dict[str, Callable[[int, Reduction], Alone]] = {"tasks": Tasks, "leases": Leases, "groups": Groups}
-"""The workloads with separate worlds and faults."""
+"""The workloads that have their own world and faults."""
 SHARES = {"records": 0.15, "tuples": 0.06, "stores": 0.06, "wire": 0.06, "deciders": 0.06, "groups": 0.06}
-"""The share of schedules with each workload, unless it is requested; the others are in all schedules."""
+"""The share of schedules that contain a workload if it is not requested. All other workloads are in every schedule."""
 
 
 @dataclass(frozen=True)

@@ -60,7 +60,7 @@ HONEST = ("ann", "bob", "web")
 ROBOTS = ("dog1", "dog2", "dog3")
 NODES = (*HONEST, *ROBOTS)
 OUTSIDE = "invented"
-"""The signer with a key of no member."""
+"""The signer whose key belongs to no member."""
 
 
 class Violation(AssertionError):
@@ -422,7 +422,7 @@ class Net:
         for name in ROBOTS:
             life = self.lives.get(name)
             if life is not None and self.owed[name] and not life.stop_state.is_motion_forbidden:
-                raise Violation(f"after {what} {name} may move, though {len(self.owed[name])} stops are not released")
+                raise Violation(f"after {what} {name} may move, although {len(self.owed[name])} stops are not released")
 
     def step(self) -> None:
         """Run one random event."""
@@ -473,7 +473,7 @@ class Net:
             self.check("the end")
         standing = [name for name in ROBOTS if self.lives[name].stop_state.is_motion_forbidden]
         if standing:
-            raise Violation(f"no release lets {', '.join(standing)} go on")
+            raise Violation(f"{', '.join(standing)} remain stopped after the release")
 
 
 def run(seed: int, counts: Counter[str]) -> None:
@@ -500,8 +500,10 @@ def _is_msgpack(value: bytes | None) -> bool:
 def main() -> int:
     """Run the command; return 1 if a sequence failed."""
     parser = argparse.ArgumentParser(prog="python -m tests.invariants.stops", description=__doc__)
-    parser.add_argument("--sequences", type=int, default=10_000, help="how many to run (default 10000)")
-    parser.add_argument("--seed", type=int, default=1, help="the seed of the first; the others follow (default 1)")
+    parser.add_argument("--sequences", type=int, default=10_000, help="number of sequences (default 10000)")
+    parser.add_argument(
+        "--seed", type=int, default=1, help="first seed; the next sequences use the next seeds (default 1)"
+    )
     args = parser.parse_args()
     counts: Counter[str] = Counter()
     failed = 0

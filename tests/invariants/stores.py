@@ -20,7 +20,7 @@ FULL = "database or disk is full"
 EARLY = (0.05, 0.1, 0.2, 0.5, 1.0, 2.0)
 """The times in seconds at which a node with a corrupt store is read."""
 RECOVERY = 2.0
-"""The time in seconds within which a node writes again after space is available (S-c)."""
+"""The time in seconds within which a node must write again after space has become available (S-c)."""
 
 
 class Stores(Workload):
@@ -63,7 +63,7 @@ class Stores(Workload):
         for place in self._schedule.alive():
             store = self._fleet.get_store(place)
             if store.write_error:
-                self._say("S-c", f"node {place} does not write again: {store.write_error}")
+                self._say("S-c", f"node {place} has not resumed writing: {store.write_error}")
             written = store.wait_for_write()
             written.addErrback(self._unwritten, place)
 
@@ -101,7 +101,7 @@ class Stores(Workload):
 
     def _read(self, records: list[Record], place: int, key: bytes) -> None:
         if not records and self._is_held(key):
-            self._say("S-b", f"node {place}, whose store has rotted, finds nothing under {key.hex()[:6]}")
+            self._say("S-b", f"node {place}, whose store is corrupt, finds no record under {key.hex()[:6]}")
 
     def _is_held(self, key: bytes) -> bool:
         holders = [place for place in self._schedule.alive() if self._fleet.get_store(place).get(key)]
@@ -118,7 +118,7 @@ class Stores(Workload):
 
     def _recovered(self, place: int, store: CheckedStore) -> None:
         if store.write_error and not store.writer.is_closed and not store.writer.fault:
-            self._say("S-c", f"node {place} does not write {RECOVERY:.0f} s after there was room: {store.write_error}")
+            self._say("S-c", f"node {place} does not write {RECOVERY:.0f} s after space was freed: {store.write_error}")
 
     def _probe(self, place: int, store: CheckedStore) -> None:
         """Write twice to the node whose disk is full: once locally, once from another node."""
@@ -130,7 +130,7 @@ class Stores(Workload):
         except Unwritable:
             pass
         else:
-            self._say("S-c", f"node {place} takes a record while its disk is full")
+            self._say("S-c", f"node {place} accepts a record while its disk is full")
         if not node._running:
             self._say("S-c", f"node {place} left because its disk is full")
         others = [other for other in self._schedule.alive() if other != place]
@@ -148,7 +148,7 @@ class Stores(Workload):
     def _refused(self, failure: Failure, place: int) -> None:
         failure.trap(EntangledError)
         if "internal" in str(failure.value):
-            self._say("S-c", f"node {place} does not say why it takes nothing: {failure.value}")
+            self._say("S-c", f"node {place} does not report why it rejects the record: {failure.value}")
 
     def _record(self, node: EntangledNode) -> Record:
         name = f"probe {self._number}"

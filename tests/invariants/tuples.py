@@ -33,11 +33,12 @@ MOST_WAITING = 6
 SWEEP = 3.0
 """The time in seconds after the repair interval at which a client takes all remaining tuples."""
 FETCH = 5.0
-"""The time in seconds after which a client waits for each tuple that still remains.  The rest of the run has time for
-two rounds in which the council waits for a failed member (1.5 s each): one may be outbid by a taker's bid before its
-failure, and the next one knows the counter of this bid.  A sweep that took a tuple ends after the first round, as
-``get_many`` may, and a second sweep from another node starts at the same tuple: a tuple that both leave is not
-necessarily stuck."""
+"""The time in seconds after which a client waits for each tuple that remains.
+
+The rest of the run has time for two rounds of 1.5 s each, in which the council waits for a failed member.  The first
+round may be outbid by a bid that a taker made before it failed; the second round knows the counter of that bid.
+Sweeps are not enough: a sweep that took a tuple ends after the first round, like ``get_many``, and a sweep from
+another node starts at the same tuple.  So a tuple that two sweeps leave is not necessarily stuck."""
 
 
 class Tuples(Workload):
@@ -74,7 +75,7 @@ class Tuples(Workload):
         """Let all nodes read all tuples, put the bell, and take the remaining tuples, finally one by one."""
         for place, space in sorted(self._spaces.items()):
             self._survey(place, space)
-            self._listen(f"node {place}, which waits in the calm", space)
+            self._listen(f"node {place}, which waits without faults", space)
         self._clock.callLater(1.0, self._ring)
         self._clock.callLater(SWEEP, self._sweep)
         self._clock.callLater(FETCH, self._fetch)
@@ -105,7 +106,7 @@ class Tuples(Workload):
 
     def _wait(self, place: int, space: TupleSpace) -> None:
         if self._spaces.get(place) is space:
-            self._waiting[place] = self._listen(f"node {place}, which waits through it all", space)
+            self._waiting[place] = self._listen(f"node {place}, which waits from the start", space)
 
     def _left(self) -> list[StoredTuple]:
         """Return the acknowledged tuples that were not taken and must still be available."""

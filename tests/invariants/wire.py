@@ -45,7 +45,7 @@ STRANGER = Address("10.66.6.6", 666)
 REMEMBERED = 6
 """The number of datagrams stored for each node and type."""
 FLOOD = 150
-"""The number of handshakes that a client with the team's key starts at once: above the limit without a cookie."""
+"""The number of simultaneous handshakes of a client with the team's key; it exceeds the limit without a cookie."""
 
 
 @implementer(ILogObserver)

@@ -34,7 +34,7 @@ FLAGS = [
     *("--disable-component-update", "--disable-sync", "--disable-dev-shm-usage"),
 ]
 DISC = 66
-"""The diameter in pixels of the red disc in the camera's picture, of 104."""
+"""The diameter of the red disc in the camera's picture, in pixels of a picture that is 104 pixels wide."""
 PHONE = {"viewport": {"width": 412, "height": 839}, "has_touch": True}
 TABLET = {"viewport": {"width": 820, "height": 1180}, "has_touch": True}
 DESK = {"viewport": {"width": 1280, "height": 800}}
@@ -42,7 +42,7 @@ VIEWS = ("tasks", "cameras", "map", "groups", "network", "events", "more", "devi
 TEXTS = catalogue("en")
 """The texts that the page shows in the tests' browser."""
 PATIENCE_MS = 45_000
-"""The timeout of a wait, for a loaded machine; a page that is in time is not delayed."""
+"""The timeout of a wait, for a loaded machine; a wait ends as soon as its condition is true."""
 INFORMED = """async () => {
   const { model } = await import("/static/model.js");
   while (!model.has.includes("invites")) await new Promise((done) => setTimeout(done, 20));
@@ -136,7 +136,7 @@ class Team:
     """A team and its page, served by a child process; ``order`` changes the content of the page."""
 
     _idle: list[subprocess.Popen[str]] = []
-    """Processes that serve no team at present."""
+    """Processes that are running but serve no team now."""
 
     def __init__(self, port: int = 0) -> None:
         self._process = Team._idle.pop() if Team._idle else self._started()

@@ -51,7 +51,7 @@ from webnode.state import DepartedDevices, State, format_state
 reactor: Any = _reactor
 PASSWORD = hash_password("correct horse", bytes(16), 4)
 FPS = 5
-"""Pictures of a camera per second: enough for the page to show that they move."""
+"""Frames per second of a camera: enough that the page shows motion."""
 HUES = {"dog1": (70, 90, 150), "dog2": (70, 150, 90), "dog3": (150, 100, 70)}
 
 

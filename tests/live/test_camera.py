@@ -99,4 +99,4 @@ class LiveCameraTests(TestCase):
         self.assertEqual((shades[:6], sizes), ([0, 1, 2, 0, 1, 2], {(32, 24, 24, 32)}))
 
     if find_spec("cv2") is None:
-        test_shows_a_video_by_the_clock.skip = "NO VIDEO IS SHOWN: install the extra vision"  # type: ignore[attr-defined]
+        test_shows_a_video_by_the_clock.skip = "VIDEOS ARE NOT TESTED: install the extra vision"  # type: ignore[attr-defined]

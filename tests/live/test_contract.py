@@ -21,8 +21,8 @@ STREAMS = ("/events", "/shot/{uuid}")
 SIGNING_OUT = "delete_session"
 CHECKS = ("not_a_server_error", "status_code_conformance", "content_type_conformance", "response_schema_conformance")
 KNOWN = {"uuid": ["01" * 16, "02" * 16, "99"], "task_id": ["t1", "t9"]}
-"""Names of present objects and of a missing one, as random names would find none.  The third dog does not answer, for
-which the page returns 504."""
+"""Ids of existing objects, and one of a missing object, because random ids match no object.  The third dog does not
+reply, so the page returns 504."""
 LIMIT_S = 170
 
 

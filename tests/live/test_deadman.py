@@ -36,13 +36,13 @@ from tests.live.test_aibo_socket import free_ports
 from tests.live.waiting import CLOCK, until, wait
 
 if not Path("/proc/self/stat").exists():
-    raise SkipTest("looks at processes in /proc")
+    raise SkipTest("the test needs /proc")
 HAS_SERIAL = find_spec("serial") is not None
 
 ROOT = Path(__file__).resolve().parents[2]
 REACTOR: Any = reactor
 LATE_S = 0.4
-"""The maximum time in seconds until the robot stands, after the deadline or the death of its node."""
+"""The maximum time in seconds until the robot stands still after its deadline or the end of its node."""
 
 
 @dataclass

@@ -13,9 +13,9 @@ SMALL = """index => {
   small.drawImage(seen, 0, 0, 26, 20);
   return Array.from(small.getImageData(0, 0, 26, 20).data);
 }"""
-"""A camera's picture, scaled down to average its noise."""
+"""Return a camera's picture, scaled down to average its noise."""
 MOVED = 4.0
-"""A mean difference of two such pictures, of 255, above the noise and below the change by a turning dog."""
+"""A mean pixel difference (0 to 255) of two such pictures: above the noise, below the change when a dog turns."""
 
 
 STOPPED = """async () => {
@@ -34,9 +34,9 @@ STOPPED = """async () => {
   }
   return { took, moved };
 }"""
-"""Press stop while a dog moves; return the milliseconds until all stand in the view from above, and later motions."""
+"""Press stop while a dog moves; return the milliseconds until all dogs stand still on the map, and later motions."""
 STANDING_MS = 6000.0
-"""The limit until all stand: 200 ms to brake, a view that is 200 ms old, and the rest for a loaded machine."""
+"""The time limit until all dogs stand still: 200 ms to brake, 200 ms age of the map, the rest for a loaded machine."""
 
 
 class DemonstrationPageTests(DemonstrationPageCase):

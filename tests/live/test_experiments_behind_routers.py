@@ -14,7 +14,7 @@ from tests.live.namespaces import NamespaceCase
 
 LIMIT_S = 400.0
 WORDS = (b"red target", b"EXECUTING", b"capabilities", b"camera")
-"""Words that the team sends; a word of four letters occurs in six million random bytes by chance now and then."""
+"""Words that the team sends.  Shorter words could occur by chance in six million random bytes."""
 
 
 class ExperimentsBehindRoutersTests(NamespaceCase):

@@ -19,7 +19,7 @@ from tests.live.until import takes, until
 
 MISSING = [name for name in ("flask", "OpenSSL", "cryptography") if find_spec(name) is None]
 DRIBBLED_S = 20.0
-"""12 s on an idle machine."""
+"""The time limit for a loaded machine; an idle machine needs 12 s."""
 CODE = "quiet-otter"
 
 

@@ -98,4 +98,4 @@ class LiveMjpegTests(TestCase):
             self.assertEqual(shapes, [(96, 128, 3)] * 5)
 
     if find_spec("cv2") is None:
-        test_other_clients_watch_the_emulator.skip = "NOBODY ELSE WATCHES: install the extra vision"  # type: ignore[attr-defined]
+        test_other_clients_watch_the_emulator.skip = "OTHER CLIENTS ARE NOT TESTED: install the extra vision"  # type: ignore[attr-defined]

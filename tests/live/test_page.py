@@ -18,7 +18,7 @@ TWINS = """async () => {
   });
   return seen;
 }"""
-"""A list updated with items of which two are equal: its text, and the number of new rows."""
+"""Update a list with items of which two are equal; return the text of the list and the number of new rows."""
 PANELS = """async () => {
   const { registerPanel } = await import("/static/panel.js");
   const { model } = await import("/static/model.js");
@@ -37,7 +37,7 @@ PANELS = """async () => {
     return { update: (_, event) => { if (event === "state") throw new Error("a fault of one"); } };
   } });
 }"""
-"""Two panels that the page shows to operators of a node with faults; one of them fails at each state."""
+"""Two panels that the page shows to operators of a node with faults; one of them raises an exception at each state."""
 
 
 class PageTests(PageCase):

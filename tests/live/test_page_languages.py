@@ -10,7 +10,7 @@ from tests.webnode.texts import catalogue
 MARKED = "[...document.querySelectorAll('[data-text]')].map(e => [e.dataset.text, e.textContent])"
 """The keys of the template's texts, each with the text that the page shows."""
 BROKEN = "document.body.innerText.match(/undefined|NaN|\\{\\w+\\}|\\b[a-z]+\\.[a-z]+[._][a-z_]+\\b/g) ?? []"
-"""Keys and placeholders in what the page shows."""
+"""Matches keys and placeholders in the text that the page shows."""
 
 
 class LanguageTests(PageCase):

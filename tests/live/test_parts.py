@@ -88,4 +88,4 @@ class LivePartsTests(TestCase):
         self.assertEqual(body.motion, (0.0, 0.0, 0.0))
 
     if find_spec("serial") is None:
-        test_is_one_device.skip = "NO ROBOT HAS PARTS: install the extra serial"  # type: ignore[attr-defined]
+        test_is_one_device.skip = "ROBOTS WITH PARTS ARE NOT TESTED: install the extra serial"  # type: ignore[attr-defined]

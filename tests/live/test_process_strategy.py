@@ -21,7 +21,7 @@ from middleware.consensus.strategy_registry import load_guarded_strategy
 ROOT = str(Path(__file__).resolve().parents[2])
 TEAM = [Report("a", 3.0, value=(1.0, 2.0)), Report("b", 1.0), Report("c", 2.0)]
 PATIENCE = 20.0
-"""Also the deadline of strategies that must answer: delays on a loaded machine are not tested."""
+"""The timeout of waits, and the deadline of strategies that must reply; it is long because of loaded machines."""
 
 
 class Good(Nearest):

@@ -90,7 +90,7 @@ class PushedCodeTests(SynchronousTestCase):
     def test_confined(self) -> None:
         """On Linux all limits that the machine supports are in force, including seccomp."""
         if not sys.platform.startswith("linux"):
-            raise SkipTest("limits of Linux")
+            raise SkipTest("the limits exist only on Linux")
         runner = self.runner(BASE)
         for limit in ("limits", "seccomp", "no new rights", "no tracing", "ends with node", "no capabilities"):
             self.assertIn(limit, runner.limits)
@@ -98,7 +98,7 @@ class PushedCodeTests(SynchronousTestCase):
     def test_nothing_of_the_machine(self) -> None:
         """A module has no access to files, sockets, processes, signals and the environment."""
         if not sys.platform.startswith("linux"):
-            raise SkipTest("limits of Linux")
+            raise SkipTest("the limits exist only on Linux")
         canary = Path(self.mktemp())
         canary.write_text("secret")
         attempts = f"""

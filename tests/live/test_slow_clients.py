@@ -12,7 +12,7 @@ from tests.live.page import TeamCase
 
 MISSING = [name for name in ("flask", "cv2") if find_spec(name) is None]
 CLOSED_S = 60.0
-"""The limit on a loaded machine; 15 s on an idle one."""
+"""The time limit in seconds for a loaded machine; an idle machine needs 15 s."""
 BEGUN = b"GET / HTTP/1.1\r\nHost: 127.0.0.1\r\nX-Slow: "
 
 

@@ -21,7 +21,7 @@ class Facing:
     """
 
     contexts: list[Context] = []
-    """Under what any of them has acted."""
+    """The contexts in which any instance has acted."""
 
     def __init__(self, parameters: Mapping[str, float | str], rng: random.Random) -> None:
         self._towards = float(parameters["towards"])

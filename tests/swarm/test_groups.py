@@ -10,9 +10,9 @@ from swarmnode.simulated_team import SimulatedTeam
 from tests.swarm.case import TeamCase
 
 TASKS = {"t0": 1.5, "t1": 2.5, "t2": -2.5}
-"""Where to face.  Task by task the nearest dog would have to turn more in all than these three need."""
+"""The direction in radians for each task.  If the nearest dog did each task, the dogs would turn more in total."""
 SLOW = 0.25
-"""Radians a second: the nearest turn takes a second, the others four and more."""
+"""Turn velocity in radians per second: the shortest turn takes one second, the other turns at least four."""
 DOGS = SimulatedTeam.DOGS
 
 

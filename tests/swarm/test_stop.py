@@ -11,7 +11,7 @@ from tests.swarm.case import TeamCase
 from webnode.stop_control import StopControl
 
 BRAKING = 0.2
-"""Seconds in which all three dogs stand, from the press of the button."""
+"""The time in seconds from the stop until all three dogs stand still."""
 
 
 class StopTests(TeamCase):

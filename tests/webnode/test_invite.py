@@ -43,7 +43,7 @@ class InviteTests(SynchronousTestCase):
         self.assertEqual(cv2.QRCodeDetector().detectAndDecode(large)[0], LINK)
 
     if missing := [name for name in ("cv2", "segno") if find_spec(name) is None]:
-        test_draw_what_a_camera_reads.skip = f"NO CODE IS READ: missing {missing}"  # type: ignore[attr-defined]
+        test_draw_what_a_camera_reads.skip = f"THE QR CODE IS NOT TESTED: missing {missing}"  # type: ignore[attr-defined]
 
     def test_draw_nothing_where_it_cannot(self) -> None:
         """An empty link gives no drawing; nor does a missing library."""

@@ -24,7 +24,7 @@ from webnode.state import State
 from webnode.state_journal import MAX_CHANGES
 
 MORE = "x" * 999
-"""What makes a state longer than a few changes."""
+"""Text that makes a state longer than a few changes."""
 JPEG = jpeg()
 
 

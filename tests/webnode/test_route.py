@@ -137,4 +137,4 @@ class TableTests(SynchronousTestCase):
 
 
 FOR_ALL = ("/api/v1/node", "/api/v1/session", "/api/v1/tasks/preview", "/api/v1/ca.crt", "/static/{file}", "/sw.js")
-"""What is no secret, and what a user needs before signing in."""
+"""The routes that are public: they reveal no secret, or are needed before signing in."""

@@ -21,7 +21,7 @@ CODE = re.compile(
     r"(?:\b(?:class|d|for|href|id|rel|role|type|viewBox)\"?: "
     r"|(?:querySelector(?:All)?|closest|closest\?\.|matchMedia|matches)\()$"
 )
-"""What stands in front of a string that is a class, an attribute or a selector."""
+"""Matches the code in front of a string that is a class, an attribute or a selector."""
 NO_TEXT = {
     " KiB": "a unit",
     " MiB": "a unit",
@@ -38,7 +38,7 @@ NO_TEXT = {
     "light dark": "a value of the property color-scheme",
     "swarm revoke ": "a command",
 }
-"""The strings that look like a text and are not translated, with the reason."""
+"""The strings that look like text shown to users but are not translated, with the reason."""
 
 
 def forms(text: Any) -> list[str]:
@@ -139,7 +139,7 @@ class TextsTests(SynchronousTestCase):
         for name, source in MODULES.items():
             for string, before in strings(source):
                 if is_text(string) and string not in NO_TEXT and not CODE.search(before[-40:]):
-                    self.fail(f"{name}: {string!r} belongs into texts/en.js")
+                    self.fail(f"{name}: {string!r} must be moved to texts/en.js")
 
     def test_no_text_in_template(self) -> None:
         """The template contains no text except the page's name and the notice for browsers without JavaScript."""

@@ -190,7 +190,7 @@ BROKEN: dict[str, list[list[Event]]] = {
     "R3": [[shot(answers=((True, 11),))], [shot(answers=((False, 1),))], [UnvalidatedTraffic(1.0, 11, 10)]],
     "R4": [[TableSize(1.0, 1, "peers", 11, 10)]],
 }
-"""Of each invariant, histories that break it and nothing else."""
+"""For each invariant, histories that violate this invariant and no other."""
 
 LAWFUL: dict[str, list[Event]] = {
     "tokens grow, and a refused command harms nobody": [
@@ -257,7 +257,7 @@ LAWFUL: dict[str, list[Event]] = {
     ],
     "of other reports another may be named": [decided(1, "a"), decided(2, "b", 2.5)],
 }
-"""Histories that look as if they broke something."""
+"""Valid histories that resemble violations of an invariant."""
 
 
 class CheckerTests(SynchronousTestCase):

@@ -34,14 +34,14 @@ WELL = Facts(
     is_gateway_resolved=True,
 )
 CALLED = LanDiscovery((), is_sent=True, has_received_own=True)
-"""A call to the LAN without an answer."""
+"""A discovery on the LAN without a reply from another node."""
 DAY = 86400.0
 OFF = Probe(Address("192.168.1.33", 8484), is_near=True, is_resolved=False)
 STRANGER = Probe(FAR, Answer(FAR, fingerprint=b"b" * 8, offset=0.0))
 NO_MARK = Probe(FAR, Answer(FAR, offset=0.0))
 UNREADABLE = Certificate(problem="others can read it")
 Case = tuple[dict[str, Any], str, str]
-"""What is other than with the healthy node, the weight and the cause of the one finding, and words that it says."""
+"""The facts that differ from those of the healthy node; the severity and text of the only finding."""
 
 
 def seen_at(*ports: int) -> dict[str, Any]:

@@ -73,7 +73,7 @@ class UnitTests(SynchronousTestCase):
     def test_systemd_takes_it(self) -> None:
         """The unit passes the checks of systemd, which rate its exposure below 2 of 10."""
         if shutil.which("systemd-analyze") is None:
-            raise SkipTest("there is no systemd-analyze here")
+            raise SkipTest("systemd-analyze is not installed")
         folder = Path(self.mktemp())
         folder.mkdir()
         file = folder / "swarm-node-dog1.service"
