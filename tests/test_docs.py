@@ -70,7 +70,7 @@ class DocumentTests(SynchronousTestCase):
                     self.assertTrue(place.exists(), f"{document.relative_to(ROOT)} links to {target}")
 
     def test_named_files_exist(self) -> None:
-        """Each file whose path is in a document exists, and defines the name that follows the path."""
+        """Each file path in a document refers to an existing file, which defines the name that follows the path."""
         for document in DOCUMENTS:
             for path, name in NAMED.findall(document.read_text(encoding="utf-8")):
                 if "/" not in path and not name:
@@ -92,7 +92,7 @@ class DocumentTests(SynchronousTestCase):
             self.assertTrue(is_same, f"{page.relative_to(ROOT)} says {number}; {expression} is {value:g}")
 
     def test_role_tables_are_those_of_the_code(self) -> None:
-        """The tables of roles on the security page are those that ``tests.role_table`` generates."""
+        """The tables of roles on the security page are the output of ``tests.role_table``."""
         self.assertIn(write_tables(), (ROOT / "docs" / "explanation" / "trust-model.md").read_text(encoding="utf-8"))
 
     def test_layers_are_those_of_the_tests(self) -> None:

@@ -38,7 +38,7 @@ class RoundCounterTests(SynchronousTestCase):
 
 class PeerReportsTests(SynchronousTestCase):
     def costs(self, peer_reports: PeerReports, now: float) -> dict[str, float | None]:
-        """Return the cost of each member whose bid is valid at ``now``."""
+        """Return the costs of the members at ``now``; None if a bid has expired."""
         return {member.uuid: member.cost for member in peer_reports.members(now)}
 
     def test_old_round_is_ignored(self) -> None:

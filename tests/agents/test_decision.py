@@ -59,7 +59,7 @@ class ReadingTests(SynchronousTestCase):
         self.assertEqual(by("capability_cost", busy, free).assigned, "b")
 
     def test_vote_decides(self) -> None:
-        """The option with the largest total weight wins, and the voter for it with the lowest cost is assigned."""
+        """The option with the largest total weight wins, and of its voters the one with the lowest cost is assigned."""
         one, two = replace(member("a", 1.0), choice="red"), replace(member("b", 2.0), choice="blue")
         three = replace(member("c", 3.0), choice="blue")
         decision = by("weighted_vote", one, two, three)

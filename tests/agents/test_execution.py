@@ -66,7 +66,7 @@ class ExecutionTests(SynchronousTestCase):
         self.assertTrue(execution.has_stalled(62.2))
 
     def test_stall(self) -> None:
-        """Without progress for ``limit`` seconds an execution has stalled, for as long as the attempt took."""
+        """Without progress for ``limit`` seconds an execution has stalled, for the duration of the attempt."""
         digger = Digger()
         execution = self.execution(digger, 2.0)
         for tenth in range(30):

@@ -107,7 +107,7 @@ class ExplorationTests(SynchronousTestCase):
         self.assertTrue(all(abs(yaw - 2.0) < 0.35 for yaw in walks), walks)
 
     def test_way_that_ended_in_a_bump_is_not_tried_again_at_once(self) -> None:
-        """A robot without a ranger does not choose the heading of a recent bump as long as it is near that location."""
+        """A robot without a ranger does not choose the heading of a recent bump when it is near that location."""
         for seed in range(20):
             exploration = Exploration(random.Random(seed))
             exploration.on_bump((0.1, 0.0, 2.0))

@@ -139,6 +139,6 @@ class PostPathTests(SynchronousTestCase):
             self.assertLess(abs(distance - 1.2), 0.1)
 
     def test_stops_before_what_is_in_the_way(self) -> None:
-        """The robot stays where it is if an obstacle is ahead, or if the target is too close."""
+        """The robot does not move if an obstacle is ahead, or if the target is too close."""
         self.assertLess(apart(self.walk(1.2, 2.0, ahead=0.3)[0], 0.0), 0.05)
         self.assertLess(apart(self.walk(MIN_CIRCLING_RADIUS_M - 0.05, 2.0)[0], 0.0), 0.01)

@@ -30,7 +30,7 @@ class TurnAroundTests(SynchronousTestCase):
         self.assertEqual(turn.cost, 0.25)
 
     def test_one_turn_and_no_more(self) -> None:
-        """The dog turns exactly once, even where the angle wraps; earlier turns do not count."""
+        """The dog turns exactly once, even if the angle wraps; earlier turns do not count."""
         turn = TurnAround({}, random.Random(1))
         yaw = 2.0
         for _ in range(20):

@@ -41,7 +41,7 @@ def row() -> dict[str, dict[str, Any]]:
 
 class TargetTests(SynchronousTestCase):
     def reached(self, results: dict[str, Any], verdict: bool | None) -> list[int]:
-        """Return the numbers of the targets whose result is ``verdict``."""
+        """Return the numbers of the targets with the result ``verdict``."""
         return [one.number for one in check_targets(results) if one.is_met is verdict]
 
     def test_all_are_reached(self) -> None:
@@ -49,7 +49,7 @@ class TargetTests(SynchronousTestCase):
         self.assertEqual(self.reached(row(), True), list(range(1, 15)))
 
     def test_what_was_not_measured_is_not_known(self) -> None:
-        """The result of a target is unknown if its figure, or that of the compared library, is missing."""
+        """The result of a target is unknown if its figure or the figure of the compared library is missing."""
         self.assertEqual(self.reached({}, None), list(range(1, 15)))
         alone = {OURS: measured()}
         self.assertEqual(self.reached(alone, None), [1, 2, 3, 4, 6, 10, 14])

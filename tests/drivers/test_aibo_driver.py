@@ -99,7 +99,7 @@ class AiboDriverTests(Conformance, AiboCase):
         self.assertEqual(self.true_speed(), 0.0)
 
     def test_names_rubbish_once(self) -> None:
-        """Invalid data is logged once, and once more if invalid data follows valid data."""
+        """Invalid data is logged once, and again if invalid data follows valid data."""
         collector = WarningCollector()
         self.addCleanup(collector.close)
         self.ready()

@@ -39,7 +39,7 @@ PLAIN = (
     b'HTTP/1.1 200 Fine\nServer: x\ncontent-type: Multipart/X-Mixed-Replace; a=b; Boundary="--cut"\n\n'
     b"\n--cut\ncontent-type: image/jpeg\n\n" + FIRST + b"\n--cut \n\n" + SECOND + b"\n--cut--\n"
 )
-# The same stream with the dashes of RFC 2046 in front of those of the boundary.
+# The same stream with the dashes of RFC 2046 in front of the boundary's own dashes.
 DOUBLE = (
     b"HTTP/1.1 200 OK\r\nContent-Type: multipart/x-mixed-replace; boundary=--cut\r\n\r\npreamble\r\n"
     b"----cut\r\n\r\n" + FIRST + b"\r\n----cut\r\n\r\n" + SECOND + b"\r\n----cut--\r\n"

@@ -35,7 +35,7 @@ class CompassDriverTests(Conformance, RobotCase):
         return math.degrees(self.value(driver, HEADING))
 
     def test_turns_as_the_yard_does(self) -> None:
-        """The heading equals that of a simulated dog: counter-clockwise from the x axis."""
+        """The heading equals the heading of a simulated dog: counter-clockwise from the x axis."""
         driver = self.make_driver()
         driver.connect()
         for degrees in (0.0, 45.0, 90.0, 179.9, -179.9, -90.0, -0.04):

@@ -45,7 +45,7 @@ class Part(BaseDriver):
         )
         self.opened = self.closed = 0
         self.t = 100.0
-        """The time of the part, whose clock has a different origin."""
+        """The time of the part's clock, which has a different origin."""
 
     def tell(self, frame: Frame | None = None, **values: Value) -> None:
         if not self._is_up:
@@ -189,7 +189,7 @@ class CompositeDriverTests(Conformance, Create2Case):
         self.assertNotIn("compass.heading", self.newest(driver).values)
 
     def test_says_why_its_robot_is_not_heard(self) -> None:
-        """``problem`` and ``token`` of the device are those of the robot."""
+        """``problem`` and ``token`` of the device equal those of the robot."""
         main = Create2Driver(parse_options({"port": "memory"}), "vacuum", self.connector, self.clock)
         driver = combine_drivers(main, [Part(self.clock)], "vacuum")
         self.connector.is_open = False

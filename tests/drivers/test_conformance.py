@@ -237,7 +237,7 @@ class Prophetic(Rover):
 
 
 class Infinite(Rover):
-    """Reports an infinite range where it should report NaN."""
+    """Reports an infinite range when it should report NaN."""
 
     def _observed(self, values: Mapping[str, Value], t_robot: float, *rest: Any) -> None:
         super()._observed({**values, "range.front": math.inf}, t_robot, *rest)
@@ -292,7 +292,7 @@ class Obliging(Rover):
 
 
 class Rude(Rover):
-    """Raises an exception where it should return a Deferred that fails."""
+    """Raises an exception when it should return a Deferred that fails."""
 
     def invoke(self, name: str, **arguments: float | str) -> Deferred[Mapping[str, Value]]:
         raise KeyError(name)

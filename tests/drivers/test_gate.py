@@ -30,7 +30,7 @@ class GateTests(SynchronousTestCase):
         self.assertEqual(gate.deadline, 2.0)
 
     def test_refuses_deadlines_that_are_no_future(self) -> None:
-        """A command whose deadline is not a finite future time is refused, and its token is not stored."""
+        """A command with a deadline that is not a finite future time is refused, and its token is not stored."""
         gate = Gate()
         for deadline in (1.0, 0.5, math.inf, math.nan):
             self.assertRaises(StaleCommand, gate.admit, Permit(7, deadline), 1.0)

@@ -116,7 +116,7 @@ class Ether:
         self.everywhere(OPERATOR, lambda place: self._order(place, task_id, order))
 
     def forget(self, task_id: str) -> None:
-        """Remove the record of the outcome, but not that of the task, from all nodes."""
+        """Remove the record of the outcome from all nodes, but keep the record of the task."""
         for place, replica in enumerate(self.replicas):
             replica.results.pop(task_id, None)
             self.changed(place, task_id)
@@ -215,7 +215,7 @@ class Ether:
 
 
 class ProposerStub:
-    """A proposer whose council is the operator's node alone and never changes."""
+    """A proposer for a council that consists of the operator's node and never changes."""
 
     def learn_charter(self, packed: bytes) -> None:
         """Ignore the record."""
@@ -225,7 +225,7 @@ class ProposerStub:
 
 
 class LeaseClientStub:
-    """A lease client whose council is the operator's node alone."""
+    """A lease client for a council that consists of the operator's node."""
 
     TTL = 1.5
     proposer = ProposerStub()

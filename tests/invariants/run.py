@@ -158,7 +158,7 @@ def least(
     is_over: Callable[[], bool] = lambda: False,
     whole: Reduction = NO_REDUCTION,
 ) -> Least:
-    """Reduce a failed schedule as long as it violates the same invariant, until ``is_over`` returns true.
+    """Reduce a failed schedule that still violates the same invariant, until ``is_over`` returns true.
 
     ``whole`` is the part of the schedule that the failed run had.
     """

@@ -1,6 +1,6 @@
 """Run random sequences of stops, releases, partitions, restarts and hostile messages on the stops of a small team.
 
-The stop states are those of the product. The network below them delays, repeats and loses messages; disks lose
+The stop states are objects of the product. The network below them delays, repeats and loses messages; disks lose
 unwritten data; replicas forget records and return old ones.
 
 One invariant is checked after each step: once a robot's node has acknowledged a stop by an honest operator, the robot
@@ -117,7 +117,7 @@ class Life:
             self.stop_state.subscribe(self.obey)
 
     def obey(self) -> str:
-        """Update the stop state as an agent does; return what the robot does."""
+        """Update the stop state as an agent does; return the activity of the robot."""
         if not self.stop_state.is_known:
             self.stop_state.request_stops()
         return STANDS_STILL if self.stop_state.is_motion_forbidden else "goes on"

@@ -121,7 +121,7 @@ class Stores(Workload):
             self._say("S-c", f"node {place} does not write {RECOVERY:.0f} s after space was freed: {store.write_error}")
 
     def _probe(self, place: int, store: CheckedStore) -> None:
-        """Write twice to the node whose disk is full: once locally, once from another node."""
+        """Write twice to the node with the full disk: once locally, once from another node."""
         self._number += 1
         node = self._schedule.node(place)
         record = self._record(node)

@@ -64,7 +64,7 @@ SMALL = """[...document.querySelectorAll('button, input, select, nav a')].filter
 
 
 def pin(port: int) -> str:
-    """Return the hash of the public key of the certificate at this port, which Chromium shall trust."""
+    """Return the hash of the public key of the certificate at this port, for Chromium to trust."""
     from cryptography.hazmat.primitives.serialization import Encoding, PublicFormat
     from cryptography.x509 import load_pem_x509_certificate
 

@@ -42,7 +42,7 @@ class Photographer:
         self._invitation = invitation
 
     def opened(self, screen: dict[str, Any], scheme: str = "light", address: str = "") -> Any:
-        """Open a page, by default that of the demonstration; return the page when it shows the team."""
+        """Open a page, by default the page of the demonstration; return the page when it shows the team."""
         context = self._browser.new_context(**screen, color_scheme=scheme, reduced_motion="reduce")
         page = context.new_page()
         page.set_default_timeout(PATIENCE_MS)
@@ -103,7 +103,7 @@ def packed(picture: Picture) -> bytes:
     cv2.setRNGSeed(1)
     found = picture.reshape(-1, 3).astype(np.float32)
     some = found[np.random.default_rng(1).integers(0, len(found), SAMPLED)]
-    # A rare colour, such as that of a line of red text, counts at least once.
+    # A rare colour, such as the red of a line of text, counts at least once.
     some = np.vstack([some, np.unique(picture.reshape(-1, 3) // 16 * 16 + 8, axis=0).astype(np.float32)])
     end = (cv2.TERM_CRITERIA_MAX_ITER + cv2.TERM_CRITERIA_EPS, 12, 1.0)
     _, _, centres = cv2.kmeans(some, COLOURS, np.zeros(0, np.int32), end, 1, cv2.KMEANS_PP_CENTERS)

@@ -21,7 +21,7 @@ reactor: Any = running
 
 
 class SlowLens:
-    """A source that fails once, and blocks as long as ``gate`` is closed."""
+    """A source that fails once, and blocks when ``gate`` is closed."""
 
     def __init__(self) -> None:
         self.gate = threading.Event()

@@ -142,7 +142,7 @@ class DeadManCase(TestCase):
             one.end()
 
     async def driven(self, kind: str, **options: object) -> Puppeteer:
-        """Return a driving program whose driver is connected and enabled."""
+        """Return a driving program with a connected and enabled driver."""
         puppeteer = Puppeteer(self.mktemp(), kind, options)
         self.puppeteers.append(puppeteer)
         await puppeteer.said("ready")
@@ -280,7 +280,7 @@ class KeeperTests(TestCase):
         self.assertEqual(said[len(halt) :], halt[: len(said) - len(halt)])
 
     async def test_replaces_one_that_does_not_listen(self) -> None:
-        """A stopped switch whose socket is full is killed and replaced, and the keeper does not block."""
+        """A stopped switch with a full socket is killed and replaced, and the keeper does not block."""
         self.keeper.set_halt_command(HaltCommand(b"halt", self.wire))
         first = self.keeper.pid
         assert first is not None
@@ -462,14 +462,14 @@ class BittleDeadManTests(DeadManCase):
 
 
 class Restless(RosbridgeRobot):
-    """A robot whose base has no timeout."""
+    """A robot that has no timeout in its base."""
 
     def _on_no_command(self) -> None:
         """Keep moving."""
 
 
 class RosbridgeDeadManTests(DeadManCase):
-    """A ROS robot whose base has no timeout."""
+    """A ROS robot that has no timeout in its base."""
 
     async def test_frozen(self) -> None:
         """If the program is stopped, the robot stops after its deadline."""

@@ -94,7 +94,7 @@ class DemonstrationPageTests(DemonstrationPageCase):
         floor = page.locator(".floor")
         floor.scroll_into_view_if_needed()
         box = floor.bounding_box()
-        # A position where a dog stands is refused; three dogs cannot occupy all four corners.
+        # A position that a dog occupies is refused; three dogs cannot occupy all four corners.
         for right, down in ((0.15, 0.15), (0.85, 0.15), (0.15, 0.85), (0.85, 0.85)):
             with page.expect_response("**/api/v1/target"):
                 page.touchscreen.tap(box["x"] + right * box["width"], box["y"] + down * box["height"])

@@ -238,7 +238,7 @@ class PageTests(PageCase):
         page.locator(".device[data-state=DONE]", has_text="dog3").wait_for()
 
     def test_tell_what_happened(self) -> None:
-        """Events are listed as text, newest first: all, those of one kind, or those of one device or task."""
+        """Events are listed as text, newest first: all events, or only the events of one kind, device or task."""
         page = self.opened(DESK)
         story = page.locator("#events li")
         page.locator("#events li", has_text="starts to observe").wait_for()

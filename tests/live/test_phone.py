@@ -137,7 +137,7 @@ class DemonstrationPhoneTests(BrowserCase, DemonstrationCase):
     is_secure = all(find_spec(name) for name in ("OpenSSL", "cryptography"))
 
     def pins(self) -> str:
-        """Return the hashes of the public keys of both web nodes, which Chromium shall trust."""
+        """Return the hashes of the public keys of both web nodes, for Chromium to trust."""
         secure = [page["url"] for page in self.demo.api("node")["pages"] if page["is_secure"]]
         return ",".join(pin(int(url.rpartition(":")[2])) for url in secure)
 

@@ -29,7 +29,7 @@ Answer = tuple[int, Message, bytes]
 
 
 def path_of(route: Route) -> str:
-    """Return the path of a route, with the names of existing objects where the test knows them."""
+    """Return the path of a route, with the names of existing objects if the test knows them."""
     return re.sub(r"\{(\w+)\}", lambda found: NAMES.get(found[1], "x"), route.path)
 
 

@@ -50,7 +50,7 @@ class SigningInTests(PageCase):
         self.assertEqual(page.locator(".device").count(), 0)
 
     def test_look_as_a_viewer(self) -> None:
-        """An operator's invitation signs in a viewer, who sees all views but no controls."""
+        """An operator's invitation signs in a viewer; a viewer sees all views but no controls."""
         page = self.opened(DESK)
         viewer = self.at_door(PHONE, f"#code={self.invitation(page)}")
         self.live(viewer)

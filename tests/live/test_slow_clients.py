@@ -17,7 +17,7 @@ BEGUN = b"GET / HTTP/1.1\r\nHost: 127.0.0.1\r\nX-Slow: "
 
 
 class Crowd:
-    """Slow clients of the page; ``open`` are those that are connected."""
+    """Slow clients of the page; ``open`` contains the connected clients."""
 
     def __init__(self, port: int) -> None:
         self._port = port

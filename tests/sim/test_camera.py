@@ -83,7 +83,7 @@ class CameraTests(SynchronousTestCase):
     def test_hides_the_target_behind_a_dog(self) -> None:
         """A dog between camera and target hides the target at any heading.
 
-        A dog beside or behind the target does not.
+        A dog next to the target or behind the target does not.
         """
         self.world.place_target(2.4, 1.2)
         plain = int((self.mask() > 0).sum())

@@ -17,7 +17,7 @@ class SensorsTests(SynchronousTestCase):
     """The sensors of dog1."""
 
     def setUp(self) -> None:
-        """Place dog1 in the middle, facing right, and dog2 where it does not disturb dog1."""
+        """Place dog1 in the middle, facing right, and dog2 out of the range of dog1's sensors."""
         self.world = World(Random(1), load_scene("three-dogs"))
         self.world.move_dog("dog2", 2.6, 2.1, 0.0)
         self.world.move_dog("dog1", 1.0, 1.0, 0.0)

@@ -236,7 +236,7 @@ class MembershipTests(TeamCase):
         self.assertLessEqual(self.gap(team, "dog2"), REACHED_GAP_M)
 
     def test_winner_that_died_is_still_named(self) -> None:
-        """As long as the decision still assigns a dead dog, the page shows the dog's name, not its id."""
+        """While the decision still assigns a dead dog, the page shows the dog's name, not its id."""
         team = self.start_team()
         team.run_demo()
         self.until(team, lambda: bool(self.executing(team)))

@@ -115,7 +115,7 @@ class ReportTests(SynchronousTestCase):
         self.assertFalse(Trial("freeze", 1, "dog1", "dog1", True, 1.0, 0, 0).has_passed)
 
     def test_picture_has_a_bar_for_each_tenth(self) -> None:
-        """The histogram has a bar for each tenth of a second; the highest bar is that of the largest bin."""
+        """The histogram has a bar for each tenth of a second; the largest bin has the highest bar."""
         picture = draw_svg(self.trials(1.01, 1.02, 1.55))
         self.assertIn('height="60.0"', picture)
         self.assertIn('height="30.0"', picture)

@@ -18,7 +18,7 @@ KEY = "of tests, and of nobody else"
 
 
 class Page(Service):
-    """A page that records how many pages are running."""
+    """A page that records the number of running pages."""
 
     def __init__(self, pages: list[Page]) -> None:
         pages.append(self)

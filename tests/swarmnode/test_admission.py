@@ -292,7 +292,7 @@ class AdmissionTests(SynchronousTestCase):
         self.assertLess(row["until"], self.team.clock.seconds() + 3600.0)
 
     def test_renew_who_has_expired(self) -> None:
-        """A member whose certificate has expired is listed as expired; a renewal makes it a member again."""
+        """A member with an expired certificate is listed as expired; a renewal makes it a member again."""
         self.done(renew.main, "dog1", "--for", "60s")
         self.team.clock.advance(70.0)
         shown = self.done(members.main)

@@ -37,7 +37,7 @@ class CommandTests(SynchronousTestCase):
             self.assertIn("usage", output.getvalue())
 
     def test_verb_without_its_libraries_names_the_extra(self) -> None:
-        """A verb whose libraries are missing is rejected; the error contains the command that installs them."""
+        """A verb with missing libraries is rejected; the error contains the command that installs them."""
         hidden = "import sys; sys.modules['pymunk'] = None; from swarmnode.command import main"
         program = f"{hidden}; sys.exit(main(['trials']))"
         child = subprocess.run([sys.executable, "-c", program], cwd=ROOT, capture_output=True, text=True, timeout=60)

@@ -19,7 +19,7 @@ print(run_search(CrowdTeam(4, 3, CrowdScene(30, 5.0, 5.0)), 4, 6.0, lambda: 0.0)
 
 class CrowdTeamTests(SynchronousTestCase):
     def made(self, seed: int, agents: int = 5) -> CrowdTeam:
-        """Return a team whose robots are among thirty robots on 5 x 5 m."""
+        """Return a team with robots that are among thirty robots on 5 x 5 m."""
         team = CrowdTeam(seed, agents, CrowdScene(30, 5.0, 5.0))
         self.addCleanup(team.stop)
         return team

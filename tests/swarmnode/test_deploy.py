@@ -174,7 +174,7 @@ class DeployTests(SynchronousTestCase):
         self.assertEqual(self.swarm("status").count("farthest"), 1)
 
     def test_keys_and_json(self) -> None:
-        """``keys`` prints the public key of each device, whose hash is the device's uuid.
+        """``keys`` prints the public key of each device; the hash of the key is the device's uuid.
 
         ``--json`` prints one line.
         """

@@ -31,7 +31,7 @@ class NoVerbs:
 
 class SplitTests(FleetCase):
     def apart(self) -> SwarmTeam:
-        """Return nodes whose directory is split, as in a large team."""
+        """Return nodes with a split directory, as in a large team."""
         fleet = self.swarm(COUNT)
         for node in fleet.nodes:
             node.directory.depth = 3

@@ -59,7 +59,7 @@ class InjectorTests(SynchronousTestCase):
             self.assertEqual(len(self.stage.devices()), 4, kind)
 
     def test_skew_changes_nothing(self) -> None:
-        """A device whose clock is wrong by a day finishes its task; only the times in its log are wrong."""
+        """A device with a clock that is wrong by a day finishes its task; only the times in its log are wrong."""
         clock = self.takeover(Fault("skew", 30.0, 86400.0))
         self.assertIsNone(clock.seconds)
         self.stage.wait(1.0)
@@ -81,7 +81,7 @@ class InjectorTests(SynchronousTestCase):
         self.assertEqual([kind for kind, _, _ in self.asked("dog1")["active"]], ["loss"])
 
     def test_cut_off_and_back(self) -> None:
-        """A device whose radio is off leaves the team, and returns after the fault."""
+        """A device with a radio that is off leaves the team, and returns after the fault."""
         self.stage.inject(self.named("dog2"), Fault("radio", 4.0))
         self.stage.wait(3.0)
         self.assertEqual([device.name for device in self.stage.devices()], ["vaio", "dog1", "dog3"])
@@ -89,7 +89,7 @@ class InjectorTests(SynchronousTestCase):
         self.assertIn("dog2", [device.name for device in self.stage.devices()])
 
     def test_battery_of_idle_dogs(self) -> None:
-        """Dogs whose batteries are drained take no task until the batteries are charged again."""
+        """Dogs with drained batteries take no task until the batteries are charged again."""
         for name in ("dog1", "dog2", "dog3"):
             self.stage.inject(self.named(name), Fault("battery", 4.0, 0.02))
         self.stage.wait(0.6)

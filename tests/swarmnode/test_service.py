@@ -1,4 +1,4 @@
-"""Tests of ``swarmnode.service``: how a node starts, stops, fails and returns."""
+"""Tests of ``swarmnode.service``: the start, stop, failure and return of a node."""
 
 from __future__ import annotations
 
@@ -91,6 +91,6 @@ class NodeServiceTests(SynchronousTestCase):
         self.assertEqual(self.seen(), 2)
 
     def test_port_in_use_flies_at_the_start(self) -> None:
-        """A node whose port is in use does not start, and raises ``PortInUse``."""
+        """A node with a port in use does not start, and raises ``PortInUse``."""
         third = self.team.service("c", 7001)
         self.assertRaises(PortInUse, third.startService)

@@ -9,7 +9,7 @@ from webnode.auth import OpenSessions, Role, User
 
 class Guests(OpenSessions):
     def authenticate(self, token: str, now: float) -> User:
-        """Return a user whose role is the text of the token."""
+        """Return a user with the text of the token as role."""
         for role in get_args(Role):
             if token == role:
                 return User(token, role, f"id of {token}")

@@ -186,7 +186,7 @@ class EventStreamsTests(SynchronousTestCase):
         self.assertIn("event", [name for name, _ in events_in(self.connected().taken())])
 
     def test_read_what_changed_only(self) -> None:
-        """As long as the version is unchanged, the state is read once per second; a new version is sent immediately."""
+        """While the version is unchanged, the state is read once per second; a new version is sent immediately."""
         self.version = 1
         page = self.connected()
         reads = self.reads

@@ -103,9 +103,9 @@ class PhoneRouteTests(SynchronousTestCase):
         self.assertEqual((answer.status_code, answer.get_json()["error"]["field"]), (403, "ticket"))
 
     def test_ticket_is_of_one_phone(self) -> None:
-        """The ticket of a phone is valid only for that phone's routes.
+        """The ticket of a phone is valid only at the routes of that phone.
 
-        The token of an operator is valid for all phones.
+        The token of an operator is valid at the routes of all phones.
         """
         one, other = self.joined(), self.joined(secret="1e" * 32, name="ben")
         self.assertEqual(self.look(one, jpeg(), ticket=other["ticket"])[0], 403)

@@ -57,7 +57,7 @@ class GuardTests(SynchronousTestCase):
             self.assertEqual(choose_token(header, "t"), "t")
 
     def test_let_in(self) -> None:
-        """A change needs the page's origin, or that of another page of the team, and the header ``X-Swarm``.
+        """A change needs the origin of the page or of another page of the team, and the header ``X-Swarm``.
 
         A read only needs a host of this node.
         """

@@ -57,7 +57,7 @@ class SignedSessionsTests(SynchronousTestCase):
     def test_sign_in_by_the_code(self) -> None:
         """The code, in any notation, signs in an operator for twelve hours.
 
-        The ticket signs in a viewer for that time.
+        The ticket signs in a viewer for the same time.
         """
         for words in ("quiet-otter", " Quiet Otter ", "QUIETOTTER"):
             token = self.signed(words)
@@ -95,7 +95,7 @@ class SignedSessionsTests(SynchronousTestCase):
         self.assertEqual(refusal.status, 401)
 
     def test_believe_gateways_alone(self) -> None:
-        """A session is invalid as long as a node that vouches for it is not a gateway.
+        """A session is invalid while one of its vouching nodes is not a gateway.
 
         Only gateways allow signing in.
         """

@@ -187,7 +187,7 @@ class TlsPortTests(SynchronousTestCase):
         self.assertEqual(parse_leaf(path.read_bytes()).find_flaw(made.signer, ["192.168.0.7"], NOW), "")
 
     def test_keep_nothing_in_memory(self) -> None:
-        """A node whose store is in memory writes no file."""
+        """A node with a store in memory writes no file."""
         self.tls_port(store=":memory:")
         self.assertEqual(os.listdir(self.folder), [])
 

@@ -41,7 +41,7 @@ STRANGER = Probe(FAR, Answer(FAR, fingerprint=b"b" * 8, offset=0.0))
 NO_MARK = Probe(FAR, Answer(FAR, offset=0.0))
 UNREADABLE = Certificate(problem="others can read it")
 Case = tuple[dict[str, Any], str, str]
-"""The facts that differ from those of the healthy node; the severity and text of the only finding."""
+"""The facts that differ from the healthy node's facts; the severity and text of the only finding."""
 
 
 def seen_at(*ports: int) -> dict[str, Any]:

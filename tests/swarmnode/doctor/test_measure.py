@@ -47,7 +47,7 @@ class MeasureTests(SynchronousTestCase):
         )
 
     def test_store(self) -> None:
-        """A missing folder, and a folder where the store should be, are reported; a store in memory has no file."""
+        """A missing folder, and a folder at the path of the store, are reported; a store in memory has no file."""
         missing = measure_facts(self.settings(store="nowhere/a.sqlite")).storage
         (self.folder / "b.sqlite").mkdir()
         folder = measure_facts(self.settings(store="b.sqlite")).storage

@@ -85,7 +85,7 @@ class UnitTests(SynchronousTestCase):
 
 class CatalogueTests(SynchronousTestCase):
     def test_says_what_is_missing(self) -> None:
-        """A kind whose library is missing is listed with the package to install; other kinds are ready."""
+        """A kind with a missing library is listed with the package to install; other kinds are ready."""
         bare = {entry.kind: entry for entry in list_kind_entries(lambda library: False)}
         self.assertIn("pip install 'swarm-node[serial]'", bare["create2"].needs)
         self.assertEqual((bare["create2"].is_ready, bare["aibo"].is_ready), (False, True))
@@ -113,7 +113,7 @@ class RecordingConnectorTests(SynchronousTestCase):
     def test_remembers_what_is_wrong_with_each_line(self) -> None:
         """Serial devices and addresses use different connectors.
 
-        The problem of a link is reported as long as it exists.
+        The problem of a link is reported until the problem ends.
         """
         line = SimpleNamespace(problem="it is off")
         tcp = SimpleNamespace(connect=lambda host, port, client: line)
