@@ -13,7 +13,7 @@ PAGE = Path(__file__).parents[2] / "docs" / "how-to" / "write-tasks-behaviours-s
 BEGIN, END = "<!-- states: python -m tests.agents.state_table -->\n", "<!-- end of the states -->\n"
 PRESENT = "PRESENT"
 PRESENT_STATES = State.OBSERVING, State.REPORTED, State.WAITING, State.CLAIMING, State.FENCED
-"""The states of an agent whose robot is free and does not act. The drawing merges them: each event has one target."""
+"""The states of an agent that does not act and has a free robot. The drawing merges them: each event has one target."""
 
 
 def write_states() -> str:

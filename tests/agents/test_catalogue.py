@@ -32,7 +32,7 @@ class CatalogueTests(SynchronousTestCase):
         )
 
     def test_phone_can_watch_and_no_more(self) -> None:
-        """A phone meets the requirements of watching the target, but not the requirements of tasks that need a mobile base."""
+        """A phone can watch the target, but cannot do the tasks that need a mobile base."""
         phone, dog = describe("phone", {}).capabilities, describe("sim", {}, "dog1").capabilities
         self.assertEqual(
             [find_unmet_requirements(each, TASKS["watch-target"].requirements) for each in (phone, dog)], [[], []]

@@ -352,7 +352,7 @@ class EngagementTests(SynchronousTestCase):
         self.assertEqual(self.engagement.me.cost, 1.9)
 
     def test_lost_body_may_still_move(self) -> None:
-        """An agent that cannot stop its robot returns the lease and states the time for which the robot may still move."""
+        """An agent that cannot stop its robot returns the lease with the time for which the robot may move."""
         for leave in (lambda: self.engagement.on_robot_lost(), lambda: self.engagement.leave(self.clock.seconds())):
             self.setUp()
             self.acting()

@@ -189,7 +189,7 @@ class CompositeDriverTests(Conformance, Create2Case):
         self.assertNotIn("compass.heading", self.newest(driver).values)
 
     def test_says_why_its_robot_is_not_heard(self) -> None:
-        """``problem`` and ``token`` of the device equal those of the robot."""
+        """``problem`` and ``token`` of the device have the values of the robot."""
         main = Create2Driver(parse_options({"port": "memory"}), "vacuum", self.connector, self.clock)
         driver = combine_drivers(main, [Part(self.clock)], "vacuum")
         self.connector.is_open = False
