@@ -97,7 +97,7 @@ def find_phrases(name: str, text: str, rules: dict[str, str]) -> list[Found]:
 
 
 class ProseTest(SynchronousTestCase):
-    """The texts of the tree, and the check itself."""
+    """Tests of the texts in the source tree, and of the check itself."""
 
     def test_rules_find_phrases(self) -> None:
         """Docstrings, comments and text are searched; code, code blocks and names in backticks are not."""

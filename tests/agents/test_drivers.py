@@ -124,7 +124,7 @@ class DriverTests(SynchronousTestCase):
         self.fail(f"{kind} never reached the target")
 
     def test_robots_reach_the_target_over_their_own_wire(self) -> None:
-        """Each real kind of robot, connected to its emulator, finds the target and stops at it without a collision."""
+        """Each real kind of robot, connected to its emulator, finds the target and stops there without a collision."""
         for kind in ("aibo", "create2", "bittle", "rosbridge"):
             for seed in (1, 4):
                 with self.subTest(kind=kind, seed=seed):

@@ -35,7 +35,7 @@ CONTACT = Contact(ME.public, Address("127.0.0.1", 7000))
 
 
 class Dog:
-    """A behaviour with a cost set by the test, which completes after ``steps`` steps."""
+    """A behaviour that completes after ``steps`` steps; the test sets its cost."""
 
     def __init__(self) -> None:
         self.cost: float | None = None
@@ -459,7 +459,7 @@ class EngagementTests(SynchronousTestCase):
         self.assertEqual([result.token for result in self.results], [6])
 
     def test_higher_token_reopens_the_task(self) -> None:
-        """An agent that learns of a higher token when it ends a task takes part in it again."""
+        """If an agent learns of a higher token when it ends a task, it takes part in the task again."""
         self.dog.steps = 1
         self.acting()
         self.step()
@@ -469,7 +469,7 @@ class EngagementTests(SynchronousTestCase):
         self.assertIsNotNone(self.engagement.step(self.clock.seconds()))
 
     def test_no_progress_gives_the_task_to_another(self) -> None:
-        """An agent without progress within the stall limit returns the lease, and does not bid for the same time."""
+        """An agent without progress within the stall limit returns the lease, and pauses bidding for the same time."""
         self.begin(replace(TASK, stall_limit=1.0))
         self.dog.progress = 0.5
         self.acting()

@@ -36,7 +36,7 @@ class Walker:
 
     @property
     def ahead(self) -> float:
-        """The range ahead in metres; NaN beyond 1.5 m."""
+        """Return the range ahead in metres; NaN beyond 1.5 m."""
         x, y, yaw = self.pose
         cos, sin = math.cos(yaw), math.sin(yaw)
         walls = [(self.side - x) / cos if cos > 0 else -x / cos if cos < 0 else math.inf]

@@ -87,7 +87,7 @@ class LoopTests(SynchronousTestCase):
         self.assertEqual(refused, [])
 
     def test_motors_are_asked_for_until_they_are_on(self) -> None:
-        """If the connection breaks while the motors start, the agent enables them again after it reconnects."""
+        """If the connection breaks while the motors start, the agent enables the motors again after it reconnects."""
         self.team.add_node("dog3")
         service = self.team.services["dog3"]
         connector = self.team.connectors["dog3"]
@@ -188,7 +188,7 @@ class LoopTests(SynchronousTestCase):
             self.assertIn(f"unknown strategy {odd.strategy!r}", self.lines("dog1")[-1])
 
     def test_old_task_that_is_done_is_not_begun_again(self) -> None:
-        """A dog that joins after the end of a task does not start it."""
+        """A dog that joins after the end of a task does not execute the task."""
         self.submit()
         self.team.clock.advance(8.0)
         self.team.add_node("dog3")

@@ -53,7 +53,7 @@ class CouncilMaintainerTests(SynchronousTestCase):
 
     @property
     def council(self) -> list[str]:
-        """The names of the members of the task's council, sorted."""
+        """Return the sorted names of the members of the task's council."""
         names = {service.assembly.node.uuid: name for name, service in self.team.services.items()}
         return sorted(names[member.node_id.hex()] for member in self.task.council)
 

@@ -53,7 +53,7 @@ class CommandTests(SynchronousTestCase):
     """Commands for walk, head and joints."""
 
     def test_golden_vectors(self) -> None:
-        """Each walk and head command has exactly these five bytes."""
+        """Each walk and head command has the five bytes of its golden vector."""
         for letter, value, golden in (
             ("f", 0.5, "66 00 00 00 3f"),
             ("r", -0.25, "72 00 00 80 be"),
@@ -109,7 +109,7 @@ class StateTests(SynchronousTestCase):
                 self.assertEqual(encode_state(seen[0]), stream[: len(stream) // 2])
 
     def test_takes_counts_from_the_stream(self) -> None:
-        """A model with other element counts is decoded with these counts."""
+        """A model with different element counts is decoded with its own counts."""
         other = WorldState(T4, "ERS-210", 5, 6, (1.0,) * 40, (2.0,) * 8, (0.0,) * 8, (0.5,) * 18)
         reader, stream = StateReader(), encode_state(replace(other, model="ERS-210 in red"))
         seen = [one for at in range(len(stream)) for one in reader.read(stream[at : at + 1])]
@@ -173,7 +173,7 @@ class MenuTests(SynchronousTestCase):
     )
 
     def test_golden_lines(self) -> None:
-        """The messages for a server start and an empty slot have exactly these bytes."""
+        """The messages for a server start and an empty slot have the bytes of the golden vectors."""
         self.assertEqual(menu.encode_message(self.MESSAGES[2]), b"load\norg.tekkotsu.mon.WalkGUI\nWalkGUI\n10050\n\n")
         self.assertEqual(
             menu.encode_message(Refresh("Root", (Item(0, False, menu.EMPTY_SLOT),))),
@@ -234,7 +234,7 @@ class PictureTests(SynchronousTestCase):
     """Camera frames."""
 
     def test_golden_vectors(self) -> None:
-        """Names, header and block have exactly these bytes; a packet with raw channels has 12648 bytes."""
+        """Names, header and block have the bytes of the golden vectors; a packet with raw channels has 12648 bytes."""
         name = "0d 00 00 00 54 65 6b 6b 6f 74 73 75 49 6d 61 67 65 00"
         self.assertEqual(encode_string("TekkotsuImage").hex(" "), name)
         self.assertEqual(picture.CLOSING.hex(" "), "0f 00 00 00 43 6c 6f 73 65 43 6f 6e 6e 65 63 74 69 6f 6e 00")

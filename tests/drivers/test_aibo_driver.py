@@ -171,7 +171,7 @@ class AiboDriverTests(Conformance, AiboCase):
         self.assertIs(self.successResultOf(enabled), True)
 
     def test_stops_motors_that_another_left_on(self) -> None:
-        """Connecting to a dog with running motors stops them."""
+        """Connecting to a dog with running motors stops the motors."""
         self.dog.press_back_button()
         driver = self.make_driver()
         driver.connect()

@@ -156,7 +156,7 @@ class WaitTests(SynchronousTestCase):
 
 
 class _Dead:
-    """A link of a failed network: sent data never leaves."""
+    """A link of a failed network: data that is sent never arrives."""
 
     is_busy = False
 

@@ -116,7 +116,7 @@ class BittleDriverTests(Conformance, BittleCase):
             self.failureResultOf(driver.invoke("joint", **arguments), Unsupported)
 
     def test_refuses_skills_of_a_dog_that_lies(self) -> None:
-        """Without a link, or with its servos off, the dog refuses skills."""
+        """A dog without a link, or with its servos off, refuses skills."""
         driver = self.make_driver()
         self.failureResultOf(driver.invoke("sit"), LinkLost)
         driver.connect()

@@ -135,7 +135,7 @@ class StreamReaderTests(SynchronousTestCase):
                 self.assertTrue(line.isprintable() and len(line) < 200, line)
 
     def test_takes_the_largest(self) -> None:
-        """A picture of exactly 1 MiB is accepted, with and without its length."""
+        """A picture of exactly 1 MiB is accepted, with and without a Content-Length."""
         large = bytes(codec.MAX_PICTURE_BYTES)
         for has_length in (True, False):
             data = encode_answer_header() + encode_part(large, has_length) + b"--frame"

@@ -88,7 +88,7 @@ class SentenceReaderTests(SynchronousTestCase):
         self.assertEqual(reader.bad_frames, 0)
 
     def test_keeps_no_endless_line(self) -> None:
-        """A line above the maximum length is dropped and counted, and the next one is read."""
+        """A line above the maximum length is dropped and counted, and the next line is read."""
         reader = SentenceReader()
         for _ in range(10):
             self.assertEqual(reader.read(bytes(100)), [])

@@ -217,7 +217,7 @@ class OdometryTests(SynchronousTestCase):
         self.assertEqual(where.jumps, 0)
 
     def test_draws_arcs(self) -> None:
-        """A half circle with a radius of one metre ends two metres to the left."""
+        """After a half circle with a radius of one metre the pose is two metres to the left."""
         where = Odometry()
         for step in range(33):
             left, right = (math.pi * (1.0 + side * 0.1175) * step / 32 / MM_PER_COUNT * 1000.0 for side in (-1, 1))

@@ -224,7 +224,10 @@ class Create2DriverTests(Conformance, Create2Case):
         self.assertGreater(driver.diagnostics()["bad_frames"], 2)
 
     def test_lives_with_a_foul_wire(self) -> None:
-        """With a tenth of the frames lost and a tenth invalid, delayed and split, the driver works and counts them."""
+        """With a tenth of the frames lost and a tenth invalid, delayed and split, the driver works.
+
+        It counts the invalid frames.
+        """
         driver = self.ready()
         self.faults.drop = self.faults.garbage = 0.1
         self.faults.split, self.faults.delay = True, 0.02

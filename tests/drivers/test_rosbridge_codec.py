@@ -38,7 +38,7 @@ ANY = st.recursive(
 
 
 def spoilt(message: Any, path: tuple[Any, ...], value: Any) -> Any:
-    """Return a copy of ``message`` with another value at ``path``."""
+    """Return a copy of ``message`` with a different value at ``path``."""
     copy = json.loads(json.dumps(message))
     at = copy
     for step in path[:-1]:

@@ -1,4 +1,4 @@
-"""Tests of ``swarmnode.simulated_team``: a simulated team that a seed reproduces."""
+"""Tests of ``swarmnode.simulated_team``: equal seeds give equal runs of a simulated team."""
 
 from __future__ import annotations
 

@@ -80,7 +80,7 @@ class TeamLinkTests(SynchronousTestCase):
         self.assertApproximates(link.draw_delays(A, B, 100, 10.0, random.Random(1))[0], 0.1, 1e-9)
 
     def test_bad_weather_is_lost_besides(self) -> None:
-        """``extra_loss`` adds loss while it is set."""
+        """If ``extra_loss`` is set, it adds to the loss of the link."""
         link = TeamLink(LinkSettings("lan"), "1")
         link.extra_loss = 0.5
         self.assertApproximates(sum(not delays for delays in _sent(link, 4000)) / 4000, 0.5, 0.03)
