@@ -300,7 +300,8 @@ class Leases(LeaseTeam):
     def _change(self, place: int, is_torn: bool = False) -> None:
         """Let a node change the council when it considers the task free or holds the task's lease itself.
 
-        With ``is_torn``, most new members are chosen at random, and only they and the node learn of the change.
+        With ``is_torn``, nodes outside the present council are preferred as members, and only the new members and the
+        node learn of the change.
         """
         if not self.is_up(place) or not self.has_stores:
             return

@@ -60,7 +60,7 @@ class Records(Workload):
                 self._find(place, target)
 
     def find_violations(self) -> list[str]:
-        """Record the present stores and routing tables."""
+        """Record the members that each node knows."""
         for place in self._schedule.alive():
             known = self._schedule.node(place).overlay.members.list_live()
             self._history.record(MembersListed, place, tuple(contact.node_id for contact in known))

@@ -387,12 +387,12 @@ class Net:
             self.counts["revoked"] += 1
 
     def attack(self) -> None:
-        """Send a hostile message that a revoked member, an invented key or a stolen operator key has signed."""
+        """Send a hostile message from a member that must not stop the team, or with an invented or stolen key."""
         self.counts["hostile"] += 1
         sender = self.rng.choice(("eye", "boot", "dog1", "thief", OUTSIDE))
         known = list(self.tracked)
         if sender == "thief" and self.rng.random() < 0.9:
-            known = []  # a stolen key may release known stops, so this attack invents stops
+            known = []  # a stolen key may release known stops, so most such attacks invent stops
         arguments = self.rng.choice(
             [
                 lambda: (2 ** self.rng.choice((31, 53, 63)), self.rng.random() < 0.5, sender),

@@ -21,7 +21,7 @@ class LanguageTests(PageCase):
         return self.informed(self.live(page))
 
     def test_choose_the_language(self) -> None:
-        """A German browser shows texts, numbers and codes of the API in German; a French browser shows English."""
+        """A German browser shows German texts and numbers, and translated API codes; a French one shows English."""
         for locale, language, metres in (("de-DE", "de", "0,62 m"), ("fr-FR", "en", "0.62 m")):
             page = self.opened_in(locale)
             texts = catalogue(language)

@@ -53,7 +53,7 @@ class UrlTests(SynchronousTestCase):
 
 class TeamFallbacksTests(FleetCase):
     def web_nodes(self) -> tuple[SwarmTeam, list[TeamFallbacks]]:
-        """Return the pages of two nodes, each of which serves its page on its own port."""
+        """Return a team of two nodes and the web fallbacks of each; each node serves the page on its own port."""
         swarm = self.swarm(2)
         webs = [TeamFallbacks(node, swarm.clock.seconds) for node in swarm.nodes]
         for place, web in enumerate(webs):
