@@ -1,4 +1,4 @@
-"""Tests of swarm-node; Hypothesis generates the same examples in each run, without a time limit."""
+"""Tests of swarm-node. Hypothesis generates the same examples in every run and has no time limit."""
 
 from hypothesis import settings
 

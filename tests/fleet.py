@@ -16,7 +16,7 @@ T = TypeVar("T")
 
 
 class FleetCase(SynchronousTestCase):
-    """A test with simulated nodes; at its end no timers may be left."""
+    """A test with simulated nodes; no timer may be left at its end."""
 
     worlds: list[EntangledTeam | SwarmTeam]
 
@@ -42,7 +42,7 @@ class FleetCase(SynchronousTestCase):
             self.assertEqual(weather_only, [], "a node left a timer behind")
 
     def done(self, world: Simulation, work: Deferred[T], within: float = 5.0) -> T:
-        """Return the result of ``work`` after ``within`` seconds of virtual time."""
+        """Run for ``within`` seconds of virtual time; return the result of ``work``."""
         world.run(within)
         return self.successResultOf(work)
 

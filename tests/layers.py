@@ -1,7 +1,7 @@
 """The layers of the code as data: the job of each package, and the packages that its modules may import.
 
-``tests.test_house`` checks each import against it, and ``python -m tests.layers`` writes the tables of
-docs/explanation/architecture.md from it.
+``tests.test_house`` checks each import against ``LAYERS``; ``python -m tests.layers`` writes the tables in
+docs/explanation/architecture.md.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ TOP = ("agents", "drivers", "formats", "middleware", "sim", "swarmnode", "webnod
 
 @dataclass(frozen=True)
 class Layer:
-    """The ``job`` of a package in one line, and the other packages or modules that it ``uses``."""
+    """The ``job`` of a package in one line, and the other packages or modules that the package ``uses``."""
 
     job: str
     uses: tuple[str, ...] = ()
@@ -140,7 +140,7 @@ LAYERS: dict[str, Layer] = {
     ),
     "swarmnode": Layer("settings in, a running node out; the `swarm` command", TOP),
 }
-"""From the bottom to the top.  A module belongs to the longest matching name."""
+"""The layers from bottom to top.  A module belongs to the layer with the longest matching name."""
 
 
 def layer_of(module: str) -> str:
@@ -152,7 +152,7 @@ def may_import(module: str, name: str) -> bool:
     """Return whether the layers permit ``module`` to import ``name``."""
     package = layer_of(module)
     if not any(is_within(name, each) for each in LAYERS):
-        return False  # tests, for example, are no part of the product
+        return False  # tests, for example, are not part of the product
     if layer_of(name) == package:
         return True
     return any(is_within(name, used) for used in LAYERS[package].uses)

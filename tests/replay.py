@@ -1,4 +1,4 @@
-"""Run a program in several processes and check that each prints the same, for each order of its sets."""
+"""Run a program in several processes, and check that its output does not depend on the order of sets."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ LIMIT_S = 300
 
 
 def replayed(case: SynchronousTestCase, program: str) -> str:
-    """Return the output of ``program``; ``case`` fails unless processes with different hash seeds print the same."""
+    """Return the output of ``program``; fail ``case`` unless the output is the same for different hash seeds."""
     printed = set()
     for hash_seed in HASH_SEEDS:
         child = subprocess.run(

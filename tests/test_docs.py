@@ -38,7 +38,7 @@ MARKED = re.compile(r"(\d[\d.,]*)<!-- ([^>]+) -->")
 
 
 def value_of(expression: str) -> float:
-    """Return the value of an expression of names with their modules, such as ``1000 * agents.loop.TICK``."""
+    """Return the value of an expression whose names include their modules, such as ``1000 * agents.loop.TICK``."""
     names: dict[str, object] = {"len": len, "max": max, "min": min}
     for path in re.findall(rf"\b(?:{'|'.join(TOP)})(?:\.\w+)+", expression):
         parts = path.split(".")
@@ -62,7 +62,7 @@ def part_of(document: Path, title: str) -> str:
 
 class DocumentTests(SynchronousTestCase):
     def test_links_lead_somewhere(self) -> None:
-        """Each relative link and picture in the documentation is an existing file or folder."""
+        """Each relative link or picture in the documentation refers to an existing file or folder."""
         for document in DOCUMENTS:
             for target in LINK.findall(document.read_text(encoding="utf-8")):
                 if not re.match(r"https?:|mailto:|#", target):
@@ -70,7 +70,7 @@ class DocumentTests(SynchronousTestCase):
                     self.assertTrue(place.exists(), f"{document.relative_to(ROOT)} links to {target}")
 
     def test_named_files_exist(self) -> None:
-        """Each file that a document names by its path exists, and defines the name after it."""
+        """Each file path in a document refers to an existing file, which defines the name that follows the path."""
         for document in DOCUMENTS:
             for path, name in NAMED.findall(document.read_text(encoding="utf-8")):
                 if "/" not in path and not name:
@@ -92,15 +92,15 @@ class DocumentTests(SynchronousTestCase):
             self.assertTrue(is_same, f"{page.relative_to(ROOT)} says {number}; {expression} is {value:g}")
 
     def test_role_tables_are_those_of_the_code(self) -> None:
-        """The tables of roles on the security page are generated from the role table."""
+        """The tables of roles on the security page are the output of ``tests.role_table``."""
         self.assertIn(write_tables(), (ROOT / "docs" / "explanation" / "trust-model.md").read_text(encoding="utf-8"))
 
     def test_layers_are_those_of_the_tests(self) -> None:
-        """The table of packages on the architecture page is generated from ``tests.layers``."""
+        """The table of packages on the architecture page is the one that ``tests.layers`` generates."""
         self.assertIn(write_table(), (ROOT / "docs" / "explanation" / "architecture.md").read_text(encoding="utf-8"))
 
     def test_every_robot_is_listed(self) -> None:
-        """The table of robots in the README lists exactly the kinds of drivers, with a link to each kind's page."""
+        """The table in the README lists exactly the kinds of drivers, each with a link to the page of the kind."""
         table = part_of(ROOT / "README.md", "Robots")
         rows = re.findall(r"^\| `(\w+)` \|.*\[[\w-]+\.md\]\(docs/([\w./-]+)\) \|$", table, re.MULTILINE)
         self.assertEqual(sorted(kind for kind, _ in rows), list_built_in_kinds())
@@ -108,7 +108,7 @@ class DocumentTests(SynchronousTestCase):
             self.assertIn(f"`{kind}`", (ROOT / "docs" / page).read_text(encoding="utf-8"))
 
     def test_every_cast_is_listed(self) -> None:
-        """The demonstration's page and ``make help`` list exactly the choices of ROBOT, with the same default."""
+        """The demonstration's page and ``make help`` list exactly the valid values of ROBOT, with the same default."""
         rows = re.findall(
             r"^\| `(\w+)`", part_of(ROOT / "docs" / "tutorials" / "demo.md", "Which robots"), re.MULTILINE
         )
@@ -119,7 +119,7 @@ class DocumentTests(SynchronousTestCase):
         self.assertIn(f"| `{default}` (default) |", part_of(ROOT / "docs" / "tutorials" / "demo.md", "Which robots"))
 
     def test_emulators_serve_the_tables_of_their_pages(self) -> None:
-        """The page of each kind with an emulator, and the simulator's page, show a table that the simulator accepts."""
+        """The simulator accepts the example table on its page, and on the page of each kind with an emulator."""
         clock = Clock()
         for page in ("how-to/simulate-robots", *(f"robots/{kind}" for kind in emulated_kinds())):
             played: set[str] = set()
@@ -156,7 +156,7 @@ class DocumentTests(SynchronousTestCase):
             self.assertIn(f"(images/figure-5-{number}.png)", chapters["Figures"])
 
     def test_pictures_are_light(self) -> None:
-        """Each picture in the documentation has at most 300 kB, and is shown in a document."""
+        """Each picture in the documentation has at most 300 kB, and is used in a document."""
         shown = " ".join(document.read_text(encoding="utf-8") for document in DOCUMENTS)
         for picture in sorted((ROOT / "docs" / "images").iterdir()):
             self.assertLess(picture.stat().st_size, 300_000, picture.name)
@@ -174,7 +174,7 @@ class ExampleTests(SynchronousTestCase):
                 self.assertIn("camera", body.capabilities)
 
     def test_belong_together(self) -> None:
-        """All examples belong to one team, and each knows the laptop's address."""
+        """All example settings belong to one team and contain the laptop's address."""
         every = {file.stem: Settings.load(str(file)) for file in EXAMPLES}
         laptop = every.pop("laptop-bootstrap").node
         self.assertEqual(laptop.known_nodes, ())

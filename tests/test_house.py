@@ -17,7 +17,7 @@ from twisted.trial.unittest import SynchronousTestCase
 from tests.layers import LAYERS, TOP, is_within, may_import
 
 ROOT = Path(__file__).resolve().parent.parent
-# Plain objects: bytes and ``now`` in, decisions out.
+# Modules without input and output: bytes and ``now`` are arguments, decisions are results.
 PURE = (
     "agents.behaviour",
     "agents.decider",
@@ -165,7 +165,7 @@ PURE = (
 PURE_LAST_NAMES = ("codec",)
 NOT_IN_PURE = ("twisted", "time", "socket", "threading", "asyncio", "selectors", "subprocess", "secrets", "sqlite3")
 
-# The only modules of the lower layers that may use the machine's clock, sockets, threads or random generator.
+# Of the lower layers, only these modules may use the machine's clock, sockets, threads or random generator.
 EDGES = (
     "drivers.camera.picture_stream",
     "drivers.deadman.supervisor",
@@ -219,7 +219,7 @@ def _imports(module: str) -> list[str]:
 
 
 def _import_names(module: str) -> Iterator[str]:
-    """Yield each module that ``module`` imports, anywhere in the file; a name in a package counts as that module."""
+    """Yield each module that ``module`` imports, anywhere in the file; a name in a package is listed as its module."""
     for node in ast.walk(TREES[module]):
         if isinstance(node, ast.Import):
             yield from (alias.name for alias in node.names)
@@ -237,7 +237,7 @@ def _ours(module: str) -> list[str]:
 def _crosses(module: str, name: str) -> bool:
     """Return whether ``module`` must not import ``name``."""
     if module.startswith("drivers.") and name.startswith("drivers.") and module != "drivers.registry":
-        # A kind of robot never imports another kind; only the registry imports all of them.
+        # A kind of robot never imports a different kind; only the registry imports all kinds.
         kinds = {file.split(".")[1] for file in FILES if re.fullmatch(r"drivers\.\w+\.driver", file)}
         return name.split(".")[1] in kinds - {module.split(".")[1]}
     return not may_import(module, name)
@@ -247,12 +247,12 @@ class FloorPlanTests(SynchronousTestCase):
     """Imports only go to lower layers."""
 
     def test_imports_follow_the_floor_plan(self) -> None:
-        """No module imports a package that is above it, in another branch, or behind a contract."""
+        """No module imports a package that is above it, in another branch, or hidden behind an interface."""
         wrong = [f"{module} imports {name}" for module in FILES for name in _ours(module) if _crosses(module, name)]
         self.assertEqual(wrong, [])
 
     def test_every_layer_has_a_wall(self) -> None:
-        """In each package except the topmost, an import of a package above it is detected."""
+        """For each package except the topmost, the test detects an import of a package above it."""
         above = [
             ("middleware.entangled.wire", "middleware.entangled.kademlia.overlay"),
             ("middleware.entangled.space", "middleware.entangled.node"),
@@ -271,7 +271,7 @@ class FloorPlanTests(SynchronousTestCase):
         self.assertEqual(modules, {"middleware.errors", "middleware.node"})
 
     def test_imports_are_absolute(self) -> None:
-        """No module uses a relative import, so that the code can be searched by name."""
+        """No module uses a relative import, so the code can be searched by module name."""
         wrong = [
             f"{module} line {node.lineno}"
             for module, tree in TREES.items()
@@ -281,7 +281,7 @@ class FloorPlanTests(SynchronousTestCase):
         self.assertEqual(wrong, [])
 
     def test_imports_make_no_circle(self) -> None:
-        """No module imports itself indirectly, including imports in functions and for types."""
+        """No module imports itself indirectly; imports in functions and for types are included."""
         arrows = {module: sorted({name for name in _ours(module) if name in FILES} - {module}) for module in FILES}
         done: set[str] = set()
         circles: list[str] = []
@@ -300,10 +300,10 @@ class FloorPlanTests(SynchronousTestCase):
 
 
 class PurityTests(SynchronousTestCase):
-    """Logic is a function of its arguments; only listed modules access the outside world."""
+    """Logic depends only on its arguments; only listed modules access the outside world."""
 
     def test_pure_modules_touch_no_world(self) -> None:
-        """The modules listed as pure import no Twisted, clock, socket, thread or store."""
+        """The modules listed as pure do not import Twisted, the clock, sockets, threads or stores."""
         wrong = [
             f"{module} imports {name}"
             for module in FILES
@@ -325,7 +325,7 @@ class PurityTests(SynchronousTestCase):
         self.assertEqual(wrong, [])
 
     def test_dice_are_handed_in(self) -> None:
-        """No module uses the process's random generator (``random.random()``); only ``random.Random`` is permitted."""
+        """No module uses the global random generator (``random.random()``); only ``random.Random`` is permitted."""
         wrong = []
         for module in FILES:
             for node in ast.walk(TREES[module]):
@@ -339,7 +339,7 @@ class PurityTests(SynchronousTestCase):
         self.assertEqual(wrong, [])
 
     def test_nobody_replaces_a_listener(self) -> None:
-        """An ``on_`` attribute is set only by its object; other code adds itself to its ``Listeners``."""
+        """An attribute ``on_...`` is set only by its own object; other code adds a listener to its ``Listeners``."""
         wrong = []
         for module in FILES:
             for node in ast.walk(TREES[module]):
@@ -352,7 +352,7 @@ class PurityTests(SynchronousTestCase):
         self.assertEqual(wrong, [])
 
     def test_package_files_hold_only_a_docstring(self) -> None:
-        """An ``__init__`` runs no code, so that the import of one module does not import its siblings."""
+        """An ``__init__`` runs no code, so importing a module does not import the other modules of the package."""
         wrong = [
             str(path.relative_to(ROOT))
             for module, path in FILES.items()
@@ -383,7 +383,7 @@ class PurityTests(SynchronousTestCase):
         self.assertEqual((child.returncode, unwanted), (0, []), child.stderr)
 
     def test_node_runs_no_pushed_code(self) -> None:
-        """The modules that a node with deployment loads do not import the module that runs pushed source."""
+        """The modules loaded by a node with deployment do not import the module that runs pushed source."""
         known, left = set[str](), ["middleware.deployment.deployment", "middleware.deployment.process_channel"]
         while left:
             module = left.pop()
@@ -400,14 +400,14 @@ class PackagingTests(SynchronousTestCase):
         self.setup.read(ROOT / "setup.cfg", encoding="utf-8")
 
     def test_wheel_has_every_package(self) -> None:
-        """The wheel contains each package; a missing one would not be noticed in an editable install."""
+        """The wheel contains every package; in an editable install a missing package would not be noticed."""
         search = self.setup["options.packages.find"]
         wheel = find_namespace_packages(str(ROOT), search["exclude"].split(), search["include"].split())
         found = {".".join(path.parent.relative_to(ROOT).parts) for room in TOP for path in (ROOT / room).rglob("*.py")}
         self.assertEqual(set(wheel), found | {"twisted.plugins"})
 
     def test_every_room_is_marked_as_typed(self) -> None:
-        """Each package ships ``py.typed``, without which type checkers ignore its annotations."""
+        """Each package contains ``py.typed``, without which type checkers ignore the package's annotations."""
         self.assertEqual([room for room in TOP if not (ROOT / room / "py.typed").exists()], [])
 
     def test_twisted_is_not_hidden(self) -> None:
@@ -415,7 +415,7 @@ class PackagingTests(SynchronousTestCase):
         self.assertEqual(list((ROOT / "twisted").rglob("__init__.py")), [])
 
     def test_nobody_else_owns_our_names(self) -> None:
-        """No other installed distribution has a top-level package with one of our names, as their files would mix."""
+        """No other installed distribution has a top-level package with the same name as ours: the files would mix."""
         owners = packages_distributions()
         foreign = {
             room: others
@@ -444,7 +444,7 @@ class TestCustomTests(SynchronousTestCase):
         self.assertEqual(wrong, [])
 
     def test_tests_wait_for_conditions(self) -> None:
-        """No test sleeps: ``tests.live.until`` is the only wait for another process."""
+        """No test sleeps; ``tests.live.until`` is the only function that waits for another process."""
         texts = {path: path.read_text(encoding="utf-8") for path in (ROOT / "tests").rglob("*.py")}
         sleeping = {
             path.relative_to(ROOT).as_posix()

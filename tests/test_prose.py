@@ -28,7 +28,7 @@ RULES = {
     r"on purpose|might well|as it were|so to speak|for good and all": "deliberately, can",
     r"(?<=[.:] )What (?:is|was|are|were|has|had|it|they|a|the)\b[^?\n]*(?=[.\n])": "name the thing, not 'what ...'",
 }
-"""Regular expressions of phrases that have to be read twice, and their replacement."""
+"""Regular expressions of phrases that have to be read twice, each with its replacement."""
 
 EXCEPTIONS = {
     ("CHANGELOG.md", "*"): "tells the history, with the names of its time",
@@ -51,7 +51,7 @@ def read_terms(text: str) -> dict[str, str]:
 
 
 def read_python(text: str) -> Iterator[tuple[int, str]]:
-    """Yield the docstrings and comments of a Python file, each with its line."""
+    """Yield the docstrings and comments of a Python file, each with its line number."""
     for node in ast.walk(ast.parse(text)):
         if isinstance(node, ast.Expr) and isinstance(node.value, ast.Constant) and isinstance(node.value.value, str):
             yield node.lineno, node.value.value
@@ -61,7 +61,7 @@ def read_python(text: str) -> Iterator[tuple[int, str]]:
 
 
 def read_markdown(text: str) -> Iterator[tuple[int, str]]:
-    """Yield the lines of a Markdown file without its code blocks and the targets of its links."""
+    """Yield the lines of a Markdown file, excluding its code blocks and the targets of its links."""
     is_code = False
     for number, line in enumerate(text.split("\n"), 1):
         if line.lstrip().startswith("```"):
@@ -97,7 +97,7 @@ def find_phrases(name: str, text: str, rules: dict[str, str]) -> list[Found]:
 
 
 class ProseTest(SynchronousTestCase):
-    """The texts of the tree, and the check itself."""
+    """Tests of the texts in the source tree, and of the check itself."""
 
     def test_rules_find_phrases(self) -> None:
         """Docstrings, comments and text are searched; code, code blocks and names in backticks are not."""
@@ -124,7 +124,7 @@ class ProseTest(SynchronousTestCase):
         )
 
     def test_tree_breaks_no_rule(self) -> None:
-        """No file under version control has a phrase that a rule replaces."""
+        """No file under version control contains a phrase for which a rule has a replacement."""
         rules = RULES | read_terms(GLOSSARY.read_text())
         listed = subprocess.run(["git", "ls-files", "-z"], cwd=ROOT, capture_output=True, text=True, check=True)
         names = [name for name in listed.stdout.split("\0") if Path(name).suffix in READERS and (ROOT / name).exists()]

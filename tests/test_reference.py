@@ -23,7 +23,7 @@ def load_generator() -> ModuleType:
 
 class ReferenceTableTests(SynchronousTestCase):
     def test_tables_agree_with_the_code(self) -> None:
-        """Each table has a row for each name in the code, with the columns of the code and no empty cell."""
+        """Each table has a row for each name in the code, the same columns as the code, and no empty cell."""
         generator = load_generator()
         for name, list_rows in generator.TABLES.items():
             text = (DOCS / "reference" / f"{name}.md").read_text(encoding="utf-8")
@@ -32,7 +32,7 @@ class ReferenceTableTests(SynchronousTestCase):
             self.assertEqual(re.findall(r"^\|.*\| *\|.*$", table, re.MULTILINE), [], f"{name}.md has an empty cell")
 
     def test_rows_are_updated(self) -> None:
-        """A changed column is replaced, a new row has empty cells, a removed row is gone, and the text is kept."""
+        """A changed column is replaced, a new row gets empty cells, an obsolete row is removed, and the text stays."""
         generator = load_generator()
         rows = ["| name | type | meaning |", "|---|---|---|", "| `a` | text | first |", "| `b` | text | second |"]
         page = "\n".join(["Before.", "", generator.BEGIN, "", *rows, "", generator.END, "", "After."])

@@ -11,7 +11,7 @@ from middleware.deployment import module_channel
 
 
 class Loopback:
-    """A conversation with a behaviour that answers at once, or on ``let`` if ``is_held`` is set."""
+    """A conversation with a behaviour; replies arrive immediately, or on ``let`` if ``is_held`` is set."""
 
     def __init__(self, make: Factory, parameters: Mapping[str, Any] | None = None) -> None:
         self.fault = ""
@@ -39,7 +39,7 @@ class Loopback:
         try:
             content = self._kind.call(self._thing, method, carried)
             answer = module_channel.parse_reply(module_channel.pack([number, True, content])[4:])[1:]
-        except Exception as error:  # as the other process does
+        except Exception as error:  # as the process of a deployed behaviour does
             answer = False, f"{type(error).__name__}: {error}"
         self._held.append(lambda: take(*answer))
         if not self.is_held:
@@ -53,7 +53,7 @@ class Loopback:
             each()
 
     def poll(self) -> None:
-        """Do nothing: no events arrive without a call."""
+        """Do nothing: replies arrive only during calls."""
 
     def close(self) -> None:
         """Record that the conversation is closed."""

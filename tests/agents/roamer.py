@@ -1,6 +1,6 @@
 """A simulated robot of any kind, built from its driver's description, to test behaviours without nodes and links.
 
-It executes each action at once, as its driver would report it, and has only the sensors of its kind.
+It executes each action immediately, as its driver would report it, and has only the sensors of its kind.
 """
 
 from __future__ import annotations
@@ -68,7 +68,7 @@ def quantised(description: Description, gaits: Mapping[str, Velocity] = GAITS) -
 
 
 class Roamer:
-    """A robot in place of the simulator's first dog; it executes each action after ``lag`` seconds."""
+    """A robot that replaces the simulator's first dog; it executes each action after ``lag`` seconds."""
 
     def __init__(
         self, kind: str, seed: int, does: Does | None = None, lag: float = 0.1, description: Description | None = None
@@ -88,7 +88,7 @@ class Roamer:
         self.behaviour.embody(self.motion)
         self.now = 0.0
         self.hardest = 0.0
-        """The highest speed in m/s at a contact with an object."""
+        """The highest speed in m/s at which the robot has touched an object."""
         self.done: Action = {}
         self.reversals = 0
         self._kind = kind
@@ -168,14 +168,14 @@ class Roamer:
         return action
 
     def _reckon(self) -> None:
-        """Integrate the executed actions into a pose estimate, as a dog without encoders does."""
+        """Integrate the executed actions into a pose estimate, like a dog without encoders."""
         x, y, yaw = self._reckoned
         distance = self.done.get("base.vx", 0.0) * TICK
         turned = math.remainder(yaw + self.done.get("base.wz", 0.0) * TICK, math.tau)
         self._reckoned = [x + distance * math.cos(yaw), y + distance * math.sin(yaw), turned]
 
     def find(self, limit: float) -> float | None:
-        """Search until the behaviour has a cost, or until ``limit``; return the cost."""
+        """Search until the behaviour has a cost, for at most ``limit`` seconds; return the cost."""
         while self.behaviour.cost is None and self.now < limit:
             self.live(self.behaviour.search)
         return self.behaviour.cost

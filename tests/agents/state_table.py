@@ -13,11 +13,11 @@ PAGE = Path(__file__).parents[2] / "docs" / "how-to" / "write-tasks-behaviours-s
 BEGIN, END = "<!-- states: python -m tests.agents.state_table -->\n", "<!-- end of the states -->\n"
 PRESENT = "PRESENT"
 PRESENT_STATES = State.OBSERVING, State.REPORTED, State.WAITING, State.CLAIMING, State.FENCED
-"""The states of an agent whose robot is free and does not act. The drawing merges them: each event has one target."""
+"""The states of an agent that does not act and has a free robot. The drawing merges them: each event has one target."""
 
 
 def write_states() -> str:
-    """Return the table of states, the diagram of the transitions between them, and the table of events."""
+    """Return the table of states, the diagram of their transitions, and the table of events."""
     states = "".join(f"| {state.name} | {state.status} | {state.text} |\n" for state in State)
     inside: dict[str, list[str]] = {}
     arrows: dict[str, list[str]] = {}
@@ -54,7 +54,7 @@ def _draw(arrows: dict[str, list[str]], indent: int = 4) -> str:
 
 
 def main() -> None:
-    """Replace the section of the states in the page."""
+    """Replace the section about the states in the page."""
     text = PAGE.read_text(encoding="utf-8")
     before, rest = text.split(BEGIN, 1)
     PAGE.write_text(before + write_states() + rest.split(END, 1)[1], encoding="utf-8")

@@ -50,28 +50,28 @@ class BehaviourTests(SynchronousTestCase):
         self.assertIs(turn._motion, motion)
 
     def test_unknown_kind_names_those_there_are(self) -> None:
-        """An unknown kind is refused with the list of the known kinds."""
+        """An unknown kind is refused; the error lists the known kinds."""
         self.assertEqual(
             self.refusal(replace(TASK, kind="fetch")),
             "no behaviour for tasks of kind 'fetch'; known kinds: find-target, turn-around, watch-target",
         )
 
     def test_kind_from_the_wire_is_never_imported(self) -> None:
-        """A kind with the form ``module:name`` is unknown, and the node imports nothing."""
+        """A kind of the form ``module:name`` is unknown, and the node imports nothing."""
         sys.modules.pop("this", None)
         for kind in ("this:s", "os:system", "subprocess:Popen", "agents.turn_around:TurnAround"):
             self.assertIn("no behaviour", self.refusal(replace(TASK, kind=kind)))
         self.assertNotIn("this", sys.modules)
 
     def test_wrong_parameters_are_refused(self) -> None:
-        """Invalid parameters raise UnknownTask with the reason, and no other error."""
+        """Invalid parameters raise UnknownTask with the reason; no other exception is raised."""
         every: list[Any] = [{"turns": "x"}, {"turns": -1.0}, {"turns": []}, [], None, 7]
         for parameters in every:
             task = replace(TASK, parameters=parameters)
             self.assertIn("invalid parameters", self.refusal(task))
 
     def test_missing_vision_names_the_extra(self) -> None:
-        """Without OpenCV, a task that needs vision raises an error that names the extra to install."""
+        """Without OpenCV, a task that needs vision raises an error that contains the extra to install."""
         hidden = {n: sys.modules.pop(n) for n in list(sys.modules) if n in ("agents.search", "agents.vision", "cv2")}
         sys.modules["cv2"] = None  # type: ignore[assignment]
 

@@ -23,7 +23,7 @@ SEEN = Observation(1.0, 2.0, {"range.near": 0.5, "bump.left": True}, {"imu.az": 
 
 
 class Spin:
-    """A behaviour that raises an exception after ``turns`` turns."""
+    """A behaviour that ends after ``turns`` turns, and raises an exception in all except the last two."""
 
     def __init__(self, parameters: object = None, rng: object = None, turns: int = 2) -> None:
         self.cost: object = 1.5
@@ -41,20 +41,20 @@ class Spin:
     hold = search
 
     def execute(self, context: Context) -> Action | None:
-        """Return an action, or None at the end; raise KeyError in all other turns."""
+        """Return an action in the last turn but one, None in the last turn; raise KeyError in all earlier turns."""
         self.turns -= 1
         return {1: GO, 0: None}[self.turns]
 
 
 def guarded(spin: object) -> tuple[Any, Loopback]:
-    """Return a guarded behaviour and its connection."""
+    """Return the proxy of a behaviour, and its connection to that behaviour."""
     connection = Loopback(lambda parameters, rng: spin)
     return BehaviourProxy(connection, STAND), connection
 
 
 class BehaviourProxyTests(SynchronousTestCase):
     def test_asks_while_it_behaves(self) -> None:
-        """The guarded behaviour passes observations in and actions out unchanged, the end included."""
+        """Observations reach the behaviour, and its actions and its end (None) reach the agent, all unchanged."""
         spin = Spin()
         behaviour, _ = guarded(spin)
         behaviour.look(SEEN, 0.5)
@@ -63,7 +63,7 @@ class BehaviourProxyTests(SynchronousTestCase):
         self.assertEqual((behaviour.execute(Context(0.0)), behaviour.execute(Context(0.1))), (GO, None))
 
     def test_stands_after_it_raised(self) -> None:
-        """After an exception the robot stands, reports no cost, and the behaviour is not called again."""
+        """After an exception the robot stands still, the cost is None, and the behaviour is not called again."""
         behaviour, connection = guarded(Spin(turns=9))
         self.assertEqual(behaviour.execute(Context(0.0)), STAND)
         self.assertTrue(behaviour.has_failed and connection.is_closed)
@@ -72,7 +72,10 @@ class BehaviourProxyTests(SynchronousTestCase):
         self.assertEqual(connection.asked, asked)
 
     def test_never_waits(self) -> None:
-        """While no answer arrives the previous action is valid for ``ACTION_TTL_S`` seconds; then the robot stands."""
+        """Until a reply arrives, the previous action stays valid for at most ``ACTION_TTL_S`` seconds.
+
+        Then the robot stands.
+        """
         behaviour, connection = guarded(Spin())
         self.assertEqual(behaviour.search(1.0), GO)
         connection.is_held = True
@@ -83,7 +86,7 @@ class BehaviourProxyTests(SynchronousTestCase):
         self.assertEqual(behaviour.search(1.1 + ACTION_TTL_S), GO)
 
     def test_action_of_another_lease_or_method(self) -> None:
-        """An answer to a call with another token or of another method moves nothing."""
+        """A reply to a call with a different token, or to a call of a different method, moves nothing."""
         behaviour, connection = guarded(Spin(turns=2))
         self.assertEqual(behaviour.execute(Context(0.0, token=4)), GO)
         connection.is_held = True
@@ -91,7 +94,7 @@ class BehaviourProxyTests(SynchronousTestCase):
         self.assertEqual(behaviour.hold(0.06), STAND)
 
     def test_looks_are_left_out(self) -> None:
-        """A slow behaviour receives the next observation only after it has answered the previous one."""
+        """A slow behaviour receives the next observation only after it has replied to the previous one."""
         spin = Spin()
         behaviour, connection = guarded(spin)
         connection.is_held = True
@@ -105,7 +108,7 @@ class BehaviourProxyTests(SynchronousTestCase):
         self.assertEqual([now for _, now in spin.seen], [0.0, 0.3])
 
     def test_hostile_answers(self) -> None:
-        """An answer with an invalid type or value ends the behaviour and raises no exception."""
+        """A reply with an invalid type or value ends the behaviour and raises no exception."""
         answers: list[object] = [
             None,
             7,
@@ -128,7 +131,10 @@ class BehaviourProxyTests(SynchronousTestCase):
             self.assertEqual((behaviour.search(0.0), behaviour.has_failed), (STAND, True), answer)
 
     def test_what_it_may_have_beside(self) -> None:
-        """Optional attributes of a behaviour are passed on; a missing one, or a failure, gives the default."""
+        """Optional attributes of a behaviour are passed on.
+
+        If an attribute is missing or raises, its default is used.
+        """
         spin = Spin()
         spin.value, spin.choice = (1.0,), "left"  # type: ignore[attr-defined]
         behaviour, connection = guarded(spin)
@@ -140,7 +146,7 @@ class BehaviourProxyTests(SynchronousTestCase):
         self.assertEqual((behaviour.value, behaviour.choice), ((), ""))
 
     def test_means_follow(self) -> None:
-        """Changed motion capabilities reach the behaviour before the next observation."""
+        """Changed motion capabilities reach the behaviour earlier than the next observation."""
         received: list[MotionCapabilities] = []
         spin = Spin()
         spin.embody = received.append  # type: ignore[attr-defined]
@@ -161,7 +167,10 @@ class BehaviourProxyTests(SynchronousTestCase):
             self.assertIsNone(guarded(spin)[0].cost)
 
     def test_behaviour_by_its_deployed_name(self) -> None:
-        """The kind ``deployed:x`` selects the deployed behaviour ``x``; another kind is refused with the known ones."""
+        """The kind ``deployed:x`` selects the deployed behaviour ``x``.
+
+        The error for an unknown name lists the known names.
+        """
         deployed: dict[tuple[str, str], Factory] = {
             ("behaviour", "spin"): Loopback.of(Spin),
             ("strategy", "best"): Spin,

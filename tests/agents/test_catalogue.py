@@ -23,7 +23,7 @@ class CatalogueTests(SynchronousTestCase):
             load_strategy(task.strategy)
 
     def test_yards_dog_can_do_what_it_is_made_for(self) -> None:
-        """A simulated dog meets the requirements of the demonstration, and lacks the gripper to fetch the ball."""
+        """A simulated dog can do the demonstration, but lacks the gripper that fetching the ball requires."""
         capabilities = describe("sim", {}, "dog1").capabilities
         self.assertEqual(find_unmet_requirements(capabilities, TASKS[DEMO_TASK].requirements), [])
         self.assertEqual(find_unmet_requirements(capabilities, TASKS["turn-around"].requirements), [])
@@ -32,7 +32,7 @@ class CatalogueTests(SynchronousTestCase):
         )
 
     def test_phone_can_watch_and_no_more(self) -> None:
-        """A phone meets the requirements to watch the target; the tasks that need a mobile base refuse it."""
+        """A phone can watch the target, but cannot do the tasks that need a mobile base."""
         phone, dog = describe("phone", {}).capabilities, describe("sim", {}, "dog1").capabilities
         self.assertEqual(
             [find_unmet_requirements(each, TASKS["watch-target"].requirements) for each in (phone, dog)], [[], []]
@@ -41,6 +41,6 @@ class CatalogueTests(SynchronousTestCase):
         self.assertIn("has no base2d", find_unmet_requirements(phone, TASKS["turn-around"].requirements))
 
     def test_unknown_name_lists_the_known(self) -> None:
-        """An unknown task name is refused with the list of the known names."""
+        """An unknown task name is refused; the error lists the known names."""
         error = self.assertRaises(UnknownTask, create_task, "dance", "t1", 0.0)
         self.assertIn("'dance'; known tasks: fetch-the-ball, find-red-target, turn-around, watch-target", str(error))

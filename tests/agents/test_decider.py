@@ -1,4 +1,4 @@
-"""Tests of ``agents.decider``: the rounds of a task, and the reports that count in a decision."""
+"""Tests of ``agents.decider``: the rounds of a task, and the reports that a decision takes into account."""
 
 from __future__ import annotations
 
@@ -14,20 +14,20 @@ B = Member("b", "dog2", "WAITING", 2.0, "a", "d1", epoch=3, serial=1)
 
 class RoundCounterTests(SynchronousTestCase):
     def test_first_decision_opens_no_round(self) -> None:
-        """Neither a changed basis without a decision nor the first decision opens a round."""
+        """The first decision opens no round; nor does a change of the inputs of a decision that has not been made."""
         epoch = RoundCounter()
         for basis in (("a",), ("a", "b")):
             self.assertEqual(epoch.determine_round(basis, "", "", ()), 0)
         self.assertEqual(epoch.determine_round(("a", "b", 1), "a", "d1", ()), 0)
 
     def test_change_after_a_decision_opens_a_round(self) -> None:
-        """Each change of a decision's basis opens one round; without a change none opens."""
+        """After a decision, each change of its inputs opens exactly one round."""
         epoch = RoundCounter()
         epoch.determine_round((1,), "a", "d1", ())
         self.assertEqual([epoch.determine_round((n,), "a", "d1", ()) for n in (1, 2, 2, 3)], [0, 1, 1, 2])
 
     def test_same_decision_joins_the_round_of_another(self) -> None:
-        """An agent whose decision equals another agent's in a newer round joins that round."""
+        """An agent whose decision equals a decision of another agent in a newer round joins that round."""
         epoch = RoundCounter()
         epoch.determine_round((1,), "a", "d0", ())
         epoch.advance(3)
@@ -38,11 +38,11 @@ class RoundCounterTests(SynchronousTestCase):
 
 class PeerReportsTests(SynchronousTestCase):
     def costs(self, peer_reports: PeerReports, now: float) -> dict[str, float | None]:
-        """Return the valid cost of each member."""
+        """Return the costs of the members at ``now``; None if a bid has expired."""
         return {member.uuid: member.cost for member in peer_reports.members(now)}
 
     def test_old_round_is_ignored(self) -> None:
-        """A report of an older round is ignored, whenever it arrives; a report of a newer round counts."""
+        """A report of an older round is ignored, whenever it arrives; a report of a newer round is used."""
         peer_reports = PeerReports("a")
         peer_reports.update([B], 0.0)
         peer_reports.update([replace(B, cost=9.0, epoch=2, serial=7)], 1.0)
@@ -51,7 +51,10 @@ class PeerReportsTests(SynchronousTestCase):
         self.assertEqual(self.costs(peer_reports, 2.0), {"b": 1.0})
 
     def test_who_left_is_forgotten_after_a_while(self) -> None:
-        """A late report of a departed member is ignored; after ``DEPARTED_MEMORY_S`` a restarted member is accepted."""
+        """A late report of a departed member is ignored.
+
+        ``DEPARTED_MEMORY_S`` later, a restarted member is accepted.
+        """
         peer_reports = PeerReports("a")
         peer_reports.update([B], 0.0)
         peer_reports.update([], 1.0)
@@ -62,7 +65,10 @@ class PeerReportsTests(SynchronousTestCase):
         self.assertEqual(len(peer_reports), 1)
 
     def test_stale_report_is_no_bid(self) -> None:
-        """A bid expires after its validity period, reduced by its age on arrival; a newer serial number renews it."""
+        """A bid expires after its validity period minus its age on arrival.
+
+        A report with a newer serial number renews it.
+        """
         peer_reports = PeerReports("a")
         bid = replace(B, valid_for=3.0, age=1.0)
         peer_reports.update([bid], 10.0)
@@ -73,7 +79,10 @@ class PeerReportsTests(SynchronousTestCase):
         self.assertEqual(self.costs(peer_reports, 12.3), {"b": 2.0})
 
     def test_own_report_comes_back(self) -> None:
-        """An agent's own report from an earlier run is not a member; it only shows the last round and serial number."""
+        """An agent does not count its own report from an earlier run as a member.
+
+        It only continues the numbers in it.
+        """
         peer_reports = PeerReports("b")
         peer_reports.update([B], 0.0)
         self.assertEqual((len(peer_reports), peer_reports.own_report), (0, B))

@@ -24,7 +24,7 @@ def member(uuid: str, cost: float | None, status: str = WAITING) -> Member:
 
 
 def decided(*members: Member, since: float | None = 100.0, hysteresis: float = 0.1) -> Decision:
-    """Return the decision with a waiting period of 8 s."""
+    """Return the decision on these reports with a waiting period of 8 s."""
     return decide(members, Nearest(), hysteresis, 8.0, since)
 
 
@@ -40,15 +40,18 @@ REPORTS = st.lists(
 
 
 def by(strategy: str, *members: Member) -> Decision:
-    """Return the decision of another strategy, long after the waiting period."""
+    """Return the decision of the strategy ``name``, long after the waiting period."""
     return decide(members, GuardedStrategy(load_strategy(strategy)), 0.1, 8.0, 100.0)
 
 
 class ReadingTests(SynchronousTestCase):
-    """Strategies that use more than the cost receive the other values."""
+    """Strategies that use reported values in addition to the cost."""
 
     def test_charged_one_is_preferred(self) -> None:
-        """At equal distance the robot with more battery charge is assigned; at equal charge, fewer tasks count."""
+        """Of equally distant robots, the robot with more battery charge is assigned.
+
+        At equal charge, the one with fewer tasks.
+        """
         low, full = replace(member("a", 5.0), battery=0.2), replace(member("b", 5.0), battery=0.9)
         self.assertEqual(by("capability_cost", low, full).assigned, "b")
         self.assertEqual(by("nearest", low, full).assigned, "a")
@@ -56,7 +59,7 @@ class ReadingTests(SynchronousTestCase):
         self.assertEqual(by("capability_cost", busy, free).assigned, "b")
 
     def test_vote_decides(self) -> None:
-        """The option with the most weight wins, its cheapest voter acts, and the reason names the option."""
+        """The option with the largest total weight wins, and of its voters the one with the lowest cost is assigned."""
         one, two = replace(member("a", 1.0), choice="red"), replace(member("b", 2.0), choice="blue")
         three = replace(member("c", 3.0), choice="blue")
         decision = by("weighted_vote", one, two, three)
@@ -73,7 +76,10 @@ class DecisionTests(SynchronousTestCase):
         self.assertEqual(decision.why, "dog-b, 1.00, best of 3")
 
     def test_waiting_period_holds_for_those_who_are_missing(self) -> None:
-        """During the waiting period no agent is assigned while a report is missing, and the reason names it."""
+        """During the waiting period no agent is assigned if a report is missing.
+
+        The reason lists the missing agents.
+        """
         members = member("a", 2.0), member("c", None, SEARCHING), member("b", None, SEARCHING)
         early = decided(*members, since=7.9)
         self.assertEqual((early.assigned, early.why), (None, "waiting for dog-b, dog-c"))
@@ -92,12 +98,12 @@ class DecisionTests(SynchronousTestCase):
             self.assertEqual(decided(acting, member("a", cost)).assigned, assigned, cost)
 
     def test_acting_member_is_not_stopped_by_a_missing_report(self) -> None:
-        """A new member without a report does not take the task from the acting agent."""
+        """The acting agent keeps the task when a new member has not reported yet."""
         decision = decided(member("z", 1.0, EXECUTING), member("a", None, SEARCHING), since=0.0)
         self.assertEqual(decision.assigned, "z")
 
     def test_acting_member_with_an_unlawful_report_gives_way(self) -> None:
-        """An acting agent with an invalid or too large cost loses the task to one with a valid cost."""
+        """An acting agent with an invalid or too large cost loses the task to an agent with a valid cost."""
         nonsense: list[Any] = [10**400, float("inf"), float("nan"), -1.0, True, "1", 1e300]
         for cost in nonsense:
             self.assertIsNone(decided(member("z", cost, EXECUTING)).assigned)
@@ -107,7 +113,7 @@ class DecisionTests(SynchronousTestCase):
                 self.assertEqual(decision.assigned, "a", (cost, hysteresis))
 
     def test_two_acting_members_come_down_to_one(self) -> None:
-        """If two agents report that they act, all choose the cheaper one, and at equal cost the lower uuid."""
+        """If two agents report that they act, all agents choose the cheaper one, or at equal cost the lower uuid."""
         self.assertEqual(decided(member("a", 1.02, EXECUTING), member("b", 1.0, EXECUTING)).assigned, "b")
         self.assertEqual(decided(member("b", 1.0, EXECUTING), member("a", 1.0, EXECUTING)).assigned, "a")
 
@@ -116,7 +122,7 @@ class DecisionTests(SynchronousTestCase):
     def test_order_of_members_does_not_matter(
         self, entries: list[tuple[int, float | None, str]], since: float, rng: object
     ) -> None:
-        """Agents that receive the same reports in any order reach the same decision with the same reason."""
+        """Agents that receive the same reports in different orders reach the same decision with the same reason."""
         members = [member(f"{number:x}", cost, status) for number, cost, status in entries]
         shuffled = list(members)
         rng.shuffle(shuffled)  # type: ignore[attr-defined]
@@ -125,7 +131,10 @@ class DecisionTests(SynchronousTestCase):
     @settings(max_examples=60)
     @given(REPORTS)
     def test_assigned_agent_has_reported_and_is_good_enough(self, entries: list[tuple[int, float | None, str]]) -> None:
-        """After the waiting period a reporting agent is assigned, and none beats it by the hysteresis."""
+        """After the waiting period an agent with a report is assigned.
+
+        No agent is better than it by more than the hysteresis.
+        """
         members = [member(f"{number:x}", cost, status) for number, cost, status in entries]
         costs = {m.uuid: m.cost for m in members if m.cost is not None}
         decision = decided(*members)
@@ -141,18 +150,21 @@ class ReportersTests(SynchronousTestCase):
     """Decisions from the reports of a subset of the agents (the reporters)."""
 
     def panelled(self, since: float, has_word: bool, *members: Member) -> str | None:
-        """Return the assigned agent."""
+        """Return the agent that is assigned according to these reports.
+
+        ``has_word``: the council has announced its bids.
+        """
         return decide(members, Nearest(), 0.1, 8.0, since, has_word).assigned
 
     def test_council_is_waited_for(self) -> None:
-        """Complete reports of the subset decide nothing until the council answers or a timeout ends."""
+        """Complete reports of the subset suffice only after the council's announcement, or after a timeout."""
         reporters = member("a", 2.0), member("b", 1.0)
         self.assertIsNone(self.panelled(0.0, False, *reporters))
         self.assertIsNone(self.panelled(8.0 + ANNOUNCEMENT_TIMEOUT_S - 0.1, False, *reporters))
         self.assertEqual(self.panelled(8.0 + ANNOUNCEMENT_TIMEOUT_S, False, *reporters), "b")
 
     def test_word_of_the_council_decides(self) -> None:
-        """After the council's answer, or while an agent acts, no missing report is waited for."""
+        """After the council's announcement, or while an agent acts, the decision does not wait for missing reports."""
         reporters = member("a", 2.0), member("b", 1.0), member("c", None)
         self.assertEqual(self.panelled(0.0, True, *reporters), "b")
         self.assertEqual(self.panelled(0.0, False, member("a", 1.0, EXECUTING), *reporters[1:]), "a")

@@ -32,11 +32,11 @@ STEPS = 2
 TICK_S = 0.048
 FPS = {"bittle": 5.0}
 TOUCH = 0.15
-"""The largest distance to the target, in metres, that counts as reached."""
+"""The largest distance to the target, in metres, at which the target counts as reached."""
 
 
 class DogBody:
-    """A simulated dog in a separate world, moved and sensed by an emulator."""
+    """A simulated dog in its own world, moved and sensed by an emulator."""
 
     def __init__(self, clock: Clock, seed: int) -> None:
         self.world = World(Random(seed), load_scene("three-dogs"))
@@ -58,7 +58,7 @@ class DogBody:
         self.world.halt("dog1")
 
     def sense(self) -> Mapping[str, Value]:
-        """Return the sensor values without the chest ranger, which points at the floor."""
+        """Return the sensor values except the chest ranger, which points at the floor."""
         return {key: value for key, value in self._senses.values().items() if key != "range.chest"}
 
     def picture(self, is_halved: bool = False) -> bytes | None:
@@ -72,7 +72,7 @@ class DogBody:
 
 
 def driven(kind: str, robot: DogBody, clock: Clock) -> Driver:
-    """Return a driver of this kind that is connected in memory to the emulator of this robot."""
+    """Return a driver of this kind, connected in memory to the emulator of ``robot``."""
     emulator: Any
     if kind == "aibo":
         emulator = AiboEmulator(clock, robot, Random(1))
@@ -89,7 +89,7 @@ def driven(kind: str, robot: DogBody, clock: Clock) -> Driver:
 
 class DriverTests(SynchronousTestCase):
     def reached(self, kind: str, seed: int) -> tuple[DogBody, float]:
-        """Return the world after a robot of this kind has reached the target, and the seconds that it needed."""
+        """Let a robot of this kind search for the target; return its world and the seconds that it needed."""
         clock = Clock()
         robot = DogBody(clock, seed)
         driver = driven(kind, robot, clock)
@@ -124,7 +124,7 @@ class DriverTests(SynchronousTestCase):
         self.fail(f"{kind} never reached the target")
 
     def test_robots_reach_the_target_over_their_own_wire(self) -> None:
-        """Each real kind of robot, connected to its emulator, finds the target and stops at it without a collision."""
+        """Each real kind of robot, connected to its emulator, finds the target and stops there without a collision."""
         for kind in ("aibo", "create2", "bittle", "rosbridge"):
             for seed in (1, 4):
                 with self.subTest(kind=kind, seed=seed):

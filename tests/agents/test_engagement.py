@@ -35,7 +35,7 @@ CONTACT = Contact(ME.public, Address("127.0.0.1", 7000))
 
 
 class Dog:
-    """A behaviour with a cost set by the test, which completes after ``steps`` steps."""
+    """A behaviour that completes after ``steps`` steps; the test sets its cost."""
 
     def __init__(self) -> None:
         self.cost: float | None = None
@@ -67,7 +67,7 @@ class Dog:
 
 
 class LeaseClientStub:
-    """A lease client that gets the lease when the test grants it, and records events."""
+    """A stub of the lease client: the test grants the lease, and the calls are recorded."""
 
     def __init__(self, clock: HeapClock, events: list[str]) -> None:
         self.is_wanted = False
@@ -81,7 +81,7 @@ class LeaseClientStub:
 
     @property
     def lease(self) -> Lease | None:
-        """Return the lease while it is valid."""
+        """Return the lease, or None if it is not valid."""
         held = self.token and self._clock.seconds() < self.deadline
         return Lease("t1", self.token, self.deadline) if held else None
 
@@ -93,7 +93,7 @@ class LeaseClientStub:
         """Ignore the charter."""
 
     def stand_by(self, rank: int = 1) -> None:
-        """Record the rank among the standbys."""
+        """Record the agent's rank among the standbys."""
         self.places.append(rank)
 
     def release(self, standbys: Sequence[Contact] = (), rest: float = 0.0) -> Deferred[object]:
@@ -122,7 +122,7 @@ class LeaseClientStub:
 
 
 class Recorder:
-    """The outputs of an engagement, which record all output."""
+    """The outputs of an engagement; all of them are recorded."""
 
     def __init__(self, events: list[str]) -> None:
         self.reports: list[Member] = []
@@ -150,12 +150,12 @@ class Recorder:
         self.decision_records.append(record)
 
     def stop_robot(self) -> float:
-        """Stop the robot, which may not receive the message."""
+        """Record the stop; without a connection it does not reach the robot."""
         self._events.append("halted")
         return self.moves_for
 
     def find_contacts(self, uuids: Sequence[str]) -> Sequence[Contact]:
-        """Return the contacts of these agents."""
+        """Return the known contacts of these agents."""
         return [self.known[uuid] for uuid in uuids if uuid in self.known]
 
 
@@ -182,7 +182,7 @@ class EngagementTests(SynchronousTestCase):
         return Member(self.others[number].node_id.hex(), f"dog{number}", status, cost)
 
     def hear(self, *members: Member) -> None:
-        """Deliver the reports of the group for the open task."""
+        """Deliver these reports on the open task."""
         self.engagement.process_reports(list(members), None, self.clock.seconds())
 
     def end(self, outcome: str, by: str) -> None:
@@ -190,7 +190,7 @@ class EngagementTests(SynchronousTestCase):
         self.engagement.process_reports([], Result(outcome, by, 1.0, 5), self.clock.seconds())
 
     def see(self, cost: float | None) -> None:
-        """Deliver an observation with this cost."""
+        """Deliver an observation that gives this cost."""
         seen = Observation(0.0, 0.0, {"cost": "none" if cost is None else cost})
         self.engagement.look(seen, self.clock.seconds())
 
@@ -209,7 +209,7 @@ class EngagementTests(SynchronousTestCase):
         self.assertEqual(self.step().action, GO)
 
     def test_states_follow_the_thesis(self) -> None:
-        """An agent's status is ASSIGNED, SEARCHING, WAITING after its report, EXECUTING with the lease, then DONE."""
+        """A status is ASSIGNED, SEARCHING, WAITING after the report, EXECUTING with the lease, and finally DONE."""
         self.assertEqual(self.engagement.me.status, ASSIGNED)
         self.hear(self.report(2, None))
         self.assertEqual(self.step().action, LOOK)
@@ -224,7 +224,7 @@ class EngagementTests(SynchronousTestCase):
         self.assertEqual(statuses, [SEARCHING, WAITING, EXECUTING, DONE])
 
     def test_nothing_is_executed_without_a_lease(self) -> None:
-        """The assigned agent holds its position until the quorum grants the lease, and again when it expires."""
+        """The assigned agent does not move before the quorum grants the lease, and stops when the lease expires."""
         self.hear(self.report(2, 2.0))
         self.see(1.0)
         for _ in range(5):
@@ -242,7 +242,7 @@ class EngagementTests(SynchronousTestCase):
         self.assertEqual(self.events, ["halted"])
 
     def test_looking_around_is_permitted_for_a_moment_only(self) -> None:
-        """A motion without a lease carries the highest token that the robot has obeyed, and a short deadline."""
+        """A search motion without a lease carries the highest token that the robot accepted, and a short deadline."""
         permit = self.step().permit
         self.assertEqual((permit.token, permit.deadline), (4, self.clock.seconds() + SEARCH_TTL_S))
 
@@ -255,7 +255,7 @@ class EngagementTests(SynchronousTestCase):
         self.assertIn("releases the task", self.log_lines)
 
     def test_who_stands_by_keeps_its_place(self) -> None:
-        """A standby keeps its place in the order of standbys from its first step on."""
+        """A standby keeps its rank among the standbys from its first step onwards."""
         self.hear(self.report(2, 0.5, EXECUTING))
         self.see(1.0)
         for _ in range(5):
@@ -264,7 +264,7 @@ class EngagementTests(SynchronousTestCase):
         self.assertEqual(self.lease_client.places, [1] * 5)
 
     def test_who_is_to_act_and_does_not_yet_is_in_the_line(self) -> None:
-        """An assigned agent that does not act yet counts as the first standby, so two agents never claim at once."""
+        """An assigned agent that does not act yet is the first standby, so two agents never claim simultaneously."""
         self.hear(self.report(2, 0.5))
         self.see(1.0)
         self.step()
@@ -274,7 +274,10 @@ class EngagementTests(SynchronousTestCase):
         self.assertEqual(self.lease_client.places, [2, 1])
 
     def test_who_is_not_let_insists(self) -> None:
-        """An assigned agent without a lease repeats its report each second, so that others do not treat it as gone."""
+        """An assigned agent without a lease repeats its report every second.
+
+        Otherwise other agents would consider it failed.
+        """
         self.hear(self.report(2, 2.0))
         self.see(1.0)
         self.step()
@@ -287,7 +290,7 @@ class EngagementTests(SynchronousTestCase):
         self.assertEqual({(member.cost, member.assigned) for member in again}, {(1.0, ME.node_id.hex())})
 
     def test_who_was_passed_over_is_let_again(self) -> None:
-        """A standby that got the lease returns it when the better agent sends its next report."""
+        """A standby that got the lease returns the lease when the better agent sends its next report."""
         better = self.report(2, 0.5)
         self.hear(better)
         self.see(1.0)
@@ -313,7 +316,7 @@ class EngagementTests(SynchronousTestCase):
         self.assertTrue(self.lease_client.is_wanted)
 
     def test_council_changes_under_who_acts(self) -> None:
-        """At a safe point the agent stops, the council changes, and the agent resumes with a new lease."""
+        """At a safe point the agent stops, the council is replaced, and the agent continues with a new lease."""
         self.acting()
         self.dog.is_safe = False
         self.engagement.schedule_council_change([CONTACT] * 3)
@@ -329,7 +332,10 @@ class EngagementTests(SynchronousTestCase):
         self.assertEqual(self.events, ["halted", "moved to 3"])
 
     def test_moved_target_is_reported_again(self) -> None:
-        """A larger cost is reported again in each state; a smaller one only by an agent that does not act."""
+        """A larger cost is reported again in every state.
+
+        A smaller cost is reported only by an agent that does not act.
+        """
         self.see(1.0)
         self.see(1.1)
         self.assertEqual([m.cost for m in self.reports], [1.0])
@@ -346,7 +352,7 @@ class EngagementTests(SynchronousTestCase):
         self.assertEqual(self.engagement.me.cost, 1.9)
 
     def test_lost_body_may_still_move(self) -> None:
-        """An agent that cannot stop its robot returns the lease with the time for which the robot may still move."""
+        """An agent that cannot stop its robot returns the lease with the time for which the robot may move."""
         for leave in (lambda: self.engagement.on_robot_lost(), lambda: self.engagement.leave(self.clock.seconds())):
             self.setUp()
             self.acting()
@@ -365,7 +371,7 @@ class EngagementTests(SynchronousTestCase):
             self.assertEqual((self.reports[-1].cost, self.reports[-1].available), (cost, True), str(cost))
 
     def test_done_is_recorded_and_the_lease_kept_until_it_is_known(self) -> None:
-        """The agent stops, records the outcome once, and returns the lease when the outcome is confirmed."""
+        """The agent stops, records the outcome once, and returns the lease after the outcome is confirmed."""
         self.dog.steps = 1
         self.acting()
         command = self.step()
@@ -406,7 +412,7 @@ class EngagementTests(SynchronousTestCase):
         self.assertEqual(self.log_lines[-3:], ["resumed by vaio", "reports 0.90 m", "acts: dog1, 0.90, best of 2"])
 
     def test_lease_is_kept_while_the_outcome_is_on_its_way(self) -> None:
-        """Another task that arrives between completion and the outcome's record does not release the lease."""
+        """The agent keeps the lease until the outcome is recorded, even if another task arrives after completion."""
         self.dog.steps = 1
         self.acting()
         self.step()
@@ -418,7 +424,7 @@ class EngagementTests(SynchronousTestCase):
         self.assertEqual(self.events, ["halted", "released"])
 
     def test_deadline_fails_the_task_once(self) -> None:
-        """After its deadline the acting agent records the task once as failed."""
+        """The agent that acts at the task's deadline records once that the task has failed."""
         self.begin(replace(TASK, deadline=5.0))
         self.acting()
         self.clock.advance(5.1)
@@ -428,7 +434,7 @@ class EngagementTests(SynchronousTestCase):
         self.assertEqual([(r.outcome, r.why) for r in self.results], [(FAILED, "past its deadline of 5 s")])
 
     def test_deadline_falls_to_one(self) -> None:
-        """An agent that does not act records the missed deadline only if no other acts and its uuid is the lowest."""
+        """An idle agent records the missed deadline only if no agent acts and its uuid is the lowest."""
         self.begin(replace(TASK, deadline=5.0))
         self.clock.advance(5.1)
         lowest = min([ME, *self.others.values()], key=lambda one: one.node_id.hex())
@@ -440,7 +446,7 @@ class EngagementTests(SynchronousTestCase):
         self.assertEqual(len(self.results), int(lowest is ME))
 
     def test_deadline_is_told_by_who_holds_the_task(self) -> None:
-        """An agent that ends a task on which no agent acts claims the lease first, as its outcome needs the token."""
+        """An agent that ends a task on which no agent acts claims the lease first: the outcome needs its token."""
         self.begin(replace(TASK, deadline=5.0))
         self.patch(self.engagement._decider, "is_first", lambda now: True)
         self.acting()
@@ -453,7 +459,7 @@ class EngagementTests(SynchronousTestCase):
         self.assertEqual([result.token for result in self.results], [6])
 
     def test_higher_token_reopens_the_task(self) -> None:
-        """An agent that learns of a higher token when it ends a task takes part in it again."""
+        """If an agent learns of a higher token when it ends a task, it takes part in the task again."""
         self.dog.steps = 1
         self.acting()
         self.step()
@@ -463,7 +469,7 @@ class EngagementTests(SynchronousTestCase):
         self.assertIsNotNone(self.engagement.step(self.clock.seconds()))
 
     def test_no_progress_gives_the_task_to_another(self) -> None:
-        """An agent without progress within the stall limit returns the lease, and does not bid for the same time."""
+        """An agent without progress within the stall limit returns the lease, and pauses bidding for the same time."""
         self.begin(replace(TASK, stall_limit=1.0))
         self.dog.progress = 0.5
         self.acting()
@@ -486,7 +492,7 @@ class EngagementTests(SynchronousTestCase):
             self.assertIsNone(self.engagement.me.cost)
 
     def test_validity_is_renewed(self) -> None:
-        """A bid with a validity period is renewed with a new serial number before it expires."""
+        """A bid with a validity period is renewed under a new serial number before it expires."""
         self.dog.valid_for = 2.0
         self.see(1.0)
         self.clock.advance(1.1)
@@ -514,7 +520,7 @@ class EngagementTests(SynchronousTestCase):
         self.assertEqual(len(self.flushLoggedErrors(ZeroDivisionError)), 1)
 
     def test_outcome_absorbs_what_follows(self) -> None:
-        """After the end of a task no event starts it again; of two outcomes, COMPLETED with a token wins."""
+        """After its end, no event starts a task again; of two outcomes, COMPLETED with a token takes precedence."""
         self.end(CANCELLED, "vaio")
         self.hear(self.report(2, 2.0))
         self.see(1.0)
@@ -526,13 +532,13 @@ class EngagementTests(SynchronousTestCase):
         self.assertEqual(self.engagement.result, Result(COMPLETED, "dog2", 1.0, 9))
 
     def test_older_life_is_counted_on(self) -> None:
-        """After a restart the agent continues the round and serial numbers that the others have seen."""
+        """After a restart the agent continues the round and serial numbers of its previous run."""
         self.hear(Member(ME.node_id.hex(), "dog1", WAITING, 9.0, epoch=4, serial=3))
         self.see(1.0)
         self.assertGreater((self.reports[-1].epoch, self.reports[-1].serial), (4, 3))
 
     def test_heirs_hear_of_a_leave_from_the_one_that_leaves(self) -> None:
-        """An agent that leaves a task names its standbys in order, without itself."""
+        """An agent that leaves a task hands its standbys, in their order and without itself, to the lease client."""
         contacts = {n: Contact(each.public, Address("10.0.0.1", n)) for n, each in self.others.items()}
         self.outputs.known = {contact.node_id.hex(): contact for contact in contacts.values()}
         self.hear(self.report(2, 3.0), self.report(3, 2.0))
@@ -544,7 +550,7 @@ class EngagementTests(SynchronousTestCase):
         self.assertEqual(self.lease_client.standbys, [contacts[3], contacts[2]])
 
     def test_each_decision_is_accounted_for_once(self) -> None:
-        """A new decision is recorded at once, changed reports at most once a second, an unchanged decision never."""
+        """Record a new decision immediately, changed reports at most once per second, an unchanged decision never."""
         records = self.outputs.decision_records
         self.step()
         self.assertEqual(records, [])

@@ -1,4 +1,4 @@
-"""Tests of ``agents.execution``: continuation under one token, progress, and the stall limit."""
+"""Tests of ``agents.execution``: continuing a task under an unchanged token, progress, and the stall limit."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ class ExecutionTests(SynchronousTestCase):
         self.assertEqual([row[3:] for row in called_with[2:]], [(3.0, False), (3.0, True)])
 
     def test_agreement_is_told(self) -> None:
-        """The agreed value reaches the behaviour, and stays under one token while no new value is agreed."""
+        """The agreed value reaches the behaviour; under the same token it stays until a new value is agreed."""
         digger = Digger()
         execution = self.execution(digger)
         for token, choice, value in ((5, "red", (1.0, 2.0)), (5, "", ()), (5, "blue", ()), (6, "", ())):
@@ -57,7 +57,7 @@ class ExecutionTests(SynchronousTestCase):
         self.assertIsNone(self.execution(Digger(float("nan"))).step(0.0, 1, 1.0).progress)
 
     def test_who_is_kept_from_it_does_not_stall(self) -> None:
-        """Time without calls, because the team is stopped, does not count as time without progress."""
+        """Time in which a stopped team makes no calls does not count as time without progress."""
         execution = self.execution(Digger(), 2.0)
         for moment in (0.0, 0.5, 1.0, 61.0, 61.5):
             execution.step(moment, 1, 99.0)
@@ -66,7 +66,7 @@ class ExecutionTests(SynchronousTestCase):
         self.assertTrue(execution.has_stalled(62.2))
 
     def test_stall(self) -> None:
-        """An execution without progress for the limit is stalled for the time of its attempt; otherwise it never is."""
+        """Without progress for ``limit`` seconds an execution has stalled, for the duration of the attempt."""
         digger = Digger()
         execution = self.execution(digger, 2.0)
         for tenth in range(30):

@@ -26,7 +26,7 @@ TICK = 0.05
 
 
 class Walker:
-    """A point in a square room that executes each action of the exploration at once."""
+    """A point in a square room that executes each action of the exploration immediately."""
 
     def __init__(self, seed: int, side: float = 3.0) -> None:
         self.exploration = Exploration(random.Random(seed))
@@ -36,7 +36,7 @@ class Walker:
 
     @property
     def ahead(self) -> float:
-        """The range ahead in metres; NaN beyond 1.5 m."""
+        """Return the range ahead in metres; NaN beyond 1.5 m."""
         x, y, yaw = self.pose
         cos, sin = math.cos(yaw), math.sin(yaw)
         walls = [(self.side - x) / cos if cos > 0 else -x / cos if cos < 0 else math.inf]
@@ -60,7 +60,7 @@ class Walker:
 
 class ExplorationTests(SynchronousTestCase):
     def test_look_all_around_before_walking(self) -> None:
-        """The robot turns a full circle before its first step, within eight seconds."""
+        """The robot turns a full circle within eight seconds before it takes its first step."""
         for seed in range(5):
             walker = Walker(seed)
             ticks, turned = 0, 0.0
@@ -71,7 +71,7 @@ class ExplorationTests(SynchronousTestCase):
             self.assertLess(ticks * TICK, 8.0, seed)
 
     def test_walk_stays_off_the_walls(self) -> None:
-        """In two minutes in a closed room the robot keeps the clearance to each wall ahead."""
+        """In two minutes in a closed room the robot keeps its clearance to every wall ahead."""
         for seed in range(5):
             walker = Walker(seed)
             for _ in range(2400):
@@ -92,7 +92,7 @@ class ExplorationTests(SynchronousTestCase):
         self.assertAlmostEqual(abs(walker.turned), MAX_SEARCH_TURN_RADPS * TICK)
 
     def test_most_open_way_is_taken(self) -> None:
-        """The robot walks in the direction with the longest range."""
+        """The robot walks in the direction of the longest range."""
         exploration = Exploration(random.Random(1))
         pose: Pose = (0.0, 0.0, 0.0)
         turned = 0.0
@@ -107,7 +107,7 @@ class ExplorationTests(SynchronousTestCase):
         self.assertTrue(all(abs(yaw - 2.0) < 0.35 for yaw in walks), walks)
 
     def test_way_that_ended_in_a_bump_is_not_tried_again_at_once(self) -> None:
-        """Without a ranger, the robot does not choose the heading of a recent bump while it is near that place."""
+        """A robot without a ranger does not choose the heading of a recent bump when it is near that location."""
         for seed in range(20):
             exploration = Exploration(random.Random(seed))
             exploration.on_bump((0.1, 0.0, 2.0))
@@ -124,7 +124,7 @@ class ExplorationTests(SynchronousTestCase):
 
 class DetourTests(SynchronousTestCase):
     def gone(self, detour: Detour, ahead: float = math.nan, moves: bool = True) -> tuple[list[Pose], float]:
-        """Return the poses of a robot on this detour, and the duration; ``moves`` is false for a stuck robot."""
+        """Follow this detour; return the robot's poses and the duration. With ``moves`` false the robot is stuck."""
         pose: Pose = (0.0, 0.0, 0.0)
         poses, now = [pose], 0.0
         while (action := detour.step(pose, ahead, now)) is not None:
@@ -149,14 +149,14 @@ class DetourTests(SynchronousTestCase):
             self.assertGreater(side * y, 0.2)
 
     def test_leg_ends_before_the_next_thing(self) -> None:
-        """With an obstacle close ahead the robot skips the leg."""
+        """If an obstacle is close ahead, the robot omits the leg."""
         detour = Detour(MotionCapabilities())
         detour.start((0.0, 0.0, 0.0), 1.0, 0.0, has_touched=False)
         poses, _ = self.gone(detour, ahead=0.2)
         self.assertEqual(poses[-1][:2], (0.0, 0.0))
 
     def test_who_is_stuck_gives_up(self) -> None:
-        """A robot that does not move ends the detour after a timeout for each of its three phases."""
+        """A robot that does not move ends the detour when each of the three phases has timed out."""
         detour = Detour(MotionCapabilities())
         detour.start((0.0, 0.0, 0.0), 1.0, 0.0, has_touched=True)
         _, took = self.gone(detour, moves=False)
@@ -164,7 +164,7 @@ class DetourTests(SynchronousTestCase):
         self.assertFalse(detour.is_active(took))
 
     def test_detour_that_nobody_walks_is_none(self) -> None:
-        """A detour without calls expires after its timeout, and ``cancel`` ends it at any time."""
+        """A detour that is not called expires after its timeout; ``cancel`` ends a detour at any time."""
         detour = Detour(MotionCapabilities())
         detour.start((0.0, 0.0, 0.0), 1.0, 0.0, has_touched=True)
         self.assertTrue(detour.is_active(1.0))

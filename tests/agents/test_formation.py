@@ -1,4 +1,4 @@
-"""Tests of ``agents.formation``: the positions of robots that do not act, and the paths to them."""
+"""Tests of ``agents.formation``: the posts of robots that do not act, and the ways to them."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ class PostTests(SynchronousTestCase):
     @settings(max_examples=80)
     @given(ANGLES)
     def test_no_way_crosses_another(self, angles: list[float]) -> None:
-        """The robots keep their angular order, and the assigned robot stays."""
+        """The robots keep their angular order around the target, and the assigned robot does not move."""
         named = sorted(((f"{number}", angle) for number, angle in enumerate(angles)), key=lambda one: one[1] % math.tau)
         placed = assign_posts(named, named[0][0])
         self.assertAlmostEqual(apart(placed[named[0][0]], named[0][1]), 0.0, 6)
@@ -52,7 +52,10 @@ class PostTests(SynchronousTestCase):
                 self.assertAlmostEqual(apart(placed[name], angle), 0.0, 6)
 
     def test_sectors_share_the_circle(self) -> None:
-        """Three robots search a third of the circle each; after one leaves, the other two search half each."""
+        """Each of three robots searches a third of the circle.
+
+        When one leaves, each of the other two searches half of it.
+        """
         self.assertEqual(assign_sector("b", {"a", "b", "c"}), (math.pi, math.tau / 3))
         self.assertEqual(assign_sector("b", {"a", "b"}), (math.remainder(1.5 * math.pi, math.tau), math.pi))
 
@@ -76,7 +79,10 @@ class FormationTests(SynchronousTestCase):
         self.others = [Member("b", "dog2", "WAITING", 1.0, angle=0.2), Member("c", "dog3", "WAITING", 1.0, angle=2.0)]
 
     def test_rests_until_somebody_leaves(self) -> None:
-        """While no robot leaves, none moves; after a departure the others, and later members, get even posts."""
+        """The robots rest until a robot leaves.
+
+        Then the remaining robots, and any that join later, get evenly spaced posts.
+        """
         self.assertEqual(self.formation.update_members(self.others), [])
         self.assertIsNone(self.formation.assign_post(self.me, self.others, None))
         self.assertEqual(self.robot.sent, [])
@@ -95,7 +101,7 @@ class FormationTests(SynchronousTestCase):
         self.assertIsNone(self.robot.sent[-1].angle)
 
     def test_post_does_not_follow_every_word(self) -> None:
-        """A post changes only if it would move far."""
+        """A post changes only by more than a minimum distance."""
         self.formation.update_members(self.others)
         self.formation.update_members([])
         first = self.formation.assign_post(self.me, self.others[:1], "b")
@@ -107,7 +113,10 @@ class FormationTests(SynchronousTestCase):
 
 class PostPathTests(SynchronousTestCase):
     def walk(self, radius: float, post: float, ahead: float = math.nan, seconds: float = 60.0) -> tuple[float, float]:
-        """Move a robot to its post around a target at (0, 0); return its final angle and distance."""
+        """Move a robot to its post around a target at (0, 0).
+
+        Return its final direction and distance from the target.
+        """
         x, y, yaw = radius, 0.0, math.pi
         circling = PostPath()
         circling.set_post(post)
@@ -130,6 +139,6 @@ class PostPathTests(SynchronousTestCase):
             self.assertLess(abs(distance - 1.2), 0.1)
 
     def test_stops_before_what_is_in_the_way(self) -> None:
-        """The robot stays if an obstacle is ahead or if it is close to the target."""
+        """The robot does not move if an obstacle is ahead, or if the target is too close."""
         self.assertLess(apart(self.walk(1.2, 2.0, ahead=0.3)[0], 0.0), 0.05)
         self.assertLess(apart(self.walk(MIN_CIRCLING_RADIUS_M - 0.05, 2.0)[0], 0.0), 0.01)

@@ -1,4 +1,4 @@
-"""Tests of ``agents.loop``: the agent between its node and its robot, in a small team in memory."""
+"""Tests of ``agents.loop``: the agent that connects its node and its robot, in a small team in memory."""
 
 from __future__ import annotations
 
@@ -32,14 +32,14 @@ class LoopTests(SynchronousTestCase):
         return agent
 
     def submit(self, **fields: Any) -> None:
-        """Submit a task with these fields directly to the node, without the operator's page and its catalogue."""
+        """Submit a task with these fields directly to the node, bypassing the operator's page and its catalogue."""
         task = Task(**{"task_id": "t1", "kind": "turn-around", "title": "Odd", **fields})
         node = self.team.services["vaio"].assembly.node
         Deferred.fromCoroutine(node.submit(task))
         self.team.clock.advance(1.0)
 
     def device(self, name: str) -> dict[str, Any]:
-        """Return a device as the page shows it."""
+        """Return the device with this name from the page's state."""
         return next(dict(row) for row in self.team.state()["devices"] if row["name"] == name)
 
     def lines(self, name: str) -> list[str]:
@@ -87,7 +87,7 @@ class LoopTests(SynchronousTestCase):
         self.assertEqual(refused, [])
 
     def test_motors_are_asked_for_until_they_are_on(self) -> None:
-        """If the connection breaks while the motors start, the agent enables them again after it reconnects."""
+        """If the connection breaks while the motors start, the agent enables the motors again after it reconnects."""
         self.team.add_node("dog3")
         service = self.team.services["dog3"]
         connector = self.team.connectors["dog3"]
@@ -102,7 +102,7 @@ class LoopTests(SynchronousTestCase):
         self.assertIsNot(self.agent_of("dog3").engagement, None)
 
     def test_switched_off_robot_takes_no_part(self) -> None:
-        """A robot with disabled motors still sends observations, and is unavailable until they are enabled again."""
+        """A robot with disabled motors still sends observations, but takes no task until they are enabled again."""
         self.submit(kind="find-target")
         self.team.clock.advance(3.0)
         driver = self.team.services["dog1"].assembly.driver
@@ -147,7 +147,7 @@ class LoopTests(SynchronousTestCase):
         self.assertEqual(self.team.state()["tasks"][0]["status"], "COMPLETED")
 
     def test_only_who_did_it_is_done(self) -> None:
-        """After the task its assigned agent becomes DONE and the other IDLE, which is never DONE in between."""
+        """After the task only the assigned agent becomes DONE; the other agent becomes IDLE and is never DONE."""
         self.submit()
         ends: dict[str, list[str]] = {"dog1": [], "dog2": []}
         for name, statuses in ends.items():
@@ -167,7 +167,7 @@ class LoopTests(SynchronousTestCase):
         self.assertEqual((other[-1], other.count("DONE")), ("IDLE", 0))
 
     def test_task_without_a_behaviour_is_left_and_said(self) -> None:
-        """A task with an unknown kind or invalid parameters adds a message to the device; the next task is done."""
+        """A task with an unknown kind or invalid parameters adds a message to the device; the next task is executed."""
         self.submit(kind="os:system")
         self.assertIn("no behaviour for tasks of kind 'os:system'", self.lines("dog1")[-1])
         self.submit(task_id="t2", created=1.0, kind="find-target", parameters={"target_radius": 0.0})
@@ -178,7 +178,7 @@ class LoopTests(SynchronousTestCase):
         self.assertEqual(states["t3"], "COMPLETED")
 
     def test_strategy_is_never_imported_from_a_task(self) -> None:
-        """A strategy with the form ``module:name`` is refused in a submission and in a record of another node."""
+        """A strategy of the form ``module:name`` is refused, both in a submission and in a record of another node."""
         node = self.team.services["vaio"].assembly.node
         task = Task("t0", "turn-around", "Odd", strategy="os:system")
         self.failureResultOf(Deferred.fromCoroutine(node.submit(task)), UnknownStrategy)
@@ -188,7 +188,7 @@ class LoopTests(SynchronousTestCase):
             self.assertIn(f"unknown strategy {odd.strategy!r}", self.lines("dog1")[-1])
 
     def test_old_task_that_is_done_is_not_begun_again(self) -> None:
-        """A dog that joins after the end of a task does not start it."""
+        """A dog that joins after the end of a task does not execute the task."""
         self.submit()
         self.team.clock.advance(8.0)
         self.team.add_node("dog3")
@@ -197,7 +197,7 @@ class LoopTests(SynchronousTestCase):
         self.assertEqual(self.agent_of("dog3")._task_queue.open_ids, set())
 
     def test_task_is_taken_up_when_nobody_could_tell_at_first(self) -> None:
-        """If no node answers a query for the group of a task, the agent repeats the query until one does."""
+        """If no node replies to a query for the reports on a task, the agent repeats the query until a node replies."""
         agent = self.agent_of("dog1")
         node = agent._node
         get, tries = node.entangled.get, []
@@ -227,7 +227,7 @@ class LoopTests(SynchronousTestCase):
         self.assertNotEqual(self.team.state()["tasks"][0]["result"]["by"], "dog3")
 
     def test_stopped_agent_stands_still(self) -> None:
-        """An agent that stops while its robot moves stops the robot."""
+        """When an agent stops, it stops its moving robot."""
         self.submit()
         self.team.clock.advance(1.0)
         moving = [dog.name for dog in self.team.simulator.world.dogs.values() if dog.is_moving]

@@ -21,7 +21,7 @@ def with_camera(**properties: float) -> MotionCapabilities:
 
 class DescriptionTests(SynchronousTestCase):
     def test_unknown_body_is_an_ers7(self) -> None:
-        """Without a description the capabilities are exactly the simulated dog's."""
+        """A robot without a description has exactly the motion capabilities of the simulated dog."""
         for name in (
             "walk",
             "turn",
@@ -54,7 +54,7 @@ class DescriptionTests(SynchronousTestCase):
         self.assertEqual(with_camera().lens, MotionCapabilities().lens)
 
     def test_slow_camera_slows_the_turn(self) -> None:
-        """At two frames per second the robot turns at most half a view between frames, and accepts older frames."""
+        """At two frames per second the robot turns at most half a view between two frames, and accepts older frames."""
         slow = MotionCapabilities(replace(WHEELS, rates={"camera": 2.0}))
         self.assertLess(slow.look_turn / 2.0, 0.51 * slow.lens[0])
         self.assertGreater(slow.fresh, 2 / 2.0)
@@ -68,7 +68,10 @@ class DescriptionTests(SynchronousTestCase):
 
 class MissingAxesTests(SynchronousTestCase):
     def test_rest_on_an_axis_that_is_not_there_is_left_out(self) -> None:
-        """Zero velocity on a missing axis is removed; other values are left for the driver to refuse."""
+        """A zero velocity on an axis that the robot lacks is removed.
+
+        Other velocities remain, and the driver refuses them.
+        """
         self.assertEqual(MotionCapabilities(WHEELS).remove_missing_axes(STAND), {"base.vx": 0.0, "base.wz": 0.0})
         self.assertEqual(MotionCapabilities().remove_missing_axes(STAND), STAND)
         aside = {"base.vy": 0.1}
@@ -77,11 +80,11 @@ class MissingAxesTests(SynchronousTestCase):
 
 class LearningTests(SynchronousTestCase):
     def turned(self, motion: MotionCapabilities, wished: float, done: float) -> None:
-        """Record a turn on the spot that was executed at another velocity."""
+        """Request a turn on the spot, and record the different velocity that was executed."""
         motion.learn({"base.vx": 0.0, "base.wz": wished}, {"base.vx": 0.0, "base.wz": done})
 
     def test_who_does_what_it_is_told_learns_nothing(self) -> None:
-        """A robot that executes an action exactly, or clipped to its limits, keeps its fine aim."""
+        """A robot that executes actions exactly, or clipped to its limits, keeps its fine aim."""
         motion = MotionCapabilities(WHEELS)
         for wished, done in ((0.5, 0.5), (5.0, 2.0), (0.01, 0.0100001)):
             self.turned(motion, wished, done)
@@ -91,7 +94,7 @@ class LearningTests(SynchronousTestCase):
         )
 
     def test_faster_turn_than_asked_for_is_a_coarse_aim(self) -> None:
-        """The larger a robot's smallest turn is, the coarser is its aim, up to a limit."""
+        """The larger the smallest possible turn of a robot is, the coarser is its aim, up to a limit."""
         motion = MotionCapabilities(replace(WHEELS, rates={"camera": 5.0}))
         self.turned(motion, 0.1, 1.0)
         large = motion.facing_tolerance
@@ -117,7 +120,10 @@ class LearningTests(SynchronousTestCase):
         self.assertEqual(motion.spin(0.0), STAND)
 
     def test_creep_that_was_too_slow_is_tried_faster(self) -> None:
-        """If a walk was too slow to move the robot, the next one is faster; too long a stride makes it stop earlier."""
+        """If a walk was too slow to move the robot, the next walk is faster.
+
+        After a long step the robot stops earlier.
+        """
         motion = MotionCapabilities(WHEELS)
         before = motion.stop_distance
         motion.learn({"base.vx": 0.04, "base.wz": 0.0}, {"base.vx": 0.0, "base.wz": 0.0})

@@ -38,7 +38,7 @@ class CouncilMaintainerTests(SynchronousTestCase):
         self.node.watch_group("turn", lambda records: self.group.__setitem__(slice(None), records))
 
     def given(self, *council: str, turns: float = TURNS) -> None:
-        """Write a long turn-around task with these nodes as its council."""
+        """Write a long task ``turn_around`` with these nodes as its council."""
         task = replace(create_task("turn-around", "turn", 0.0), waiting_period=1.0, parameters={"turns": turns})
         members = tuple(self.team.services[name].assembly.node.entangled.contact for name in council)
         task = task.with_council(create_charter(self.node.entangled.identity, "turn", members))
@@ -53,7 +53,7 @@ class CouncilMaintainerTests(SynchronousTestCase):
 
     @property
     def council(self) -> list[str]:
-        """The names of the members of the task's council, sorted."""
+        """Return the sorted names of the members of the task's council."""
         names = {service.assembly.node.uuid: name for name, service in self.team.services.items()}
         return sorted(names[member.node_id.hex()] for member in self.task.council)
 
@@ -62,14 +62,17 @@ class CouncilMaintainerTests(SynchronousTestCase):
         return [name for name, dog in self.team.simulator.world.dogs.items() if dog.is_moving]
 
     def run_for(self, seconds: float) -> None:
-        """Advance the time in steps, and check in each that at most one dog moves."""
+        """Advance the time in steps; check after each step that at most one dog moves."""
         end = self.team.clock.seconds() + seconds
         while self.team.clock.seconds() < end:
             self.team.clock.advance(0.05)
             self.assertLessEqual(len(self.moving()), 1)
 
     def test_who_acts_fills_the_council(self) -> None:
-        """The acting agent replaces dead members of the council and continues; if it fails, another completes."""
+        """The acting agent replaces dead council members and continues.
+
+        If the agent itself fails, another completes the task.
+        """
         self.given("witness1", "witness2", "dog1", turns=12.0)
         self.run_for(3.0)
         (first,) = self.moving()
@@ -91,7 +94,7 @@ class CouncilMaintainerTests(SynchronousTestCase):
         self.assertNotEqual(outcome.by, first)
 
     def test_before_anybody_acts(self) -> None:
-        """Two members of the council fail one after the other during a pause; after the resume one dog acts."""
+        """Two council members fail one after the other during a pause; after the resume exactly one dog acts."""
         self.given("witness1", "witness2", "witness3")
         self.successResultOf(self.ordered(PAUSE))
         self.run_for(2.0)
@@ -103,7 +106,7 @@ class CouncilMaintainerTests(SynchronousTestCase):
         self.assertEqual(len(self.moving()), 1)
 
     def test_nobody_to_follow(self) -> None:
-        """If no node is left to replace a dead member, the council stays, and the acting agent is not interrupted."""
+        """If no node can replace a dead member, the council stays as it is, and the acting agent is not interrupted."""
         self.made(SimulatedTeam(4, 0.1, dogs=("dog1", "dog2")))
         self.given("vaio", "dog1", "dog2")
         self.run_for(3.0)

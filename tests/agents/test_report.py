@@ -38,7 +38,7 @@ class ReporterTests(SynchronousTestCase):
         return Minded()
 
     def news(self, charge: float = 0.8, load: int = 2) -> dict[str, Any]:
-        """Return the changed values, and store them as reported."""
+        """Return the values that changed since the previous report, and mark them as reported."""
         seen = Observation(0.0, 0.0, {"power.level": charge})
         self.reporter.load = load
         changes = self.reporter.find_changes(self.me, False, seen, self.clock.seconds()) or {}
@@ -46,14 +46,17 @@ class ReporterTests(SynchronousTestCase):
         return changes
 
     def test_all_is_told_at_first(self) -> None:
-        """The first report with a cost contains battery, load and the behaviour's values; later ones only changes."""
+        """The first report with a cost contains battery, load and the behaviour's values.
+
+        Later reports only the changes.
+        """
         offer = {"value": (1.0, 2.0), "choice": "red", "weight": 3.0, "electorate": 9.0}
         self.assertEqual(self.news(), {"cost": 2.0, "available": True, "battery": 0.8, "load": 2, **offer})
         self.clock.advance(9.0)
         self.assertEqual(self.news(), {})
 
     def test_without_cost_nothing_is_offered(self) -> None:
-        """An agent without a cost reports no vote and no value."""
+        """An agent without a cost reports neither a vote nor a value."""
         self.minded.cost = None
         self.assertEqual(self.news(), {})
 
@@ -67,7 +70,7 @@ class ReporterTests(SynchronousTestCase):
         self.assertEqual(self.news(float("nan")), {})
 
     def test_votes_at_once_and_numbers_at_leisure(self) -> None:
-        """A changed vote is reported at once, a changed number at most once a second."""
+        """A changed vote is reported immediately, a changed number at most once per second."""
         self.news()
         self.minded.choice, self.minded.value = "blue", (1.1, 2.0)
         self.assertEqual(self.news(), {"choice": "blue"})

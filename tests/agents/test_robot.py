@@ -16,7 +16,7 @@ from tests.agents.roamer import described, quantised
 
 
 class Robot:
-    """A driver of a Bittle with the methods that a body needs to move it."""
+    """A driver stub with the description of a Bittle, and the methods that move a robot."""
 
     def __init__(self) -> None:
         self.description = described("bittle")
@@ -35,12 +35,12 @@ class RobotTests(SynchronousTestCase):
         self.body = AgentRobot(cast(Driver, self.robot), Clock(), lambda seen: None, lambda why: None)
 
     def do(self, **wished: float) -> None:
-        """Send these velocities to the body; all other axes rest."""
+        """Command these velocities; the velocities of all other axes are zero."""
         action = {**STAND, **{f"base.{axis}": value for axis, value in wished.items()}}
         self.assertTrue(self.body.perform(RobotCommand(action, Permit(1, 1.0))))
 
     def test_robot_is_asked_for_nothing_that_it_has_not(self) -> None:
-        """A robot without a sideways gait receives no sideways value, which its driver would refuse as unknown."""
+        """A robot without a sideways gait receives no sideways velocity, which its driver would refuse."""
         self.do(vx=0.1)
         self.assertEqual(self.robot.asked, [{"base.vx": 0.1, "base.wz": 0.0}])
 

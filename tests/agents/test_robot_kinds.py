@@ -22,7 +22,7 @@ JERKS = {"f": Velocity(0.15, 0.0), "b": Velocity(-0.1, 0.0), "l": Velocity(0.0, 
 
 
 def roamer(kind: str, seed: int) -> Roamer:
-    """Return a robot of this kind at a random position, with a target at another."""
+    """Return a robot of this kind and a target, both at random positions."""
     return Roamer(kind, seed, lag=LAG.get(kind, 0.1))
 
 
@@ -39,13 +39,13 @@ def with_gaits(gaits: dict[str, Velocity], seed: int) -> Roamer:
 
 class RobotKindTests(SynchronousTestCase):
     def arrived(self, robot: Roamer, limit: float = 60.0) -> None:
-        """Check that the robot reaches the target, stops close to it, and touched nothing faster than a slow walk."""
+        """Check that the robot stops close to the target, and bumped into nothing faster than at a slow walk."""
         self.assertTrue(robot.reach(limit), "never done")
         self.assertLessEqual(robot.gap, 0.15)
         self.assertLessEqual(robot.hardest, max(WALK_SPEED_MPS, robot.motion.walk) + 0.01)
 
     def test_robots_that_feel_their_way_find_it_too(self) -> None:
-        """A robot without a ranger walks for a minute, bumps no faster than it walks, and then reaches the target."""
+        """A robot without a ranger bumps into nothing faster than at a slow walk, and reaches the target."""
         for kind in ("create2", "bittle"):
             with self.subTest(kind=kind):
                 robot = roamer(kind, 1)
@@ -66,7 +66,7 @@ class RobotKindTests(SynchronousTestCase):
                 self.assertLess(robot.reversals, 10)
 
     def test_robot_that_turns_only_as_it_walks_gets_there(self) -> None:
-        """A robot that cannot turn on the spot searches on arcs, and backs off from a target within their radius."""
+        """A robot that cannot turn on the spot searches on arcs, and leaves a target inside its turning circle."""
         for seed in (1, 2):
             with self.subTest(seed=seed):
                 robot = with_gaits(ARCS, seed)
@@ -94,7 +94,7 @@ class BumpTests(SynchronousTestCase):
         return robot
 
     def test_bump_into_the_target_is_an_arrival(self) -> None:
-        """A target smaller than the task says looks farther away than it is; a bump into it completes the task."""
+        """A target smaller than the task states appears farther away than it is; bumping into it completes the task."""
         robot = roamer("create2", 1)
         robot.behaviour = SearchAndApproach({"target_radius": 0.16, "target_height": 0.44}, Random(4))
         robot.behaviour.embody(robot.motion)
@@ -104,7 +104,7 @@ class BumpTests(SynchronousTestCase):
         self.assertLessEqual(robot.hardest, 0.17)
 
     def test_bump_on_the_way_is_gone_round(self) -> None:
-        """The robot bumps into an invisible obstacle once, backs off, drives around it and reaches the target."""
+        """The robot bumps into an invisible obstacle once, backs off, drives around it, and reaches the target."""
         robot = self.facing()
         for _ in range(60):
             robot.live(lambda now: robot.behaviour.execute(Context(now)))
@@ -141,7 +141,7 @@ class BumpTests(SynchronousTestCase):
 
 
 class StubRobot:
-    """A behaviour on a robot of this kind that receives target positions instead of camera frames."""
+    """A behaviour that controls a robot of this kind and receives target positions instead of camera frames."""
 
     def __init__(self, kind: str) -> None:
         self.motion = MotionCapabilities(described(kind))
@@ -172,14 +172,14 @@ class NearTests(SynchronousTestCase):
         return acts
 
     def test_bump_counts_as_arrival_before_the_target_only(self) -> None:
-        """A bump completes the task only if the target is near and ahead; otherwise the robot backs off."""
+        """A bump completes the task only if the target is close and ahead; after any other bump the robot backs off."""
         self.assertIsNone(self.acts(0.33, 0.05)[-1])
         for distance, bearing in ((0.33, 0.6), (1.0, 0.05)):
             acts = self.acts(distance, bearing)
             self.assertTrue(all(action is not None and action["base.vx"] < 0.0 for action in acts), (distance, bearing))
 
     def test_who_turns_on_a_circle_backs_off_from_what_is_in_it(self) -> None:
-        """A robot backs off from a target inside its turning circle, and turns towards one that is farther away."""
+        """A robot backs off from a target inside its turning circle, and turns towards a target outside of it."""
         stub = StubRobot("bittle")
         stub.motion.circle = 0.15
         for distance, sign in ((0.2, -1.0), (1.0, 1.0)):

@@ -21,7 +21,7 @@ TICK = 8 * SUBSTEP_S
 
 
 class Walk:
-    """A simulated dog and its behaviour; the other dogs stand far away."""
+    """A simulated dog and its behaviour; the other dogs are far away."""
 
     def __init__(self, seed: int = 1, x: float = 0.4, y: float = 1.2, heading: float = 0.0) -> None:
         self.world = World(Random(seed), load_scene("three-dogs"))
@@ -58,7 +58,7 @@ class Walk:
         return action
 
     def find(self, limit: float = 60.0) -> float | None:
-        """Search until the behaviour has a cost, or until ``limit``."""
+        """Search until the behaviour has a cost, for at most ``limit`` seconds."""
         while self.behaviour.cost is None and self.now < limit:
             self.live()
         return self.behaviour.cost
@@ -89,7 +89,7 @@ class SearchTests(SynchronousTestCase):
 
 class RangerTests(SynchronousTestCase):
     def measure_cost(self, replaced: dict[str, float]) -> float:
-        """Return the reported distance, relative to the true one, of a target at 0.9 m with these ranger values."""
+        """Return the reported distance, as a ratio to the true one, of a target at 0.9 m with these ranger values."""
         walk = Walk()
         walk.world.place_target(0.4 + NOSE_M + 0.9, 1.2)
         walk.replaced = replaced
@@ -98,11 +98,11 @@ class RangerTests(SynchronousTestCase):
         return cost / walk.distance()
 
     def test_ranger_is_believed_where_the_picture_agrees(self) -> None:
-        """If range and camera agree, the cost is the range, which is more accurate."""
+        """If range and camera agree, the cost is the range, which is the more accurate value."""
         self.assertLess(abs(self.measure_cost({"range.near": math.nan, "range.far": 0.86}) * 0.9 - 0.94), 0.02)
 
     def test_ranger_that_reads_something_else_is_not_believed(self) -> None:
-        """If a dog in between, a wall behind or no echo disturbs the range, the cost is the camera's distance."""
+        """If another dog, a wall behind the target or a missing echo falsifies the range, the camera gives the cost."""
         for wrong in (0.2, 0.45, 1.4, math.nan):
             self.assertLess(abs(self.measure_cost({"range.near": math.nan, "range.far": wrong}) - 1), 0.08, wrong)
 
@@ -155,7 +155,7 @@ class MemoryTests(SynchronousTestCase):
         return walk
 
     def test_target_out_of_sight_is_remembered_for_a_while(self) -> None:
-        """A hidden target keeps its cost for ``TARGET_MEMORY_S`` seconds, then the cost is removed."""
+        """A hidden target keeps its cost for ``TARGET_MEMORY_S`` seconds; then the cost is None."""
         walk = self.found()
         walk.turned_off.add("camera")
         hidden = walk.now
@@ -175,10 +175,10 @@ class MemoryTests(SynchronousTestCase):
 
 
 class HiddenTests(SynchronousTestCase):
-    """Another robot stands in front of the target, such as one that failed on its way."""
+    """Another robot, for example one that failed on its way, hides the target."""
 
     def hidden(self, at: float = 0.55) -> Walk:
-        """Return a dog that has found the target, then hidden by another dog ``at`` metres ahead."""
+        """Return a dog that has found the target, after another dog ``at`` metres ahead has hidden it."""
         walk = Walk()
         walk.world.place_target(1.9, 1.4)
         self.assertIsNotNone(walk.find())
@@ -188,7 +188,10 @@ class HiddenTests(SynchronousTestCase):
         return walk
 
     def test_report_stays_for_a_while(self) -> None:
-        """A target hidden by another robot keeps its cost for ``HIDDEN_TARGET_MEMORY_S`` seconds, and then loses it."""
+        """A target hidden by another robot keeps its cost for ``HIDDEN_TARGET_MEMORY_S`` seconds.
+
+        Then the cost is None.
+        """
         walk = self.hidden()
         started_at = walk.now
         while walk.now - started_at < HIDDEN_TARGET_MEMORY_S - 0.5:
@@ -199,7 +202,7 @@ class HiddenTests(SynchronousTestCase):
         self.assertIsNone(walk.behaviour.cost)
 
     def test_way_leads_round_it(self) -> None:
-        """The dog walks around another dog in front of the target without a push, and stops at the target."""
+        """The dog walks around another dog in front of the target without pushing it, and stops at the target."""
         walk = self.hidden()
         other = walk.world.dogs["dog2"]
         place = other.x, other.y
@@ -211,7 +214,7 @@ class HiddenTests(SynchronousTestCase):
 
 class ParameterTests(SynchronousTestCase):
     def test_sizes_that_cannot_be_are_refused(self) -> None:
-        """A target size that is not a positive finite number in range is refused on creation."""
+        """A target size that is not a finite number in the permitted range is refused when the behaviour is created."""
         for name in ("target_radius", "target_height"):
             for wrong in (0.0, -1.0, math.inf, math.nan, 1e9, "big"):
                 self.assertRaises(ValueError, SearchAndApproach, {name: wrong}, Random(1))

@@ -28,7 +28,7 @@ DEADLINE = 100.0
 
 class TableTests(SynchronousTestCase):
     def test_each_pair_has_one_row(self) -> None:
-        """Each event has exactly one row in each state, and no row is redundant."""
+        """Each event has exactly one row in each state, and every row is needed."""
         named = [(state, row.event) for row in ROWS for state in row.states]
         self.assertEqual((len(named), set(TABLE)), (len(set(named)), set(product(State, Event))))
         for row in ROWS:
@@ -50,18 +50,18 @@ class TableTests(SynchronousTestCase):
                 self.assertIn(Effect.STOP, effects, event.name)
 
     def test_the_end_is_the_end(self) -> None:
-        """DONE has no outgoing transition, its only effect is HAND_OVER, and OUTCOME leads to DONE from each state."""
+        """No transition leaves DONE, its only effect is HAND_OVER, and OUTCOME leads to DONE from each state."""
         follow = {(target, effects) for (state, _), (target, effects) in TABLE.items() if state is S.DONE}
         self.assertEqual(follow, {(S.DONE, ()), (S.DONE, (Effect.HAND_OVER,))})
         self.assertEqual({TABLE[state, Event.OUTCOME][0] for state in State}, {S.DONE})
 
     def test_statuses_are_those_of_the_page(self) -> None:
-        """Each state maps to a known status, and only EXECUTING to the status EXECUTING."""
+        """Each state has a known status, and only the state EXECUTING has the status EXECUTING."""
         self.assertTrue({state.status for state in S} <= set(STATUSES))
         self.assertEqual([state for state in S if state.status == EXECUTING], [S.EXECUTING])
 
     def test_rank_is_shown(self) -> None:
-        """The text of a waiting agent contains its rank, which stays until an event changes it."""
+        """The text of a waiting agent contains its rank, which does not change until the next event."""
         machine = StateMachine()
         machine.state = S.OBSERVING
         for event, rank, shown in (
@@ -73,12 +73,15 @@ class TableTests(SynchronousTestCase):
             self.assertEqual(str(machine), shown)
 
     def test_page_has_the_table(self) -> None:
-        """The documentation contains the states as generated from the table."""
+        """The documentation contains the state table in its generated form."""
         self.assertIn(write_states(), PAGE.read_text(encoding="utf-8"))
 
 
 class Rig:
-    """An agent in a task with stubs of robot, lease client, other agent and clock; each input checks the invariants."""
+    """An agent in a task, with stubs of the robot, the lease client, the other agent and the clock.
+
+    It checks invariants.
+    """
 
     def __init__(self) -> None:
         self.clock = HeapClock()
@@ -95,7 +98,7 @@ class Rig:
 
     @property
     def key(self) -> tuple[object, ...]:
-        """The part of the state that determines the event of an input."""
+        """Return the part of the state from which the effect of an input follows."""
         one, client = self.engagement, self.lease_client
         held = (
             one.state_machine.state,
@@ -111,7 +114,7 @@ class Rig:
         return (*held, *asked, moves, one.me.cost, *(other.cost for other in self.others))
 
     def feed(self, name: str) -> list[str]:
-        """Apply one input, run a step, and return the faults that the invariants find."""
+        """Apply one input and run a step; return the invariants that were violated."""
         for past in (
             self.events,
             self.outputs.reports,
@@ -132,7 +135,7 @@ class Rig:
         return faults
 
     def faults(self, command: RobotCommand | None) -> list[str]:
-        """Return the invariants that the events and ``command`` of a step violate."""
+        """Return the invariants that the events and the ``command`` of a step violate."""
         faults = []
         for event in self.events:
             if event == "halted":
@@ -152,7 +155,7 @@ class Rig:
 
 
 def hear(rig: Rig, one: Engagement, now: float, *others: Member) -> None:
-    """The other agents report; without ``others``, they have left."""
+    """The other agents report, or have left if there are no ``others``."""
     rig.others = list(others)
     one.process_reports(rig.others, None, now)
 
@@ -164,7 +167,7 @@ def take(rig: Rig, one: Engagement, now: float) -> None:
 
 
 def lend(rig: Rig, one: Engagement, now: float) -> None:
-    """Another task of the group gets the robot, unless this one acts."""
+    """Another task of the group gets the robot, unless this task acts."""
     if not one.is_acting and one.can_yield_robot:
         one.set_robot_lent(True, now)
 
@@ -193,7 +196,7 @@ def leave(rig: Rig, one: Engagement, now: float) -> None:
 
 
 def expire(rig: Rig, one: Engagement, now: float) -> None:
-    """The task passes its deadline; a held lease is renewed."""
+    """The deadline of the task passes; a held lease is renewed."""
     rig.is_late = True
     rig.lease_client.deadline += DEADLINE
     rig.clock.advance(DEADLINE + 1.0)
@@ -229,7 +232,7 @@ INPUTS: dict[str, Callable[[Rig, Engagement, float], object]] = {
 
 class ReachableTests(SynchronousTestCase):
     def test_invariants_hold_in_each_state_that_is_reached(self) -> None:
-        """Each input in each reachable state keeps the invariants, such as no action without a lease."""
+        """Every input in every reachable state preserves the invariants, such as no action without a lease."""
         first = Rig()
         shared = {id(each): each for each in (first.engagement.task, CONTACT)}
         known: dict[tuple[object, ...], tuple[str, ...]] = {first.key: ()}

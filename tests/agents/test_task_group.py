@@ -1,4 +1,4 @@
-"""Tests of ``agents.task_group``: each agent divides the tasks of a group by the same reports."""
+"""Tests of ``agents.task_group``: every agent assigns the tasks of a group from the same reports."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ def members(costs: dict[str, float | None], acting: str = "") -> list[Member]:
 
 class TaskGroupTests(SynchronousTestCase):
     def division(self, costs: Costs, strategy: str = "group_optimal", **acting: str) -> TaskGroup:
-        """Return the division of all tasks after the gathering period; ``acting`` maps a task to its acting agent."""
+        """Return the assignment of all tasks after the gathering period; ``acting`` maps a task to its acting agent."""
         task_group = TaskGroup(GuardedStrategy(load_strategy(strategy)))
         for name, row in costs.items():
             here = members(row, acting.get(name, ""))
@@ -60,7 +60,7 @@ class TaskGroupTests(SynchronousTestCase):
         return {name: decision.assigned for name, decision in self.decided(costs, **acting).items()}
 
     def test_optimum_of_all_tasks(self) -> None:
-        """Each agent is assigned one task, and the total cost is the minimum over all assignments."""
+        """Each agent is assigned one task, and no other assignment has a lower total cost."""
         rng = random.Random(4)
         for _ in range(50):
             costs: Costs = {t: {a: round(rng.uniform(0.0, 9.0), 2) for a in AGENTS} for t in ("t1", "t2", "t3")}
@@ -73,7 +73,7 @@ class TaskGroupTests(SynchronousTestCase):
             self.assertAlmostEqual(total, best)
 
     def test_one_digest_of_all_reports(self) -> None:
-        """The decisions on all tasks carry the same digest of all reports, and their reasons name the division."""
+        """The decisions on all tasks have the same digest of all reports, and their reasons describe the assignment."""
         costs: Costs = {"t1": {"a": 1.0, "b": 2.0}, "t2": {"a": 1.5, "b": 5.0}}
         first = self.decided(costs)
         self.assertEqual(first["t1"].digest, first["t2"].digest)
@@ -87,19 +87,25 @@ class TaskGroupTests(SynchronousTestCase):
         self.assertEqual(len({point.digest for point in shares}), 1)
 
     def test_more_tasks_than_agents(self) -> None:
-        """With more tasks than agents the remaining task waits, and its reason says so."""
+        """With more tasks than agents, one task waits; its reason says that all bidders have reached their capacity."""
         found = self.decided({"t1": {"a": 1.0}, "t2": {"a": 2.0}})
         self.assertEqual((found["t1"].assigned, found["t2"].assigned), ("a", None))
         self.assertEqual(found["t2"].why, "all bidders have reached their capacity")
 
     def test_who_acts_counts_for_its_task_alone(self) -> None:
-        """An acting agent is not assigned another task of the group, even if it is the nearest; a free agent is."""
+        """An acting agent gets no other task of the group, even if it is the nearest agent.
+
+        A free agent gets the task.
+        """
         costs: Costs = {"t1": {"a": 1.0, "b": 9.0}, "t2": {"a": 0.1, "b": 9.0}}
         self.assertEqual(self.assigned(costs, t1="a"), {"t1": "a", "t2": "b"})
         self.assertEqual(self.assigned({"t1": costs["t1"], "t2": {"a": 0.1}}, t1="a"), {"t1": "a", "t2": None})
 
     def test_who_acts_keeps_it_within_the_hysteresis(self) -> None:
-        """A free agent takes a task over only if it is better by the hysteresis; otherwise it gets another task."""
+        """A free agent takes over a task only if its cost is lower by the hysteresis.
+
+        Otherwise it gets a different task.
+        """
         for cost, given in ((0.95, "a"), (0.85, "b")):
             self.assertEqual(self.assigned({"t1": {"a": 1.0, "b": cost}}, t1="a"), {"t1": given})
         costs: Costs = {"t1": {"a": 1.0, "b": 0.95}, "t2": {"b": 9.0}}
@@ -108,7 +114,7 @@ class TaskGroupTests(SynchronousTestCase):
             self.assertEqual(points.assigned_agent, "b", strategy)
 
     def test_group_is_gathered_first(self) -> None:
-        """No agent is assigned before the gathering period ends; an agent that acts already continues."""
+        """No agent is assigned before the gathering period ends, except an agent that is already acting."""
         costs: Costs = {"t1": {"a": 1.0, "b": 0.1}, "t2": {"a": 2.0, "b": 2.0}}
         for now, given, why in (
             (GROUP_SETTLE_S - 0.1, None, "waiting for the rest of the group"),
@@ -121,7 +127,7 @@ class TaskGroupTests(SynchronousTestCase):
         self.assertEqual((held.assigned, len(held.digest)), ("a", 8))
 
     def test_missing_reports_on_other_tasks_are_waited_for(self) -> None:
-        """During the waiting period no agent is assigned while one has not reported on another task of the group."""
+        """During the waiting period no agent is assigned until all have reported on every task of the group."""
         costs: Costs = {"t1": {"a": 1.0, "b": 2.0}, "t2": {"a": 1.0, "b": None}}
         found = self.decided(costs, since=7.9)
         self.assertEqual((found["t1"].assigned, found["t1"].why), (None, "waiting for dog-b"))
@@ -129,7 +135,10 @@ class TaskGroupTests(SynchronousTestCase):
         self.assertEqual(self.decided(costs, since=7.9, t2="a")["t1"].assigned, "b")
 
     def test_what_is_divided_together(self) -> None:
-        """Tasks with the same group, strategy and requirements are divided together; a task without a group is not."""
+        """Tasks with the same group, strategy and requirements are assigned jointly.
+
+        A task without a group is assigned alone.
+        """
         one = task("t1", requirements={"camera": {"width": 1, "colour": "rgb"}, "legs": {}})
         two = task("t2", requirements={"legs": {}, "camera": {"colour": "rgb", "width": 1}})
         self.assertEqual(get_group_key(one), get_group_key(two))
@@ -138,28 +147,28 @@ class TaskGroupTests(SynchronousTestCase):
         self.assertIsNone(get_group_key(replace(one, group="")))
 
     def test_schedules(self) -> None:
-        """In random schedules each task ends once, no agent acts on two tasks, and all agents agree."""
+        """In random schedules each task ends once, no agent acts on two tasks, and all agents reach equal decisions."""
         broken = {seed: found for seed in range(6) if (found := Groups(seed).run())}
         self.assertEqual(broken, {})
 
 
 class SelectParticipationTests(SynchronousTestCase):
-    """The choice of the task of a group that uses the robot."""
+    """The choice of the task in a group that controls the robot."""
 
     def part(self, cost: float | None = 1.0, assigned: str = "", is_acting: bool = False, is_free: bool = True) -> Any:
-        """Return a task as its agent sees it."""
+        """Return a task and its state as seen by the agent."""
         me = Member("a", "dog", WAITING, cost, assigned)
         return SimpleNamespace(engagement=SimpleNamespace(me=me, is_acting=is_acting, can_yield_robot=is_free))
 
     def test_given_task_has_it(self) -> None:
-        """The robot works on its agent's assigned task, unless it acts on another one or records its outcome."""
+        """The robot works on its agent's assigned task, unless the agent acts on another or records its outcome."""
         other, given = self.part(None), self.part(assigned="a")
         self.assertIs(select_participation([other, given], other), given)
         for holder in (self.part(is_acting=True), self.part(is_free=False)):
             self.assertIs(select_participation([given, holder], holder), holder)
 
     def test_else_what_it_cannot_tell_yet(self) -> None:
-        """Without an assigned task the robot measures a task of unknown cost; if there is none, it keeps its task."""
+        """Without an assigned task the robot measures a task of unknown cost, or else keeps its present task."""
         reported, unknown, also = self.part(), self.part(None), self.part(None, assigned="b")
         self.assertIs(select_participation([reported, unknown, also], reported), unknown)
         self.assertIs(select_participation([reported, unknown, also], also), also)

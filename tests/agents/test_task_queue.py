@@ -1,4 +1,4 @@
-"""Tests of ``agents.task_queue``: the task that uses the robot, and the tasks that have ended."""
+"""Tests of ``agents.task_queue``: the task that controls the robot, and the tasks that have ended."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ OLD, NEW, URGENT = task("old", 1.0), task("new", 2.0), task("urgent", 3.0, 5)
 
 class TaskQueueTests(SynchronousTestCase):
     def test_order(self) -> None:
-        """The task with the highest priority is first, then the oldest; the number of followed tasks is limited."""
+        """Tasks are ordered by priority, then by age; an agent takes part in a limited number of them."""
         task_queue = TaskQueue()
         for one in (NEW, URGENT, OLD):
             task_queue.add(one)
@@ -29,7 +29,7 @@ class TaskQueueTests(SynchronousTestCase):
         self.assertEqual(len(task_queue.list_followed()), MAX_FOLLOWED)
 
     def test_ended_task_never_starts_again(self) -> None:
-        """An ended task is not accepted again within the longest lease plus the longest absence of a node."""
+        """An ended task is not accepted again for the longest lease plus the longest absence of a node."""
         task_queue = TaskQueue()
         task_queue.add(OLD)
         task_queue.mark_over("old", 0.0)
@@ -45,7 +45,7 @@ class TaskQueueTests(SynchronousTestCase):
 
 class SelectTaskTests(SynchronousTestCase):
     def test_who_gets_the_body(self) -> None:
-        """The first task in order uses the robot, unless the present one must not stop or acts at equal priority."""
+        """The first task in the queue gets the robot, unless the present task must not stop or acts at its priority."""
         every = [NEW, OLD, URGENT]
         self.assertIs(select_task(every, None, True), URGENT)
         self.assertIs(select_task(every, OLD, True), URGENT)

@@ -21,7 +21,7 @@ def seen(**values: Value) -> Observation:
 
 class TurnAroundTests(SynchronousTestCase):
     def test_cost_is_the_charge_used_up(self) -> None:
-        """The cost is the used share of the battery; without a reading there is no cost."""
+        """The cost is the used share of the battery charge; without a battery reading there is no cost."""
         turn = TurnAround({}, random.Random(1))
         self.assertIsNone(turn.cost)
         turn.look(seen(odom_yaw=0.0), 0.0)
@@ -30,7 +30,7 @@ class TurnAroundTests(SynchronousTestCase):
         self.assertEqual(turn.cost, 0.25)
 
     def test_one_turn_and_no_more(self) -> None:
-        """The dog turns exactly once, across the discontinuity of the angle; earlier turns do not count."""
+        """The dog turns exactly once, even if the angle wraps; earlier turns do not count."""
         turn = TurnAround({}, random.Random(1))
         yaw = 2.0
         for _ in range(20):

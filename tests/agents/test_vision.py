@@ -19,7 +19,7 @@ SIZE = TargetSize(0.08, 0.22)
 
 
 class Studio:
-    """A dog at the left wall with a camera on its nose, which points along the map."""
+    """A dog at the left wall whose head camera points along the map."""
 
     def __init__(self, seed: int = 1) -> None:
         self.world = World(Random(seed), load_scene("three-dogs"))
@@ -34,13 +34,13 @@ class Studio:
         self.world.place_target(0.3 + NOSE_M + reach * math.cos(bearing), 1.2 + reach * math.sin(bearing))
 
     def look(self) -> Detection | None:
-        """Return the sighting in the next camera frame."""
+        """Return the detection in the next camera frame."""
         return find_target(self.camera.render_jpeg(self.world.dogs["dog1"]), SIZE)
 
 
 class VisionTests(SynchronousTestCase):
     def seen(self, studio: Studio) -> Detection:
-        """Return the next sighting, which must not be None."""
+        """Return the detection in the next camera frame; fail if there is none."""
         sighting = studio.look()
         assert sighting is not None
         return sighting
@@ -55,7 +55,7 @@ class VisionTests(SynchronousTestCase):
             self.assertLess(max(map(abs, errors)), 0.12, (distance, errors))
 
     def test_lens_is_reckoned_with(self) -> None:
-        """With a lens half as wide, the same frame gives about twice the distance and a smaller bearing."""
+        """With half the field of view, the same frame gives about twice the distance and a smaller bearing."""
         studio = Studio()
         studio.target(0.9, 0.2)
         picture = studio.camera.render_jpeg(studio.world.dogs["dog1"])
@@ -66,7 +66,10 @@ class VisionTests(SynchronousTestCase):
         self.assertLess(narrow.bearing, 0.6 * wide.bearing)
 
     def test_picture_that_is_all_target_says_so(self) -> None:
-        """A target that fills the frame from edge to edge has ``is_filling`` set; one at a single edge has not."""
+        """A target that fills the frame from edge to edge has ``is_filling`` set.
+
+        A target at a single edge does not.
+        """
         for width, is_filling in ((64, True), (40, False)):
             picture = np.full((48, 64, 3), 128, np.uint8)
             picture[:, 64 - width :] = (40, 30, 200)
@@ -83,7 +86,7 @@ class VisionTests(SynchronousTestCase):
                 self.assertLess(abs(math.degrees(self.seen(studio).bearing) - degrees), 1.5, (distance, degrees))
 
     def test_half_hidden_target_is_known_to_be(self) -> None:
-        """A target that another dog hides in part is not reported as whole, and its distance error is below 25 %."""
+        """A target partly hidden by another dog is not reported as whole, and its distance error is below 25 %."""
         studio = Studio()
         studio.target(1.4)
         self.assertTrue(self.seen(studio).is_whole)
@@ -98,7 +101,7 @@ class VisionTests(SynchronousTestCase):
             self.assertLess(abs(distance / 1.4 - 1), 0.25, halves)
 
     def test_yellow_stripes_and_walls_are_not_red(self) -> None:
-        """Without a target nothing is found on any dog or wall, near or far."""
+        """Without a target there is no detection on any dog or wall, close or distant."""
         studio = Studio()
         for x in (0.7, 1.0, 1.6):
             for name, heading in (("dog2", 0.0), ("dog3", math.pi / 2), ("dog2", math.pi)):
@@ -109,7 +112,7 @@ class VisionTests(SynchronousTestCase):
                 studio.world.move_dog(name, 2.8, 0.2 if name == "dog2" else 2.2, 0.0)
 
     def test_bytes_that_are_no_picture_are_nothing_seen(self) -> None:
-        """Empty data, noise, a truncated frame and a frame of one pixel give no sighting and no error."""
+        """Empty data, noise, a truncated frame and a frame of one pixel give no detection and no error."""
         studio = Studio()
         studio.target(1.0)
         whole = studio.camera.render_jpeg(studio.world.dogs["dog1"])

@@ -46,7 +46,7 @@ class Phone:
 
 class PhoneTests(SynchronousTestCase):
     def test_cost_is_the_distance_that_the_phone_tells(self) -> None:
-        """The cost is the median of the newest distances, and is None before the first ones."""
+        """The cost is the median of the newest distances, and None until there is a distance."""
         phone = Phone()
         phone.live()
         self.assertIsNone(phone.behaviour.cost)
@@ -56,7 +56,10 @@ class PhoneTests(SynchronousTestCase):
         self.assertEqual(phone.behaviour.cost, 0.5)
 
     def test_cost_goes_with_the_target(self) -> None:
-        """A short loss of sight keeps the cost; after a longer one it is None until enough new sightings arrive."""
+        """The cost survives a short loss of sight.
+
+        After a longer loss it is None until there are enough new detections.
+        """
         phone = Phone()
         phone.live(0.5, MIN_DETECTIONS)
         phone.live(ticks=round(TARGET_MEMORY_S / TICK) - 1)
@@ -82,7 +85,7 @@ class PhoneTests(SynchronousTestCase):
         self.assertEqual(phone.behaviour.progress, 1.0)
 
     def test_what_others_did_in_between_does_not_count(self) -> None:
-        """After a new token the progress continues, but the time between the two and long silences do not count."""
+        """With a new token the progress continues; time between the two tokens and long gaps do not count."""
         phone = Phone(seconds=10.0)
         phone.execute(0.5, 11, is_resumed=False)
         phone.now += 5.0
@@ -106,7 +109,7 @@ class PhoneTests(SynchronousTestCase):
             self.assertRaises(ValueError, WatchTarget, {"seconds": wrong}, random.Random(1))
 
     def test_a_phones_node_loads_no_vision(self) -> None:
-        """If the phone detects the target itself, its gateway loads neither OpenCV nor NumPy (34 MiB)."""
+        """For a phone that detects the target itself, the gateway loads neither OpenCV nor NumPy (34 MiB)."""
         script = (
             "import sys, random\nfrom agents.watch_target import WatchTarget\nfrom drivers.reading import Observation\n"
             "watch = WatchTarget({}, random.Random(1))\n"
@@ -120,7 +123,7 @@ class PhoneTests(SynchronousTestCase):
 
 class DogTests(SynchronousTestCase):
     def test_turns_to_the_target_and_keeps_it_in_view(self) -> None:
-        """A dog with the target behind it turns to it, measures its distance, and watches it without approaching."""
+        """A dog with the target behind it turns to the target, measures its distance, and watches from there."""
         walk = Walk()
         watch = WatchTarget({"seconds": 3.0, "target_radius": 0.08}, random.Random(1))
         walk.behaviour = watch  # type: ignore[assignment]
@@ -143,7 +146,7 @@ class DogTests(SynchronousTestCase):
         self.assertGreater(walk.now, 3.0)
 
     def test_looks_through_the_lens_of_its_body(self) -> None:
-        """The lens from the robot's description is used, even if the first frame arrives later."""
+        """The lens in the robot's description is used, even if it arrives later than the first frame."""
         watch = WatchTarget({}, random.Random(1))
         lens = {"camera": {"fov_h_deg": 28.4}}
         watch.embody(MotionCapabilities(Description("narrow", "", lens, {}, 0.1)))
@@ -157,7 +160,10 @@ class DogTests(SynchronousTestCase):
         self.assertTrue(1.8 < cost / walk.distance() < 2.5)
 
     def test_watches_with_a_camera_alone(self) -> None:
-        """A fixed camera without motors and detections watches the target from its frames, with empty actions."""
+        """A fixed camera without motors watches the target: the behaviour detects the target in the frames.
+
+        All actions are empty.
+        """
         walk = Walk()
         watch = WatchTarget({}, random.Random(1))
         walk.world.place_target(1.2, 1.2)

@@ -1,4 +1,4 @@
-"""Tests of the evaluation in ``benchmarks.nat``: criteria, table, document and figure; no trial runs."""
+"""Tests of the evaluation in ``benchmarks.nat``: criteria, table, document and figure. No trial runs."""
 
 from __future__ import annotations
 
@@ -22,14 +22,14 @@ def good(part: str = PLAIN) -> list[Outcome]:
 
 class OutcomeTests(SynchronousTestCase):
     def test_thirteen_of_fifteen_pairs_can_be_punched(self) -> None:
-        """All pairs can be punched, except symmetric with symmetric or port restricted, and those without UDP."""
+        """All pairs can be punched except symmetric with symmetric or port restricted, and those without UDP."""
         pairs = [(a, b) for n, a in enumerate(MATRIX) for b in MATRIX[n:] if NatKind.NOUDP not in (a, b)]
         self.assertEqual(len(pairs), 15)
         closed = [(a.value, b.value) for a, b in pairs if not is_punchable(a, b)]
         self.assertEqual(closed, [("port", "sym"), ("sym", "sym")])
 
     def test_a_good_round_keeps_every_promise(self) -> None:
-        """A good round meets all criteria; a relayed punchable pair, or slow pairs, miss one."""
+        """A good round meets all criteria; a relayed pair that could be punched, or slow pairs, violate a criterion."""
         self.assertEqual([one for one in check_requirements([*good(), *good(LOSS)]) if not one.is_kept], [])
         relayed = good()
         relayed[0].path = "relayed"
@@ -43,7 +43,7 @@ class OutcomeTests(SynchronousTestCase):
         self.assertEqual([one.is_kept for one in check_requirements(late)], [True, True, True, False])
 
     def test_one_of_twenty_may_fail_under_loss(self) -> None:
-        """With packet loss 95 percent must succeed in each class: one failure of 21 is allowed."""
+        """With packet loss, 95 percent of each class must succeed: one failure of 21 is permitted."""
         lossy = good(LOSS)
         lossy[0].took_s = [None, None]
         self.assertEqual(
@@ -63,7 +63,7 @@ class OutcomeTests(SynchronousTestCase):
         self.assertEqual((format_cell(some[2:]), format_cell([])), ("fails", ""))
 
     def test_report_and_document(self) -> None:
-        """The table has each kind; the document changes between its marks only, and is refused without them."""
+        """The table contains each kind; the document changes only between its marks, and is refused without marks."""
         self.assertIn("noudp", format_table(good()))
         text = update_document(f"before\n{BEGIN}\nold\n{END}\nafter\n", good())
         self.assertTrue(text.startswith("before\n") and text.endswith("\nafter\n"))
@@ -73,7 +73,7 @@ class OutcomeTests(SynchronousTestCase):
         self.assertRaises(ValueError, update_document, "no marks", good())
 
     def test_picture_has_a_square_for_each_pair(self) -> None:
-        """The figure has 21 squares, a frame and a legend, and marks a failed pair."""
+        """The figure has 21 squares, a frame and a legend; a failed pair is marked."""
         bad = good()
         bad[3].took_s = [None, None]
         picture = draw_svg(bad, "a < b")
@@ -82,7 +82,7 @@ class OutcomeTests(SynchronousTestCase):
         self.assertEqual(picture.count(">fails<"), 1)
 
     def test_every_host_of_a_pair_exists(self) -> None:
-        """The sites of a run contain each host that a pair names."""
+        """The sites of a run contain each host that belongs to a pair."""
         hosts = {f"{site.name}{number}" for site in list_sites() for number in range(1, site.hosts + 1)}
         pairs = [*list_plain_pairs(PLAIN), *list_special_pairs()]
         self.assertEqual({host for pair in pairs for host in (pair.host_a, pair.host_b)} - hosts, set())

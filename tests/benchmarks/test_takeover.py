@@ -1,4 +1,4 @@
-"""Tests of the command line of ``python -m benchmarks.takeover``; no trial runs."""
+"""Tests of the command line of ``python -m benchmarks.takeover``. No trial runs."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from benchmarks.takeover import __main__ as takeover
 
 class CommandLineTests(SynchronousTestCase):
     def test_wrong_values_are_named(self) -> None:
-        """An invalid number, share or folder ends with code 2 and an error with the valid values, before any trial."""
+        """An invalid number, share or folder exits with code 2; the error lists the valid values. No trial starts."""
         self.patch(takeover, "run_virtual", lambda *_: [])
         blocked = Path(self.mktemp())
         blocked.write_text("a file", encoding="utf-8")

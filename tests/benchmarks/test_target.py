@@ -11,7 +11,7 @@ from benchmarks.dht.target import OPENDHT, TORRENT, check_targets
 
 
 def measured() -> dict[str, Any]:
-    """Return results of our node that reach each target."""
+    """Return results of this project's node that reach each target."""
     operation = {"p50": 0.5, "max": 9.0, "per_s": 9000.0, "cpu_ms": 0.1, "datagrams": 2.0, "tried": 200, "failed": 0}
     lost = {part: {"found_percent": 100.0, "p95": 9.0, "max": 30.0} for part in ("a quarter", "a half")}
     return {
@@ -41,7 +41,7 @@ def row() -> dict[str, dict[str, Any]]:
 
 class TargetTests(SynchronousTestCase):
     def reached(self, results: dict[str, Any], verdict: bool | None) -> list[int]:
-        """Return the numbers of the targets with this ``verdict``."""
+        """Return the numbers of the targets with the result ``verdict``."""
         return [one.number for one in check_targets(results) if one.is_met is verdict]
 
     def test_all_are_reached(self) -> None:
@@ -49,7 +49,7 @@ class TargetTests(SynchronousTestCase):
         self.assertEqual(self.reached(row(), True), list(range(1, 15)))
 
     def test_what_was_not_measured_is_not_known(self) -> None:
-        """A target without its figure, or without the figure of the compared library, is unknown."""
+        """The result of a target is unknown if its figure or the figure of the compared library is missing."""
         self.assertEqual(self.reached({}, None), list(range(1, 15)))
         alone = {OURS: measured()}
         self.assertEqual(self.reached(alone, None), [1, 2, 3, 4, 6, 10, 14])
@@ -58,7 +58,7 @@ class TargetTests(SynchronousTestCase):
         self.assertEqual(self.reached(results, None), [14])
 
     def test_each_figure_counts(self) -> None:
-        """One insufficient figure misses exactly the targets that depend on it."""
+        """One insufficient figure causes exactly the targets that depend on it to be missed."""
         spoilt: list[tuple[tuple[str, ...], Any, list[int]]] = [
             (("remote_get", "p50"), 0.91, [1]),
             (("put", "p50"), 0.91, [2, 14]),
@@ -88,6 +88,6 @@ class TargetTests(SynchronousTestCase):
             self.assertEqual(self.reached(results, False), missed, path)
 
     def test_in_words(self) -> None:
-        """The text of a limit contains the figure and the required value."""
+        """The text of a target contains the measured figure and the required value."""
         limits = [str(limit) for verdict in check_targets({OURS: measured()})[:3] for limit in verdict.limits]
         self.assertEqual(limits, ["p50 ms 0.50 (at most ?)"] * 2 + ["gets/s 9,000 (at least ?)"])

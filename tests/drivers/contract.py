@@ -1,4 +1,4 @@
-"""Test cases for robots in memory; combined with ``Conformance``, a case runs the conformance tests."""
+"""Test cases for robots in memory; a test case that also inherits ``Conformance`` runs the conformance tests."""
 
 from __future__ import annotations
 
@@ -48,7 +48,7 @@ class KeptLog:
 
 
 class RobotCase(SynchronousTestCase):
-    """A robot in memory, its drivers, and virtual time; after each test no delayed calls may be left."""
+    """A robot in memory, its drivers, and virtual time; no delayed calls may remain after a test."""
 
     STEP_S = 0.005
     END_S = 0.1
@@ -131,5 +131,5 @@ class RobotCase(SynchronousTestCase):
         return self.newest(driver).values.get(key)
 
     def near(self, value: Any, wanted: float, off: float = 0.01) -> None:
-        """Fail if a value differs from the wanted one by more than ``off``."""
+        """Fail if a value differs from the expected value by more than ``off``."""
         self.assertLessEqual(abs(float(value) - wanted), off)

@@ -53,7 +53,7 @@ class CommandTests(SynchronousTestCase):
     """Commands for walk, head and joints."""
 
     def test_golden_vectors(self) -> None:
-        """Each walk and head command has exactly these five bytes."""
+        """Each walk and head command has the five bytes of its golden vector."""
         for letter, value, golden in (
             ("f", 0.5, "66 00 00 00 3f"),
             ("r", -0.25, "72 00 00 80 be"),
@@ -64,7 +64,7 @@ class CommandTests(SynchronousTestCase):
             self.assertEqual(encode_command(letter, value).hex(" "), golden)
 
     def test_reads_commands_cut_anyhow(self) -> None:
-        """The reader gives the same commands for single bytes as for the whole stream."""
+        """The reader returns the same commands for single bytes as for the whole stream."""
         reader = CommandReader()
         stream = encode_command("f", 0.5) + encode_command("r", -0.25)
         seen = [one for at in range(len(stream)) for one in reader.read(stream[at : at + 1])]
@@ -87,7 +87,7 @@ class StateTests(SynchronousTestCase):
     """World state and gains."""
 
     def test_sizes_and_places(self) -> None:
-        """The packets of an ERS-7 have 374, 244 and 224 bytes, with each field at its documented offset."""
+        """The packets of an ERS-7 have 374, 244 and 224 bytes; each field is at its documented offset."""
         new, old = encode_state(felt()), encode_state(felt(T2))
         self.assertEqual((len(new), len(old)), (374, 244))
         self.assertEqual(len(encode_gains(1, ((1.0, 2.0, 3.0),) * 18)), 224)
@@ -99,7 +99,7 @@ class StateTests(SynchronousTestCase):
         self.assertEqual([struct.unpack_from("<I", old, at)[0] for at in (80, 128)], [11, 10])
 
     def test_reads_both_dialects_byte_by_byte(self) -> None:
-        """Both dialects are recognised by their first bytes and decoded, for each division of the stream."""
+        """Both dialects are recognised by their first bytes and decoded, however the stream is split into chunks."""
         for dialect in (T4, T2):
             stream = encode_state(felt(dialect)) + encode_state(felt(dialect, 1032))
             for step in (1, 7, len(stream)):
@@ -109,7 +109,7 @@ class StateTests(SynchronousTestCase):
                 self.assertEqual(encode_state(seen[0]), stream[: len(stream) // 2])
 
     def test_takes_counts_from_the_stream(self) -> None:
-        """A model with other element counts is decoded with these counts."""
+        """A model with different element counts is decoded with its own counts."""
         other = WorldState(T4, "ERS-210", 5, 6, (1.0,) * 40, (2.0,) * 8, (0.0,) * 8, (0.5,) * 18)
         reader, stream = StateReader(), encode_state(replace(other, model="ERS-210 in red"))
         seen = [one for at in range(len(stream)) for one in reader.read(stream[at : at + 1])]
@@ -118,7 +118,7 @@ class StateTests(SynchronousTestCase):
         self.assertTrue(sensors.is_known(felt()) and sensors.is_known(felt(T2)))
 
     def test_refuses_what_is_neither_dialect(self) -> None:
-        """Invalid counts, a model name without an end, and bytes of neither dialect raise BadFrame."""
+        """Invalid counts, an unterminated model name, and bytes of neither dialect raise BadFrame."""
         wild = bytearray(encode_state(felt()))
         wild[14] = wild[15] = 0xFF
         for data in (bytes(wild), b"ERS-" * 20, bytes(40), struct.pack("<II", 5, 17)):
@@ -127,7 +127,7 @@ class StateTests(SynchronousTestCase):
     @settings(deadline=None, max_examples=200)
     @given(st.binary(max_size=600), st.integers(0, 374))
     def test_survives_any_bytes(self, noise: bytes, keep: int) -> None:
-        """Random bytes after a valid start give a state or BadFrame."""
+        """Random bytes after a valid start give a state or raise BadFrame."""
         for start in (encode_state(felt())[:keep], encode_state(felt(T2))[:keep]):
             with contextlib.suppress(BadFrame):
                 list(StateReader().read(start + noise))
@@ -147,7 +147,7 @@ class SensorsTests(SynchronousTestCase):
         self.assertEqual(len([key for key in seen if key.startswith("button.")]), 10)
 
     def test_refuses_what_cannot_be(self) -> None:
-        """A single NaN, infinite or out-of-range number in any field raises BadFrame for the packet."""
+        """Each number that is NaN, infinite or out of range, in any field, raises BadFrame for the whole packet."""
         good = felt()
         for bad in (math.nan, math.inf, -math.inf, 1e9):
             for field in ("outputs", "sensors", "buttons", "duties"):
@@ -173,7 +173,7 @@ class MenuTests(SynchronousTestCase):
     )
 
     def test_golden_lines(self) -> None:
-        """The messages for a server start and an empty slot have exactly these bytes."""
+        """The messages for a server start and an empty slot have the bytes of the golden vectors."""
         self.assertEqual(menu.encode_message(self.MESSAGES[2]), b"load\norg.tekkotsu.mon.WalkGUI\nWalkGUI\n10050\n\n")
         self.assertEqual(
             menu.encode_message(Refresh("Root", (Item(0, False, menu.EMPTY_SLOT),))),
@@ -190,7 +190,7 @@ class MenuTests(SynchronousTestCase):
             self.assertEqual(reader.bad_lines, 0)
 
     def test_reads_the_menu_of_old_tekkotsu(self) -> None:
-        """A menu with four fields per item (Tekkotsu 2) is recognised by its first item and read completely."""
+        """A menu with four fields per item (Tekkotsu 2) is recognised by its first item, and is read completely."""
         shown = Refresh(
             "Root", (Item(2, True, "Mon", "all servers"), Item(0, False, "7", ""), Item(0, False, "x", "5"))
         )
@@ -216,7 +216,7 @@ class MenuTests(SynchronousTestCase):
         self.assertEqual(reader.bad_lines, 1)
 
     def test_drops_a_menu_without_an_end(self) -> None:
-        """A menu that exceeds the size limit is dropped, and the next message is read."""
+        """A menu above the size limit is dropped, and the next message is read."""
         item = "0\n0\nx\n200\n" + "y\n" * 201
         reader = MenuReader()
         list(reader.read(("refresh\nRoot\n200\n" + item * 30).encode()))
@@ -234,7 +234,7 @@ class PictureTests(SynchronousTestCase):
     """Camera frames."""
 
     def test_golden_vectors(self) -> None:
-        """Names, header and block have exactly these bytes; a packet with raw channels has 12648 bytes."""
+        """Names, header and block have the bytes of the golden vectors; a packet with raw channels has 12648 bytes."""
         name = "0d 00 00 00 54 65 6b 6b 6f 74 73 75 49 6d 61 67 65 00"
         self.assertEqual(encode_string("TekkotsuImage").hex(" "), name)
         self.assertEqual(picture.CLOSING.hex(" "), "0f 00 00 00 43 6c 6f 73 65 43 6f 6e 6e 65 63 74 69 6f 6e 00")
@@ -251,7 +251,7 @@ class PictureTests(SynchronousTestCase):
         self.assertEqual(picture.REQUEST, b"connection request")
 
     def test_reads_every_kind_byte_by_byte(self) -> None:
-        """JPEGs, raw, single and blank channels, text and the end are read for each division of the stream."""
+        """JPEGs, raw, single and blank channels, text and the end are read however the stream is split into chunks."""
         single = picture.encode_header(1, 0, 4, 2, 9, 10) + picture.encode_block(Block(4, 2, "RawImage", bytes(8)))
         jpegs = b"".join(picture.encode_block(Block(4, 2, "JPEGGrayscale", JPEG, n)) for n in range(3))
         blank = picture.encode_block(Block(0, 0, "blank", b"", 1, 0xFFFFFFFF))
@@ -278,7 +278,7 @@ class PictureTests(SynchronousTestCase):
             self.assertEqual(reader.bad_frames, 0)
 
     def test_grows_small_channels(self) -> None:
-        """Each pixel of a subsampled channel is repeated for the pixels that it covers."""
+        """Each pixel of a subsampled channel is repeated for all pixels that it covers."""
         parts = (Block(4, 2, "RawImage", b"abcdefgh"), Block(2, 1, "RawImage", b"xy"), Block(2, 1, "RawImage", b"uv"))
         data = picture.encode_header(0, 0, 4, 2, 0, 0) + b"".join(picture.encode_block(one) for one in parts)
         seen = picture.decode_message(data)
@@ -286,7 +286,7 @@ class PictureTests(SynchronousTestCase):
         self.assertEqual(seen.data, b"abcdefgh" + b"xxyyxxyy" + b"uuvvuuvv")
 
     def test_refuses_datagrams_that_are_no_packet(self) -> None:
-        """A datagram of wrong length or with any invalid field raises BadFrame."""
+        """A datagram with a wrong length or any invalid field raises BadFrame."""
         raw = Block(4, 2, "RawImage", bytes(8))
         head = picture.encode_header(1, 0, 4, 2, 0, 0)
         for data in (
@@ -311,7 +311,7 @@ class PictureTests(SynchronousTestCase):
             self.assertRaises(BadFrame, picture.decode_message, data)
 
     def test_finds_its_way_after_garbage(self) -> None:
-        """After invalid bytes the next whole packet is read, also byte by byte."""
+        """After invalid bytes the next complete packet is read, also when the bytes arrive one by one."""
         broken = bytearray(COLOUR)
         broken[18] = 9
         stream = bytes(broken) + b"garbage garbage garbage" + COLOUR
@@ -324,7 +324,7 @@ class PictureTests(SynchronousTestCase):
     @settings(deadline=None, max_examples=200)
     @given(st.binary(max_size=300), st.integers(0, 200))
     def test_survives_any_bytes(self, noise: bytes, keep: int) -> None:
-        """Random bytes after a valid start raise nothing in a stream, and give a packet or BadFrame in a datagram."""
+        """After a valid start, random bytes raise nothing in a stream; in a datagram they give a packet or BadFrame."""
         list(PictureReader().read(COLOUR[:keep] + noise))
         with contextlib.suppress(BadFrame):
             picture.decode_message(COLOUR[:keep] + noise)

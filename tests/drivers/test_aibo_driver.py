@@ -51,7 +51,7 @@ class AiboDriverTests(Conformance, AiboCase):
         self.near(float(values["odom.yaw"]), self.body.yaw, 0.05)
 
     def test_says_a_live_walk_again_and_a_still_dog_nothing(self) -> None:
-        """The driver repeats a walk before the dog's 3 s timer ends, and sends nothing to a dog at rest."""
+        """The driver repeats a walk before the dog's 3 s timer expires, and sends nothing to a dog at rest."""
         driver = self.ready()
         driver.act({"base.vx": 0.1}, self.permit(seconds=5.0))
         self.pass_time(4.5)
@@ -83,7 +83,10 @@ class AiboDriverTests(Conformance, AiboCase):
         self.assertEqual(driver.act({"base.wz": 9.0}, self.permit())["base.vx"], 0.0)
 
     def test_recovers_from_silence(self) -> None:
-        """After half a second without a world state the driver is stale; it recovers to ready, with the dog at rest."""
+        """After half a second without a world state the driver is stale.
+
+        When states arrive, it is ready and the dog at rest.
+        """
         driver = self.ready()
         driver.act({"base.vx": 0.1}, self.permit(seconds=20.0))
         self.dog.faults.drop = 1.0
@@ -96,7 +99,7 @@ class AiboDriverTests(Conformance, AiboCase):
         self.assertEqual(self.true_speed(), 0.0)
 
     def test_names_rubbish_once(self) -> None:
-        """Invalid data is logged once, and a second time if it starts again after valid data."""
+        """Invalid data is logged once, and again if invalid data follows valid data."""
         collector = WarningCollector()
         self.addCleanup(collector.close)
         self.ready()
@@ -118,7 +121,7 @@ class AiboDriverTests(Conformance, AiboCase):
             client.link.send(random.randbytes(40))
 
     def test_recovers_from_a_reboot_that_nobody_told(self) -> None:
-        """After a reboot without notice the driver starts the dog's servers again."""
+        """After a reboot that the dog did not announce, the driver starts the dog's servers again."""
         driver = self.ready()
         self.dog.faults.half_open = True
         self.pass_time(0.4)
@@ -146,7 +149,7 @@ class AiboDriverTests(Conformance, AiboCase):
             self.pass_time(0.1)
 
     def test_respects_the_switch_on_the_dog(self) -> None:
-        """The dog's emergency stop button stops it, and only ``enable`` releases it, not a reconnect."""
+        """The dog's emergency stop button stops the dog; ``enable`` releases it, a reconnect does not."""
         driver = self.ready()
         driver.act({"base.vx": 0.1}, self.permit(seconds=20.0))
         self.pass_time(0.1)
@@ -168,7 +171,7 @@ class AiboDriverTests(Conformance, AiboCase):
         self.assertIs(self.successResultOf(enabled), True)
 
     def test_stops_motors_that_another_left_on(self) -> None:
-        """Connecting to a dog with running motors stops them."""
+        """Connecting to a dog with running motors stops the motors."""
         self.dog.press_back_button()
         driver = self.make_driver()
         driver.connect()
@@ -176,7 +179,7 @@ class AiboDriverTests(Conformance, AiboCase):
         self.assertTrue(self.dog.is_engaged)
 
     def test_waits_for_a_port_that_another_client_holds(self) -> None:
-        """Each port accepts one client: a second driver waits, counts refusals, and connects after the first leaves."""
+        """Each port accepts one client: a second driver counts the refusals, and connects after the first has left."""
         first = self.ready()
         second = self.make_driver()
         connected = second.connect()
@@ -188,7 +191,7 @@ class AiboDriverTests(Conformance, AiboCase):
         self.successResultOf(connected)
 
     def test_stands_noise_on_every_port(self) -> None:
-        """Random bytes on any port raise no exception, and the dog is ready again when they end."""
+        """Random bytes on any port raise no exception, and the dog is ready again after they end."""
         self.ready()
         dice = random.Random(7)
         for _ in range(300):
@@ -200,7 +203,7 @@ class AiboDriverTests(Conformance, AiboCase):
         self.assertGreater(self.drivers[0].diagnostics()["bad_frames"], 0)
 
     def test_ages_where_readings_are_absurd(self) -> None:
-        """Out-of-range readings are dropped and counted, and the age of the last valid one grows."""
+        """Out-of-range readings are dropped and counted, and the age of the last valid reading grows."""
         driver = self.ready()
         self.body.values = {"imu.ax": math.inf}
         self.pass_time(0.3)
@@ -211,7 +214,7 @@ class AiboDriverTests(Conformance, AiboCase):
         self.assertLess(driver.diagnostics()["age"], 0.1)
 
     def test_counts_time_past_its_wrap(self) -> None:
-        """The robot time continues when its millisecond counter wraps."""
+        """The robot time continues when the dog's millisecond counter wraps."""
         self.dog.start_ms = 2**32 - 1200
         driver = self.ready()
         before = self.newest(driver).t_robot
@@ -219,7 +222,7 @@ class AiboDriverTests(Conformance, AiboCase):
         self.near(self.newest(driver).t_robot - before, 1.0, 0.05)
 
     def test_looks_where_it_is_told(self) -> None:
-        """``look`` moves the head within its limits if the motors are on; invalid arguments are refused."""
+        """``look`` moves the head within its limits when the motors are on; invalid arguments are refused."""
         driver = self.make_driver()
         self.failureResultOf(driver.invoke("look", pan=0.5), LinkLost)
         driver.connect()
@@ -247,7 +250,7 @@ class AiboDriverTests(Conformance, AiboCase):
         self.failureResultOf(driver.invoke("play", sound='x"\n!reset'), Unsupported)
 
     def test_tries_the_ports_of_a_dog_whose_menu_is_silent(self) -> None:
-        """A main control that does not answer does not prevent a connection to servers that run already."""
+        """If main control does not reply, the driver still connects to servers that are already running."""
         self.dog.menu.running = {"estop", "state", "walk", "head"}
         self.dog.menu.make_answer = lambda data: b""  # type: ignore[method-assign]
         driver = self.make_driver()
@@ -258,7 +261,7 @@ class AiboDriverTests(Conformance, AiboCase):
         self.successResultOf(connected)
 
     def test_knows_no_sensors_of_another_model(self) -> None:
-        """An unknown model can be driven; only its emergency stop and motion are observed, no sensors."""
+        """An unknown model can be driven; its emergency stop and motion are observed, but no sensors."""
         driver = self.ready()
         stranger = WorldState(T4, "ERS-210", 5, 6, (1.0,) * 40, (2.0,) * 8, (0.0,) * 8, (0.5,) * 18)
         self.drivers[-1]._on_world_state(stranger)
@@ -284,7 +287,7 @@ class OldAiboDriverTests(AiboDriverTests):
 
 
 class RecordingUdp:
-    """A datagram path to the emulated dog, in memory."""
+    """A datagram path to the emulated dog, in memory, that records the datagrams."""
 
     is_busy = False
 
@@ -302,7 +305,7 @@ class RecordingUdp:
         self._dog.on_datagram(data, self._received)
 
     def close(self) -> None:
-        """Do nothing, as no resource is open."""
+        """Do nothing, because no resource is open."""
 
 
 class AiboCameraTests(AiboCase):
@@ -311,7 +314,7 @@ class AiboCameraTests(AiboCase):
     END_S = 0.04
 
     def film(self, transport: str, fps: float = 30.0) -> AiboDriver:
-        """Return a driver of a new dog after 2 s of camera frames."""
+        """Return a driver of a new dog that has received camera frames for 2 s."""
         self.tearDown()
         self.setUp()
         self.body.jpeg = jpeg()
@@ -324,7 +327,7 @@ class AiboCameraTests(AiboCase):
         return driver
 
     def test_films_over_both_transports(self) -> None:
-        """Thirty JPEGs a second arrive over TCP, and over UDP after one request."""
+        """Thirty JPEGs per second arrive over TCP, and also over UDP after one request."""
         for transport in ("tcp", "udp"):
             driver = self.film(transport)
             self.near(driver.diagnostics()["pictures"], 59, 3)
@@ -335,7 +338,7 @@ class AiboCameraTests(AiboCase):
         self.assertEqual(self.udp.sent, 1)
 
     def test_films_as_often_as_it_is_asked(self) -> None:
-        """The frame rate can be changed, also to zero and back."""
+        """The frame rate can be changed; a rate of zero stops the frames."""
         driver = self.film("tcp", 15.0)
         self.near(driver.diagnostics()["pictures"], 29, 2)
         driver.set_camera_fps(0.0)
@@ -350,7 +353,7 @@ class AiboCameraTests(AiboCase):
         self.assertEqual(driver.camera_fps, 30.0)
 
     def test_films_on_when_somebody_stopped_the_server(self) -> None:
-        """A camera server that announces its end is started again, over both transports."""
+        """A camera server that announces its end is started again, over TCP and over UDP."""
         for transport in ("tcp", "udp"):
             driver = self.film(transport)
             self.dog.menu.make_answer(b'!select "#Raw Cam Server"\n')
@@ -360,7 +363,7 @@ class AiboCameraTests(AiboCase):
             self.assertGreater(driver.diagnostics()["pictures"], before + 30, transport)
 
     def test_stamps_pictures_with_the_time_of_the_rest(self) -> None:
-        """The robot time of a frame is within 0.1 s of its observation's, also after a reboot."""
+        """The robot time of a frame is within 0.1 s of the robot time of its observation, also after a reboot."""
         driver = self.film("tcp")
         for _ in range(2):
             newest = self.newest(driver)
@@ -370,7 +373,7 @@ class AiboCameraTests(AiboCase):
             self.pass_time(4)
 
     def test_asks_again_when_datagrams_cease(self) -> None:
-        """After a reboot the driver requests datagrams again; invalid ones are counted."""
+        """After a reboot the driver requests datagrams again; invalid datagrams are counted."""
         driver = self.film("udp")
         self.dog.faults.garbage = 1.0
         self.pass_time(0.4)

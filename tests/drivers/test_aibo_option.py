@@ -23,7 +23,7 @@ class AiboOptionTests(SynchronousTestCase):
     """Options in the configuration."""
 
     def test_overrides_what_is_given(self) -> None:
-        """A port option replaces only that port; without a camera the description has none."""
+        """An option for a port replaces only that port; if the camera is off, the description has no camera."""
         self.assertEqual(parse_options({"host": "10.0.0.1", "camera_transport": "udp"}).camera_transport, "udp")
         self.assertEqual(parse_options({"host": "dog1", "ports": {"walk": 5}}).ports, {**PORTS, "walk": 5})
         self.assertIn("camera", describe("aibo", {"host": "dog1"}).capabilities)
@@ -35,7 +35,7 @@ class RecipeTests(SynchronousTestCase):
     """Commands for main control."""
 
     def test_sends_every_name(self) -> None:
-        """A server is started and stopped under each of its names, after the settings in both spellings."""
+        """Each server is started and stopped under all its names; the settings come first, in both spellings."""
         lines = menu.make_start_commands(["walk", "camera"], "tcp", 30.0)
         self.assertEqual(
             lines,
@@ -63,7 +63,7 @@ class RecipeTests(SynchronousTestCase):
         self.assertEqual(menu.make_greeting(), ["!hello", "!dump_stack", "!refresh"])
 
     def test_size(self) -> None:
-        """The requested width appears in the description and selects the layer that the dog sends."""
+        """The requested width appears in the description and selects the resolution layer that the dog sends."""
         self.assertEqual(
             menu.make_size_commands(208)[:2], ["!set vision.rawcam.y_skip=1", "!set vision.rawcam.uv_skip=2"]
         )
@@ -91,7 +91,7 @@ class WaitTests(SynchronousTestCase):
     """The delays between connection attempts."""
 
     def test_waits_as_the_dogs_own_clients_do(self) -> None:
-        """Delays after refusals are 0.5, 1, 2, 5 and 5 s, and 0.5 s again after an answer."""
+        """After refusals the delays are 0.5, 1, 2, 5 and 5 s; after received data the next delay is 0.5 s again."""
         reactor: Any = MemoryReactorClock()
         line = TcpConnector(reactor, RETRY_DELAYS_S).connect("dog1", 10050, _Client())
         for wait in (0.5, 1.0, 2.0, 5.0, 5.0):
@@ -106,7 +106,7 @@ class WaitTests(SynchronousTestCase):
         self.assertEqual(reactor.getDelayedCalls(), [])
 
     def test_does_not_pester_what_hangs_up_at_once(self) -> None:
-        """Delays grow for a peer that closes each connection at once; a connection that lasts resets them."""
+        """The delays grow for a peer that closes each connection at once; a longer connection resets them."""
         for waits, wanted in ((RETRY_DELAYS_S, [0.5, 1.0, 2.0, 5.0, 5.0]), ((), [0.1, 0.16, 0.256, 0.4096, 0.65536])):
             reactor: Any = MemoryReactorClock()
             line: Any = TcpConnector(reactor, waits).connect("dog1", 10050, _Client())
@@ -156,7 +156,7 @@ class WaitTests(SynchronousTestCase):
 
 
 class _Dead:
-    """A link of a failed network: sent data never leaves."""
+    """A link of a failed network: data that is sent never arrives."""
 
     is_busy = False
 

@@ -33,7 +33,7 @@ class CommandTests(SynchronousTestCase):
         self.assertEqual(codec.encode_text_command("i", 8, -20.4, 9, 130), b"i8 -20 9 130\n")
 
     def test_refuses_what_would_be_another_command(self) -> None:
-        """A skill name with a line feed, or an angle equal to a command's end mark, is refused."""
+        """A skill name with a line feed is refused, and so is an angle whose byte equals the command's end mark."""
         for name in ("", "wk\nd", "8", "a" * 17):
             self.assertRaises(ValueError, codec.encode_skill, name)
         self.assertRaises(ValueError, codec.encode_binary_command, "I", (0, 126))
@@ -43,7 +43,7 @@ class LineTests(SynchronousTestCase):
     """Lines from the robot."""
 
     def test_reads_lines_however_they_are_cut(self) -> None:
-        """Lines that arrive byte by byte equal lines that arrive at once."""
+        """Lines that arrive byte by byte are read like lines that arrive in one piece."""
         said = b"wkF\r\nk\r\n\r\n=\r\n0\t1\t\r\n"
         whole, pieces = LineReader(), LineReader()
         lines = list(whole.read(said))
@@ -62,7 +62,7 @@ class LineTests(SynchronousTestCase):
     @given(st.binary(max_size=300))
     @settings(max_examples=200, deadline=None)
     def test_takes_any_bytes(self, data: bytes) -> None:
-        """For any bytes, readers and parsers raise nothing except ``BadFrame``."""
+        """For any bytes, readers and parsers raise no exception except ``BadFrame``."""
         lines = list(LineReader().read(data + b"\n"))
         for parse in (
             codec.parse_joints,
@@ -80,19 +80,19 @@ class LineTests(SynchronousTestCase):
     @given(st.lists(st.integers(-125, 125), min_size=16, max_size=16))
     @settings(max_examples=50, deadline=None)
     def test_joints_of_both_boards(self, angles: list[int]) -> None:
-        """Joint angles survive the formats of both boards, as radians."""
+        """Joint angles in the formats of both boards are decoded as radians."""
         row = "".join(f"{angle},\t" for angle in angles)
         wanted = {joint: math.radians(angle) for joint, angle in enumerate(angles)}
         self.assertEqual(codec.parse_joints(["=", INDICES, row]), wanted)
         self.assertEqual(codec.parse_joints([f"={INDICES}", row]), wanted)
 
     def test_refuses_what_are_no_joints(self) -> None:
-        """Too few angles, wrong indices and angles out of range are refused."""
+        """A line with too few angles, wrong indices or angles out of range is refused."""
         for lines in ([], ["=", "0\t1", "5,\t"], ["=", "1\t0", "5,\t6,"], ["=", "0", "271,"]):
             self.assertRaises(BadFrame, codec.parse_joints, lines)
 
     def test_attitude_of_both_boards(self) -> None:
-        """Columns without a space are separated; the order is yaw, pitch, roll, and pitch first on a NyBoard."""
+        """Columns without a separating space are split; the order is yaw, pitch, roll, but pitch first on a NyBoard."""
         told = codec.parse_attitude(["ICM:   0.1  -0.2   9.8-179.9 -10.0  20.0"])
         self.assertAlmostEqual(told["yaw"], math.radians(-179.9))
         self.assertAlmostEqual(told["pitch"], math.radians(-10.0))
@@ -108,7 +108,10 @@ class LineTests(SynchronousTestCase):
         self.assertRaises(BadFrame, codec.parse_nyboard_attitude, ["1.0"])
 
     def test_volts_and_distance(self) -> None:
-        """Voltages of two cells and distances in centimetres are converted, 0 is NaN; others are refused."""
+        """The voltages of two cells and distances in centimetres are converted; a distance of 0 is NaN.
+
+        Other values are refused.
+        """
         self.assertEqual(codec.parse_voltage(["Voltage: 7.95 V"]), 7.95)
         self.assertRaises(BadFrame, codec.parse_voltage, ["Voltage: 79.5 V"])
         self.assertRaises(BadFrame, codec.parse_voltage, ["7.95"])
@@ -118,7 +121,7 @@ class LineTests(SynchronousTestCase):
             self.assertRaises(BadFrame, codec.parse_distance, lines)
 
     def test_says_who_it_is(self) -> None:
-        """The banner, the board's version, an unknown skill and the end token (in either case) are recognised."""
+        """The banner, the board's version, an unknown skill and the end token (upper or lower case) are recognised."""
         self.assertTrue(codec.is_banner("* Start *"))
         self.assertEqual(codec.parse_board(["Bittle", "Software version: B10_250712"]), "biboard")
         self.assertEqual(codec.parse_board(["Bittle", "Software version: N_250224"]), "nyboard")
@@ -134,14 +137,14 @@ class HttpTests(SynchronousTestCase):
     """HTTP requests and responses over Wi-Fi."""
 
     def test_paths(self) -> None:
-        """Commands become URL paths of either board, with escaped bytes and without the line feed."""
+        """Commands become URL paths for either board; bytes are escaped and the line feed is omitted."""
         self.assertEqual(codec.format_command_path("biboard", b"kwkF\n"), "/cmd?cmd=kwkF")
         self.assertEqual(codec.format_command_path("nyboard", b"I\x08\xec~"), "/action?name=I%08%EC~")
         self.assertEqual(codec.format_status_path("12"), "/status?taskId=12")
         self.assertTrue(codec.encode_request("10.0.0.1", "/cmd").startswith(b"GET /cmd HTTP/1.1\r\nHost: 10.0.0.1\r\n"))
 
     def test_tasks(self) -> None:
-        """A task has a number; it is running, completed with a text, or failed with the robot's message."""
+        """A task has a number, and is running, completed with a text, or failed with the robot's message."""
         self.assertEqual(codec.parse_task_id(b"TASK_ID:17"), "17")
         self.assertRaises(BadFrame, codec.parse_task_id, b"busy")
         self.assertIsNone(codec.parse_task_result(b"pending"))
@@ -150,7 +153,7 @@ class HttpTests(SynchronousTestCase):
         self.assertIn("time", str(self.assertRaises(BadFrame, codec.parse_task_result, b"error\nERROR: time out")))
 
     def test_reads_a_response_one_byte_at_a_time(self) -> None:
-        """A body ends at its length or at the end of the connection; an incomplete one is refused."""
+        """A body ends after its declared length, or with the connection; an incomplete body is refused."""
         said = b"HTTP/1.1 200 OK\r\nContent-Length: 3\r\n\r\nabc"
         reader = ResponseReader()
         got = [reader.read(said[at : at + 1]) for at in range(len(said))]
@@ -166,7 +169,10 @@ class HttpTests(SynchronousTestCase):
     @given(st.binary(max_size=200))
     @settings(max_examples=100, deadline=None)
     def test_other_responses_are_refused(self, data: bytes) -> None:
-        """Another status, data other than HTTP and too long responses are refused; random bytes raise only BadFrame."""
+        """An error status, data that is not HTTP, and too long responses are refused.
+
+        Random bytes raise only BadFrame.
+        """
         self.assertRaises(BadFrame, ResponseReader().read, b"HTTP/1.1 404 Not Found\r\n\r\n" + data)
         self.assertRaises(BadFrame, ResponseReader().read, b"x" * 9000 + data)
         reader = ResponseReader()
@@ -181,7 +187,7 @@ class GaitTests(SynchronousTestCase):
     """The choice of the nearest gait."""
 
     def test_chooses(self) -> None:
-        """Slow, fast, backward, turn and arc wishes each give their gait; a wish near zero gives STAND."""
+        """Slow, fast, backward, turning and arc motions each select their gait; a velocity near zero selects STAND."""
         for wish, name in (
             ((0.0, 0.0), STAND),
             ((0.01, 0.05), STAND),
@@ -197,7 +203,10 @@ class GaitTests(SynchronousTestCase):
         self.assertEqual(select_gait(0.0, 0.0, GAITS)[1], REST)
 
     def test_never_goes_where_it_shall_not(self) -> None:
-        """A gait never moves against the wish; if none fits, the dog stands; gaits without motion are ignored."""
+        """A gait never moves against the requested direction.
+
+        If no gait fits, the dog stands; gaits without motion are ignored.
+        """
         self.assertEqual(select_gait(-1.0, 1.0, {"wkF": Velocity(0.1, 0.0), "hlw": REST}), (STAND, REST))
         for wish in ((0.1, 0.0), (-0.1, 0.0), (0.0, 0.15), (0.0, -1.0), (0.03, -0.4), (-0.05, 0.4)):
             _, real = select_gait(*wish, GAITS)
@@ -208,7 +217,7 @@ class GaitTests(SynchronousTestCase):
 
 
 class RequestTableTests(SynchronousTestCase):
-    """The assignment of answers to requests."""
+    """The assignment of replies to requests."""
 
     def setUp(self) -> None:
         self.clock = Clock()
@@ -220,7 +229,7 @@ class RequestTableTests(SynchronousTestCase):
             self.dialogue.process_line(line)
 
     def test_answers_come_in_order(self) -> None:
-        """A stop is sent at once after an open request, and both get their answers."""
+        """A stop is sent immediately, even if a request is pending, and both get their replies."""
         asked = self.dialogue.request(b"j\n", 1.0)
         stop = self.dialogue.request(b"kup\n", 1.0)
         self.assertEqual(self.sent, [b"j\n", b"kup\n"])
@@ -230,7 +239,7 @@ class RequestTableTests(SynchronousTestCase):
         self.assertEqual(self.clock.getDelayedCalls(), [])
 
     def test_a_command_too_long_has_failed(self) -> None:
-        """A command that exceeds the robot's buffer fails, although its token follows; the next request succeeds."""
+        """A command that exceeds the robot's buffer fails, even if its token follows; the next request succeeds."""
         long, next_one = self.dialogue.request(b"i8 10 9 10\n", 1.0), self.dialogue.request(b"j\n", 1.0)
         self.hear("OVF", "i", "=", "0", "5,", "j")
         self.failureResultOf(long, RobotError)
@@ -238,7 +247,7 @@ class RequestTableTests(SynchronousTestCase):
         self.hear("OVF")
 
     def test_a_lost_answer_shifts_no_other(self) -> None:
-        """If an answer is lost, the next answer still goes to its request, also between skills."""
+        """If a reply is lost, the next reply is still assigned to its own request, also between two skills."""
         lost, got = self.dialogue.request(b"gp\n", 1.0), self.dialogue.request(b"j\n", 1.0)
         self.hear("j")
         self.failureResultOf(lost, NoReply)
@@ -249,7 +258,7 @@ class RequestTableTests(SynchronousTestCase):
         self.successResultOf(got)
 
     def test_a_rest_says_that_the_gyroscope_is_off(self) -> None:
-        """The ``g`` before the ``d`` of a rest is not the answer to an attitude request."""
+        """The token ``g`` that precedes the ``d`` of a rest is not taken for the reply to an attitude request."""
         rest, attitude = self.dialogue.request(b"d\n", 1.0), self.dialogue.request(b"gp\n", 1.0)
         self.hear("g", "d")
         self.successResultOf(rest)
@@ -258,7 +267,7 @@ class RequestTableTests(SynchronousTestCase):
         self.assertEqual(len(self.successResultOf(attitude)), 1)
 
     def test_may_be_ended_while_it_fails_a_question(self) -> None:
-        """An errback may end the dialogue, and no request fails twice."""
+        """An errback may end the dialogue; no request fails twice."""
         first, second = self.dialogue.request(b"gp\n", 1.0), self.dialogue.request(b"P~", 1.0)
         third = self.dialogue.request(b"j\n", 1.0)
         first.addErrback(lambda _: self.dialogue.fail_all(LinkLost("gone")))
@@ -269,7 +278,7 @@ class RequestTableTests(SynchronousTestCase):
         self.assertEqual(self.clock.getDelayedCalls(), [])
 
     def test_late_unknown_and_ended(self) -> None:
-        """A timeout, an unknown skill and the end each fail the request; lines without a request are ignored."""
+        """A request fails at its timeout, for an unknown skill, and at the end; lines without a request are ignored."""
         self.hear("k")
         late = self.dialogue.request(b"j\n", 1.0)
         self.clock.advance(1.0)
@@ -285,10 +294,10 @@ class RequestTableTests(SynchronousTestCase):
 
 
 class OptionTests(SynchronousTestCase):
-    """Options of the kind."""
+    """The options of the Bittle."""
 
     def test_describes_what_the_gaits_can_do(self) -> None:
-        """The limits follow from the gaits, without a key for missing axes; the capabilities follow from the board."""
+        """The limits follow from the gaits, without keys for missing axes; the capabilities follow from the board."""
         told = describe("bittle", {"port": "/dev/ttyUSB0", "gaits": {"wkF": [0.1, 0]}, "board": "nyboard"})
         self.assertEqual(told.limits, {"base.vx": (0.0, 0.1)})
         self.assertNotIn("ranger", told.capabilities)

@@ -15,7 +15,7 @@ from sim.robots.emulator.bittle import BEHAVIOUR_S, UNSUPPORTED_TOKENS, Bittle
 from tests.drivers.contract import KeptLink, RobotCase
 
 GAITS = {"wkF": [0.1, 0.0], "trF": [0.15, 0.0], "bk": [-0.05, 0.0], "vtL": [0.0, 0.5], "vtR": [0.0, -0.5]}
-"""Measured gaits: the conformance tests command 0.1 m/s, which these contain exactly."""
+"""Measured gaits, one of which has exactly the 0.1 m/s that the conformance tests command."""
 
 
 class BittleCase(RobotCase):
@@ -54,7 +54,7 @@ class BittleDriverTests(Conformance, BittleCase):
         self.assertEqual(self.value(driver, "skill.running"), "vtL")
 
     def test_asks_for_a_gait_once(self) -> None:
-        """A repeated action sends its command once, as the firmware restarts a gait with each command."""
+        """A repeated action sends its command only once, because each command restarts the gait in the firmware."""
         driver = self.ready()
         for _ in range(10):
             driver.act({"base.vx": 0.1}, self.permit())
@@ -83,7 +83,10 @@ class BittleDriverTests(Conformance, BittleCase):
         self.near(self.value(driver, "odom.x"), self.body.x, 0.02)
 
     def test_does_skills(self) -> None:
-        """A skill completes at its end; until then the dog refuses actions and stays ready; gaits are no skills."""
+        """A skill ends by itself; until then the dog refuses actions and stays ready.
+
+        The names of gaits are not skills.
+        """
         driver = self.ready()
         driver.act({"base.vx": 0.1}, self.permit(seconds=5.0))
         self.pass_time(0.2)
@@ -113,7 +116,7 @@ class BittleDriverTests(Conformance, BittleCase):
             self.failureResultOf(driver.invoke("joint", **arguments), Unsupported)
 
     def test_refuses_skills_of_a_dog_that_lies(self) -> None:
-        """Without a link, or with its servos off, the dog refuses skills."""
+        """A dog without a link, or with its servos off, refuses skills."""
         driver = self.make_driver()
         self.failureResultOf(driver.invoke("sit"), LinkLost)
         driver.connect()
@@ -124,7 +127,7 @@ class BittleDriverTests(Conformance, BittleCase):
         self.assertTrue(self.robot.is_limp)
 
     def test_asks_again_for_a_gait_whose_answer_was_lost(self) -> None:
-        """A stop that the dog has not confirmed within a second is repeated."""
+        """A stop that the dog does not confirm within a second is repeated."""
         driver = self.ready()
         self.faults.half_open = True
         driver.stop()
@@ -148,7 +151,7 @@ class BittleDriverTests(Conformance, BittleCase):
         self.assertGreater(self.true_speed(), 0.05)
 
     def test_walks_on_with_a_dog_whose_banner_was_lost(self) -> None:
-        """After an unnoticed reboot the driver sends the unchanged gait again."""
+        """After a reboot without a banner the driver repeats the current gait."""
         driver = self.ready()
         driver.act({"base.vx": 0.1}, self.permit(seconds=9.0))
         self.pass_time(0.5)
@@ -162,7 +165,7 @@ class BittleDriverTests(Conformance, BittleCase):
         self.assertGreater(self.true_speed(), 0.05)
 
     def test_takes_up_a_dog_that_was_silent(self) -> None:
-        """A silent dog is stale and stopped; the problem has a text, and clears with the next answer."""
+        """A silent dog is stale and stopped; ``problem`` contains the cause until the dog replies again."""
         driver = self.ready()
         driver.act({"base.vx": 0.1}, self.permit(seconds=2.0))
         self.faults.half_open = True
@@ -174,7 +177,10 @@ class BittleDriverTests(Conformance, BittleCase):
         self.assertEqual((driver.state, driver.problem), ("ready", ""))
 
     def test_lives_with_a_foul_wire(self) -> None:
-        """With a tenth of the lines lost and a tenth invalid, split and delayed, the dog walks, stops, and counts."""
+        """With a tenth of the lines lost and a tenth invalid, split and delayed, the dog walks and stops.
+
+        The driver counts the errors.
+        """
         driver = self.ready()
         self.faults.drop = self.faults.garbage = 0.1
         self.faults.split, self.faults.delay = True, 0.01
@@ -188,12 +194,12 @@ class BittleDriverTests(Conformance, BittleCase):
         self.assertGreater(driver.diagnostics()["bad_frames"], 3)
 
     def test_says_that_the_board_is_another(self) -> None:
-        """If the option ``board`` is wrong, the problem names the board that the robot reports."""
+        """If the option ``board`` is wrong, ``problem`` contains the board that the robot reports."""
         driver = self.connected(board="nyboard")
         self.assertIn("biboard", driver.problem)
 
     def test_complains_of_a_gait_that_the_dog_does_not_know(self) -> None:
-        """A gait in the options that the firmware lacks is counted as refused and not sent again."""
+        """A gait in the options that the firmware lacks is counted as refused, and is not requested again."""
         driver = self.ready(gaits={"moonF": [0.1, 0.0]})
         driver.act({"base.vx": 0.1}, self.permit(seconds=3.0))
         self.pass_time(2.0)
@@ -222,7 +228,7 @@ class NyBoardTests(BittleCase):
     board = "nyboard"
 
     def test_is_found_by_its_version(self) -> None:
-        """The board is recognised by its version, reports roll and pitch, and is not asked for its battery."""
+        """The board is recognised by its version, reports roll and pitch, and gets no request for its battery."""
         self.body.values["imu.pitch"] = -0.3
         driver = self.connected(3.0)
         self.assertEqual(self.value(driver, "mode"), "nyboard")
@@ -232,7 +238,7 @@ class NyBoardTests(BittleCase):
 
 
 class WifiTests(BittleCase):
-    """A BiBoard with a web server."""
+    """A BiBoard that is controlled through its web server."""
 
     def build(self) -> None:
         super().build()
@@ -247,7 +253,7 @@ class WifiTests(BittleCase):
         return driver
 
     def test_walks_and_stops(self) -> None:
-        """Over Wi-Fi the driver connects, the dog stands and walks, is observed, and stops at its deadline."""
+        """Over Wi-Fi the driver connects and reports observations; the dog stands, walks, and stops at its deadline."""
         driver = self.walking()
         self.pass_time(1.5)
         self.assertLess(self.true_speed(), 0.01)
@@ -261,7 +267,7 @@ class WifiTests(BittleCase):
         self.assertTrue(self.robot.is_limp)
 
     def test_is_let_go_once_it_was_told_to_lie_down(self) -> None:
-        """``disconnect`` fires after the last command has reached the dog, or after a timeout if it has failed."""
+        """``disconnect`` fires after the last command has reached the dog, or after a timeout."""
         for is_dead in (False, True):
             driver = self.walking()
             self.robot.received_commands.clear()
@@ -277,7 +283,10 @@ class WifiTests(BittleCase):
             self.pass_time(3.0)
 
     def test_outlives_a_lost_network(self) -> None:
-        """Without the network the driver is stale with a problem; with it, the driver is ready and the dog stands."""
+        """Without the network the driver is stale with a problem.
+
+        When the network returns, it is ready and the dog stands.
+        """
         driver = self.walking()
         self.connector.is_open = False
         self.pass_time(12.0)
@@ -289,7 +298,7 @@ class WifiTests(BittleCase):
         self.assertLess(self.true_speed(), 0.01)
 
     def test_lives_with_a_foul_network(self) -> None:
-        """Lost, invalid and split responses cause delays but no exception, and the dog still stops."""
+        """Lost, invalid and split responses cause delays but no exceptions, and the dog still stops."""
         driver = self.walking()
         self.faults.drop = self.faults.garbage = 0.1
         self.faults.split = True
@@ -303,7 +312,10 @@ class WifiTests(BittleCase):
         driver.act({"base.vx": 0.1}, self.permit())
 
     def test_web_server_outlives_rubbish(self) -> None:
-        """An invalid request gets status 400 or a closed connection; the number of stored tasks is limited."""
+        """The web server replies to an invalid request with status 400 or closes the connection.
+
+        The number of tasks that it stores is limited.
+        """
         for data in (b"\r\n\r\n", b"RUBBISH\r\n\r\n", b"GET http://[ HTTP/1.1\r\n\r\n"):
             link = KeptLink()
             self.robot.accept_http(link).data_received(data)
@@ -320,7 +332,7 @@ class WifiTests(BittleCase):
         self.assertLessEqual(len(self.robot.tasks) + len(self.robot.task_output), 50)
 
     def test_names_the_wrong_board(self) -> None:
-        """If the option ``board`` is wrong, the problem contains the HTTP status."""
+        """If the option ``board`` is wrong, ``problem`` contains the HTTP status."""
         other = "nyboard" if self.board == "biboard" else "biboard"
         driver = self.make_driver(board=other)
         connected = driver.connect()
@@ -330,7 +342,7 @@ class WifiTests(BittleCase):
         self.assertIn("404", driver.problem)
 
     def test_may_be_given_up_at_any_moment(self) -> None:
-        """A ``disconnect`` at any moment of the connection leaves no state behind."""
+        """A ``disconnect`` at any moment while the driver connects closes the driver immediately."""
         for steps in range(0, 60, 3):
             driver = self.make_driver()
             driver.connect().addErrback(lambda _: None)

@@ -1,4 +1,4 @@
-"""Tests of ``drivers.camera.codec`` with streams of real cameras, whole and split, with errors, and random bytes."""
+"""Tests of ``drivers.camera.codec`` with streams of real cameras (whole, split and with errors) and random bytes."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from drivers.errors import BadFrame
 
 FIRST, SECOND = b"\xff\xd8one\r\n--fram\xff\xd9", b"\xff\xd8two--\n\xff\xd9"
 
-# The format of the camera server in Espressif's examples: each piece is a separate chunk.
+# The format of the camera server in Espressif's examples: each part is a separate HTTP chunk.
 ESP32 = (
     b"HTTP/1.1 200 OK\r\nContent-Type: multipart/x-mixed-replace;boundary=123456789000000000000987654321\r\n"
     b"Transfer-Encoding: chunked\r\nAccess-Control-Allow-Origin: *\r\n\r\n"
@@ -29,7 +29,7 @@ ESP32 = (
     )
     + b"0\r\n\r\n"
 )
-# The format of mjpg-streamer: HTTP/1.0 with lengths.
+# The format of mjpg-streamer: HTTP/1.0, and each part has a Content-Length.
 STREAMER = b"HTTP/1.0 200 OK\r\nContent-Type: multipart/x-mixed-replace;boundary=boundarydonotcross\r\n\r\n" + b"".join(
     b"--boundarydonotcross\r\nContent-Type: image/jpeg\r\nContent-Length: %d\r\n\r\n" % len(picture) + picture + b"\r\n"
     for picture in (FIRST, SECOND)
@@ -39,7 +39,7 @@ PLAIN = (
     b'HTTP/1.1 200 Fine\nServer: x\ncontent-type: Multipart/X-Mixed-Replace; a=b; Boundary="--cut"\n\n'
     b"\n--cut\ncontent-type: image/jpeg\n\n" + FIRST + b"\n--cut \n\n" + SECOND + b"\n--cut--\n"
 )
-# The same by RFC 2046: with dashes in front of the boundary's dashes.
+# The same stream with the dashes of RFC 2046 in front of the boundary's own dashes.
 DOUBLE = (
     b"HTTP/1.1 200 OK\r\nContent-Type: multipart/x-mixed-replace; boundary=--cut\r\n\r\npreamble\r\n"
     b"----cut\r\n\r\n" + FIRST + b"\r\n----cut\r\n\r\n" + SECOND + b"\r\n----cut--\r\n"
@@ -48,7 +48,7 @@ STREAMS = {"esp32": ESP32, "streamer": STREAMER, "plain": PLAIN, "double": DOUBL
 
 
 def read(data: bytes, size: int = 0) -> tuple[list[bytes], StreamReader]:
-    """Return the pictures in ``data`` and the new reader that read it in pieces of ``size``."""
+    """Read ``data`` in pieces of ``size`` bytes; return the pictures and the reader."""
     reader, found = StreamReader(), list[bytes]()
     for place in range(0, len(data), size or len(data)):
         found += reader.read(data[place : place + (size or len(data))])
@@ -57,7 +57,7 @@ def read(data: bytes, size: int = 0) -> tuple[list[bytes], StreamReader]:
 
 class StreamReaderTests(SynchronousTestCase):
     def test_reads_what_cameras_send(self) -> None:
-        """The pictures in each stream format are read for each division of the bytes."""
+        """The pictures in each stream format are read however the stream is split into chunks."""
         for name, data in STREAMS.items():
             for size in (0, 1, 2, 3, 7, 64):
                 found, reader = read(data, size)
@@ -66,7 +66,7 @@ class StreamReaderTests(SynchronousTestCase):
                 self.assertEqual(read(data + b"anything", size)[0], [FIRST, SECOND])
 
     def test_reads_what_the_emulator_says(self) -> None:
-        """Streams written by the emulator are read, with and without lengths and chunks."""
+        """Streams written by the emulator are read, with and without lengths, chunked or not."""
         for is_chunked in (False, True):
             for has_length in (False, True):
                 said = [encode_part(picture, has_length) for picture in (FIRST, SECOND, FIRST)]
@@ -77,7 +77,7 @@ class StreamReaderTests(SynchronousTestCase):
                 self.assertEqual(read(data, 5)[0], [FIRST, SECOND, FIRST][: 3 if has_length else 2])
 
     def test_finds_its_way_back(self) -> None:
-        """A wrong length and a false boundary damage at most two pictures, and the following ones are read."""
+        """A wrong length or a false boundary damages at most two pictures; the following pictures are read."""
         short = b"--frame\r\nContent-Length: 3\r\n\r\n" + FIRST
         strange = b"--frames of a film\r\n--frame" + bytes(90) + b"\r\nContent-Length: x\r\n"
         found, _ = read(
@@ -90,7 +90,7 @@ class StreamReaderTests(SynchronousTestCase):
         )
 
     def test_names_what_is_no_stream(self) -> None:
-        """Each answer without a picture stream is refused with one line that names the cause or the remedy."""
+        """Each response that is not a picture stream is refused; one line describes the cause or the remedy."""
         ok = b"HTTP/1.1 200 OK\r\n"
         for data, word in (
             (b"HTTP/1.1 401 Unauthorized\r\n\r\n", "NAME:PASSWORD"),
@@ -135,14 +135,14 @@ class StreamReaderTests(SynchronousTestCase):
                 self.assertTrue(line.isprintable() and len(line) < 200, line)
 
     def test_takes_the_largest(self) -> None:
-        """A picture of exactly 1 MiB is accepted, with and without its length."""
+        """A picture of exactly 1 MiB is accepted, with and without a Content-Length."""
         large = bytes(codec.MAX_PICTURE_BYTES)
         for has_length in (True, False):
             data = encode_answer_header() + encode_part(large, has_length) + b"--frame"
             self.assertEqual(read(data, 40_000)[0], [large])
 
     def test_keeps_no_more_than_it_needs(self) -> None:
-        """Data between pictures is dropped on arrival."""
+        """Data between pictures is discarded on arrival."""
         reader = StreamReader()
         reader.read(encode_answer_header())
         for _ in range(100):
@@ -153,7 +153,7 @@ class StreamReaderTests(SynchronousTestCase):
     @settings(max_examples=300)
     @given(st.lists(st.binary(max_size=60), max_size=6), st.booleans(), st.integers(1, 80))
     def test_any_bytes_as_a_stream(self, pieces: list[bytes], is_chunked: bool, size: int) -> None:
-        """Random bytes after a head give pictures, nothing or BadFrame, and no other error."""
+        """Random bytes after a header give pictures, nothing or BadFrame, but no other exception."""
         data = encode_answer_header(is_chunked=is_chunked) + b"\r\n--frame\r\n".join(pieces)
         try:
             found, _ = read(data, size)
@@ -164,7 +164,7 @@ class StreamReaderTests(SynchronousTestCase):
     @settings(max_examples=300)
     @given(st.sampled_from(sorted(STREAMS)), st.data())
     def test_spoilt_streams(self, name: str, data: st.DataObject) -> None:
-        """A stream with changed or missing bytes gives the same result whole and byte by byte."""
+        """A stream with changed or missing bytes gives the same result whether it arrives whole or byte by byte."""
         stream = bytearray(STREAMS[name])
         for _ in range(data.draw(st.integers(1, 4))):
             place = data.draw(st.integers(0, len(stream) - 1))
@@ -180,7 +180,7 @@ class StreamReaderTests(SynchronousTestCase):
 
 class RequestTests(SynchronousTestCase):
     def test_asks(self) -> None:
-        """The request contains host and path, and the credentials only if there are any."""
+        """The request contains host and path, and credentials only if they are configured."""
         plain = codec.encode_request("cam:81", "/stream?a=1")
         self.assertTrue(plain.startswith(b"GET /stream?a=1 HTTP/1.1\r\nHost: cam:81\r\n"))
         self.assertTrue(plain.endswith(b"\r\n\r\n"))

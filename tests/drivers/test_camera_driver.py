@@ -40,7 +40,7 @@ class CameraDriverTests(Conformance, RobotCase):
         self.options = {"source": str(self.folder), "fps": 20}
 
     def test_shows_a_folder_by_the_clock(self) -> None:
-        """The pictures repeat in the order of their names at the given rate, equal in each run."""
+        """The pictures repeat in the order of their file names at the given rate, and are the same in each run."""
         runs = []
         for _ in range(2):
             driver, seen = self.make_driver(fps=10), list[int]()
@@ -56,7 +56,7 @@ class CameraDriverTests(Conformance, RobotCase):
         self.assertEqual((frame.width, frame.height, frame.seq), (128, 96, 10))
 
     def test_takes_as_many_pictures_as_are_wanted(self) -> None:
-        """A new frame rate applies at once; at zero no picture is taken, and the device stays ready."""
+        """A new frame rate applies immediately; at rate zero no picture is taken, but the device stays ready."""
         driver = self.ready()
         driver.set_camera_fps(0)
         before = driver.diagnostics()["pictures"]
@@ -74,7 +74,7 @@ class CameraDriverTests(Conformance, RobotCase):
         self.assertEqual(resting.state, "ready")
 
     def test_drops_what_is_no_picture(self) -> None:
-        """An invalid file is counted and skipped; the other files are shown."""
+        """An invalid file is counted and skipped; the other files are sent."""
         (self.folder / "2.jpg").write_bytes(jpeg(2)[:-1])
         driver = self.make_driver()
         driver.connect()
@@ -85,7 +85,10 @@ class CameraDriverTests(Conformance, RobotCase):
         self.assertEqual(driver.state, "ready")
 
     def test_comes_back_with_its_pictures(self) -> None:
-        """Without pictures the driver is stale and retries with growing delays; then it is ready again."""
+        """Without pictures the driver is stale and retries with growing delays.
+
+        When pictures return, it is ready again.
+        """
         driver = self.ready()
         for mark in (1, 2, 3):
             (self.folder / f"{mark}.jpg").unlink()
@@ -102,7 +105,7 @@ class CameraDriverTests(Conformance, RobotCase):
         self.assertRaises(Unsupported, driver.act, {"base.vx": 0.1}, self.permit())
 
     def test_waits_for_a_camera_that_is_not_there(self) -> None:
-        """A missing video is no error of the node: ``connect`` waits, and ``disconnect`` fails it."""
+        """A missing video raises no exception in the node: ``connect`` waits until ``disconnect`` makes it fail."""
         driver = self.make_driver(source=str(self.folder / "none.avi"))
         connected = driver.connect()
         self.pass_time(10.0)
@@ -112,7 +115,7 @@ class CameraDriverTests(Conformance, RobotCase):
         self.failureResultOf(connected, LinkLost)
 
     def test_asks_a_device_in_a_thread(self) -> None:
-        """A camera, by number or device file, is read in a thread; a file is read by the clock."""
+        """A camera, selected by number or device file, is read in a thread; a file is read by a timer."""
 
         class Reactor(Clock):
             def callFromThread(self, call: Any) -> None:  # noqa: N802 (Twisted's)
@@ -134,7 +137,7 @@ class Picture:
 
 
 class Lens:
-    """A fake of the module cv2, with one camera."""
+    """A fake of the module cv2 with one camera."""
 
     CAP_PROP_FRAME_WIDTH, CAP_PROP_FRAME_HEIGHT, CAP_PROP_BUFFERSIZE, CAP_PROP_POS_FRAMES = range(4)
     INTER_AREA = IMWRITE_JPEG_QUALITY = 0
@@ -176,7 +179,7 @@ class PictureSourceTests(SynchronousTestCase):
         return CaptureSource(Options(file.name, **options), lambda: lens)
 
     def test_reduces_large_pictures(self) -> None:
-        """A picture larger than requested is scaled with its aspect ratio; a smaller one is kept."""
+        """A picture larger than requested is reduced and keeps its aspect ratio; a smaller picture is unchanged."""
         source = self.capture(Lens(Picture(1280, 720), Picture(100, 50)), width=320, height=240)
         source.open()
         first, second = source.read_picture(), source.read_picture()
@@ -184,7 +187,7 @@ class PictureSourceTests(SynchronousTestCase):
         self.assertEqual((second.width, second.height), (100, 50))
 
     def test_begins_a_video_anew(self) -> None:
-        """A video repeats after its end; one without any frame raises LinkLost, and is released once."""
+        """A video repeats after its end. A video without frames raises LinkLost; the capture is released once."""
         lens = Lens(Picture(10, 10), None, Picture(20, 20))
         source = self.capture(lens)
         source.open()
@@ -197,7 +200,7 @@ class PictureSourceTests(SynchronousTestCase):
         self.assertRaises(LinkLost, source.read_picture)
 
     def test_names_why_there_are_no_pictures(self) -> None:
-        """A missing OpenCV, camera or file, a busy camera and an invalid picture each raise an error with its cause."""
+        """The error states the cause: no OpenCV, no such camera or file, a busy camera, or an invalid picture."""
 
         def missing() -> Any:
             raise ImportError("cv2")
@@ -217,7 +220,10 @@ class PictureSourceTests(SynchronousTestCase):
         self.assertRaises(LinkLost, FolderSource("/nowhere").read_picture)
 
     def test_reel_outlives_what_opencv_throws(self) -> None:
-        """An exception of OpenCV closes the camera and is reported by name; the next round opens it again."""
+        """An exception of OpenCV closes the camera, and its name is reported.
+
+        The next attempt opens the camera again.
+        """
 
         class Moody(PictureSource):
             rounds = 0

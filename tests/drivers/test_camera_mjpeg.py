@@ -37,7 +37,7 @@ class MjpegStreamTests(Conformance, RobotCase):
         self.connector = MemoryConnector(self.clock, self.camera.accept)
 
     def test_shows_what_the_camera_sees(self) -> None:
-        """The newest frame has the camera's size and data, without a gap in its numbers, in each stream format."""
+        """In each stream format the newest frame has the camera's size and data, and no frame number is missing."""
         for has_length in (True, False):
             for is_chunked in (True, False):
                 self.camera.has_length, self.camera.is_chunked = has_length, is_chunked
@@ -56,7 +56,10 @@ class MjpegStreamTests(Conformance, RobotCase):
                 driver.disconnect()
 
     def test_takes_as_many_pictures_as_are_wanted(self) -> None:
-        """Frames above the wanted rate are dropped; at rate zero the driver disconnects, then connects again."""
+        """Frames above the requested rate are dropped.
+
+        At rate zero the driver disconnects; a higher rate connects it again.
+        """
         driver = self.ready()
         self.assertIsInstance(driver, Filming)
         driver.set_camera_fps(10)
@@ -88,7 +91,7 @@ class MjpegStreamTests(Conformance, RobotCase):
         self.assertEqual((stream.dropped, driver.diagnostics()["pictures"]), (0, 6))
 
     def test_comes_back_with_the_camera(self) -> None:
-        """A lost link is logged once and retried with growing delays; then the camera is ready again."""
+        """A lost link is logged once and retried with growing delays, until the camera is ready again."""
         driver = self.ready()
         driver.log = log = KeptLog()
         self.connector.is_open = False
@@ -113,7 +116,7 @@ class MjpegStreamTests(Conformance, RobotCase):
         self.assertEqual((driver.state, driver.diagnostics()["reconnects"]), ("ready", 2.0))
 
     def test_comes_back_while_no_pictures_are_wanted(self) -> None:
-        """At rate zero a lost camera is reconnected for one frame, which shows that it works again."""
+        """At rate zero a lost camera is connected again for a single frame, which shows that it works."""
         driver = self.ready()
         self.connector.is_open = False
         self.connector.cut()
@@ -126,7 +129,7 @@ class MjpegStreamTests(Conformance, RobotCase):
         self.assertEqual((driver.state, len(self.camera.clients)), ("ready", 0))
 
     def test_notices_a_camera_that_fell_silent(self) -> None:
-        """A connection without data is closed and opened again, until the camera sends frames."""
+        """A connection without data is closed and opened again until the camera sends frames."""
         driver = self.ready()
         self.faults.half_open = True
         self.pass_time(1.0)
@@ -138,7 +141,7 @@ class MjpegStreamTests(Conformance, RobotCase):
         self.assertEqual(driver.state, "ready")
 
     def test_names_what_is_no_camera(self) -> None:
-        """An invalid answer is reported with a remedy and retried with back-off, until frames arrive."""
+        """An invalid response is reported with a remedy, and retried with back-off until frames arrive."""
         self.camera.status = "401 Unauthorized"
         driver = self.make_driver()
         connected = driver.connect()
@@ -160,7 +163,7 @@ class MjpegStreamTests(Conformance, RobotCase):
         self.assertEqual(driver.state, "ready")
 
     def test_survives_a_foul_network(self) -> None:
-        """Lost, invalid, delayed and split data cost frames; after the faults all frames arrive."""
+        """Lost, invalid, delayed and split data cost frames; after the faults every frame arrives."""
         driver = self.make_driver()
         driver.connect()
         self.faults.drop, self.faults.garbage, self.faults.split, self.faults.delay = 0.1, 0.2, True, 0.03
@@ -175,7 +178,7 @@ class MjpegStreamTests(Conformance, RobotCase):
         self.assertEqual(after["bad_frames"], before["bad_frames"])
 
     def test_says_that_the_pictures_have_another_size(self) -> None:
-        """Frames of another size than configured are shown, and the correct settings are logged once."""
+        """Frames of a different size than configured are accepted, and the correct settings are logged once."""
         driver = self.make_driver(width=320, height=240)
         driver._stream.log = log = KeptLog()
         driver.connect()
@@ -184,7 +187,7 @@ class MjpegStreamTests(Conformance, RobotCase):
         self.assertEqual(driver.description.capabilities["camera"]["width"], 320)
 
     def test_hears_no_more_of_a_call_that_is_over(self) -> None:
-        """Data and the end of a previous connection have no effect on the new one."""
+        """Late data and the end of a previous connection have no effect on the new connection."""
         driver = self.ready()
         stream = driver._stream
         old = stream._attempt
@@ -196,7 +199,7 @@ class MjpegStreamTests(Conformance, RobotCase):
         self.assertEqual((driver.diagnostics()["pictures"], driver.problem, driver.state), (count, "", "ready"))
 
     def test_is_told_where_it_is(self) -> None:
-        """A URL contains host, port, path and credentials; an invalid URL is refused without showing it."""
+        """A URL contains host, port, path and credentials; the error for an invalid URL does not show the URL."""
         place = parse_url("http://anna:s%20p@cam.lan/a/b?c=1")
         self.assertEqual((place.host, place.port, place.path, place.login), ("cam.lan", 80, "/a/b?c=1", "anna:s p"))
         self.assertEqual((place.name, parse_url("http://[::1]:81").name), ("cam.lan:80", "[::1]:81"))

@@ -1,4 +1,4 @@
-"""Tests of ``drivers.compass.codec`` with sentences of real compasses, split and with errors, and random bytes."""
+"""Tests of ``drivers.compass.codec`` with sentences of real compasses (whole, split, with errors) and random bytes."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from drivers.errors import BadFrame
 
 class HeadingTests(SynchronousTestCase):
     def test_reads_what_compasses_send(self) -> None:
-        """Sentences of real compasses give their heading, corrected to east, and whether it is true or magnetic."""
+        """Sentences of real compasses give a heading with its deviation applied, and whether it is true or magnetic."""
         for line, degrees, is_true in (
             (b"$HCHDG,98.3,0.0,E,12.6,W*57", 85.7, True),
             (b"$HCHDG,101.1,,,7.1,W*3C", 94.0, True),
@@ -32,7 +32,7 @@ class HeadingTests(SynchronousTestCase):
         self.assertEqual(parse_heading(b"$HEHDT,1,T"), Heading(1.0, True, 3))
 
     def test_passes_over_other_sentences(self) -> None:
-        """A valid sentence of another type gives None."""
+        """A valid sentence of a different type gives None."""
         for line in (b"$GPVTG,45.0,T,40.0,M,5.5,N,10.2,K", b"!AIVDM,1,1,,A,x,0", b"$PHDG,1.0", b"$HCHDGX,1", b"$"):
             self.assertIsNone(parse_heading(line))
 
@@ -63,7 +63,10 @@ class HeadingTests(SynchronousTestCase):
 
 class SentenceReaderTests(SynchronousTestCase):
     def test_reads_however_it_is_cut(self) -> None:
-        """Headings are read for each division of the bytes; a partial first sentence is no error, noise is counted."""
+        """Headings are read however the input is split into chunks.
+
+        An incomplete first sentence is not an error; other invalid data is counted.
+        """
         stream = (
             *(b"01.1,M*00\r\n", encode_sentence("HCHDM", "10.0", "M"), b"\r\n", encode_sentence("GPVTG", "45.0", "T")),
             *(encode_sentence("HCHDM", "20.0", "M").strip() + b"\n", b"$HCHDM,3.0,M\r\n", b"$HCHDM,40.0,M*00\r"),
@@ -75,17 +78,17 @@ class SentenceReaderTests(SynchronousTestCase):
             for place in range(0, len(data), size):
                 found += reader.read(data[place : place + size])
             self.assertEqual([heading.degrees for heading in found], [10.0, 20.0, 50.0])
-            # One sentence without its checksum after others with theirs, and one with a wrong checksum.
+            # One sentence without a checksum after sentences with checksums, and one with a wrong checksum.
             self.assertEqual((reader.bad_frames, reader.sentences), (2, 4))
 
     def test_takes_sentences_without_checksums(self) -> None:
-        """Sentences of a compass that never sends checksums are accepted."""
+        """If a compass never sends checksums, its sentences are accepted."""
         reader = SentenceReader()
         self.assertEqual(len(reader.read(b"$HCHDM,10.0,M\n$HCHDM,11.0,M\n")), 2)
         self.assertEqual(reader.bad_frames, 0)
 
     def test_keeps_no_endless_line(self) -> None:
-        """A line above the maximum length is dropped and counted, and the next one is read."""
+        """A line above the maximum length is dropped and counted, and the next line is read."""
         reader = SentenceReader()
         for _ in range(10):
             self.assertEqual(reader.read(bytes(100)), [])
@@ -95,7 +98,7 @@ class SentenceReaderTests(SynchronousTestCase):
     @settings(max_examples=200)
     @given(st.lists(st.binary(max_size=30) | st.sampled_from([b"$HCHDG,", b"\r\n", b"1.0,E", b"*57", b"$HEHDT,1,T"])))
     def test_any_bytes(self, pieces: list[bytes]) -> None:
-        """Random bytes give valid headings only, and the same ones byte by byte as at once."""
+        """Random bytes give only valid headings, and the same headings whether they arrive whole or byte by byte."""
         data = b"".join(pieces)
         whole, cut = SentenceReader(), SentenceReader()
         found = whole.read(data)

@@ -35,7 +35,7 @@ class CompassDriverTests(Conformance, RobotCase):
         return math.degrees(self.value(driver, HEADING))
 
     def test_turns_as_the_yard_does(self) -> None:
-        """The heading equals a simulated dog's: counter-clockwise from the x axis."""
+        """The heading equals the heading of a simulated dog: counter-clockwise from the x axis."""
         driver = self.make_driver()
         driver.connect()
         for degrees in (0.0, 45.0, 90.0, 179.9, -179.9, -90.0, -0.04):
@@ -46,7 +46,7 @@ class CompassDriverTests(Conformance, RobotCase):
             self.assertTrue(abs(math.remainder(self.heading(driver) - degrees, 360.0)) < 0.06, degrees)
 
     def test_counts_from_the_yards_axis(self) -> None:
-        """Degrees clockwise from north become radians from the x axis, which by default points east."""
+        """Degrees clockwise from north become radians counter-clockwise from the x axis, which by default is east."""
         north = self.make_driver()
         turned = self.make_driver(mounted_deg=30)
         other = self.make_driver(x_axis_deg=0)
@@ -58,7 +58,10 @@ class CompassDriverTests(Conformance, RobotCase):
             self.assertAlmostEqual(self.heading(driver), degrees, 6)
 
     def test_allows_for_the_place(self) -> None:
-        """Deviation and variation in a sentence are applied; without them, the variation in the options is."""
+        """Deviation and variation in a sentence are applied.
+
+        If they are missing, the variation in the options is applied.
+        """
         self.compass.deviation, self.compass.variation = 3.0, -12.0
         self.body.values[HEADING] = math.radians(20.0)
         for kinds, options in (
@@ -73,7 +76,10 @@ class CompassDriverTests(Conformance, RobotCase):
             self.assertAlmostEqual(self.heading(driver), 20.0, 6)
 
     def test_believes_the_best_sentence(self) -> None:
-        """If a compass sends several sentence types, the most accurate one is used; if it stops, the next one is."""
+        """If a compass sends several sentence types, the most accurate type is used.
+
+        If it stops, the next best is used.
+        """
         self.compass.variation = 10.0
         self.compass.kinds = ("HDM", "HDT")
         driver, seen = self.make_driver(), set[float]()
@@ -89,7 +95,10 @@ class CompassDriverTests(Conformance, RobotCase):
         self.assertEqual((driver.state, seen), ("ready", {0, 10}))
 
     def test_names_why_there_is_no_heading(self) -> None:
-        """Refusal, silence, noise and other sentences each set a problem and are logged once; a heading clears it."""
+        """Refusal, silence, noise and unusable sentences each set ``problem`` and are logged once.
+
+        A heading clears it.
+        """
         self.connector.is_open = False
         driver = self.make_driver()
         driver.log = log = KeptLog()
@@ -115,7 +124,7 @@ class CompassDriverTests(Conformance, RobotCase):
         self.assertEqual((driver.problem, len(log.lines), len(set(log.lines))), ("", 4, 4))
 
     def test_hangs_up_on_silence(self) -> None:
-        """A link without data is closed and opened again, as the other end may have failed."""
+        """A link without data is closed and opened again, because the other end may have failed."""
         driver = self.ready()
         silent = self.compass.clients[0]
         self.faults.half_open = True
@@ -126,7 +135,7 @@ class CompassDriverTests(Conformance, RobotCase):
         self.assertEqual((driver.state, driver.diagnostics()["reconnects"]), ("ready", 1.0))
 
     def test_asks_for_the_baud_rate(self) -> None:
-        """On a serial port, noise is reported with the baud rate, and a closed device with its name."""
+        """On a serial port, a report on noise contains the baud rate, and a report on a closed device its name."""
         self.compass.kinds = ()
         self.options = {"rate": 20, "device": "/dev/ttyUSB1", "baud": 9600}
         driver = self.make_driver()
@@ -145,7 +154,7 @@ class CompassDriverTests(Conformance, RobotCase):
         self.failureResultOf(connected, LinkLost)
 
     def test_drops_what_is_spoilt(self) -> None:
-        """An invalid sentence never gives a heading, and the valid ones in between are read."""
+        """An invalid sentence never gives a heading, and the valid sentences in between are read."""
         driver, seen = self.make_driver(), set[float]()
         driver.connect()
         self.faults.garbage, self.faults.split, self.faults.drop = 0.3, True, 0.1
@@ -157,7 +166,7 @@ class CompassDriverTests(Conformance, RobotCase):
         self.assertTrue(counts["bad_frames"] > 200 and counts["frames"] > 600, counts)
 
     def test_serves_whoever_listens(self) -> None:
-        """The emulated compass sends to each client, except one with a full buffer, and ignores received data."""
+        """The emulated compass sends to all clients except clients with a full buffer, and ignores received data."""
         slow, quick = KeptLink(), KeptLink()
         one, _ = self.compass.accept(slow), self.compass.accept(quick)
         one.data_received(b"$PXYZ,1\r\n")

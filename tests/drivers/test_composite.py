@@ -45,7 +45,7 @@ class Part(BaseDriver):
         )
         self.opened = self.closed = 0
         self.t = 100.0
-        """The part's clock has another origin."""
+        """The time of the part's clock, which has a different origin."""
 
     def tell(self, frame: Frame | None = None, **values: Value) -> None:
         if not self._is_up:
@@ -108,7 +108,10 @@ class CompositeDriverTests(Conformance, Create2Case):
         return driver
 
     def test_shows_what_its_parts_see(self) -> None:
-        """The device has the camera's capability before it connects, and its frames in the robot's observations."""
+        """The device has the camera's capability even before it connects.
+
+        Frames are part of the robot's observations.
+        """
         driver = self.make_driver()
         self.assertIn("camera", driver.description.capabilities)
         self.assertEqual(
@@ -126,7 +129,7 @@ class CompositeDriverTests(Conformance, Create2Case):
         self.assertIn("bump.left", self.newest(driver).values)
 
     def test_rides_with_a_camera_board_and_a_compass(self) -> None:
-        """Robot, network camera and compass are one device; each reconnects separately."""
+        """Robot, network camera and compass form one device, but each of them reconnects separately."""
         self.body.jpeg = jpeg(9)
         self.body.values["compass.heading"] = 0.5
         camera, compass = MjpegCamera(self.clock, self.body), NmeaCompass(self.clock, self.body)
@@ -165,7 +168,7 @@ class CompositeDriverTests(Conformance, Create2Case):
         compass.stop()
 
     def test_leaves_out_what_is_not_ready(self) -> None:
-        """A silent part's values are omitted until its next observation, while the robot stays ready."""
+        """The values of a silent part are omitted until its next observation; the robot stays ready."""
         compass = Part(self.clock)
         driver = self.with_parts(compass)
         driver.connect()
@@ -186,7 +189,7 @@ class CompositeDriverTests(Conformance, Create2Case):
         self.assertNotIn("compass.heading", self.newest(driver).values)
 
     def test_says_why_its_robot_is_not_heard(self) -> None:
-        """A problem of the robot is reported as by its driver alone."""
+        """``problem`` and ``token`` of the device have the values of the robot."""
         main = Create2Driver(parse_options({"port": "memory"}), "vacuum", self.connector, self.clock)
         driver = combine_drivers(main, [Part(self.clock)], "vacuum")
         self.connector.is_open = False
@@ -196,7 +199,7 @@ class CompositeDriverTests(Conformance, Create2Case):
         driver.disconnect()
 
     def test_is_as_fresh_as_its_robot(self) -> None:
-        """A part's values cause no observation, and do not make a silent robot's look new."""
+        """A part's values cause no observation, and do not make the values of a silent robot look new."""
         compass = Part(self.clock)
         driver, seen = self.with_parts(compass), list[Observation]()
         driver.subscribe(seen.append)
@@ -216,13 +219,16 @@ class CompositeDriverTests(Conformance, Create2Case):
         self.assertGreater(driver.diagnostics()["age"], age + 0.9)
 
     def test_keeps_what_is_the_robots(self) -> None:
-        """The robot's keys and capabilities precede a part's; of two equal parts the first that is ready counts."""
+        """A key or capability of the robot takes precedence over the same one of a part.
+
+        Of two equal parts, the first is used.
+        """
         robot, part = Part(self.clock), Part(self.clock)
         alone = combine_drivers(robot, [part], "post")
         alone.connect()
         robot.tell(compass_heading=1.0)
         part.tell(compass_heading=9.0, hum_hz=50.0)
-        robot.tell(power_level=1.0)  # without a heading this time
+        robot.tell(power_level=1.0)  # this observation has no heading
         self.assertEqual(self.newest(alone).values, {"power.level": 1.0, "hum.hz": 50.0})
         first, second, vain = Part(self.clock), Part(self.clock), Part(self.clock, "case", "power")
         driver = self.with_parts(first, second, vain)
@@ -243,7 +249,7 @@ class CompositeDriverTests(Conformance, Create2Case):
         self.assertIn("compass2.frames", driver.diagnostics())
 
     def test_dates_a_picture_by_the_robots_clock(self) -> None:
-        """The age of a frame is correct for each offset of the part's clock."""
+        """The age of a frame is correct for any offset between the clocks of the part and the robot."""
         lens = Lens(self.clock, "camera")
         driver = self.with_parts(lens)
         driver.connect()
@@ -257,7 +263,7 @@ class CompositeDriverTests(Conformance, Create2Case):
         self.assertEqual(seen.frame.seq, 7)
 
     def test_films_where_somebody_does(self) -> None:
-        """The frame rate is set at the part with a camera; without such a part it cannot be set."""
+        """The frame rate is passed to the part that has a camera; without such a part, setting it fails."""
         lens = Lens(self.clock, "camera")
         driver: object = self.with_parts(Part(self.clock), lens)
         assert isinstance(driver, Filming)
@@ -267,7 +273,10 @@ class CompositeDriverTests(Conformance, Create2Case):
         self.assertNotIsInstance(self.with_parts(Part(self.clock, "camera")), Filming)
 
     def test_asks_who_knows_the_skill(self) -> None:
-        """A skill is executed by the robot or the part that has it; an unknown one is refused with the known ones."""
+        """A skill is executed by the robot or the part that has it.
+
+        The error for an unknown skill lists the known skills.
+        """
         driver = self.with_parts(Part(self.clock))
         self.assertEqual(driver.description.skills, ("dock", "beep", "hum"))
         self.assertEqual(self.successResultOf(driver.invoke("hum")), {"hummed": True})
@@ -276,7 +285,7 @@ class CompositeDriverTests(Conformance, Create2Case):
         self.assertIn("dock, beep, hum", str(error))
 
     def test_outlives_a_part_that_is_none(self) -> None:
-        """A failing part is logged once and the robot works; a part that never connects is not logged."""
+        """A failing part is logged once, and the robot still works; a part that never connects is not logged."""
         compass, absent = Part(self.clock), Part(self.clock, "camera")
         driver = self.with_parts(compass, absent)
         driver.log = log = KeptLog()  # type: ignore[assignment]
@@ -291,7 +300,7 @@ class CompositeDriverTests(Conformance, Create2Case):
         self.assertEqual((compass.opened, absent.opened, absent.closed), (1, 1, 1))
 
     def test_leaves_its_parts_with_its_robot(self) -> None:
-        """If the connection to the robot fails, the parts are disconnected as well."""
+        """If the robot fails to connect, the parts are disconnected as well."""
         main, part = Part(self.clock), Part(self.clock)
         driver = combine_drivers(main, [part], "post")
         connected = driver.connect()
@@ -300,7 +309,7 @@ class CompositeDriverTests(Conformance, Create2Case):
         self.assertEqual((part.opened, part.closed, driver.state), (1, 1, "closed"))
 
     def test_is_gone_when_all_are(self) -> None:
-        """``disconnect`` waits for the parts, also if the robot never connected and on the second call."""
+        """``disconnect`` waits for the parts, even if the robot never connected, and also when called twice."""
 
         class Slow(Part):
             gone: Deferred[None]
@@ -321,7 +330,10 @@ class CompositeDriverTests(Conformance, Create2Case):
             self.assertIsNone(self.successResultOf(leaving))
 
     def test_refuses_a_second_robot(self) -> None:
-        """A robot that moves is refused as a part, and the error of an invalid part contains its number."""
+        """A part that moves is refused because it is a second robot.
+
+        The error for an invalid part contains its number.
+        """
         robot = ("bittle", {"port": "/dev/x"})
         compass = describe("camera", {})
         self.assertIn(

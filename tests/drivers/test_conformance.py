@@ -29,7 +29,7 @@ if TYPE_CHECKING:
     from drivers.base import BaseDriver
 
     class Rover(BaseDriver):
-        """The attributes that the type checker needs."""
+        """A correct robot with the attributes that the type checker needs; the subclasses violate one rule each."""
 
         _line: Any
         _newest: Any
@@ -57,7 +57,7 @@ class Boundless(Rover):
 
 
 class Hasty(Rover):
-    """Is connected when its link opens."""
+    """Reports that it is connected as soon as its link is open."""
 
     def link_up(self, link: Any) -> None:
         super().link_up(link)
@@ -77,7 +77,7 @@ class Eager(Rover):
 
 
 class Restless(Rover):
-    """Moves on when it is disabled."""
+    """Continues to move when it is disabled."""
 
     def disable(self) -> Deferred[bool]:
         self._wants_motors = False
@@ -85,7 +85,7 @@ class Restless(Rover):
 
 
 class Boastful(Rover):
-    """Returns the requested instead of the executed action."""
+    """Returns the requested action instead of the executed action."""
 
     def act(self, action: Action, permit: Permit) -> Action:
         super().act(action, permit)
@@ -120,7 +120,7 @@ class Credulous(Rover):
 
 
 class Endless(Rover):
-    """Moves on after its deadline."""
+    """Continues to move after its deadline."""
 
     def act(self, action: Action, permit: Permit) -> Action:
         done = dict(super().act(action, permit))
@@ -129,7 +129,7 @@ class Endless(Rover):
 
 
 class Abrupt(Rover):
-    """Keeps the deadline of the first command although a later one extends it."""
+    """Keeps the deadline of the first command, even if a later command extends it."""
 
     def act(self, action: Action, permit: Permit) -> Action:
         self._first = getattr(self, "_first", None) or permit.deadline
@@ -162,7 +162,7 @@ class Stubborn(Rover):
 
 
 class Deaf(Rover):
-    """Reports a stop and moves on."""
+    """Reports a stop but continues to move."""
 
     def stop(self) -> Action:
         self._clear_motion()
@@ -179,7 +179,7 @@ class Undying(Rover):
 
 
 class Clumsy(Rover):
-    """Fails if it is disconnected twice."""
+    """Fails when it is disconnected twice."""
 
     def disconnect(self) -> Deferred[None]:
         if self._is_closed:
@@ -214,7 +214,7 @@ class Rash(Rover):
 
 
 class Unmoved(Rover):
-    """Reports ready after its link is lost."""
+    """Reports that it is ready after its link is lost."""
 
     def link_down(self) -> None:
         self._is_up = True
@@ -237,14 +237,14 @@ class Prophetic(Rover):
 
 
 class Infinite(Rover):
-    """Reports an infinite range instead of NaN."""
+    """Reports an infinite range when it should report NaN."""
 
     def _observed(self, values: Mapping[str, Value], t_robot: float, *rest: Any) -> None:
         super()._observed({**values, "range.front": math.inf}, t_robot, *rest)
 
 
 class Clinging(Rover):
-    """Keeps a subscriber that has unsubscribed."""
+    """Keeps calling a subscriber that has unsubscribed."""
 
     def subscribe(self, seen: Callable[[Observation], None]) -> Callable[[], None]:
         super().subscribe(seen)
@@ -252,7 +252,7 @@ class Clinging(Rover):
 
 
 class Frail(Subscribers[Observation]):
-    """Drops all subscribers if one raises an exception."""
+    """Drops all subscribers if one of them raises an exception."""
 
     def notify(self, newest: Observation) -> None:
         try:
@@ -263,7 +263,7 @@ class Frail(Subscribers[Observation]):
 
 
 class Fragile(Rover):
-    """Has such subscribers."""
+    """Uses the subscribers of ``Frail``."""
 
     def __init__(self, *given: Any, **more: Any) -> None:
         super().__init__(*given, **more)
@@ -271,14 +271,14 @@ class Fragile(Rover):
 
 
 class Silent(Rover):
-    """Reports no counter of refused commands, and one unknown counter."""
+    """Lacks the counter of refused commands, and has an unknown counter."""
 
     def diagnostics(self) -> dict[str, float]:
         return {"frames": 1.0, "age": super().diagnostics()["age"]}
 
 
 class Ageless(Rover):
-    """Reports an age of zero."""
+    """Reports that its observations have the age zero."""
 
     def diagnostics(self) -> dict[str, float]:
         return {**super().diagnostics(), "age": 0.0}
@@ -292,7 +292,7 @@ class Obliging(Rover):
 
 
 class Rude(Rover):
-    """Raises an exception instead of a failing Deferred."""
+    """Raises an exception when it should return a Deferred that fails."""
 
     def invoke(self, name: str, **arguments: float | str) -> Deferred[Mapping[str, Value]]:
         raise KeyError(name)
@@ -361,12 +361,15 @@ class KitTests(SynchronousTestCase):
         self.assertLess(len([line for line in lines if line.strip()]), 50)
 
     def test_document_names_every_rule(self) -> None:
-        """The table of rules in the documentation lists the checks in order."""
+        """The table of rules in the documentation lists the checks in the order in which they run."""
         text = (FOLDER.parents[1] / "docs" / "how-to" / "write-a-driver.md").read_text(encoding="utf-8")
         table = text.partition("| rule | ")[2].partition("\n\n")[0]
         self.assertEqual(re.findall(r"^\| (\w+) \|", table, re.MULTILINE), list(CHECKS))
 
     def test_tells_what_is_wrong(self) -> None:
-        """A violation names the expected and the actual behaviour; an exception is a violation with its name."""
+        """The message of a violation states expected and actual behaviour.
+
+        An exception is a violation with its name.
+        """
         self.assertIn("after its deadline the robot moves at 0.15", find_violations(bench(Endless))["deadline"])
         self.assertIn("KeyError", find_violations(bench(Rude))["invoke"])

@@ -51,7 +51,7 @@ class CommandTests(SynchronousTestCase):
         self.assertEqual(codec.encode_song(0, [(69, 32)]) + codec.encode_play(0), bytes((140, 0, 1, 69, 32, 141, 0)))
 
     def test_robot_hears_each_command_however_it_is_cut(self) -> None:
-        """A reader that gets one byte at a time reads the same commands as one that gets all at once."""
+        """Single bytes give the same commands as the whole input."""
         said = (
             bytes((128, 131))
             + codec.encode_drive(-300, 1000)
@@ -69,7 +69,7 @@ class CommandTests(SynchronousTestCase):
         self.assertEqual((whole.unknown, pieces.unknown), (1, 1))
 
     def test_robot_waits_for_missing_data(self) -> None:
-        """An incomplete command takes its data from the next one, as in the real robot; five start bytes end this."""
+        """An incomplete command takes the next bytes as its data, like the real robot; five start bytes end this."""
         reader = CommandReader()
         self.assertEqual(list(reader.read(codec.encode_drive_direct(100, 100)[:1])), [])
         self.assertEqual([one.opcode for one in reader.read(bytes((128,)) * 5)], [145, 128])
@@ -77,7 +77,7 @@ class CommandTests(SynchronousTestCase):
     @given(st.binary(max_size=200))
     @settings(max_examples=200, deadline=None)
     def test_robot_takes_any_bytes(self, data: bytes) -> None:
-        """For any bytes the robot's reader raises nothing, and uses each byte at most once."""
+        """For any bytes the robot's reader raises no exception, and uses each byte at most once."""
         reader = CommandReader()
         heard = sum(1 + len(one.data) for one in reader.read(data))
         self.assertLessEqual(heard + reader.unknown, len(data))
@@ -87,14 +87,14 @@ class StreamTests(SynchronousTestCase):
     """Frames from the robot."""
 
     def test_golden_frame_of_the_specification(self) -> None:
-        """The example frame of the specification decodes to 2 * 256 + 25 = 537 and encodes to the same bytes."""
+        """The specification's example frame decodes to 2 * 256 + 25 = 537, and encodes to the same bytes."""
         reader = StreamReader((29, 13))
         self.assertEqual(list(reader.read(SPECIFIED)), [{"cliff_front_left_signal": 537, "virtual_wall": 0}])
         self.assertEqual(encode_stream_frame((29, 13), {"cliff_front_left_signal": 537}), SPECIFIED)
         self.assertEqual((reader.frames, reader.bad_frames), (1, 0))
 
     def test_sizes_of_packets_and_groups(self) -> None:
-        """Groups have the lengths in the specification, so each packet has its size and offset."""
+        """Groups have the specified lengths, which shows that the packet sizes and offsets are right."""
         sizes = {0: 26, 1: 10, 2: 6, 3: 10, 4: 14, 5: 12, 6: 52, 100: 80, 101: 28, 106: 12, 107: 9}
         self.assertEqual({one: len(encode_packet(one, {})) for one in GROUPS}, sizes)
         offsets = {7: 0, 17: 10, 19: 12, 22: 17, 27: 26, 34: 39, 35: 40, 43: 52, 46: 57, 52: 69, 58: 79}
@@ -104,7 +104,7 @@ class StreamTests(SynchronousTestCase):
     @given(values_of(PACKET_IDS), st.integers(1, 90))
     @settings(max_examples=100, deadline=None)
     def test_reads_what_is_written(self, values: dict[str, int], size: int) -> None:
-        """Each frame survives encoding and decoding, also in pieces and with a byte 19 in its data."""
+        """Each frame survives encoding and decoding, also in pieces and with the header byte 19 in its data."""
         data = encode_stream_frame(PACKET_IDS, values) * 2
         reader = StreamReader(PACKET_IDS)
         got = [frame for at in range(0, len(data), size) for frame in reader.read(data[at : at + size])]
@@ -112,7 +112,7 @@ class StreamTests(SynchronousTestCase):
         self.assertEqual(reader.bad_frames, 0)
 
     def test_fed_one_byte_at_a_time_with_heads_within(self) -> None:
-        """Frames with header bytes in their data are found byte by byte from the middle of a frame."""
+        """Frames are found byte by byte from the middle of a frame, even with header bytes in their data."""
         values = {"left_encoder": 19 * 256 + 78, "right_encoder": 19 * 256 + 78, "charge": 19 * 256 + 78}
         data = encode_stream_frame(PACKET_IDS, values)
         reader = StreamReader(PACKET_IDS)
@@ -122,7 +122,7 @@ class StreamTests(SynchronousTestCase):
         self.assertEqual(reader.bad_frames, 1)
 
     def test_counts_and_skips_what_is_no_frame(self) -> None:
-        """An invalid byte costs one frame, the text of a reboot none; the following frames are read."""
+        """An invalid byte costs one frame, the text of a reboot costs none; the following frames are read."""
         data = encode_stream_frame((29, 13), {"virtual_wall": 1})
         reader = StreamReader((29, 13))
         spoilt = data[:3] + bytes((data[3] ^ 8,)) + data[4:]
@@ -132,13 +132,13 @@ class StreamTests(SynchronousTestCase):
         self.assertEqual((reader.frames, reader.bad_frames), (3, 2))
 
     def test_refuses_other_packets_with_a_right_checksum(self) -> None:
-        """A frame of equal length with other packets is refused despite a valid checksum."""
+        """A frame that contains other packets is refused, even if its length and checksum are right."""
         reader = StreamReader((29, 13))
         self.assertEqual(list(reader.read(encode_stream_frame((28, 13), {}))), [])
         self.assertEqual(reader.bad_frames, 1)
 
     def test_refuses_what_no_robot_can_mean(self) -> None:
-        """A frame with mode 9 or a battery of 60 V is dropped and counted."""
+        """A frame that contains mode 9 or a battery voltage of 60 V is dropped and counted."""
         reader = StreamReader((35, 22))
         for values in ({"mode": 9}, {"voltage": 60_000}):
             self.assertEqual(list(reader.read(encode_stream_frame((35, 22), values))), [])
@@ -148,7 +148,7 @@ class StreamTests(SynchronousTestCase):
     @given(st.lists(st.one_of(st.binary(max_size=40), st.just(SPECIFIED), st.just(SPECIFIED[:5])), max_size=12))
     @settings(max_examples=200, deadline=None)
     def test_takes_any_bytes(self, pieces: list[bytes]) -> None:
-        """For any bytes the reader raises nothing, and reads at least one of two following frames."""
+        """Any bytes raise no exception, and of two frames that follow them at least one is read."""
         reader = StreamReader((29, 13))
         for piece in pieces:
             list(reader.read(piece))
@@ -171,14 +171,17 @@ class SensorsTests(SynchronousTestCase):
         self.assertEqual((felt["button.dock"], felt["button.clean"]), (1.0, 0.0))
 
     def test_power_in_si_units(self) -> None:
-        """Power values are in SI units, a negative current discharges; without a capacity there is no level."""
+        """Power values are in SI units; a negative current discharges the battery.
+
+        Without a capacity there is no level.
+        """
         felt = convert_frame(self.frame(voltage=14400, current=-250, temperature=-5, charge=500, charging_state=2))
         self.assertEqual((felt["power.volts"], felt["power.amps"], felt["power.celsius"]), (14.4, -0.25, -5.0))
         self.assertEqual((felt["power.level"], felt["power.charging"]), (0.25, True))
         self.assertNotIn("power.level", convert_frame(self.frame(capacity=0)))
 
     def test_names_the_causes_of_a_safety_event(self) -> None:
-        """The causes of a safety event are named by the keys of the observation."""
+        """The causes of a safety event are listed by the keys of the observation."""
         felt = convert_frame(self.frame(bumps=8, cliff_left=1))
         self.assertEqual(describe_safety_event(felt), "cliff.left, wheeldrop.left")
         self.assertEqual(describe_safety_event(convert_frame(self.frame(charger=2))), "charger")
@@ -204,7 +207,7 @@ class OdometryTests(SynchronousTestCase):
         self.assertGreater(where.wz, 0.4)
 
     def test_counters_wrap(self) -> None:
-        """A counter that wraps, in either direction, gives a small step and no jump."""
+        """A counter that wraps in either direction gives a small step, not a jump."""
         where = Odometry()
         where.update(65530, 65530, 0.0)
         where.update(4, 4, 0.1)
@@ -214,7 +217,7 @@ class OdometryTests(SynchronousTestCase):
         self.assertEqual(where.jumps, 0)
 
     def test_draws_arcs(self) -> None:
-        """A half circle with a radius of one metre ends two metres to the left."""
+        """After a half circle with a radius of one metre the pose is two metres to the left."""
         where = Odometry()
         for step in range(33):
             left, right = (math.pi * (1.0 + side * 0.1175) * step / 32 / MM_PER_COUNT * 1000.0 for side in (-1, 1))
@@ -224,7 +227,7 @@ class OdometryTests(SynchronousTestCase):
         self.assertAlmostEqual(abs(where.yaw), math.pi, places=2)
 
     def test_jumps_move_nothing(self) -> None:
-        """A counter step beyond the wheel's speed, as after a reboot, is counted as a jump and moves nothing."""
+        """A counter step beyond the wheel's speed, such as after a reboot, counts as a jump and moves nothing."""
         where = Odometry()
         where.update(20_000, 20_000, 0.0)
         where.update(0, 0, 0.015)
@@ -234,7 +237,7 @@ class OdometryTests(SynchronousTestCase):
 
 
 class OptionTests(SynchronousTestCase):
-    """Options of the kind."""
+    """The options of the Create 2."""
 
     def test_every_baud_carries_the_stream(self) -> None:
         """At each permitted baud rate (10 bits per byte) a frame fits into the stream's interval."""

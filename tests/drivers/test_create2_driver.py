@@ -57,7 +57,10 @@ class Create2DriverTests(Conformance, Create2Case):
         self.assertEqual(driver.diagnostics()["jumps"], 0)
 
     def test_slows_both_wheels_where_one_would_be_too_fast(self) -> None:
-        """A curve above the maximum wheel speed keeps its radius: both wheels slow down, and ``act`` shows it."""
+        """In a curve above the maximum wheel speed both wheels slow down, so the radius stays.
+
+        ``act`` shows the result.
+        """
         driver = self.ready()
         done = driver.act({"base.vx": 0.5, "base.wz": 2.0}, self.permit())
         self.assertLess(done["base.vx"], 0.4)
@@ -67,7 +70,7 @@ class Create2DriverTests(Conformance, Create2Case):
         self.assertAlmostEqual(self.body.motion[2], done["base.wz"])
 
     def test_stays_off_after_a_safety_event(self) -> None:
-        """A lifted wheel stops the robot, is named, and leaves the motors off until ``enable``."""
+        """A lifted wheel stops the robot and is reported; the motors stay off until ``enable``."""
         driver = self.ready()
         driver.act({"base.vx": 0.2}, self.permit(seconds=5.0))
         self.pass_time(0.2)
@@ -90,7 +93,7 @@ class Create2DriverTests(Conformance, Create2Case):
         driver.act({"base.vx": 0.1}, self.permit())
 
     def test_full_mode_has_no_guards(self) -> None:
-        """In full mode, set by an option, a cliff does not stop the robot."""
+        """In full mode, which an option selects, a cliff does not stop the robot."""
         self.body.values["cliff.left"] = True
         driver = self.ready(mode="full")
         self.assertEqual(self.value(driver, "mode"), "full")
@@ -107,7 +110,7 @@ class Create2DriverTests(Conformance, Create2Case):
         self.failureResultOf(enabled, NoReply)
 
     def test_docks(self) -> None:
-        """The skill ``dock`` completes when the robot charges; the motors are off then, without a safety event."""
+        """The skill ``dock`` completes when the robot charges; the motors are then off, which is not a safety event."""
         driver = self.ready()
         docked = driver.invoke("dock")
         self.pass_time(0.5)
@@ -123,7 +126,7 @@ class Create2DriverTests(Conformance, Create2Case):
         self.assertIs(self.value(driver, "power.charging"), True)
 
     def test_docking_can_be_stopped(self) -> None:
-        """A stop, a cancellation, a lost link and a timeout each end the search for the dock."""
+        """A stop, a cancellation, a lost link and a timeout each end the skill ``dock``."""
         driver = self.ready()
         docking = driver.invoke("dock")
         self.pass_time(0.2)
@@ -150,7 +153,10 @@ class Create2DriverTests(Conformance, Create2Case):
         self.assertLess(self.true_speed(), 0.01)
 
     def test_beeps(self) -> None:
-        """``beep`` plays the nearest note and returns it; invalid arguments and unknown skills are refused."""
+        """``beep`` plays the nearest note and returns its frequency.
+
+        Invalid arguments and unknown skills are refused.
+        """
         driver = self.make_driver()
         self.failureResultOf(driver.invoke("beep"), LinkLost)
         driver.connect()
@@ -168,7 +174,7 @@ class Create2DriverTests(Conformance, Create2Case):
         self.failureResultOf(driver.invoke("fly"), Unsupported)
 
     def test_starts_a_rebooted_robot_again(self) -> None:
-        """After a reboot during a drive the robot is started again, at rest, without a jump of its odometry."""
+        """After a reboot during a drive, the driver starts the robot again, at rest and without an odometry jump."""
         driver = self.ready()
         driver.act({"base.vx": 0.2}, self.permit(seconds=9.0))
         self.pass_time(1.0)
@@ -183,7 +189,7 @@ class Create2DriverTests(Conformance, Create2Case):
         driver.act({"base.vx": 0.1}, self.permit())
 
     def test_takes_nothing_from_before_its_start(self) -> None:
-        """Frames sent before the start command arrives cause no safety event, and the motors are enabled again."""
+        """Frames sent before the start command arrives cause no safety event; the motors are enabled again."""
         self.connector = MemoryConnector(self.clock, self.robot.accept, delay=0.02)
         driver = self.ready()
         self.cut_link()
@@ -191,7 +197,7 @@ class Create2DriverTests(Conformance, Create2Case):
         self.assertEqual((driver.state, self.robot.mode, driver.diagnostics()["safety_events"]), ("ready", 2, 0))
 
     def test_stops_a_robot_that_it_no_longer_hears(self) -> None:
-        """A robot that receives but does not send is stopped within a second, and the problem names its silence."""
+        """A robot that receives but does not send is stopped within a second, and ``problem`` reports its silence."""
         driver = self.ready()
         driver.act({"base.vx": 0.2}, self.permit(seconds=9.0))
         self.pass_time(0.2)
@@ -205,7 +211,7 @@ class Create2DriverTests(Conformance, Create2Case):
         self.assertEqual(driver.state, "ready")
 
     def test_names_a_wrong_baud_rate(self) -> None:
-        """Bytes without a valid frame are reported as a probable wrong baud rate."""
+        """Bytes without a valid frame are reported as a possibly wrong baud rate."""
         self.faults.garbage = 1.0
         driver = self.make_driver()
         connected = driver.connect()
@@ -218,7 +224,10 @@ class Create2DriverTests(Conformance, Create2Case):
         self.assertGreater(driver.diagnostics()["bad_frames"], 2)
 
     def test_lives_with_a_foul_wire(self) -> None:
-        """With a tenth of the frames lost and a tenth invalid, delayed and split, the driver works and counts them."""
+        """With a tenth of the frames lost and a tenth invalid, delayed and split, the driver works.
+
+        It counts the invalid frames.
+        """
         driver = self.ready()
         self.faults.drop = self.faults.garbage = 0.1
         self.faults.split, self.faults.delay = True, 0.02
@@ -251,7 +260,7 @@ class EmulatorTests(SynchronousTestCase):
         """Do nothing."""
 
     def tell(self, data: bytes) -> bytes:
-        """Send ``data`` and return the robot's answer within 10 ms."""
+        """Send ``data`` and return the data that the robot sends within 10 ms."""
         assert self.link is not None
         self.said = b""
         self.link.send(data)
@@ -259,7 +268,7 @@ class EmulatorTests(SynchronousTestCase):
         return self.said
 
     def test_is_off_until_it_is_started(self) -> None:
-        """Before a start command the robot ignores all data; after it, it is in passive mode and does not drive."""
+        """Until the start command the robot ignores all data; afterwards it is in passive mode and does not drive."""
         self.assertEqual(self.tell(bytes((142, 35))), b"")
         self.assertEqual(self.tell(bytes((128, 142, 35))), b"\x01")
         self.tell(codec.encode_drive_direct(100, 100))
@@ -269,7 +278,7 @@ class EmulatorTests(SynchronousTestCase):
         self.assertEqual(self.tell(bytes((135, 142, 35))), b"\x01")
 
     def test_answers_groups_and_lists(self) -> None:
-        """Group 100 has 80 bytes, a list is answered without ids, and unknown packets are omitted."""
+        """Group 100 has 80 bytes; the reply to a list has no packet ids, and omits unknown packets."""
         self.assertEqual(len(self.tell(bytes((128, 142, 100)))), 80)
         self.assertEqual(len(self.tell(codec.encode_query((35, 22, 200, 43)))), 5)
 
@@ -285,7 +294,7 @@ class EmulatorTests(SynchronousTestCase):
         self.assertTrue(math.isclose(self.body.motion[2], 0.1, abs_tol=0.01))
 
     def test_a_ledge_stops_it_ahead_only(self) -> None:
-        """In safe mode a cliff stops forward motion, and permits backward motion."""
+        """In safe mode a cliff stops forward motion but not backward motion."""
         self.body.values["cliff.left"] = True
         self.tell(bytes((128, 131)) + codec.encode_drive_direct(-100, -100))
         self.assertEqual(self.body.motion[0], -0.1)

@@ -47,7 +47,7 @@ from tests.formats.rfc6455 import masked
 
 
 class RecordingLink(SharedLink):
-    """A channel that records halt messages; with ``is_answered``, each one is confirmed."""
+    """A channel that records halt messages; each message is confirmed if ``is_answered`` is set."""
 
     def __init__(self, is_answered: bool = False) -> None:
         super().__init__(-1)
@@ -64,17 +64,17 @@ class RecordingLink(SharedLink):
 
 
 class HaltTimerTests(SynchronousTestCase):
-    """The time and the number of halts."""
+    """The times and the number of halts."""
 
     def setUp(self) -> None:
-        """Guard a robot that may move until 10."""
+        """Guard a robot that is permitted to move until 10 s."""
         self.link = RecordingLink()
         self.timer = HaltTimer()
         self.timer.set_halt_command(self.link, b"halt")
         self.timer.arm(10.0)
 
     def test_halts_when_the_time_is_over(self) -> None:
-        """The halt is sent after the deadline plus a grace period, three times at intervals, and counted once."""
+        """The halt is sent after the deadline plus a grace period, repeated to three in total, and counted once."""
         wait = self.timer.get_timeout(9.0)
         self.assertIsNotNone(wait)
         self.assertAlmostEqual(wait or 0.0, 1.0 + GRACE_S)
@@ -90,7 +90,7 @@ class HaltTimerTests(SynchronousTestCase):
         self.assertIsNone(self.timer.get_timeout(20.0))
 
     def test_heeds_newer_words(self) -> None:
-        """A new deadline replaces the old one, rest removes it, and both end the repetition of a halt."""
+        """A new deadline replaces the old deadline, and rest removes it; both end the repetition of a halt."""
         self.timer.arm(11.0)
         self.timer.send_due_halts(10.5)
         self.assertEqual(self.link.said, [])
@@ -107,7 +107,7 @@ class HaltTimerTests(SynchronousTestCase):
             self.assertEqual(self.link.said, [])
 
     def test_halts_at_once_when_the_node_is_gone(self) -> None:
-        """The end of the node halts the robot at once if it may move, and otherwise sends nothing."""
+        """When the node ends, a robot that may move is halted immediately; to a robot at rest nothing is sent."""
         self.timer.on_node_end(5.0)
         self.timer.send_due_halts(5.001)
         self.assertEqual(self.link.said, [b"halt"])
@@ -117,7 +117,10 @@ class HaltTimerTests(SynchronousTestCase):
         self.assertIsNone(still.get_timeout(5.0))
 
     def test_lets_go_of_what_was_guarded(self) -> None:
-        """A new channel closes the old one and keeps the deadline; without a channel nothing is sent or counted."""
+        """A new channel replaces and closes the old channel; the deadline stays.
+
+        Without a channel nothing is sent or counted.
+        """
         other = RecordingLink()
         self.timer.set_halt_command(other, b"other")
         self.assertFalse(self.link.is_open)
@@ -161,10 +164,10 @@ class RecordingTimer(HaltTimer):
 
 
 class MessageParserTests(SynchronousTestCase):
-    """The protocol of the process."""
+    """The messages to the process of the switch."""
 
     def test_hears_words_cut_anyhow(self) -> None:
-        """Messages are read for each division of the bytes, and each file descriptor belongs to its message."""
+        """Messages are read however they are split into chunks, and each file descriptor belongs to its message."""
         said = HEADER.pack(SET_LINK, 0.0, 4) + b"halt" + HEADER.pack(ARM, 7.5, 0) + HEADER.pack(DISARM, 0.0, 0)
         said += HEADER.pack(LINK_LOST, 0.0, 0) + HEADER.pack(SET_LINK, 0.0, 0)
         call = b"10.0.0.5\x0080\0GET /x\0y"
@@ -187,7 +190,7 @@ class MessageParserTests(SynchronousTestCase):
 
 
 class OrderedDeadMan(MemoryDeadManSwitch):
-    """A switch that ends when ``ended`` fires."""
+    """A dead man's switch that ends when the test fires ``ended``."""
 
     def close(self) -> Deferred[None]:
         super().close()
@@ -196,7 +199,7 @@ class OrderedDeadMan(MemoryDeadManSwitch):
 
 
 class Puppet(BaseDriver):
-    """A fake driver that records its commands in its switch's list, too."""
+    """A fake driver that records its commands in the list of calls of its switch."""
 
     def __init__(self, clock: Clock, switch: OrderedDeadMan | None) -> None:
         description = Description("puppet", "puppet", {"base2d": {}}, {"base.vx": (-1.0, 1.0)}, 0.1)
@@ -242,7 +245,10 @@ class BaseDriverTests(SynchronousTestCase):
         self.driver.up()
 
     def test_tells_before_it_commands(self) -> None:
-        """The deadline is set before the motion is commanded; at the end, rest is set with the halt."""
+        """The switch gets the deadline before the robot gets the motion.
+
+        At the end it gets rest, then the robot the halt.
+        """
         self.driver.act({"base.vx": 0.1}, Permit(1, 0.2))
         self.assertEqual(self.switch.seconds, 0.2)
         self.clock.advance(0.2)
@@ -250,21 +256,21 @@ class BaseDriverTests(SynchronousTestCase):
         self.assertEqual(self.switch.calls, ["guard", "until", "drive", "rest", "halt"])
 
     def test_a_refused_command_arms_nothing(self) -> None:
-        """A command with an old token or a passed deadline does not set the switch."""
+        """A command with a lower token or a past deadline does not set the switch."""
         self.driver.act({"base.vx": 0.1}, Permit(5, 0.2))
         for permit in (Permit(4, 5.0), Permit(6, 0.0)):
             self.assertRaises(StaleCommand, self.driver.act, {"base.vx": 0.1}, permit)
         self.assertEqual((self.switch.seconds, self.switch.calls.count("until")), (0.2, 1))
 
     def test_what_is_over_is_over(self) -> None:
-        """A late command, before the timer of the previous motion's end, starts from rest."""
+        """If a motion is over but its timer has not run yet, the next command starts from rest."""
         self.driver.act({"base.vx": 0.1}, Permit(1, 0.2))
-        self.clock.rightNow = 0.22  # time passes without timer calls
+        self.clock.rightNow = 0.22  # time passes, but no timer runs
         self.assertEqual(self.driver.act({}, Permit(1, 0.5)), {"base.vx": 0.0})
         self.assertEqual(self.switch.calls[3:], ["rest", "halt", "until", "drive"])
 
     def test_follows_the_link(self) -> None:
-        """The switch releases a lost link and guards the next one."""
+        """The switch releases a lost link and guards the next link."""
         self.driver.down()
         self.assertIsNone(self.switch.command)
         self.driver.up()
@@ -293,7 +299,7 @@ class HaltCommandTests(RobotCase):
         self.switch = MemoryDeadManSwitch()
 
     def tearDown(self) -> None:
-        """Skip the check of the base class, as the robots are still running."""
+        """Skip the check of the base class, because the robots are still running."""
 
     def word(self, driver: BaseDriver, settle: float = 1.0) -> HaltCommand:
         """Return the halt message of a driver after it has connected."""
@@ -304,7 +310,7 @@ class HaltCommandTests(RobotCase):
         return self.switch.command
 
     def test_aibo(self) -> None:
-        """The AIBO gets zero for forward, strafe and rotate, at the walk server only."""
+        """The AIBO gets zero for forward, strafe and rotate; only its walk server gets them."""
         dog = AiboEmulator(self.clock, self.body, Random(1))
         dog.start()
         driver = AiboDriver({"host": "dog", "camera": False}, "dog", dog.connector(), self.clock, dead_man=self.switch)
@@ -323,7 +329,7 @@ class HaltCommandTests(RobotCase):
         self.assertEqual(self.word(driver).data, bytes((145, 0, 0, 0, 0)))
 
     def test_bittle(self) -> None:
-        """The Bittle gets the skill to stand up with its line feed, or the HTTP request for it."""
+        """The Bittle gets the skill to stand up with its line feed, or over Wi-Fi the HTTP request for this skill."""
         robot = Bittle(self.body, self.clock, Random(1))
         connector = MemoryConnector(self.clock, robot.accept)
         driver = BittleDriver(checked_bittle({"port": "x"}), "dog", connector, self.clock, self.switch)
@@ -339,13 +345,13 @@ class HaltCommandTests(RobotCase):
             self.assertTrue(command.data.endswith(b"\r\n\r\n"))
 
     def test_rosbridge(self) -> None:
-        """A ROS base gets a masked text frame with zero velocity, of the type to which it subscribes."""
+        """A ROS base gets a masked text frame that contains a zero velocity of the type that the base subscribes to."""
         for kind, is_stamped in (("Twist", False), ("TwistStamped", True)):
             robot = RosbridgeRobot(self.clock, self.body, Random(1), velocity_type=f"geometry_msgs/msg/{kind}")
             self.assertEqual("twist" in self.published(self.word(self.rosbridge(robot))), is_stamped)
 
     def test_rosbridge_that_says_its_type_late(self) -> None:
-        """If the message type is known only later, the halt message is updated."""
+        """If the message type becomes known later, the halt message is replaced."""
         robot = RosbridgeRobot(self.clock, self.body, Random(1), velocity_type="geometry_msgs/msg/TwistStamped")
         robot.rosapi_s = TYPE_TIMEOUT_S + 1.0
         driver = self.rosbridge(robot)

@@ -24,7 +24,7 @@ MODULES = ("rover_of_tests", "torn_of_tests", "plain_of_tests")
 
 class ForeignTests(SynchronousTestCase):
     def setUp(self) -> None:
-        """Put a distribution with a working driver and broken ones on this process's path, as pip does."""
+        """Add a distribution with a working driver and broken drivers to the path of this process, as pip does."""
         folder = Path(self.mktemp()).resolve()
         (folder / "rovers-1.dist-info").mkdir(parents=True)
         (folder / "rovers-1.dist-info" / "METADATA").write_text("Name: rovers\nVersion: 1\n")
@@ -48,7 +48,7 @@ class ForeignTests(SynchronousTestCase):
         return line
 
     def test_kinds_of_others_are_known(self) -> None:
-        """An installed entry point is a kind like the built-in ones, and is imported only on use."""
+        """A kind from an installed entry point is used like a built-in kind, and is imported only on use."""
         self.assertLess({"rover", "torn", "gone", "aibo", "sim"}, set(list_kinds()))
         self.assertNotIn("rover_of_tests", sys.modules)
         driver = create_driver("rover", {"host": "rover"}, "dog1", Clock())
@@ -56,12 +56,15 @@ class ForeignTests(SynchronousTestCase):
         self.assertEqual(describe("rover", {"host": "rover"}), driver.description)
 
     def test_place_is_a_kind(self) -> None:
-        """``module:Class`` needs no entry point."""
+        """A kind of the form ``module:Class`` needs no entry point."""
         driver = create_driver("rover_of_tests:Rover", {"host": "rover"}, "dog1", Clock())
         self.assertEqual(driver.description, describe("rover_of_tests:Rover", {"host": "rover"}))
 
     def test_broken_ones_are_named_and_harm_nothing(self) -> None:
-        """A driver that cannot be imported or created is refused with an error that names it; others still work."""
+        """A driver that cannot be imported or created is refused; the error contains its name.
+
+        Other drivers still work.
+        """
         self.assertIn("RuntimeError: torn in two", self.refused("torn"))
         self.assertIn("no_such_module_of_tests", self.refused("gone"))
         self.assertIn("AttributeError", self.refused("rover_of_tests:Nobody"))

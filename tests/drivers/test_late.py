@@ -1,7 +1,7 @@
 """Tests that no driver repeats a motion after its deadline, even if its timers are late.
 
-After a pause of the process all timers are overdue, and run in the order of their times: the repetition of a motion
-before its end.
+After a pause of the process all timers are overdue, and run in the order of their times: the timer that repeats a
+motion runs before the timer that ends it.
 """
 
 from __future__ import annotations
@@ -35,14 +35,14 @@ class WatchedRobot(MemoryRobot):
 
 
 class LateTests(RobotCase):
-    """Each driver of a robot without deadlines, with a pause of the process after a command."""
+    """For each robot that does not check deadlines itself, the process pauses after a command."""
 
     def build(self) -> None:
         """Create the base that records its velocities."""
         self.body = self.watched = WatchedRobot()
 
     def tearDown(self) -> None:
-        """Skip the check of the base class, as the robots are still running."""
+        """Skip the check of the base class, because the robots are still running."""
 
     def enabled(self, kind: str, connector: Any, settle: float = 1.0, **options: object) -> Driver:
         self.kind, self.connector = kind, connector
@@ -50,7 +50,7 @@ class LateTests(RobotCase):
         return driver
 
     def freeze(self, driver: Driver, permitted: float, before: float = 0.0) -> None:
-        """Permit a motion, pause beyond its deadline, and check that the robot gets only zero velocities."""
+        """Permit a motion, pause the process beyond the deadline, and check that only zero velocities follow."""
         driver.act({"base.vx": 0.1}, self.permit(seconds=permitted))
         self.pass_time(before)
         self.watched.told.clear()
@@ -60,7 +60,7 @@ class LateTests(RobotCase):
         self.assertEqual(self.body.motion, (0.0, 0.0, 0.0))
 
     def test_aibo(self) -> None:
-        """The walk that is repeated each half second is not repeated after its deadline."""
+        """The walk command, which the driver repeats every half second, is not repeated after its deadline."""
         for phase in range(10):
             self.setUp()
             dog = AiboEmulator(self.clock, self.body, Random(1))
@@ -70,7 +70,7 @@ class LateTests(RobotCase):
             )
 
     def test_rosbridge(self) -> None:
-        """The velocity that is published ten times a second is not published after its deadline."""
+        """The velocity, which the driver publishes ten times per second, is not published after its deadline."""
         robot = RosbridgeRobot(self.clock, self.body, Random(1))
         robot.start()
         connector = MemoryConnector(self.clock, robot.accept)
@@ -83,7 +83,7 @@ class LateTests(RobotCase):
         self.freeze(self.enabled("create2", connector, port="memory"), 0.5, before=0.1)
 
     def test_silence_of_a_frozen_node_is_not_the_robots(self) -> None:
-        """After a pause of the node, a driver does not treat an active robot as silent."""
+        """After a pause of the node, the driver does not consider an active robot silent."""
         collector = WarningCollector()
         self.addCleanup(collector.close)
         for phase in range(5):
@@ -107,14 +107,14 @@ class LateTests(RobotCase):
         self.assertEqual(collector.warnings, [])
 
     def test_bittle_without_an_answer(self) -> None:
-        """A gait without an answer is not requested again after its deadline."""
+        """A gait to which the robot has not replied is not requested again after its deadline."""
         robot = Bittle(self.body, self.clock, Random(1))
         driver = self.enabled("bittle", MemoryConnector(self.clock, robot.accept), port="memory")
         robot.faults.half_open = True
         self.freeze(driver, 1.2, before=0.1)
 
     def test_bittle_over_wifi(self) -> None:
-        """A gait that waits for an earlier request or its connection is not sent after its deadline."""
+        """A gait that waits for an earlier request or for a connection is not sent after its deadline."""
         for board in ("biboard", "nyboard"):
             for phase in range(30):
                 self.setUp()

@@ -21,14 +21,14 @@ class PhoneDriverTests(Conformance, RobotCase):
     options = {"orientation": True, "position": True}
 
     def pass_time(self, seconds: float) -> None:
-        """Advance the clock; each phone sends 20 frames a second."""
+        """Advance the clock; each phone sends 20 frames per second."""
         for _ in range(round(seconds / self.STEP_S)):
             self.clock.advance(self.STEP_S)
             for driver in self.drivers:
                 driver.process_picture(JPEG, 208, 156, {})
 
     def test_says_what_it_has(self) -> None:
-        """The capabilities contain the camera, and orientation and position if the browser reports them; no motion."""
+        """The capabilities are the camera, and orientation and position if the browser reports them, but no motion."""
         everything = describe("phone", {"orientation": True, "position": True})
         self.assertEqual(sorted(everything.capabilities), ["camera", "orientation", "position"])
         self.assertEqual(everything.limits, {})
@@ -38,7 +38,7 @@ class PhoneDriverTests(Conformance, RobotCase):
         self.assertIsInstance(create_driver("phone", {}, "anna", self.clock), PhoneDriver)
 
     def test_tells_where_it_sees_the_target(self) -> None:
-        """The page's measurements are in the observation with the frame; without a target they are NaN."""
+        """The page's measurements are in the observation that contains the frame; without a target they are NaN."""
         driver = self.make_driver()
         driver.process_picture(JPEG, 208, 156, {})
         self.assertIsNone(driver.observe(), "nothing is taken before connect")

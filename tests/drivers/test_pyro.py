@@ -1,4 +1,4 @@
-"""Tests of ``drivers.pyro``: the robot interface of Pyro brains (2011), over the present drivers and emulators."""
+"""Tests of ``drivers.pyro``: the robot interface of Pyro brains (2011), on top of the present drivers and emulators."""
 
 from __future__ import annotations
 
@@ -25,20 +25,20 @@ from tests.drivers.contract import RobotCase
 
 
 def encoded(image: Any) -> bytes:
-    """Return a JPEG with almost exact colours."""
+    """Encode a JPEG that keeps the colours almost exactly."""
     finest = [cv2.IMWRITE_JPEG_QUALITY, 100, cv2.IMWRITE_JPEG_SAMPLING_FACTOR, cv2.IMWRITE_JPEG_SAMPLING_FACTOR_444]
     return bytes(cv2.imencode(".jpg", image, finest)[1].tobytes())
 
 
 def picture(left: int, colour: tuple[int, int, int] = (190, 32, 42)) -> bytes:
-    """Return a grey picture of 104 x 80 with a patch of 16 x 16 in this colour (RGB) at column ``left``."""
+    """Return a grey picture of 104 x 80 pixels with a 16 x 16 patch of this colour (RGB) at column ``left``."""
     image = np.full((80, 104, 3), 128, np.uint8)
     image[32:48, left : left + 16] = colour[::-1]
     return encoded(image)
 
 
 class _Lab(RobotCase):
-    """A dog that is driven through ``pyro``."""
+    """A dog that is controlled through ``pyro``."""
 
     STEP_S = 0.004
     kind = "aibo"
@@ -59,14 +59,17 @@ class _Lab(RobotCase):
         self.connector = self.robot.connector()
 
     def moved(self) -> tuple[float, ...]:
-        """Return the robot's motion after a short time, rounded."""
+        """Return the robot's velocity after a short time, rounded."""
         self.pass_time(0.06)
         return tuple(round(speed, 3) for speed in self.body.motion)
 
 
 class MotionTests(_Lab):
     def test_shares_become_speeds(self) -> None:
-        """A relative speed is scaled by the robot's limit, which differs forward and backward; left is positive."""
+        """A relative speed is scaled by the robot's limit, which differs between forward and backward.
+
+        Left is positive.
+        """
         self.pyro.move(0.5, 0.0)
         self.assertEqual(self.moved(), (0.08, 0.0, 0.0))
         self.pyro.move(-0.5, 0.0)
@@ -87,14 +90,14 @@ class MotionTests(_Lab):
         self.assertEqual(self.moved(), (0.0, 0.0, 0.0))
 
     def test_too_much_is_all_there_is(self) -> None:
-        """A relative speed above 1 is clipped, and a value that is no number is refused."""
+        """A relative speed above 1 is clipped; a value that is not a number is refused."""
         self.pyro.move(7.0, 0.0)
         self.assertEqual(self.moved(), (0.16, 0.0, 0.0))
         for wrong in (math.nan, math.inf, "fast", True):
             self.assertRaises(UsageError, self.pyro.move, wrong, 0.0)
 
     def test_robot_stops_when_its_brain_falls_silent(self) -> None:
-        """The robot stops half a second after the last command; ``update`` extends the time."""
+        """The robot stops half a second after the last command; each ``update`` extends this time."""
         self.pyro.move(0.5, 0.0)
         for _ in range(20):
             self.pass_time(0.1)
@@ -104,14 +107,14 @@ class MotionTests(_Lab):
         self.assertEqual(self.body.motion, (0.0, 0.0, 0.0))
 
     def test_robot_of_a_team_is_not_taken(self) -> None:
-        """A robot that has obeyed a team's token refuses the brain's motions, but not a stop."""
+        """A robot that has accepted a command of a team refuses motions of the brain, but not a stop."""
         self.driver.act({"base.vx": 0.1}, self.permit(7, 2.0))
         self.assertRaises(StaleCommand, self.pyro.move, 0.5, 0.0)
         self.pyro.stop()
         self.assertEqual(self.moved(), (0.0, 0.0, 0.0))
 
     def test_pressed_switch_is_no_error_of_the_brain(self) -> None:
-        """A pressed emergency stop halts the dog without an exception; it moves again only after ``connect``."""
+        """A pressed emergency stop halts the dog without an exception; the dog moves again only after ``connect``."""
         self.pyro.move(0.5, 0.0)
         self.robot.press_back_button()
         self.pass_time(0.2)
@@ -130,7 +133,7 @@ class MotionTests(_Lab):
         self.assertEqual(self.moved(), (0.08, 0.0, 0.0))
 
     def test_place_is_counted_from_where_it_was_localized(self) -> None:
-        """``localize`` sets the pose, and the odometry continues from it."""
+        """``localize`` sets the pose, and the odometry continues from that pose."""
         self.pyro.move(0.0, 0.5)
         self.pass_time(0.3)
         self.pyro.stop()
@@ -147,7 +150,7 @@ class MotionTests(_Lab):
 
 class ThreadTests(_Lab):
     def test_every_call_goes_where_the_driver_lives(self) -> None:
-        """Motion, update, stop and sound are executed through ``call``, so that no other thread uses the driver."""
+        """Motion, update, stop and sound are executed through ``call``; no other thread uses the driver."""
         calls: list[Callable[[], Any]] = []
         robot = PyroRobot(self.driver, self.clock, calls.append)
         robot.move(0.5, 0.0)
@@ -169,7 +172,7 @@ class DeviceTests(_Lab):
         self.pyro.update()
 
     def test_range_sensor_has_values_groups_and_units(self) -> None:
-        """The range readings are available in robot diameters, metres and fractions, singly, in groups and by angle."""
+        """Range readings are available in robot diameters, metres and fractions, one by one, by group and by angle."""
         self.feel(range_near=0.3, range_far=0.36)
         far = self.pyro.range
         self.assertEqual([round(v, 3) for v in far.distance("M")], [0.3, 0.36, 1.5])
@@ -181,12 +184,12 @@ class DeviceTests(_Lab):
         self.assertEqual([round(v, 3) for v in far[0].hit if v is not None], [0.42, 0.0, 0.0])
 
     def test_nothing_in_reach_is_as_far_as_it_sees(self) -> None:
-        """A reading without an echo is the sensor's maximum range, and never NaN."""
+        """A reading without an echo is the sensor's maximum range, not NaN."""
         self.feel(range_near=math.nan)
         self.assertEqual(self.pyro.range[0].distance("M"), 1.5)
 
     def test_devices_and_features_in_the_words_of_brains(self) -> None:
-        """Devices and features have their Pyro names; the error of a missing one names it."""
+        """Devices and features have their Pyro names; the error for a missing device or feature contains its name."""
         robot = self.pyro
         self.assertEqual(robot.builtinDevices, ["battery", "camera", "ir", "position", "ptz"])
         self.assertEqual(robot.supportedFeatures, ["continuous-movement", "range-sensor", "odometry", "mono-sound"])
@@ -211,7 +214,7 @@ class DeviceTests(_Lab):
         self.assertAlmostEqual(battery.level, 0.4, 2)
 
     def test_joints_buttons_and_sensors_by_their_old_names(self) -> None:
-        """The old names of joints, buttons and sensors work; a wrong name is refused with the known ones."""
+        """The old names of joints, buttons and sensors work; the error for a wrong name lists the known names."""
         self.feel(button_chin=1.0, range_near=0.2)
         robot = self.pyro
         self.assertEqual(robot.getButton("chin"), 1.0)
@@ -224,7 +227,10 @@ class DeviceTests(_Lab):
         robot.playSound("bark")
 
     def test_head_turns_in_shares(self) -> None:
-        """Relative pan and tilt become joint angles of the dog, and ``pose`` returns them."""
+        """Relative pan and tilt move the dog's joints by a share of their range.
+
+        ``pose`` returns the relative values.
+        """
         ptz = self.pyro.ptz[0]
         ptz.setPose(0.5, -0.5, 0.0, 0.5)
         self.pass_time(0.3)
@@ -237,7 +243,7 @@ class DeviceTests(_Lab):
         self.assertLess(max(abs(one) for one in ptz.pose), 0.03)
 
     def test_picture_goes_through_the_filters(self) -> None:
-        """A red patch is found with its frame; without one the frame is zero; an invalid picture is counted."""
+        """A red patch is found in its frame; without a frame the image is zero. An invalid picture is counted."""
         camera = self.pyro.camera[0]
         camera.addFilter("match", 190, 32, 42)
         camera.addFilter("blobify", 0, 255, 255, 0, 1, 1, 1)
@@ -257,7 +263,7 @@ class DeviceTests(_Lab):
 
 class FilterTests(SynchronousTestCase):
     def test_function_as_a_filter(self) -> None:
-        """A function as a filter may apply other filters, runs once per picture, and two matches mark both colours."""
+        """A filter function may apply other filters, and runs once per picture; two matches mark both colours."""
         camera = Camera(104, 80)
 
         def process(one: Camera) -> Any:
@@ -285,7 +291,7 @@ class Create2Tests(_Lab):
         self.connector = MemoryConnector(self.clock, self.robot.accept)
 
     def test_robot_without_ranger_has_bumpers(self) -> None:
-        """Bumpers are ordered from the left; a missing range sensor and a sideways motion each raise an error."""
+        """Bumpers are ordered from the left; using the missing range sensor or moving sideways raises an error."""
         self.assertEqual(self.pyro.builtinDevices, ["battery", "bumper", "position"])
         self.assertEqual((self.pyro.bumper[0].value, self.pyro.stall), ([0.0, 0.0], 0))
         self.body.values["bump.right"] = True
@@ -302,7 +308,7 @@ class Create2Tests(_Lab):
 
 class ScanTests(SynchronousTestCase):
     def test_scan_counts_from_the_left(self) -> None:
-        """The sectors of a scan are ordered from the left clockwise, with the groups of Pyro."""
+        """The sectors of a scan are ordered clockwise from the left, and have Pyro's groups."""
         names = ("front", "front_left", "left", "back", "right", "front_right")
         values: dict[str, Value] = {f"range.{name}": 0.1 * n for n, name in enumerate(names)}
         scan = make_ranger(describe("rosbridge", {}), values)
@@ -345,7 +351,7 @@ class BrainTests(_Lab):
         return made[0], ended
 
     def test_brain_steps_ten_times_a_second(self) -> None:
-        """A brain makes ten steps a second, each after an update; at its end the robot stops."""
+        """A brain makes ten steps per second, each after an update; at its end the robot stops."""
 
         class Walk(Brain):
             def step(self) -> None:
@@ -372,7 +378,7 @@ class BrainTests(_Lab):
         self.assertEqual((str(ended[0].value), given, self.moved()), ("tripped", [1], (0.0, 0.0, 0.0)))
 
     def test_brain_pauses_and_quits(self) -> None:
-        """A paused brain makes no steps and its robot stands; ``quit`` ends the brain."""
+        """A paused brain makes no steps and its robot stands still; ``quit`` ends the brain."""
 
         class Nap(Brain):
             def step(self) -> None:

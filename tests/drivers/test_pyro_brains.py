@@ -22,7 +22,7 @@ STEP_S = 0.008
 
 class BrainTests(SynchronousTestCase):
     def setUp(self) -> None:
-        """Import the examples, which are files without a package."""
+        """Import the examples, which are not in a package."""
         sys.path.insert(0, str(EXAMPLES))
         self.addCleanup(sys.path.remove, str(EXAMPLES))
         self.lab, self.avoid, self.track_ball = (
@@ -37,7 +37,7 @@ class BrainTests(SynchronousTestCase):
         watch: Callable[[Any, float], None],
         arrange: Callable[[Any], None] = lambda pen: None,
     ) -> Any:
-        """Run a brain in a pen prepared by ``arrange``; call ``watch`` with the pen and the remaining seconds."""
+        """Run a brain in a pen that ``arrange`` prepares; call ``watch`` with the pen and the remaining seconds."""
         clock = Clock()
         pen = self.lab.Pen(clock, seed)
         arrange(pen)
@@ -62,7 +62,7 @@ class BrainTests(SynchronousTestCase):
         return pen
 
     def test_avoid_wanders_and_hits_no_wall(self) -> None:
-        """In a minute in two worlds the dog walks several metres and touches no wall."""
+        """Within a minute the dog walks several metres in each of two worlds, and touches no wall."""
         for seed in (1, 3):
             places: list[tuple[float, float]] = []
 
@@ -77,7 +77,7 @@ class BrainTests(SynchronousTestCase):
             self.assertGreater(way, 3.0, seed)
 
     def test_track_ball_turns_to_the_ball(self) -> None:
-        """From each side the dog turns until the ball is straight ahead, and again after the ball has moved."""
+        """From each side the dog turns until the ball is straight ahead, and does so again after the ball has moved."""
         for heading in (2.0, -2.5):
             off: list[float] = []
 

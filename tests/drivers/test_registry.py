@@ -1,4 +1,4 @@
-"""Tests of ``drivers.registry`` and of the options of the kinds."""
+"""Tests of ``drivers.registry``, and of the options of each kind of robot."""
 
 from __future__ import annotations
 
@@ -71,10 +71,10 @@ INCOMPLETE: list[tuple[str, dict[str, object], str]] = [
 
 
 class RegistryTests(SynchronousTestCase):
-    """From a kind's name to its driver."""
+    """The registry creates drivers from the names of their kinds."""
 
     def test_makes_a_driver(self) -> None:
-        """A new driver of each kind is idle and has the registry's description."""
+        """A new driver of each kind is idle, and has the description that the registry gives."""
         connector: Any = object()
         for kind in list_built_in_kinds():
             options = NEEDED.get(kind, {})
@@ -92,12 +92,12 @@ class RegistryTests(SynchronousTestCase):
             self.assertTrue(import_module(f"drivers.{kind}").__doc__, kind)
 
     def test_names_the_known_kinds(self) -> None:
-        """An unknown kind raises a usage error with the known kinds."""
+        """An unknown kind raises a usage error that lists the known kinds."""
         for ask in (lambda: create_driver("warp", {}, "dog1", Clock()), lambda: describe("warp", {})):
             self.assertIn("known are " + ", ".join(list_kinds()), str(self.assertRaises(UsageError, ask)))
 
     def test_names_the_wrong_option(self) -> None:
-        """Each invalid option is refused with one line that names its key and a remedy."""
+        """Each invalid option is refused; one line contains its key and a remedy."""
         for kind, key, value in WRONG:
             line = str(self.assertRaises(UsageError, describe, kind, {**NEEDED.get(kind, {}), key: value}))
             self.assertIn(key, line)
@@ -112,7 +112,7 @@ class RegistryTests(SynchronousTestCase):
         self.assertNotIn("camera", describe("sim", {"camera_fps": 0}).capabilities)
 
     def test_imports_no_kind_before_it_is_asked_for(self) -> None:
-        """The registry imports a driver only on use, and the sim driver imports no OpenCV, NumPy or physics."""
+        """The registry imports a driver only when it is used; the sim driver imports no OpenCV, NumPy or physics."""
         script = (
             "import sys; from twisted.internet.task import Clock\n"
             "import drivers.registry as r; assert 'drivers.sim.driver' not in sys.modules\n"

@@ -38,7 +38,7 @@ ANY = st.recursive(
 
 
 def spoilt(message: Any, path: tuple[Any, ...], value: Any) -> Any:
-    """Return a copy of ``message`` with another value at ``path``."""
+    """Return a copy of ``message`` with a different value at ``path``."""
     copy = json.loads(json.dumps(message))
     at = copy
     for step in path[:-1]:
@@ -53,7 +53,7 @@ def paths(message: Any, start: tuple[Any, ...] = ()) -> list[tuple[Any, ...]]:
 
 
 class SayingTests(SynchronousTestCase):
-    """Operations sent to rosbridge, byte for byte."""
+    """Operations sent to rosbridge have the expected bytes."""
 
     def test_writes_the_operations_of_the_protocol(self) -> None:
         """Advertise, publish, subscribe and call_service are encoded as in ROSBRIDGE_PROTOCOL.md."""
@@ -88,7 +88,7 @@ class SayingTests(SynchronousTestCase):
             self.assertEqual(said, wanted)
 
     def test_never_says_what_is_no_number(self) -> None:
-        """NaN, which JSON lacks, raises ValueError."""
+        """NaN and infinity, which JSON lacks, raise ValueError."""
         self.assertRaises(ValueError, encode_operation, "publish", msg=codec.make_twist(math.nan, 0.0, 0.0))
 
 
@@ -96,7 +96,7 @@ class HearingTests(SynchronousTestCase):
     """Operations received from rosbridge."""
 
     def test_reads_the_operations_of_the_protocol(self) -> None:
-        """Publications, service responses of both results, and status messages are decoded."""
+        """Publications, status messages, and responses of successful and failed services are decoded."""
         self.assertEqual(decode_message(b'{"op":"publish","topic":"/a","msg":{"b":1}}'), TopicMessage("/a", {"b": 1}))
         said = b'{"op":"service_response","id":"7","service":"/s","values":{"type":"x"},"result":true}'
         self.assertEqual(decode_message(said), ServiceResponse("7", {"type": "x"}, True))
@@ -107,7 +107,7 @@ class HearingTests(SynchronousTestCase):
         self.assertEqual(decode_message(b'{"op":"status","level":"error","msg":"oh"}'), Status("error", "oh"))
 
     def test_refuses_what_is_no_operation(self) -> None:
-        """Invalid bytes, JSON and operations raise BadFrame, for each depth and size."""
+        """Invalid bytes, JSON and operations raise BadFrame, whatever their depth and size."""
         for said in (
             *(b"", b"\xff\xfe", b"{", b"[]", b"3", b"null", b"{}", b'{"op":"png"}', b'{"op":["publish"]}'),
             *(b'{"op":"publish","topic":1,"msg":{}}', b'{"op":"publish","topic":"/a","msg":[]}'),
@@ -125,7 +125,7 @@ class HearingTests(SynchronousTestCase):
 
     @given(ANY)
     def test_any_json(self, said: Any) -> None:
-        """Random JSON, with the NaN and Infinity of old versions, gives a message or BadFrame."""
+        """Random JSON, including NaN and Infinity as old versions send them, gives a message or BadFrame."""
         for whole in (said, {"op": "publish", "topic": "/a", "msg": said}, {"op": "service_response", "id": said}):
             try:
                 decode_message(json.dumps(whole).encode())
@@ -134,10 +134,10 @@ class HearingTests(SynchronousTestCase):
 
 
 class ReadingTests(SynchronousTestCase):
-    """ROS messages as SI values."""
+    """ROS messages are converted to SI values."""
 
     def test_odometry(self) -> None:
-        """Odometry gives position, heading and velocity; ``base.moving`` is false below a threshold."""
+        """Odometry gives position, heading and velocity; ``base.moving`` is false below a minimum velocity."""
         values = codec.convert_odometry(ODOMETRY)
         self.assertEqual((values["odom.x"], values["odom.y"], values["base.moving"]), (1.0, -2.5, True))
         self.assertAlmostEqual(abs(float(values["odom.yaw"])), math.pi)
@@ -146,7 +146,7 @@ class ReadingTests(SynchronousTestCase):
         self.assertIs(codec.convert_odometry(still)["base.moving"], False)
 
     def test_absurd_odometry(self) -> None:
-        """Null, NaN, infinite, too large and missing values, and a zero quaternion raise BadFrame."""
+        """Null, NaN, infinite, too large or missing values and a zero quaternion each raise BadFrame."""
         for path in (
             ("pose", "pose", "position", "x"),
             ("pose", "pose", "orientation", "w"),
@@ -159,7 +159,10 @@ class ReadingTests(SynchronousTestCase):
         self.assertRaises(BadFrame, codec.convert_odometry, spoilt(ODOMETRY, ("pose", "pose", "orientation"), zero))
 
     def test_scan(self) -> None:
-        """Each sector gives its nearest echo; null, 0.0 and values out of range are ignored; an offset turns it."""
+        """Each sector reports its nearest echo.
+
+        Null, 0.0 and values out of range are ignored; an offset rotates the scan.
+        """
         values = codec.convert_scan(SCAN, SECTORS)
         self.assertEqual((values["range.right"], values["range.front"]), (1.0, 0.5))
         self.assertTrue(math.isnan(float(values["range.left"])))
@@ -178,7 +181,7 @@ class ReadingTests(SynchronousTestCase):
             self.assertRaises(BadFrame, codec.convert_scan, {**SCAN, key: value}, SECTORS)
 
     def test_imu(self) -> None:
-        """The acceleration is always given, the attitude unless its covariance marks it as unknown."""
+        """The acceleration is always reported; the attitude is reported unless its covariance marks it as unknown."""
         turn = math.sin(math.pi / 12), math.cos(math.pi / 12)
         said = {
             "linear_acceleration": {"x": 0.1, "y": 0, "z": 9.8},
@@ -192,7 +195,10 @@ class ReadingTests(SynchronousTestCase):
         self.assertRaises(BadFrame, codec.convert_imu, {"linear_acceleration": {"x": 0, "y": 0, "z": 2000}})
 
     def test_battery(self) -> None:
-        """Known values are given, null and NaN are omitted; a level above full raises BadFrame with the option."""
+        """Known values are reported; null and NaN are omitted.
+
+        A level above 100 % raises BadFrame that suggests the option.
+        """
         said = {"voltage": 11.5, "current": None, "percentage": 0.8, "power_supply_status": 1}
         self.assertEqual(codec.convert_battery(said), {"power.volts": 11.5, "power.level": 0.8, "power.charging": True})
         self.assertEqual(codec.convert_battery({"percentage": 80.0}, 100.0)["power.level"], 0.8)
@@ -203,7 +209,7 @@ class ReadingTests(SynchronousTestCase):
             self.assertRaises(BadFrame, codec.convert_battery, each)
 
     def test_picture(self) -> None:
-        """A complete JPEG is decoded from base64 with its size; other data raises BadFrame with the format."""
+        """A complete JPEG and its size are decoded from base64; for other data the BadFrame contains the format."""
         said = {"format": "jpeg", "data": base64.b64encode(JPEG).decode()}
         self.assertEqual(codec.decode_picture(said), (JPEG, 128, 96))
         png = base64.b64encode(b"\x89PNG").decode()
@@ -213,7 +219,7 @@ class ReadingTests(SynchronousTestCase):
             self.assertRaises(BadFrame, codec.decode_picture, {"format": "jpeg", "data": data})
 
     def test_stamp(self) -> None:
-        """The stamps of ROS 1 and 2 are read; an invalid one gives None."""
+        """Time stamps of ROS 1 and ROS 2 are read; an invalid stamp gives None."""
         self.assertEqual(codec.read_stamp(ODOMETRY), 12.5)
         self.assertEqual(codec.read_stamp({"header": {"stamp": {"secs": 3, "nsecs": 0}}}), 3.0)
         for at in (None, 3, {"sec": 1.5, "nanosec": 0}, {"sec": -1, "nanosec": 0}, {"sec": 1, "nanosec": 10**9}):
@@ -241,7 +247,7 @@ class ReadingTests(SynchronousTestCase):
 
 
 def spoilt_python(message: Any, path: tuple[Any, ...], value: Any) -> Any:
-    """Return a copy like ``spoilt``, also with values that JSON lacks."""
+    """Return a copy as ``spoilt`` does, but with values that JSON lacks."""
     marked = spoilt(message, path, "\0here")
 
     def put(at: Any) -> Any:

@@ -40,7 +40,7 @@ class RosbridgeDriverTests(Conformance, RobotCase):
         return [said for said in self.robot.received_messages if said["op"] == op]
 
     def test_drives_with_the_type_that_the_robot_listens_to(self) -> None:
-        """The driver asks the robot for its velocity type: Twist and TwistStamped work without options."""
+        """The driver queries the robot's velocity type, so robots with Twist and with TwistStamped need no option."""
         for kind in ("geometry_msgs/msg/Twist", "geometry_msgs/msg/TwistStamped", "geometry_msgs/Twist"):
             self.robot.velocity_type = kind
             driver = self.ready()
@@ -52,7 +52,7 @@ class RosbridgeDriverTests(Conformance, RobotCase):
             self.pass_time(0.1)
 
     def test_takes_twist_where_nobody_can_be_asked(self) -> None:
-        """Without rosapi the driver waits one second and uses Twist; an explicit type needs no wait."""
+        """Without rosapi the driver waits one second and then uses Twist; with an explicit type it does not wait."""
         self.robot.has_rosapi = False
         driver = self.make_driver()
         connected = driver.connect()
@@ -68,7 +68,7 @@ class RosbridgeDriverTests(Conformance, RobotCase):
         self.assertEqual(self.heard("advertise")[-1]["type"], "geometry_msgs/msg/TwistStamped")
 
     def test_takes_an_answer_that_comes_late(self) -> None:
-        """If rosapi answers after the timeout, the type changes, and the next connection starts with it."""
+        """If rosapi replies after the timeout, the type is changed, and the next connection starts with this type."""
         self.robot.velocity_type = "geometry_msgs/msg/TwistStamped"
         self.robot.rosapi_s = 1.5
         driver = self.make_driver()
@@ -88,7 +88,7 @@ class RosbridgeDriverTests(Conformance, RobotCase):
         self.assertTrue(self.heard("advertise")[0]["type"].endswith("/TwistStamped"))
 
     def test_waits_for_a_base_that_is_still_starting(self) -> None:
-        """While no node subscribes to the velocity the robot is not ready; the driver repeats the query."""
+        """The robot is not ready until a node subscribes to the velocity; the driver repeats the query."""
         self.robot.velocity_type = ""
         driver = self.make_driver()
         connected = driver.connect()
@@ -100,7 +100,7 @@ class RosbridgeDriverTests(Conformance, RobotCase):
         self.successResultOf(connected)
 
     def test_warns_of_a_type_that_the_robot_ignores(self) -> None:
-        """With a wrong explicit type the robot does not move, and the warning names the option."""
+        """With a wrong explicit type the robot does not move, and the warning contains the option."""
         warnings: list[str] = []
         driver = self.make_driver(velocity_type="twist_stamped")
         driver._warn_once = warnings.append
@@ -110,7 +110,7 @@ class RosbridgeDriverTests(Conformance, RobotCase):
         self.assertGreater(self.robot.ignored_count, 0)
 
     def test_says_the_velocity_again_and_zero_at_the_end(self) -> None:
-        """The velocity is published ten times a second; at the deadline zero is published once, then nothing."""
+        """The velocity is published ten times per second; at the deadline zero is published once, then nothing more."""
         driver = self.ready()
         self.robot.received_messages.clear()
         driver.act({"base.vx": 0.1}, self.permit(seconds=1.0))
@@ -122,7 +122,7 @@ class RosbridgeDriverTests(Conformance, RobotCase):
         self.assertLess(abs(self.body.x - 0.1), 0.01)
 
     def test_stops_at_its_base_when_the_link_is_lost(self) -> None:
-        """Without a link the base stops by its timeout, and the new link starts with zero velocity."""
+        """If the link is lost, the timeout of the base stops it; a new link starts with zero velocity."""
         driver = self.ready()
         driver.act({"base.vx": 0.2}, self.permit(seconds=5.0))
         self.pass_time(0.2)
@@ -155,7 +155,7 @@ class RosbridgeDriverTests(Conformance, RobotCase):
         self.assertEqual(driver.description.capabilities["camera"]["fps"], 10.0)
 
     def test_asks_for_as_many_pictures_as_are_wanted(self) -> None:
-        """Another frame rate renews the subscription, zero ends it; without an image topic there is no camera."""
+        """A new frame rate renews the subscription, zero ends it; a robot without an image topic has no camera."""
         driver = self.ready(image_topic=IMAGE, camera_fps=5)
         driver.set_camera_fps(0)
         self.pass_time(0.1)
@@ -170,7 +170,7 @@ class RosbridgeDriverTests(Conformance, RobotCase):
         self.assertEqual((blind.camera_fps, "camera" in blind.description.capabilities), (0.0, False))
 
     def test_leaves_out_what_a_silent_topic_said(self) -> None:
-        """The age of a silent scan grows, and after two seconds its distances are omitted."""
+        """The age of a silent scan grows; after two seconds its distances are omitted."""
         driver = self.ready()
         for client in self.robot._clients:
             client._topics.pop("/scan")
@@ -182,7 +182,7 @@ class RosbridgeDriverTests(Conformance, RobotCase):
         self.assertEqual((driver.state, self.values(driver)["power.level"]), ("ready", 0.8))
 
     def test_switches_motors_that_there_are(self) -> None:
-        """With a motor service, ``enable`` and ``disable`` call it; a missing service fails with NoReply."""
+        """``enable`` and ``disable`` call the motor service; if that service is missing, they fail with NoReply."""
         self.robot.has_motor_power = False
         driver = self.ready(motor_service="/motor_power")
         self.assertTrue(self.robot.has_motor_power)
@@ -198,7 +198,7 @@ class RosbridgeDriverTests(Conformance, RobotCase):
         self.assertIs(self.values(other)["estop.engaged"], True)
 
     def test_has_the_skills_that_are_set(self) -> None:
-        """A skill calls its service; an unknown, failing, lost or late call fails with its error."""
+        """A skill calls its service; unknown, failing, lost and late calls fail with the matching error."""
         driver = self.ready(services={"dock": "/dock", "sing": "/sing"})
         self.assertEqual(driver.description.skills, ("dock", "sing"))
         docked, sung = driver.invoke("dock"), driver.invoke("sing")
@@ -217,7 +217,7 @@ class RosbridgeDriverTests(Conformance, RobotCase):
         self.failureResultOf(late, LinkLost)
 
     def test_counts_what_rosbridge_complains_about(self) -> None:
-        """A rosbridge error is counted and logged once; other topics and late answers are ignored."""
+        """An error that rosbridge reports is counted and logged once; unknown topics and late replies are ignored."""
         driver = self.ready()
         driver.log = log = KeptLog()
         for _ in range(2):
@@ -229,7 +229,7 @@ class RosbridgeDriverTests(Conformance, RobotCase):
         self.assertEqual(log.lines, ["robot: rosbridge says: no such type"])
 
     def test_calls_what_speaks_no_rosbridge_ever_more_slowly(self) -> None:
-        """A server that is not rosbridge is retried with delays up to five seconds, while ``connect`` waits."""
+        """A server that is not rosbridge is retried with delays of up to five seconds; ``connect`` waits."""
         calls: list[float] = []
 
         class Web:
@@ -258,7 +258,7 @@ class RosbridgeDriverTests(Conformance, RobotCase):
             self.failureResultOf(connected, LinkLost)
 
     def test_lives_with_a_foul_wire(self) -> None:
-        """Invalid, lost, delayed and split data cost frames and links; afterwards the driver is ready again."""
+        """Invalid, lost, delayed and split data cost frames and links; after these faults the driver is ready again."""
         driver = self.ready(image_topic=IMAGE)
         self.robot.faults.garbage, self.robot.faults.drop = 0.1, 0.05
         self.robot.faults.split, self.robot.faults.delay = True, 0.02
@@ -272,7 +272,7 @@ class RosbridgeDriverTests(Conformance, RobotCase):
         self.robot.faults.delay = 0.0
 
     def test_notices_a_link_that_is_half_open(self) -> None:
-        """A silent robot on an open link is stale at once, and reconnected after three seconds."""
+        """A silent robot on an open link is stale at the next check, and is reconnected after three seconds."""
         driver = self.ready()
         self.robot.faults.half_open = True
         self.pass_time(0.7)
@@ -284,7 +284,7 @@ class RosbridgeDriverTests(Conformance, RobotCase):
         self.assertEqual(driver.state, "ready")
 
     def test_is_described_by_its_options(self) -> None:
-        """The description has a sideways limit if the robot moves sideways, and the sensors of its topics."""
+        """The description lists the topics' sensors, and a sideways limit if the options permit sideways motion."""
         holonomic = describe("rosbridge", {"max_vy": 0.3, "model": "Omni", "imu_topic": "/imu"})
         self.assertEqual(holonomic.limits["base.vy"], (-0.3, 0.3))
         self.assertIn("imu", holonomic.capabilities)

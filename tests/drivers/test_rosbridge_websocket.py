@@ -19,7 +19,7 @@ class GreetingTests(SynchronousTestCase):
         self.assertTrue(server.is_open)
 
     def test_names_what_answers_instead(self) -> None:
-        """Another server, a wrong key and endless headers are faults with the reason."""
+        """A server of another protocol, a wrong key and endless headers are faults; each contains its reason."""
         for said, reason in (
             (b"HTTP/1.1 404 Not Found\r\n\r\n", "404"),
             (b"SSH-2.0-OpenSSH_9\r\n\r\n", "SSH-2.0"),
@@ -34,7 +34,7 @@ class GreetingTests(SynchronousTestCase):
             self.assertEqual(one.receive_data(answer), ([], b""))
 
     def test_turns_a_browser_away(self) -> None:
-        """A request without the upgrade or without a key gets status 400."""
+        """A request without an upgrade or without a key gets status 400."""
         for said in (b"GET / HTTP/1.1\r\nHost: h\r\n\r\n", b"POST / HTTP/1.1\r\nUpgrade: websocket\r\n\r\n"):
             one = WebSocket()
             self.assertTrue(one.receive_data(said)[1].startswith(b"HTTP/1.1 400"))

@@ -1,4 +1,4 @@
-"""Tests of ``drivers.serial`` with fake devices."""
+"""Tests of ``drivers.serial`` with fake serial devices."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from drivers.serial import FLUSH_TIMEOUT_S, MAX_BACKLOG_BYTES, SerialConnector, 
 
 
 class Device(StringTransport):
-    """A serial port as Twisted's: written data stays in ``dataBuffer`` until ``flush``."""
+    """A fake of Twisted's serial port: written data stays in ``dataBuffer`` until ``flush``."""
 
     def __init__(self, link: Protocol) -> None:
         super().__init__()
@@ -50,7 +50,7 @@ class Device(StringTransport):
 
 
 class SerialTests(SynchronousTestCase):
-    """A line over a device."""
+    """A serial line over a fake device."""
 
     def setUp(self) -> None:
         self.clock = Clock()
@@ -62,7 +62,7 @@ class SerialTests(SynchronousTestCase):
         self.downs = 0
 
     def opened(self, link: Protocol, device: str, baud: int, reactor: Any) -> Any:
-        """Open a device, or raise ``error``."""
+        """Open a fake device, or raise ``error``."""
         self.asked.append((device, baud, reactor.seconds()))
         if self.error is not None:
             raise self.error
@@ -85,7 +85,7 @@ class SerialTests(SynchronousTestCase):
         return line
 
     def test_carries_bytes_both_ways(self) -> None:
-        """An open device carries bytes in both directions, and the link is busy when too many are buffered."""
+        """An open device carries bytes in both directions; the link is busy while too many bytes are buffered."""
         self.line()
         self.clock.advance(0.0)
         self.assertEqual(self.asked, [("/dev/robot", 115200, 0.0)])
@@ -98,7 +98,7 @@ class SerialTests(SynchronousTestCase):
         self.assertEqual((self.heard, self.devices[0].value()[:5]), ([b"hello"], b"there"))
 
     def test_tries_again_with_back_off_and_names_why(self) -> None:
-        """A device that cannot be opened is retried with growing delays; each cause is one line."""
+        """A device that cannot be opened is retried with growing delays; each cause is logged in one line."""
         line = self.line()
         for number, words in (
             (errno.ENOENT, "no such device"),
@@ -120,7 +120,10 @@ class SerialTests(SynchronousTestCase):
         self.assertEqual((line.problem, len(self.links)), ("", 1))
 
     def test_names_errors_without_a_number(self) -> None:
-        """An unknown error is reported with its text, and one caused by a system error with the system's."""
+        """An unknown error is reported with its own text.
+
+        If a system error caused it, with the text of the system error.
+        """
         self.assertIn("strange baud", describe_problem(ValueError("strange\nbaud")))
         try:
             try:
@@ -131,7 +134,7 @@ class SerialTests(SynchronousTestCase):
             self.assertIn("no permission", describe_problem(error))
 
     def test_opens_again_after_a_pulled_cable(self) -> None:
-        """A lost device is reported and opened again; data sent in between is lost."""
+        """A lost device is reported and opened again; data sent while it is closed is lost."""
         self.line()
         self.clock.advance(0.0)
         self.devices[0].connectionLost(Failure(OSError("gone")))
@@ -142,7 +145,7 @@ class SerialTests(SynchronousTestCase):
         self.assertEqual((self.downs, len(self.links)), (1, 2))
 
     def test_hangs_up_after_what_was_sent(self) -> None:
-        """``disconnect`` sends the last bytes, closes, and leaves no delayed call, also if called twice."""
+        """``disconnect`` sends the remaining bytes and closes; no delayed call is left, even after a second call."""
         line = self.line()
         self.clock.advance(0.0)
         self.links[0].send(b"stop")
@@ -156,7 +159,7 @@ class SerialTests(SynchronousTestCase):
         self.assertEqual(self.clock.getDelayedCalls(), [])
 
     def test_hangs_up_on_a_device_that_takes_nothing(self) -> None:
-        """A device that does not accept the last bytes is closed after a second."""
+        """A device that does not accept the remaining bytes is closed after a second."""
         line = self.line()
         self.clock.advance(0.0)
         self.links[0].send(b"stop")
@@ -167,7 +170,7 @@ class SerialTests(SynchronousTestCase):
         self.assertEqual(self.clock.getDelayedCalls(), [])
 
     def test_hangs_up_before_it_is_open(self) -> None:
-        """A line that waits for its device can be closed."""
+        """A line can be closed while it waits for its device."""
         self.error = OSError(errno.ENOENT, "none")
         line = self.line()
         self.clock.advance(0.0)

@@ -54,7 +54,7 @@ def payload(*row: object) -> bytes:
 
 
 class CodecTests(SynchronousTestCase):
-    """From a message to its payload and back."""
+    """Messages are converted to payloads and back."""
 
     def test_gives_back_every_message(self) -> None:
         """Each message type survives encoding and decoding."""
@@ -91,7 +91,7 @@ class CodecTests(SynchronousTestCase):
             self.assertRaises(BadFrame, decode_message, bad)
 
     def test_is_total(self) -> None:
-        """Random bytes give a message or BadFrame."""
+        """Random bytes give a message or raise BadFrame."""
 
         @given(st.binary(max_size=200))
         @example(b"\x91" * 5000)
@@ -114,14 +114,14 @@ class CodecTests(SynchronousTestCase):
 
 
 class FrameReaderTests(SynchronousTestCase):
-    """From a stream of bytes to messages."""
+    """A stream of bytes is converted to messages."""
 
     def setUp(self) -> None:
         self.stream = b"".join(encode_message(message) for message in MESSAGES)
         self.reader = FrameReader()
 
     def test_reads_whole_and_byte_by_byte(self) -> None:
-        """The reader gives the same messages for each division of the bytes."""
+        """The reader returns the same messages however the input is split into chunks."""
         self.assertEqual(list(self.reader.read(self.stream)), MESSAGES)
         pieces = FrameReader()
         read = [message for byte in self.stream for message in pieces.read(bytes([byte]))]
@@ -139,7 +139,7 @@ class FrameReaderTests(SynchronousTestCase):
         ):
             reader = FrameReader()
             read = list(reader.read(noise + self.stream))
-            # Noise that looks like the start of a frame may consume the first real ones, but never all of them.
+            # Noise that looks like the start of a frame may consume the first real frames, but never all of them.
             self.assertEqual(read, MESSAGES[-len(read) :])
             self.assertGreater(len(read), len(MESSAGES) - 3)
             self.assertGreater(reader.bad_frames, 0)

@@ -23,7 +23,7 @@ from tests.drivers.contract import RobotCase
 
 
 def pump(clock: Clock, seconds: float) -> None:
-    """Advance the time in small steps, so that answers to answers arrive."""
+    """Advance the time in small steps, because a reply may trigger another reply."""
     clock.pump([0.004] * round(seconds / 0.004))
 
 
@@ -59,7 +59,7 @@ class SimDriverTests(Conformance, RobotCase):
         self.assertLess(abs(float(seen.values["imu.az"]) - 9.8), 0.5)
 
     def test_gets_pictures_at_the_rate_it_asked_for(self) -> None:
-        """Two seconds at 15 frames a second give 30 complete JPEGs with consecutive numbers."""
+        """At 15 frames per second, two seconds give 30 complete JPEGs with consecutive numbers."""
         driver = self.make_driver(camera=True, camera_fps=15)
         seen: set[int] = set()
         driver.subscribe(lambda one: seen.add(one.frame.seq if one.frame else 0))
@@ -73,7 +73,7 @@ class SimDriverTests(Conformance, RobotCase):
         self.assertEqual((frame.width, frame.height), (208, 160))
 
     def test_is_told_that_there_is_no_such_robot(self) -> None:
-        """Connecting to a robot that the simulator lacks fails at once, with the names of its robots."""
+        """Connecting to a robot that the simulator lacks fails immediately; the error lists the simulator's robots."""
         driver = self.make_driver(robot="dog9")
         connected = driver.connect()
         self.pass_time(0.1)
@@ -81,7 +81,7 @@ class SimDriverTests(Conformance, RobotCase):
         self.assertEqual(driver.state, "closed")
 
     def test_waits_for_a_robot_that_is_taken(self) -> None:
-        """A second driver of dog1 is refused while the first is connected, and connects after the first leaves."""
+        """A second driver of dog1 is refused while the first is connected, and connects after the first has left."""
         first, second = self.make_driver(), self.make_driver()
         first.connect()
         self.pass_time(0.1)
@@ -124,7 +124,7 @@ class SimDriverTests(Conformance, RobotCase):
 
 
 class MuteRobot:
-    """A remote end that sends sensor values once and answers nothing."""
+    """A remote end that sends sensor values once and never replies."""
 
     def __init__(self, link: Link) -> None:
         self.link = link
@@ -167,7 +167,7 @@ class SimDriverAloneTests(SynchronousTestCase):
         self.assertIn(encode_message(Motors(True)), self.robots[0].heard)
 
     def test_answers_every_switch(self) -> None:
-        """A switch that is requested while another one fails gets the result of the last one."""
+        """If a motor switch is requested while another one fails, all requests get the result of the last one."""
         again: list[Deferred[bool]] = []
         self.driver.enable().addErrback(lambda _: again.append(self.driver.enable()))
         last = self.driver.disable()
@@ -177,7 +177,7 @@ class SimDriverAloneTests(SynchronousTestCase):
         self.assertEqual(len(again), 1)
 
     def test_lives_on_after_bad_bytes(self) -> None:
-        """Invalid bytes, and messages that only clients send, are counted and dropped."""
+        """Invalid bytes are counted and dropped, and so are messages that only clients may send."""
         self.robots[0].link.send(b"rubbish" + encode_message(Motors(True)))
         self.robots[0].tell()
         pump(self.clock, 0.02)
@@ -185,7 +185,7 @@ class SimDriverAloneTests(SynchronousTestCase):
         self.assertEqual(self.driver.state, "ready")
 
     def test_ends_the_motion_on_its_own_side_too(self) -> None:
-        """At the deadline the driver sends one halt."""
+        """At the deadline the driver itself sends one halt."""
         self.robots[0].link.send(encode_message(Sensors(1.0, {"estop.engaged": False}, {}, 0)))
         pump(self.clock, 0.02)
         self.driver.act({"base.vx": 0.1}, Permit(1, self.clock.seconds() + 0.1))
@@ -195,7 +195,7 @@ class SimDriverAloneTests(SynchronousTestCase):
 
 
 class SimulatorClientTests(SynchronousTestCase):
-    """The operator's client of the same protocol."""
+    """The operator's client of the protocol of the simulator."""
 
     def setUp(self) -> None:
         """Create a simulator and a connected operator."""
@@ -208,7 +208,7 @@ class SimulatorClientTests(SynchronousTestCase):
         pump(self.clock, 0.2)
 
     def test_sees_the_truth(self) -> None:
-        """The snapshot equals the world's state, in values that JSON can encode."""
+        """The snapshot equals the state of the world, in values that JSON can encode."""
         snapshot = self.successResultOf(self.connected)
         self.assertEqual(list(snapshot["walls"]), [3.0, 2.4])
         self.assertEqual([dog["name"] for dog in snapshot["dogs"]], ["dog1", "dog2", "dog3"])
@@ -236,7 +236,7 @@ class SimulatorClientTests(SynchronousTestCase):
         self.assertIn(snapshot["target"], seen)
 
     def test_is_told_why_not(self) -> None:
-        """An impossible order fails with the simulator's message."""
+        """A request that the simulator cannot execute fails with the simulator's message."""
         for order, words in (
             (self.operator.place_target(9.0, 1.0), "does not fit"),
             (self.operator.move_dog("dog7", 1.0, 1.0, 0.0), "no dog is named"),
@@ -245,7 +245,7 @@ class SimulatorClientTests(SynchronousTestCase):
             self.assertIn(words, str(self.failureResultOf(order, UsageError).value))
 
     def test_fails_orders_without_a_link(self) -> None:
-        """Orders fail with LinkLost if the link breaks, and until it is open again."""
+        """Requests fail with LinkLost when the link breaks, and also until it is open again."""
         on_the_way = self.operator.clear_target()
         self.connector.cut()
         self.failureResultOf(on_the_way, LinkLost)
@@ -255,7 +255,7 @@ class SimulatorClientTests(SynchronousTestCase):
         self.assertIsNotNone(self.operator.snapshot)
 
     def test_leaves_nothing_behind(self) -> None:
-        """After one or two calls of ``disconnect`` no timer is left."""
+        """No timer remains after ``disconnect`` is called once or twice."""
         self.operator.disconnect()
         self.operator.disconnect()
         self.yard.stop()

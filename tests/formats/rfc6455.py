@@ -12,7 +12,7 @@ MASK = bytes.fromhex("37fa213d")
 
 
 def answer_to(request: bytes) -> bytes:
-    """Return the answer of a server to a client's request."""
+    """Return a server's response to the opening handshake of a client."""
     found = re.search(rb"Sec-WebSocket-Key: (\S+)", request, re.IGNORECASE)
     assert found
     key = hashlib.sha1(found[1] + b"258EAFA5-E914-47DA-95CA-C5AB0DC85B11", usedforsecurity=False).digest()
@@ -21,7 +21,7 @@ def answer_to(request: bytes) -> bytes:
 
 
 def framed(opcode: int, payload: bytes, mask: bytes | None) -> bytes:
-    """Return one complete frame; a client sends a ``mask`` of 4 bytes, a server none."""
+    """Return one complete frame; ``mask`` has 4 bytes for a client and is empty for a server."""
     size, bit = len(payload), 0 if mask is None else 0x80
     if size < 126:
         start = bytes([0x80 | opcode, bit | size])

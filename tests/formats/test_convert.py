@@ -48,24 +48,27 @@ class _Table:
 
 
 class ConvertTests(SynchronousTestCase):
-    """Values are converted to the declared types, or the error names key, problem and remedy."""
+    """Values are converted to the declared types; an error contains the key, the problem and a remedy."""
 
     def refused(self, key: str, value: object) -> InvalidValue:
-        """Return the error for a wrong value."""
+        """Return the error message for an invalid value."""
         error: InvalidValue = self.assertRaises(InvalidValue, convert_table, {"name": "a", key: value}, _Table)
         self.assertEqual(error.key, key)
         self.assertTrue(error.problem and error.remedy)
         return error
 
     def test_converts(self) -> None:
-        """Integers become floats where declared, lists become tuples, and the ``ConversionStep`` is applied last."""
+        """Integers become floats where floats are declared, lists become tuples.
+
+        Then the ``ConversionStep`` is applied.
+        """
         given = {"name": "a", "rate": 2, "sizes": [1, 1, 2], "parts": [{"kind": "camera"}], "word": "ay"}
         table = convert_table(given, _Table)
         self.assertEqual(table, _Table("a", 80, 2.0, "safe", (1, 2), (_Part("camera"),), "AY"))  # type: ignore[arg-type]
         self.assertIsInstance(table.rate, float)
 
     def test_refuses_wrong_types_and_bounds(self) -> None:
-        """Values are not coerced: no boolean to a number, no text to a number, no NaN into a range."""
+        """Values are not coerced: a boolean is not a number, text is not a number, and NaN is in no range."""
         nan, inf = float("nan"), float("inf")
         wrong: dict[str, list[object]] = {
             "name": ["", "x" * 9, 1, None, "a\nb"],
@@ -83,7 +86,7 @@ class ConvertTests(SynchronousTestCase):
                 self.refused(key, value)
 
     def test_names_the_innermost_value(self) -> None:
-        """The error for a list or table names the wrong entry and shows its value."""
+        """The error for a list or table identifies the invalid entry and shows its value."""
         self.assertIn("[1] is -5", self.refused("sizes", [1, -5]).problem)
         self.assertIn('[0].size is "b"', self.refused("parts", [{"kind": "a", "size": "b"}]).problem)
 
@@ -93,7 +96,7 @@ class ConvertTests(SynchronousTestCase):
         self.assertNotIn("hunter2", error.problem + error.remedy)
 
     def test_says_what_is_known(self) -> None:
-        """The error names the nearest key for an unknown one, and an example for a missing one."""
+        """The error for an unknown key suggests the nearest key; the error for a missing key contains an example."""
         error = self.assertRaises(InvalidValue, convert_table, {"nam": "a"}, _Table)
         self.assertIn("nearest is name", error.remedy)
         error = self.assertRaises(InvalidValue, convert_table, {}, _Table)

@@ -12,7 +12,10 @@ from tests.webnode.picture import jpeg
 
 class JpegTests(SynchronousTestCase):
     def test_size_of_a_picture(self) -> None:
-        """A complete JPEG has a size, also after other segments, fill bytes and bare markers; other data has none."""
+        """The size of a complete JPEG is found, even after other segments, fill bytes and bare markers.
+
+        Data that is not a JPEG has no size.
+        """
         self.assertEqual(read_size(jpeg(208, 156)), (208, 156))
         for before in (b"\xff\xff\xd0\xff\xdb\x00\x04zz", b"\xff\xff\x01"):
             self.assertEqual(read_size(b"\xff\xd8" + before + jpeg(10, 20)[2:]), (10, 20))
@@ -25,6 +28,6 @@ class JpegTests(SynchronousTestCase):
     @settings(max_examples=100)
     @given(st.binary(max_size=40))
     def test_any_bytes(self, data: bytes) -> None:
-        """For any bytes between the markers of a JPEG the result is a size or None."""
+        """With any bytes between the markers of a JPEG, the result is a size or None."""
         size = read_size(b"\xff\xd8" + data + b"\xff\xd9")
         self.assertTrue(size is None or min(size) > 0)

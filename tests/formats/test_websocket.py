@@ -37,7 +37,7 @@ def client() -> Plain:
 
 class GreetingTests(SynchronousTestCase):
     def test_refused_greetings(self) -> None:
-        """A rejected handshake opens no connection and stops reading; a server answers with HTTP 400."""
+        """A rejected handshake opens no connection and ends reading; a server replies with HTTP 400."""
         for old, new in ((b"101 Switching", b"200 OK"), (b"Accept: ", b"Accept: x"), (b"e: websocket", b"e: h2c")):
             one = Plain()
             answer = answer_to(one.opening())
@@ -49,7 +49,7 @@ class GreetingTests(SynchronousTestCase):
             self.assertTrue(server.fault and not server.is_open)
 
     def test_endless_greetings(self) -> None:
-        """A handshake without an end is rejected at the maximum size."""
+        """A handshake that does not end is rejected at the maximum size."""
         one = Plain(is_client=False)
         one.receive_data(b"GET /" + b"x" * (MAX_HEAD_BYTES - 6))
         self.assertEqual(one.fault, "")
@@ -59,7 +59,7 @@ class GreetingTests(SynchronousTestCase):
 
 class FrameTests(SynchronousTestCase):
     def test_joins_fragments(self) -> None:
-        """The two fragments in the RFC give one Hello, and a ping between them is answered."""
+        """The two fragments in the RFC's example give one Hello; a ping between the fragments gets a pong."""
         one = client()
         said = bytes.fromhex("010348656c") + bytes.fromhex("890548656c6c6f") + bytes.fromhex("80026c6f")
         messages, reply = one.receive_data(said)
@@ -69,7 +69,7 @@ class FrameTests(SynchronousTestCase):
         self.assertEqual((one.fault, one.frames), ("", 6))
 
     def test_answers_a_close(self) -> None:
-        """A close is answered once, and nothing is received or sent after it."""
+        """The endpoint replies to a close once; after it, nothing is received or sent."""
         one = client()
         messages, reply = one.receive_data(framed(CLOSE, b"\x03\xe8bye", None) + framed(TEXT, b"x", None))
         self.assertEqual((messages, reply[0] & 0x0F), ([], CLOSE))
@@ -77,7 +77,7 @@ class FrameTests(SynchronousTestCase):
         self.assertEqual((one.encode_close(), one.encode_ping(), one.encode_text(b"x")), (b"", b"", b""))
 
     def test_refuses_what_the_rfc_forbids(self) -> None:
-        """Masks from a server, extensions, unknown opcodes, invalid fragments and excessive sizes are faults."""
+        """Masked frames from a server, extensions, unknown opcodes, bad fragments and excessive sizes are faults."""
         part = b"\x7f" + (LONGEST // 2 + 1).to_bytes(8, "big") + bytes(LONGEST // 2 + 1)
         for said in (
             framed(TEXT, b"x", MASK),
@@ -107,7 +107,7 @@ class FrameTests(SynchronousTestCase):
 
     @given(st.lists(st.binary(max_size=200), max_size=4))
     def test_both_ends_understand_each_other_cut_anyhow(self, said: list[bytes]) -> None:
-        """Both ends decode each other's messages if each byte arrives separately."""
+        """Each end decodes the messages of the other end, even if every byte arrives separately."""
         near, far = Plain(), Plain(is_client=False)
         heard: list[bytes] = []
         for place in near.opening():
@@ -123,7 +123,7 @@ class FrameTests(SynchronousTestCase):
 
     @given(st.lists(st.binary(max_size=40), max_size=6))
     def test_any_bytes(self, pieces: list[bytes]) -> None:
-        """Any bytes give messages or a fault, and never raise."""
+        """Any bytes give messages or a fault, and raise no exception."""
         for one in (client(), Plain(), Plain(is_client=False)):
             one.opening()
             for piece in pieces:

@@ -1,4 +1,4 @@
-"""Run schedules from the command line; see the package."""
+"""Run schedules from the command line; the docstring of the package explains the options."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ BOUND = 400
 STRETCH = 1000
 """The maximum number of seeds in one line of a seed log."""
 MOST_SHRUNK = 3
-"""The maximum number of failures that are shrunk."""
+"""The maximum number of failed schedules that are reduced."""
 INTERRUPTED = 130
 
 NAMES = (*WORKLOADS, *ALONE)
@@ -31,34 +31,40 @@ NAMES = (*WORKLOADS, *ALONE)
 def main() -> int:
     """Run the command; return 1 if a schedule failed, or with ``--bugs`` if a bug was not detected."""
     parser = argparse.ArgumentParser(prog="python -m tests.invariants", description=__doc__)
-    parser.add_argument("--schedules", type=int, help="how many to run (default 200; of each bug at most 400)")
-    parser.add_argument("--seed", type=int, default=1, help="the seed of the first; the others follow (default 1)")
-    parser.add_argument("--jobs", type=int, default=os.cpu_count() or 1, help="processes (default: one for each core)")
-    parser.add_argument("--scheduler", default="", metavar="ADDRESS", help="run on the workers of this Dask scheduler")
-    parser.add_argument("--only", default="", help=f"workloads in all of them, with commas: {', '.join(NAMES)}")
-    parser.add_argument("--keep", help="of the faults only these happen: their numbers from 0, with commas, or none")
-    parser.add_argument("--calm", action="store_true", help="take the weather away")
-    parser.add_argument("--seconds", type=float, help="end workloads and faults after so many")
+    parser.add_argument("--schedules", type=int, help="number of schedules (default 200; at most 400 per bug)")
     parser.add_argument(
-        "--shrink", type=float, default=60.0, help="seconds in which a failed one is shrunk (default 60)"
+        "--seed", type=int, default=1, help="first seed; the next schedules use the next seeds (default 1)"
     )
-    parser.add_argument("--log", default="", metavar="FILE", help="add what came of it to a seed log")
-    parser.add_argument("--resume", action="store_true", help="leave out the seeds that the seed log has")
-    parser.add_argument("--bug", choices=sorted(BUGS), metavar="NAME", help="run with a bug put in, until it shows")
-    parser.add_argument("--bugs", action="store_true", help="run with each bug in turn, and say when it showed")
+    parser.add_argument(
+        "--jobs", type=int, default=os.cpu_count() or 1, help="number of processes (default: one per core)"
+    )
+    parser.add_argument("--scheduler", default="", metavar="ADDRESS", help="run on the workers of this Dask scheduler")
+    parser.add_argument("--only", default="", help=f"workloads to run, separated by commas: {', '.join(NAMES)}")
+    parser.add_argument("--keep", help="numbers of the faults to inject, from 0, separated by commas, or none")
+    parser.add_argument("--calm", action="store_true", help="without random loss, duplication, reordering and jitter")
+    parser.add_argument("--seconds", type=float, help="end workloads and faults after this number of seconds")
+    parser.add_argument(
+        "--shrink", type=float, default=60.0, help="seconds for reducing a failed schedule (default 60)"
+    )
+    parser.add_argument("--log", default="", metavar="FILE", help="append the results to this seed log")
+    parser.add_argument("--resume", action="store_true", help="skip the seeds in the seed log")
+    parser.add_argument(
+        "--bug", choices=sorted(BUGS), metavar="NAME", help="run with this seeded bug until it is detected"
+    )
+    parser.add_argument("--bugs", action="store_true", help="run with each seeded bug in turn; print what detected it")
     args = parser.parse_args()
     only = tuple(name for name in args.only.split(",") if name)
     if unknown := [name for name in only if name not in NAMES]:
-        parser.error(f"--only: no workload {unknown[0]}; there are {', '.join(NAMES)}")
+        parser.error(f"--only: unknown workload {unknown[0]}; choose from {', '.join(NAMES)}")
     count = args.schedules or (BOUND if args.bugs or args.bug else 200)
     if count < 1 or args.jobs < 1:
-        parser.error("--schedules, --jobs: at least 1")
+        parser.error("--schedules, --jobs: must be at least 1")
     if args.seconds is not None and not args.seconds > 0.0:
-        parser.error("--seconds: more than 0")
+        parser.error("--seconds: must be more than 0")
     if args.resume and not args.log:
-        parser.error("--resume: name the seed log with --log FILE")
+        parser.error("--resume: no seed log is given; add --log FILE")
     if args.log and (args.bug or args.bugs):
-        parser.error("--log: runs with a bug put in are not logged")
+        parser.error("--log: runs with a seeded bug cannot be logged; remove --log")
     if args.bug:
         only = only or FINDERS[args.bug]
     try:
@@ -75,12 +81,12 @@ def main() -> int:
 
 
 def numbers(told: str | None) -> tuple[int, ...] | None:
-    """Return the numbers of faults in ``--keep``."""
+    """Return the numbers of the faults in ``--keep``."""
     if told in (None, "none"):
         return None if told is None else ()
     named = str(told).split(",")
     if not all(number.isdecimal() for number in named):
-        raise ValueError(f"--keep: {told!r} names no faults; give their numbers with commas between them, or none")
+        raise ValueError(f"--keep: {told!r} is not a list of fault numbers; use numbers separated by commas, or none")
     return tuple(map(int, named))
 
 
@@ -95,7 +101,7 @@ class Session:
         self._failed = self._ran = 0
 
     def run(self, seeds: range) -> int:
-        """Run all seeds; return 1 if one failed, or if none detected the seeded bug."""
+        """Run all seeds; return 1 if a schedule failed or, with a seeded bug, if none detected the bug."""
         args = self._args
         signal.signal(signal.SIGINT, self._interrupt)
         if not args.log:
@@ -119,12 +125,12 @@ class Session:
                 raise KeyboardInterrupt
 
     def _interrupt(self, *_: object) -> None:
-        """End after the present schedule: inside one, a Deferred would catch the interrupt as its failure."""
+        """End after the present schedule. During a schedule, a Deferred would catch the interrupt as its failure."""
         self._is_interrupted = True
         signal.signal(signal.SIGINT, signal.default_int_handler)
 
     def _print_failure(self, outcome: Outcome) -> None:
-        """Print the failure, and the line that replays its smallest variant."""
+        """Print the failure, and the command that replays its smallest variant."""
         say(f"FAILED  {line(outcome.seed, self._trim, self._args.bug)}")
         say(f"        {outcome.title}")
         for violation in outcome.found[:6]:
@@ -136,16 +142,16 @@ class Session:
     def _print_least(self, whole: Outcome, left: Least) -> None:
         say(f"LEAST   {line(whole.seed, left.trim, self._args.bug)}")
         kept = whole.faults if left.trim.keep is None else len(left.trim.keep)
-        say(f"        {kept} of {whole.faults} faults are left, after {left.runs} runs: {left.outcome.found[0]}")
+        say(f"        {kept} of {whole.faults} faults remain after {left.runs} runs: {left.outcome.found[0]}")
 
     def _log(self, seeds: range) -> None:
-        """Run the seeds in stretches, and log each one, also if it is interrupted."""
+        """Run the seeds in stretches; log each finished seed, even if the run is interrupted."""
         args, what = self._args, "+".join(self._trim.only)
         text = Path(args.log).read_text(encoding="utf-8") if os.path.exists(args.log) else ""
         logged = seed_log.parse_entries(text, args.log)
         left = seed_log.find_missing(seeds, logged, what) if args.resume else list(seeds)
         Path(args.log).open("ab").close()
-        say(f"{len(left)} of {len(seeds)} schedules, from seed {left[0]}" if left else "all are in the seed log")
+        say(f"{len(left)} of {len(seeds)} schedules, from seed {left[0]}" if left else "all seeds are in the seed log")
         commit, outcomes = commit_of(Path(__file__).resolve().parents[2]), self._outcomes(left)
         for stretch in seed_log.split_ranges(left, STRETCH):
             started_at, failures, ran = time.monotonic(), [], 0
@@ -165,12 +171,12 @@ class Session:
 
 
 def until_then(moment: float) -> Callable[[], bool]:
-    """Return a function that tells whether ``moment`` has passed."""
+    """Return a function that returns whether ``moment`` has passed."""
     return lambda: time.monotonic() > moment
 
 
 def commit_of(tree: Path) -> str:
-    """Return the commit of the tree, with + if it has changes, or an empty string outside a repository."""
+    """Return the commit of the working tree, with + if it has changes; an empty string outside a repository."""
     asked = subprocess.run(
         ["git", "describe", "--always", "--dirty=+", "--exclude=*"], cwd=tree, capture_output=True, text=True
     )
@@ -178,7 +184,7 @@ def commit_of(tree: Path) -> str:
 
 
 def show_bugs(seeds: range, jobs: int, scheduler: str) -> int:
-    """Print for each bug the schedule that detected it, the number of schedules, and the violations."""
+    """Print, for each bug, the schedule that detected it, the number of schedules, and the violations."""
     hidden, started_at = 0, time.monotonic()
     say(f"{'bug':48s} {'workloads':16s} {'seed':>5s}  {'needed':>6s}  shows as")
     for bug, only, number, outcome in hunt_all(seeds, jobs, scheduler):
@@ -193,7 +199,7 @@ def show_bugs(seeds: range, jobs: int, scheduler: str) -> int:
 
 
 def say(text: str) -> None:
-    """Write a line at once."""
+    """Write a line and flush it immediately."""
     sys.stdout.write(text + "\n")
     sys.stdout.flush()
 

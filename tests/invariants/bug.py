@@ -1,4 +1,4 @@
-"""Seeded bugs: each breaks the library in one place, and a schedule must detect it."""
+"""Seeded bugs: each bug breaks the library in one place, and the schedules must detect it."""
 
 from __future__ import annotations
 
@@ -217,7 +217,7 @@ async def _decided_by_the_new(self: LeaseProposer, ballot: Any, members: Any, ke
 def _row(
     event: Event, relation: BallotRelation, kind: ReplyKind, state: State = State.OPEN
 ) -> list[tuple[Any, str, Any]]:
-    """Return a change of the table with another answer in one row."""
+    """Return a function that changes one row of the table."""
     return [(acceptor_, "TABLE", {**TABLE, (state, event, relation): (kind, TABLE[state, event, relation][1])})]
 
 
@@ -341,7 +341,7 @@ FINDERS = {name: finders for finders, bugs in _BUGS.items() for name in bugs}
 
 @contextmanager
 def seeded(name: str | None) -> Iterator[None]:
-    """Apply the seeded bug ``name`` to the library, or none."""
+    """Apply the seeded bug ``name`` to the library, or no bug for None."""
     changes = BUGS[name] if name else []
     kept = [(place, attribute, getattr(place, attribute)) for place, attribute, _ in changes]
     for place, attribute, broken in changes:

@@ -1,8 +1,14 @@
-"""Deciders: agents that receive the same reports decide the same, for each order of the reports.
+"""Check that agents that receive the same reports reach the same decision, in any order of the reports.
 
-C1  agents with the same reports in any order assign the same agent            (E7, S3) C2  an invalid report is never
-assigned, and does not change the assignment    (S4) C3  among 300 agents the cheapest is found, as among three C4  if
-bidders stop by the stopping rule, no task has two owners
+Invariants (in brackets: the invariants of a whole team that follow from them):
+
+C1: agents with the same reports in any order assign the same agent (E7, S3).
+
+C2: an invalid report is never assigned, and does not change the assignment (S4).
+
+C3: among 300 agents the agent with the lowest cost is found, as among three.
+
+C4: if bidders stop by the stopping rule, no task has two owners.
 """
 
 from __future__ import annotations
@@ -21,23 +27,23 @@ LINE = 12
 
 
 class Deciders(Workload):
-    """Reports of random teams, and bidders in a line, in addition to the schedule of ``schedule.seed``."""
+    """Lets random teams decide, and bidders in a line bid; independent of the faults in the schedule."""
 
     def __init__(self, schedule: Schedule) -> None:
         self._rng = random.Random(f"deciders/{schedule.seed}")
         self._found: list[str] = []
 
     def step(self) -> None:
-        """Let a small team decide."""
+        """Let a small team decide on random reports."""
         contacts = [Report(f"agent-{n:03d}", self._rng.choice([1.0, 1.0, 2.0])) for n in range(4)]
         views = [self._rng.sample(contacts, len(contacts)) for _ in contacts]
         assigned = sorted({str(Nearest().find(view).assigned_agent) for view in views})
         if len(assigned) > 1:
-            self._found.append(f"C1: {' and '.join(assigned)} are assigned by equal reports")
+            self._found.append(f"C1: {' and '.join(assigned)} are assigned from equal reports")
         bad = Report("agent-bad", self._rng.choice([math.nan, math.inf, -math.inf, -1.0]))
         view = self._rng.sample([*contacts, bad], len(contacts) + 1)
         if str(Nearest().find(view).assigned_agent) not in assigned:
-            self._found.append(f"C2: a cost of {bad.cost} makes {Nearest().find(view).assigned_agent} win")
+            self._found.append(f"C2: a cost of {bad.cost} gets {Nearest().find(view).assigned_agent} assigned")
 
     def make_final_requests(self) -> None:
         """Let a large team decide once, and a line of bidders bid until all have stopped."""
@@ -54,7 +60,7 @@ class Deciders(Workload):
 
 
 def stopped(mission: Mission) -> dict[str, list[str]]:
-    """Return the owners of each task, for bidders in a line that each stop independently."""
+    """Return the owners of each task after bidders in a line have bid; each bidder stops independently."""
     names = mission.alive
     near = {a: [names[m] for m in (n - 1, n + 1) if 0 <= m < len(names)] for n, a in enumerate(names)}
     bidders = {}

@@ -1,7 +1,7 @@
-"""Ether: groups, results and leases of a team in memory, with delayed, repeated, reordered and lost reports.
+"""Replace the network between complete agents: groups, results and leases of a team in memory.
 
-It replaces the network between complete agents, so that a schedule takes milliseconds: presence by leases, results
-stored by a majority, and a council that grants a task's lease to one of the agents that reach it.
+Reports are delayed, repeated, reordered and lost. Presence is a lease, results are stored by a majority, and a council
+grants a task's lease to one of the agents that reach it. A schedule takes milliseconds.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ from middleware.tasks.task import ORDER, RESULT, TASKS, Member, Result, Task, gr
 PRESENCE = 1.0
 REPEAT = 0.5
 OPERATOR = 0
-"""The place of the node without a robot."""
+"""The place of the operator's node, which has no robot."""
 
 
 @dataclass
@@ -50,14 +50,14 @@ class Replica:
 
 
 class Ether:
-    """The nodes 0 (the operator's) to ``n``; all others have robots."""
+    """The network between the nodes 0 (the operator's node) to ``n``; all nodes except 0 have robots."""
 
     def __init__(self, clock: HeapClock, rng: random.Random, n: int) -> None:
         self.clock = clock
         self.rng = rng
         self.conditions = NetworkConditions()
         self.side: dict[int, int] = {}
-        """Nodes with different numbers cannot reach each other."""
+        """The partition of each node; nodes in different partitions cannot reach each other."""
         self.replicas = [Replica() for _ in range(n + 1)]
         self.nodes: dict[int, Node] = {}
         self.acknowledged: dict[str, tuple[Result, float]] = {}
@@ -70,14 +70,14 @@ class Ether:
         return self.side.get(one, 0) == self.side.get(other, 0)
 
     def send(self, source: int, target: int, deliver: Callable[[], None]) -> None:
-        """Send a message through the present conditions."""
+        """Send a message; the present network conditions may delay, lose or duplicate it."""
         for _ in range(1 + (self.rng.random() < self.conditions.duplicate)):
             lost = self.rng.random() < self.conditions.loss or not self.reaches(source, target)
             if not lost:
                 self.clock.callLater(self.conditions.delay * self.rng.uniform(0.2, 3.0), deliver)
 
     def everywhere(self, source: int, change: Callable[[int], None]) -> None:
-        """Apply a change at ``source`` at once, and at the others when the message arrives."""
+        """Apply a change at ``source`` immediately, and at each other node when the message arrives."""
         change(source)
         for target in range(len(self.replicas)):
             if target != source:
@@ -88,7 +88,10 @@ class Ether:
         self.everywhere(OPERATOR, lambda place: self._task(place, task))
 
     def conclude(self, place: int, task_id: str, result: Result) -> Deferred[None]:
-        """Record an outcome; after 0.3 s it is acknowledged if a majority has stored it, else it fails."""
+        """Record an outcome.
+
+        After 0.3 s the write succeeds if a majority has stored the outcome, and fails otherwise.
+        """
         done: Deferred[None] = Deferred()
         self.everywhere(place, lambda target: self._result(target, task_id, result))
 
@@ -113,19 +116,19 @@ class Ether:
         self.everywhere(OPERATOR, lambda place: self._order(place, task_id, order))
 
     def forget(self, task_id: str) -> None:
-        """Expire the outcome's record at all nodes, but not the task's."""
+        """Remove the record of the outcome from all nodes, but keep the record of the task."""
         for place, replica in enumerate(self.replicas):
             replica.results.pop(task_id, None)
             self.changed(place, task_id)
             self.listed(place)
 
     def report(self, place: int, task_id: str, member: Member | None) -> None:
-        """Send a report to all (None: withdraw it)."""
+        """Send a report to all nodes; None withdraws the report."""
         for target in range(1, len(self.replicas)):
             self.send(place, target, lambda target=target: self._member(target, place, task_id, member))  # type: ignore[misc]
 
     def results(self, place: int, task_id: str) -> list[Record]:
-        """Return the outcomes that the node of a place knows, as records."""
+        """Return the outcomes that the node at this place knows, as records."""
         known = self.replicas[place].results.get(task_id, {})
         return [
             Record(group_key(task_id), RESULT, bytes(32), 1, "team", 1.0, result.pack(), bytes(64))
@@ -133,7 +136,7 @@ class Ether:
         ]
 
     def outcome(self, place: int, task_id: str) -> Result | None:
-        """Return the outcome of a task that the node of a place knows."""
+        """Return the outcome of a task that the node at this place knows."""
         known = self.replicas[place].results.get(task_id, {})
         return known[max(known)] if known else None
 
@@ -153,7 +156,7 @@ class Ether:
             ordered([Record(group_key(task_id), ORDER, bytes(32), 1, "team", 1.0, one, bytes(64)) for one in packed])
 
     def listed(self, place: int) -> None:
-        """Notify the agent of the node of the present tasks."""
+        """Notify the agent of the node of the current tasks."""
         node = self.nodes.get(place)
         if node is not None and node.on_tasks is not None:
             tasks = self.replicas[place].tasks
@@ -190,7 +193,7 @@ class Ether:
         self.changed(place, task_id)
 
     def _repeat(self) -> None:
-        """Send all reports again, exchange data with a random node, and expire silent members."""
+        """Send all reports again, exchange data with a random node, and remove silent members."""
         self.clock.callLater(REPEAT, self._repeat)
         for place, node in sorted(self.nodes.items()):
             for task_id, member in sorted(node.reports.items()):
@@ -212,17 +215,17 @@ class Ether:
 
 
 class ProposerStub:
-    """A council of the operator's node alone, without changes."""
+    """A proposer for a council that consists of the operator's node and never changes."""
 
     def learn_charter(self, packed: bytes) -> None:
         """Ignore the record."""
 
     def ping_members(self) -> None:
-        """Do nothing, as the member is always present."""
+        """Do nothing, because the only member is always present."""
 
 
 class LeaseClientStub:
-    """The lease client for a council at the operator's node."""
+    """A lease client for a council that consists of the operator's node."""
 
     TTL = 1.5
     proposer = ProposerStub()
@@ -241,27 +244,27 @@ class LeaseClientStub:
         return Lease(self._task_id, self.token, self._deadline) if is_held else None
 
     def on_higher_token(self, token: int) -> None:
-        """Use higher tokens than this one from now on."""
+        """From now on, use only tokens higher than this token."""
         self._floor = max(self._floor, token)
 
     def claim(self) -> None:
-        """Claim the lease, and renew it."""
+        """Claim the lease, and then renew it."""
         if not self._wanted:
             self._wanted = True
             self._ether.clock.callLater(0.02, self._claim, self._life)
 
     def suspect_holder(self) -> None:
-        """Do nothing: claims are repeated often enough."""
+        """Do nothing, because claims are repeated often enough."""
 
     def close_task(self, token: int) -> Deferred[bytes]:
-        """Permit the end of the task."""
+        """Allow the task to end."""
         return succeed(b"")
 
     def stand_by(self, rank: int = 1) -> None:
-        """Do nothing: this council does not notify standbys, and each client polls it."""
+        """Do nothing: this council does not notify standbys, so each client polls it."""
 
     def release(self, standbys: object = (), rest: float = 0.0) -> Deferred[object]:
-        """Return the lease; while the robot still moves, let it expire instead."""
+        """Return the lease. If the robot is still moving, let the lease expire instead."""
         self._wanted, self._deadline = False, 0.0
         self._life += 1
         holder = self._ether.holders.get(self._task_id)
@@ -296,7 +299,7 @@ class LeaseClientStub:
 
 
 class Node:
-    """The part of a node that its agent uses."""
+    """The part of a node that the node's agent uses."""
 
     def __init__(self, ether: Ether, place: int) -> None:
         self.ether = ether
@@ -361,7 +364,7 @@ class Node:
         return LeaseClientStub(self.ether, self.place, task.task_id, changed, floor)
 
     def _get(self, key: bytes) -> Deferred[list[Record]]:
-        """Return the records that the reachable nodes know, if these are a majority."""
+        """Return the records that the reachable nodes know; fail if these nodes are not a majority."""
         reached = [place for place in range(len(self.ether.replicas)) if self.ether.reaches(self.place, place)]
         if 2 * len(reached) <= len(self.ether.replicas) or self.ether.rng.random() < self.ether.conditions.loss:
             return fail(Unavailable(len(reached), len(self.ether.replicas)))

@@ -1,7 +1,8 @@
-"""The workload of leases: agents claim, keep, lose and return leases under all faults (E1 to E3, E5, E8, E9).
+"""The workload of leases: agents claim, keep, lose and return leases under all faults.
 
-It has a separate world, small enough for a thousand schedules in two minutes: the classes of the protocol, simulated
-machines and a simulated link.  The assignments are random, as leases must be exclusive for any assignment.
+It checks the invariants E1 to E3, E5, E8 and E9. It has its own small world, so a thousand schedules take two minutes:
+the classes of the protocol, simulated machines and a simulated link. The assignments are random, because leases must be
+exclusive for any assignment.
 """
 
 from __future__ import annotations
@@ -24,9 +25,9 @@ from sim.team.shrinking import NO_REDUCTION, Reduction
 
 TTL = 1.5
 SLACK = 0.8
-"""E3: the maximum time beyond the TTL until another agent executes, if only the executor has failed."""
+"""The maximum time in seconds beyond the TTL until another agent executes, if only the executor has failed (E3)."""
 LEAVE = 0.2
-"""The maximum time until a standby holds a returned lease, beyond the time to stop."""
+"""The maximum time in seconds, beyond the time to stop, until a standby gets a returned lease."""
 
 
 KINDS = (
@@ -36,7 +37,7 @@ KINDS = (
 
 
 def draw_faults(rng: random.Random, n: int, agents: Sequence[int], has_stores: bool) -> list[TimedFault]:
-    """Return random faults for a schedule with ``n`` places; places of agents are chosen more often."""
+    """Return random faults for a schedule with ``n`` places; the places of agents are chosen more often."""
     faults = []
     for _ in range(rng.choice([1, 2, 3, 3, 4, 6])):
         at = rng.uniform(0.5, 12.0)
@@ -55,7 +56,7 @@ def draw_faults(rng: random.Random, n: int, agents: Sequence[int], has_stores: b
 
 
 class Leases(LeaseTeam):
-    """The run of ``seed``, which determines everything."""
+    """The run that ``seed`` completely determines."""
 
     def __init__(self, seed: int, trim: Reduction = NO_REDUCTION, ttl: float = TTL) -> None:
         rng = self._schedule_rng = random.Random(f"leases/{seed}")
@@ -63,9 +64,9 @@ class Leases(LeaseTeam):
         agents = rng.choice([2, 3, 3, 4])
         stop_time = rng.choice([0.0, 0.0, 0.3])
         drift = rng.choice([0.0, 0.01, 0.01, 0.01, 0.05])
-        # The worst permitted case must occur often: a slow holder and fast members.
+        # The worst permitted combination, a slow holder and fast members, must occur often.
         rates = [1.0 + rng.choice([-1, 1]) * drift for _ in range(n)]
-        # Without stores a restarted member loses all state: then councils do not change, and tokens may decrease.
+        # Without stores a restarted member loses all its state; councils then do not change, and tokens may decrease.
         has_stores = rng.random() < 0.7
         super().__init__(f"leases/{seed}", rates, agents, ttl, stop_time, drift, has_stores)
         self.air = LinkQuality(
@@ -89,7 +90,7 @@ class Leases(LeaseTeam):
 
     @property
     def digest(self) -> str:
-        """The hash of all messages that arrived, with their times."""
+        """Return the hash of all messages that arrived, with their times."""
         return self.switchboard.digest()
 
     def __str__(self) -> str:
@@ -100,7 +101,7 @@ class Leases(LeaseTeam):
         )
 
     def run(self) -> list[str]:  # type: ignore[override]
-        """Run the faults, then the healthy phase; return one line per violation."""
+        """Run the faults and then the healthy phase; return one line per violation."""
         self.clock.advance(self.ttl + 0.1)
         self.radio.quality = self.air
         self.recorder.record_assumptions()
@@ -118,7 +119,7 @@ class Leases(LeaseTeam):
         return self.recorder.violations
 
     def _choose(self) -> None:
-        """Randomly let agents claim, stand by, leave or suspect."""
+        """Let random agents claim, stand by, leave or suspect the holder."""
         for task_id in self.charters:
             for place in self.agents:
                 bidder = self.nodes[place]
@@ -146,9 +147,9 @@ class Leases(LeaseTeam):
                 self.nodes[place] = self.start_life(place)
 
     def _verify_health(self, task_id: str) -> None:
-        """Check E3, the graceful leave and E5 while all is healthy and one agent after the other leaves."""
+        """Without faults, let one agent after the other leave; check E3, the graceful leave and E5."""
         if not self.has_stores:
-            # A lease that no member remembers must end first, as the next one may have its token.
+            # A lease that no member remembers must end first, because the next lease may have the same token.
             self.clock.advance(self.ttl)
         for rank, place in enumerate(self._schedule_rng.sample(self.agents, len(self.agents))):
             lease_client = self.nodes[place].get_lease_client(task_id)
@@ -158,7 +159,7 @@ class Leases(LeaseTeam):
                 lease_client.claim()
         # A restarted member is silent for one TTL, and a device may have to report its token first.
         since, most = self.clock.seconds(), 2 * self.ttl + SLACK + 1.0
-        if not self._wait_for_command(task_id, f"all is well with {task_id}", 0, since, most, most):
+        if not self._wait_for_command(task_id, f"there are no faults, task {task_id}", 0, since, most, most):
             return
         self.clock.advance(self._schedule_rng.uniform(0.7, 1.3) * self.ttl)
         _, token, holder = self.recorder.accepted[task_id][-1]
@@ -172,11 +173,11 @@ class Leases(LeaseTeam):
         left_at = self.clock.seconds()
         self.nodes[holder].leave(task_id)
         within = self.stop_time + LEAVE + 0.1 + 0.1 * len(self.agents)
-        self._wait_for_command(task_id, f"{holder} gives {task_id} back", token, left_at, within, 2 * self.ttl + SLACK)
+        self._wait_for_command(task_id, f"{holder} returns {task_id}", token, left_at, within, 2 * self.ttl + SLACK)
         self.nodes[holder].get_lease_client(task_id).stand_by(len(self.agents))
 
     def _depart_suddenly(self, task_id: str, token: int, holder: int) -> None:
-        """Kill, freeze or disconnect the executor, with one member of the council."""
+        """Kill, freeze or disconnect the executing agent together with a member of the council."""
         gone_at, rng = self.clock.seconds(), self._schedule_rng
         members = [self.get_place(member) for member in self.charters[task_id].members]
         spare = [place for place in members if place not in self.agents]
@@ -186,7 +187,7 @@ class Leases(LeaseTeam):
         others = [place for place in self.agents if place != holder]
         within = self.ttl / (1.0 - self.drift) + SLACK + STAGGER_S * (len(self.agents) - 1)
         if len(others) > 1 and rng.random() < 0.75:
-            # The strategy assigns one agent when the lease ends, then another.
+            # The strategy assigns one agent when the lease ends, and then a different one.
             fickle = rng.choice(others)
             self.nodes[fickle].leave(task_id)
             self.clock.advance(rng.uniform(0.8, 1.0) * self.ttl)
@@ -198,12 +199,15 @@ class Leases(LeaseTeam):
             # A robot that this agent has moved must stop first.
             within += self.stop_time if self.nodes[fickle].has_lease(task_id) else 0.0
             self.nodes[fickle].leave(task_id)
-        why = f"{holder} of {task_id} is gone ({how})"
+        why = f"{holder}, holder of {task_id}, has failed ({how})"
         self._wait_for_command(task_id, why, token, gone_at, within, 3 * self.ttl + SLACK)
         self._heal()
 
     def _conclude(self, task_id: str) -> None:
-        """Complete the task by its executor, or cancel it: after the acknowledgement no robot moves."""
+        """Let the executing agent complete the task, or cancel the task.
+
+        After the acknowledgement no robot may move.
+        """
         _, token, holder = self.recorder.accepted[task_id][-1]
         place = self._schedule_rng.choice([holder, self.n - 1])
         if place == holder:
@@ -223,7 +227,10 @@ class Leases(LeaseTeam):
         self.clock.advance(2 * self.ttl)
 
     def _wait_for_command(self, task_id: str, why: str, above: int, since: float, within: float, most: float) -> bool:
-        """Wait up to ``most`` s for a command with a token above ``above``, due ``within`` s of ``since``."""
+        """Wait up to ``most`` s for a command with a token above ``above``.
+
+        The command is due ``within`` s after ``since``.
+        """
         started_at = self.clock.seconds()
         self.recorder.history.record(CommandExpected, task_id, why, above, since, within)
         accepted = self.recorder.accepted[task_id]
@@ -291,9 +298,10 @@ class Leases(LeaseTeam):
         self.radio.cut |= {pair for a in places for b in rest for pair in ((a, b), (b, a))}
 
     def _change(self, place: int, is_torn: bool = False) -> None:
-        """Let a node change the council, at a time when the task may be free or held by this node.
+        """Let a node change the council when it considers the task free or holds the task's lease itself.
 
-        With ``is_torn``, mostly new members are chosen, and only they and the node learn of the change.
+        With ``is_torn``, nodes outside the present council are preferred as members, and only the new members and the
+        node learn of the change.
         """
         if not self.is_up(place) or not self.has_stores:
             return

@@ -1,4 +1,7 @@
-"""The workload of records: writes, removals and reads at all consistency levels, and their results (D1 to D7)."""
+"""The workload of records: writes, removals and reads at all consistency levels.
+
+It records the results and checks the invariants D1 to D7.
+"""
 
 from __future__ import annotations
 
@@ -23,7 +26,7 @@ NAMES = ("a", "b")
 
 
 class Records(Workload):
-    """Clients of each node write their slots under a few keys, and read all slots."""
+    """Each node has a client that writes its own slots under a few keys, and reads all slots."""
 
     def __init__(self, schedule: Schedule) -> None:
         self._schedule = schedule
@@ -38,7 +41,7 @@ class Records(Workload):
             self._let_lie(schedule.node(schedule.lying_place))
 
     def step(self) -> None:
-        """Perform a few operations at random nodes, and inspect each store and routing table."""
+        """Perform a few operations at random nodes; inspect each store and routing table."""
         alive = self._schedule.alive()
         for _ in range(self._rng.randrange(3)):
             if alive:
@@ -47,7 +50,7 @@ class Records(Workload):
         self._look()
 
     def make_final_requests(self) -> None:
-        """Let all nodes read all keys, and look up a few ids."""
+        """Let all nodes read all keys and look up a few ids."""
         self._look()
         for place in self._schedule.alive():
             for key in KEYS:
@@ -57,7 +60,7 @@ class Records(Workload):
                 self._find(place, target)
 
     def find_violations(self) -> list[str]:
-        """Record the present tables."""
+        """Record the members that each node knows."""
         for place in self._schedule.alive():
             known = self._schedule.node(place).overlay.members.list_live()
             self._history.record(MembersListed, place, tuple(contact.node_id for contact in known))
@@ -93,7 +96,7 @@ class Records(Workload):
         record_outcome(self._history, asked, looking, lambda found: tuple(contact.node_id for contact in found))
 
     def _meddle(self, place: int) -> None:
-        """Let a member send an old record of another member, and a forged one."""
+        """Let a member send an old record of another member, and a forged record."""
         if not self._old:
             return
         node = self._schedule.node(place)
@@ -108,7 +111,7 @@ class Records(Workload):
                     forged.addErrback(_weather)
 
     def _let_lie(self, node: EntangledNode) -> None:
-        """Let a member answer lookups with contacts that do not exist."""
+        """Let a member reply to lookups with contacts that do not exist."""
         ghosts = [Identity(bytes([n]) * 32) for n in range(200, 204)]
         named = [[ghost.public, "10.9.9.9", 9000 + n] for n, ghost in enumerate(ghosts)]
         node.endpoint.expose("find_node", lambda peer, target: named)

@@ -25,20 +25,20 @@ from tests.invariants.wire import Wire
 
 
 class Alone(Protocol):
-    """A workload with a separate world and faults, which last ``seconds``."""
+    """A workload with its own world and its own faults, which last ``seconds``."""
 
     seconds: float
 
     @property
     def faults(self) -> Sequence[object]:
-        """The faults of the workload."""
+        """Return the faults of the workload."""
 
     @property
     def digest(self) -> str:
-        """A hash of all events."""
+        """Return a hash of all events."""
 
     def run(self) -> list[str]:
-        """Run the workload and return one line per violation."""
+        """Run the workload; return one line per violation."""
 
 
 WORKLOADS: dict[str, Callable[[Schedule], Workload]] = {
@@ -50,17 +50,17 @@ WORKLOADS: dict[str, Callable[[Schedule], Workload]] = {
 }
 """The workloads that share a world, in the order in which they act."""
 ALONE: dict[str, Callable[[int, Reduction], Alone]] = {"tasks": Tasks, "leases": Leases, "groups": Groups}
-"""The workloads with separate worlds and faults."""
+"""The workloads that have their own world and faults."""
 SHARES = {"records": 0.15, "tuples": 0.06, "stores": 0.06, "wire": 0.06, "deciders": 0.06, "groups": 0.06}
-"""The share of schedules with each workload, unless it is requested; the others are in all schedules."""
+"""The share of schedules that contain a workload if it is not requested. All other workloads are in every schedule."""
 
 
 @dataclass(frozen=True)
 class Outcome:
-    """The result of one schedule: its ``title``, the violations (``found``), and the hash of all datagrams.
+    """The result of one schedule: its ``title``, its violations (``found``), and the hash of all datagrams.
 
-    ``names`` are its workloads, ``faults`` the largest number of faults in a world, and ``seconds`` the longest
-    duration of a world.
+    ``names`` are the schedule's workloads, ``faults`` is the largest number of faults in one of its worlds, and
+    ``seconds`` the longest duration of a world.
     """
 
     seed: int
@@ -73,14 +73,14 @@ class Outcome:
 
     @property
     def worlds(self) -> list[tuple[str, ...]]:
-        """The workloads of each independent world."""
+        """Return the workloads of each independent world."""
         alone = [(name,) for name in self.names if name in ALONE]
         together = tuple(name for name in self.names if name in WORKLOADS)
         return [*alone, together] if together else [*alone]
 
 
 def drawn(seed: int) -> list[str]:
-    """Return the workloads of a seed."""
+    """Return the random workloads of a seed."""
     rng = random.Random(f"workloads/{seed}")
     return [
         *(name for name, share in SHARES.items() if rng.random() < share),
@@ -89,9 +89,9 @@ def drawn(seed: int) -> list[str]:
 
 
 def run(seed: int, only: tuple[str, ...] = (), bug: str | None = None, trim: Reduction = NO_REDUCTION) -> Outcome:
-    """Run the schedule of ``seed``, with the workloads ``only`` if given, and with a seeded bug.
+    """Run the schedule of ``seed``, with the workloads ``only`` (if given) and the seeded bug ``bug``.
 
-    ``trim`` is the part of the schedule that remains; its workloads have precedence over ``only``.
+    ``trim`` is the part of the schedule that remains; its workloads take precedence over ``only``.
     """
     names = tuple(trim.only or only or drawn(seed))
     with seeded(bug):
@@ -128,7 +128,7 @@ Hunted = tuple[str, tuple[str, ...], int, Outcome | None]
 
 
 def hunt(number: int, seeds: Sequence[int]) -> Hunted:
-    """Look for the bug of this number, one schedule after the other."""
+    """Run one schedule after the other until one detects the bug with this number."""
     bug = list(BUGS)[number]
     only = FINDERS[bug]
     for needed, seed in enumerate(seeds, start=1):
@@ -145,7 +145,7 @@ def hunt_all(seeds: Sequence[int], jobs: int, scheduler: str = "") -> Iterator[H
 
 @dataclass(frozen=True)
 class Least:
-    """The smallest failing ``trim``, its outcome, and the number of ``runs`` to find it."""
+    """The smallest failing ``trim``, its outcome, and the number of ``runs`` that were needed to find it."""
 
     trim: Reduction
     outcome: Outcome
@@ -158,7 +158,7 @@ def least(
     is_over: Callable[[], bool] = lambda: False,
     whole: Reduction = NO_REDUCTION,
 ) -> Least:
-    """Shrink a failed schedule while it violates the same invariant, until ``is_over`` returns true.
+    """Reduce a failed schedule that still violates the same invariant, until ``is_over`` returns true.
 
     ``whole`` is the part of the schedule that the failed run had.
     """
@@ -178,7 +178,7 @@ def least(
 
     worlds = outcome.worlds
     if len(worlds) > 1:
-        # The worlds are independent, so one of them fails alone.
+        # The worlds are independent, so one of them fails by itself.
         any(fails(replace(whole, only=world)) for world in worlds)
     left = best.outcome
     reduce_run(best.trim, left.faults, left.names if len(left.worlds) == 1 else (), left.seconds, fails)

@@ -1,9 +1,11 @@
 """Run random sequences of stops, releases, partitions, restarts and hostile messages on the stops of a small team.
 
-The stop states are the product's.  The network below them delays, repeats and loses messages, disks lose unwritten
-data, and replicas forget records and return old ones.  Checked after each step: once a robot's node has acknowledged a
-stop by an honest operator, the robot stands until it receives a release that names this stop, from a member with the
-right to order.  Checked at the end, with a healthy network: an operator can release the whole team.
+The stop states are objects of the product. The network below them delays, repeats and loses messages; disks lose
+unwritten data; replicas forget records and return old ones.
+
+One invariant is checked after each step: once a robot's node has acknowledged a stop by an honest operator, the robot
+stands still until it receives a release of this stop from a member that may stop the team. Another is checked at the
+end, with a healthy network: an operator can release the whole team.
 
 ``python -m tests.invariants.stops --sequences 10000 --seed 1`` runs 10,000 sequences and prints the counts of events.
 """
@@ -58,7 +60,7 @@ HONEST = ("ann", "bob", "web")
 ROBOTS = ("dog1", "dog2", "dog3")
 NODES = (*HONEST, *ROBOTS)
 OUTSIDE = "invented"
-"""The signer with a key of no member."""
+"""The signer whose key belongs to no member."""
 
 
 class Violation(AssertionError):
@@ -115,29 +117,29 @@ class Life:
             self.stop_state.subscribe(self.obey)
 
     def obey(self) -> str:
-        """Obey the stop as an agent does."""
+        """Update the stop state as an agent does; return the activity of the robot."""
         if not self.stop_state.is_known:
             self.stop_state.request_stops()
         return STANDS_STILL if self.stop_state.is_motion_forbidden else "goes on"
 
     def expose(self, name: str, answer: Callable[..., Any], changes: bool, idempotent: bool) -> None:
-        """Store the handler of the calls."""
+        """Store the handler of calls to this node."""
         self.answer = answer
 
     def later(self, seconds: float, call: Callable[[], None]) -> None:
-        """Schedule a call that is dropped at the end of this run."""
+        """Schedule a call that is dropped when this run of the node ends."""
         self.net.clock.callLater(seconds, lambda: None if self.is_over else call())
 
     def may_call(self, public: bytes, method: str) -> bool:
-        """Return whether a present member may call the method."""
+        """Return whether the member may call the method now."""
         return self.net.may(public)
 
     def may_store(self, slot: Slot) -> bool:
-        """Return whether the owner may write the slot at present."""
+        """Return whether the owner may write the slot now."""
         return self.net.may(slot.owner)
 
     def may_stay(self, slot: Slot) -> bool:
-        """Keep each stored record, as the most permissive replica does."""
+        """Return True: the node keeps every stored record, like the most permissive replica."""
         return True
 
     def call(self, contact: Contact, method: str, *arguments: object, changes: bool = False) -> Deferred[Any]:
@@ -159,13 +161,13 @@ class Life:
         return succeed(records)
 
     def watch(self, key: bytes, changed: Callable[[list[Record]], None], keep: bool) -> Life:
-        """Watch the records at this node; the watch is this object."""
+        """Watch the records at this node; return this object as the watch."""
         self.changed = changed
         self.look()
         return self
 
     def look(self) -> None:
-        """Notify the watch of changed records."""
+        """Notify the watch if the records have changed."""
         records = self.net.newest([self.name])
         if self.changed is not None and records != self.records:
             self.records = records
@@ -197,7 +199,7 @@ class Net:
     # -- interface for the nodes ------------------------------------------------------------------------------------
 
     def may(self, public: bytes) -> bool:
-        """Return whether the owner of this key is a member with the right to order."""
+        """Return whether the owner of this key is a member that may stop the team."""
         name = self.names.get(public, "")
         return name in TEAM and name not in self.revoked and roles.may_call((TEAM[name],), METHOD)
 
@@ -215,7 +217,7 @@ class Net:
         return [best[owner] for owner in sorted(best)]
 
     def write(self, name: str, value: bytes) -> None:
-        """Write a new record of an owner to its replica, or to a random one if the owner is no node."""
+        """Write a new record of an owner to the owner's replica, or to a random replica if the owner is not a node."""
         own = self.identities[name].public
         known = [r.sequence for r in (*self.old, *self.newest(list(NODES))) if r.owner == own]
         record = Record(STOPS_KEY, SLOT, own, max(known, default=0) + 1, "team", 600.0, value, self.rng.randbytes(64))
@@ -223,7 +225,7 @@ class Net:
         self.hold(name if name in NODES else self.rng.choice(NODES), record)
 
     def hold(self, name: str, record: Record) -> None:
-        """Store a record at a replica if it beats the present one and its owner may write it."""
+        """Store a record at a replica if it is newer than the present record and its owner may write it."""
         owner = self.names.get(record.owner)
         if owner is not None and not self.may(record.owner):
             return
@@ -233,7 +235,7 @@ class Net:
                 self.lives[name].look()
 
     def reached(self, name: str, records: list[Record]) -> None:
-        """Record the releases that reach a robot in records of members with the right to order."""
+        """Record the releases that reach a robot in records of members that may stop the team."""
         for record in records:
             if name in ROBOTS and self.may(record.owner) and _is_msgpack(record.value):
                 self.released(name, msgpack.unpackb(record.value or b""))
@@ -245,7 +247,7 @@ class Net:
             self.owed[name] -= set(statement.released)
 
     def send(self, sender: str, to: str, arguments: tuple[Any, ...]) -> Deferred[Any]:
-        """Send a call; the request or its answer may be lost."""
+        """Send a call; the request or its reply may be lost."""
         self.sent.append((sender, to, arguments))
         if not self.reaches(sender, to) or self.rng.random() < 0.1:
             return fail(NoAnswer("lost"))
@@ -253,7 +255,7 @@ class Net:
         return fail(NoAnswer("lost")) if self.rng.random() < 0.1 else answered
 
     def deliver(self, sender: str, to: str, arguments: tuple[Any, ...]) -> Deferred[Any]:
-        """Process a call as the endpoint of ``to`` does: check the role, the types, then call the method."""
+        """Process a call as the endpoint of ``to`` does: check the role and the types, then call the method."""
         if not self.may(self.identities[sender].public):
             self.counts["refused"] += 1
             return fail(Refused("role"))
@@ -274,7 +276,7 @@ class Net:
             status, obeyed = answer
             if to in ROBOTS and life is self.lives.get(to) and not status.endswith(NOT_SAVED):
                 ids = {stop for stop, _ in obeyed} & self.tracked
-                # A release may have arrived between the order and the end of the write.
+                # A release may have arrived between the stop and the end of the write.
                 fresh = {stop for stop, _ in arguments[0]} & ids & set(life.stop_state.stops)
                 self.owed[to] |= fresh
                 self.counts["acknowledged"] += len(fresh)
@@ -299,7 +301,7 @@ class Net:
         if name:
             before = set(self.lives[name].stop_state.stops)
             asked = self.lives[name].stop_state.stop
-            # The id must be known before the first answer arrives.
+            # The id must be known before the first reply arrives.
             state = self.rng.getstate()
             self.tracked.add(self.rng.randbytes(ID_BYTES))
             self.rng.setstate(state)
@@ -307,7 +309,7 @@ class Net:
             self.counts["stops"] += bool(set(self.lives[name].stop_state.stops) - before)
 
     def release(self) -> None:
-        """Let an honest operator release some or all stops that it knows."""
+        """Let an honest operator release some or all of the stops that it knows."""
         name = self.orderer()
         if name:
             known = list(self.lives[name].stop_state.stops)
@@ -321,13 +323,13 @@ class Net:
         return self.rng.choice(up) if up else ""
 
     def partition(self) -> None:
-        """Divide the network in two, or heal it."""
+        """Partition the network, or heal it."""
         is_whole = self.rng.random() < 0.5
         self.sides = {name: 0 if is_whole else self.rng.randrange(2) for name in TEAM}
         self.counts["partitions"] += 1
 
     def restart(self) -> None:
-        """Crash one node or all, and restart them later."""
+        """Crash one node or all nodes, and restart them later."""
         for name in NODES if self.rng.random() < 0.1 else [self.rng.choice(NODES)]:
             life = self.lives.pop(name, None)
             if life is None:
@@ -345,7 +347,7 @@ class Net:
             self.begin(name)
 
     def forget(self) -> None:
-        """Let a replica lose a record, as at its expiry."""
+        """Let a replica lose a record, as if the record had expired."""
         name = self.rng.choice(NODES)
         if self.replicas[name]:
             del self.replicas[name][self.rng.choice(list(self.replicas[name]))]
@@ -373,7 +375,7 @@ class Net:
             self.hold(self.rng.choice(NODES), self.rng.choice(self.old))
 
     def revoke(self) -> None:
-        """Revoke an operator; one honest operator remains."""
+        """Revoke an operator; at least one honest operator remains."""
         name = self.rng.choice(("bob", "web", "thief"))
         if name not in self.revoked and self.rng.random() < 0.3:
             self.revoked.add(name)
@@ -385,12 +387,12 @@ class Net:
             self.counts["revoked"] += 1
 
     def attack(self) -> None:
-        """Send a hostile message from a member without the right to order, an invented key or a stolen operator key."""
+        """Send a hostile message from a member that must not stop the team, or with an invented or stolen key."""
         self.counts["hostile"] += 1
         sender = self.rng.choice(("eye", "boot", "dog1", "thief", OUTSIDE))
         known = list(self.tracked)
         if sender == "thief" and self.rng.random() < 0.9:
-            known = []  # it may release known stops; the attack is invented ones
+            known = []  # a stolen key may release known stops, so most such attacks invent stops
         arguments = self.rng.choice(
             [
                 lambda: (2 ** self.rng.choice((31, 53, 63)), self.rng.random() < 0.5, sender),
@@ -416,11 +418,11 @@ class Net:
     # -- invariants -------------------------------------------------------------------------------------------------
 
     def check(self, what: str) -> None:
-        """Check that no robot with an unreleased stop may move."""
+        """Check that a robot with a stop that has not been released cannot move."""
         for name in ROBOTS:
             life = self.lives.get(name)
             if life is not None and self.owed[name] and not life.stop_state.is_motion_forbidden:
-                raise Violation(f"after {what} {name} may move, though {len(self.owed[name])} stops are not released")
+                raise Violation(f"after {what} {name} may move, although {len(self.owed[name])} stops are not released")
 
     def step(self) -> None:
         """Run one random event."""
@@ -445,14 +447,14 @@ class Net:
         self.check("a while")
 
     def tick(self, seconds: float) -> None:
-        """Let time pass, and let the agents refresh their stop states."""
+        """Let time pass; let the agents update their stop states."""
         self.clock.advance(seconds)
         for name in ROBOTS:
             if name in self.lives and self.lives[name].stop_state.is_motion_forbidden:
                 self.lives[name].stop_state.recheck()
 
     def end(self) -> None:
-        """Restart all nodes, end the attacks, and let an operator release all stops that the devices name."""
+        """Restart all nodes, end the attacks, and let an operator release all stops that the devices report."""
         self.sides = dict.fromkeys(TEAM, 0)
         self.revoked.add("thief")
         gone = self.identities[OUTSIDE].public, *(self.identities[name].public for name in self.revoked)
@@ -471,11 +473,11 @@ class Net:
             self.check("the end")
         standing = [name for name in ROBOTS if self.lives[name].stop_state.is_motion_forbidden]
         if standing:
-            raise Violation(f"no release lets {', '.join(standing)} go on")
+            raise Violation(f"{', '.join(standing)} remain stopped after the release")
 
 
 def run(seed: int, counts: Counter[str]) -> None:
-    """Run one sequence; raise ``Violation`` if an invariant fails."""
+    """Run one sequence; raise ``Violation`` if an invariant is violated."""
     net = Net(seed, counts)
     counts["sequences"] += 1
     for _ in range(STEPS):
@@ -490,7 +492,7 @@ def _expected(failure: Failure) -> None:
 def _is_msgpack(value: bytes | None) -> bool:
     try:
         msgpack.unpackb(value or b"")
-    except Exception:  # the decoder raises many kinds on crafted bytes
+    except Exception:  # the decoder raises exceptions of many types on crafted bytes
         return False
     return True
 
@@ -498,8 +500,10 @@ def _is_msgpack(value: bytes | None) -> bool:
 def main() -> int:
     """Run the command; return 1 if a sequence failed."""
     parser = argparse.ArgumentParser(prog="python -m tests.invariants.stops", description=__doc__)
-    parser.add_argument("--sequences", type=int, default=10_000, help="how many to run (default 10000)")
-    parser.add_argument("--seed", type=int, default=1, help="the seed of the first; the others follow (default 1)")
+    parser.add_argument("--sequences", type=int, default=10_000, help="number of sequences (default 10000)")
+    parser.add_argument(
+        "--seed", type=int, default=1, help="first seed; the next sequences use the next seeds (default 1)"
+    )
     args = parser.parse_args()
     counts: Counter[str] = Counter()
     failed = 0

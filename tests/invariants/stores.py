@@ -1,4 +1,4 @@
-"""The workload of stores: full and corrupt disks, and S-a to S-c for nodes that lose power."""
+"""The workload of stores: full and corrupt disks; it checks S-a to S-c for nodes that lose power."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ FULL = "database or disk is full"
 EARLY = (0.05, 0.1, 0.2, 0.5, 1.0, 2.0)
 """The times in seconds at which a node with a corrupt store is read."""
 RECOVERY = 2.0
-"""The time in seconds within which a node writes again after space is available (S-c)."""
+"""The time in seconds within which a node must write again after space has become available (S-c)."""
 
 
 class Stores(Workload):
@@ -37,21 +37,21 @@ class Stores(Workload):
         schedule.team.watch_lives(self._born, lambda place, node: None)
         voters = min(schedule.n, 8)
         deaths = sum(len(fault.places) for fault in schedule.faults if fault.kind == "die")
-        # A corrupt store is one replica less; the invariants hold only while a majority remains.
+        # A corrupt store removes a replica; the invariants hold only if a majority of the replicas remains.
         if deaths + 1 <= voters // 2:
             killed = [place for fault in schedule.faults if fault.kind.startswith("kill") for place in fault.places]
             if killed:
                 schedule.team.planned_corruption[self._rng.choice(killed)] = self._rng.choice(["row", "file"])
 
     def step(self) -> None:
-        """Fill a disk, probe a full one, or free space."""
+        """Fill a disk, probe a full disk, or free space."""
         if self._full is None:
             alive = self._schedule.alive()
             if alive and self._rng.random() < 0.1:
                 place = self._rng.choice(alive)
                 self._full = (place, self._fleet.get_store(place))
                 self._full[1].writer.fault = FULL
-                # It may last longer than the other faults, but not longer than the repair interval.
+                # The fault may last longer than the other faults, but not longer than the repair interval.
                 self._fleet.clock.callLater(self._rng.choice([1.0, 4.0, 8.0]), self._make_room)
             return
         place, store = self._full
@@ -59,16 +59,16 @@ class Stores(Workload):
             self._probe(place, store)
 
     def make_final_requests(self) -> None:
-        """Check that all data is written by now."""
+        """Check that all data has been written by now."""
         for place in self._schedule.alive():
             store = self._fleet.get_store(place)
             if store.write_error:
-                self._say("S-c", f"node {place} does not write again: {store.write_error}")
+                self._say("S-c", f"node {place} has not resumed writing: {store.write_error}")
             written = store.wait_for_write()
             written.addErrback(self._unwritten, place)
 
     def find_violations(self) -> list[str]:
-        """Return the violations, after a comparison of memory and files."""
+        """Compare the data in memory with the files; return all violations."""
         for line in self._fleet.lost:
             self._say("S-a", line)
         for line in self._fleet.undetected:
@@ -92,7 +92,7 @@ class Stores(Workload):
                 self._fleet.clock.callLater(moment, self._read_early, place, node)
 
     def _read_early(self, place: int, node: EntangledNode) -> None:
-        """Read at a node with a corrupt store: it must not deny records that a majority holds."""
+        """Read at a node with a corrupt store, which must not deny records that a majority stores."""
         if place not in self._schedule.alive() or self._schedule.node(place) is not node:
             return
         for key in KEYS:
@@ -101,7 +101,7 @@ class Stores(Workload):
 
     def _read(self, records: list[Record], place: int, key: bytes) -> None:
         if not records and self._is_held(key):
-            self._say("S-b", f"node {place}, whose store has rotted, finds nothing under {key.hex()[:6]}")
+            self._say("S-b", f"node {place}, whose store is corrupt, finds no record under {key.hex()[:6]}")
 
     def _is_held(self, key: bytes) -> bool:
         holders = [place for place in self._schedule.alive() if self._fleet.get_store(place).get(key)]
@@ -118,10 +118,10 @@ class Stores(Workload):
 
     def _recovered(self, place: int, store: CheckedStore) -> None:
         if store.write_error and not store.writer.is_closed and not store.writer.fault:
-            self._say("S-c", f"node {place} does not write {RECOVERY:.0f} s after there was room: {store.write_error}")
+            self._say("S-c", f"node {place} does not write {RECOVERY:.0f} s after space was freed: {store.write_error}")
 
     def _probe(self, place: int, store: CheckedStore) -> None:
-        """Write to the node with the full disk locally and from another node."""
+        """Write twice to the node with the full disk: once locally, once from another node."""
         self._number += 1
         node = self._schedule.node(place)
         record = self._record(node)
@@ -130,7 +130,7 @@ class Stores(Workload):
         except Unwritable:
             pass
         else:
-            self._say("S-c", f"node {place} takes a record while its disk is full")
+            self._say("S-c", f"node {place} accepts a record while its disk is full")
         if not node._running:
             self._say("S-c", f"node {place} left because its disk is full")
         others = [other for other in self._schedule.alive() if other != place]
@@ -148,7 +148,7 @@ class Stores(Workload):
     def _refused(self, failure: Failure, place: int) -> None:
         failure.trap(EntangledError)
         if "internal" in str(failure.value):
-            self._say("S-c", f"node {place} does not say why it takes nothing: {failure.value}")
+            self._say("S-c", f"node {place} does not report why it rejects the record: {failure.value}")
 
     def _record(self, node: EntangledNode) -> Record:
         name = f"probe {self._number}"

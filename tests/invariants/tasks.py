@@ -1,6 +1,7 @@
-"""The workload of tasks: complete agents over a network in memory, with all their decisions and actions (E4 to E7).
+"""The workload of tasks: complete agents over a network in memory, with all their decisions and actions.
 
-It needs no team of nodes: ``python -m tests.invariants --only tasks`` runs it alone, in milliseconds per schedule.
+It checks the invariants E4 to E7 and needs no team of nodes: ``python -m tests.invariants --only tasks`` runs it alone,
+in milliseconds per schedule.
 """
 
 from __future__ import annotations
@@ -36,7 +37,7 @@ HEARD = 3.0
 
 
 class Tasks:
-    """One schedule: agents, tasks and faults from ``seed``."""
+    """One schedule of agents, tasks and faults, which ``seed`` determines."""
 
     def __init__(self, seed: int, trim: Reduction = NO_REDUCTION) -> None:
         self.rng = random.Random(f"tasks/{seed}")
@@ -89,7 +90,7 @@ class Tasks:
 
     @property
     def digest(self) -> str:
-        """A hash of all assignments and their times."""
+        """Return a hash of all assignments with their times."""
         return hashlib.blake2s("".join(self.trace).encode(), digest_size=8).hexdigest()
 
     # -- events -----------------------------------------------------------------------------------------------------
@@ -105,7 +106,7 @@ class Tasks:
         agent.startService()
 
     def death(self, place: int) -> None:
-        """End an agent without notice."""
+        """End an agent without notifying the others."""
         self.history.record(Died, place)
         del self.ether.nodes[place]
         self.agents.pop(place).stopService()
@@ -152,7 +153,7 @@ class Tasks:
         self.enter(self.any_task())
 
     def enter(self, task: Task) -> None:
-        """Add ``task`` to the schedule."""
+        """Add ``task`` to the tasks of the schedule."""
         self.tasks[task.task_id] = task
         self.history.record_request("operator", "submit", task.task_id)
         self.ether.submit(task)
@@ -191,7 +192,7 @@ class Tasks:
         return not any(task_queue.open_ids or any(map(task_queue.is_new, self.tasks)) for task_queue in task_queues)
 
     def late(self) -> None:
-        """Expire the outcome's record while the task is still listed."""
+        """Let the record of each outcome expire although its task is still listed."""
         for name in self.tasks:
             if self.ether.outcome(OPERATOR, name) is not None:
                 self.history.record(OutcomeExpired, name)
@@ -207,7 +208,7 @@ class Tasks:
     # -- observations -----------------------------------------------------------------------------------------------
 
     def watch(self) -> None:
-        """Inspect each agent."""
+        """Inspect each agent, and record acknowledged outcomes."""
         now = self.clock.seconds()
         for name, known in self.ether.acknowledged.items():
             if self._acknowledged.get(name) is not known:
@@ -230,7 +231,7 @@ class Tasks:
                     self.trace.append(f"{now:.2f} {name} dog{place} {token}")
 
     def holding(self, agent: Agent) -> tuple[str, ...]:
-        """Return the tasks for which an agent holds the lease; none in this workload."""
+        """Return no tasks: this workload does not check which leases an agent holds."""
         return ()
 
     @contextmanager
@@ -287,10 +288,10 @@ class Tasks:
 
 
 class Groups(Tasks):
-    """The workload of groups: tasks that are divided together, and the leases that agents hold (E8)."""
+    """The workload of groups: tasks that are assigned jointly, and the leases that agents hold (E8)."""
 
     def submit(self) -> None:
-        """Submit one to three tasks, most of them in one group, all with the schedule's strategy."""
+        """Submit one to three tasks, most of them in one group, all with the strategy of the schedule."""
         rng = self.rng
         strategy = ("group_optimal", "cbba", "nearest")[self.n % 3]
         for _ in range(rng.choice([1, 2, 3])):
@@ -308,5 +309,5 @@ class Groups(Tasks):
 
 
 def faded(task: Task, **changes: Any) -> Task:
-    """Return the task with an operator's change."""
+    """Return the task after an operator's change has been applied."""
     return replace(task, generation=task.generation + 1, **changes)

@@ -1,4 +1,7 @@
-"""The workload of tuples: puts, takes, claims and reads by several clients, and their results (T1 to T6)."""
+"""The workload of tuples: several clients put, take, claim and read tuples.
+
+It records the results and checks the invariants T1 to T6.
+"""
 
 from __future__ import annotations
 
@@ -30,15 +33,19 @@ MOST_WAITING = 6
 SWEEP = 3.0
 """The time in seconds after the repair interval at which a client takes all remaining tuples."""
 FETCH = 5.0
-"""The time in seconds after which a client waits for each tuple that still remains.  The rest of the run has time for
-two rounds in which the council waits for a failed member (1.5 s each): one may be outbid by a taker's bid before its
-failure, and the next one knows the counter of this bid.  A sweep that took a tuple ends after the first round, as
-``get_many`` may, and a second sweep from another node starts at the same tuple: a tuple that both leave is not
-necessarily stuck."""
+"""The time in seconds after which a client waits for each tuple that remains.
+
+The rest of the run has time for two rounds of 1.5 s each, in which the council waits for a failed member.  The first
+round may be outbid by a bid that a taker made before it failed; the second round knows the counter of that bid.
+Sweeps are not enough: a sweep that took a tuple ends after the first round, like ``get_many``, and a sweep from
+another node starts at the same tuple.  So a tuple that two sweeps leave is not necessarily stuck."""
 
 
 class Tuples(Workload):
-    """Clients of each node put, take, claim and read jobs; two wait for a bell tuple, put at the end."""
+    """Clients of each node put, take, claim and read jobs.
+
+    Two clients wait for a bell tuple, which is put at the end.
+    """
 
     def __init__(self, schedule: Schedule) -> None:
         self._schedule = schedule
@@ -65,10 +72,10 @@ class Tuples(Workload):
             act(place, self._spaces[place])
 
     def make_final_requests(self) -> None:
-        """Let all nodes read all tuples, then put the bell and take the remaining tuples, at last one by one."""
+        """Let all nodes read all tuples, put the bell, and take the remaining tuples, finally one by one."""
         for place, space in sorted(self._spaces.items()):
             self._survey(place, space)
-            self._listen(f"node {place}, which waits in the calm", space)
+            self._listen(f"node {place}, which waits without faults", space)
         self._clock.callLater(1.0, self._ring)
         self._clock.callLater(SWEEP, self._sweep)
         self._clock.callLater(FETCH, self._fetch)
@@ -89,7 +96,7 @@ class Tuples(Workload):
         space = self._spaces[place] = TupleSpace(node, self._clock, rng)
         self._witness.wrap_member(node.take_acceptor, node.endpoint.expose, node.identity.public)
         if place < 2:
-            # Later, as the node may not have started yet.
+            # Later, because the node may not have started yet.
             self._clock.callLater(0.1, self._wait, place, space)
 
     def _died(self, place: int, node: EntangledNode) -> None:
@@ -99,14 +106,14 @@ class Tuples(Workload):
 
     def _wait(self, place: int, space: TupleSpace) -> None:
         if self._spaces.get(place) is space:
-            self._waiting[place] = self._listen(f"node {place}, which waits through it all", space)
+            self._waiting[place] = self._listen(f"node {place}, which waits from the start", space)
 
     def _left(self) -> list[StoredTuple]:
-        """Return the acknowledged tuples that were not taken and must still be takeable."""
+        """Return the acknowledged tuples that were not taken and must still be available."""
         return [p for p in self._witness.list_undecided() if p.fields in self._acknowledged and self._can_decide(p)]
 
     def _can_decide(self, stored_tuple: StoredTuple) -> bool:
-        """Return whether a majority of the council is online with its state."""
+        """Return whether a majority of the council is online and has its state."""
         acceptors = {
             node.identity.public: node.take_acceptor for node in map(self._schedule.node, self._schedule.alive())
         }
@@ -137,7 +144,7 @@ class Tuples(Workload):
         self._taking(space.get_many(JOB, self._rng.choice([1, 3])), place)
 
     def _taking(self, taking: Deferred[list[Tuple]], place: int) -> None:
-        """Record a client's take."""
+        """Record a take of a client."""
         record_outcome(self._history, self._history.record_request(place, TAKE, "job"), taking, tuple)
 
     def _claim(self, place: int, space: TupleSpace) -> None:
@@ -160,7 +167,7 @@ class Tuples(Workload):
         space.read_all(JOB).addErrback(_weather)
 
     def _again(self, place: int, space: TupleSpace) -> None:
-        """Ask members again to confirm a decided take: each member that accepted it must repeat its answer."""
+        """Ask members again to confirm a decided take: each member that accepted it must repeat its reply."""
         decided = [one for one in self._witness.tuples.values() if self._witness.find_takers(one.tuple_id)]
         if not decided:
             return
@@ -211,7 +218,7 @@ class Tuples(Workload):
         self._taking(self._spaces[place].get_many(JOB, 1000), place)
 
     def _fetch(self) -> None:
-        """Wait for each tuple separately, so that one which cannot be taken does not block the others."""
+        """Wait for each tuple separately, so a tuple that cannot be taken does not block the others."""
         for posted in self._left():
             place = self._rng.choice(sorted(self._spaces))
             self._get(posted.fields, place, self._spaces[place])

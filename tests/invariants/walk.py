@@ -16,7 +16,7 @@ from middleware.entangled.clock import HeapClock
 
 
 class Walk:
-    """Walk along a line to a target; the cost is in quarters, so that equal costs are frequent."""
+    """Walk along a line to a target; the cost is rounded to quarters, so equal costs are frequent."""
 
     def __init__(self, parameters: Mapping[str, float | str], rng: random.Random) -> None:
         self._target = float(parameters["target"])
@@ -30,12 +30,12 @@ class Walk:
 
     @property
     def cost(self) -> float | None:
-        """The distance, rounded to quarters."""
+        """Return the distance, rounded to quarters."""
         return None if self._place is None else round(4.0 * abs(self._target - self._place) + self._drift) / 4.0
 
     @property
     def is_safe(self) -> bool:
-        """False at some positions, at which the robot must not be stopped."""
+        """Return False at some positions, at which the robot must not be stopped."""
         return self._place is None or round(5.0 * self._place) % 5 != 0
 
     def search(self, now: float) -> Action:
@@ -69,11 +69,11 @@ class Robot:
 
     @property
     def token(self) -> int:
-        """The highest token that the robot has obeyed."""
+        """Return the highest token that the robot has accepted."""
         return self._gate.token or 0
 
     def connect(self) -> Deferred[None]:
-        """Start to send observations."""
+        """Start sending observations."""
         self._is_on = True
         self._clock.callLater(0.1, self._live)
         return succeed(None)
@@ -93,7 +93,7 @@ class Robot:
         return lambda: None
 
     def observe(self) -> None:
-        """Do nothing, as observations are pushed."""
+        """Do nothing, because observations are pushed."""
 
     def stop(self) -> None:
         """Stop the robot."""
@@ -116,7 +116,7 @@ class Robot:
 
 
 def restarted(robot: Robot, clock: HeapClock) -> Robot:
-    """Return the robot for its restarted node, with the same gate."""
+    """Return the robot for its restarted node; the gate is the same."""
     again = Robot(clock, robot.place)
     again._gate = robot._gate
     return again

@@ -1,7 +1,7 @@
-"""The workload of the wire: injected datagrams that no correct node sends, and their effects (R1 to R4).
+"""The workload of the wire: injects datagrams that no correct node sends, and checks their effects (R1 to R4).
 
-The datagrams are derived from delivered ones: repeated, changed, truncated, sent to another node, or to the restarted
-node.  Answers to them are held back, so that an injection changes only counters.
+The datagrams are derived from delivered datagrams: repeated, changed, truncated, or sent to another node or to the
+restarted node. The replies to injected datagrams are not delivered, so an injection changes only counters.
 """
 
 from __future__ import annotations
@@ -45,7 +45,7 @@ STRANGER = Address("10.66.6.6", 666)
 REMEMBERED = 6
 """The number of datagrams stored for each node and type."""
 FLOOD = 150
-"""The number of handshakes that a client with the team's key starts at once: above the limit without a cookie."""
+"""The number of simultaneous handshakes of a client with the team's key; it exceeds the limit without a cookie."""
 
 
 @implementer(ILogObserver)
@@ -62,7 +62,7 @@ class Ear:
 
 
 class Wire(Workload):
-    """Injects datagrams into running nodes, counts the runs of a method, and checks all table sizes at the end."""
+    """Injects datagrams into running nodes, counts the executions of a method, and checks table sizes at the end."""
 
     def __init__(self, schedule: Schedule) -> None:
         self._schedule = schedule
@@ -96,11 +96,11 @@ class Wire(Workload):
                 )
 
         vars(self._board).update(_transmit=tapped_carry, _deliver=tapped_deliver)
-        # Stored datagrams are kept after the end of a node, and injected into its next run.
+        # Recorded datagrams are kept after a node has ended, and injected into its next run.
         schedule.team.watch_lives(self._born, lambda place, node: None)
 
     def step(self) -> None:
-        """Inject one or two datagrams, and send a request that must run at most once."""
+        """Inject one or two datagrams, and send a request that must be executed at most once."""
         alive = self._schedule.alive()
         if not alive:
             return
@@ -111,7 +111,7 @@ class Wire(Workload):
             self._ask(requester, responder)
 
     def make_final_requests(self) -> None:
-        """Inject a last datagram at each node, and flood one with handshakes."""
+        """Inject a last datagram at each node, and flood one node with handshakes."""
         alive = self._schedule.alive()
         for place in alive:
             self._shoot(place)
@@ -125,10 +125,10 @@ class Wire(Workload):
                 self._history.record(TableSize, place, what, size, cap)
         return []
 
-    # -- injected datagrams (R1, R3) --------------------------------------------------------------------------------
+    # -- injected datagrams (invariants R1, R3) ---------------------------------------------------------------------
 
     def _shoot(self, place: int) -> None:
-        """Inject a datagram that the node must drop, and compare the node's state before and after."""
+        """Inject a datagram that the node must drop; compare the node's state before and after."""
         own = self._schedule.team.address(place)
         shot = self._made(own)
         if shot is None:
@@ -141,7 +141,7 @@ class Wire(Workload):
         globalLogPublisher.addObserver(self._ear)
         try:
             receiver(datagram, source)
-        except Exception as error:  # it must raise nothing
+        except Exception as error:  # no exception is permitted
             raised = repr(error)
         finally:
             globalLogPublisher.removeObserver(self._ear)
@@ -154,7 +154,7 @@ class Wire(Workload):
         """Return a datagram for the node at ``own``: its kind, source and bytes."""
         rng, now = self._rng, self._schedule.team.clock.seconds()
         kind = rng.choice(KINDS)
-        if kind == "greeting":  # valid, from an address that is not yet proven
+        if kind == "greeting":  # valid, but from an address that is not verified
             return kind, STRANGER, pack_discovery(derive_key(TEAM_KEY, b"greet"), rng.randbytes(TOKEN_BYTES), rng)
         source = rng.choice([STRANGER, None])
         place = own
@@ -168,9 +168,9 @@ class Wire(Workload):
             return None
         recorded = known[rng.choice(sorted(known))]
         _, sender, datagram = rng.choice(recorded)
-        at = min(when for when, _, other in recorded if other == datagram)  # it may have been retransmitted
+        at = min(when for when, _, other in recorded if other == datagram)  # the datagram may have been retransmitted
         if kind == "replayed" and datagram[0] == INIT and at < max(now - RESPONSES_S, self._born_at[own]):
-            # It opens a session that is of no use to an attacker without its keys.
+            # This opens a session that is useless to an attacker without its keys.
             return None
         if kind == "forged":
             where = rng.randrange(len(datagram))
@@ -184,13 +184,13 @@ class Wire(Workload):
         return kind, source or sender, datagram
 
     def _state(self, node: EntangledNode) -> str:
-        """Return a name for the state of a node: equal states have equal names, in each process."""
+        """Return a name for the state of a node. Equal states have equal names in all processes."""
         clock = self._schedule.team.clock
         calls = sorted((time, order) for time, order, call in clock._heap if call.active())
         return self._states.setdefault(state_of([node, node.store, calls]), f"state {len(self._states)}")
 
     def _flood(self, place: int) -> None:
-        """Start more handshakes at once than a node answers, from unknown members."""
+        """Start more handshakes from unknown members than a node handles simultaneously."""
         node = self._schedule.node(place)
         static = derive_exchange_key(node.identity.public)
         rng = random.Random(f"flood/{self._schedule.seed}")
@@ -202,7 +202,7 @@ class Wire(Workload):
         half_open = len(node.endpoint._half_open._unconfirmed)
         self._history.record(TableSize, place, "handshakes with who showed no cookie", half_open, FLOOD * 4 // 5)
 
-    # -- requests (R2) ----------------------------------------------------------------------------------------------
+    # -- requests (invariant R2) ------------------------------------------------------------------------------------
 
     def _born(self, place: int, node: EntangledNode) -> None:
         self._born_at[self._schedule.team.address(place)] = self._schedule.team.clock.seconds()
@@ -226,7 +226,7 @@ class Wire(Workload):
         asking = self._schedule.node(requester).endpoint.ask(contact, "run", number, changes=True)
         record_outcome(self._history, asked, asking, shown)
 
-    # -- tables (R4) ------------------------------------------------------------------------------------------------
+    # -- tables (invariant R4) --------------------------------------------------------------------------------------
 
     def _tables(self, node: EntangledNode) -> list[tuple[str, int, int]]:
         """Return all tables that peers can fill, with their sizes and limits."""

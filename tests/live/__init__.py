@@ -2,6 +2,6 @@
 
 import signal
 
-# A background job inherits an ignored SIGINT, and so would the child processes to which these tests send one.
+# A background job inherits an ignored SIGINT. Child processes, to which these tests send SIGINT, would inherit it too.
 if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
     signal.signal(signal.SIGINT, signal.default_int_handler)

@@ -23,20 +23,20 @@ PATIENCE_MS = 120_000
 
 
 class Demonstration:
-    """``python -m sim.demo`` as a child process; ``invitation`` is the URL that it prints, with the join code.
+    """The process ``python -m sim.demo``; ``invitation`` is the URL with the join code that it prints.
 
     With ``is_secure`` the page is also served over TLS, and the invitation is its HTTPS URL.
     """
 
     def __init__(self, log: Path, *options: str, is_secure: bool = False) -> None:
         with log.open("w", encoding="utf-8") as errors:
-            # The page is the same for all kinds of robots, and simulated dogs need the least resources.
+            # The page is the same for all kinds of robots; simulated dogs need the fewest resources.
             command = [sys.executable, "-m", "sim.demo", "--robot", "sim", "--web-port", "0", *options]
             command += ["--tls"] if is_secure else []
             root = Path(__file__).parents[2]
             self._process = subprocess.Popen(command, cwd=root, stdout=subprocess.PIPE, stderr=errors, text=True)
         self.pid = self._process.pid
-        # Other tests verify the certificate; here TLS only gives access to the camera.
+        # Other tests verify the certificate; here TLS is only needed to get access to the camera.
         self._trust = ssl.create_default_context()
         self._trust.check_hostname, self._trust.verify_mode = False, ssl.CERT_NONE
         self._token = ""
@@ -64,12 +64,12 @@ class Demonstration:
         return said[-1].split()[2]
 
     def sign_in(self, url: str) -> None:
-        """Use the node of the page at ``url`` from now on."""
+        """Send all further requests to the node that serves the page at ``url``."""
         self.url = url
         self._token = self.api("session", {"code": self.code})["token"]
 
     def api(self, path: str, body: Any = None) -> Any:
-        """Return the answer of the page's node to an operator's request; ``body`` is sent as JSON."""
+        """Return the response to an operator's request to the page's node; ``body`` is sent as JSON."""
         headers = {"Content-Type": "application/json", "Authorization": f"Bearer {self._token}"}
         data = None if body is None else json.dumps(body).encode()
         asked = urllib.request.Request(f"{self.url}api/v1/{path}", data, headers)
@@ -77,19 +77,19 @@ class Demonstration:
             return json.load(answer)
 
     def send_signal(self, name: str, how: signal.Signals) -> int:
-        """Send a signal to the process of the node ``name``; return its process id."""
+        """Send a signal to the process of the node ``name``; return the id of that process."""
         pid = next(pid for pid, each in list_descendants(self.pid).items() if each == name)
         os.kill(pid, how)
         return pid
 
     def stop(self) -> None:
-        """End the demonstration, and wait for all its processes."""
+        """Stop the demonstration, and wait until all its processes have ended."""
         self._process.terminate()
         self._process.wait(20)
 
 
 class DemonstrationCase(SynchronousTestCase):
-    """The demonstration, started with ``options``, with TLS if ``is_secure`` is set."""
+    """A test of the demonstration, started with ``options``, and with TLS if ``is_secure`` is set."""
 
     options: tuple[str, ...] = ()
     is_secure = False
@@ -102,10 +102,10 @@ class DemonstrationCase(SynchronousTestCase):
 
 
 class DemonstrationPageCase(BrowserCase, DemonstrationCase):
-    """The demonstration, and a browser."""
+    """A test of the demonstration with a browser."""
 
     def opened(self, screen: dict[str, Any], scheme: Any = "light") -> Any:
-        """Return the page, signed in, when it shows the team."""
+        """Return the page after it has signed in and shows the team."""
         page = self.tab(screen, scheme)
         page.set_default_timeout(PATIENCE_MS)
         page.goto(self.demo.invitation)

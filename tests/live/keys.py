@@ -1,4 +1,4 @@
-"""The keys of the web nodes of ``tests.live.team``, by name."""
+"""The keys of the web nodes of ``tests.live.team``, by the name of the node."""
 
 from __future__ import annotations
 

@@ -1,6 +1,6 @@
 """A test case for network namespaces; without support for them its tests are skipped with a prominent message.
 
-With ``SWARM_CI=1`` missing support is a failure, as a skipped test proves nothing.
+With ``SWARM_CI=1`` missing support is a failure, because a skipped test proves nothing.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ class NamespaceCase(SynchronousTestCase):
             raise SkipTest(why)
 
     def internet(self, *sites: Site) -> Internet:
-        """Return an internet of these sites, which is removed after the test."""
+        """Return a simulated internet of these sites, which is removed after the test."""
         net = Internet(sites)
         net.__enter__()
         self.addCleanup(net.close)
@@ -36,7 +36,7 @@ class NamespaceCase(SynchronousTestCase):
 
 @cache
 def refused() -> str:
-    """Return the reason why namespaces are unavailable, printed once, or an empty string."""
+    """Return the reason why namespaces are unavailable, or an empty string; print the reason once."""
     why = find_unavailable_reason()
     if why:
         stream = sys.__stderr__ or sys.stderr

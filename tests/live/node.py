@@ -19,7 +19,7 @@ PATIENCE_S = 30.0
 
 
 class Node:
-    """A node in a child process; ``lines`` is its output."""
+    """A node in a child process; ``lines`` contains its output."""
 
     def __init__(self, process: subprocess.Popen[str]) -> None:
         self.process = process
@@ -29,7 +29,7 @@ class Node:
         self._reader.start()
 
     def says(self, words: str) -> None:
-        """Wait until the output contains ``words``; fail with the output after a timeout or at the node's end."""
+        """Wait until the output contains ``words``; after a timeout, or when the node ends, fail with the output."""
 
         def is_said() -> bool:
             has_ended = not self._reader.is_alive()
@@ -51,11 +51,11 @@ class Node:
 
 
 class NodeCase(SynchronousTestCase):
-    """Nodes on this machine, with all their files in ``folder``."""
+    """A test of nodes on this machine, which have all their files in ``folder``."""
 
     def setUp(self) -> None:
         super().setUp()
-        # Trial's folders are deeper than the maximum length of a socket's path.
+        # The folders of Trial have paths that are too long for a socket.
         self.folder = Path(tempfile.mkdtemp()).resolve()
         self.addCleanup(shutil.rmtree, self.folder)
         inherited = {name: value for name, value in os.environ.items() if not name.startswith("SWARM_")}

@@ -1,8 +1,8 @@
 """Shared parts of the tests in a real browser: screens, the page's server as a child process, and opened pages.
 
-A browser, its driver and the program that serves teams start slowly, and ``trial -j`` distributes single tests, so
-that a class fixture would be created for each.  They are started once per process and kept; each test has a separate
-browser context and team.
+A browser, its driver and the program that serves teams start slowly, and ``trial -j`` distributes single tests, so a
+class fixture would be created for each test. They are therefore started once per process and reused; each test has its
+own browser context and team.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ FLAGS = [
     *("--disable-component-update", "--disable-sync", "--disable-dev-shm-usage"),
 ]
 DISC = 66
-"""The diameter in pixels of the red disc in the camera's picture, of 104."""
+"""The diameter of the red disc in the camera's picture, in pixels of a picture that is 104 pixels wide."""
 PHONE = {"viewport": {"width": 412, "height": 839}, "has_touch": True}
 TABLET = {"viewport": {"width": 820, "height": 1180}, "has_touch": True}
 DESK = {"viewport": {"width": 1280, "height": 800}}
@@ -42,7 +42,7 @@ VIEWS = ("tasks", "cameras", "map", "groups", "network", "events", "more", "devi
 TEXTS = catalogue("en")
 """The texts that the page shows in the tests' browser."""
 PATIENCE_MS = 45_000
-"""The timeout of a wait, for a loaded machine; a page that is in time is not delayed."""
+"""The timeout of a wait, for a loaded machine; a wait ends as soon as its condition is true."""
 INFORMED = """async () => {
   const { model } = await import("/static/model.js");
   while (!model.has.includes("invites")) await new Promise((done) => setTimeout(done, 20));
@@ -74,7 +74,7 @@ def pin(port: int) -> str:
 
 
 def film(path: Path) -> Path:
-    """Write a video for the fake camera, 320 x 240: a red disc that trembles slightly."""
+    """Write a video for the fake camera: a red disc, 320 x 240 pixels, that trembles slightly."""
     import cv2
     import numpy as np
 
@@ -88,10 +88,10 @@ def film(path: Path) -> Path:
 
 
 class Chromium:
-    """The browser's driver and a browser with a video as camera; a context without permission has no camera.
+    """The browser's driver, and a browser whose camera plays a video; a context without permission has no camera.
 
-    Between two calls the driver marks the thread as running an event loop; other tests run theirs, so the mark is
-    removed while no test uses the driver.
+    Between two calls the driver marks the thread as running an event loop. Other tests run their own loops, so the mark
+    is removed when no test uses the driver.
     """
 
     def __init__(self) -> None:
@@ -128,15 +128,15 @@ class Chromium:
 
 @cache
 def chromium() -> Chromium:
-    """Return the browser of this process."""
+    """Return the browser that all tests of this process share."""
     return Chromium()
 
 
 class Team:
-    """A team and its page, served by a child process; ``order`` changes its content."""
+    """A team and its page, served by a child process; ``order`` changes the content of the page."""
 
     _idle: list[subprocess.Popen[str]] = []
-    """Processes that serve no team at present."""
+    """Processes that are running but serve no team now."""
 
     def __init__(self, port: int = 0) -> None:
         self._process = Team._idle.pop() if Team._idle else self._started()
@@ -155,14 +155,14 @@ class Team:
         return process
 
     def order(self, words: str) -> str:
-        """Send an order, wait for its end, and return the answer."""
+        """Send a command to the child process, wait until it is executed, and return the reply."""
         assert self._process.stdin is not None and self._process.stdout is not None
         self._process.stdin.write(words + "\n")
         self._process.stdin.flush()
         return self._process.stdout.readline()
 
     def freeze(self) -> None:
-        """Suspend the process, with its port open."""
+        """Suspend the process; its port stays open."""
         os.kill(self.pid, signal.SIGSTOP)
 
     def thaw(self) -> None:
@@ -175,7 +175,7 @@ class Team:
         self._process.communicate()
 
     def end(self) -> None:
-        """Close the page; the process is used for another team later."""
+        """Close the page; the process can then serve another team."""
         if self._process.poll() is None:
             self.thaw()
             if self.order("end"):
@@ -185,7 +185,10 @@ class Team:
 
 
 class BrowserCase(SynchronousTestCase):
-    """A browser; ``faults`` are the errors of its pages, ``asked`` the URLs that the newest one requested."""
+    """A test with a browser.
+
+    ``faults`` are the errors on its pages, ``asked`` the URLs that the newest page has requested.
+    """
 
     if MISSING:
         skip = f"THE PAGE IS NOT TESTED IN A BROWSER: missing {'; '.join(MISSING)}"
@@ -208,7 +211,7 @@ class BrowserCase(SynchronousTestCase):
     def tab(self, screen: dict[str, Any], scheme: Any = "light", **more: Any) -> Any:
         """Return an empty page on that screen, in a new session.
 
-        The service worker, which loads all files again, is blocked unless ``service_workers="allow"`` is given.
+        The service worker would load all files again, so it is blocked unless ``service_workers="allow"`` is given.
         """
         more = {"service_workers": "block", **more}
         context = self.browser.new_context(**screen, color_scheme=scheme, reduced_motion="reduce", **more)
@@ -232,22 +235,22 @@ class BrowserCase(SynchronousTestCase):
         return page
 
     def informed(self, page: Any) -> Any:
-        """Return the page when it has its node's features, which change its content."""
+        """Return the page when it has received the features of its node, on which its content depends."""
         page.evaluate(INFORMED)
         return page
 
     def view(self, page: Any, name: str) -> None:
-        """Open a view, as a link does."""
+        """Open a view by following its link."""
         page.evaluate(f"location.hash = {name!r}")
         page.locator(f"body[data-view={name}]").wait_for()
 
     def floor(self, page: Any) -> Callable[[float, float], tuple[float, float]]:
-        """Return a function from metres on the map to pixels on the screen."""
+        """Return a function that converts metres on the map to pixels on the screen."""
         box = page.locator(".floor").bounding_box()
         return lambda x, y: (box["x"] + box["width"] * x / 3.0, box["y"] + box["height"] * (1 - y / 2.4))
 
     def pass_by(self, page: Any, seconds: float) -> None:
-        """Advance the page's clock, and wait until the resulting requests are sent."""
+        """Advance the page's clock; wait until the requests that this causes have been sent."""
         page.clock.fast_forward(1000 * seconds)
         page.evaluate("fetch('/api/v1/node').then((told) => told.text())")
 
@@ -274,14 +277,14 @@ class BrowserCase(SynchronousTestCase):
         self.assertEqual((page.evaluate(SMALL), self.faults), ([], []), where)
 
     def sound_by_day_and_night(self, page: Any) -> None:
-        """Check the page in light and dark colours."""
+        """Check the page in light and in dark colours."""
         for scheme in ("light", "dark"):
             page.emulate_media(color_scheme=scheme)
             self.sound(page)
 
 
 class TeamCase(SynchronousTestCase):
-    """The page of a team of ``tests.live.team``."""
+    """A test of the page of a team of ``tests.live.team``."""
 
     def setUp(self) -> None:
         super().setUp()
@@ -290,15 +293,18 @@ class TeamCase(SynchronousTestCase):
 
 
 class PageCase(BrowserCase, TeamCase):
-    """The page of a team, and a browser."""
+    """A test of the page of a team with a browser."""
 
     def note(self, words: Any) -> None:
-        """Record an error on the page's console, with its source."""
+        """Record an error on the page's console, with the source of the error."""
         if words.type == "error":
             self.faults.append(f"{words.text} {words.location['url']}")
 
     def opened(self, screen: dict[str, Any], scheme: Any = "light", has_clock: bool = False) -> Any:
-        """Return the page, signed in, when it shows the team; with ``has_clock``, ``pass_by`` controls its time."""
+        """Return the page after it has signed in and shows the team.
+
+        With ``has_clock``, ``pass_by`` advances its time.
+        """
         page = self.tab(screen, scheme)
         page.on("console", self.note)
         if has_clock:

@@ -1,7 +1,7 @@
 """Take the pictures of the page in docs/images from a real demonstration.
 
-``python -m tests.live.pictures`` takes all pictures; names of scenes as arguments select some.  The pictures show no
-mouse pointer, and have at most 256 colours to keep the files small.
+``python -m tests.live.pictures`` takes all pictures; arguments select scenes by name. The pictures show no mouse
+pointer, and have at most 256 colours, so the files stay small.
 """
 
 from __future__ import annotations
@@ -35,14 +35,14 @@ Picture = np.ndarray[Any, np.dtype[np.uint8]]
 
 
 class Photographer:
-    """Pages of one demonstration, and the pictures of them."""
+    """Opens pages of one demonstration and takes pictures of them."""
 
     def __init__(self, browser: Any, invitation: str) -> None:
         self._browser = browser
         self._invitation = invitation
 
     def opened(self, screen: dict[str, Any], scheme: str = "light", address: str = "") -> Any:
-        """Open a page and return it when it shows the team, or open the page at ``address``."""
+        """Open a page, by default the page of the demonstration; return the page when it shows the team."""
         context = self._browser.new_context(**screen, color_scheme=scheme, reduced_motion="reduce")
         page = context.new_page()
         page.set_default_timeout(PATIENCE_MS)
@@ -92,23 +92,23 @@ def keep(name: str, picture: Picture) -> None:
 
 
 def beside(pictures: list[Picture]) -> Picture:
-    """Return pictures of equal height, side by side."""
+    """Return one picture that shows the given pictures side by side at equal height."""
     gap = np.full((pictures[0].shape[0], GAP, 3), GREY, np.uint8)
     row = [each for picture in pictures for each in (picture, gap)][:-1]
     return np.hstack(row)
 
 
 def packed(picture: Picture) -> bytes:
-    """Return a PNG with the best palette, found by k-means with a fixed seed."""
+    """Return a PNG with the best palette, which k-means with a fixed seed finds."""
     cv2.setRNGSeed(1)
     found = picture.reshape(-1, 3).astype(np.float32)
     some = found[np.random.default_rng(1).integers(0, len(found), SAMPLED)]
-    # A rare colour, such as a line of red text, counts at least once.
+    # A rare colour, such as the red of a line of text, counts at least once.
     some = np.vstack([some, np.unique(picture.reshape(-1, 3) // 16 * 16 + 8, axis=0).astype(np.float32)])
     end = (cv2.TERM_CRITERIA_MAX_ITER + cv2.TERM_CRITERIA_EPS, 12, 1.0)
     _, _, centres = cv2.kmeans(some, COLOURS, np.zeros(0, np.int32), end, 1, cv2.KMEANS_PP_CENTERS)
     usual, counts = np.unique(picture.reshape(-1, 3), axis=0, return_counts=True)
-    # The colours of backgrounds and text, which cover most of the picture, stay exact.
+    # The colours of background and text, which cover most of the picture, are not approximated.
     exact = usual[np.argsort(-counts)[: 256 - COLOURS]]
     palette = np.vstack([exact, np.rint(centres).astype(np.uint8)])
     cube = np.stack(np.meshgrid(*[np.arange(4, 256, 8)] * 3, indexing="ij"), -1).reshape(-1, 3).astype(np.float32)
@@ -167,7 +167,7 @@ def running(photographer: Photographer) -> None:
 
 
 def lost(photographer: Photographer, demo: Demonstration) -> None:
-    """Take pictures of all views after the acting dog has lost its network and another has taken over."""
+    """Take pictures of all views after the acting dog has lost its network and another dog has taken over."""
     desktop = photographer.opened(DESK)
     phones = {scheme: photographer.opened(PHONE, scheme) for scheme in ("light", "dark")}
     photographer.view(phones["dark"], "groups")
@@ -198,7 +198,7 @@ def lost(photographer: Photographer, demo: Demonstration) -> None:
 
 
 def takeover(photographer: Photographer, demo: Demonstration) -> None:
-    """Record a takeover as animation: the node of the acting dog is killed, and another dog gets the task."""
+    """Record a takeover as an animation: the acting dog's node is killed, and another dog gets the task."""
     desktop = photographer.opened(DESK)
     frames: list[Picture] = []
     times: list[float] = []
@@ -248,7 +248,7 @@ def stopped(photographer: Photographer) -> None:
 
 
 def outdoors(browser: Any) -> None:
-    """Take a picture of positions on a map without a simulator, with the team of the tests."""
+    """Take a picture of positions on a map without a simulator, using the team of the tests."""
     team = Team()
     try:
         team.order("outdoors")
@@ -284,7 +284,7 @@ def main(wanted: list[str]) -> int:
                 "opened": lambda: opened(photographer, demo),
                 "stopped": lambda: stopped(photographer),
                 "outdoors": lambda: outdoors(browser),
-                # It permanently ends a node of the demonstration.
+                # This scene permanently ends a node of the demonstration.
                 "takeover": lambda: takeover(photographer, demo),
             }
             for name, scene in scenes.items():

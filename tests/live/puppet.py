@@ -1,6 +1,6 @@
-"""A program with one robot and no other part of a node, for tests that freeze and kill it.
+"""A program that contains only a robot's driver, for tests that freeze and kill the program.
 
-Its arguments are a driver's kind and options (JSON); it executes commands on its input and prints the results.
+Its arguments are a driver's kind and options (JSON); it executes commands from its input and prints the results.
 """
 
 from __future__ import annotations
@@ -43,7 +43,7 @@ class Puppet(LineReceiver):
 
 
 def pid_of(driver: BaseDriver) -> int:
-    """Return the process id of the dead man's switch, or 0 without one."""
+    """Return the process id of the dead man's switch, or 0 if there is no switch."""
     keeper = driver._dead_man
     return keeper.pid or 0 if isinstance(keeper, Supervisor) else 0
 

@@ -1,13 +1,13 @@
 """A web node with three dogs that stand still: the server of the page's tests, run as a child process.
 
-``python -m tests.live.team`` executes the commands on its input, and answers each with a line.  ``team PORT`` starts a
-new team; the answer contains the port, the join code, and an operator's token and ticket; vaio and pi accept each
-other's sessions.  ``end`` closes its page.  The other commands change the team:
+``python -m tests.live.team`` executes the commands on its input, and replies to each with a line. ``team PORT`` starts
+a new team, in which vaio and pi accept each other's sessions; the reply contains the port, the join code, and an
+operator's token and ticket. ``end`` closes the page of the team. The other commands change the team:
 
 ``gone NAME``, ``back NAME``, ``status NAME STATUS``, ``name NAME``: the name of the node that serves the page, ``pages
-NODE=URL ...``: the web nodes, starting with this one, ``strange FILE``: devices and tasks with the texts of this JSON
-list, ``session SECONDS``: the duration of a session, ``place NAME KEY=NUMBER ...``: the position that a device
-reports, ``outdoors``: no simulator, ``crowd COUNT``: this number of devices, three of them with cameras.
+NODE=URL ...``: the web nodes, starting with this node, ``strange FILE``: devices and tasks with the texts of this JSON
+list, ``session SECONDS``: the duration of a session, ``place NAME KEY=NUMBER ...``: the position that a device reports,
+``outdoors``: no simulator, ``crowd COUNT``: this number of devices, three of them with cameras.
 
 The program ends at the end of its input.
 """
@@ -51,7 +51,7 @@ from webnode.state import DepartedDevices, State, format_state
 reactor: Any = _reactor
 PASSWORD = hash_password("correct horse", bytes(16), 4)
 FPS = 5
-"""Pictures of a camera per second: enough for the page to show that they move."""
+"""Frames per second of a camera: enough that the page shows motion."""
 HUES = {"dog1": (70, 90, 150), "dog2": (70, 150, 90), "dog3": (150, 100, 70)}
 
 
@@ -80,7 +80,7 @@ def dog(number: int, status: str, task: str, started: float) -> dict[str, Any]:
 
 
 def why() -> dict[str, Any]:
-    """Return two decisions: dog3's is followed by dog2's, of which dog3 does not know."""
+    """Return two decisions: the one for dog3 is followed by the one for dog2, which dog3 has not received."""
     costs = {"dog2": 0.62, "dog1": 1.04, "dog3": 1.37}
     reports = [{"agent": f"0{name[-1]}" * 16, "name": name, "cost": cost, "more": ""} for name, cost in costs.items()]
     first = {
@@ -118,7 +118,7 @@ def why() -> dict[str, Any]:
 
 
 class Team:
-    """The parts that the service normally provides: the records, and generated camera frames."""
+    """The parts that a node normally provides to its page: the records, and generated camera frames."""
 
     def __init__(self) -> None:
         now = time.time()
@@ -152,7 +152,7 @@ class Team:
         ]
 
     def read(self) -> State:
-        """Return the state, updated each second and after each command."""
+        """Return the state, which is updated every second and after each command."""
         now = self.version, int(time.time()), self.stop_control.is_halted()
         if self._made[0] != now:
             self._made = now, self._state()
@@ -181,7 +181,7 @@ class Team:
         return {**state, "halted": self.stop_control.is_halted()}
 
     def be_strange(self, words: list[str]) -> None:
-        """Create a device, a task and a decision for each of ``words``, with this text in each text field."""
+        """For each of ``words``, create a device, a task and a decision that have it in every text field."""
         now = time.time()
         self.batch += 1
         self.devices, self.tasks = [], []
@@ -212,7 +212,7 @@ class Team:
         self._departed = DepartedDevices()
 
     def be_many(self, count: int) -> None:
-        """Add idle dogs up to ``count``."""
+        """Add idle dogs until there are ``count`` devices."""
         now = time.time()
         for number in range(len(self.devices) + 1, count + 1):
             more = {"name": f"unit{number}", "uuid": f"{number:032x}", "joined": number, "kind": "turtlebot"}
@@ -220,7 +220,7 @@ class Team:
             self.devices.append({**dog(number % 250, "IDLE", "", now), **more, "capabilities": able})
 
     def watch(self, uuid: str, on_frame: OnFrame) -> Any:
-        """Send frames of a floor, a wall and a rolling red ball, ``FPS`` per second."""
+        """Send ``FPS`` frames per second that show a floor, a wall and a rolling red ball."""
         number = int(uuid[:2], 16)
         seq = 0
         running = True
@@ -283,7 +283,7 @@ class Orders(LineReceiver):
     _pages: list[Page]
 
     def lineReceived(self, line: bytes) -> None:
-        """Execute one command and answer it, so that the test knows its end."""
+        """Execute one command; reply to it, so the test knows when it has been executed."""
         verb, *rest = line.decode().split()
         if verb == "team":
             self._begin(int(rest[0]))
@@ -295,7 +295,7 @@ class Orders(LineReceiver):
             self.sendLine(line)
 
     def _begin(self, port: int) -> None:
-        """Serve a new team, and answer with its port and credentials."""
+        """Serve a new team; reply with its port and credentials."""
         self._team = team = Team()
         pages = Fallbacks()
         self._pages = pages.pages
@@ -336,13 +336,13 @@ class Orders(LineReceiver):
             self._team.be_strange(json.loads(Path(rest[0]).read_text(encoding="utf-8")))
 
     def connectionLost(self, reason: Any = None) -> None:
-        """End with the test."""
+        """Exit when the test closes the input."""
         if reactor.running:
             reactor.stop()
 
 
 def make_services(team: Team) -> Services:
-    """Return the page's services: fakes in memory that accept each order."""
+    """Return the page's services: fakes in memory that accept every request."""
     control = MemoryTeamControl(CATALOGUE, team.yard)
     able = [{"uuid": f"{n:02x}" * 16, "name": f"dog{n}", "busy": "Patrol the yard" * (n == 2)} for n in (1, 2)]
     control.frames = team
@@ -358,7 +358,7 @@ def make_services(team: Team) -> Services:
 
 
 class TeamSessions(SignedSessions):
-    """Sessions with tokens for gateways only."""
+    """Sessions that issue tokens for gateways only."""
 
     def issue_peer_tokens(self, user: User, nodes: Iterable[str], now: float) -> dict[str, Token]:
         """Return the tokens for gateways."""
@@ -367,12 +367,12 @@ class TeamSessions(SignedSessions):
 
 
 def checked(text: str, password: str) -> Deferred[Any]:
-    """Check a password on a thread."""
+    """Check a password on a worker thread."""
     return deferToThread(verify_password, text, password)
 
 
 def network() -> Any:
-    """Return the view of a network: two nodes know each other, and a third does not answer."""
+    """Return the view of a network in which two nodes know each other, and a third node does not reply."""
     uuids = {n: f"0{n}" * 16 for n in (1, 2, 3)}
 
     def view(others: tuple[int, ...], lookups: list[Any]) -> dict[str, Any]:
@@ -391,7 +391,7 @@ def network() -> Any:
 
 
 def links() -> Any:
-    """Return the links of the page's node: three path kinds, a revoked member and a rejected join code."""
+    """Return the links of the page's node: paths of three kinds, a revoked member and a rejected join code."""
     vaio, uuids = "0a" * 16, {n: f"0{n}" * 16 for n in (1, 2, 3)}
 
     def make_link(n: int, kind: str, score: int | None, rtt: float | None = None, by: str = "") -> dict[str, Any]:

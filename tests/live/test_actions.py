@@ -11,7 +11,7 @@ class ActionPageTests(PageCase):
     timeout = 170
 
     def test_stop_from_everywhere(self) -> None:
-        """One touch stops the team from each scroll position and dialog, and another one releases it."""
+        """One touch stops the team from any scroll position and dialog; another touch releases it."""
         page = self.opened(PHONE)
         corner = page.locator(".stop").bounding_box()
         page.locator(".stop").tap()
@@ -35,7 +35,10 @@ class ActionPageTests(PageCase):
         self.assertEqual(self.faults, [])
 
     def test_stop_by_keyboard(self) -> None:
-        """The Tab and Enter keys suffice to stop and release the team; the stop button is near the start."""
+        """The keys Tab and Enter are enough to stop and release the team.
+
+        The stop button is among the first elements.
+        """
         page = self.opened(DESK)
         page.keyboard.press("Tab")
         page.keyboard.press("Tab")
@@ -48,7 +51,7 @@ class ActionPageTests(PageCase):
         self.told(page, TEXTS["stop.released"])
 
     def test_ask_before_assigning(self) -> None:
-        """Before a task is assigned, the page shows the devices that can execute it, and reasons for the others."""
+        """Before a task is assigned, the page lists the devices that can execute it, and the reasons of all others."""
         page = self.opened(PHONE)
         self.view(page, "tasks")
         page.locator(".preview [data-can=can]", has_text="dog1, dog2 (now: Patrol the yard)").wait_for()
@@ -57,7 +60,7 @@ class ActionPageTests(PageCase):
         page.locator(".preview [data-can=nobody]", has_text=TEXTS["preview.nobody"]).wait_for()
 
     def test_assign_to_a_group(self) -> None:
-        """A task is added to a group by touch and by keyboard; the preview lists the tasks of the group."""
+        """A task is added to a group by touch and by keyboard; the preview lists the other tasks of the group."""
         for screen, type_on in ((PHONE, False), (DESK, True)):
             page = self.opened(screen)
             self.view(page, "tasks")
@@ -85,7 +88,10 @@ class ActionPageTests(PageCase):
             self.sound(page)
 
     def test_lift_a_robot(self) -> None:
-        """A robot is moved by dragging and arrow keys, and turned by a click or Enter; the target stays."""
+        """A robot is moved by dragging and with arrow keys, and turned by a click or Enter.
+
+        The target does not move.
+        """
         page = self.opened(DESK)
         at = self.floor(page)
         page.locator(".dog .grip").nth(2).wait_for(state="attached")
@@ -115,7 +121,7 @@ class ActionPageTests(PageCase):
         self.assertEqual(self.faults, [])
 
     def test_lift_a_robot_by_touch(self) -> None:
-        """A finger on a robot or the target moves it without scrolling; a tap turns a robot."""
+        """A finger on a robot or the target moves it, and does not scroll the page; a tap turns a robot."""
         page = self.opened(PHONE)
         page.locator(".dog .grip").nth(2).wait_for(state="attached")
         self.view(page, "map")
@@ -152,7 +158,10 @@ class ActionPageTests(PageCase):
         self.assertEqual(self.faults, [])
 
     def test_change_settings(self) -> None:
-        """A device's settings are shown, changed and saved by keyboard; invalid ones are refused with the reason."""
+        """A device's settings are shown, changed and saved by keyboard.
+
+        Invalid settings are refused with the reason.
+        """
         page = self.opened(PHONE)
         page.locator(".device").first.tap()
         name = page.locator("[name=description]")

@@ -1,4 +1,4 @@
-"""Tests of a closed team of real processes: created, joined with a code over UDP, and left."""
+"""Tests of a closed team of real processes: it is created, joined with a code over UDP, and left."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from tests.live.node import PATIENCE_S, NodeCase
 
 class ClosedTeamTests(NodeCase):
     def told(self, *words: str, code: int = 0) -> Any:
-        """Return the answer of ``swarm WORDS --json``, or its error output if it fails with ``code``."""
+        """Return the result of ``swarm WORDS --json``, or the error output if it fails with ``code``."""
         done = self.swarm(*words, "--json")
         self.assertEqual(done.returncode, code, done.stderr)
         return json.loads(done.stdout) if code == 0 else done.stderr

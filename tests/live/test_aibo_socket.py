@@ -30,7 +30,7 @@ class AiboSocketTests(TestCase):
     timeout = 30
 
     async def test_drives_and_films(self) -> None:
-        """Over both transports a dog connects, sends frames, walks, stops, survives a reboot and frees its ports."""
+        """Over TCP and over UDP a dog connects, sends frames, walks, stops, survives a reboot and frees its ports."""
         for transport in ("tcp", "udp"):
             await self._drive(transport)
 

@@ -1,4 +1,4 @@
-"""S8: a node sends no more bytes than it received to an address that has not proved itself."""
+"""Tests of attack S8: to an unverified address a node sends no more bytes than it received from that address."""
 
 from __future__ import annotations
 
@@ -30,7 +30,10 @@ class AmplificationTests(NamespaceCase):
     """A node at ``pub``, a member that joined it, and an attacker that sends recorded and random datagrams."""
 
     def test_a_stranger_gets_no_more_than_he_sends(self) -> None:
-        """Recorded datagrams from another address, and random ones with each first byte, cause fewer bytes back."""
+        """The node sends fewer bytes than it receives from an unknown address.
+
+        The datagrams are recorded ones from another address, and random ones with each possible first byte.
+        """
         folder = Path(self.mktemp()).absolute()
         folder.mkdir(parents=True)
         with Internet([Site("a", NatKind.PORT), Site("b", NatKind.PORT), Site("stranger", NatKind.NONE)]) as net:
@@ -63,10 +66,10 @@ class AmplificationTests(NamespaceCase):
                     await asyncio.sleep(0.05)
             traffic = seen.from_host(net.address("stranger1"))
             self.assertEqual(traffic.received, len(sent))
-            # Some answers arrived, so the comparison is meaningful.
+            # Some replies have arrived, so the comparison is meaningful.
             self.assertGreater(traffic.sent, 0)
             self.assertLessEqual(traffic.amplification, 1.0)
-            # Each datagram has a separate port, so no answer is covered by another request's bytes.
+            # Each datagram has its own port, so the bytes of one request cannot count for the reply to another.
             for peer, each in seen.traffic.items():
                 if peer.startswith(net.address("stranger1") + ":"):
                     self.assertLessEqual(each.amplification, 1.0)

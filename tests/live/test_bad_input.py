@@ -1,4 +1,4 @@
-"""Tests of real ``twistd`` processes with invalid input, and of one without its bootstrap node."""
+"""Tests of real ``twistd`` processes with invalid input, and of a node whose bootstrap node is missing."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ class BadInputTests(NodeCase):
     """Invalid input gives one line on stderr and exit code 2; ``tests.swarmnode.test_plugin`` checks each line."""
 
     def refused(self, *arguments: str) -> str:
-        """Return the error line of a refused node."""
+        """Return the error line of a node that is refused."""
         child = self.popen(*arguments)
         self.addCleanup(child.kill)
         output, errors = child.communicate(timeout=PATIENCE_S)
@@ -29,12 +29,12 @@ class BadInputTests(NodeCase):
             self.assertIn(part, line)
 
     def test_unknown_key(self) -> None:
-        """An unknown key is reported before the start, with file, key and the nearest known key."""
+        """An unknown key is reported before the start; the error contains file, key and the nearest known key."""
         path = self.file('[node]\nname = "a"\nteam_key = "t"\nprot = 7000\n')
         self.assert_says(self.refused("--config", path), path, "[node] prot", "the nearest is port")
 
     def test_ports_in_use(self) -> None:
-        """A used UDP port, or TCP port of the page, is reported with file, key and a remedy."""
+        """A UDP port in use, or a TCP port of the page in use, is reported with file, key and a remedy."""
         for kind, key, text in (
             (socket.SOCK_DGRAM, "[node] port", "port = {}\n"),
             (socket.SOCK_STREAM, "[web] port", 'roles = ["web"]\n[web]\nport = {}\n'),
@@ -49,7 +49,7 @@ class BadInputTests(NodeCase):
             self.assert_says(line, path, key, str(port), "choose another port, or 0")
 
     def test_address_of_another_machine(self) -> None:
-        """An address of another machine is reported with the file and a remedy that does not suggest another port."""
+        """An address of another machine is reported with the file; the remedy is not a different port."""
         for text, key in (
             ('[node]\nname = "a"\nteam_key = "t"\nhost = "192.0.2.1"\n', "[node]"),
             ('[node]\nname = "a"\nteam_key = "t"\nroles = ["web"]\n[web]\nhost = "192.0.2.1"\nport = 0\n', "[web]"),
@@ -61,10 +61,10 @@ class BadInputTests(NodeCase):
 
 
 class UnreachableBootstrapTests(NodeCase):
-    """A missing bootstrap node is no error."""
+    """A missing bootstrap node is not an error."""
 
     def test_unreachable_bootstrap_is_tried_again(self) -> None:
-        """A node without an answer from its bootstrap node logs this, retries, and ends within 2 s of SIGTERM."""
+        """If its bootstrap node does not reply, a node logs this and retries; it ends within 2 s after SIGTERM."""
         with closing(socket.socket(socket.AF_INET, socket.SOCK_DGRAM)) as silent:
             silent.bind(("127.0.0.1", 0))
             port = silent.getsockname()[1]
@@ -84,7 +84,7 @@ class UnreachableBootstrapTests(NodeCase):
             began = time.monotonic()
             output, errors = child.communicate(timeout=PATIENCE_S)
         self.assertLess(time.monotonic() - began, 2.0)
-        # After an orderly end Twisted raises the signal again, so that a shell sees the cause of the end.
+        # After an orderly end Twisted raises the signal again, so a shell can see why the process ended.
         self.assertEqual((child.returncode, errors), (-signal.SIGTERM, ""), output)
         self.assertIn("Server Shut Down", output)
         self.assertNotIn("Traceback", output)

@@ -47,7 +47,7 @@ class BenchDhtTests(SynchronousTestCase):
         self.assertIn("swarm-memory", plot.read_text())
 
     def test_an_unknown_peer_is_refused(self) -> None:
-        """An unknown library is refused with one line that lists the known ones."""
+        """An unknown library is refused with one line that lists the known libraries."""
         ran = self.bench("--peers", "gnutella")
         self.assertEqual(ran.returncode, 2)
         self.assertIn("gnutella is unknown; choose from swarm-sqlite", ran.stderr)

@@ -21,7 +21,7 @@ reactor: Any = running
 
 
 class SlowLens:
-    """A source that fails once, and blocks while ``gate`` is closed."""
+    """A source that fails once, and blocks when ``gate`` is closed."""
 
     def __init__(self) -> None:
         self.gate = threading.Event()
@@ -49,7 +49,10 @@ class LiveCameraTests(TestCase):
     timeout = 30
 
     async def test_camera_never_holds_the_reactor_up(self) -> None:
-        """A blocking camera blocks only its thread, a lost one is opened again, and ``disconnect`` ends the thread."""
+        """A blocking camera blocks only its own thread.
+
+        A lost camera is opened again; ``disconnect`` ends the thread.
+        """
         lens = SlowLens()
         film = ThreadedStream(lens, reactor.callFromThread)
         driver = CameraDriver(parse_options({"fps": 30}), film, reactor, "cam")
@@ -70,7 +73,7 @@ class LiveCameraTests(TestCase):
         self.assertEqual(lens.closed, 2)
 
     def test_shows_a_video_by_the_clock(self) -> None:
-        """A video's frames are complete, scaled to the wanted size, and repeat after its end."""
+        """The frames of a video are complete, have the requested size, and repeat after the end of the video."""
         import cv2
         import numpy
 
@@ -96,4 +99,4 @@ class LiveCameraTests(TestCase):
         self.assertEqual((shades[:6], sizes), ([0, 1, 2, 0, 1, 2], {(32, 24, 24, 32)}))
 
     if find_spec("cv2") is None:
-        test_shows_a_video_by_the_clock.skip = "NO VIDEO IS SHOWN: install the extra vision"  # type: ignore[attr-defined]
+        test_shows_a_video_by_the_clock.skip = "VIDEOS ARE NOT TESTED: install the extra vision"  # type: ignore[attr-defined]

@@ -1,4 +1,4 @@
-"""Tests of a running node during a step of the wall clock: no timer, lease or TTL changes (R5)."""
+"""Tests of a running node when the wall clock is set: no timer, lease or TTL changes (invariant R5)."""
 
 from __future__ import annotations
 
@@ -85,7 +85,7 @@ print(json.dumps({"seen": seen, "beats": beats, "wrong": wrong}))
 
 class ClockStepTest(SynchronousTestCase):
     def test_steps(self) -> None:
-        """A lease survives a step of the wall clock and expires in time, and all timers run on time."""
+        """When the wall clock is set, a lease survives and later expires in time, and all timers run on time."""
         children = []
         for step in STEPS:
             folder = Path(self.mktemp())
@@ -111,7 +111,7 @@ class ClockStepTest(SynchronousTestCase):
             self.assertGreater(gone[0] - after[0][0], 0.3, step)
 
     def test_nobody_asks_the_wall(self) -> None:
-        """No module of the library, the drivers or the agents reads the wall clock; it is passed as an argument."""
+        """No module of the library, the drivers or the agents reads the wall clock; the time is an argument."""
         asking = []
         for room in ("formats", "middleware", "drivers", "agents"):
             for path in sorted((ROOT / room).rglob("*.py")):

@@ -15,14 +15,14 @@ from typing import Any
 from tests.live.page import TeamCase
 
 MISSING = [name for name in ("schemathesis", "flask", "cv2") if find_spec(name) is None]
-# Streams, which do not end, and long polls, which last five seconds, have separate tests.
+# Streams, which do not end, and long polls, which last five seconds, are tested separately.
 STREAMS = ("/events", "/shot/{uuid}")
-# This request ends the session, and all later ones would fail.
+# This request ends the session, so all later requests would fail.
 SIGNING_OUT = "delete_session"
 CHECKS = ("not_a_server_error", "status_code_conformance", "content_type_conformance", "response_schema_conformance")
 KNOWN = {"uuid": ["01" * 16, "02" * 16, "99"], "task_id": ["t1", "t9"]}
-"""Names of present objects and of a missing one, as random names would find none.  The third dog does not answer, for
-which the page returns 504."""
+"""Ids of existing objects, and one of a missing object, because random ids match no object.  The third dog does not
+reply, so the page returns 504."""
 LIMIT_S = 170
 
 
@@ -31,7 +31,7 @@ class ContractTests(TeamCase):
         skip = f"THE API IS NOT TESTED AGAINST ITS DOCUMENT: missing {', '.join(MISSING)} (make contract)"
 
     def test_keep_to_the_document(self) -> None:
-        """For any request, each route answers as documented, and never with a 5xx."""
+        """For any request, each route responds as documented, and never with a 5xx status."""
         with tempfile.TemporaryDirectory() as folder:
             path = Path(folder) / "openapi.json"
             path.write_text(json.dumps(self.document()), encoding="utf-8")
@@ -51,7 +51,7 @@ class ContractTests(TeamCase):
         self.assertGreater(int(counts[1]), 400)
 
     def document(self) -> Any:
-        """Return the node's document, with present and missing names for the ``KNOWN`` fields."""
+        """Return the node's document; ``KNOWN`` fields get names that exist and names that do not."""
         address = f"{self.team.url}api/v1/openapi.json?ticket={self.team.ticket}"
         with urllib.request.urlopen(address, timeout=10) as answer:
             document = json.load(answer)

@@ -1,4 +1,4 @@
-"""Tests of a real node with its control socket and the real ``swarm`` command, before and after a SIGKILL."""
+"""Tests of a real node, its control socket and the real ``swarm`` command, before and after a SIGKILL."""
 
 from __future__ import annotations
 
@@ -16,13 +16,13 @@ class ControlTests(NodeCase):
         return node
 
     def said(self, *words: str) -> str:
-        """Return the output of ``swarm WORDS``, which must succeed."""
+        """Run ``swarm WORDS``, which must succeed; return its output."""
         ran = self.swarm(*words)
         self.assertEqual((ran.returncode, ran.stderr), (0, ""), ran.stdout)
         return ran.stdout
 
     def test_shell_and_node_talk(self) -> None:
-        """Values, tuples, keywords and methods work through the shell, and the values survive a SIGKILL."""
+        """Values, tuples, keywords and methods work through the shell; the values survive a SIGKILL."""
         self.assertIn("no node runs", self.swarm("dht", "get", "a").stderr)
         node = self.joined()
         self.assertIn("1 replicas", self.said("dht", "put", "colour", "red"))
@@ -42,7 +42,7 @@ class ControlTests(NodeCase):
         self.assertIn("red", self.said("dht", "get", "colour"))
 
     def test_operator_pushes_to_a_running_node(self) -> None:
-        """A node that trusts its operator runs a pushed module, rolls it back, and keeps it over a SIGKILL."""
+        """A node that trusts its operator runs a pushed module, rolls it back, and keeps it after a SIGKILL."""
         node = self.joined()
         key = json.loads(self.said("deploy", "keys", "--json"))["a"]
         node.kill()
@@ -64,5 +64,5 @@ class ControlTests(NodeCase):
         self.assertIn("the team has no task", self.swarm("why", "last").stderr)
 
     def shows(self, words: str) -> None:
-        """Wait until ``swarm deploy status`` shows this."""
+        """Wait until the output of ``swarm deploy status`` contains these words."""
         until(lambda: words in self.swarm("deploy", "status").stdout)

@@ -9,9 +9,9 @@ from tests.live.page import DESK, PHONE, PageCase
 
 COUNT = 2000
 SHOWN_S = 40.0
-"""The limit on a loaded machine; 2.2 to 3.7 s on two cores that run five other tests."""
+"""The time limit for a loaded machine; with five other tests on two cores the page needs 2.2 to 3.7 s."""
 TOLD_MS = 1000.0
-"""The limit of the page's work for one change; 23 to 33 ms there."""
+"""The time limit for showing one change; with five other tests on two cores the page needs 23 to 33 ms."""
 CHANGE = """async () => {
   const { applyEvent, model } = await import("/static/model.js");
   const { notifyPanels } = await import("/static/shell.js");
@@ -27,12 +27,12 @@ CHANGE = """async () => {
   }
   return taken.sort((a, b) => a - b)[2];
 }"""
-"""The milliseconds that the page needs for one changed device: the median of five."""
+"""Return the median of the times in milliseconds that the page needs for each of five changes of a device."""
 
 
 class CrowdTests(PageCase):
     def test_show_two_thousand(self) -> None:
-        """Two thousand devices are shown in time, a changed one is updated fast, and a filter finds some of them."""
+        """Two thousand devices are shown in time, a change of one is shown quickly, and a filter finds some devices."""
         self.team.order(f"crowd {COUNT}")
         for screen in (PHONE, DESK):
             page = self.tab(screen)
@@ -46,7 +46,7 @@ class CrowdTests(PageCase):
             page.context.close()
 
     def find(self, page: Any) -> None:
-        """Filter the devices by words, and by words without a match."""
+        """Filter the devices by words that match, and by words that do not."""
         page.locator("#filter").fill("gripper turtle")
         page.locator("#count", has_text=f"40 of {COUNT}").wait_for()
         self.assertEqual(page.locator("#devices > li").count(), 40)

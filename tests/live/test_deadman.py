@@ -36,18 +36,18 @@ from tests.live.test_aibo_socket import free_ports
 from tests.live.waiting import CLOCK, until, wait
 
 if not Path("/proc/self/stat").exists():
-    raise SkipTest("looks at processes in /proc")
+    raise SkipTest("the test needs /proc")
 HAS_SERIAL = find_spec("serial") is not None
 
 ROOT = Path(__file__).resolve().parents[2]
 REACTOR: Any = reactor
 LATE_S = 0.4
-"""The maximum time in seconds until the robot stands, after the deadline or the death of its node."""
+"""The maximum time in seconds until the robot stands still after its deadline or the end of its node."""
 
 
 @dataclass
 class TimedBody(MemoryRobot):
-    """A base that records its motions with their times."""
+    """A base that records its motions and their times."""
 
     told: list[tuple[float, tuple[float, float, float]]] = field(default_factory=list)
 
@@ -70,7 +70,7 @@ class TimedBody(MemoryRobot):
 
 
 def is_alive(pid: int) -> bool:
-    """Return whether the process exists and is no zombie."""
+    """Return whether the process exists and is not a zombie."""
     try:
         state = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0]
     except OSError:
@@ -79,7 +79,7 @@ def is_alive(pid: int) -> bool:
 
 
 def ignores_signals(pid: int) -> bool:
-    """Return whether the process has reached the point at which it ignores SIGTERM."""
+    """Return whether the process has started to ignore SIGTERM."""
     status = Path(f"/proc/{pid}/status").read_text()
     return bool(int(status.partition("SigIgn:")[2].split()[0], 16) >> (signal.SIGTERM - 1) & 1)
 
@@ -96,7 +96,7 @@ class Puppeteer:
             )
 
     async def said(self, word: str, count: int = 1) -> list[str]:
-        """Wait for the line number ``count`` that starts with this word, and return the rest of it."""
+        """Wait until ``count`` lines start with this word; return the rest of the last of them."""
         found: list[list[str]] = []
 
         def is_said() -> bool:
@@ -113,7 +113,7 @@ class Puppeteer:
         self.process.stdin.flush()
 
     async def switch(self) -> tuple[int, float]:
-        """Return the process id of the switch and its number of halts."""
+        """Return the process id of the switch, and the number of halts that it sent."""
         count = self._path.read_text().count("switch") + 1
         self.tell("switch")
         pid, halts = await self.said("switch", count)
@@ -142,21 +142,21 @@ class DeadManCase(TestCase):
             one.end()
 
     async def driven(self, kind: str, **options: object) -> Puppeteer:
-        """Return a driving program that is connected and enabled."""
+        """Return a driving program with a connected and enabled driver."""
         puppeteer = Puppeteer(self.mktemp(), kind, options)
         self.puppeteers.append(puppeteer)
         await puppeteer.said("ready")
         return puppeteer
 
     async def walking(self, puppeteer: Puppeteer, seconds: float, count: int = 1) -> float:
-        """Let the robot walk, and return the deadline."""
+        """Let the robot walk; return the deadline of the motion."""
         puppeteer.tell(f"walk {seconds}")
         (deadline,) = await puppeteer.said("walking", count)
         await until(lambda: self.body.is_moving)
         return float(deadline)
 
     async def freeze(self, puppeteer: Puppeteer, permitted: float = 0.5) -> None:
-        """Freeze the program during a motion: the robot stops in time, and moves again only by a new permit."""
+        """Freeze the program during a motion: the robot stops in time, and moves again only with a new permit."""
         deadline = await self.walking(puppeteer, permitted)
         puppeteer.process.send_signal(signal.SIGSTOP)
         await wait(deadline - now() + 0.5)
@@ -172,7 +172,7 @@ class DeadManCase(TestCase):
         await until(lambda: not self.body.is_moving, 2.0)
 
     async def kill(self, puppeteer: Puppeteer) -> None:
-        """Kill the program during a motion: the robot stops at once, and the switch ends within a second."""
+        """Kill the program during a motion: the robot stops immediately, and the switch ends within a second."""
         pid, _ = await puppeteer.switch()
         await self.walking(puppeteer, 5.0)
         killed = now()
@@ -184,7 +184,7 @@ class DeadManCase(TestCase):
 
 
 class Wire:
-    """A link over a pair of sockets; ``far`` is the robot's end."""
+    """A link over a pair of sockets; ``far`` is the end of the robot."""
 
     def __init__(self) -> None:
         self.is_busy = False
@@ -211,7 +211,7 @@ class Wire:
 
 
 class KeeperTests(TestCase):
-    """The switch and its keeper, without a robot."""
+    """The switch and the keeper that starts it, without a robot."""
 
     timeout = 30
 
@@ -235,7 +235,7 @@ class KeeperTests(TestCase):
         self.assertEqual(self.keeper.halts, 1)
 
     async def test_stays_armed_until_the_halt_has_left(self) -> None:
-        """``disarm`` disarms the switch only after the link has sent the driver's halt."""
+        """``disarm`` takes effect only after the link has sent the driver's halt."""
         self.keeper.set_halt_command(HaltCommand(b"halt", self.wire))
         self.keeper.arm(0.2)
         self.keeper.disarm()
@@ -249,7 +249,7 @@ class KeeperTests(TestCase):
         self.wire.is_busy = False
 
     async def test_lets_go_of_the_link(self) -> None:
-        """A link that the driver has released and closed is also closed at the robot's end."""
+        """When the driver releases and closes a link, it is closed at the robot's end as well."""
         self.keeper.set_halt_command(HaltCommand(b"halt", self.wire))
         await wait(0.1)
         self.wire.near.close()
@@ -258,7 +258,7 @@ class KeeperTests(TestCase):
         await until(lambda: self.wire.heard() is None, 1.0)
 
     async def test_leaves_no_timer_once_closed(self) -> None:
-        """The loss of a link after ``close`` starts no timer."""
+        """If a link is lost after ``close``, no timer starts."""
         self.keeper.set_halt_command(HaltCommand(b"halt", self.wire))
         self.keeper.arm(1.0)
         await self.keeper.close()
@@ -266,7 +266,7 @@ class KeeperTests(TestCase):
         self.keeper.on_link_lost()
 
     async def test_finishes_a_halt_that_left_in_part(self) -> None:
-        """A halt that was sent in part is completed before it is repeated."""
+        """A partly sent halt is completed before it is repeated."""
         self.wire.near.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, 4608)
         halt = bytes(range(250)) * 40
         self.keeper.set_halt_command(HaltCommand(halt, self.wire))
@@ -280,7 +280,7 @@ class KeeperTests(TestCase):
         self.assertEqual(said[len(halt) :], halt[: len(said) - len(halt)])
 
     async def test_replaces_one_that_does_not_listen(self) -> None:
-        """A stopped process with a full socket is killed and replaced, without a wait of the keeper."""
+        """A stopped switch with a full socket is killed and replaced, and the keeper does not block."""
         self.keeper.set_halt_command(HaltCommand(b"halt", self.wire))
         first = self.keeper.pid
         assert first is not None
@@ -295,7 +295,7 @@ class KeeperTests(TestCase):
         await until(lambda: self.wire.heard() == b"halt", 1.0)
 
     async def test_names_what_cannot_be_started(self) -> None:
-        """If no switch can be started, or each one ends at once, this is logged once and retried."""
+        """If no switch can be started, or each switch ends immediately, this is logged once and retried."""
         for program, words in (
             ("/nowhere/python", "no dead man's switch yet"),
             ("/bin/false", "starting another one"),
@@ -319,7 +319,7 @@ class KeeperTests(TestCase):
             self.wire.heard()
 
     async def test_ends_at_any_moment(self) -> None:
-        """A keeper that is closed before, during or after a start, once or twice, leaves no process."""
+        """A keeper leaves no process, whether it is closed before, during or after a start, once or twice."""
         for stage in range(4):
             keeper = Supervisor("robot", reactor)
             if stage:
@@ -330,7 +330,7 @@ class KeeperTests(TestCase):
                 os.kill(pid or 0, signal.SIGKILL)
                 await until(lambda keeper=keeper: keeper.pid is None, 1.0)  # type: ignore[misc]
             elif stage == 3:
-                os.kill(pid or 0, signal.SIGSTOP)  # which does not receive the end
+                os.kill(pid or 0, signal.SIGSTOP)  # a stopped process, which does not receive the end
             await keeper.close()
             await keeper.close()
             self.assertFalse(pid and Path(f"/proc/{pid}").exists())
@@ -338,7 +338,7 @@ class KeeperTests(TestCase):
 
 
 class AiboDeadManTests(DeadManCase):
-    """An AIBO, which without a switch walks on for three seconds."""
+    """An AIBO, which without a switch would walk on for three seconds."""
 
     def setUp(self) -> None:
         super().setUp()
@@ -356,15 +356,18 @@ class AiboDeadManTests(DeadManCase):
         await self.server.stop()
 
     async def test_frozen(self) -> None:
-        """If the program is stopped (SIGSTOP), the dog stops after the deadline until it gets a new permit."""
+        """If the program is stopped (SIGSTOP), the dog stops after its deadline, until it gets a new permit."""
         await self.freeze(await self.driven("aibo", **self.options))
 
     async def test_killed(self) -> None:
-        """If the program is killed, the dog stops at once, and the switch ends."""
+        """If the program is killed, the dog stops immediately, and the switch ends."""
         await self.kill(await self.driven("aibo", **self.options))
 
     async def test_interrupted(self) -> None:
-        """Ctrl-C and SIGTERM do not end the switch before its program; then both end, and the dog stands."""
+        """On Ctrl-C and SIGTERM the switch outlives its program.
+
+        Then the switch also ends, and the dog stands still.
+        """
         puppeteer = await self.driven("aibo", **self.options)
         pid, _ = await puppeteer.switch()
         await until(lambda: ignores_signals(pid))
@@ -378,7 +381,7 @@ class AiboDeadManTests(DeadManCase):
         self.assertFalse(Path(f"/proc/{pid}").exists())
 
     async def test_replaced(self) -> None:
-        """A killed switch is replaced during a walk, and the new one halts the dog in time."""
+        """A switch that is killed during a walk is replaced, and the new switch halts the dog in time."""
         puppeteer = await self.driven("aibo", **self.options)
         first, _ = await puppeteer.switch()
         deadline = await self.walking(puppeteer, 2.0)
@@ -394,7 +397,7 @@ class AiboDeadManTests(DeadManCase):
         puppeteer.process.send_signal(signal.SIGCONT)
 
     async def test_lost_link(self) -> None:
-        """The switch releases a lost link, as the dog accepts one client, and guards the next one."""
+        """The switch releases a lost link, because the dog accepts only one client, and guards the next link."""
         puppeteer = await self.driven("aibo", **self.options)
         self.dog.reboot()
         await wait(2.5)
@@ -402,7 +405,7 @@ class AiboDeadManTests(DeadManCase):
 
 
 class Create2DeadManTests(DeadManCase):
-    """A Create 2 on a serial port, which without a switch drives on."""
+    """A Create 2 on a serial port, which without a switch would drive on."""
 
     if not HAS_SERIAL:
         skip = "needs the extra serial"
@@ -418,20 +421,20 @@ class Create2DeadManTests(DeadManCase):
         self.robot.stop()
 
     async def test_frozen(self) -> None:
-        """If the program is stopped, the robot stops after the deadline."""
+        """If the program is stopped, the robot stops after its deadline."""
         await self.freeze(await self.driven("create2", port=self.port.path))
 
     async def test_killed(self) -> None:
-        """If the program is killed, the robot stops at once, and the port is free."""
+        """If the program is killed, the robot stops immediately, and the serial port is free."""
         await self.kill(await self.driven("create2", port=self.port.path))
         await self.driven("create2", port=self.port.path)
 
 
 class BittleDeadManTests(DeadManCase):
-    """A Bittle, which without a switch walks on."""
+    """A Bittle, which without a switch would walk on."""
 
     async def test_frozen_on_a_cable(self) -> None:
-        """If the program is stopped, the dog stops after the deadline."""
+        """If the program is stopped, the dog stops after its deadline."""
         if not HAS_SERIAL:
             raise SkipTest("needs the extra serial")
         robot = Bittle(self.body, CLOCK, Random(1))
@@ -444,7 +447,7 @@ class BittleDeadManTests(DeadManCase):
             robot.stop()
 
     async def test_frozen_over_wifi(self) -> None:
-        """Over HTTP the switch opens a separate connection, for both boards."""
+        """Over HTTP the switch opens its own connection, for both boards."""
         for board in ("biboard", "nyboard"):
             robot = Bittle(self.body, CLOCK, Random(1), board=board)
             listening = REACTOR.listenTCP(0, TcpLinkFactory(robot.accept_http), interface="127.0.0.1")
@@ -459,17 +462,17 @@ class BittleDeadManTests(DeadManCase):
 
 
 class Restless(RosbridgeRobot):
-    """A robot without a timeout in its base."""
+    """A robot that has no timeout in its base."""
 
     def _on_no_command(self) -> None:
-        """Move on."""
+        """Keep moving."""
 
 
 class RosbridgeDeadManTests(DeadManCase):
-    """A ROS robot without a timeout in its base."""
+    """A ROS robot that has no timeout in its base."""
 
     async def test_frozen(self) -> None:
-        """If the program is stopped, the robot stops after the deadline."""
+        """If the program is stopped, the robot stops after its deadline."""
         robot = Restless(CLOCK, self.body, Random(1))
         robot.start()
         listening = REACTOR.listenTCP(0, TcpLinkFactory(robot.accept), interface="127.0.0.1")

@@ -1,4 +1,4 @@
-"""Tests of the real demonstration, with six processes and the page, used by touch and on a desktop in Chromium."""
+"""Tests of the real demonstration (six processes and the page) by touch and on a desktop, in Chromium."""
 
 from __future__ import annotations
 
@@ -13,9 +13,9 @@ SMALL = """index => {
   small.drawImage(seen, 0, 0, 26, 20);
   return Array.from(small.getImageData(0, 0, 26, 20).data);
 }"""
-"""A camera's picture, scaled down to average its noise."""
+"""Return a camera's picture, scaled down to average its noise."""
 MOVED = 4.0
-"""A mean difference of two such pictures, of 255, above the noise and below the change by a turning dog."""
+"""A mean pixel difference (0 to 255) of two such pictures: above the noise, below the change when a dog turns."""
 
 
 STOPPED = """async () => {
@@ -34,14 +34,14 @@ STOPPED = """async () => {
   }
   return { took, moved };
 }"""
-"""Press stop while a dog moves; return the milliseconds until all stand in the view from above, and later motions."""
+"""Press stop while a dog moves; return the milliseconds until all dogs stand still on the map, and later motions."""
 STANDING_MS = 6000.0
-"""The limit until all stand: 200 ms to brake, a view that is 200 ms old, and the rest for a loaded machine."""
+"""The time limit until all dogs stand still: 200 ms to brake, 200 ms age of the map, the rest for a loaded machine."""
 
 
 class DemonstrationPageTests(DemonstrationPageCase):
     def fits(self, page: Any) -> None:
-        """Check the page's accessibility, and that no content is cut off."""
+        """Check that the page is accessible and that no content is cut off."""
         self.sound(page)
         cut = page.evaluate(
             "[...document.querySelectorAll('button, select, dialog, .badge, .device, li, dd')]"
@@ -50,14 +50,14 @@ class DemonstrationPageTests(DemonstrationPageCase):
         self.assertEqual(cut, [], page.url)
 
     def test_be_driven_and_looked_at(self) -> None:
-        """A phone controls the team by touch, and a desktop shows devices, cameras and map during a search."""
+        """A phone controls the team by touch; a desktop shows devices, cameras and the map during a search."""
         phone = self.opened(PHONE)
         self.drive(phone)
         phone.context.close()
         self.look(self.opened(DESK))
 
     def drive(self, page: Any) -> None:
-        """Run the demo, stop and release it, open a device, send it a message, disconnect it, and move the target."""
+        """Run the demo, stop and release the team; open, message and disconnect a device, and move the target."""
         self.fits(page)
         page.locator("#demo").tap()
         self.stop(page)
@@ -94,7 +94,7 @@ class DemonstrationPageTests(DemonstrationPageCase):
         floor = page.locator(".floor")
         floor.scroll_into_view_if_needed()
         box = floor.bounding_box()
-        # A position with a dog is refused; three dogs cannot occupy four corners.
+        # A position that a dog occupies is refused; three dogs cannot occupy all four corners.
         for right, down in ((0.15, 0.15), (0.85, 0.15), (0.15, 0.85), (0.85, 0.85)):
             with page.expect_response("**/api/v1/target"):
                 page.touchscreen.tap(box["x"] + right * box["width"], box["y"] + down * box["height"])
@@ -107,7 +107,7 @@ class DemonstrationPageTests(DemonstrationPageCase):
             self.fail(page.locator("#status-line").inner_text())
 
     def stop(self, page: Any) -> None:
-        """A stop during the search halts all three dogs at once and for 3 s; after the release they continue."""
+        """A stop during the search halts all three dogs immediately and for 3 s; after the release they continue."""
         seen = page.evaluate(STOPPED)
         self.assertLess(seen["took"], STANDING_MS, seen)
         self.assertEqual(seen["moved"], 0)
@@ -117,7 +117,7 @@ class DemonstrationPageTests(DemonstrationPageCase):
         page.locator(".halted").wait_for(state="hidden")
 
     def look(self, page: Any) -> None:
-        """The page shows devices in joining order, three cameras with changing views, and the map."""
+        """Check that the page shows devices in joining order, three cameras with changing views, and the map."""
         devices = self.demo.api("devices")
         self.assertEqual(page.locator(".device b").all_inner_texts(), [device["name"] for device in devices])
         joined = [device["joined"] for device in devices]

@@ -1,4 +1,4 @@
-"""Tests of the deployment page: its code blocks run on computers that are network namespaces."""
+"""Tests of the deployment page of the documentation: its code blocks run on computers that are network namespaces."""
 
 from __future__ import annotations
 
@@ -35,11 +35,11 @@ Block = tuple[str, bool, list[str]]
 
 
 class DeployTests(NamespaceCase):
-    """Each computer has its name from the page, a separate home directory, and only the page's files."""
+    """Each computer has its name from the page, its own home directory, and only the page's files."""
 
     def setUp(self) -> None:
         super().setUp()
-        # Trial's folders are deeper than the maximum length of a socket's path.
+        # The folders of Trial have paths that are too long for a socket.
         self.folder = Path(tempfile.mkdtemp())
         self.addCleanup(shutil.rmtree, self.folder)
         self.programs = self.folder / "bin"
@@ -56,7 +56,7 @@ class DeployTests(NamespaceCase):
         self.nodes: dict[str, subprocess.Popen[bytes]] = {}
 
     def blocks(self, first: str, last: str) -> Iterator[Block]:
-        """Yield computer, whether its node ends before, and lines, for the blocks between two headings."""
+        """Yield computer, whether its node is stopped first, and lines, for each block between two headings."""
         text = PAGE.read_text(encoding="utf-8")
         part = text[text.index(f"## {first}") : text.index(f"## {last}") if last else len(text)]
         for name, again, lines in BLOCK.findall(part):
@@ -69,14 +69,14 @@ class DeployTests(NamespaceCase):
         return path
 
     def surroundings(self, name: str) -> dict[str, str]:
-        """Return the environment of a user at a computer."""
+        """Return the environment variables of a user at a computer."""
         home = self.home(name)
         inherited = {key: value for key, value in make_environment().items() if not key.startswith(("SWARM_", "XDG_"))}
         here = {"HOME": str(home), "XDG_RUNTIME_DIR": str(home), "PYTHONPATH": str(ROOT), "PYTHONUNBUFFERED": "1"}
         return {**inherited, **here, "PATH": f"{self.programs}:{inherited['PATH']}"}
 
     def follow(self, net: Internet, places: dict[str, str], blocks: Iterable[Block]) -> dict[str, str]:
-        """Run the blocks; return the last output of each line, by computer and line."""
+        """Run the blocks; return the last output of each line by computer and line."""
         said: dict[str, str] = {}
         for name, again, lines in blocks:
             host = places[name]
@@ -96,7 +96,7 @@ class DeployTests(NamespaceCase):
         return said
 
     def meant(self, line: str, name: str, net: Internet) -> str:
-        """Return a line of the page with the real code and addresses."""
+        """Return a line of the page with the real code and addresses filled in."""
         if "swarm join " in line:
             line = CODE.sub(self.codes[name], line)
         if "w1" in net.hosts:
@@ -104,7 +104,7 @@ class DeployTests(NamespaceCase):
         return line.replace(RENTED, net.address(PUBLIC_HOST))
 
     def run_line(self, net: Internet, host: str, name: str, line: str) -> str:
-        """Run a line, which must succeed, and return its output."""
+        """Run a line, which must succeed; return its output."""
         done = subprocess.run(
             net.command(host, ["sh", "-c", line]),
             cwd=self.home(name),
@@ -117,7 +117,7 @@ class DeployTests(NamespaceCase):
         return done.stdout
 
     def start(self, net: Internet, host: str, name: str, line: str) -> None:
-        """Start a node, and wait until it has joined its team."""
+        """Start a node; wait until it has joined its team."""
         log = self.home(name) / "log"
         with open(log, "wb") as file:
             options = {"cwd": self.home(name), "env": self.surroundings(name), "stdout": file, "stderr": file}
@@ -129,7 +129,7 @@ class DeployTests(NamespaceCase):
         return "\n".join(f"-- {path.parent.name}\n{path.read_text()}" for path in self.folder.glob("*/log"))
 
     def test_three_laptops(self) -> None:
-        """The page's lines make a team of three laptops behind one router, and its web page opens on another laptop."""
+        """With the page's lines three laptops behind one router form a team, and one opens the web page of another."""
         with Internet([Site("w", NatKind.PORT, hosts=3)]) as net:
             places = {"vaio": "w1", "dog1": "w2", "dog2": "w3"}
             said = self.follow(net, places, self.blocks("Three laptops on one Wi-Fi", "Over the internet"))
@@ -141,14 +141,17 @@ class DeployTests(NamespaceCase):
             self.assertEqual(self.run_line(net, "w2", "dog1", command).strip(), "200")
 
     def test_over_the_internet(self) -> None:
-        """The page's lines work for a rented computer with a firewall and laptops behind routers, one without UDP."""
+        """The page's lines work for a rented computer with a firewall and laptops behind routers.
+
+        One of the laptops has no UDP.
+        """
         sites = [Site("o", NatKind.PORT), Site("h", NatKind.PORT), Site("u", NatKind.NOUDP)]
         with Internet(sites) as net:
             net.get_namespace(PUBLIC_HOST).run(f"nft -f - <<'END'\n{FIREWALL}\nEND\n")
             places = {"boss": "o1", "host1": PUBLIC_HOST, "cam1": "h1", "cam2": "u1"}
             making, *rest = self.blocks("Over the internet", "")
             self.follow(net, places, [making])
-            for ending in ("toml", "membership"):  # with scp in the page
+            for ending in ("toml", "membership"):  # the page uses scp here
                 shutil.move(self.home("boss") / f"host1.{ending}", self.home("host1"))
             said = self.follow(net, places, rest)
             gone = self.home("cam2") / "log"

@@ -1,4 +1,4 @@
-"""Tests of ``swarm doctor`` in an internet of namespaces: each cause is created and must be named."""
+"""Tests of ``swarm doctor`` in a simulated internet of namespaces: each cause is created and must be reported."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ while True:
 
 
 class DoctorCase(NamespaceCase):
-    """An internet with nodes, and the doctor."""
+    """A simulated internet with nodes, and the doctor."""
 
     net: Internet
 
@@ -61,7 +61,7 @@ class DoctorCase(NamespaceCase):
         return file
 
     def node(self, at: str, settings: Path) -> subprocess.Popen[Any]:
-        """Run a node at a host until it has a control socket."""
+        """Run a node on a host; wait until it has a control socket."""
         log = open(settings.with_suffix(".log"), "w", encoding="utf-8")  # noqa: SIM115 (the process has it)
         self.addCleanup(log.close)
         home = self.home(settings)
@@ -72,7 +72,7 @@ class DoctorCase(NamespaceCase):
         return process
 
     def home(self, settings: Path) -> Path:
-        """Return the folder of a node's control socket, as the hosts share one disk."""
+        """Return the folder of a node's control socket; it depends on the host, because the hosts share one disk."""
         home = Path("/tmp") / f"doctor-{abs(hash((str(self.folder), settings.stem))) % 10**9}"
         if not home.exists():
             home.mkdir(mode=0o700)
@@ -87,7 +87,7 @@ class DoctorCase(NamespaceCase):
         home.rmdir()
 
     def asked(self, at: str, settings: Path, late: float = 0.0) -> Mapping[str, Any]:
-        """Return the doctor's findings at a host."""
+        """Return the findings of the doctor on a host."""
         words = ["env", f"XDG_RUNTIME_DIR={self.home(settings)}", sys.executable, "-c", DOCTOR, str(late)]
         done = self.net.run(at, [*words, "--json", str(settings)], timeout=LIMIT_S)
         self.assertIn(done.returncode, (0, 1), done.stderr)
@@ -101,10 +101,13 @@ class DoctorCase(NamespaceCase):
 
 
 class WayTests(DoctorCase):
-    """Causes between a node and the internet."""
+    """Causes on the path between a node and the internet."""
 
     def test_routers_and_firewalls(self) -> None:
-        """Each kind of router and a firewall against UDP are named by the nodes behind them, a cut as no bootstrap."""
+        """Nodes behind each kind of router, and behind a firewall that blocks UDP, report it.
+
+        A cut connection is reported as a missing bootstrap node.
+        """
         net = self.net = self.internet(
             Site("c", NatKind.PORT),
             Site("s", NatKind.SYM),
@@ -150,7 +153,7 @@ class LanTests(DoctorCase):
         self.assertEqual((done.stdout.strip(), done.stderr), (self.other, ""))
 
     def test_multicast_blocked(self) -> None:
-        """A LAN without multicast is named, although the node is reachable by its address."""
+        """A LAN without multicast is reported, even if the node is reachable at its address."""
         self.assertEqual(self.causes("a1", self.own), [])
         for port in ("h1", "h2"):
             self.net.get_namespace("a-gw").run(f"ip link set {port} type bridge_slave mcast_flood off mcast_router 0\n")
@@ -158,25 +161,25 @@ class LanTests(DoctorCase):
         self.assertEqual(self.causes("a1", self.own), ["multicast-blocked"])
 
     def test_firewall_of_this_machine(self) -> None:
-        """A local firewall that blocks multicast is named as this machine's."""
+        """A firewall on this machine that blocks multicast is reported as this machine's firewall."""
         self.net.get_namespace("a1").run(_DROP.format(port=8483))
         said = self.asked("a1", self.own)["findings"]
         self.assertEqual([finding["cause"] for finding in said], ["multicast-blocked"])
         self.assertIn("This machine", said[0]["what"])
 
     def test_firewall_of_the_other(self) -> None:
-        """A neighbour's firewall that blocks its port is named as the neighbour's."""
+        """If a neighbour's firewall blocks the neighbour's port, it is reported as the neighbour's firewall."""
         self.net.get_namespace("a2").run(_DROP.format(port=8484))
         self.assertIn("peer-firewall", self.causes("a1", self.own))
 
     def test_client_isolation(self) -> None:
-        """Client isolation at the access point is named."""
+        """Client isolation at the access point is reported."""
         for port in ("h1", "h2"):
             self.net.get_namespace("a-gw").run(f"ip link set {port} type bridge_slave isolated on\n")
         self.assertEqual(self.causes("a1", self.own), ["client-isolation"])
 
     def test_settings_and_clock(self) -> None:
-        """A port without a node, an impossible host, another team and a slow clock are named."""
+        """A port without a node, an impossible host, another team and a wrong clock are reported."""
         own, other = self.net.address("a1"), self.net.address("a2")
         nobody = self.settings("own", own, [f"{other}:9999"], lan=False)
         self.assertEqual(self.causes("a1", nobody), ["nobody-listens"])
@@ -188,7 +191,7 @@ class LanTests(DoctorCase):
         self.assertEqual(self.causes("a1", settings, late=3600.0), ["clock-off"])
 
     def test_version(self) -> None:
-        """A node with another protocol version is named."""
+        """A node with a different protocol version is reported."""
         words = [sys.executable, "-c", OTHER_VERSION, self.net.address("a2"), "8499"]
         process = self.net.start("a2", words, stdout=subprocess.PIPE, text=True)
         assert process.stdout is not None
@@ -197,7 +200,7 @@ class LanTests(DoctorCase):
         self.assertEqual(self.causes("a1", settings), ["version-skew"])
 
     def test_machine(self) -> None:
-        """A used port, an impossible store and readable settings are named together."""
+        """A port in use, an impossible store and settings that others can read are reported together."""
         settings = self.settings("taken", self.net.address("a2"), [], store="nowhere/a.sqlite", lan=False)
         settings.chmod(0o644)
         self.assertEqual(self.causes("a2", settings), ["port-in-use", "store-unwritable", "key-readable"])

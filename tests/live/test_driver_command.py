@@ -52,14 +52,14 @@ class DriverCommandTests(TestCase):
         self.addCleanup(self.folder.cleanup)
 
     def started(self, *words: str, **more: Any) -> subprocess.Popen[bytes]:
-        """Start the command with these words; it is killed after the test."""
+        """Start the command with these words; kill it after the test."""
         child = subprocess.Popen([*COMMAND, *words, *self.robot], cwd=ROOT, **more)
         self.addCleanup(child.wait)
         self.addCleanup(child.kill)
         return child
 
     async def ended(self, child: subprocess.Popen[bytes], seconds: float = 20.0) -> int:
-        """Wait for the end of a child, and return its exit code."""
+        """Wait until a child process has ended; return its exit code."""
         until = IReactorTime(reactor).seconds() + seconds
         while child.poll() is None and IReactorTime(reactor).seconds() < until:
             await wait(0.02)
@@ -74,7 +74,7 @@ class DriverCommandTests(TestCase):
         self.assertGreater(self.body.motion[0], 0.03)
 
     async def test_probe_and_monitor(self) -> None:
-        """``probe`` prints the data over TCP, ``monitor`` saves a frame, and a closed port is reported."""
+        """``probe`` prints data over TCP, ``monitor`` saves a frame, and a closed port is reported."""
         out = Path(self.folder.name) / "out"
         with out.open("wb") as file:
             self.assertEqual(await self.ended(self.started("probe", "--seconds", "1", stdout=file)), 0)
@@ -90,7 +90,7 @@ class DriverCommandTests(TestCase):
         self.assertIn("! 127.0.0.1:1: nothing listens at this port", out.read_text())
 
     async def test_interrupted(self) -> None:
-        """Ctrl-C ends ``monitor`` and ``drive`` without a traceback, with the dog at rest and its motors off."""
+        """After Ctrl-C ``monitor`` and ``drive`` end without a traceback; the dog is at rest with its motors off."""
         out = Path(self.folder.name) / "out"
         with out.open("wb") as file:
             child = self.started("monitor", stdout=file, stderr=file)
@@ -110,7 +110,10 @@ class DriverCommandTests(TestCase):
         self.assertNotIn("Traceback", os.read(ours, 65536).decode())
 
     async def test_drive(self) -> None:
-        """Keys in a terminal move the dog, which stops without keys; x ends the command and restores the terminal."""
+        """Keys in a terminal move the dog, which stops when no key is pressed.
+
+        X ends the command and resets the terminal.
+        """
         ours, theirs = pty.openpty()
         self.addCleanup(os.close, ours)
         self.addCleanup(os.close, theirs)

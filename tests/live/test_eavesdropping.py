@@ -1,4 +1,4 @@
-"""S11: the data that a network capture can read of a team that sends names, positions and messages."""
+"""Tests of attack S11: the data that an eavesdropper can read when a team sends names, positions and messages."""
 
 from __future__ import annotations
 
@@ -54,7 +54,7 @@ class EavesdroppingTests(TestCase):
         self.papers: list[Membership] = []
 
     def node(self, paper: Membership, known: list[Address]) -> tuple[EntangledNode, Deferred[None]]:
-        """Return a node with this membership, and a Deferred that fires when it has joined."""
+        """Return a node with this membership, and a Deferred that fires when the node has joined."""
         self.papers.append(paper)
         dice, store = random.SystemRandom(), MemoryStore()
         team = Team(MemoryMembership(paper), store, time.time, dice)
@@ -90,7 +90,7 @@ class EavesdroppingTests(TestCase):
 
     @inlineCallbacks
     def test_nothing_is_readable(self) -> Generator[Deferred[Any], Any, None]:
-        """No name, task, position, message, key, certificate or secret is readable; public data is."""
+        """No name, task, position, message, key, certificate or secret is readable; only public data is."""
         dice = random.SystemRandom()
         signer = create_operator("kennel", dice)
         first = signer.create_membership("hedgehog", ("device", "bootstrap", "gateway"), time.time(), dice)
@@ -118,7 +118,7 @@ class EavesdroppingTests(TestCase):
             public = paper.identity.public
             secret += [paper.seed, public, derive_node_id(public), paper.certificate[:40], paper.certificate[-40:]]
         self.assertEqual([each for each in secret if each in whole or each.hex().encode() in whole], [])
-        # The capture works: a discovery reply contains the team's fingerprint unencrypted.
+        # The capture works: it contains the team's fingerprint, which a discovery reply contains unencrypted.
         yield two.endpoint.probe(one.contact.address)
         yield deferLater(reactor, 0.1, lambda: None)
         fingerprint = one.endpoint.admission.fingerprint

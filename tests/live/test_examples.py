@@ -1,4 +1,4 @@
-"""Tests of the examples, as processes over the loopback interface."""
+"""Tests of the examples, run as processes that communicate over the loopback interface."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ class ExamplesTests(TestCase):
     """The examples in the documentation."""
 
     def start(self, name: str, *words: object) -> subprocess.Popen[str]:
-        """Start an example, which is killed after the test or a timeout."""
+        """Start an example; kill it after the test or a timeout."""
         process = subprocess.Popen(
             [sys.executable, str(ROOT / "examples" / f"{name}.py"), *map(str, words)],
             stdin=subprocess.PIPE,
@@ -65,7 +65,7 @@ class ExamplesTests(TestCase):
         self.assertEqual((ran.stdout, ran.returncode), ("[b'red']\n", 0), ran.stderr)
 
     def test_keyvalue(self) -> None:
-        """A process reads the value that another one stores."""
+        """A process reads the value that another process stores."""
         first, second = free_port(), free_port()
         self.start("keyvalue", first)
         known = f"127.0.0.1:{first}"
@@ -73,7 +73,7 @@ class ExamplesTests(TestCase):
         self.assertEqual(self.line(self.start("keyvalue", free_port(), known, "colour")), "red")
 
     def test_chat(self) -> None:
-        """Each of two chats prints the other's lines, without control characters."""
+        """Each of two chats prints the lines of the other, without control characters."""
         first = free_port()
         ann = self.start("chat", "--port", first, "ann")
         self.assertEqual(self.line(ann), "here: ann")
@@ -85,8 +85,8 @@ class ExamplesTests(TestCase):
         self.assertEqual(self.line(bob), "ann: hel [2Jlo")
 
     def test_workqueue(self) -> None:
-        """All jobs are done although a worker dies during its first one."""
-        # The number of jobs leaves the second worker time to start on a loaded machine.
+        """All jobs are done even if a worker is killed during its first job."""
+        # With this number of jobs the second worker has time to start, even on a loaded machine.
         first, jobs = free_port(), 30
         boss = self.start("workqueue", "--port", first, "boss", jobs)
         self.assertEqual(self.line(boss), f"jobs are put: {jobs}")

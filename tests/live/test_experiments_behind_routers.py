@@ -14,14 +14,20 @@ from tests.live.namespaces import NamespaceCase
 
 LIMIT_S = 400.0
 WORDS = (b"red target", b"EXECUTING", b"capabilities", b"camera")
-"""Words that the team sends; a word of four letters occurs in six million random bytes by chance now and then."""
+"""Words that the team sends.  Shorter words could occur by chance in six million random bytes."""
 
 
 class ExperimentsBehindRoutersTests(NamespaceCase):
-    """dog1 is behind a port restricted router, dog2 behind a symmetric one, dog3 on the LAN of the bootstrap node."""
+    """dog1 is behind a port restricted router, dog2 behind a symmetric router.
+
+    dog3 is on the LAN of the bootstrap node.
+    """
 
     def test_both_experiments_hold(self) -> None:
-        """The nearest dog acts, after its failure another one, as the page shows; a capture contains no plain text."""
+        """The nearest dog acts, and after its failure another dog, as the page shows.
+
+        A capture contains no plain text.
+        """
         folder = Path(self.mktemp()).absolute()
         report = folder.parent / "report.json"
         folder.parent.mkdir(parents=True, exist_ok=True)

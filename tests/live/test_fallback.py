@@ -1,4 +1,4 @@
-"""Tests of the page's fallback to another web node when its node dies, freezes or stops."""
+"""Tests of the page's fallback to another web node when its own node is killed, freezes or stops."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ class FallbackTests(BrowserCase):
         self.assertEqual(self.faults, [])
 
     def served(self, name: str, page: Any = None) -> None:
-        """Wait until the page is served by ``name``, live, with three cameras."""
+        """Wait until the page is live, served by ``name``, and shows three cameras."""
         page = page or self.page
         self.wait_for_node(page, name)
         page.locator(CAMERAS).nth(2).wait_for()
@@ -48,12 +48,12 @@ class FallbackTests(BrowserCase):
         return self.webs[place].pid
 
     def lose(self, how: signal.Signals) -> None:
-        """Send the serving node the signal, and wait until the page is live at the other node."""
+        """Send the signal to the serving node; wait until the page is live at the other node."""
         os.kill(self.pid(0), how)
         self.wait_for_node(self.page, "pi")
 
     def test_go_on_after_a_crash(self) -> None:
-        """After a SIGKILL the page is live at the other node, in the same view, and sends its requests there."""
+        """After a SIGKILL the page is live at the other node, in the same view, and sends its requests to that node."""
         self.opened()
         self.page.locator(".device", has_text="dog2").dblclick()
         self.page.locator("#d-text").fill("half a sentence")
@@ -69,7 +69,7 @@ class FallbackTests(BrowserCase):
         self.page.locator(".device[data-state=IDLE]", has_text="dog3").wait_for()
 
     def test_go_on_after_a_freeze(self) -> None:
-        """After a SIGSTOP, with connections still accepted, the page sends the request to the other node."""
+        """After a SIGSTOP, when the frozen node still accepts connections, the page uses the other node."""
         self.opened()
         os.kill(self.pid(0), signal.SIGSTOP)
         self.page.locator("#demo").click()
@@ -78,7 +78,7 @@ class FallbackTests(BrowserCase):
         self.served("pi")
 
     def test_go_past_an_impostor(self) -> None:
-        """A listed web node that is no gateway gets no requests and no token, and no URL contains a token."""
+        """A listed web node that is not a gateway gets no requests and no token, and no URL contains a token."""
         eve = Team()
         self.addCleanup(eve.end)
         eve.order("name eve")
@@ -101,7 +101,7 @@ class FallbackTests(BrowserCase):
             self.assertEqual(strays, [])
 
     def test_new_task_is_asked_for_again(self) -> None:
-        """A task sent to a frozen node is sent to the other one, with the same idempotency key."""
+        """A task sent to a frozen node is sent again to the other node, with the same idempotency key."""
         self.opened()
         keys: list[str] = []
 
@@ -119,7 +119,7 @@ class FallbackTests(BrowserCase):
         self.assertEqual((len(keys), len(set(keys))), (2, 1))
 
     def test_keep_all_or_nothing(self) -> None:
-        """A single file is not cached, as the page would open without its other files; the complete page is."""
+        """The page is cached as a whole: with a single cached file it would open without the other files."""
         self.opened()
         self.page.evaluate(KEPT)
         held = "async () => (await (await caches.open('swarm.shell')).keys()).length"
@@ -132,7 +132,7 @@ class FallbackTests(BrowserCase):
         self.assertEqual(self.page.evaluate(held), 0)
 
     def test_open_while_the_node_is_gone(self) -> None:
-        """A cached page opens at the URL of a failed node, and finds the other one."""
+        """A cached page opens at the URL of a failed node, and finds the other node."""
         self.opened()
         # The page is cached with all its files or not at all.
         self.page.evaluate(KEPT)
@@ -148,12 +148,15 @@ class FallbackTests(BrowserCase):
 
 
 class DemonstrationFallbackTests(DemonstrationPageCase):
-    """Experiment 2 of the thesis with the real team, and in addition the failure of its web node."""
+    """Experiment 2 of the thesis with the real team, and additionally a failure of the web node."""
 
     options = ("--web-port", "0")
 
     def test_experiment_2_and_the_web_node(self) -> None:
-        """The acting dog is killed and the page's node frozen; page and task continue, then the other node dies."""
+        """The acting dog is killed and the page's node frozen; page and task continue.
+
+        Then the other web node is killed.
+        """
         page = self.opened(DESK)
         page.locator("#standby-nodes", has_text="pi").wait_for()
         page.locator("#demo").click()

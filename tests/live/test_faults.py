@@ -9,14 +9,14 @@ from tests.live.page import DESK, PHONE, TABLET, PageCase
 
 class FaultPageTests(PageCase):
     def opened(self, screen: dict[str, Any], scheme: Any = "light", has_clock: bool = False) -> Any:
-        """Return the page with dog2's dialog and its faults."""
+        """Return the page with the open dialog of dog2, which shows the faults."""
         page = super().opened(screen, scheme, has_clock)
         page.evaluate("location.hash = 'device/' + '02'.repeat(16)")
         page.locator(".fault-buttons button").first.wait_for()
         return page
 
     def test_let_it_fail(self) -> None:
-        """A tap injects a fault for the given seconds; its timer is shown in the dialog and on the list."""
+        """A tap injects a fault for the given seconds; its timer is shown in the dialog and in the list of devices."""
         page = self.opened(PHONE)
         page.locator("#f-seconds").fill("30")
         page.get_by_role("button", name="Cut radio").tap()
@@ -30,7 +30,7 @@ class FaultPageTests(PageCase):
         page.context.close()
 
     def test_by_keyboard(self) -> None:
-        """By keyboard, Tab reaches each button and Enter injects the fault; without seconds nothing happens."""
+        """Tab reaches each button and Enter injects the fault; if no seconds are given, nothing happens."""
         page = self.opened(DESK)
         page.locator("#f-seconds").focus()
         page.keyboard.press("Tab")

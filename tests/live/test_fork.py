@@ -13,17 +13,17 @@ from sim.team.scale.fork import run_in_fork
 
 
 class Ended(Exception):
-    """A signal has arrived."""
+    """Raised when a signal arrives."""
 
 
 def ended(*signal: Any) -> None:
-    """Handle a signal."""
+    """Raise ``Ended`` when a signal arrives."""
     raise Ended
 
 
 class ForkTests(SynchronousTestCase):
     def test_returns_and_raises(self) -> None:
-        """Results and exceptions of the call reach the parent, and changes of variables do not."""
+        """Results and exceptions of the call reach the parent; changes of variables do not."""
         changed: list[int] = []
 
         def call() -> int:
@@ -36,12 +36,12 @@ class ForkTests(SynchronousTestCase):
             run_in_fork(lambda: int("none"), ValueError)
 
     def test_ends_without_a_word(self) -> None:
-        """A child process that ends without an answer raises an error with its exit code."""
+        """A child process that ends without a result raises an error that contains the exit code."""
         with self.assertRaisesRegex(RuntimeError, "exit code 7"):
             run_in_fork(lambda: os._exit(7))
 
     def test_ended_with_who_waits_for_it(self) -> None:
-        """If the waiting parent is interrupted, the call is ended as well, and its exception arrives."""
+        """If the waiting parent is interrupted, the call is interrupted too, and its exception reaches the parent."""
         ready, told = os.pipe()
         self.addCleanup(os.close, ready)
         self.addCleanup(os.close, told)

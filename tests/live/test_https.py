@@ -19,12 +19,12 @@ from tests.live.until import takes, until
 
 MISSING = [name for name in ("flask", "OpenSSL", "cryptography") if find_spec(name) is None]
 DRIBBLED_S = 20.0
-"""12 s on an idle machine."""
+"""The time limit for a loaded machine; an idle machine needs 12 s."""
 CODE = "quiet-otter"
 
 
 class SecureNode:
-    """A web node in a child process, with the page at ``plain`` and ``secure``."""
+    """A web node in a child process; its page is at ``plain`` (HTTP) and ``secure`` (HTTPS)."""
 
     def __init__(self, test: NodeCase, name: str, known: str = "") -> None:
         http, https = free_ports.find_free_ports("tcp", "127.0.0.1", 2)
@@ -44,7 +44,7 @@ class SecureNode:
 
 
 def asked(url: str, trust: ssl.SSLContext | None = None, body: object = None, token: str = "") -> bytes:
-    """Return the body of an answer."""
+    """Return the body of the response."""
     data = None if body is None else json.dumps(body).encode()
     headers = {"Content-Type": "application/json", **({"Authorization": f"Bearer {token}"} if token else {})}
     with urllib.request.urlopen(urllib.request.Request(url, data, headers), timeout=10, context=trust) as answer:
@@ -57,21 +57,21 @@ class HttpsTests(NodeCase):
         skip = f"THE PAGE OVER TLS IS NOT TESTED: missing {', '.join(MISSING)} (pip install 'swarm-node[tls]')"
 
     def trusting(self, node: SecureNode, **versions: Any) -> ssl.SSLContext:
-        """Return an SSL context that trusts the authority of the node's team, and checks the address."""
+        """Return an SSL context that trusts the authority of the node's team and checks the address."""
         trust = ssl.create_default_context(cadata=node.authority)
         for name, version in versions.items():
             setattr(trust, name, version)
         return trust
 
     def test_serve_the_page_to_who_trusts_it(self) -> None:
-        """One node serves the whole page over TLS, guards it like the plain port, and closes slow handshakes."""
+        """One node serves the whole page over TLS, applies the plain port's checks, and closes slow handshakes."""
         node = SecureNode(self, "vaio")
         self.serve_all_of_the_page(node)
         self.keep_the_guard(node)
         self.let_go_who_dribbles_a_handshake(node)
 
     def serve_all_of_the_page(self, node: SecureNode) -> None:
-        """Page, scripts, API and stream need TLS 1.2 or newer and trust in the team's authority."""
+        """Check that page, scripts, API and stream need TLS 1.2 or newer and trust in the team's authority."""
         trust = self.trusting(node)
         self.assertIn(b"<title>Swarm</title>", asked(node.secure, trust))
         self.assertIn(b"import", asked(f"{node.secure}/static/page.js", trust))
@@ -99,7 +99,7 @@ class HttpsTests(NodeCase):
         self.assertIn(b"vaio", asked(node.secure, self.trusting(node, maximum_version=ssl.TLSVersion.TLSv1_2)))
 
     def keep_the_guard(self, node: SecureNode) -> None:
-        """Requests that the plain port refuses, such as for another host or origin, are also refused over TLS."""
+        """Check that requests that the plain port refuses, such as for another host, are also refused over TLS."""
         trust = self.trusting(node)
         for path, headers, body, status in (
             ("/api/v1/state", {}, None, 401),
@@ -115,7 +115,10 @@ class HttpsTests(NodeCase):
             self.assertEqual((error.code, set(told["error"])), (status, {"field", "problem", "remedy"}))
 
     def test_trust_each_node_once(self) -> None:
-        """Trust in one web node's authority does not include another's; a restarted node keeps its certificate."""
+        """Trust in the authority of one web node does not include other nodes.
+
+        A restarted node keeps its certificate.
+        """
         first, second = SecureNode(self, "vaio"), SecureNode(self, "pi")
         self.assertNotEqual(first.authority, second.authority)
         self.assertIn(b"pi", asked(second.secure, self.trusting(second)))
@@ -127,7 +130,7 @@ class HttpsTests(NodeCase):
         self.assertEqual(ssl.get_server_certificate(("127.0.0.1", again.port)), before)
 
     def let_go_who_dribbles_a_handshake(self, node: SecureNode) -> None:
-        """Forty clients with slow, silent or invalid handshakes are closed in time, while others are served."""
+        """Check that forty clients with slow, silent or invalid handshakes are closed, while others are served."""
         began = time.monotonic()
         slow = [socket.create_connection(("127.0.0.1", node.port), 5.0) for _ in range(40)]
         for client in slow:

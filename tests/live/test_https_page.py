@@ -19,7 +19,7 @@ class HttpsPageTests(BrowserCase, NodeCase):
         skip = f"THE PAGE OVER TLS IS NOT TESTED IN A BROWSER: missing {'; '.join(MISSING)}"
 
     def test_stay_secure_when_the_node_is_lost(self) -> None:
-        """The page has camera and service worker, and changes to another node's HTTPS, never to HTTP."""
+        """The page has camera and service worker; it changes to the HTTPS URL of another node, but never to HTTP."""
         first = SecureNode(self, "vaio")
         second = SecureNode(self, "pi", first.address)
         pins = ",".join(pin(node.port) for node in (first, second))

@@ -29,7 +29,7 @@ class InviteTests(PageCase):
         page.locator("#invite[open]").wait_for()
 
     def read(self, page: Any, number: int = 0) -> str:
-        """Return the text of a QR code on the screen."""
+        """Return the text in a QR code on the screen."""
         import cv2
         import numpy as np
 
@@ -38,7 +38,7 @@ class InviteTests(PageCase):
         return str(cv2.QRCodeDetector().detectAndDecode(picture)[0])
 
     def another(self, page: Any) -> None:
-        """Request a new invitation, as OpenCV's reader fails at one code in a hundred."""
+        """Request a new invitation, because OpenCV's reader fails for one code in a hundred."""
         before = page.locator("#i-link").input_value()
         for kind in ("viewer", "phone"):
             page.locator("#i-kind").select_option(kind)
@@ -46,7 +46,7 @@ class InviteTests(PageCase):
             before = page.locator("#i-link").input_value()
 
     def test_read_the_code(self) -> None:
-        """On each screen, light and dark, the QR code contains the shown URL, and axe finds no violation."""
+        """On each screen, in light and dark, the QR code contains the displayed URL, and axe finds no violation."""
         for screen in (PHONE, TABLET, DESK):
             page = self.opened(screen)
             self.invite(page)
@@ -81,13 +81,13 @@ class InviteTests(PageCase):
         self.assertTrue(page.locator("#i-link").input_value().startswith("http://127.0.0.1:"))
 
     def test_lead_to_the_phone(self) -> None:
-        """The link of a phone signs it in with this role, opens its view, and leaves no token in the URL."""
+        """The link for a phone signs in with its role, opens the phone's view, and leaves no token in the URL."""
         page = self.opened(DESK)
         self.invite(page)
         link = page.locator("#i-link").input_value()
         page.get_by_role("button", name="Copy").first.click()
         page.locator("#invite [role=status]", has_text="op").wait_for()
-        # The stop button works above the dialog, and after it.
+        # The stop button works over the open dialog, and after the dialog is closed.
         page.get_by_role("button", name="Stop").click()
         page.locator("body[data-halted=true]").wait_for()
         page.keyboard.press("Escape")
@@ -96,7 +96,7 @@ class InviteTests(PageCase):
         page.goto("about:blank")
         phone = self.tab(PHONE)
         phone.goto(f"{self.team.url}#{link.partition('#')[2]}")
-        # The URL changes at once, the session exists only after the node's answer.
+        # The URL changes immediately, but the session exists only after the node's response.
         phone.wait_for_function(
             "() => location.hash === '#phone' && "
             "JSON.parse(localStorage['swarm.sessions'] ?? '{}')[location.origin]?.token"

@@ -19,12 +19,12 @@ reactor: Any = _reactor
 
 
 class LoopbackTests(TestCase):
-    """Two members of the group on loopback."""
+    """Two members of the multicast group on the loopback interface."""
 
     def group(
         self, host: str = "127.0.0.1", look: Any = list_interfaces, moved: Callable[[], None] = lambda: None
     ) -> tuple[LanMulticast, list[tuple[bytes, Address]]]:
-        """Return a member of the group, and the list of datagrams that it receives."""
+        """Return a member of the group, and the list of datagrams that the member receives."""
         heard: list[tuple[bytes, Address]] = []
         group = LanMulticast(reactor, host, look)
         group.listen(lambda datagram, source: heard.append((datagram, source)), moved)
@@ -44,7 +44,7 @@ class LoopbackTests(TestCase):
         return Deferred.fromCoroutine(wait())
 
     async def test_all_in_the_group_hear_a_call_and_can_answer(self) -> None:
-        """A datagram to the group reaches each member on the machine, and an answer reaches the sender."""
+        """A datagram to the group reaches each member on the machine, and a reply reaches the sender."""
         a, heard_a = self.group()
         _, heard_b = self.group()
         a.send(b"who?")
@@ -52,7 +52,7 @@ class LoopbackTests(TestCase):
         self.assertEqual(heard_b[0][0], b"who?")
         source = heard_b[0][1]
         self.assertEqual(source.host, "127.0.0.1")
-        await self.soon(heard_a)  # its own datagram
+        await self.soon(heard_a)  # the member's own datagram
         answering = reactor.listenUDP(0, DatagramProtocol(), "127.0.0.1")
         self.addCleanup(answering.stopListening)
         answering.write(b"here", tuple(source))
@@ -60,7 +60,7 @@ class LoopbackTests(TestCase):
         self.assertEqual(heard_a[1], (b"here", Address("127.0.0.1", answering.getHost().port)))
 
     async def test_a_change_is_told(self) -> None:
-        """A change of the interfaces is reported, but not their first reading."""
+        """A change of the interfaces is reported, but not the first list of interfaces."""
         loopback = Interface(1, "lo", ("127.0.0.1",), is_loopback=True)
         found = [[loopback], [loopback], [Interface(1, "lo", ("127.0.0.1", "::1"), is_loopback=True)]]
         changes: list[int] = []
@@ -78,7 +78,7 @@ class LoopbackTests(TestCase):
         self.assertIn("127.0.0.1", loopback[0].addresses)
 
     async def test_no_interface_is_no_error(self) -> None:
-        """Without an interface a datagram is lost, and ``close`` may be called twice."""
+        """Without an interface a datagram is lost without an error; ``close`` may be called twice."""
         group, heard = self.group("192.0.2.77", lambda: [])
         group.send(b"who?")
         await deferLater(reactor, 0.05)

@@ -1,4 +1,4 @@
-"""Tests of each view on each screen, opened and used by touch and by keyboard, light and dark."""
+"""Tests of each view on each screen, opened and used by touch and by keyboard, in light and in dark colours."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ class MatrixTests(PageCase):
     timeout = 170
 
     def reach(self, page: Any, view: str, is_phone: bool, by_key: bool) -> None:
-        """Open a view as a user of that screen does; a larger screen shows it already."""
+        """Open a view as a user of that screen does; on a larger screen the view is already open."""
         for place in [*["more"] * (view in FURTHER), view] if is_phone else []:
             if by_key:
                 self.tab_to(page, f"a[href='#{place}']")
@@ -41,13 +41,13 @@ class MatrixTests(PageCase):
             self.tab_to(page, USED[view])
 
     def look_through(self, screen: dict[str, Any]) -> None:
-        """Open all views and a device on one screen, by touch in light colours and by keyboard in dark ones."""
+        """Open all views and a device on one screen, by touch in light colours and by keyboard in dark colours."""
         for scheme, by_key in (("light", "has_touch" not in screen), ("dark", True)):
             page = self.opened(screen, scheme)
             page.locator(".preview li").first.wait_for(state="attached")
             for view in VIEWS:
                 self.reach(page, view, screen is PHONE, by_key)
-                # A larger screen shows all views at once, so one check suffices.
+                # A larger screen shows all views simultaneously, so one check is enough.
                 if screen is PHONE or view in ("network", "map"):
                     self.sound(page)
             if by_key:

@@ -1,4 +1,4 @@
-"""Tests of camera streams over real sockets: the driver with another server, and the emulator with OpenCV's client."""
+"""Tests of camera streams over real sockets: the driver with a different server, the emulator with OpenCV's client."""
 
 from __future__ import annotations
 
@@ -48,7 +48,7 @@ class LiveMjpegTests(TestCase):
         return create_driver("camera", {"url": url, "width": 128, "height": 96, "fps": 30, **options}, "cam", reactor)
 
     async def test_watches_a_server_of_others(self) -> None:
-        """A stream of Python's HTTP server, in HTTP/1.0 and without lengths, is read."""
+        """The driver reads a stream of Python's HTTP server, which uses HTTP/1.0 and sends no lengths."""
 
         class Page(http.server.BaseHTTPRequestHandler):
             def do_GET(self) -> None:  # noqa: N802 (its own)
@@ -98,4 +98,4 @@ class LiveMjpegTests(TestCase):
             self.assertEqual(shapes, [(96, 128, 3)] * 5)
 
     if find_spec("cv2") is None:
-        test_other_clients_watch_the_emulator.skip = "NOBODY ELSE WATCHES: install the extra vision"  # type: ignore[attr-defined]
+        test_other_clients_watch_the_emulator.skip = "OTHER CLIENTS ARE NOT TESTED: install the extra vision"  # type: ignore[attr-defined]

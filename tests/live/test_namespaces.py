@@ -1,4 +1,4 @@
-"""Tests of the internet of namespaces: its routers, its links, and its complete removal."""
+"""Tests of the simulated internet of namespaces: its routers, its links, and its complete removal."""
 
 from __future__ import annotations
 
@@ -64,7 +64,7 @@ class InternetTests(NamespaceCase):
         self.assertEqual(process.stdout.readline(), "ready\n")
 
     def test_mappings_are_of_their_kind(self) -> None:
-        """Each kind of router maps to one outside port for all peers, to one per peer, or to none."""
+        """Each kind of router maps a socket to one external port for all peers, to one per peer, or to none."""
         kinds = list(NatKind)
         net = self.internet(*(Site(kind.value, kind) for kind in kinds))
         self.echo(net)
@@ -79,7 +79,7 @@ class InternetTests(NamespaceCase):
             self.assertEqual(len(ports), 3 if kind is NatKind.SYM else 1, (kind, seen))
 
     def test_lines_lose_what_is_said(self) -> None:
-        """A cut blocks all datagrams in one direction, losses are counted, and a healed link passes all datagrams."""
+        """A cut blocks all datagrams in one direction, losses are counted, and a repaired link passes all datagrams."""
         net = self.internet(Site("a", NatKind.PORT))
         self.echo(net)
         self.assertNotIn(None, self.seen(net, "a1"))
@@ -92,7 +92,7 @@ class InternetTests(NamespaceCase):
         self.assertNotIn(None, self.seen(net, "a1"))
 
     def test_routers_get_another_address(self) -> None:
-        """A renumbered site is seen only at its new address, and a moved host at its new router's."""
+        """A renumbered site is seen only at its new address, and a moved host only at the address of its new router."""
         net = self.internet(Site("a", NatKind.PORT), Site("b", NatKind.FULL))
         self.echo(net)
         before, new = net.get_external_address("a"), net.renumber("a")
@@ -118,7 +118,7 @@ class InternetTests(NamespaceCase):
         self.assertIn(b"who am I", whole.read_bytes())
 
     def test_nothing_is_left(self) -> None:
-        """After an exception or a kill of the creating process, no process of an internet is left."""
+        """After an exception, or if the creating process is killed, no process of a simulated internet is left."""
         program = (
             "import os, signal, sys\n"
             "from sim.namespaces.internet import Internet, Site\nfrom sim.namespaces.nat import NatKind\n"
@@ -146,7 +146,7 @@ class MatrixTests(NamespaceCase):
     """A small run of ``make live-nat``."""
 
     def test_whoever_can_reach_each_other_does(self) -> None:
-        """In one round of the matrix, nodes without routers connect at once, and table, JSON and figure are written."""
+        """In one round, nodes without routers connect immediately, and table, JSON and figure are written."""
         folder = Path(self.mktemp()).absolute()
         command = [sys.executable, "-m", "benchmarks.nat", "--count", "1", "--lossy", "0", "--out", str(folder)]
         ran = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=120)

@@ -1,4 +1,4 @@
-"""Tests of the page in a real browser: the views and actions of an operator, on a phone and on a desktop."""
+"""Tests of the page in a real browser: an operator's views and actions, on a phone and on a desktop."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ TWINS = """async () => {
   });
   return seen;
 }"""
-"""A list updated with items of which two are equal: its text, and the number of new rows."""
+"""Update a list with items of which two are equal; return the text of the list and the number of new rows."""
 PANELS = """async () => {
   const { registerPanel } = await import("/static/panel.js");
   const { model } = await import("/static/model.js");
@@ -37,7 +37,7 @@ PANELS = """async () => {
     return { update: (_, event) => { if (event === "state") throw new Error("a fault of one"); } };
   } });
 }"""
-"""Two panels that the page shows to operators of a node with faults; one of them fails at each state."""
+"""Two panels that the page shows to operators of a node with faults; one of them raises an exception at each state."""
 
 
 class PageTests(PageCase):
@@ -45,7 +45,7 @@ class PageTests(PageCase):
         return list(page.locator(".device b").all_inner_texts())
 
     def test_reach_each_view(self) -> None:
-        """On a phone each view is shown alone after at most two taps; keys, back and links open it as well."""
+        """On a phone at most two taps open any view, alone on the screen; keys, back and links open it as well."""
         page = self.opened(PHONE)
         shown = "[...document.querySelectorAll('main section, footer')].filter(e => e.checkVisibility()).map(e => e.id)"
         for name, links in {
@@ -78,7 +78,7 @@ class PageTests(PageCase):
         self.assertEqual(self.faults, [])
 
     def test_choose_colours(self) -> None:
-        """The page follows the system's colours; the choice of light or dark overrides them and is stored."""
+        """The page follows the system's colours; choosing light or dark overrides them and is stored."""
         page = self.opened(DESK, "light")
         dark = "getComputedStyle(document.body).backgroundColor"
         before = page.evaluate(dark)
@@ -94,7 +94,7 @@ class PageTests(PageCase):
         self.assertEqual((page.evaluate(dark), page.locator("#theme").input_value()), (chosen, "dark"))
 
     def test_fill_a_wall(self) -> None:
-        """A large screen shows all views at once, or one of them in full size."""
+        """A large screen shows all views simultaneously, or one of them in full size."""
         page = self.opened({"viewport": {"width": 2560, "height": 1440}})
         heights = page.evaluate("[...document.querySelectorAll('main section')].map(e => e.getBoundingClientRect())")
         self.assertEqual(len([box for box in heights if box["top"] < 1440]), 7)
@@ -104,7 +104,7 @@ class PageTests(PageCase):
         self.assertGreater(page.locator("canvas").first.bounding_box()["width"], 600)
 
     def test_ask_devices(self) -> None:
-        """The network is queried only while its view is shown, and a device's storage when its dialog opens."""
+        """The network is queried only while its view is shown, the storage of a device when its dialog opens."""
         page = self.opened(PHONE, has_clock=True)
 
         def asks() -> bool:
@@ -128,7 +128,10 @@ class PageTests(PageCase):
         self.assertFalse(asks())
 
     def test_tell_why(self) -> None:
-        """A task lists agreeing and differing agents; its details show each decision's rule and reports."""
+        """A task lists agents that agree and agents that differ.
+
+        Its details show the rule and reports of each decision.
+        """
         for screen in (PHONE, DESK):
             page = self.opened(screen)
             self.view(page, "tasks")
@@ -150,7 +153,7 @@ class PageTests(PageCase):
             self.team.order("status dog1 WAITING")
 
     def test_show_cameras(self) -> None:
-        """A desktop shows three live cameras; a camera out of view, or of an absent device, is not requested."""
+        """A desktop shows three live cameras; the camera of an absent device, or out of view, is not requested."""
         page = self.opened(DESK)
         page.locator("figure[data-camera=live]").nth(2).wait_for()
         self.team.order("gone dog2")
@@ -170,7 +173,7 @@ class PageTests(PageCase):
         phone.locator("figure[data-camera=live]").first.wait_for()
 
     def test_show_who_left(self) -> None:
-        """A device that leaves stays in its place as gone, with its age, and returns automatically."""
+        """A device that leaves stays at its place as gone, with the time since then, and returns automatically."""
         page = self.opened(DESK)
         self.assertEqual(self.names(page), ["dog1", "dog2", "dog3"])
         self.team.order("gone dog1")
@@ -182,7 +185,7 @@ class PageTests(PageCase):
         page.locator(".device[data-state=WAITING]", has_text="dog1").wait_for()
 
     def test_open_a_device(self) -> None:
-        """A double click, Enter and its URL open a device, a click does not; Escape, Close and back close it."""
+        """A double click, Enter and its URL open a device, a single click does not; Escape, Close and back close it."""
         page = self.opened(DESK)
         dialog = page.locator("dialog[open]")
         page.locator(".device").nth(1).click()
@@ -217,7 +220,7 @@ class PageTests(PageCase):
         self.assertEqual(self.faults, [])
 
     def test_run_the_parts_of_the_page(self) -> None:
-        """A panel is shown in its place and to its roles, gets events, and ends; equal rows are kept apart."""
+        """A panel appears at its place for its roles, gets events, and ends; rows with equal content are kept apart."""
         page = self.informed(self.opened(DESK))
         self.assertEqual(page.evaluate(TWINS), [["abab", 4], ["aba", 0], ["baa", 0]])
         page.evaluate(PANELS)
@@ -235,7 +238,7 @@ class PageTests(PageCase):
         page.locator(".device[data-state=DONE]", has_text="dog3").wait_for()
 
     def test_tell_what_happened(self) -> None:
-        """Events are listed as text, newest first: of all kinds, of one kind, and of one device or task."""
+        """Events are listed as text, newest first: all events, or only the events of one kind, device or task."""
         page = self.opened(DESK)
         story = page.locator("#events li")
         page.locator("#events li", has_text="starts to observe").wait_for()
@@ -258,7 +261,7 @@ class PageTests(PageCase):
         self.assertEqual(self.faults, [])
 
     def test_give_tasks(self) -> None:
-        """On a phone, buttons assign and cancel a task, and the group shows its bids and the assigned agent."""
+        """On a phone, buttons assign and cancel a task; the group shows its bids and the assigned agent."""
         page = self.opened(PHONE)
         page.locator("#demo").tap()
         self.told(page, TEXTS["demo.runs"])
@@ -278,7 +281,7 @@ class PageTests(PageCase):
         self.assertEqual(len(set(shapes)), 3)
         self.team.order("status dog3 DONE")
         page.locator(".device[data-state=DONE]", has_text="done").wait_for()
-        # If the events fill the screen, the page is scrolled, and not a list within it.
+        # If the events fill the screen, the page is scrolled, not a list within it.
         self.view(page, "events")
         page.locator("#events li", has_text="starts to observe").wait_for()
         inside = """events => {
@@ -313,7 +316,7 @@ class PageTests(PageCase):
         page.locator("#target-position", has_text="Target at 1.50, 1.20").wait_for()
 
     def test_survive_loss(self) -> None:
-        """A frozen node is detected in about two seconds, a killed one at once; the page recovers when it is back."""
+        """A frozen node is detected after about two seconds, a killed node immediately; later the page recovers."""
         page = self.opened(DESK)
         started = time.monotonic()
         self.team.freeze()

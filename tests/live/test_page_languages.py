@@ -1,4 +1,4 @@
-"""The page in the languages of its catalogues, in a real browser."""
+"""Tests of the page in each of its languages, in a real browser."""
 
 from __future__ import annotations
 
@@ -10,18 +10,18 @@ from tests.webnode.texts import catalogue
 MARKED = "[...document.querySelectorAll('[data-text]')].map(e => [e.dataset.text, e.textContent])"
 """The keys of the template's texts, each with the text that the page shows."""
 BROKEN = "document.body.innerText.match(/undefined|NaN|\\{\\w+\\}|\\b[a-z]+\\.[a-z]+[._][a-z_]+\\b/g) ?? []"
-"""Keys and placeholders in what the page shows."""
+"""Matches keys and placeholders in the text that the page shows."""
 
 
 class LanguageTests(PageCase):
     def opened_in(self, locale: str, screen: dict[str, Any] = DESK) -> Any:
-        """The page in a browser of that locale, signed in."""
+        """Return the page, signed in, in a browser with that locale."""
         page = self.tab(screen, locale=locale)
         page.goto(f"{self.team.url}#code={self.team.code}")
         return self.informed(self.live(page))
 
     def test_choose_the_language(self) -> None:
-        """A German browser shows German texts, numbers and codes of the API; a French one shows English."""
+        """A German browser shows German texts and numbers, and translated API codes; a French one shows English."""
         for locale, language, metres in (("de-DE", "de", "0,62 m"), ("fr-FR", "en", "0.62 m")):
             page = self.opened_in(locale)
             texts = catalogue(language)

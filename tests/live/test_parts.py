@@ -1,4 +1,4 @@
-"""Tests of a robot on a serial port with a network camera and compass: one device in the settings file."""
+"""Tests of a robot on a serial port that has a network camera and a compass: one device in the settings file."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ class LivePartsTests(TestCase):
 
     @inlineCallbacks
     def test_is_one_device(self) -> Generator[Deferred[Any], Any, None]:
-        """Each part has its kind of link; the camera is lost and reconnects while the robot drives."""
+        """Each part has its own kind of link; the camera is lost and reconnects while the robot drives."""
         body = MemoryRobot(jpeg=jpeg(5), values={"compass.heading": 0.5})
         robot, camera, compass = (
             Create2(body, reactor, Random(1)),
@@ -88,4 +88,4 @@ class LivePartsTests(TestCase):
         self.assertEqual(body.motion, (0.0, 0.0, 0.0))
 
     if find_spec("serial") is None:
-        test_is_one_device.skip = "NO ROBOT HAS PARTS: install the extra serial"  # type: ignore[attr-defined]
+        test_is_one_device.skip = "ROBOTS WITH PARTS ARE NOT TESTED: install the extra serial"  # type: ignore[attr-defined]

@@ -9,7 +9,7 @@ from tests.live.page import DESK, PHONE, PageCase
 
 class PathsTests(PageCase):
     def open_network(self, screen: dict[str, Any]) -> Any:
-        """Return the page with the network view when both panels are shown."""
+        """Open the network view, wait until both panels are shown, and return the page."""
         page = self.opened(screen)
         self.view(page, "network")
         page.locator("#paths li").nth(2).wait_for()
@@ -18,7 +18,7 @@ class PathsTests(PageCase):
         return page
 
     def test_tell_the_ways(self) -> None:
-        """Each path shows its score, rating, kind and duration; among other nodes' links the worst is first."""
+        """Each path shows its score, rating, kind and duration; among the links of other nodes the worst is first."""
         page = self.open_network(PHONE)
         rows = [item.inner_text().split("\n") for item in page.locator("#paths li").all()]
         self.assertEqual(
@@ -41,7 +41,7 @@ class PathsTests(PageCase):
         self.sound_by_day_and_night(page)
 
     def test_tell_who_was_turned_away(self) -> None:
-        """Several nodes' reports of one rejection are one line with peer, reporters, reason and remedy."""
+        """A rejection that several nodes report is one line with the peer, the reporters, the reason and the remedy."""
         page = self.open_network(DESK)
         told = [item.inner_text().split("\n") for item in page.locator("#refusals li").all()]
         self.assertEqual(
@@ -63,8 +63,8 @@ class PathsTests(PageCase):
     def test_tell_the_team(self) -> None:
         """A closed team shows its name, fingerprint and members; certificates that expire soon are first and marked.
 
-        An operator sees the command that revokes a member; a viewer sees the members without commands and buttons. A
-        member with many roles still has its name on one line.
+        An operator sees the command that revokes a member; a viewer sees the members without commands and buttons. The
+        name of a member with many roles still fits on one line.
         """
         page = self.open_network(DESK)
         self.assertEqual(page.locator("#team-kind").inner_text(), "Closed team yard")

@@ -71,7 +71,7 @@ class PhoneViewTests(BrowserCase, TeamCase):
             page.context.close()
 
     def test_leave_while_hidden(self) -> None:
-        """A hidden page leaves and releases the camera; a visible one rejoins automatically as the same phone."""
+        """A hidden page leaves the team and releases the camera; when it is visible, it rejoins as the same phone."""
         page = self.opened()
         page.get_by_role("button", name="Take part", exact=True).tap()
         page.locator(".phone .request", has_text="Look for the red target").wait_for()
@@ -86,7 +86,7 @@ class PhoneViewTests(BrowserCase, TeamCase):
         self.assertEqual(self.faults, [])
 
     def test_say_why_not(self) -> None:
-        """A denied camera, an insecure page and a viewer each get a message with the remedy."""
+        """For a denied camera, an insecure page and a viewer the page shows a message with the remedy."""
         page = self.opened(may_film=False)
         page.get_by_role("button", name="Take part", exact=True).tap()
         page.locator(".phone .trouble", has_text=TEXTS["camera.error.NotAllowedError"]).wait_for()
@@ -106,7 +106,7 @@ class PhoneViewTests(BrowserCase, TeamCase):
             return str(json.load(answer)["token"])
 
     def test_see_as_robots_do(self) -> None:
-        """In simulated camera frames the page finds the target at the same place as the robots."""
+        """In simulated camera frames the page finds the target at the same position as the robots."""
         import base64
 
         from agents.vision import TargetSize, find_target
@@ -132,12 +132,12 @@ class PhoneViewTests(BrowserCase, TeamCase):
 
 
 class DemonstrationPhoneTests(BrowserCase, DemonstrationCase):
-    """The team of the demonstration, six processes, and a visitor's phone."""
+    """The team of the demonstration (six processes) and a visitor's phone."""
 
     is_secure = all(find_spec(name) for name in ("OpenSSL", "cryptography"))
 
     def pins(self) -> str:
-        """Return the public key hashes of both web nodes for Chromium to trust."""
+        """Return the hashes of the public keys of both web nodes, for Chromium to trust."""
         secure = [page["url"] for page in self.demo.api("node")["pages"] if page["is_secure"]]
         return ",".join(pin(int(url.rpartition(":")[2])) for url in secure)
 
@@ -158,7 +158,7 @@ class DemonstrationPhoneTests(BrowserCase, DemonstrationCase):
         return {name: each["status"] for name, each in self.devices().items()}
 
     def has_task(self, page: Any) -> bool:
-        """Return whether the phone has the task, by its page and by the team's."""
+        """Return whether the phone has the task, according to its own page and to the team's page."""
         said = page.locator(".phone .request").text_content()
         return "You have the task" in said and self.statuses().get("anna") == "EXECUTING"
 
@@ -186,7 +186,7 @@ class DemonstrationPhoneTests(BrowserCase, DemonstrationCase):
         return page
 
     def lose_web_node(self, page: Any) -> None:
-        """Kill the phone's web node; the phone continues at the other one as the same device."""
+        """Kill the phone's web node; the phone continues at the other node as the same device."""
         before = self.devices()["anna"]
         self.demo.send_signal("vaio", signal.SIGKILL)
         page.locator("#node", has_text="pi").wait_for()
@@ -200,7 +200,10 @@ class DemonstrationPhoneTests(BrowserCase, DemonstrationCase):
         self.assertIsNone(after["gone"])
 
     def test_wins_at_another_web_node_and_is_taken_over(self) -> None:
-        """A phone joins with one tap, survives the death of its web node, wins a task, and leaves it to a dog."""
+        """A phone joins with one tap, keeps working when its web node is killed, and wins a task.
+
+        When the phone leaves, a dog takes over the task.
+        """
         page = self.joined()
         anna = self.devices()["anna"]
         self.assertEqual((anna["kind"], "camera" in anna["capabilities"]), ("phone", True))
@@ -222,7 +225,7 @@ class DemonstrationPhoneTests(BrowserCase, DemonstrationCase):
 
         def dog_waits() -> bool:
             if self.demo.api("tasks")[0]["status"] == "COMPLETED":
-                # On a slow machine the dogs search for longer than the phone's task lasts.
+                # On a slow machine the dogs search for longer than the phone needs for its task.
                 self.demo.api("tasks", {"name": "watch-target"})
             found = self.statuses()
             waits = any(status == "WAITING" for name, status in found.items() if name.startswith("dog"))

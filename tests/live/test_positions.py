@@ -6,7 +6,7 @@ from typing import Any
 
 from tests.live.page import DESK, PHONE, TABLET, PageCase
 
-# All positions in one call: the page may scroll or grow between two calls.
+# All positions in one call, because the page may scroll or grow between two calls.
 CENTRES = """names => names.map((name) => {
     const box = document.querySelector(`.spot[aria-label^=${name}] .dot`).getBoundingClientRect();
     return [box.x + box.width / 2, box.y + box.height / 2];
@@ -15,11 +15,11 @@ CENTRES = """names => names.map((name) => {
 
 class PositionTests(PageCase):
     def centres(self, page: Any, *names: str) -> list[list[float]]:
-        """Return the centres of the devices' marks at one time, in pixels."""
+        """Return the centres of the devices' marks in pixels, all measured at the same time."""
         return list(page.evaluate(CENTRES, list(names)))
 
     def test_draw_to_scale(self) -> None:
-        """Positions in metres are drawn to scale with y upwards and a scale bar; a tap opens the device."""
+        """Positions in metres are drawn to scale, with y upwards and a scale bar; a tap on a mark opens the device."""
         self.team.order("outdoors")
         for place in ("dog1 x=0 y=0 heading=0", "dog2 x=30 y=0 heading=1.5708", "dog3 x=0 y=12 heading=0"):
             self.team.order(f"place {place}")
@@ -43,7 +43,7 @@ class PositionTests(PageCase):
         page.locator("#d-name", has_text="dog3").wait_for()
 
     def test_draw_by_the_globe(self) -> None:
-        """Positions on the globe are drawn north up with their accuracy; those in another frame are listed."""
+        """Positions on the globe are drawn north up with their accuracy; positions in metres are only listed."""
         self.team.order("outdoors")
         self.team.order("place dog1 lat=48.1371 lon=11.5754 accuracy=8")
         self.team.order("place dog2 lat=48.1372 lon=11.5757 accuracy=25")
@@ -52,10 +52,10 @@ class PositionTests(PageCase):
             page = self.opened(screen, scheme)
             self.view(page, "map")
             page.locator("#position-map .spot").nth(1).wait_for()
-            # The drawing is to scale after the page has received all three positions.
+            # The drawing is to scale once the page has received all three positions.
             page.locator("#place-map", has_text="north is up. 1 more is reported in another frame").wait_for()
             one, two = self.centres(page, "dog1", "dog2")
-            # 22.3 m to the east and 11.1 m to the north.
+            # 22.3 m to the east and 11.1 m to the north
             self.assertLess(abs((two[0] - one[0]) / (one[1] - two[1]) - (22.3 / 11.13)), 0.1)
             self.assertIn("48.13710°, 11.57540°, to 8.0 m", page.locator(".places").inner_text())
             self.assertIn("dog3 1.00, 1.00 m", page.locator(".places").inner_text())
@@ -67,7 +67,7 @@ class PositionTests(PageCase):
             self.sound(page)
 
     def test_leave_it_to_the_yard(self) -> None:
-        """With a simulator its map is shown, even if devices report positions."""
+        """With a simulator the map of the simulator is shown, even if devices report positions."""
         self.team.order("place dog1 x=1 y=1 heading=0")
         page = self.opened(DESK)
         page.locator("#map .dog").nth(2).wait_for()

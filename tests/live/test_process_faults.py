@@ -1,4 +1,4 @@
-"""Tests of ``middleware.faults.process`` with real processes: a frozen one continues, a killed one ends."""
+"""Tests of ``middleware.faults.process`` with real processes: a frozen process continues, a killed process ends."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ class OwnProcessTests(SynchronousTestCase):
         return subprocess.run([sys.executable, "-c", program], cwd=ROOT, capture_output=True, text=True, timeout=60)
 
     def test_freeze(self) -> None:
-        """A frozen process executes nothing, and continues automatically after the given time."""
+        """A frozen process executes nothing, and continues by itself after the given time."""
         child = self.run_program(FREEZE)
         self.assertEqual(child.returncode, 0, child.stderr)
         self.assertGreater(float(child.stdout), 0.45)

@@ -21,7 +21,7 @@ from middleware.consensus.strategy_registry import load_guarded_strategy
 ROOT = str(Path(__file__).resolve().parents[2])
 TEAM = [Report("a", 3.0, value=(1.0, 2.0)), Report("b", 1.0), Report("c", 2.0)]
 PATIENCE = 20.0
-"""Also the deadline of strategies that must answer: delays on a loaded machine are not tested."""
+"""The timeout of waits, and the deadline of strategies that must reply; it is long because of loaded machines."""
 
 
 class Good(Nearest):
@@ -79,7 +79,7 @@ class Raising(Nearest):
 
 class ProcessStrategyTests(SynchronousTestCase):
     def guard(self, name: str, deadline: float = PATIENCE) -> GuardedStrategy:
-        """Return a guard around a class of this module in a loaded child process."""
+        """Return a guard around a class of this module, which is loaded in a child process."""
         worker = ProcessStrategy(name, f"{__name__}:{name}", deadline, path=(ROOT,))
         self.addCleanup(worker.stop)
         guard = GuardedStrategy(worker, twice=True)
@@ -95,7 +95,7 @@ class ProcessStrategyTests(SynchronousTestCase):
         return found
 
     def test_good_one(self) -> None:
-        """A strategy in another process gives the same results as in this one."""
+        """A strategy in another process gives the same results as in this process."""
         guard = self.guard("Good")
         self.assertEqual(guard.find(TEAM), Nearest().find(TEAM))
         self.assertEqual(guard.find(TEAM).strategy, "Good")
@@ -104,7 +104,10 @@ class ProcessStrategyTests(SynchronousTestCase):
         self.assertEqual(self.flushLoggedErrors(), [])
 
     def test_group(self) -> None:
-        """A strategy for groups gives the same results in its process; one for single tasks is called for each task."""
+        """A strategy for groups gives the same results in its process.
+
+        A strategy for single tasks is called per task.
+        """
         items = [Item("s", (1.0, 2.0)), Item("t")]
         bids = [Report(a, c, task=t) for a, c in (("a", 1.0), ("b", 2.0)) for t in "st"]
         self.assertEqual(self.guard("Many").find_group(bids, items), Cbba().find_group(bids, items))
@@ -112,7 +115,7 @@ class ProcessStrategyTests(SynchronousTestCase):
         self.assertEqual(self.flushLoggedErrors(), [])
 
     def test_looping(self) -> None:
-        """A strategy that never answers costs its deadline three times; then it is not called, and its process ends."""
+        """A strategy that never replies costs its deadline three times; then it is not called, and its process ends."""
         guard = self.guard("Looping", DEADLINE_S)
         worst = 0.0
         end = time.monotonic() + PATIENCE
@@ -126,7 +129,7 @@ class ProcessStrategyTests(SynchronousTestCase):
         self.flushLoggedErrors()
 
     def test_others(self) -> None:
-        """A strategy with a too large answer, too much memory, a dead process or an exception is skipped."""
+        """A strategy is skipped if its reply is too large, it needs too much memory, its process died or it raises."""
         for name, why in (
             ("Giant", "bytes, more than"),
             ("Hungry", "MemoryError"),
@@ -139,11 +142,14 @@ class ProcessStrategyTests(SynchronousTestCase):
             self.assertIn(why, found.reason)
 
     def test_chatty(self) -> None:
-        """Printed text of a strategy is not read as its answer."""
+        """Text that a strategy prints is not read as its reply."""
         self.assertEqual(self.guard("Chatty").find(TEAM), Nearest().find(TEAM))
 
     def test_stopped(self) -> None:
-        """A stopped strategy is skipped and starts no process; if its process died, the next call starts a new one."""
+        """A stopped strategy is skipped and starts no process.
+
+        After the death of a process the next call starts another.
+        """
         guard = self.guard("Good")
         worker = guard.strategy
         assert isinstance(worker, ProcessStrategy) and worker._process is not None
@@ -160,7 +166,7 @@ class ProcessStrategyTests(SynchronousTestCase):
         self.flushLoggedErrors()
 
     def test_foreign_by_name(self) -> None:
-        """A strategy named by module and class runs in a separate process."""
+        """A strategy identified by module and class runs in a separate process."""
         guard = load_guarded_strategy(f"{__name__}:Good", dotted=True)
         self.addCleanup(guard.stop)
         self.assertIsInstance(guard.strategy, ProcessStrategy)

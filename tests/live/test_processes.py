@@ -1,4 +1,4 @@
-"""Tests with real processes: the processes of a team end with their parent."""
+"""Tests with real processes: the processes of a team end when their parent ends."""
 
 from __future__ import annotations
 
@@ -33,12 +33,12 @@ PATIENCE_S = 15.0
 
 
 def is_alive(pid: int) -> bool:
-    """Return whether a process with this id runs."""
+    """Return whether a process with this id is running."""
     try:
         os.kill(pid, 0)
     except ProcessLookupError:
         return False
-    # Without a process that collects orphans, ended ones stay in the table as zombies.
+    # If no process collects orphans, ended processes stay in the table as zombies.
     try:
         return ") Z " not in Path(f"/proc/{pid}/stat").read_text(encoding="ascii", errors="replace")
     except OSError:
@@ -46,7 +46,7 @@ def is_alive(pid: int) -> bool:
 
 
 class OrphanTests(SynchronousTestCase):
-    """Children end with their parent, for each kind of end."""
+    """Children end with their parent, however the parent ends."""
 
     def setUp(self) -> None:
         folder = Path(self.mktemp()).resolve()
@@ -64,7 +64,7 @@ class OrphanTests(SynchronousTestCase):
         self.assertEqual(sorted(line[1] for line in lines), ["a", "b"])
 
     def assert_ended(self) -> None:
-        """Wait until no child runs, and fail after a timeout."""
+        """Wait until no child is running; fail after a timeout."""
         until(lambda: not any(map(is_alive, self.pids)), told=lambda: list(filter(is_alive, self.pids)))
 
     def test_killed_parent_leaves_no_orphan(self) -> None:
@@ -74,7 +74,7 @@ class OrphanTests(SynchronousTestCase):
         self.assert_ended()
 
     def test_interrupted_parent_ends_its_children_first(self) -> None:
-        """If the parent is interrupted (Ctrl-C), it ends its children first."""
+        """If the parent is interrupted (Ctrl-C), its children end first."""
         self.parent.send_signal(signal.SIGINT)
         self.parent.wait(PATIENCE_S)
         self.assert_ended()

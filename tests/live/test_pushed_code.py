@@ -65,10 +65,10 @@ class Behaviour:
 
 
 class PushedCodeTests(SynchronousTestCase):
-    """One process per module."""
+    """Each module runs in one process."""
 
     def runner(self, source: str, kind: str = STRATEGY) -> Runner:
-        """Return a runner of this module, when it is ready or refused."""
+        """Return the runner of this module when it is ready or has refused the module."""
         data = source.encode()
         runner = Runner(make_next_manifest("best", kind, data, None), data, ProcessChannel, time.monotonic)
         self.addCleanup(runner.stop, "the test is over")
@@ -77,12 +77,12 @@ class PushedCodeTests(SynchronousTestCase):
         return runner
 
     def looked(self, runner: Runner) -> Runner:
-        """Update the runner's state and return it."""
+        """Update the state of the runner and return the runner."""
         runner.poll()
         return runner
 
     def asked(self, source: str) -> list[str]:
-        """Return the results of the module's attempts; raise if there is no answer."""
+        """Return the results of the module's attempts; raise if there is no reply."""
         runner = self.runner(BASE + source)
         self.assertIs(runner.state, State.READY, runner.why)
         return [told[CHOICE] for told in runner.call(*ATTEMPT)]
@@ -90,15 +90,15 @@ class PushedCodeTests(SynchronousTestCase):
     def test_confined(self) -> None:
         """On Linux all limits that the machine supports are in force, including seccomp."""
         if not sys.platform.startswith("linux"):
-            raise SkipTest("limits of Linux")
+            raise SkipTest("the limits exist only on Linux")
         runner = self.runner(BASE)
         for limit in ("limits", "seccomp", "no new rights", "no tracing", "ends with node", "no capabilities"):
             self.assertIn(limit, runner.limits)
 
     def test_nothing_of_the_machine(self) -> None:
-        """A module cannot access files, sockets, processes, signals and the environment."""
+        """A module has no access to files, sockets, processes, signals and the environment."""
         if not sys.platform.startswith("linux"):
-            raise SkipTest("limits of Linux")
+            raise SkipTest("the limits exist only on Linux")
         canary = Path(self.mktemp())
         canary.write_text("secret")
         attempts = f"""
@@ -129,7 +129,7 @@ def ATTEMPT(what):
         self.assertEqual(environment, "0")
 
     def test_not_in_the_node(self) -> None:
-        """The node's process loads no part of the module, which runs in another process."""
+        """The node's process loads no part of the module, which runs in a separate process."""
         before = set(sys.modules)
         (number,) = self.asked("def ATTEMPT(what): return [os.getpid()]\nsys.canary = 1\n")
         self.assertNotEqual(int(number), os.getpid())
@@ -137,7 +137,7 @@ def ATTEMPT(what):
         self.assertFalse([name for name in set(sys.modules) - before if name.startswith("swarm_deployed_")])
 
     def test_strategy_that_hangs(self) -> None:
-        """A strategy that hangs in use is killed and restarted, at most three times."""
+        """A strategy that hangs when it is used is killed and restarted, at most three times."""
         runner = self.runner(BASE + "def ATTEMPT(what):\n    while True: pass\n")
         losses = 0
         while runner.state is not State.OUT:
@@ -150,7 +150,7 @@ def ATTEMPT(what):
         self.flushLoggedErrors()
 
     def test_what_it_says_is_limited(self) -> None:
-        """A module that writes to the pipe directly, or returns too large an answer, is killed or refused."""
+        """A module that writes directly to the pipe, or returns too large a reply, is killed or refused."""
         flood = "def ATTEMPT(what):\n    for fd in range(3, 9):\n        try: os.write(fd, b'\\xff' * 100)\n"
         runner = self.runner(BASE + flood + "        except OSError: pass\n")
         self.assertRaises(StrategyError, runner.call, *ATTEMPT)
@@ -178,7 +178,10 @@ def ATTEMPT(what):
             self.assertIn(why, runner.why)
 
     def test_behaviour(self) -> None:
-        """A behaviour gets frames and returns actions without a wait of the agent; one that hangs is killed."""
+        """A behaviour receives frames and returns actions; the agent does not wait.
+
+        A behaviour that hangs is killed.
+        """
         runner = self.runner(SPIN, BEHAVIOUR)
         self.assertIs(runner.state, State.READY, runner.why)
         frame = Frame(1, 640, 480, b"j" * 200_000, 0.0)

@@ -55,7 +55,7 @@ class ThreadTests(TestCase):
 
         def end(result: Any) -> Any:
             dog.stop()
-            # The end of the links in memory arrives later.
+            # The links in memory end a moment later.
             return deferLater(reactor, 0.05, lambda: result)
 
         done: Deferred[None] = deferToThread(script).addCallback(told).addBoth(end)
@@ -64,7 +64,7 @@ class ThreadTests(TestCase):
 
 class CommandTests(SynchronousTestCase):
     def test_examples_run_as_commands(self) -> None:
-        """Each of the two brains runs as a command for a second, prints its robot's devices, and ends without error."""
+        """Each of the two brains runs as a command for a second, prints the robot's devices, and ends without error."""
         for name in ("avoid", "track_ball"):
             done = subprocess.run(
                 [sys.executable, f"examples/pyro/{name}.py", "--seconds", "1"],

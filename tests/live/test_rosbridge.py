@@ -1,4 +1,4 @@
-"""Tests of the rosbridge driver over real TCP, of its emulator with another client, and with another server."""
+"""Tests of the rosbridge driver over real TCP and with another server, and of its emulator with another client."""
 
 from __future__ import annotations
 
@@ -51,12 +51,12 @@ ros.terminate()
 
 
 class LiveRosbridgeTests(TestCase):
-    """Real sockets on this machine."""
+    """Tests of driver and emulator over real sockets on this machine."""
 
     timeout = 60
 
     def setUp(self) -> None:
-        """Start a robot that listens on a free port."""
+        """Start an emulated robot that listens on a free port."""
         self.body = MemoryRobot(values={"power.level": 0.8, "range.near": 0.5})
         self.robot = RosbridgeRobot(reactor, self.body, Random(1))
         self.robot.start()
@@ -66,7 +66,7 @@ class LiveRosbridgeTests(TestCase):
         self.addCleanup(self.robot.stop)
 
     async def test_drives_over_tcp(self) -> None:
-        """Over TCP the robot drives, stops at the deadline, and is reconnected after a reboot."""
+        """Over TCP the robot drives, stops at the deadline, and is connected again after a reboot."""
         driver = RosbridgeDriver({"port": self.port}, TcpConnector(reactor), reactor)
         await driver.connect()
         self.addCleanup(driver.disconnect)
@@ -81,7 +81,7 @@ class LiveRosbridgeTests(TestCase):
         self.assertEqual(driver.diagnostics()["bad_frames"], 0)
 
     async def test_other_client_takes_it_for_a_robot(self) -> None:
-        """The client roslibpy can subscribe, publish and call services, and gets the error of a missing service."""
+        """The client roslibpy can subscribe, publish and call services; calling a missing service gives an error."""
 
         def run() -> subprocess.CompletedProcess[str]:
             command = [sys.executable, "-c", OTHERS, str(self.port)]

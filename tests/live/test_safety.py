@@ -1,4 +1,4 @@
-"""Tests of each route of a real page with each role and with invalid requests: permissions and errors."""
+"""Tests of every route of a real page with every role and with invalid requests: permissions and errors."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ class SafetyTests(TeamCase):
         self._number = 0
 
     def token(self, role: Role, ticket: bool = False, name: str = "") -> str:
-        """Return an unused token of this role; an empty string for ``anyone``."""
+        """Return an unused token of this role; an empty string for the role ``anyone``."""
         if role == "anyone":
             return ""
         self._number += 1
@@ -51,7 +51,7 @@ class SafetyTests(TeamCase):
         return self._key.sign_token(claim.ticket if ticket else claim)
 
     def asked(self, method: str, path: str, body: bytes | None = None, **headers: str) -> Answer:
-        """Send one request on a new connection; of a stream, read only the headers."""
+        """Send one request on a new connection; from a stream, read only the headers."""
         given = {name.replace("_", "-"): value for name, value in headers.items()}
         connection = http.client.HTTPConnection("127.0.0.1", self.team.port, timeout=10)
         try:
@@ -63,14 +63,14 @@ class SafetyTests(TeamCase):
             connection.close()
 
     def bearer(self, role: Role, name: str = "") -> dict[str, str]:
-        """Return the headers of a client with this role."""
+        """Return the headers of a client that has this role."""
         token = self.token(role, name=name)
         return {"Authorization": f"Bearer {token}"} if token else {}
 
     def test_let_in_whom_the_table_says(self) -> None:
-        """Each route accepts a token of the roles in its line of the table, and answers all others with 401 or 403.
+        """Each route accepts tokens of the roles in its row of the table, and rejects all others with 401 or 403.
 
-        Each answer has all security headers and does not name the server.
+        Every response has all security headers and does not identify the server.
         """
         wrong: list[object] = []
         for route in TABLE:
@@ -86,7 +86,7 @@ class SafetyTests(TeamCase):
         self.assertEqual(wrong, [])
 
     def test_let_a_ticket_look_only(self) -> None:
-        """An operator's ticket gives access to a viewer's routes, but not to orders and secrets."""
+        """An operator's ticket gives access to the routes for viewers, but not to changes and secrets."""
         wrong = []
         for route in TABLE:
             if route.role not in ("viewer", "operator"):
@@ -98,13 +98,13 @@ class SafetyTests(TeamCase):
         self.assertEqual(wrong, [])
 
     def lax(self, name: str, headers: Message) -> list[object]:
-        """Return the faults in the headers of an answer."""
+        """Return the problems with the headers of a response."""
         lacks = [key for key, value in HEADERS.items() if headers.get(key) != value]
         lacks += [key for key in ("Server", "Set-Cookie", "X-Powered-By") if headers.get(key)]
         return [(name, lacks)] if lacks else []
 
     def test_send_every_header_with_errors(self) -> None:
-        """Each kind of error response has all security headers and does not name the server."""
+        """Every kind of error response has all security headers and does not identify the server."""
         wrong = []
         for method, path in (("GET", "/nothing"), ("PUT", "/"), ("PUT", "/events"), ("GET", "/static/../app.py")):
             wrong += self.lax(f"{method} {path}", self.asked(method, path)[1])
@@ -118,7 +118,7 @@ class SafetyTests(TeamCase):
         self.assertEqual(wrong, [])
 
     def raw(self, data: bytes) -> Answer:
-        """Return the answer to bytes that no regular client would send."""
+        """Return the response to bytes that no regular client would send."""
         with socket.create_connection(("127.0.0.1", self.team.port), 5.0) as client:
             client.sendall(data)
             answer = http.client.HTTPResponse(client)
@@ -126,7 +126,7 @@ class SafetyTests(TeamCase):
             return answer.status, answer.headers, answer.read()
 
     def test_refuse_at_once_and_in_words(self) -> None:
-        """An invalid request is refused within 50 ms, with a JSON error that names field and remedy."""
+        """An invalid request is refused within 50 ms, with a JSON error that contains field and remedy."""
         signed = self.bearer("operator")
         dog = f"/api/v1/devices/{'01' * 16}"
 
@@ -171,7 +171,7 @@ class SafetyTests(TeamCase):
             self.assertEqual(set(json.loads(body)["error"]), {"field", "problem", "remedy"}, name)
             self.assertNotIn(b"Traceback", body, name)
             took = self.best(ask)
-            # On a machine loaded by other programs a valid request is slow, too.
+            # On a loaded machine even a valid request is slow.
             if took > REFUSED_S and took > 3 * self.best(lambda: self.asked("GET", "/api/v1/tasks", None, **signed)):
                 slow.append((name, took))
         self.assertEqual(slow, [])

@@ -1,4 +1,4 @@
-"""Tests with two hundred scripts as names, tasks and messages: the page shows each as text, and none runs."""
+"""Tests with two hundred scripts as names, tasks and messages: the page shows each script as text and runs none."""
 
 from __future__ import annotations
 
@@ -67,7 +67,7 @@ class ScriptTests(PageCase):
         dialog.dismiss()
 
     def show(self, words: list[str]) -> None:
-        """Make the team's texts consist of ``words``."""
+        """Replace the team's texts with ``words``."""
         path = Path(self.mktemp()).absolute()
         path.write_text(json.dumps(words), encoding="utf-8")
         self.team.order(f"strange {path}")
@@ -101,7 +101,7 @@ class ScriptTests(PageCase):
         )
 
     def test_notice_what_would_run(self) -> None:
-        """The test can detect a script: inserted markup is reported by the CSP."""
+        """The test can detect a script: the CSP reports markup that is inserted into the page."""
         self.page.goto(f"{self.team.url}#code={self.team.code}")
         self.page.locator(".device").first.wait_for()
         self.page.evaluate("document.body.insertAdjacentHTML('beforeend', '<img src=x onerror=ran()>')")

@@ -1,4 +1,4 @@
-"""Tests of the serial robots' drivers over real pseudo-terminals, with their emulators at the other end."""
+"""Tests of the serial robots' drivers over real pseudo-terminals, with emulators at the other end."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ except ImportError as missing:
 
 
 class Create2PtyTests(TestCase):
-    """A Create 2 at a pseudo-terminal."""
+    """A Create 2 on a pseudo-terminal."""
 
     timeout = 30
 
@@ -51,7 +51,7 @@ class Create2PtyTests(TestCase):
         return driver
 
     async def test_outlives_a_pulled_cable(self) -> None:
-        """While the cable is unplugged the driver is stale and names the missing device; then it is ready again."""
+        """With an unplugged cable the driver is stale and reports the missing device; with the cable, it is ready."""
         driver = self.driver()
         await driver.connect()
         await driver.enable()
@@ -71,7 +71,7 @@ class Create2PtyTests(TestCase):
         self.assertEqual((driver.state, self.robot.mode), ("ready", 2))
 
     async def test_names_a_busy_port(self) -> None:
-        """A second driver of a port reports it as busy, and connects after the first has disconnected."""
+        """A second driver of a port reports that the port is busy, and connects after the first has disconnected."""
         first, second = self.driver(), self.driver()
         await first.connect()
         connected = second.connect()
@@ -81,7 +81,7 @@ class Create2PtyTests(TestCase):
         self.assertEqual(second.problem, "")
 
     async def test_names_what_is_no_port(self) -> None:
-        """A file that is no serial device, and one without permission, are reported."""
+        """A file that is not a serial device, and a device without permission, are reported."""
         plain = self.mktemp()
         with open(plain, "wb"):
             pass
@@ -91,7 +91,7 @@ class Create2PtyTests(TestCase):
             await self.named(self.path, "no permission")
 
     async def named(self, path: str, words: str) -> None:
-        """Wait until a driver of this path reports these words."""
+        """Wait until the problem of a driver with this path contains these words."""
         driver = Create2Driver(parse_options({"port": path}), "vacuum", SerialConnector(), CLOCK)
         driver.connect().addErrback(lambda _: None)
         self.drivers.append(driver)

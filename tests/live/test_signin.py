@@ -9,13 +9,13 @@ from tests.live.page import DESK, PHONE, TEXTS, PageCase
 
 class SigningInTests(PageCase):
     def at_door(self, screen: dict[str, Any], fragment: str = "", scheme: Any = "light") -> Any:
-        """Return a new page that is opened with this link."""
+        """Return a new page, opened with this link."""
         page = self.tab(screen, scheme)
         page.goto(self.team.url + fragment)
         return page
 
     def test_sign_in_by_hand(self) -> None:
-        """Without a session the page shows only the sign-in form; a wrong code is refused, Escape changes nothing."""
+        """Without a session the page shows only the sign-in form; a wrong code is refused, and Escape has no effect."""
         for screen, scheme in ((PHONE, "light"), (DESK, "dark")):
             page = self.at_door(screen, scheme=scheme)
             page.locator("#signin-code").wait_for()
@@ -35,7 +35,10 @@ class SigningInTests(PageCase):
             self.assertEqual(self.faults, [])
 
     def test_stay_signed_in(self) -> None:
-        """A link with the code signs in and removes the code from the URL; the session lasts until the sign-out."""
+        """A link with the code signs in and removes the code from the URL.
+
+        The session lasts until the user signs out.
+        """
         page = self.opened(DESK)
         self.assertNotIn("code", page.url)
         page.reload()
@@ -47,7 +50,7 @@ class SigningInTests(PageCase):
         self.assertEqual(page.locator(".device").count(), 0)
 
     def test_look_as_a_viewer(self) -> None:
-        """An operator's invitation creates a viewer that sees all views and gets no controls."""
+        """An operator's invitation signs in a viewer; a viewer sees all views but no controls."""
         page = self.opened(DESK)
         viewer = self.at_door(PHONE, f"#code={self.invitation(page)}")
         self.live(viewer)
@@ -65,7 +68,7 @@ class SigningInTests(PageCase):
         self.assertEqual(told, 403)
 
     def test_read_the_audit(self) -> None:
-        """An operator opens the audit log by keyboard and sees the last action; a viewer is not offered the log."""
+        """An operator opens the audit log by keyboard and sees the last action; the log is not offered to a viewer."""
         for screen, scheme in ((PHONE, "dark"), (DESK, "light")):
             page = self.opened(screen, scheme)
             page.locator("#demo").click()
@@ -91,7 +94,7 @@ class SigningInTests(PageCase):
         return link.partition("#code=")[2]
 
     def test_ask_again_when_the_session_ends(self) -> None:
-        """If the node no longer knows the session, the page asks for the code and returns to its view."""
+        """If the node no longer accepts the session, the page asks for the code and then shows the same view again."""
         page = self.opened(DESK)
         page.evaluate(
             "fetch('/api/v1/session', {method: 'DELETE', headers: {'X-Swarm': '1', Authorization: 'Bearer ' + "
@@ -105,8 +108,8 @@ class SigningInTests(PageCase):
         self.live(page)
 
     def test_stay_for_days(self) -> None:
-        """An open page renews its session repeatedly before its end, and stays live."""
-        # The page renews the session one hour before its end.
+        """An open page renews its session each time before the session ends, and stays live."""
+        # The page renews the session one hour before the session ends.
         self.team.order("session 3603")
         page = self.opened(DESK)
         first = page.evaluate("JSON.parse(localStorage['swarm.sessions'])[location.origin].token")

@@ -1,4 +1,4 @@
-"""Tests of the ``sim`` command as processes: equal hashes, and an orderly end."""
+"""Tests of the ``sim`` command as a process: equal hashes, and a clean exit."""
 
 from __future__ import annotations
 
@@ -46,7 +46,7 @@ lasts = 4.0
 
 
 class SimulationTests(SynchronousTestCase):
-    """Behaviour of ``sim run``."""
+    """Tests of ``sim run``."""
 
     def setUp(self) -> None:
         """Write a scenario."""
@@ -56,7 +56,7 @@ class SimulationTests(SynchronousTestCase):
         self.scenario.write_text(SCENARIO)
 
     def begun(self, hash_seed: int, *words: str) -> subprocess.Popen[str]:
-        """Start the command with this hash seed of Python."""
+        """Start the command; ``PYTHONHASHSEED`` is this hash seed."""
         return subprocess.Popen(
             [sys.executable, "-m", "swarmnode.simulation", "run", "--scenario", str(self.scenario), *words],
             cwd=ROOT,
@@ -67,7 +67,7 @@ class SimulationTests(SynchronousTestCase):
         )
 
     def test_hash_is_the_same_in_every_process(self) -> None:
-        """One seed gives the same hash for each PYTHONHASHSEED; another seed gives another hash."""
+        """The same seed gives the same hash for each PYTHONHASHSEED; a different seed gives a different hash."""
         runs = [self.begun(1, "--seed", "4"), self.begun(2, "--seed", "4"), self.begun(2, "--seed", "5")]
         hashes = []
         for process in runs:
@@ -81,7 +81,7 @@ class SimulationTests(SynchronousTestCase):
         """After SIGINT the command ends with a JSON report that is marked as partial."""
         report = self.folder / "r.json"
         process = self.begun(1, "--nodes", "2000", "--json", str(report))
-        while not report.exists():  # it is opened at the start of the run
+        while not report.exists():  # the file is opened at the start of the run
             self.assertIsNone(process.poll())
             os.sched_yield()
         process.send_signal(signal.SIGINT)

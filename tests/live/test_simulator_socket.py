@@ -45,7 +45,7 @@ async def running_yard() -> AsyncIterator[tuple[subprocess.Popen[str], int]]:
 
 
 class SimulatorSocketTests(TestCase):
-    """A driver and an operator, each over TCP."""
+    """A driver and an operator, each connected over TCP."""
 
     timeout = 20
 
@@ -75,7 +75,7 @@ class SimulatorSocketTests(TestCase):
             await operator.disconnect()
 
     async def test_opens_a_lost_link_again(self) -> None:
-        """If the simulator is killed, the driver is stale at once; it reconnects to a new one at the same port."""
+        """If the simulator is killed, the driver becomes stale; it reconnects to a new simulator on the same port."""
         clock = IReactorTime(reactor)
         async with running_yard() as (process, port):
             driver = create_driver("sim", {"port": port, "camera": False}, "dog2", clock)
@@ -108,19 +108,22 @@ class SimulatorCommandTests(SynchronousTestCase):
         return line
 
     def test_names_the_mistake(self) -> None:
-        """An unknown scene or invalid port ends with code 2 and one line with the valid values."""
+        """For an unknown scene or an invalid port the exit code is 2, and one line lists the valid values."""
         self.assertIn("known are three-dogs", self.refusal("--scene", "nowhere"))
         self.assertIn("1 to 65535", self.refusal("--port", "70000"))
 
     def test_names_an_address_of_another(self) -> None:
-        """An address of another machine, or an invalid one, ends with code 2 and asks for another address."""
+        """For an address of another machine, or an invalid one, the exit code is 2.
+
+        The error asks for a valid address.
+        """
         for host in ("192.0.2.1", "300.1.1.1"):
             said = self.refusal("--host", host, "--port", "0")
             self.assertIn(f"cannot listen on {host}:0: ", said)
             self.assertTrue(said.endswith("; give --host an address of this machine\n"), said)
 
     def test_names_a_port_in_use(self) -> None:
-        """A second simulator at the same port ends with code 2 and names the port."""
+        """A second simulator on the same port ends with code 2; the error contains the port."""
         first = spawned("--port", "0")
         try:
             assert first.stdout is not None

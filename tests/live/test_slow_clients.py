@@ -1,4 +1,4 @@
-"""Tests of a real page among clients that send slowly or not at all: they are disconnected, and others are served."""
+"""Tests of a real page whose clients send slowly or nothing: they are disconnected, and other clients are served."""
 
 from __future__ import annotations
 
@@ -12,12 +12,12 @@ from tests.live.page import TeamCase
 
 MISSING = [name for name in ("flask", "cv2") if find_spec(name) is None]
 CLOSED_S = 60.0
-"""The limit on a loaded machine; 15 s on an idle one."""
+"""The time limit in seconds for a loaded machine; an idle machine needs 15 s."""
 BEGUN = b"GET / HTTP/1.1\r\nHost: 127.0.0.1\r\nX-Slow: "
 
 
 class Crowd:
-    """Clients of the page; ``open`` are the connected ones."""
+    """Slow clients of the page; ``open`` contains the connected clients."""
 
     def __init__(self, port: int) -> None:
         self._port = port
@@ -38,7 +38,7 @@ class Crowd:
             self._selector.register(client, selectors.EVENT_READ)
 
     def live(self, seconds: float, drip: bytes = b"") -> None:
-        """Read all data for ``seconds``, then send ``drip`` from each open client."""
+        """Read all data for ``seconds``; then send ``drip`` from each open client."""
         end = time.monotonic() + seconds
         while (left := end - time.monotonic()) > 0.0:
             for key, _ in self._selector.select(left):
@@ -77,7 +77,7 @@ class SlowClientTests(TeamCase):
         self.addCleanup(lambda: self.crowd.leave())
 
     def ask_state(self) -> None:
-        """Request the state, which must be answered within 10 s."""
+        """Request the state; the response must arrive within 10 s."""
         page = http.client.HTTPConnection("127.0.0.1", self.team.port, timeout=10)
         page.request("GET", "/api/v1/state", headers={"Authorization": f"Bearer {self.team.token}"})
         answer = page.getresponse()

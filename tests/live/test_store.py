@@ -46,7 +46,7 @@ print(number)
 
 class KillTest(SynchronousTestCase):
     def test_a_handful_of_kills(self) -> None:
-        """A writer that is killed at any moment loses no acknowledged row, and corrupts nothing."""
+        """A writer that is killed at any moment loses no acknowledged row and corrupts no data."""
         seen = run_kills(str(Path(self.mktemp()).resolve()), 6, seed=1)
         self.assertEqual((seen.lost, seen.damaged, seen.kills), ([], [], 6))
         self.assertGreater(seen.acknowledged, 0)
@@ -54,7 +54,10 @@ class KillTest(SynchronousTestCase):
 
 class FailingDiskTest(SynchronousTestCase):
     def test_lives_on(self) -> None:
-        """If the system refuses writes, reads work, writes fail with the reason, and afterwards all works again."""
+        """While the operating system refuses writes, reads work and writes fail with the reason.
+
+        Afterwards reads and writes work again.
+        """
         path = str(Path(self.mktemp()).resolve())
         child = subprocess.run(
             [sys.executable, "-c", FAILING_DISK, path], cwd=ROOT, capture_output=True, text=True, timeout=60

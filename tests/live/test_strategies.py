@@ -1,4 +1,4 @@
-"""Tests that a team with strategies from other distributions leaves no process."""
+"""Tests that a team leaves no process if it uses strategies from other distributions."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ class StrategiesTests(SynchronousTestCase):
         self.patch(ProcessStrategy, "_start", started)
 
     def installed(self) -> None:
-        """Put the entry point "spare" on this process's path, as pip does."""
+        """Add the entry point "spare" to the path of this process, as pip does."""
         folder = Path(self.mktemp()).resolve()
         (folder / "spare-1.dist-info").mkdir(parents=True)
         (folder / "spare_of_tests.py").write_text(MODULE)
@@ -46,7 +46,7 @@ class StrategiesTests(SynchronousTestCase):
         self.patch(sys, "path", [str(folder), ROOT, *sys.path])
 
     def submit(self, team: SimulatedTeam, task_id: str) -> None:
-        """Submit a task with the strategy "spare", and check its completion."""
+        """Submit a task with the strategy "spare"; check that the task completes."""
         task = Task(task_id, "turn-around", "Odd", strategy="spare", created=team.clock.seconds())
         submitted = Deferred.fromCoroutine(team.services["vaio"].assembly.node.submit(task))
         team.clock.advance(10.0)
@@ -56,11 +56,11 @@ class StrategiesTests(SynchronousTestCase):
 
     @property
     def alive(self) -> int:
-        """The number of running processes."""
+        """Return the number of running processes."""
         return sum(process.poll() is None for process in self.processes)
 
     def test_node_has_one_process_and_ends_it(self) -> None:
-        """Each node has one process for all tasks of a strategy, which ends with the node, also after a crash."""
+        """Each node has one process for all tasks of a strategy; it ends with the node, even if the node crashes."""
         team = SimulatedTeam(11, dogs=("dog1", "dog2"))
         self.addCleanup(self.flushLoggedErrors)  # a strategy that is still loading is logged
         self.addCleanup(team.stop)

@@ -18,13 +18,16 @@ ROOT = Path(__file__).resolve().parents[2]
 
 class InterruptTests(TestCase):
     def command(self, count: int, book: str) -> subprocess.Popen[str]:
-        """Start many short schedules in one process, with a logbook."""
+        """Start a process that runs many short schedules with a seed log."""
         words = ["--schedules", str(count), "--only", "leases", "--jobs", "1", "--log", book, "--resume"]
         command = [sys.executable, "-m", "tests.invariants", *words]
         return subprocess.Popen(command, cwd=ROOT, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True)
 
     def test_interrupted(self) -> None:
-        """After Ctrl-C the logbook contains the completed schedules, and the next call runs only the others."""
+        """After Ctrl-C the seed log contains the completed schedules.
+
+        The next call runs only the remaining schedules.
+        """
         book = os.path.abspath(self.mktemp())
         with self.command(100_000, book) as child:
             assert child.stdout is not None

@@ -1,4 +1,4 @@
-"""Tests of real tunnels over the loopback interface: TLS, crowds, slow readers, dead links, and nodes without UDP."""
+"""Tests of real tunnels over loopback: TLS, many clients, slow readers, dead links, and nodes without UDP."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ REQUEST = (
 
 
 class Forwarder(portforward.ProxyServer):
-    """A TCP proxy that can stop to forward data while both connections stay open."""
+    """A TCP proxy that can stop forwarding data while both of its connections stay open."""
 
     is_stuck = False
 
@@ -56,7 +56,7 @@ class TunnelTests(TestCase):
         Forwarder.is_stuck = False
 
     def made(self, *urls: Url) -> tuple[TunnelNetwork, TcpTransport]:
-        """Return a tunnel; without URLs it listens on a free port."""
+        """Return a tunnel; without URLs, it listens on a free port."""
         carrier = TcpTransport(reactor, HOST, 0)
         tunnel = TunnelNetwork(carrier, REACTOR, random.SystemRandom(), urls, not urls)
 
@@ -89,7 +89,7 @@ class TunnelTests(TestCase):
         return time.monotonic() - began
 
     def dialled(self, url: Url) -> ssl.SSLSocket:
-        """Return a TLS client without a handshake."""
+        """Return a TLS client that has not started its handshake."""
         context = ssl.SSLContext(ssl.PROTOCOL_TLS_CLIENT)
         context.check_hostname, context.verify_mode = False, ssl.CERT_NONE
         plain = socket.create_connection((url.host, url.port), 5.0)
@@ -100,7 +100,7 @@ class TunnelTests(TestCase):
         return client
 
     async def member(self, url: Url) -> tuple[Endpoint, Contact, TunnelNetwork]:
-        """Return an endpoint that has connected to ``url``, the other endpoint's contact, and its tunnel."""
+        """Return an endpoint that has connected to ``url``, the contact of the other endpoint, and the tunnel."""
         tunnel, _ = self.made(url)
         client = self.endpoint(2, tunnel)
         contact = await client.discover(url.address, 4.0)
@@ -119,7 +119,7 @@ class TunnelTests(TestCase):
         return client
 
     async def test_endpoints_talk(self) -> None:
-        """Two endpoints exchange requests and answers over TLS, up to 1 MiB; the first answer takes under a second."""
+        """Two endpoints exchange requests and replies of up to 1 MiB over TLS; the first reply takes less than 1 s."""
         _, _, url = self.served()
         began = time.monotonic()
         client, contact, tunnel = await self.member(url)
@@ -132,7 +132,7 @@ class TunnelTests(TestCase):
         self.assertEqual(tunnel.counters["opened"], 1, "where nothing is lost one connection is enough")
 
     async def test_bear_a_crowd(self) -> None:
-        """Of five hundred slow clients few are accepted, all are closed in time, and a member is served meanwhile."""
+        """Of five hundred slow clients few are accepted and all are closed in time; meanwhile a member is served."""
         _, tunnel, url = self.served()
         client, contact, _ = await self.member(url)
         crowd: set[socket.socket] = set()
@@ -179,7 +179,7 @@ class TunnelTests(TestCase):
         self.assertLessEqual(most, MAX_HANDSHAKES + 2)
 
     async def test_bear_one_address(self) -> None:
-        """The number of clients per address is limited, and further ones are closed at once."""
+        """The number of clients per address is limited; each further client is closed immediately."""
         _, tunnel, url = self.served()
         crowd = [socket.create_connection((url.host, url.port), 5.0) for _ in range(100)]
         for each in crowd:
@@ -188,7 +188,7 @@ class TunnelTests(TestCase):
         self.assertEqual(tunnel.counters["crowded"], 100 - MAX_PER_HOST)
 
     async def test_garbage(self) -> None:
-        """Invalid TLS, handshake or frame data ends only its link, and raises nothing."""
+        """Invalid TLS, handshake or frame data ends only its own link, and raises no exception."""
         _, tunnel, url = self.served()
         client, contact, _ = await self.member(url)
         dice = random.Random(3)
@@ -205,7 +205,10 @@ class TunnelTests(TestCase):
         self.assertEqual(answer, 1)
 
     async def test_slow_reader(self) -> None:
-        """For a client that does not read, little is buffered, the rest is dropped, and others are served fast."""
+        """For a client that does not read, little data is buffered and the rest dropped.
+
+        Other clients are served fast.
+        """
         _, tunnel, url = self.served()
         client, contact, _ = await self.member(url)
         others = set(tunnel.peers)
@@ -227,7 +230,7 @@ class TunnelTests(TestCase):
         self.assertLess(slowest, 0.3)
 
     async def test_strain(self) -> None:
-        """On Linux the link metrics show no backlog if all data is confirmed, and one if the client does not read."""
+        """On Linux the link metrics show a backlog if the client does not read, and none if all data is confirmed."""
         if sys.platform != "linux":
             self.skipTest("only Linux tells")
         server, tunnel, url = self.served()
@@ -254,7 +257,7 @@ class TunnelTests(TestCase):
         server.stop()
 
     async def test_dead_end(self) -> None:
-        """A link that is open but transmits nothing is closed within 12 s and opened again."""
+        """A link that is open but transmits no data is closed within 12 s, and then opened again."""
         server, tunnel, url = self.served()
 
         factory = portforward.ProxyFactory(HOST, url.port)
@@ -280,7 +283,7 @@ class TunnelTests(TestCase):
         await task.deferLater(REACTOR, 0.2)
 
     def test_port_in_use(self) -> None:
-        """A used port is refused with one line that names the setting and the remedy."""
+        """A port in use is refused with one line that contains the setting and the remedy."""
         with socket.socket() as taken:
             taken.bind((HOST, 0))
             taken.listen()
@@ -300,7 +303,7 @@ class NodeTests(NodeCase):
         return child
 
     def test_enter_without_udp(self) -> None:
-        """A real node whose known node does not answer over UDP joins over TLS."""
+        """A real node whose known node does not reply over UDP joins over TLS."""
         (number,) = free_ports.find_free_ports("tcp", HOST, 1)
         with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as silent:
             silent.bind((HOST, 0))

@@ -18,7 +18,7 @@ from middleware.entangled.wire.endpoint import Endpoint
 
 
 class UdpTests(TestCase):
-    """Behaviour of ``UdpNetwork``."""
+    """Tests of ``UdpNetwork``."""
 
     def network(self, host: str = "127.0.0.1") -> UdpNetwork:
         """Return a network on a free port, which is closed after the test."""
@@ -33,7 +33,7 @@ class UdpTests(TestCase):
 
     @inlineCallbacks
     def test_endpoints_talk(self) -> Generator[Deferred[Any], Any, None]:
-        """Two endpoints exchange requests and answers over real sockets, up to 1 MiB."""
+        """Two endpoints exchange requests and replies of up to 1 MiB over real sockets."""
         ends = []
         for seed in (1, 2):
             end = Endpoint(Identity(bytes([seed]) * 32), b"k" * 32, self.network(), reactor, random.SystemRandom())
@@ -51,7 +51,7 @@ class UdpTests(TestCase):
         self.assertTrue(answer == large, "1 MiB comes back as it went")
 
     def test_port_in_use(self) -> None:
-        """A used port is refused with one line that names it and a remedy."""
+        """A port in use is refused with one line that contains the port and a remedy."""
         first = self.network()
         first.listen(lambda datagram, source: None)
         self.assertNotEqual(first.address.port, 0)
@@ -61,7 +61,7 @@ class UdpTests(TestCase):
         self.assertNotIn("\n", str(error))
 
     def test_what_cannot_be_sent_is_counted(self) -> None:
-        """Invalid addresses, too large datagrams and a closed port raise nothing, and are counted."""
+        """Invalid addresses, too large datagrams and a closed port raise no exception, and are counted."""
         network = self.network()
         network.send(b"x", Address("127.0.0.1", 9))
         network.listen(lambda datagram, source: None)
@@ -74,7 +74,7 @@ class UdpTests(TestCase):
 
     @inlineCallbacks
     def test_every_interface(self) -> Generator[Deferred[Any], Any, None]:
-        """A network at "*" listens on one port for both families, and answers in the family of the request."""
+        """A network at "*" listens on one port for IPv4 and IPv6, and replies with the IP version of the request."""
         wide = self.network("*")
         wide.listen(lambda datagram, source: wide.send(datagram + b" too", source))
         self.assertNotIn(wide.address.host, ("*", "0.0.0.0", "::"))
@@ -88,7 +88,7 @@ class UdpTests(TestCase):
 
     @inlineCallbacks
     def test_further_ports(self) -> Generator[Deferred[Any], Any, None]:
-        """A peer can be assigned to an additional port; an unknown sender is answered from the port that it used."""
+        """A peer can be assigned to an additional port; an unknown sender gets its reply from the port that it used."""
         one, other = self.network(), self.network()
         heard: list[Address] = []
         arrived: Deferred[None] = Deferred()

@@ -18,7 +18,7 @@ class WebCodeTests(NodeCase):
         skip = f"SIGNING IN AT A REAL NODE IS NOT TESTED: missing {', '.join(MISSING)}"
 
     def test_sign_in_with_what_the_node_says(self) -> None:
-        """``swarm web`` prints URL and code, the code signs in, and the following order is in the audit file."""
+        """``swarm web`` prints URL and code, the code signs in, and the next change is recorded in the audit file."""
         web = 'roles = ["web"]\nstore = "vaio.sqlite"\n[web]\nport = 0\n'
         self.node("--config", self.file(f'[node]\nname = "vaio"\nteam_key = "t"\nport = 0\n{web}'))
         page = json.loads(until(lambda: self.swarm("web", "--json").stdout))

@@ -27,7 +27,7 @@ reactor: Any = _reactor
 
 
 class Stream(Protocol):
-    """Collects a stream's data, and waits for words in it."""
+    """Collects the data of a stream, and waits for words in the data."""
 
     def __init__(self) -> None:
         self.data = b""
@@ -47,7 +47,7 @@ class Stream(Protocol):
 
 
 def read(connection: socket.socket) -> bytes:
-    """Return the data that waits to be read."""
+    """Return the data that has arrived but has not been read yet."""
     taken = b""
     with contextlib.suppress(BlockingIOError):
         while data := connection.recv(1 << 16):
@@ -101,7 +101,7 @@ class WebServiceTests(TestCase):
         return stream
 
     async def test_serve_everything(self) -> None:
-        """Page, JSON, files, camera frames and orders are served on one port."""
+        """Page, JSON, files, camera frames and changes are served on one port."""
         self.assertIn(b"vaio", await self.body("/"))
         self.assertEqual(json.loads(await self.body("/api/v1/devices"))[0]["name"], "dog1")
         self.assertIn(b"EventSource", await self.body("/static/stream.js"))
@@ -114,7 +114,7 @@ class WebServiceTests(TestCase):
         self.assertEqual(json.loads(await self.body("/api/v1/demo", b"POST")), {"id": "demo-1"})
 
     async def test_stream_while_workers_are_stuck(self) -> None:
-        """While all workers are blocked, states, files and frames are sent; the blocked answers follow later."""
+        """While all workers are blocked, states, files and frames are sent; the blocked responses follow later."""
         self.gate.clear()
         held = [self.asked("/api/v1/state") for _ in range(WORKERS + 2)]
         stream = await self.opened("/events")
@@ -127,7 +127,7 @@ class WebServiceTests(TestCase):
             self.assertIn(b"dog2", await readBody(await each))
 
     async def test_feed_many_pages(self) -> None:
-        """Sixty open pages get their streams, and JSON requests are answered meanwhile."""
+        """Sixty open pages receive their streams, and JSON requests are answered at the same time."""
         streams = [await self.opened("/events") for _ in range(60)]
         self.devices.append({"uuid": "02", "name": "dog2", "joined": 2})
         for stream in streams:
@@ -135,7 +135,10 @@ class WebServiceTests(TestCase):
         self.assertIn(b"dog2", await self.body("/api/v1/state"))
 
     async def test_keep_little_for_a_slow_page(self) -> None:
-        """For a page that stops reading, under 200 kB of 1.5 MB are buffered; it gets the newest state afterwards."""
+        """Of 1.5 MB for a page that stops reading, less than 200 kB are buffered.
+
+        It receives the newest state later.
+        """
         self.devices[0]["description"] = "x" * 250
         self.devices += [{**self.devices[0], "uuid": f"a{n}", "name": f"dog{n}"} for n in range(100)]
         with socket.socket() as slow:
@@ -155,7 +158,7 @@ class WebServiceTests(TestCase):
         self.assertLess(len(taken), 400_000)
 
     async def test_serve_at_further_ports(self) -> None:
-        """An additional port serves the same page, and is closed with the first one."""
+        """An additional port serves the same page, and is closed together with the first port."""
         opened: list[Any] = []
 
         def open_second_port(site: Any) -> Any:
@@ -187,7 +190,7 @@ class WebServiceTests(TestCase):
         await maybeDeferred(again.stopService)
 
     async def test_stop_with_an_answer_under_way(self) -> None:
-        """A worker that is about to answer does not block the reactor during a stop, and ends."""
+        """A worker that is about to respond does not block the reactor during a stop, and ends."""
         self.gate.clear()
         asked = self.asked("/api/v1/state").addErrback(lambda _: None)
         while not self.held.is_set():

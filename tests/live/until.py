@@ -1,4 +1,4 @@
-"""Wait for a condition that another process or thread fulfils."""
+"""Wait for a condition that depends on another process or thread."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from typing import TypeVar
 T = TypeVar("T")
 STEP_S = 0.02
 PATIENCE_S = 120.0
-"""The timeout for a loaded machine; a condition that is fulfilled earlier ends the wait."""
+"""The timeout for a loaded machine; a wait ends as soon as its condition is true."""
 
 
 def until(is_so: Callable[[], T], within: float = PATIENCE_S, told: Callable[[], object] = str) -> T:

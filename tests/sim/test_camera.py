@@ -17,7 +17,7 @@ from sim.robots.world import World
 
 
 def red(image: Image) -> Image:
-    """Mask the target's red: one range of Cr, as in the colour space of the ERS-7."""
+    """Return the mask of the target's red: one range of Cr, as in the colour space of the ERS-7."""
     mask = cv2.inRange(cv2.cvtColor(image, cv2.COLOR_BGR2YCrCb), (20, 170, 60), (235, 255, 128))
     return np.asarray(mask, dtype=np.uint8)
 
@@ -45,7 +45,7 @@ class CameraTests(SynchronousTestCase):
         return red(self.camera.render_image(self.dog))
 
     def test_sees_no_red_without_a_target(self) -> None:
-        """Walls, floor, dogs and noise contain no target red, also nose to nose, in corners and at walls."""
+        """Walls, floor, dogs and noise contain no target red, even at close range, in corners and at walls."""
         for seed in range(20):
             self.world.scatter(seed, clearance=0.25, from_walls=0.12)
             for dog in self.world.dogs.values():
@@ -57,7 +57,7 @@ class CameraTests(SynchronousTestCase):
             self.camera.render_image(self.dog)
 
     def test_shows_the_target_where_and_as_large_as_it_is(self) -> None:
-        """Bearing and width of the red area match the geometry within 1.6 pixels, near and far."""
+        """Bearing and width of the red area match the geometry within 1.6 pixels, both close and far away."""
         for x, y in ((1.0, 1.2), (1.5, 1.35), (2.0, 0.9), (2.8, 1.2), (2.8, 1.9)):
             self.world.place_target(x, y)
             left, right = columns(self.mask())
@@ -76,12 +76,15 @@ class CameraTests(SynchronousTestCase):
         self.assertGreaterEqual(right - left + 1, 9)
 
     def test_fills_the_view_when_touching(self) -> None:
-        """Nose to nose with the target, more than 70 % of the picture is red."""
+        """In a camera that touches the target, more than 70 % of the picture is red."""
         self.world.place_target(0.5 + 0.12 + 0.081, 1.2)
         self.assertGreater(int((self.mask() > 0).sum()), 0.7 * WIDTH * HEIGHT)
 
     def test_hides_the_target_behind_a_dog(self) -> None:
-        """A dog between camera and target hides it at any heading; a dog next to it or behind it does not."""
+        """A dog between camera and target hides the target at any heading.
+
+        A dog next to the target or behind the target does not.
+        """
         self.world.place_target(2.4, 1.2)
         plain = int((self.mask() > 0).sum())
         self.assertGreater(plain, 100)

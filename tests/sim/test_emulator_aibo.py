@@ -1,4 +1,4 @@
-"""Tests of ``sim.robots.emulator.aibo_dog`` by a client that sends and receives bytes."""
+"""Tests of ``sim.robots.emulator.aibo_dog`` with a client that sends and receives raw bytes."""
 
 from __future__ import annotations
 
@@ -56,7 +56,7 @@ class AiboEmulatorTests(SynchronousTestCase):
         return dog
 
     def called(self, port: int) -> Client:
-        """Return a client of the port, connected if the port listens."""
+        """Return a client of the port; it is connected if the port listens."""
         client = Client()
         line = self.connector.connect("dog", port, client)
         self.addCleanup(line.disconnect)
@@ -67,7 +67,7 @@ class AiboEmulatorTests(SynchronousTestCase):
         self.clock.pump([0.002] * round(seconds / 0.002))
 
     def say(self, client: Client, data: bytes) -> bytes:
-        """Send bytes and return the answer that arrives within 10 ms."""
+        """Send bytes and return the bytes that arrive within 10 ms."""
         assert client.link is not None
         client.heard = b""
         client.link.send(data)
@@ -82,7 +82,10 @@ class AiboEmulatorTests(SynchronousTestCase):
         return main, self.called(WALK)
 
     def test_listens_where_a_dog_does(self) -> None:
-        """Main control and e-stop listen from the start, other servers once selected, each for one client."""
+        """Main control and e-stop listen from the start, other servers when they are selected.
+
+        Each serves one client.
+        """
         self.assertIsNone(self.called(WALK).link)
         main = self.called(MAIN)
         self.assertIsNotNone(self.called(ESTOP).link)
@@ -98,7 +101,7 @@ class AiboEmulatorTests(SynchronousTestCase):
         self.assertTrue(self.dog.is_listening(WALK))
 
     def test_shows_in_the_menu_what_runs(self) -> None:
-        """A running server is listed as #name: selecting name again has no effect, and #name stops it."""
+        """A running server is listed as #name. Selecting name again has no effect; selecting #name stops the server."""
         main = self.called(MAIN)
         self.say(main, b'!select "Walk Remote Control"\n')
         again = self.say(main, b'!select "Walk Remote Control"\n')
@@ -108,7 +111,7 @@ class AiboEmulatorTests(SynchronousTestCase):
         self.assertFalse(self.dog.is_listening(WALK))
 
     def test_answers_every_line(self) -> None:
-        """Known commands are answered with their result, and invalid lines with a status."""
+        """The reply to a known command is its result; the reply to an invalid line is a status."""
         main = self.called(MAIN)
         self.assertEqual(self.say(main, b"!hello\r\n"), b"hello\n1\n")
         self.assertEqual(self.say(main, b"!dump_stack\n"), b"stack_dump\n1\nRoot Control\n")
@@ -117,7 +120,7 @@ class AiboEmulatorTests(SynchronousTestCase):
         self.assertIn(b"\n----------\n0\n\n2\n1\nMode Switch\n2\n", self.say(main, b"!refresh\n"))
 
     def test_starts_stopped_and_tells_changes_alone(self) -> None:
-        """The e-stop is on at first, sends nothing on connect, and reports changes, refreshes and button presses."""
+        """The e-stop is on at first and sends nothing on connect; it reports changes, refreshes and button presses."""
         estop = self.called(ESTOP)
         self.assertEqual(estop.heard, b"")
         for said, answer in ((b"refresh\n", b"on\n"), (b"stop\n", b""), (b"start\n", b"off\n"), (b"warp\n", b"")):
@@ -127,7 +130,10 @@ class AiboEmulatorTests(SynchronousTestCase):
         self.assertEqual(estop.heard, b"on\n")
 
     def test_walks_while_its_motors_are_on(self) -> None:
-        """Each motion component holds until it changes; a stopped dog ignores commands and restarts at rest."""
+        """Each motion component stays in force until it changes.
+
+        A stopped dog ignores commands and restarts at rest.
+        """
         _, walk = self.released()
         self.say(walk, encode_command("f", 0.5) + encode_command("r", -0.25))
         self.assertEqual(self.body.motion, (0.08, 0.0, -0.5075))
@@ -140,14 +146,14 @@ class AiboEmulatorTests(SynchronousTestCase):
         self.assertEqual(self.body.motion, (0.0, 0.0, 0.0))
 
     def test_walks_no_nan(self) -> None:
-        """A component that is not finite counts as zero; the others are obeyed."""
+        """A motion component that is not finite counts as zero; the other components are used."""
         _, walk = self.released()
         for value in (math.nan, math.inf, -math.inf):
             self.say(walk, encode_command("f", 0.5) + encode_command("r", value))
             self.assertEqual(self.body.motion, (0.08, 0.0, 0.0))
 
     def test_stops_three_seconds_after_the_last_command(self) -> None:
-        """The walk stops 3 s after the last command, which may be a command without effect."""
+        """The walk stops 3 s after the last command, even if that command had no effect."""
         _, walk = self.released()
         self.say(walk, encode_command("f", 0.5))
         self.pass_time(2.5)
@@ -158,14 +164,14 @@ class AiboEmulatorTests(SynchronousTestCase):
         self.assertEqual(self.body.motion, (0.0, 0.0, 0.0))
 
     def test_stops_when_its_walk_server_stops(self) -> None:
-        """Stopping the walk server stops the walk and closes its connection."""
+        """Stopping the walk server ends the walk and closes the server's connection."""
         main, walk = self.released()
         self.say(walk, encode_command("f", 0.5))
         self.say(main, b'!select "#Walk Remote Control"\n')
         self.assertEqual((self.body.motion, walk.link), ((0.0, 0.0, 0.0), None))
 
     def test_tells_its_world_every_32_ms(self) -> None:
-        """World states of 374 bytes (244 in the older dialect) arrive every 32 ms, with gains of 224 bytes."""
+        """World states of 374 bytes (244 in the older dialect) arrive every 32 ms, together with gains of 224 bytes."""
         for dialect, size in (("T4", 374), (T2, 244)):
             self.dog = self.made(dialect)
             main = self.called(MAIN)
@@ -178,7 +184,7 @@ class AiboEmulatorTests(SynchronousTestCase):
             self.assertEqual(len(gains.heard), 224 * (len(state.heard) // size))
 
     def test_holds_its_head(self) -> None:
-        """Head commands move the neck to the given share of its range, and are clamped."""
+        """Head commands move the neck to the requested share of its range, and are clamped."""
         main = self.called(MAIN)
         self.say(main, b'!select "Head Remote Control"\n!select "World State Serializer"\n')
         head, state = self.called(HEAD), self.called(STATE)
@@ -190,7 +196,7 @@ class AiboEmulatorTests(SynchronousTestCase):
         self.assertAlmostEqual(pan, 0.768, places=5)
 
     def test_sends_pictures_only_where_they_are_asked_for(self) -> None:
-        """Pictures are sent over TCP if so configured, over UDP after a request, and end with ``CloseConnection``."""
+        """Pictures are sent over TCP if configured, and over UDP after a request; they end with ``CloseConnection``."""
         main = self.called(MAIN)
         heard = self.say(main, b'!select "Raw Cam Server"\n')
         self.assertIn(b'10011\n"raw" "10011" "udp"\n', heard)
@@ -226,7 +232,7 @@ class AiboEmulatorTests(SynchronousTestCase):
 
 
 class Ports(Clock):
-    """A reactor that closes sockets in its next turn, like a real one; until then their ports stay in use."""
+    """A reactor that, like a real one, closes sockets in its next turn; until then their ports are in use."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -274,7 +280,7 @@ class AiboServerTests(SynchronousTestCase):
         self.assertEqual((self.reactor.taken, self.reactor.getDelayedCalls()), ({}, []))
 
     def test_opens_a_port_again_once_its_socket_is_closed(self) -> None:
-        """A port reopens after its socket is closed, also if the client leaves before that."""
+        """A port reopens after its socket has closed, even if the client left before the socket was closed."""
         gone = self.dog.accept(ESTOP, KeptLink())
         gone.link_down()
         main = self.dog.accept(MAIN, KeptLink())
@@ -284,7 +290,7 @@ class AiboServerTests(SynchronousTestCase):
         self.assertEqual(set(self.reactor.taken), {ESTOP, MAIN})
 
     def test_tries_a_port_again_that_another_program_took(self) -> None:
-        """A port that another program took in the meantime is retried until it is free, without an exception."""
+        """A port that another program is using is retried, without an exception, until it is free."""
         client = self.dog.accept(ESTOP, KeptLink())
         self.reactor.advance(0.0)
         self.reactor.taken[ESTOP] = "another"

@@ -13,7 +13,7 @@ from tests.drivers.contract import KeptLink
 
 class MjpegCameraTests(SynchronousTestCase):
     def setUp(self) -> None:
-        """Start a camera with 8 pictures a second."""
+        """Start a camera with 8 pictures per second."""
         self.clock = Clock()
         self.body = MemoryRobot(jpeg=b"\xff\xd8a\xff\xd9")
         self.camera = MjpegCamera(self.clock, self.body, 8.0)
@@ -30,7 +30,7 @@ class MjpegCameraTests(SynchronousTestCase):
         return StreamReader().read(wire.said)
 
     def test_serves_several_clients(self) -> None:
-        """Each client gets every picture after its request, for any path, until it leaves."""
+        """After its request, for any path, each client gets every picture until the client leaves."""
         first, second = KeptLink(), KeptLink()
         asks = self.camera.accept(first)
         for byte in encode_request("cam", "/stream"):
@@ -46,7 +46,7 @@ class MjpegCameraTests(SynchronousTestCase):
         self.assertEqual((len(self.pictures(first)), len(self.pictures(second))), (16, 16))
 
     def test_drops_for_a_busy_client(self) -> None:
-        """Pictures for a busy client are dropped whole, and other clients lose none."""
+        """A picture for a busy client is dropped as a whole; other clients lose no picture."""
         slow, quick = KeptLink(), KeptLink()
         for wire in (slow, quick):
             self.camera.accept(wire).data_received(encode_request("cam", "/"))
@@ -57,7 +57,7 @@ class MjpegCameraTests(SynchronousTestCase):
         self.assertEqual((len(self.pictures(slow)), len(self.pictures(quick)), self.camera.dropped), (8, 16, 8))
 
     def test_turns_away(self) -> None:
-        """Another method, an endless request, and a request while the camera is out of order get no pictures."""
+        """A wrong method, an endless request, and a request to a camera that is out of order get no pictures."""
         posts, endless, late = KeptLink(), KeptLink(), KeptLink()
         self.camera.accept(posts).data_received(b"POST / HTTP/1.1\r\n\r\n")
         self.camera.accept(endless).data_received(bytes(10_000))

@@ -1,4 +1,4 @@
-"""Tests of the workloads of a simulated team: their figures and the violations that they find."""
+"""Tests of the workloads of a simulated team: their figures, and the violations that they detect."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ from sim.team.scenario import parse_scenario
 
 
 def played(text: str, seed: int = 1) -> tuple[Outcome, dict[str, Metric]]:
-    """Run a scenario and return the outcome and its figures by name."""
+    """Run a scenario; return the outcome and its figures by name."""
     settings = {name: kind.settings for name, kind in LOADS.items()}
     outcome = Run(parse_scenario(text, "test", "test", settings), seed, LOADS).run()
     return outcome, {metric.name: metric for metric in outcome.metrics}
@@ -31,7 +31,7 @@ def played(text: str, seed: int = 1) -> tuple[Outcome, dict[str, Metric]]:
 
 class NodeIdIndexTests(SynchronousTestCase):
     def test_closest(self) -> None:
-        """``find_closest`` matches a search of all living nodes after random joins and deaths."""
+        """After random joins and ends of nodes, ``find_closest`` matches a search of all running nodes."""
         rng, census, living = random.Random(1), NodeIdIndex(), set()
         for _ in range(300):
             born = rng.randbytes(20)
@@ -51,7 +51,7 @@ class NodeIdIndexTests(SynchronousTestCase):
 
 class PacerTests(SynchronousTestCase):
     def test_due(self) -> None:
-        """The due count follows the rate at any polling interval, up to the total count."""
+        """The number of due operations follows the rate, however often it is polled, up to the total number."""
         clock = HeapClock()
         pace = Pacer(clock, 2.5, 12)
         due = [pace.take_due()]
@@ -79,7 +79,7 @@ class QuietTests(SynchronousTestCase):
     """In a run without faults the workloads find no violation and measure the expected values."""
 
     def check(self, text: str, bounds: Bounds, **counts: int) -> None:
-        """Run a scenario; check that it has no violation, and check each figure's bounds and number of samples."""
+        """Run a scenario; check that it has no violation, and that each figure has its bounds and number of samples."""
         outcome, figures = played(text)
         self.assertEqual(outcome.violations, [])
         for name, (low, high) in bounds.items():
@@ -94,13 +94,13 @@ class QuietTests(SynchronousTestCase):
         self.check(RECORDS, {"records.acknowledged": (1.0, 1.0), "records.read": (1.0, 1.0)})
 
     def test_lookups(self) -> None:
-        """Every lookup finds its node in time, and every key's closest nodes in order."""
+        """Every lookup finds its node in time, and finds the closest nodes of every key in the right order."""
         bounds: Bounds = {"lookups.reached.p50": (0.05, 0.9), "lookups.seconds.p50": (0.05, 1.0)}
         bounds |= {"lookups.success": (1.0, 1.0), "lookups.exact": (1.0, 1.0)}
         self.check(LOOKUPS, bounds, lookups__success=90, lookups__exact=20)
 
     def test_values(self) -> None:
-        """A value survives the death of all but one of its acknowledging nodes, and a reader finds every holder."""
+        """A value survives the end of all but one of the nodes that acknowledged it; a reader finds every holder."""
         bounds: Bounds = {"values.read": (1.0, 1.0), "values.lost": (0.0, 0.0), "values.killed": (4.0, 8.0)}
         self.check(VALUES, bounds, values__read=1)
         bounds = {"values.holders_found": (1.0, 1.0), "values.copies": (8.0, 8.0), "values.lost": (0.0, 0.0)}
@@ -111,7 +111,7 @@ class QuietTests(SynchronousTestCase):
         self.check(WATCHES, {"watches.heard": (1.0, 1.0), "watches.seconds.max": (0.0, 1.0)})
 
     def test_auctions(self) -> None:
-        """In small and large teams all bidders name the nearest agent soon after the waiting period."""
+        """In small and large teams all bidders choose the nearest agent soon after the waiting period."""
         bounds: Bounds = {"auctions.right": (1.0, 1.0), "auctions.last": (0.0, 0.6), "auctions.messages": (1.0, 10.0)}
         for nodes in (3, 40):
             self.check(f"nodes = {nodes}\n{AUCTIONS}", bounds, auctions__agree__p50=2 * nodes)
@@ -122,15 +122,18 @@ class QuietTests(SynchronousTestCase):
         self.check(DIRECTORY, {**bounds, "directory.devices": (12.0, 12.0), "directory.listed_whole": (1.0, 1.0)})
 
     def test_takeovers(self) -> None:
-        """When the holder of a lease dies, another node gets the lease within two seconds, and never two at once."""
+        """When the holder of a lease fails, another node gets the lease within two seconds.
+
+        At no time do two nodes hold the lease.
+        """
         self.check(TAKEOVERS, {"takeovers.seconds.max": (0.5, 2.0)}, takeovers__seconds__max=8)
 
     def test_tasks(self) -> None:
-        """Each of many concurrent tasks has one holder, the nearest, also if datagrams are lost."""
+        """Each of many concurrent tasks has one holder, which is the nearest agent, even if datagrams are lost."""
         self.check(TASKS, {"tasks.held_once": (1.0, 1.0), "tasks.by_the_nearest": (1.0, 1.0)}, tasks__held_once=30)
 
     def test_traffic(self) -> None:
-        """In a quiet team of twelve each node knows all others and sends at most ten datagrams a second."""
+        """In a team of twelve without faults each node knows all others and sends at most ten datagrams per second."""
         bounds: Bounds = {"traffic.datagrams": (0.5, 10.0), "traffic.bytes": (15.0, 3000.0)}
         self.check(TRAFFIC, {**bounds, "traffic.contacts": (11.0, 11.0)})
 
@@ -139,7 +142,7 @@ class WrongTests(SynchronousTestCase):
     """The workloads detect defects."""
 
     def test_what_is_not_kept(self) -> None:
-        """A node that acknowledges writes without storing them violates D1, and watchers receive no change."""
+        """A node that acknowledges writes without storing them violates invariant D1, and watchers miss the change."""
         self.patch(EntangledNode, "put", lambda node, *what: succeed(5))
         outcome, _ = played(RECORDS)
         self.assertEqual({line[:3] for line in outcome.violations}, {"D1:"})
@@ -147,7 +150,7 @@ class WrongTests(SynchronousTestCase):
         self.assertEqual(figures["watches.heard"].value, 0.0)
 
     def test_what_is_old(self) -> None:
-        """A reader that always gets the first value of a slot violates D2."""
+        """A reader that always gets the first value of a slot violates invariant D2."""
         get, first = EntangledNode.get, dict[Any, Record]()
 
         def stale(node: EntangledNode, key: bytes, *concern: Any) -> Deferred[list[Record]]:
@@ -158,7 +161,7 @@ class WrongTests(SynchronousTestCase):
         self.assertIn("D2:", {line[:3] for line in outcome.violations})
 
     def test_wrong_and_late_lookups(self) -> None:
-        """A lookup beyond its time limit counts as late; a lookup without the closest node is wrong and not exact."""
+        """A lookup beyond its time limit is late; a lookup that misses the closest node is wrong and not exact."""
         _, figures = played(LOOKUPS + "limit = 0.1\n")
         self.assertEqual((figures["lookups.success"].value, figures["lookups.late"].value), (0.0, 90.0))
         find = EntangledNode.find_node
@@ -174,7 +177,7 @@ class WrongTests(SynchronousTestCase):
         self.assertEqual(len([line for line in outcome.violations if line.startswith("D6")]), 20)
 
     def test_lost_values(self) -> None:
-        """A value that no node returns is a violation at once, and a lost value at the end."""
+        """A value that no node returns is a violation immediately; a lost value is a violation at the end."""
         get = EntangledNode.get
 
         def nothing(node: EntangledNode, key: bytes, concern: Any = "majority") -> Deferred[list[Record]]:
@@ -187,7 +190,7 @@ class WrongTests(SynchronousTestCase):
         self.assertTrue(any("is lost after" in line for line in outcome.violations))
 
     def test_two_holders(self) -> None:
-        """Acceptors that grant every request cause two holders of a lease, which violates E2."""
+        """Acceptors that grant every request give a lease to two holders, which violates invariant E2."""
         self.patch(
             LeaseAcceptor, "prepare", lambda acceptor, task, number, ballot, *_: Reply(ReplyKind.GRANTED, ballot)
         )
@@ -202,7 +205,7 @@ class WrongTests(SynchronousTestCase):
 
 class RepeatTests(SynchronousTestCase):
     def test_same_seed_same_hash(self) -> None:
-        """A run with every workload gives the same digest twice, and another digest with another seed."""
+        """A run with every workload gives the same digest twice, and a different digest with a different seed."""
         text = 'nodes = 10\nseconds = 6.0\n[link]\nkind = "wifi"\nloss = 0.05\n'
         few = {"tasks": "count = 10\n", "values": "count = 5\n", "takeovers": "rate = 0.5\n"}
         text += "".join(f"[load.{name}]\n{few.get(name, '')}" for name in sorted(LOADS))

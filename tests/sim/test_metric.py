@@ -38,7 +38,7 @@ class MetricTests(SynchronousTestCase):
         self.assertIsNone(Metric("x", None).holds)
 
     def test_percentiles(self) -> None:
-        """A percentile is one of the values, the smallest that covers the share."""
+        """A percentile is the smallest of the values that covers the share."""
         values = [float(n) for n in range(100, 0, -1)]
         self.assertEqual((percentile(values, 0.5), percentile(values, 0.99)), (50.0, 99.0))
         self.assertEqual([figure.value for figure in make_percentiles("x", values, "s")], [50.0, 99.0, 100.0])
@@ -46,7 +46,7 @@ class MetricTests(SynchronousTestCase):
         self.assertIsNone(mean([]))
 
     def test_table(self) -> None:
-        """The table shows missed targets, and the upper confidence limit of a share without failures."""
+        """The table shows missed targets; for a share without failures it shows the upper confidence limit."""
         shown = format_table(
             [
                 make_share("found", 1000, 1000).with_target(Bound(0.999, is_maximum=False)),

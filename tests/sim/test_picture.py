@@ -15,7 +15,7 @@ from sim.robots.world import World
 
 
 class PictureTests(SynchronousTestCase):
-    """The map from above."""
+    """The map as seen from above."""
 
     def setUp(self) -> None:
         """Place a target at the right, above the middle of the map."""
@@ -23,7 +23,7 @@ class PictureTests(SynchronousTestCase):
         self.world.place_target(2.2, 1.7)
 
     def drawn(self, caption: str = "", **changes: object) -> Any:
-        """Return the blue, green and red channels of the picture of a snapshot with ``changes``."""
+        """Draw a snapshot with ``changes``; return the blue, green and red channels of the picture."""
         data = draw_map({**self.world.snapshot(), **changes}, caption)
         image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR)
         assert image is not None
@@ -31,7 +31,7 @@ class PictureTests(SynchronousTestCase):
         return np.moveaxis(image.astype(int), 2, 0)
 
     def test_shows_the_target_where_it_is(self) -> None:
-        """The target is drawn red at its place, and nothing is red without a target; a caption is drawn below."""
+        """The target is drawn red at its position, and nothing is red without a target; a caption is drawn below."""
         blue, green, red = self.drawn()
         rows, lit = np.nonzero((red > 180) & (green < 70) & (blue < 70))
         self.assertGreater(len(rows), 100)

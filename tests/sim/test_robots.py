@@ -44,11 +44,11 @@ class SimulatedDogTests(SimulatorCase):
     """``SimulatedDog`` moves a lent dog and reads its sensors."""
 
     def lent(self, limits: Any = LIMITS) -> SimulatedDog:
-        """Return the emulated robot of dog1, which faces the middle of the map."""
+        """Return the emulated robot that moves dog1, which faces the middle of the map."""
         return self.simulator.reserve_for_emulator("dog1", limits)
 
     def test_moves_as_fast_as_its_kind(self) -> None:
-        """The body obeys the limits with which it is lent, and stops when it is halted."""
+        """The body obeys the limits of the kind that it emulates, and stops on a halt."""
         body = self.lent({"base.vx": (-0.5, 0.5), "base.wz": (-4.25, 4.25)})
         body.drive(0.9, 0.2, 0.0)
         self.pass_time(1.0)
@@ -71,7 +71,7 @@ class SimulatedDogTests(SimulatorCase):
             self.assertTrue(math.isfinite(self.simulator.world.dogs["dog1"].x))
 
     def test_senses(self) -> None:
-        """Sensors are always readable, bumpers detect walls ahead and at the side, and pictures have two sizes."""
+        """Sensors can be read at any time, bumpers detect walls ahead and at the side, and pictures have two sizes."""
         body = self.lent()
         self.pass_time(0.5)
         sensed = body.sense()
@@ -89,10 +89,10 @@ class SimulatedDogTests(SimulatorCase):
 
 
 class RobotsTests(SimulatorCase):
-    """The table of robots is validated, and each dog accepts one kind of connection only."""
+    """The table of robots is validated, and each dog accepts only one kind of connection."""
 
     def test_lent_dog_has_no_other_driver(self) -> None:
-        """A driver of simulated dogs is rejected by a dog that is lent to an emulator."""
+        """A dog that is lent to an emulator rejects the driver of simulated dogs."""
         from drivers.sim.driver import SimDriver
 
         self.simulator.reserve_for_emulator("dog1", describe("create2", {"port": "x"}).limits)
@@ -102,7 +102,10 @@ class RobotsTests(SimulatorCase):
         self.assertIn("reached as a robot of another kind", self.failureResultOf(failed).getErrorMessage())
 
     def test_refuses_what_it_cannot_play(self) -> None:
-        """An unknown dog, a kind without emulator, an unknown dialect and invalid options are rejected by name."""
+        """An unknown dog, a kind without emulator, an unknown dialect and invalid options are rejected.
+
+        The error contains the invalid name.
+        """
         aibo = {"kind": "aibo", "options": {"host": "127.0.0.1"}}
         cases: list[tuple[dict[str, Any], str]] = [
             ({"dog9": aibo}, "no robot is named 'dog9'.*it has dog1, dog2, dog3"),
@@ -122,7 +125,7 @@ class RobotsTests(SimulatorCase):
                 EmulatedRobots(self.clock, Random(1), self.simulator, table)
 
     def test_replaces_no_file(self) -> None:
-        """A file at the path of the serial port is kept and reported; only a leftover link is replaced."""
+        """A file at the path of the serial port is kept and reported; only the link of an earlier run is replaced."""
         folder = Path(self.mktemp())
         folder.mkdir()
         path = folder / "ttyUSB0"
@@ -137,14 +140,14 @@ class RobotsTests(SimulatorCase):
         path.symlink_to("/dev/pts/99999")
         port = PtyPort(MemoryReactorClock(), Bittle(MemoryRobot(), self.clock, Random(1)).accept, str(path))
         self.assertNotEqual(str(path.readlink()), "/dev/pts/99999")
-        # A link that another program put at the path stays.
+        # If another program has put a link at the path, the link is kept.
         path.unlink()
         path.symlink_to("elsewhere")
         port.close()
         self.assertEqual(str(path.readlink()), "elsewhere")
 
     def test_names_whose_address_cannot_be_had(self) -> None:
-        """A robot that cannot be served is reported with the reason, and no file stays open."""
+        """A robot that cannot be served is reported with the reason; no file stays open."""
         before = len(os.listdir("/dev/fd"))
         table = {"dog2": {"kind": "create2", "options": {"port": "/nowhere/at/all"}}}
         robots = EmulatedRobots(MemoryReactorClock(), Random(1), self.simulator, table)

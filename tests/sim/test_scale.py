@@ -1,4 +1,4 @@
-"""Tests of ``sim scale``: expected values, resumed measurements, drawings and pages."""
+"""Tests of ``sim scale``: expected values, resumed measurements, figures and pages."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ from sim.team.scale.measurement_file import MeasurementFile
 
 
 def world() -> Environment:
-    """Return an environment with more memory than any team needs."""
+    """Return an environment that has more memory than any team needs."""
     ticks = itertools.count()
     return Environment(
         io.StringIO(), io.StringIO(), lambda: next(ticks), lambda: 0.0, read=lambda path: "MemAvailable: 99999999 kB"
@@ -32,7 +32,7 @@ def world() -> Environment:
 
 
 def sized(nodes: int) -> SizeResult:
-    """Return results for a size: hops equal the number of nodes, all other values are 1."""
+    """Return results for a size: the number of hops equals the number of nodes, all other values are 1."""
     figures = [Metric(curve.metric, 1.0, curve.unit) for curve in CURVES if curve.metric != "lookups.hops.mean"]
     return SizeResult(
         nodes, [*figures, Metric("lookups.hops.mean", float(nodes), "hops").with_target(None)], [], "h", 1.0
@@ -41,7 +41,7 @@ def sized(nodes: int) -> SizeResult:
 
 class TheoryTests(SynchronousTestCase):
     def test_curves(self) -> None:
-        """The expected numbers of hops, contacts, tree messages and agreement follow the formulas."""
+        """The expected numbers of hops, contacts, tree messages and agreement rounds follow the formulas."""
         self.assertEqual((theory.hops(3), theory.hops(1024)), (2.0, 5.0))
         self.assertEqual(theory.contacts(4), 3.0)
         self.assertTrue(60 < theory.contacts(1024) < 80)
@@ -52,7 +52,7 @@ class TheoryTests(SynchronousTestCase):
 
 class MeasurementFileTests(SynchronousTestCase):
     def test_resumed(self) -> None:
-        """A size that is in the file is not measured again; a file with other settings is not overwritten."""
+        """A size that is in the file is not measured again; a file with different settings is not overwritten."""
         out = self.mktemp()
         asked: list[int] = []
 
@@ -70,7 +70,7 @@ class MeasurementFileTests(SynchronousTestCase):
         self.assertEqual(Path(out, "scale.json").read_text(), before)
 
     def test_ended_run_keeps_what_it_has(self) -> None:
-        """Each size is written after its measurement; the measurement that is interrupted is discarded."""
+        """Each size is written when it has been measured; an interrupted measurement is discarded."""
         out, here, wishes = self.mktemp(), world(), list[int]()
         here.is_stopped = lambda: bool(wishes)
 
@@ -84,7 +84,7 @@ class MeasurementFileTests(SynchronousTestCase):
         self.assertEqual(list(json.loads(Path(out, "scale.json").read_text())["sizes"]), ["3"])
 
     def test_bad_input(self) -> None:
-        """Invalid sizes, an invalid file, and a folder that cannot be written are rejected by name."""
+        """An invalid size or file, or a folder that cannot be written, is rejected; the error contains its name."""
         for text in ("", "many", "2", "3,1000000"):
             with self.assertRaisesRegex(BadSetting, "--nodes"):
                 run_scale(["--nodes", text, "--out", self.mktemp()], world())
@@ -108,7 +108,7 @@ class MeasurementFileTests(SynchronousTestCase):
                 )
 
     def test_missed_targets_show(self) -> None:
-        """A figure beyond its target is marked in the table and sets exit code 1."""
+        """A figure that misses its target is marked in the table and gives exit code 1."""
         here = world()
         code = run_scale(
             ["--nodes", "1000", "--out", self.mktemp()], here, lambda nodes, settings, watcher: sized(nodes)
@@ -121,7 +121,7 @@ class MeasurementFileTests(SynchronousTestCase):
 
 class DrawingTests(SynchronousTestCase):
     def test_svg(self) -> None:
-        """Each curve with points has its own chart, and the drawing is valid XML for any values."""
+        """Each curve with points has its own chart; the drawing is valid XML for any values."""
         for values in ([1.0, 1.0], [0.0, 0.0], [0.001, 5e6], [3.0, 4.0]):
             points = {curve.metric: [(3, values[0]), (1000, values[1])] for curve in CURVES[:5]}
             root = ElementTree.fromstring(draw_svg(CURVES, points, "a & b"))
@@ -132,20 +132,20 @@ class DrawingTests(SynchronousTestCase):
 
 class PageTests(SynchronousTestCase):
     def test_table(self) -> None:
-        """A value beyond its target is bold, and the last column extrapolates over the logarithm of the size."""
+        """A value that misses its target is bold; the last column extrapolates over the logarithm of the size."""
         hops = [(n, 1.0 + 0.3 * math.log2(n)) for n in (3, 100, 300, 1000)]
         shown = format_markdown(CURVES, {"lookups.hops.mean": hops, "traffic.cpu": [(100, 1.0), (1000, 1.0)]})
         self.assertRegex(shown, r"Hops of a lookup \| hops \|.*\| 6.979 \|")
         self.assertRegex(shown, r"Processor of a node.* \| - \| 1 \| - \| \*\*1\*\* \| <= 0.5 \|  \|")
         self.assertIsNone(extrapolate(hops[:3]))
-        # If smaller teams have other targets, the table shows them.
+        # If the targets depend on the size of the team, the table shows them.
         shown = format_markdown(CURVES, {"auctions.agree.p95": [(n, 0.7) for n in (3, 100, 1000, 10_000)]})
         self.assertIn("| 0.7 | **0.7** | 0.7 | 0.7 | <= 1; <= 0.6 at 100, <= 0.8 at 1,000 |", shown)
 
 
 class MeasurementTests(SynchronousTestCase):
     def test_ends_soon(self) -> None:
-        """A survey that is interrupted ends at the next check, within 0.25 s of simulated time."""
+        """An interrupted survey ends at the next check, within 0.25 s of simulated time."""
         looks: list[int] = []
 
         def is_stopped() -> bool:
@@ -157,7 +157,7 @@ class MeasurementTests(SynchronousTestCase):
         self.assertEqual(len(looks), 5)
 
     def test_small_team(self) -> None:
-        """A survey of five nodes measures every figure without violations, and its digest is reproducible."""
+        """A survey of five nodes measures every figure without violations; its digest is reproducible."""
         settings = SurveySettings(settle=5.0, quiet=5.0, lookups=2.0, exact=5, auctions=1, takeovers=1, swarm_most=5)
         one, same = measure_size(5, settings), measure_size(5, settings)
         self.assertEqual(one.violations, [])

@@ -15,7 +15,7 @@ class SceneTests(SynchronousTestCase):
     """Scenes are read from JSON."""
 
     def setUp(self) -> None:
-        """Create a valid scene for the tests to change."""
+        """Create a valid scene, which the tests change."""
         self.fields = {
             "name": "two",
             "width": 2.0,
@@ -40,7 +40,7 @@ class SceneTests(SynchronousTestCase):
         self.assertEqual((scene.width, scene.height), (3.0, 2.4))
 
     def test_reads_a_file(self) -> None:
-        """A name that ends in .json is a path, and degrees become radians; unknown names and paths are rejected."""
+        """A name that ends in .json is a path, and angles are in degrees; unknown names and paths are rejected."""
         path = Path(self.mktemp() + ".json")
         path.write_text(json.dumps(self.fields))
         self.assertEqual(load_scene(str(path)).dogs[0].heading, math.pi / 2)
@@ -48,12 +48,15 @@ class SceneTests(SynchronousTestCase):
         self.assertIn("nowhere.json", str(self.assertRaises(SceneError, load_scene, "nowhere.json")))
 
     def test_refuses_what_is_no_scene(self) -> None:
-        """Text that is not a JSON object is rejected with the name of its source."""
+        """The error for text that is not a JSON object contains the name of the text's source."""
         for text in ("", "{", "[]", "7", "null", "[" * 100_000):
             self.assertIn("two.json", str(self.assertRaises(SceneError, parse_scene, text, "two.json")))
 
     def test_names_the_wrong_key(self) -> None:
-        """A missing or invalid field, and dogs in a wall, overlapping or with equal names are rejected with the key."""
+        """The error for a missing or invalid field contains its key.
+
+        So does the error for dogs that are in a wall, overlap or have equal names.
+        """
         wrong = {"width": 0, "height": "2", "wall_height": None, "name": 7, "dogs": [], "target": 3}
         for key, value in wrong.items():
             self.setUp()

@@ -17,14 +17,14 @@ class SensorsTests(SynchronousTestCase):
     """The sensors of dog1."""
 
     def setUp(self) -> None:
-        """Place dog1 in the middle, facing right, and dog2 out of its way."""
+        """Place dog1 in the middle, facing right, and dog2 out of the range of dog1's sensors."""
         self.world = World(Random(1), load_scene("three-dogs"))
         self.world.move_dog("dog2", 2.6, 2.1, 0.0)
         self.world.move_dog("dog1", 1.0, 1.0, 0.0)
         self.sensors = Sensors(Random(2), self.world, self.world.dogs["dog1"])
 
     def run_for(self, seconds: float) -> dict[str, list[float]]:
-        """Run for some seconds and return all samples."""
+        """Run for some seconds; return all samples."""
         rows: dict[str, list[float]] = {}
         for _ in range(round(seconds / SUBSTEP_S / 4)):
             for _ in range(4):
@@ -36,14 +36,14 @@ class SensorsTests(SynchronousTestCase):
         return rows
 
     def mean_range(self, key: str, gap: float) -> float:
-        """Return the mean of a ranger with the target ``gap`` metres before the nose, NaN if all samples are."""
+        """Return the mean range with the target ``gap`` metres ahead; NaN if all samples are NaN."""
         self.world.place_target(1.0 + NOSE_M + gap + 0.08, 1.0)
         row = self.run_for(0.4)[key]
         self.assertTrue(all(math.isnan(x) for x in row) or not any(math.isnan(x) for x in row))
         return statistics.fmean(row)
 
     def test_ranges_within_the_reach_of_each_ranger(self) -> None:
-        """Near covers 0.05 to 0.5 m and far 0.2 to 1.5 m; nearer reads as the minimum, farther as NaN."""
+        """Near covers 0.05 to 0.5 m, far 0.2 to 1.5 m. Shorter distances read as the minimum, longer ones as NaN."""
         for gap in (0.1, 0.3, 0.45):
             self.assertLess(abs(self.mean_range("range.near", gap) - gap), 0.003)
         self.assertAlmostEqual(self.mean_range("range.near", 0.02), 0.05, 3)
@@ -55,12 +55,12 @@ class SensorsTests(SynchronousTestCase):
         self.assertTrue(all(math.isnan(x) for x in self.run_for(0.1)["range.far"]))
 
     def test_sees_the_floor_with_the_chest(self) -> None:
-        """The chest ranger reads the floor at 0.20 m, and less with an obstacle at the feet."""
+        """The range sensor on the chest measures 0.20 m to the floor, and less if an obstacle is at the feet."""
         self.assertLess(abs(statistics.fmean(self.run_for(0.4)["range.chest"]) - 0.204), 0.003)
         self.assertLess(self.mean_range("range.chest", 0.12), 0.15)
 
     def test_feels_gravity_and_its_own_start(self) -> None:
-        """At rest the accelerometer shows gravity, upwards positive; a start is positive in x, a stop negative."""
+        """At rest the accelerometer shows gravity, positive upwards; a start is positive in x, a stop is negative."""
         rows = self.run_for(1.0)
         self.assertLess(abs(statistics.fmean(rows["imu.az"]) - 9.80665), 0.05)
         self.assertLess(abs(statistics.fmean(rows["imu.ax"])), 0.05)
@@ -71,7 +71,7 @@ class SensorsTests(SynchronousTestCase):
         self.assertLess(statistics.fmean(self.run_for(0.032)["imu.ax"]), -1.0)
 
     def test_reckons_its_way_with_a_drift(self) -> None:
-        """Odometry follows the walk within 8 % but not exactly; the battery drains faster while walking."""
+        """Odometry follows the walk within 8 % but not exactly; the battery discharges faster during a walk."""
         self.run_for(6.0)
         rested = 1.0 - float(self.sensors.values()["power.level"])
         self.world.drive("dog1", 0.16, 0.0, 0.0)

@@ -1,4 +1,4 @@
-"""Tests of ``sim.robots.simulator`` and ``sim.robots.paced_simulator`` on the level of messages."""
+"""Tests of the messages of ``sim.robots.simulator`` and ``sim.robots.paced_simulator``."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ from sim.robots.world import TICK_S
 
 
 class Client:
-    """A client with a link to the simulator that stores the received messages."""
+    """A client of the simulator that stores the received messages."""
 
     def __init__(self, simulator: RobotSimulator) -> None:
         self.is_busy = False
@@ -48,7 +48,7 @@ class Client:
         self.heard += self._reader.read(data)
 
     def close(self) -> None:
-        """Close the link from the side of the simulator."""
+        """Record that the simulator closes the link."""
         if self.is_open:
             self.is_open = False
             if self.session is not None:
@@ -60,7 +60,7 @@ class Client:
         self.session.data_received(b"".join(encode_message(message) for message in messages))
 
     def of(self, kind: type[Message]) -> list[Message]:
-        """Return the received messages of one kind."""
+        """Return the received messages of one type."""
         return [message for message in self.heard if isinstance(message, kind)]
 
 
@@ -89,7 +89,7 @@ class SimulatorTests(SynchronousTestCase):
         return self.simulator.world.dogs["dog1"].is_moving
 
     def test_sends_a_sensor_frame_each_32_ms(self) -> None:
-        """After ten seconds 312 frames have arrived, with timestamps 32 ms apart and without drift."""
+        """After ten seconds 312 frames have arrived; their timestamps are exactly 32 ms apart."""
         for _ in range(1000):
             self.clock.advance(0.01)
             self.client.say(KeepAlive())
@@ -107,7 +107,7 @@ class SimulatorTests(SynchronousTestCase):
         self.assertEqual(len(self.client.of(Picture)), before + 1)
 
     def test_draws_only_for_those_who_asked(self) -> None:
-        """A client gets no pictures by default, ten a second if it requests ten, and at most thirty."""
+        """A client gets no pictures by default, ten per second if it requests ten, and never more than thirty."""
         self.ticks(31)
         self.assertEqual(self.client.of(Picture), [])
         for wish, count in ((10.0, 10), (99.0, 30)):
@@ -117,7 +117,10 @@ class SimulatorTests(SynchronousTestCase):
             self.assertIn(len(self.client.of(Picture)) - before, (count - 1, count, count + 1))
 
     def test_stops_at_the_end_of_the_time_to_live(self) -> None:
-        """A command ends after its TTL, counted from its timestamp; a timestamp in the future does not extend it."""
+        """A command ends when its TTL, counted from its timestamp, has passed.
+
+        A future timestamp does not extend it.
+        """
         self.ticks(40)
         self.drive(ttl=0.3)
         self.ticks(8)
@@ -138,7 +141,7 @@ class SimulatorTests(SynchronousTestCase):
         self.assertFalse(self.is_moving())
 
     def test_halts_at_once(self) -> None:
-        """A halt needs no token, and a dog with disabled motors does not move."""
+        """A halt needs no token; a dog with disabled motors does not move."""
         for stop in (Halt(), Motors(False)):
             self.drive(ttl=5.0)
             self.ticks(5)
@@ -151,7 +154,7 @@ class SimulatorTests(SynchronousTestCase):
         self.assertFalse(self.is_moving())
 
     def test_stops_the_dog_of_a_lost_driver(self) -> None:
-        """If the connection closes, the dog stops and is free for another driver, which receives the last token."""
+        """If the connection closes, the dog stops; a new driver can connect, and receives the last token."""
         self.drive(token=9, ttl=5.0)
         self.ticks(5)
         self.client.close()
@@ -178,7 +181,7 @@ class SimulatorTests(SynchronousTestCase):
         self.assertLess(self.simulator.world.t, 2.0)
 
     def test_tells_what_the_gates_did(self) -> None:
-        """Lower tokens and expired commands have no effect; each gate counts accepted and rejected commands."""
+        """Lower tokens and expired commands have no effect; each gate counts its accepted and rejected commands."""
         self.drive(token=7)
         self.drive(token=7)
         self.drive(token=6, vx=-0.1)
@@ -200,7 +203,7 @@ class SimulatorTests(SynchronousTestCase):
         self.assertEqual(self.simulator.driven_robots, [])
 
     def test_refuses_drivers(self) -> None:
-        """A taken robot is refused temporarily; an unknown robot, another version or a second robot permanently."""
+        """A robot with a driver is refused temporarily; an unknown robot, version or second robot permanently."""
         cases = [("dog1", VERSION, False), ("cat", VERSION, True), ("dog2", VERSION + 1, True)]
         for robot, version, is_lasting in cases:
             client = Client(self.simulator)
@@ -214,7 +217,7 @@ class SimulatorTests(SynchronousTestCase):
         self.assertEqual(self.simulator.driven_robots, [])
 
     def test_drops_for_a_client_that_does_not_read(self) -> None:
-        """A busy client gets nothing until it is free again, and then the newest frame, not the oldest."""
+        """A busy client gets nothing until it can receive again; then it gets the newest frame."""
         self.client.is_busy = True
         self.ticks(10)
         self.assertEqual(self.client.heard, [])
@@ -226,7 +229,7 @@ class SimulatorTests(SynchronousTestCase):
         self.assertEqual({len(row) for row in newest.samples.values()}, {4})
 
     def test_lives_on_after_rubbish(self) -> None:
-        """Invalid bytes, orders without operator rights and commands without a dog have no effect."""
+        """Invalid bytes, requests without the operator's rights, and commands without a dog have no effect."""
         before = self.simulator.world.snapshot()
         stranger = Client(self.simulator)
         assert stranger.session is not None
@@ -235,7 +238,7 @@ class SimulatorTests(SynchronousTestCase):
         self.assertEqual((stranger.heard, self.simulator.world.snapshot()), ([], before))
 
     def test_shows_the_operator_everything(self) -> None:
-        """An operator receives the truth at the requested rate, and an answer to every order, valid or not."""
+        """An operator receives the true state at the requested rate, and a reply to every request, valid or invalid."""
         operator = Client(self.simulator)
         operator.say(SubscribeWorld(VERSION, 5.0))
         self.ticks(31)
@@ -252,7 +255,7 @@ class SimulatorTests(SynchronousTestCase):
         self.assertIsNotNone(self.simulator.world.target)
 
     def test_turns_away_the_crowd(self) -> None:
-        """The sixty-fifth connection is rejected; ``stop`` closes all connections and leaves no timer."""
+        """The sixty-fifth connection is rejected; ``stop`` closes all connections, and no timer remains."""
         crowd = [Client(self.simulator) for _ in range(65)]
         self.assertEqual(sum(not client.is_open for client in crowd), 2)
         self.assertTrue(self.client.is_open)
@@ -265,7 +268,7 @@ class PeriodicTimerTests(SynchronousTestCase):
     """``PeriodicTimer`` schedules pictures."""
 
     def test_keeps_its_rate_on_average(self) -> None:
-        """Any rate up to the tick rate is kept; after a pause one picture is due, not all the missed ones."""
+        """The timer keeps any rate up to the tick rate; after a pause one picture is due, not all missed pictures."""
         for rate in (0.0, 1.0, 10.0, 15.0, 29.97, 30.0, 31.25):
             beat = PeriodicTimer(rate)
             count = sum(beat.is_due(tick * TICK_S) for tick in range(1, 3126))

@@ -12,7 +12,7 @@ from sim.robots.world import SUBSTEP_S, NotPossible, World
 
 
 def make_world(seed: int = 1) -> World:
-    """Return a world with the three dogs far apart."""
+    """Return a world in which the three dogs are far apart."""
     return World(Random(seed), load_scene("three-dogs"))
 
 
@@ -32,7 +32,7 @@ class WorldTests(SynchronousTestCase):
         self.world.move_dog("dog1", 1.4, 1.0, 0.0)
 
     def test_walks_as_far_as_an_aibo(self) -> None:
-        """Speed is limited to 0.16 m/s, and two seconds cover that distance less the acceleration."""
+        """The speed is limited to 0.16 m/s; in two seconds a dog walks this distance, less the acceleration."""
         self.world.drive("dog1", 5.0, 0.0, 0.0)
         run(self.world, 2.0)
         self.assertAlmostEqual(self.dog.motion.vx, 0.160, 6)
@@ -40,7 +40,7 @@ class WorldTests(SynchronousTestCase):
         self.assertAlmostEqual(self.dog.y, 1.0, 6)
 
     def test_moves_in_its_own_frame(self) -> None:
-        """Velocities are relative to the dog: left of a dog that faces up is smaller x; turns are counter-clockwise."""
+        """Velocities are relative to the dog: if it faces up, left is smaller x; turns are counter-clockwise."""
         self.world.move_dog("dog1", 1.4, 1.0, math.pi / 2)
         self.world.drive("dog1", 0.0, 0.1, 0.0)
         run(self.world, 1.0)
@@ -50,7 +50,7 @@ class WorldTests(SynchronousTestCase):
         self.assertGreater(self.dog.heading, math.pi / 2 + 0.4)
 
     def test_needs_time_to_start_and_to_stop(self) -> None:
-        """Speed changes gradually, and a dog at full speed stops within a tenth of a second."""
+        """The speed changes gradually; a dog at full speed stops within a tenth of a second."""
         self.world.drive("dog1", 0.16, 0.0, 0.0)
         run(self.world, 0.05)
         self.assertTrue(0.01 < self.dog.motion.vx < 0.08)
@@ -89,7 +89,7 @@ class WorldTests(SynchronousTestCase):
         self.assertEqual((self.world.target.x, self.world.target.y), (1.8, 1.0))
 
     def test_measures_ahead(self) -> None:
-        """The distance ahead ends at a wall, a dog or the target, never at the dog itself; out of range it is None."""
+        """The measured distance ends at a wall, another dog or the target; out of range it is None."""
         self.assertIsNone(self.world.distance_ahead(self.dog, 0.1, 1.0))
         self.assertAlmostEqual(self.world.distance_ahead(self.dog, 0.1, 3.0) or 0.0, 1.5, 6)
         self.world.place_target(2.0, 1.0)
@@ -101,7 +101,7 @@ class WorldTests(SynchronousTestCase):
         self.assertIsNone(self.world.distance_ahead(self.dog, 0.1, 1.0))
 
     def test_places_the_target_later(self) -> None:
-        """A delayed target appears after its delay, unless a target was placed or removed in the meantime."""
+        """A target with a delay appears after the delay, unless a target was placed or removed during the delay."""
         self.world.place_target_later(1.0)
         run(self.world, 0.9)
         self.assertIsNone(self.world.target)
@@ -117,7 +117,7 @@ class WorldTests(SynchronousTestCase):
             self.assertRaises(NotPossible, self.world.place_target_later, seconds)
 
     def test_places_the_target_clear_of_everything(self) -> None:
-        """For each seed the dogs have distinct distances to a random target, so one is clearly the nearest."""
+        """For each seed the distances of the dogs to the random target differ, so one dog is clearly the nearest."""
         for seed in range(60):
             world, same = make_world(seed), make_world()
             for each in (world, same):
@@ -132,7 +132,7 @@ class WorldTests(SynchronousTestCase):
             self.assertGreaterEqual(min(far[1] - far[0], far[2] - far[1]), 0.25 - 1e-9, seed)
 
     def test_refuses_impossible_orders(self) -> None:
-        """Places in walls, dogs or the target, and unknown dogs are rejected; nothing moves."""
+        """Positions in walls, dogs or the target, and unknown dogs, are rejected; nothing moves."""
         self.world.place_target(2.0, 2.0)
         before = self.world.snapshot()
         for order in (

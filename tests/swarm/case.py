@@ -1,4 +1,4 @@
-"""Shared test case for whole teams in memory."""
+"""A shared test case for whole teams in memory."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ LOOK_S = 0.05
 
 
 class TeamCase(SynchronousTestCase):
-    """Tests of a team of a laptop and three dogs."""
+    """Tests of a team that consists of a laptop and three dogs."""
 
     def start_team(
         self,
@@ -29,13 +29,13 @@ class TeamCase(SynchronousTestCase):
         loss: float = 0.0,
         others: tuple[str, ...] = (),
     ) -> SimulatedTeam:
-        """Start a team that stops with the test."""
+        """Start a team that is stopped at the end of the test."""
         team = SimulatedTeam(seed, conditions=replace(LAN, loss=loss), dogs=dogs, others=others)
         self.addCleanup(team.stop)
         return team
 
     def until(self, team: SimulatedTeam, is_so: Callable[[], bool], limit: float = 90.0) -> float:
-        """Run the team until a condition holds; return the seconds, or fail after ``limit``."""
+        """Run the team until a condition is true; return the seconds, or fail after ``limit`` seconds."""
         started_at = team.clock.seconds()
         while not is_so():
             if team.clock.seconds() - started_at > limit:
@@ -45,15 +45,15 @@ class TeamCase(SynchronousTestCase):
         return team.clock.seconds() - started_at
 
     def look(self, team: SimulatedTeam) -> None:
-        """Hook that ``until`` calls after each step."""
+        """Do nothing; ``until`` calls this hook after each step."""
 
     def task(self, team: SimulatedTeam) -> dict[str, Any]:
-        """Return the newest task as the page shows it."""
+        """Return the newest task in the page's state."""
         tasks = team.state()["tasks"]
         return dict(tasks[0]) if tasks else {"status": "absent"}
 
     def device(self, team: SimulatedTeam, name: str) -> dict[str, Any]:
-        """Return a device as the page shows it."""
+        """Return a device in the page's state."""
         return next((dict(row) for row in team.state()["devices"] if row["name"] == name), {"status": "absent"})
 
     def statuses(self, team: SimulatedTeam) -> dict[str, str]:
@@ -70,13 +70,13 @@ class TeamCase(SynchronousTestCase):
         return [m["name"] for m in groups[0]["members"] if m["status"] == "EXECUTING"] if groups else []
 
     def gap(self, team: SimulatedTeam, name: str) -> float:
-        """Return the metres between the dog's footprint and the target."""
+        """Return the distance in metres between the dog's footprint and the target."""
         dog, target = team.simulator.world.dogs[name], team.simulator.world.target
         assert target is not None
         return math.hypot(dog.x - target.x, dog.y - target.y) - target.radius - FOOTPRINT_RADIUS_M
 
     def moving(self, team: SimulatedTeam) -> list[str]:
-        """Return the dogs that move now."""
+        """Return the dogs that are moving."""
         return [dog.name for dog in team.simulator.world.dogs.values() if dog.is_moving]
 
     def submit(self, team: SimulatedTeam, task: Task) -> None:
@@ -96,6 +96,6 @@ class TeamCase(SynchronousTestCase):
         ]
 
     def use_facing(self) -> None:
-        """Register the behaviour ``facing`` for this test."""
+        """Register the behaviour ``facing`` for the duration of this test."""
         KINDS["facing"] = "tests.swarm.facing:Facing"
         self.addCleanup(KINDS.pop, "facing")

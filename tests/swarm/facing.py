@@ -1,4 +1,4 @@
-"""A behaviour for tests of whole teams with a different cost and vote for each dog and task."""
+"""A behaviour for tests of whole teams; its cost and vote differ for each dog and task."""
 
 from __future__ import annotations
 
@@ -15,13 +15,13 @@ NEAR = math.radians(6.0)
 
 
 class Facing:
-    """Turn to the direction ``towards`` (radians by the compass) at ``speed``; the cost is the angle, in tenths.
+    """Turn to the compass direction ``towards`` (radians) at ``speed``; the cost is the angle, rounded to tenths.
 
-    It votes for the half of the world to which the dog looked first, and offers that direction as a number.
+    The agent votes for the half of the world that the dog first faced, and offers that direction as its number.
     """
 
     contexts: list[Context] = []
-    """Under what any of them has acted."""
+    """The contexts in which any instance has acted."""
 
     def __init__(self, parameters: Mapping[str, float | str], rng: random.Random) -> None:
         self._towards = float(parameters["towards"])
@@ -36,7 +36,7 @@ class Facing:
 
     @property
     def cost(self) -> float | None:
-        """Return the angle to turn, in radians."""
+        """Return the angle to turn, in radians; None before the first observation."""
         return None if self._first is None else round(abs(self._way), 1)
 
     @property
@@ -46,7 +46,7 @@ class Facing:
 
     @property
     def value(self) -> tuple[float, ...]:
-        """Return the first direction."""
+        """Return the direction that the dog first faced."""
         return () if self._first is None else (round(self._first, 2),)
 
     def search(self, now: float) -> Action:

@@ -35,7 +35,7 @@ class AgreementTests(TeamCase):
         return format_explanation(explain_decisions(self.verdicts(self.team, "t1")))
 
     def test_charged_dog_goes(self) -> None:
-        """With ``capability_cost`` the nearest dog does not act on a low battery, and the explanations agree."""
+        """With ``capability_cost`` the nearest dog does not act if its battery is low; all explanations agree."""
         self.team.simulator._sensors["dog2"]._power = 0.1
         shown = self.run_task("capability_cost")
         self.assertNotEqual(shown["result"]["by"], "dog2")
@@ -52,7 +52,10 @@ class AgreementTests(TeamCase):
         self.assertEqual({member.battery for member in self.members_seen.values()}, {1.0})
 
     def test_vote_reaches_who_acts(self) -> None:
-        """The option of two of three dogs wins, and one of the two acts on it; the explanations agree."""
+        """Of two options, the one with two votes of three dogs wins, and one of these two dogs acts on it.
+
+        All explanations agree.
+        """
         shown = self.run_task("weighted_vote")
         self.assertIn(shown["result"]["by"], ("dog1", "dog2"))
         self.assertEqual({context.choice for context in Facing.contexts}, {"north"})
@@ -62,7 +65,7 @@ class AgreementTests(TeamCase):
         self.assertEqual(shown["why"][0]["agreed"], "north")
 
     def test_mean_reaches_who_acts(self) -> None:
-        """All dogs agree on the exact mean of their three values, and the assigned agent receives it."""
+        """All dogs agree on the exact mean of their three values, and the assigned agent receives this mean."""
         self.run_task("average")
         offered = [member.value[0] for member in self.members_seen.values()]
         self.assertEqual((len(offered), len(set(offered))), (3, 3))

@@ -1,4 +1,4 @@
-"""Tests of whole teams in memory: the thesis' experiments, tasks, membership and faults."""
+"""Tests of whole teams in memory: the experiments of the thesis, tasks, membership and faults."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ class ExperimentTests(TeamCase):
 
 class TaskTests(TeamCase):
     def test_task_that_nobody_can_do_stays_open_and_says_why(self) -> None:
-        """A task with a requirement that no device meets stays open, and its note lists the missing capabilities."""
+        """A task with a requirement that no device meets stays open; its note lists the missing capabilities."""
         team = self.start_team()
         answer = team.control.assign("fetch-the-ball")
         team.clock.advance(5.0)
@@ -49,7 +49,7 @@ class TaskTests(TeamCase):
         self.assertEqual(set(self.statuses(team).values()), {"IDLE"})
 
     def test_device_is_done_or_idle_until_its_next_task(self) -> None:
-        """After a task its dog is DONE and the others are IDLE until all of them take part in the next task."""
+        """After a task its dog is DONE and the others are IDLE, until all of them take part in the next task."""
         team = self.start_team()
         team.control.assign("turn-around")
         shown: list[dict[str, str]] = []
@@ -73,7 +73,7 @@ class TaskTests(TeamCase):
         self.until(team, lambda: self.task(team)["status"] == "COMPLETED")
 
     def test_tasks_are_done_one_after_the_other(self) -> None:
-        """A task that arrives while a dog is busy is done afterwards."""
+        """A task that arrives while a dog is busy is executed afterwards."""
         team = self.start_team()
         team.control.assign("turn-around")
         team.clock.advance(0.2)
@@ -102,7 +102,10 @@ class TaskTests(TeamCase):
         self.until(team, lambda: is_done("slow"))
 
     def test_paused_task_rests_until_it_is_resumed(self) -> None:
-        """While a task is paused no dog moves and the page names the operator; after the resume it completes."""
+        """While a task is paused, no dog moves and the page shows which operator paused it.
+
+        After the resume it completes.
+        """
         team = self.start_team()
         team.run_demo()
         self.until(team, lambda: bool(self.executing(team)))
@@ -119,7 +122,7 @@ class TaskTests(TeamCase):
         self.until(team, lambda: self.task(team)["status"] == "COMPLETED")
 
     def test_deadline_fails_the_task_and_says_so(self) -> None:
-        """A task that misses its deadline fails once, for all devices, and the page shows the reason."""
+        """A task that misses its deadline fails once for all devices, and the page shows the reason."""
         team = self.start_team()
         task = Task("late", "find-target", "Late", created=team.clock.seconds(), deadline=4.0)
         self.submit(team, task)
@@ -142,7 +145,7 @@ class TaskTests(TeamCase):
         self.assertEqual(set(self.statuses(team).values()), {"IDLE"})
 
     def test_moved_target_is_reached(self) -> None:
-        """If the target moves while a dog walks to it, a dog still reaches it before the task is completed."""
+        """If the target moves while a dog walks to it, the task completes only when a dog has reached the target."""
         team = self.start_team()
         team.run_demo()
         self.until(team, lambda: bool(self.executing(team)))
@@ -160,7 +163,7 @@ class TaskTests(TeamCase):
 
 class MembershipTests(TeamCase):
     def test_task_assigned_to_one_dog_draws_in_those_that_come(self) -> None:
-        """Two dogs that join later take part in a running task; all three report and agree on the same dog."""
+        """Two dogs that join later take part in a running task; all three dogs report, and agree on the same dog."""
         team = self.start_team(dogs=("dog1",))
         team.run_demo()
         team.clock.advance(1.0)
@@ -179,7 +182,7 @@ class MembershipTests(TeamCase):
         self.until(team, lambda: self.task(team)["status"] == "COMPLETED")
 
     def test_others_spread_when_one_leaves(self) -> None:
-        """After a loss the waiting dog moves around the target, away from the acting dog and without a collision."""
+        """After a loss the waiting dog moves around the target, away from the acting dog, without a collision."""
         team = self.start_team(1)
         team.scatter(3)
         team.run_demo()
@@ -233,7 +236,7 @@ class MembershipTests(TeamCase):
         self.assertLessEqual(self.gap(team, "dog2"), REACHED_GAP_M)
 
     def test_winner_that_died_is_still_named(self) -> None:
-        """While the decision still names a dead dog, the page shows the dog's name instead of its id."""
+        """While the decision still assigns a dead dog, the page shows the dog's name, not its id."""
         team = self.start_team()
         team.run_demo()
         self.until(team, lambda: bool(self.executing(team)))
@@ -247,7 +250,7 @@ class MembershipTests(TeamCase):
         self.assertTrue(shown <= set(team.DOGS), shown)
 
     def test_killed_dog_says_nothing_more(self) -> None:
-        """A killed node sends no further datagram, not even the release of its lease, and its robot stops."""
+        """A killed node sends no further datagram, not even the release of its lease; its robot stops."""
         team = self.start_team()
         team.run_demo()
         self.until(team, lambda: bool(self.executing(team)))
@@ -261,7 +264,7 @@ class MembershipTests(TeamCase):
         self.assertFalse(team.simulator.world.dogs[first].is_moving)
 
     def test_disconnected_dog_comes_back(self) -> None:
-        """A dog that leaves for 5 s is GONE, returns as the same device, and another dog does its task."""
+        """A dog that leaves for 5 s is GONE, and a different dog does its task; the dog returns as the same device."""
         team = self.start_team()
         team.run_demo()
         self.until(team, lambda: bool(self.executing(team)))
@@ -277,7 +280,7 @@ class MembershipTests(TeamCase):
         self.until(team, lambda: self.task(team)["status"] == "COMPLETED")
 
     def test_at_no_time_do_two_dogs_walk_to_the_target(self) -> None:
-        """During the loss and return of a dog at most one dog holds a lease at any time."""
+        """While a dog is lost and returns, at most one dog holds a lease at any time."""
         team = self.start_team(4)
         team.run_demo()
         killed = ""
@@ -327,7 +330,7 @@ class LinkConditionTests(TeamCase):
         self.until(team, lambda: self.task(team)["status"] == "COMPLETED")
 
     def test_broken_link_of_the_dog_on_its_way_moves_another(self) -> None:
-        """If a node loses the link to its robot, another dog takes over the task."""
+        """If the acting node loses the link to its robot, a different dog takes over the task."""
         team = self.start_team()
         team.run_demo()
         self.until(team, lambda: bool(self.executing(team)))

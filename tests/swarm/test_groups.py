@@ -10,9 +10,9 @@ from swarmnode.simulated_team import SimulatedTeam
 from tests.swarm.case import TeamCase
 
 TASKS = {"t0": 1.5, "t1": 2.5, "t2": -2.5}
-"""Where to face.  Task by task the nearest dog would have to turn more in all than these three need."""
+"""The direction in radians for each task.  If the nearest dog did each task, the dogs would turn more in total."""
 SLOW = 0.25
-"""Radians a second: the nearest turn takes a second, the others four and more."""
+"""Turn velocity in radians per second: the shortest turn takes one second, the other turns at least four."""
 DOGS = SimulatedTeam.DOGS
 
 
@@ -37,7 +37,7 @@ class GroupTests(TeamCase):
         return team
 
     def look(self, team: SimulatedTeam) -> None:
-        """Record the first costs, the dogs that start each task, and dogs that act on two tasks at a time."""
+        """Record the first costs, the dogs that start each task, and dogs that act on two tasks simultaneously."""
         acting: dict[str, list[str]] = {}
         for name in TASKS:
             for member in self.members(team, name):
@@ -56,7 +56,7 @@ class GroupTests(TeamCase):
         return [task["status"] for task in team.state()["tasks"]] == ["COMPLETED"] * len(TASKS)
 
     def by(self, team: SimulatedTeam) -> dict[str, str]:
-        """Return the dog that did each completed task."""
+        """Return the dog that completed each task."""
         return {task["id"]: task["result"]["by"] for task in team.state()["tasks"] if task["result"] is not None}
 
     def ruling(self, team: SimulatedTeam, name: str) -> EpochExplanation:
@@ -64,7 +64,7 @@ class GroupTests(TeamCase):
         return explain_decisions(self.verdicts(team, name)).epochs[0]
 
     def test_each_dog_does_one(self) -> None:
-        """Three dogs do three tasks at once, one each, with the lowest total cost; all agree.
+        """Three dogs do one of three tasks each, simultaneously and with the lowest total cost; all dogs agree.
 
         All reports on the three tasks have the same digest.
         """
@@ -85,7 +85,7 @@ class GroupTests(TeamCase):
         self.assertAlmostEqual(sum(self.costs[name][dog] for name, dog in by.items()), best)
 
     def test_nearest_one_by_one_costs_more(self) -> None:
-        """With ``nearest`` the same tasks are assigned one by one, at a higher total cost."""
+        """With ``nearest`` the same tasks are assigned one by one, and the total cost is higher."""
         team = self.busy_team(strategy="nearest")
         self.until(team, lambda: self.are_done(team), 60.0)
         best = min(sum(self.costs[t][d] for t, d in zip(TASKS, order, strict=True)) for order in permutations(DOGS))
@@ -109,7 +109,7 @@ class GroupTests(TeamCase):
         self.assertEqual(self.twice, [])
 
     def test_operator_gives_a_group(self) -> None:
-        """Predefined tasks in one group are done at once, one by each dog, and the page shows the group."""
+        """Predefined tasks in one group are done simultaneously, one by each dog, and the page shows the group."""
         team = self.start_team(5)
         for _ in DOGS:
             team.control.assign("turn-around", group="yard")
@@ -121,7 +121,7 @@ class GroupTests(TeamCase):
         self.assertLess(max(began) - min(began), 3.0)
 
     def test_newcomer_takes_what_is_left(self) -> None:
-        """Two busy dogs leave the third task open, and a dog that joins takes it."""
+        """Two busy dogs leave the third task open; a dog that joins executes it."""
         team = self.busy_team(("dog1", "dog2"))
         self.until(team, lambda: len(self.began) == 2)
         (left,) = set(TASKS) - set(self.began)

@@ -11,7 +11,7 @@ from tests.swarm.case import TeamCase
 from webnode.stop_control import StopControl
 
 BRAKING = 0.2
-"""Seconds in which all three dogs stand, from the press of the button."""
+"""The time in seconds from the stop until all three dogs stand still."""
 
 
 class StopTests(TeamCase):
@@ -24,7 +24,7 @@ class StopTests(TeamCase):
         return self.team.services[name].assembly.node
 
     def moved_in(self, seconds: float) -> set[str]:
-        """Return the dogs that move in the next seconds."""
+        """Return the dogs that move during the next seconds."""
         moved: set[str] = set()
         for _ in range(round(seconds / 0.05)):
             self.team.clock.advance(0.05)
@@ -32,7 +32,7 @@ class StopTests(TeamCase):
         return moved
 
     def outcomes(self, asked: Deferred[dict[str, str]]) -> dict[str, str]:
-        """Return the answer of each device by name."""
+        """Return the outcome for each device, by the device's name."""
         return {
             name: expected for uuid, expected in self.successResultOf(asked).items() if (name := self.name_of(uuid))
         }
@@ -42,13 +42,16 @@ class StopTests(TeamCase):
         return next(name for name, service in self.team.services.items() if service.assembly.node.uuid == uuid)
 
     def until_executing(self) -> str:
-        """Run the demonstration until a dog acts, and return its name."""
+        """Run the demonstration until a dog acts; return the name of that dog."""
         self.team.run_demo()
         self.until(self.team, lambda: bool(self.executing(self.team) and self.moving(self.team)))
         return self.executing(self.team)[0]
 
     def test_all_stand_at_once_and_go_on(self) -> None:
-        """After a stop all dogs stand within 0.2 s and for 10 s; after the release the same dog continues."""
+        """After a stop all dogs stop within 0.2 s and do not move for 10 s.
+
+        After the release the same dog continues.
+        """
         acting = self.until_executing()
         token = self.team.services[acting].assembly.agent.engagement.lease_client.token  # type: ignore[union-attr]
         asked = self.halts.stop("ann")
@@ -69,7 +72,7 @@ class StopTests(TeamCase):
         self.assertEqual((state["tasks"][0]["status"], state["tasks"][0]["result"]["by"]), ("COMPLETED", acting))
 
     def test_nobody_takes_over(self) -> None:
-        """If the acting dog dies during a stop, no dog moves before the release; then another takes over."""
+        """If the acting dog fails during a stop, no dog moves before the release; then another dog takes over."""
         acting = self.until_executing()
         self.halts.stop("ann")
         self.team.clock.advance(1.0)
@@ -97,7 +100,10 @@ class StopTests(TeamCase):
         self.assertTrue(self.moving(team))
 
     def test_who_cannot_be_told_reads_it(self) -> None:
-        """An unreachable dog is reported as unreachable, and stops as soon as it hears the others again."""
+        """An unreachable dog is reported as unreachable.
+
+        It stops as soon as it can communicate with the others again.
+        """
         self.team.run_demo()
         self.team.clock.advance(1.0)
         self.team.block_datagrams("dog2")
@@ -110,7 +116,7 @@ class StopTests(TeamCase):
         self.assertEqual(self.moved_in(3.0), set())
 
     def test_a_release_ends_the_stops_that_it_names(self) -> None:
-        """A release covers only the stops that it lists: a later stop by another operator remains."""
+        """A release ends only the stops that it lists: a later stop by a different operator remains in force."""
         self.halts.stop("ann")
         self.team.clock.advance(0.5)
         shown = [stop["id"] for stop in self.team.state()["halt"]["stops"]]
@@ -124,7 +130,7 @@ class StopTests(TeamCase):
         self.assertFalse(self.team.state()["halted"])
 
     def test_nobody_waits_for_who_is_silent(self) -> None:
-        """A silent device does not delay the stop of the others, and the page does not show the team as stopped."""
+        """A silent device does not delay the stop of the others; the page does not show the team as stopped."""
         acting = self.until_executing()
         silent = "dog2" if acting == "dog1" else "dog1"
         self.team.block_datagrams(silent)
@@ -137,7 +143,7 @@ class StopTests(TeamCase):
         self.assertEqual((state["halted"], [other["name"] for other in state["halt"]["others"]]), (False, [silent]))
 
     def test_a_release_that_was_not_heard_shows(self) -> None:
-        """A robot that misses the release is shown as standing, and continues when it receives the release."""
+        """A robot that misses the release is shown as stopped; it continues when it receives the release."""
         self.halts.stop("ann")
         self.team.clock.advance(1.0)
         self.assertTrue(self.team.state()["halted"])
@@ -159,7 +165,7 @@ class StopTests(TeamCase):
         self.assertFalse(self.node("dog1").stop_state.is_motion_forbidden)
 
     def test_the_device_says_who(self) -> None:
-        """Each device logs the operator that stopped it and the operator that released it."""
+        """The log of each device contains the operator that stopped it and the operator that released it."""
         self.halts.stop("ann")
         self.team.clock.advance(0.5)
         self.halts.release("bob")

@@ -17,9 +17,9 @@ from tests.swarm.case import TeamCase
 
 class TakeoverTests(TeamCase):
     def test_each_way_to_be_lost(self) -> None:
-        """After each kind of loss another dog completes the task within 2.5 s, and no two dogs ever move at once.
+        """After each kind of loss another dog completes the task within 2.5 s, and two dogs never move simultaneously.
 
-        A frozen dog does nothing after the thaw; a dog that the others do not hear stops before another dog moves; a
+        A frozen dog does nothing after the thaw. A dog that cannot reach the others stops before another dog moves. A
         robot without a link to its node stops by itself.
         """
         seeds = {Cause.POLITE_LEAVE: (2,), Cause.LOST_LINK: (1, 2, 3)}
@@ -31,9 +31,9 @@ class TakeoverTests(TeamCase):
                 self.assertLess(one.takeover or 99.0, 2.5, one)
 
     def test_dog_and_page_at_once(self) -> None:
-        """If the acting dog and the node that serves the page are lost at the same time, another dog takes over.
+        """If the acting dog and the node that serves the page are lost simultaneously, another dog takes over.
 
-        In both runs a council of three would contain the two lost nodes.
+        With both seeds a council of three members would contain the two lost nodes.
         """
         for seed in (6, 7):
             team = self.start_team(seed, others=("pi",))
@@ -46,7 +46,7 @@ class TakeoverTests(TeamCase):
             self.assertLess(team.clock.seconds() - started_at, 3.0, seed)
 
     def moving_for_it(self, team: SimulatedTeam, besides: str) -> str:
-        """Return the first dog other than ``besides`` that holds a lease and moves."""
+        """Return the first dog except ``besides`` that holds a lease and moves."""
 
         def going() -> list[str]:
             acting = [
@@ -63,11 +63,14 @@ class TakeoverTests(TeamCase):
 
 class TakeoverObserverTests(SynchronousTestCase):
     def judge(self, cause: Cause = Cause.CRASH) -> TakeoverObserver:
-        """Return a judge for the loss of dog1 at 100 s, with a limit of 25 s and 1 s of observation after the end."""
+        """Return an observer of the loss of dog1 at 100 s; its limit is 25 s, and it observes for 1 s after the end."""
         return TakeoverObserver(cause, 1, "dog1", 100.0, random.Random(1), 25.0, 1.0)
 
     def test_counts_from_the_loss(self) -> None:
-        """The takeover ends when another dog moves; two moving dogs and motion of the lost dog count separately."""
+        """The takeover ends when another dog moves.
+
+        Simultaneous motion and motion of the lost dog are counted separately.
+        """
         judge = self.judge()
         looks = [["dog1"], [], ["dog2"], ["dog1", "dog2"], ["dog1"], ["dog3"]]
         for number, moving in enumerate(looks, start=1):
@@ -86,7 +89,7 @@ class TakeoverObserverTests(SynchronousTestCase):
         self.assertEqual(judge.make_trial(), Trial("crash", 1, "dog1", "dog2", True, 3.0, 0, 0))
 
     def test_thaws_the_frozen_once(self) -> None:
-        """Only a frozen dog is thawed, once, and the trial is not over before that."""
+        """Only a frozen dog is thawed, and only once; the trial is not over before the thaw."""
         judge = self.judge(Cause.FREEZE)
         self.assertFalse(judge.is_over(999.0))
         self.assertEqual([judge.take_thaw(now) for now in (102.9, 105.1, 105.2)], [False, True, False])
@@ -100,19 +103,19 @@ class ReportTests(SynchronousTestCase):
         return [Trial("crash", n, "dog1", "dog2", s is not None, s, 0, 0) for n, s in enumerate(seconds)]
 
     def test_table_says_who_held_and_whether_the_target_is_reached(self) -> None:
-        """The line of each cause has the counts, percentiles and the verdict on the target."""
+        """The line of each cause contains the counts and percentiles, and whether the target is met."""
         line = format_table(self.trials(1.0, 1.2, 1.4, None)).splitlines()[1].split()
         self.assertEqual(line[:7], ["crash", "4", "3", "1.20", "1.40", "1.40", "1.40"])
         self.assertEqual(line[-1], "yes")
         self.assertTrue(format_table(self.trials(1.0, 2.1)).endswith("no"))
 
     def test_zombie_is_no_success(self) -> None:
-        """A trial fails if the lost dog moves after the takeover or completes the task."""
+        """A trial fails if the lost dog moves after the takeover, or if the lost dog completes the task."""
         self.assertFalse(Trial("freeze", 1, "dog1", "dog2", True, 1.0, 0, 1).has_passed)
         self.assertFalse(Trial("freeze", 1, "dog1", "dog1", True, 1.0, 0, 0).has_passed)
 
     def test_picture_has_a_bar_for_each_tenth(self) -> None:
-        """The histogram has a bar for each tenth of a second, and the largest bin has the highest bar."""
+        """The histogram has a bar for each tenth of a second; the largest bin has the highest bar."""
         picture = draw_svg(self.trials(1.01, 1.02, 1.55))
         self.assertIn('height="60.0"', picture)
         self.assertIn('height="30.0"', picture)

@@ -1,4 +1,4 @@
-"""Runs ``swarm`` verbs against a node of a virtual team in virtual time."""
+"""Run ``swarm`` verbs against a node of a simulated team in virtual time."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ PATIENCE = 5.0
 def runtime_folder(case: SynchronousTestCase, node: str = "vaio") -> Path:
     """Create a folder in which commands find the control socket of ``node``, until the test ends.
 
-    Trial's own folders are deeper than the path of a socket may be.
+    The folders of Trial have paths that are too long for a socket.
     """
     folder = Path(tempfile.mkdtemp())
     case.addCleanup(shutil.rmtree, folder)
@@ -37,7 +37,7 @@ def runtime_folder(case: SynchronousTestCase, node: str = "vaio") -> Path:
 
 
 class Shell:
-    """Runs commands on the machine of ``node``; an answer may take ``PATIENCE`` seconds of the team's time."""
+    """Runs commands on the machine of ``node``; the wait for a reply is limited to ``PATIENCE`` virtual seconds."""
 
     def __init__(self, team: SimulatedTeam, node: SwarmNode) -> None:
         self._team = team
@@ -45,7 +45,7 @@ class Shell:
         self.said = ""
 
     def ask(self, path: Path, request: dict[str, Any]) -> Iterator[dict[str, Any]]:
-        """Answer a request like the control socket."""
+        """Return the reply of the node, like the control socket."""
         answers: list[dict[str, Any]] = []
         work = self._verbs.run(request["verb"], request["with"], lambda event: None)
         work.addCallbacks(

@@ -1,4 +1,4 @@
-"""Nodes of the command line in virtual time, for tests."""
+"""Nodes as started by the command line, in virtual time, for tests."""
 
 from __future__ import annotations
 
@@ -18,14 +18,14 @@ KEY = "of tests, and of nobody else"
 
 
 class Page(Service):
-    """A page that records that it exists."""
+    """A page that records the number of running pages."""
 
     def __init__(self, pages: list[Page]) -> None:
         pages.append(self)
 
 
 class MemoryTeam:
-    """A switchboard, a clock and the nodes on them."""
+    """A switchboard, a clock and the nodes that use them."""
 
     def __init__(self) -> None:
         self.clock = HeapClock()
@@ -33,7 +33,7 @@ class MemoryTeam:
         self.pages: list[Page] = []
 
     def make_dependencies(self, name: str, port: int, store: MemoryStore | None = None) -> Dependencies:
-        """Return the environment of one node."""
+        """Return the dependencies of one node."""
         return Dependencies(
             self.clock,
             lambda: self.switchboard.make_network("127.0.0.1", port),

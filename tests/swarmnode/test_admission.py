@@ -1,4 +1,4 @@
-"""Tests of the verbs that create, join and leave a closed team, at a node of a virtual team."""
+"""Tests of the verbs that create, join and leave a closed team, with a node of a simulated team."""
 
 from __future__ import annotations
 
@@ -58,13 +58,13 @@ class AdmissionTests(SynchronousTestCase):
         return code, out.getvalue()
 
     def done(self, main: Callable[..., int], *words: str, **more: Any) -> Any:
-        """Return the answer of a verb that succeeds."""
+        """Run a verb, which must succeed; return its result."""
         code, output = self.run_verb(main, *words, "--json", **more)
         self.assertEqual(code, 0, self.said)
         return json.loads(output)
 
     def knock(self, code: JoinCode, seed: bytes, wish: str, addresses: Sequence[Address], timeout: float) -> Membership:
-        """Send a join request like the verb, in the team's virtual time and network."""
+        """Send a join request as the verb does, but in the virtual time and network of the team."""
         self.newcomers += 1
         network = self.team.switchboard.make_network("127.0.0.1", 9000 + self.newcomers)
         work = JoinClient(code, seed, network, self.team.clock, self.dice, wish).join(addresses, timeout)
@@ -97,7 +97,10 @@ class AdmissionTests(SynchronousTestCase):
         self.assertIn("is there already", self.said)
 
     def test_init_with_options(self) -> None:
-        """By default the first node listens on all interfaces; ``--page`` enables its page, ``--member`` adds one."""
+        """By default the first node listens on all interfaces.
+
+        ``--page`` enables the page, ``--member`` adds a member.
+        """
         words = ("yard", "--operator", str(self.folder / "yard"), "--folder", str(self.folder), "--first", "vaio")
         for twice in (("--member", "vaio"), ("--member", "dog1", "--member", "dog1=gateway")):
             self.assertEqual(self.run_verb(init.main, *words, *twice)[0], 2)
@@ -113,7 +116,7 @@ class AdmissionTests(SynchronousTestCase):
         self.assertEqual(MembershipFile(Path(node.membership)).membership.member.roles, ("operator", "gateway"))
 
     def test_newcomer_hears_more_than_its_own_machine(self) -> None:
-        """A node that joins through another machine listens on all interfaces, otherwise on the loopback address."""
+        """A node that joins through another machine listens on all interfaces, other nodes on the loopback address."""
         found = self.done(invite.main, "dog9")
 
         def elsewhere(*knock: Any) -> Membership:
@@ -126,7 +129,7 @@ class AdmissionTests(SynchronousTestCase):
         self.assertEqual(Settings.load(near["settings"]).node.host, "127.0.0.1")
 
     def test_invite_and_join(self) -> None:
-        """A code from the laptop admits a new member and creates files with which its node starts."""
+        """With an invitation from the laptop a node joins, and the verb writes files with which the node starts."""
         code, output = self.run_verb(invite.main, "dog9")
         self.assertEqual(code, 0, self.said)
         self.assertIn("admits dog9, once, within 24 h", output)
@@ -144,7 +147,7 @@ class AdmissionTests(SynchronousTestCase):
         self.assertEqual(made_node.entangled.identity, kept.membership.identity)
 
     def test_killed_while_joining(self) -> None:
-        """A node that is killed after its admission can join again with the same code, which counts once."""
+        """A node killed after its admission can join again with the same code, which is used up only once."""
         found = self.done(invite.main, "dog9")
         words = (found["text"], "--folder", str(self.folder / "new"))
 
@@ -163,13 +166,13 @@ class AdmissionTests(SynchronousTestCase):
         self.assertEqual(self.joined(other, "more")["name"], "dog8")
 
     def test_place_of_a_member(self) -> None:
-        """The address of a member is described in words for tunnels, relays and unknown addresses."""
+        """The location of a member is a phrase if its address is a tunnel, a relay or unknown."""
         places = {"10.0.0.7:8484": "10.0.0.7:8484", "": "no known address", "~wss-1fa56333f510:1": "by a tunnel"}
         for address, words in {**places, f"~{'ab' * 20}:1": "by a relay"}.items():
             self.assertEqual(members.format_location(address), words)
 
     def test_settings_that_were_there(self) -> None:
-        """Existing settings are kept and reported; new settings are not reported."""
+        """Existing settings are kept and reported; settings that the verb created are not reported."""
         where = self.folder / "new"
         where.mkdir()
         (where / "swarm.toml").write_text('[node]\nname = "mine"\n')
@@ -182,7 +185,7 @@ class AdmissionTests(SynchronousTestCase):
         self.assertNotIn("was there already", output)
 
     def test_key_of_another_code_is_not_used(self) -> None:
-        """A repeated join with the same code uses the same key, a join with another code another key."""
+        """A repeated join with the same code uses the same key; a join with a different code creates a new key."""
         seeds: list[bytes] = []
         first, other = (self.done(invite.main, name)["text"] for name in ("dog8", "dog9"))
 
@@ -196,7 +199,10 @@ class AdmissionTests(SynchronousTestCase):
         self.assertEqual((seeds[0], len(set(seeds))), (seeds[1], 2))
 
     def test_bad_codes_are_named(self) -> None:
-        """A mistyped code is rejected before a request is sent, a used code by the bootstrap node, with remedies."""
+        """A mistyped code is rejected before a request is sent, a used code by the bootstrap node.
+
+        Both with a remedy.
+        """
         found = self.done(invite.main, "dog9")
         wrong = found["code"][:-1] + ("0" if found["code"][-1] != "0" else "1")
         self.assertEqual(self.run_verb(join.main, wrong, "--at", "127.0.0.1:7000", send_requests=self.knock)[0], 2)
@@ -210,7 +216,10 @@ class AdmissionTests(SynchronousTestCase):
         self.assertIn("--at HOST:PORT", self.said)
 
     def test_code_alone(self) -> None:
-        """A code without address is tried on the LAN; a member that joins again does not spend its new code."""
+        """A code without an address is tried on the LAN.
+
+        A node that is already a member does not use up its new code.
+        """
         code = self.done(invite.main, "dog8")["code"]
         around = [Address("127.0.0.1", 7077), Address("127.0.0.1", 7000)]
         self.assertEqual(self.joined(code, find_nodes=lambda: around)["name"], "dog8")
@@ -223,7 +232,7 @@ class AdmissionTests(SynchronousTestCase):
         self.assertIn("the team already has a member dog1", self.said)
 
     def test_revoke(self) -> None:
-        """A revoked member is removed from the list, and an unknown name is rejected with the known names."""
+        """A revoked member is removed from the list; the error for an unknown name lists the known names."""
         self.joined(self.done(invite.main, "dog9")["text"])
         self.assertEqual(self.run_verb(revoke.main, "dgo9")[0], 1)
         self.assertIn("members: dog1, dog9, vaio", self.said)
@@ -232,7 +241,7 @@ class AdmissionTests(SynchronousTestCase):
         self.assertEqual([each["name"] for each in self.done(members.main)["revoked"]], ["dog9"])
 
     def test_invitations_are_listed(self) -> None:
-        """Valid invitations are listed with their remaining uses, and with ``--all`` also the others."""
+        """Valid invitations are listed with their remaining uses; ``--all`` also lists invalid invitations."""
         text = self.done(invite.main, "dog8", "--uses", "2", "--role", "viewer")["text"]
         self.done(invite.main, "dog9")
         name = self.joined(text)["name"]
@@ -249,7 +258,7 @@ class AdmissionTests(SynchronousTestCase):
         self.assertIn("dog8", self.run_verb(invitations.main)[1])
 
     def test_revoke_invitation(self) -> None:
-        """Revoking an invitation revokes all members that joined with it, and lists them."""
+        """Revoking an invitation revokes all members that joined with it; the output lists these members."""
         text = self.done(invite.main, "pupil", "--uses", "3")["text"]
         self.joined(text)
         found = self.done(revoke.main, "pupil")
@@ -264,7 +273,7 @@ class AdmissionTests(SynchronousTestCase):
         self.assertEqual(numbers, {"vaio": 2, "dog1": 2})
 
     def test_promote(self) -> None:
-        """A promoted member has the role at once with a new lifetime; a member with a fixed end keeps that end."""
+        """A promoted member has its new role and lifetime immediately; a member with a fixed end keeps that end."""
         self.team.clock.advance(100.0)
         ends = {row["name"]: row for row in self.done(members.main)["members"]}
         self.assertEqual(self.done(promote.main, "dog1")["roles"], ["device", "bootstrap"])
@@ -283,7 +292,7 @@ class AdmissionTests(SynchronousTestCase):
         self.assertLess(row["until"], self.team.clock.seconds() + 3600.0)
 
     def test_renew_who_has_expired(self) -> None:
-        """A member with an expired certificate is listed as expired, and is a member again after a renewal."""
+        """A member with an expired certificate is listed as expired; a renewal makes it a member again."""
         self.done(renew.main, "dog1", "--for", "60s")
         self.team.clock.advance(70.0)
         shown = self.done(members.main)
@@ -299,7 +308,7 @@ class AdmissionTests(SynchronousTestCase):
         self.assertEqual(self.run_verb(renew.main, "dog1")[0], 1)
 
     def renewer_after(self, *words: str) -> bytes:
-        """Return the renewer of the laptop's certificate after the bootstrap node that renewed it is revoked."""
+        """Revoke the bootstrap node that renewed the laptop's certificate; return the renewer of that certificate."""
         dog, laptop = self.team.services["dog1"].assembly.node.team, self.laptop.team
         assert dog is not None and laptop is not None
         self.done(promote.main, "dog1")
@@ -317,11 +326,11 @@ class AdmissionTests(SynchronousTestCase):
         self.assertNotEqual(self.renewer_after(), b"")
 
     def test_revoke_with_all_renewals(self) -> None:
-        """With ``--all`` the renewals of a revoked node become invalid."""
+        """With ``--all`` the renewals that a revoked node signed become invalid."""
         self.assertEqual(self.renewer_after("--all"), b"")
 
     def test_keys_of_others(self) -> None:
-        """A key of another team, a key that others can read, and a missing key are rejected with a remedy."""
+        """A key of a different team, a key that other users can read, and a missing key are rejected with a remedy."""
         other = self.folder / "other"
         operators.create_operator_file(other, operators.create_operator("other", random.Random(2)))
         self.assertEqual(self.run_verb(invite.main, "dog9", "--operator", str(other))[0], 1)
@@ -334,7 +343,7 @@ class AdmissionTests(SynchronousTestCase):
         self.assertIn("swarm init", self.said)
 
     def test_node_takes_statements_only(self) -> None:
-        """A statement over the control socket is accepted only with the signature of the team's operator."""
+        """The control socket accepts a statement only with the signature of the team's operator."""
         strange = operators.create_operator("other", random.Random(2)).revoke(
             b"r" * 32, "dog1", self.team.clock.seconds()
         )
@@ -349,12 +358,15 @@ class TeamSettingsTests(SynchronousTestCase):
         return str(self.assertRaises(BadSetting, assemble_node, settings, MemoryTeam().make_dependencies("a", 7000)))
 
     def test_neither_and_both(self) -> None:
-        """A node without a team is rejected with a hint to ``swarm join``, and so is a node with two teams."""
+        """A node without a team is rejected with a hint to ``swarm join``.
+
+        A node with two teams is rejected as well.
+        """
         self.assertIn("swarm join CODE", self.refusal())
         self.assertIn("closed or open", self.refusal(team_key=KEY, membership="m"))
 
     def test_membership_opens_the_door(self) -> None:
-        """A membership sets the node's identity and certificate; no team key is needed."""
+        """A membership determines the node's identity and certificate; no team key is needed."""
         dice = random.Random(1)
         membership = operators.create_operator("yard", dice).create_membership("a", ("device",), 0, dice)
         dependencies = MemoryTeam().make_dependencies("a", 7000)

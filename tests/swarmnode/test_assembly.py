@@ -24,7 +24,7 @@ class AssemblyTests(SynchronousTestCase):
         )
 
     def test_driver_brings_kind_and_capabilities(self) -> None:
-        """A node with a driver takes kind and capabilities from the robot; the settings override them."""
+        """A node with a driver gets kind and capabilities from the robot, unless the settings override them."""
         team = MemoryTeam()
         settings = self.settings(
             node={"capabilities": {"base2d": {"max": 1}, "horn": {}}},
@@ -41,7 +41,7 @@ class AssemblyTests(SynchronousTestCase):
         self.assertIsNotNone(made.agent)
 
     def test_parts_bring_their_capabilities(self) -> None:
-        """A robot with a camera as part has the capabilities of both, and its pictures can be requested."""
+        """A robot that has a camera as a part has the capabilities of both, and serves pictures."""
         parts = [{"kind": "camera", "options": {"source": "/pictures"}}]
         driver = {"kind": "create2", "options": {"port": "/dev/robot"}, "parts": parts}
         made = assemble_node(self.settings(driver=driver), MemoryTeam().make_dependencies("a", 7000))
@@ -52,25 +52,25 @@ class AssemblyTests(SynchronousTestCase):
         self.assertIn("[driver] parts: are set, but there is no robot", str(caught.exception))
 
     def test_node_without_body_has_no_agent(self) -> None:
-        """A laptop has no driver and no agent, and takes its kind from the settings."""
+        """A laptop has neither a driver nor an agent, and its kind is set in the settings."""
         made = assemble_node(self.settings(node={"kind": "laptop"}), MemoryTeam().make_dependencies("a", 7000))
         self.assertEqual((made.agent, made.driver, made.node.presence.device.kind), (None, None, "laptop"))
 
     def test_identity_is_kept_in_the_store(self) -> None:
-        """The store keeps the node's identity over restarts with any random generator."""
+        """The store preserves the node's identity over restarts, whatever the random generator returns."""
         store = MemoryStore()
         first = load_identity(store, random.Random(1))
         self.assertEqual(load_identity(store, random.Random(2)).node_id, first.node_id)
         self.assertNotEqual(load_identity(MemoryStore(), random.Random(2)).node_id, first.node_id)
 
     def test_spoiled_identity_is_made_anew(self) -> None:
-        """An invalid stored identity is replaced, so the node starts."""
+        """A node with an invalid stored identity gets a new identity and starts."""
         store = MemoryStore()
         store.set_note("identity", b"short")
         self.assertEqual(load_identity(store, random.Random(1)).node_id, load_identity(store, random.Random(1)).node_id)
 
     def test_lost_identity_is_said(self) -> None:
-        """A node logs a warning if its existing store has lost the identity, and none if its store is new."""
+        """A node logs a warning if an existing store has lost the identity, but not if the store is new."""
         lost = MemoryStore()
         lost.origin = "replaced"
         for store, words in ((MemoryStore(), []), (lost, ["the data store has lost the node's identity"])):

@@ -17,7 +17,7 @@ ROOT = Path(__file__).resolve().parents[2]
 
 class CommandTests(SynchronousTestCase):
     def test_help_lists_the_verbs(self) -> None:
-        """Without a verb, or with --help, the verbs are listed; an unknown verb is an error in one line."""
+        """Without a verb, or with --help, the verbs are listed; an unknown verb gives one error line."""
         for words, code in (([], 0), (["--help"], 0), (["fly"], 2)):
             output, complaint = io.StringIO(), io.StringIO()
             with contextlib.redirect_stdout(output), contextlib.redirect_stderr(complaint):
@@ -28,7 +28,7 @@ class CommandTests(SynchronousTestCase):
         self.assertIn("no verb 'fly'", complaint.getvalue())
 
     def test_each_verb_explains_itself(self) -> None:
-        """Each verb prints its help."""
+        """Each verb has a help text."""
         for verb in ("demo", "yard", "trials", "dht", "tuple", "keyword", "rpc"):
             output = io.StringIO()
             with contextlib.redirect_stdout(output), self.assertRaises(SystemExit) as caught:
@@ -37,7 +37,7 @@ class CommandTests(SynchronousTestCase):
             self.assertIn("usage", output.getvalue())
 
     def test_verb_without_its_libraries_names_the_extra(self) -> None:
-        """A verb with missing libraries is rejected with the command that installs them."""
+        """A verb with missing libraries is rejected; the error contains the command that installs them."""
         hidden = "import sys; sys.modules['pymunk'] = None; from swarmnode.command import main"
         program = f"{hidden}; sys.exit(main(['trials']))"
         child = subprocess.run([sys.executable, "-c", program], cwd=ROOT, capture_output=True, text=True, timeout=60)
@@ -46,7 +46,7 @@ class CommandTests(SynchronousTestCase):
         self.assertIn("pip install 'swarm-node[all]'", child.stderr)
 
     def test_help_of_a_node_verb_needs_no_twisted(self) -> None:
-        """The help of verbs for a running node imports neither Twisted nor msgpack, so it is fast."""
+        """Verbs that query a running node print their help without importing Twisted or msgpack, to save time."""
         program = (
             "import sys\nfrom swarmnode import command as swarm\n"
             "try: swarm.main(['dht', '--help'])\n"

@@ -19,15 +19,15 @@ print(run_search(CrowdTeam(4, 3, CrowdScene(30, 5.0, 5.0)), 4, 6.0, lambda: 0.0)
 
 class CrowdTeamTests(SynchronousTestCase):
     def made(self, seed: int, agents: int = 5) -> CrowdTeam:
-        """Return a team among thirty robots on 5 x 5 m."""
+        """Return a team with robots that are among thirty robots on 5 x 5 m."""
         team = CrowdTeam(seed, agents, CrowdScene(30, 5.0, 5.0))
         self.addCleanup(team.stop)
         return team
 
     def test_search_among_others(self) -> None:
-        """The thesis' experiment in a crowd: the agents agree on the nearest, which reaches the target.
+        """In a crowd, the agents agree on the agent nearest to the target, and its robot reaches the target.
 
-        The control has no robot, each agent has one, and each node has its own address.
+        The control node has no robot, each agent has one robot, and each node has its own address.
         """
         team = self.made(3)
         self.assertEqual(list(team.services), [TASK_NODE, *team.simulator.names])
@@ -43,7 +43,10 @@ class CrowdTeamTests(SynchronousTestCase):
         self.assertLess(float(crowd.x[body] - target.x) ** 2 + float(crowd.y[body] - target.y) ** 2, 0.4**2)
 
     def test_seed_replays_it(self) -> None:
-        """Processes with different hash seeds exchange the same datagrams; another seed gives another digest."""
+        """Processes with different hash seeds exchange the same datagrams.
+
+        A different seed gives a different digest.
+        """
         digest = replayed(self, RUN)
         other = run_search(self.made(2, 3), 2, 6.0, lambda: 0.0).digest
         self.assertNotEqual(*(half.split("-") for half in (digest, other)))

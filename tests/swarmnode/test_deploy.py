@@ -49,7 +49,10 @@ class DeployTests(SynchronousTestCase):
         self.shelves = {name: MemoryModuleStore() for name in self.team.DOGS}
 
     def let_in(self, *modules: str, refusing: str = "") -> None:
-        """Start the dogs, each with its own module store; all but ``refusing`` accept ``modules`` from the laptop."""
+        """Start the dogs, each with its own module store.
+
+        All except ``refusing`` accept ``modules`` from the laptop.
+        """
         allowed = {"allow": True, "operators": [self.laptop.entangled.identity.public.hex()], "modules": list(modules)}
         for name in self.team.DOGS:
             tables = {} if name == refusing else {"deployment": allowed}
@@ -57,13 +60,13 @@ class DeployTests(SynchronousTestCase):
             self.team.clock.advance(0.5)
 
     def swarm(self, line: str) -> str:
-        """Run ``swarm deploy LINE``, which must succeed, and return its output."""
+        """Run ``swarm deploy LINE``, which must succeed; return its output."""
         code, output = self.shell.run(main, line.split())
         self.assertEqual((code, self.shell.said), (0, ""))
         return output
 
     def refused(self, line: str) -> str:
-        """Run ``swarm deploy LINE``, which must fail, and return its error output."""
+        """Run ``swarm deploy LINE``, which must fail; return its error output."""
         code, _ = self.shell.run(main, line.split())
         self.assertTrue(code in (1, 2))
         return self.shell.said
@@ -74,7 +77,7 @@ class DeployTests(SynchronousTestCase):
         return str(path)
 
     def push(self, text: str = FARTHEST, name: str = "farthest", more: str = "") -> str:
-        """Push a strategy and let it reach the team."""
+        """Push a strategy, and wait until the team has received it."""
         told = self.swarm(f"push {self.file(text)} --name {name} --kind strategy {more}")
         self.team.clock.advance(2.0)
         return told
@@ -84,12 +87,12 @@ class DeployTests(SynchronousTestCase):
         return " | ".join(text for _, text in device.messages)
 
     def deployed(self) -> dict[str, str]:
-        """Return the version that each device runs, as the page shows it."""
+        """Return the version that each device runs, according to the page."""
         devices = self.team.state()["devices"]
         return {d["name"]: d["deployed"].get("farthest", "") for d in devices if d["name"] != "vaio"}
 
     def verdicts(self, strategy: str, seconds: float) -> list[DecisionRecord]:
-        """Submit a task with a strategy and return the decision records of the dogs."""
+        """Submit a task with a strategy; return the decision records of the dogs."""
         task = replace(
             TASKS[DEMO_TASK], task_id=f"t{self.team.clock.seconds():.0f}", strategy=strategy, waiting_period=30.0
         )
@@ -104,7 +107,7 @@ class DeployTests(SynchronousTestCase):
         return [verdict for each in records if (verdict := parse_decision_record(each)) is not None]
 
     def test_team_runs_what_is_pushed(self) -> None:
-        """All three dogs load a pushed strategy, show it, and use it for the next task."""
+        """All three dogs load a pushed strategy, report its version, and use it for the next task."""
         self.let_in("farthest")
         told = self.push()
         self.assertIn("pushed strategy farthest 1 ", told)
@@ -120,7 +123,10 @@ class DeployTests(SynchronousTestCase):
         self.assertEqual(first.winner, max(costs, key=lambda agent: costs[agent]))
 
     def test_node_with_deployment_off_refuses_by_name(self) -> None:
-        """A dog that does not allow deployment loads nothing, and reports that it cannot take part in the task."""
+        """A dog that does not allow deployment loads nothing.
+
+        Its report explains why it cannot take part in the task.
+        """
         self.let_in("farthest", refusing="dog3")
         self.push()
         self.assertEqual(self.deployed()["dog3"], "")
@@ -131,7 +137,7 @@ class DeployTests(SynchronousTestCase):
         self.assertNotIn("is not deployed", self.messages("dog1"))
 
     def test_rollback_and_next_version(self) -> None:
-        """A rollback restores version 1; versions up to 2 are then rejected, and version 3 replaces both."""
+        """A rollback restores version 1. Afterwards versions up to 2 are rejected; version 3 replaces both."""
         self.let_in("farthest")
         self.push()
         first = self.deployed()
@@ -149,7 +155,10 @@ class DeployTests(SynchronousTestCase):
         self.assertEqual({label[:2] for label in self.deployed().values()}, {"3 "})
 
     def test_wrong_commands(self) -> None:
-        """Invalid commands are rejected before anything is sent, syntax errors with the line of the module."""
+        """Invalid commands are rejected before anything is sent.
+
+        For a syntax error the line in the module is printed.
+        """
         self.let_in("farthest")
         path = self.file("def f(:\n")
         self.assertIn("line 1", self.refused(f"push {path} --name farthest --kind strategy"))
@@ -165,7 +174,10 @@ class DeployTests(SynchronousTestCase):
         self.assertEqual(self.swarm("status").count("farthest"), 1)
 
     def test_keys_and_json(self) -> None:
-        """``keys`` prints the public key of each device, which hashes to its uuid; ``--json`` prints one line."""
+        """``keys`` prints the public key of each device; the hash of the key is the device's uuid.
+
+        ``--json`` prints one line.
+        """
         self.let_in("farthest")
         keys = json.loads(self.swarm("keys --json"))
         devices = {d["name"]: d["uuid"] for d in self.team.state()["devices"]}
@@ -175,7 +187,7 @@ class DeployTests(SynchronousTestCase):
         self.assertEqual((row["name"], row["version"], row["by"]), ("farthest", 1, "vaio"))
         self.assertEqual(sorted(row["devices"]), ["dog1", "dog2", "dog3", "vaio"])
         self.assertEqual(json.loads(self.swarm(f"push {self.file('1')} --name o --kind strategy --json"))["version"], 1)
-        # Control characters in a device's texts do not reach the terminal.
+        # Control characters in strings from a device do not reach the terminal.
         self.team.services["dog1"].assembly.node.presence.change(deployed={"farthest": "1\x1b[2J\nx"})
         self.team.clock.advance(1.0)
         self.assertIn("\n  dog1  1 [2J x\n", self.swarm("status"))

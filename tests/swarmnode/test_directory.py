@@ -1,4 +1,4 @@
-"""Tests of the page and the shell with a directory that is split by prefix: both list all devices."""
+"""Tests of the page and the shell with a directory that is split by id prefix: both list all devices."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ COUNT = 9
 
 
 class NoVerbs:
-    """Verbs that the test does not expect."""
+    """A stub of the verbs for tests that use none."""
 
     def run(self, name: object, arguments: object, tell: Callable[[Any], None]) -> Deferred[Any]:
         """Fail the test."""
@@ -48,7 +48,7 @@ class SplitTests(FleetCase):
         self.assertEqual([device["name"] for device in state["devices"]], [f"dog{n}" for n in range(COUNT)])
 
     def test_shell(self) -> None:
-        """``swarm links``, ``chaos`` and ``deploy`` see every device, in the order of joining."""
+        """``swarm links``, ``chaos`` and ``deploy`` find every device, in the order in which the devices joined."""
         fleet = self.apart()
         runtime_folder(self, "dog2")
         verbs = TeamVerbs(NoVerbs(), fleet.nodes[2])

@@ -1,4 +1,4 @@
-"""Tests of ``swarmnode.faults`` and ``middleware.faults.scenario``: injected faults and their output."""
+"""Tests of ``swarmnode.faults`` and ``middleware.faults.scenario``: injected faults and the reports on them."""
 
 from __future__ import annotations
 
@@ -23,14 +23,14 @@ class ChaosTests(SynchronousTestCase):
         self.folder = runtime_folder(self)
 
     def team(self, faults: bool = True) -> None:
-        """Start a team, with a shell at its laptop."""
+        """Start a team, and a shell on its laptop."""
         self.virtual = SimulatedTeam(4, faults=faults)
         self.addCleanup(self.virtual.stop)
         self.virtual.clock.advance(2.0)
         self.shell = Shell(self.virtual, self.virtual.services["vaio"].assembly.node)
 
     def chaos(self, line: str) -> tuple[int, str]:
-        """Run ``swarm chaos LINE`` in the team's time; return exit code and output."""
+        """Run ``swarm chaos LINE`` in virtual time; return exit code and output."""
         clock = self.virtual.clock
 
         def command(words: list[str], out: Any, ask: Any) -> int:
@@ -39,7 +39,7 @@ class ChaosTests(SynchronousTestCase):
         return self.shell.run(command, line.split())
 
     def test_one_fault(self) -> None:
-        """A fault in the acting device is reported with the successor and the takeover time, and exit code 0."""
+        """For a fault in the acting device, successor and takeover time are printed, and the exit code is 0."""
         self.team()
         self.virtual.control.assign("turn-around")
         code, output = self.chaos("executing radio --seconds 4")
@@ -50,14 +50,14 @@ class ChaosTests(SynchronousTestCase):
         self.assertIn("dog1        kill, freeze, radio, one-way, delay, loss, skew, battery", self.chaos("list")[1])
 
     def test_not_allowed(self) -> None:
-        """A device that does not allow faults is reported with the setting that allows them."""
+        """For a device that does not allow faults, the error contains the setting that allows them."""
         self.team(faults=False)
         code, output = self.chaos("dog1 loss")
         self.assertEqual((code, output), (1, ""))
         self.assertIn('dog1: it does not allow faults; set "allow = true" in [faults]', self.shell.said)
 
     def test_wrong_words(self) -> None:
-        """An unknown kind, an invalid amount and an unknown device are rejected in one line with a remedy."""
+        """An unknown kind, an invalid amount and an unknown device each give one error line with a remedy."""
         self.team()
         for line, code, said in (
             ("dog1 fly", 2, "there is no fault 'fly'; choose one of kill, freeze"),
@@ -69,24 +69,24 @@ class ChaosTests(SynchronousTestCase):
             self.assertIn(said, self.shell.said)
 
     def rehearsed(self, name: str, *words: str) -> list[str]:
-        """Run a scenario in a simulated team, which must succeed, and return its lines."""
+        """Run a scenario in a simulated team, which must succeed; return its output lines."""
         output = io.StringIO()
         code = main(["run", str(SCENARIOS / name), "--rehearse", *words], output)
         self.assertEqual(code, 0, output.getvalue())
         return output.getvalue().splitlines()
 
     def test_same_seed_same_run(self) -> None:
-        """A simulated scenario gives the same lines and digest twice; another seed gives another run."""
+        """A simulated scenario gives the same lines and digest twice; a different seed gives a different run."""
         first = self.rehearsed("takeover.toml")
         self.assertEqual(sum("took over" in line for line in first), 2)
         self.assertEqual(self.rehearsed("takeover.toml"), first)
         self.assertNotEqual(self.rehearsed("takeover.toml", "--seed", "8")[-1], first[-1])
 
     def test_bad_day(self) -> None:
-        """In spite of packet loss and a wrong clock two devices are replaced in time."""
+        """Despite packet loss and a wrong clock, two devices are replaced in time."""
         lines = self.rehearsed("bad-day.toml")
         self.assertEqual(sum("took over" in line for line in lines), 2)
-        for seed in ("12", "24"):  # with these seeds the first answer is lost
+        for seed in ("12", "24"):  # with these seeds the first reply is lost
             self.rehearsed("bad-day.toml", "--seed", seed)
 
 
@@ -100,12 +100,12 @@ class ScenarioTests(SynchronousTestCase):
             self.assertEqual([step.at for step in steps], sorted(step.at for step in steps))
 
     def test_short(self) -> None:
-        """The defaults of a step are: at once, the acting device, fifteen seconds."""
+        """By default a step starts immediately, affects the acting device, and lasts fifteen seconds."""
         (step,) = parse_scenario({"fault": [{"kind": "radio"}]}, "x").steps
         self.assertEqual((step.at, step.device, step.fault), (0.0, "executing", Fault("radio")))
 
     def test_wrong(self) -> None:
-        """Invalid values are rejected with file and key."""
+        """The error for an invalid value contains file and key."""
         wrong: list[tuple[dict[str, Any], str]] = [
             ({}, "[[fault]]"),
             ({"fault": []}, "[[fault]]"),

@@ -1,4 +1,4 @@
-"""Tests of ``swarmnode.gateway``: phones as nodes of a team in virtual time."""
+"""Tests of ``swarmnode.gateway``: phones as devices of a team, in virtual time."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ CAN = {"width": 208, "height": 156, "orientation": False, "position": True}
 
 
 class Phone:
-    """A phone at one gateway that sends pictures as time passes."""
+    """A phone at one gateway; it sends pictures as time passes."""
 
     def __init__(self, case: GatewayTests, at: Gateway, secret: bytes = b"s" * 32, name: str = "anna") -> None:
         self.case = case
@@ -76,7 +76,7 @@ class GatewayTests(SynchronousTestCase):
         )
 
     def live(self, seconds: float) -> None:
-        """Advance the time while the phones send ten pictures a second."""
+        """Advance the time; the phones send ten pictures per second."""
         for _ in range(round(seconds / STEP)):
             self.team.clock.advance(STEP)
             for phone in self.phones:
@@ -107,7 +107,7 @@ class GatewayTests(SynchronousTestCase):
         self.assertEqual(set(seen), {jpeg()})
 
     def test_wins_and_is_taken_over(self) -> None:
-        """The nearest phone gets the task; when it leaves, a dog that sees the target takes over at once."""
+        """The nearest phone is assigned the task; when it leaves, a dog that sees the target takes over."""
         phone = Phone(self, self.gateways["vaio"])
         self.team.simulator.world.place_target(1.5, 1.2)
         self.sees = {"target.bearing": 0.0, "target.distance": 0.05}
@@ -128,7 +128,7 @@ class GatewayTests(SynchronousTestCase):
         self.until(lambda: self.team.state()["tasks"][0]["status"] == "COMPLETED", 60.0)
 
     def test_silence_is_leaving(self) -> None:
-        """A phone that falls silent is removed, and another device has its task within two seconds."""
+        """A phone that falls silent is removed, and a different device takes over its task within two seconds."""
         phone = Phone(self, self.gateways["vaio"])
         self.team.simulator.world.place_target(1.5, 1.2)
         self.sees = {"target.bearing": 0.0, "target.distance": 0.05}
@@ -143,7 +143,7 @@ class GatewayTests(SynchronousTestCase):
         self.assertLess(self.team.clock.seconds() - began, 2.0 + PICTURE_TIMEOUT_S)
 
     def test_first_look_may_take_longer(self) -> None:
-        """The first picture may take ``FIRST_PICTURE_TIMEOUT_S``; after it a phone that falls silent is removed."""
+        """The first picture may take up to ``FIRST_PICTURE_TIMEOUT_S``; a phone that falls silent later is removed."""
         phone = Phone(self, self.gateways["vaio"])
         phone.looks = False
         self.live(FIRST_PICTURE_TIMEOUT_S - 0.2)
@@ -152,11 +152,11 @@ class GatewayTests(SynchronousTestCase):
         self.assertEqual(self.assertRaises(Refusal, phone.look, {}).status, 404)
 
     def test_is_the_same_device_elsewhere(self) -> None:
-        """After the death of its web node a phone joins through another with the same uuid, position and name."""
+        """If its web node fails, a phone joins through a different one, with the same uuid, position and name."""
         phone = Phone(self, self.gateways["vaio"])
         self.live(1.5)
         before = self.device(phone.uuid)
-        # The web node dies with the nodes of its phones.
+        # When the web node stops, the nodes of its phones stop too.
         lost = self.gateways.pop("vaio")
         for each in lost._phones.values():
             each._node.stop_silently()
@@ -175,13 +175,16 @@ class GatewayTests(SynchronousTestCase):
         self.assertEqual(names.count("anna"), 1)
 
     def test_identity_is_of_team_and_phone(self) -> None:
-        """Another phone or another team results in another identity."""
+        """The identity depends on the phone and on the team."""
         seeds = {derive_seed(team, phone) for team in (b"a" * 32, b"b" * 32) for phone in (b"1" * 32, b"2" * 32)}
         self.assertEqual(len(seeds), 4)
         self.assertEqual(derive_seed(b"a" * 32, b"1" * 32), derive_seed(b"a" * 32, b"1" * 32))
 
     def test_comes_back_while_it_leaves(self) -> None:
-        """A phone that joins again while it releases its task waits for that, and is listed once."""
+        """A phone that joins again while it is releasing its task waits until the release is done.
+
+        It is listed once.
+        """
         phone = Phone(self, self.gateways["vaio"])
         self.sees = {"target.bearing": 0.0, "target.distance": 0.05}
         self.team.control.assign("watch-target")
@@ -197,7 +200,7 @@ class GatewayTests(SynchronousTestCase):
         self.until(lambda: self.device(phone.uuid).get("status") == "EXECUTING", 40.0)
 
     def test_leaves_with_its_web_node(self) -> None:
-        """A web node that stops removes its phones, which are gone when the stop is complete."""
+        """A web node that stops removes its phones before the stop is complete."""
         phones = [Phone(self, self.gateways["vaio"], bytes([n]) * 32, f"p{n}") for n in (1, 2)]
         self.live(1.0)
         self.phones.clear()
@@ -207,7 +210,7 @@ class GatewayTests(SynchronousTestCase):
         self.assertEqual(told, ["GONE", "GONE"])
 
     def test_names_are_of_one_device_each(self) -> None:
-        """A phone with the name of another device gets a suffix; otherwise it keeps its name."""
+        """A phone with the same name as another device gets a suffix; otherwise its name is unchanged."""
         first = Phone(self, self.gateways["vaio"], b"1" * 32, "dog1")
         second = Phone(self, self.gateways["vaio"], b"2" * 32, "anna")
         third = Phone(self, self.gateways["vaio"], b"3" * 32, "anna")
@@ -216,7 +219,7 @@ class GatewayTests(SynchronousTestCase):
         self.assertEqual(told, [f"dog1-{first.uuid[:4]}", "anna", f"anna-{third.uuid[:4]}"])
 
     def test_takes_so_many(self) -> None:
-        """A phone beyond ``MAX_PHONES`` is rejected until another one leaves; a connected phone may join again."""
+        """Beyond ``MAX_PHONES`` a phone is rejected until another phone leaves; a connected phone may join again."""
         gateway = self.gateways["vaio"]
         phones = [Phone(self, gateway, bytes([n]) * 32, f"p{n}") for n in range(MAX_PHONES)]
         refusal = self.failureResultOf(gateway.join(b"x" * 32, "late", CAN), Refusal).value
@@ -229,7 +232,7 @@ class GatewayTests(SynchronousTestCase):
         self.assertTrue(self.successResultOf(gateway.join(b"x" * 32, "late", CAN)))
 
     def test_sent_away_stays_away(self) -> None:
-        """A phone that an operator disconnects may not join again before the time is over."""
+        """A phone that an operator disconnects cannot join again until the time is over."""
         phone = Phone(self, self.gateways["vaio"])
         self.live(1.0)
         self.team.control.disconnect(phone.uuid, 3.0)
@@ -265,7 +268,7 @@ class GatewayTests(SynchronousTestCase):
         phone.look({})
 
     def test_says_that_the_team_stands(self) -> None:
-        """While the team is stopped, the phone shows it."""
+        """While the team is stopped, the phone's page reports it."""
         phone = Phone(self, self.gateways["vaio"])
         self.live(1.0)
         node = self.team.services["vaio"].assembly.node
@@ -274,7 +277,7 @@ class GatewayTests(SynchronousTestCase):
         self.assertEqual(phone.said, "The team is stopped. Wait.")
 
     def until(self, is_so: object, limit: float) -> None:
-        """Advance the time until a condition holds."""
+        """Advance the time until a condition is true."""
         assert callable(is_so)
         for _ in range(round(limit / STEP)):
             if is_so():

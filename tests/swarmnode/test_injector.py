@@ -1,4 +1,4 @@
-"""Tests of ``middleware.faults.injector``: injected faults reach a device, take effect, and end."""
+"""Tests of ``middleware.faults.injector``: an injected fault reaches its device, takes effect, and ends."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ class InjectorTests(SynchronousTestCase):
         return told
 
     def turn(self) -> tuple[Any, str]:
-        """Return the acting device, shortly after its start, and the task."""
+        """Return the task and its acting device, shortly after that device has begun to act."""
         task = self.stage.assign("turn-around")
         for _ in range(100):
             self.stage.wait(0.05)
@@ -38,7 +38,7 @@ class InjectorTests(SynchronousTestCase):
         self.fail("nobody ever acted")
 
     def takeover(self, fault: Fault) -> Takeover:
-        """Inject a fault into the acting device; return the takeover when it is over or its time limit is reached."""
+        """Inject a fault into the acting device; return the takeover when it has ended or reached its time limit."""
         lost, task = self.turn()
         self.stage.inject(lost, fault)
         now = self.stage.seconds()
@@ -49,17 +49,17 @@ class InjectorTests(SynchronousTestCase):
         return clock
 
     def test_takeover(self) -> None:
-        """An acting device that is killed, frozen, cut off, muted or drained is replaced within two seconds."""
+        """An acting device that is killed, frozen, disconnected, muted or without battery is replaced within 2 s."""
         for kind in ("kill", "freeze", "radio", "one-way", "battery"):
             self.assertTrue(KINDS[kind].is_lost)
             clock = self.takeover(Fault(kind, 4.0, KINDS[kind].amount))
             assert clock.seconds is not None, kind
             self.assertLessEqual(clock.seconds, TARGET_S, kind)
-            self.stage.wait(25.0)  # all devices are back
+            self.stage.wait(25.0)  # all devices have returned
             self.assertEqual(len(self.stage.devices()), 4, kind)
 
     def test_skew_changes_nothing(self) -> None:
-        """A device with a clock that is a day wrong finishes its task; only its log lines have the wrong time."""
+        """A device with a clock that is wrong by a day finishes its task; only the times in its log are wrong."""
         clock = self.takeover(Fault("skew", 30.0, 86400.0))
         self.assertIsNone(clock.seconds)
         self.stage.wait(1.0)
@@ -67,7 +67,7 @@ class InjectorTests(SynchronousTestCase):
         self.assertGreater(device.messages[-1][0], 86400.0)
 
     def test_heal(self) -> None:
-        """A fault ends after its time, a repeated fault starts again with its new values, other faults continue."""
+        """A fault ends after its duration; a repeated fault starts again with its new values; other faults continue."""
         dog = self.named("dog1")
         self.stage.inject(dog, Fault("delay", 2.0, 0.05))
         self.stage.inject(dog, Fault("loss", 20.0, 0.01))
@@ -81,7 +81,7 @@ class InjectorTests(SynchronousTestCase):
         self.assertEqual([kind for kind, _, _ in self.asked("dog1")["active"]], ["loss"])
 
     def test_cut_off_and_back(self) -> None:
-        """The team loses a device without radio, which is back after the fault."""
+        """A device with a radio that is off leaves the team, and returns after the fault."""
         self.stage.inject(self.named("dog2"), Fault("radio", 4.0))
         self.stage.wait(3.0)
         self.assertEqual([device.name for device in self.stage.devices()], ["vaio", "dog1", "dog3"])
@@ -89,7 +89,7 @@ class InjectorTests(SynchronousTestCase):
         self.assertIn("dog2", [device.name for device in self.stage.devices()])
 
     def test_battery_of_idle_dogs(self) -> None:
-        """No dog with a drained battery takes a task, until the batteries are charged again."""
+        """Dogs with drained batteries take no task until the batteries are charged again."""
         for name in ("dog1", "dog2", "dog3"):
             self.stage.inject(self.named(name), Fault("battery", 4.0, 0.02))
         self.stage.wait(0.6)
@@ -101,7 +101,7 @@ class InjectorTests(SynchronousTestCase):
         self.assertEqual(len(find_executing(self.stage.devices())), 1)
 
     def test_what_can_be_suffered(self) -> None:
-        """A laptop cannot have a battery fault, and unsupported faults and values are rejected with a reason."""
+        """A laptop cannot have a battery fault; unsupported faults and invalid values are rejected with a reason."""
         self.assertEqual(self.asked("vaio")["kinds"], [kind for kind in KINDS if kind != "battery"])
         self.assertEqual(self.asked("dog1")["kinds"], list(KINDS))
         error = self.assertRaises(Rejection, self.stage.inject, self.named("vaio"), Fault("battery", 5.0, 0.01))
@@ -114,7 +114,7 @@ class InjectorTests(SynchronousTestCase):
 
 class TransitionTests(SynchronousTestCase):
     def test_every_order_ends(self) -> None:
-        """From each state an injected fault can reach its end by events of the table, and the end is final."""
+        """Every state of an injected fault has a sequence of events that leads to OVER, which is final."""
         for state in State:
             reached, left = {state}, [state]
             while left:
@@ -128,7 +128,7 @@ class TransitionTests(SynchronousTestCase):
 
 class ForbiddenTests(SynchronousTestCase):
     def test_nothing_where_not_allowed(self) -> None:
-        """A node that does not allow faults rejects the method, and its network works normally."""
+        """A node that does not allow faults rejects the method, and its network is not affected."""
         team = SimulatedTeam(3, dogs=("dog1",))
         self.addCleanup(team.stop)
         node = team.services["vaio"].assembly.node

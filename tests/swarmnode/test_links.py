@@ -30,7 +30,7 @@ class LinksTests(SynchronousTestCase):
         self.links: Any = [{**NEAR, "times": [0.002] * 10}, {**FAR, "times": [0.08] * 9 + [None]}]
 
     def ask(self, path: Path, request: dict[str, Any]) -> Iterator[dict[str, Any]]:
-        """Answer in place of the node, without records."""
+        """Return the reply of the node, without records."""
         yield {"answer": self.links if request["verb"] == "links" else []}
 
     def run_it(self, *words: str) -> tuple[int, str]:
@@ -39,7 +39,7 @@ class LinksTests(SynchronousTestCase):
         return main(words, out, self.ask), out.getvalue()
 
     def test_worst_first(self) -> None:
-        """Each peer has a line with score, path, measurements and duration; the worst is first."""
+        """Each peer has a line with score, path, measurements and duration; the peer with the lowest score is first."""
         score = compute_quality([0.08] * 9 + [None], True).score
         self.assertLess(score, 100)
         code, printed = self.run_it()
@@ -55,12 +55,12 @@ class LinksTests(SynchronousTestCase):
         )
 
     def test_silent_peer(self) -> None:
-        """A peer that does not answer has a score of 0, and the exit code is 1."""
+        """A peer that does not reply has the score 0, and the exit code is 1."""
         self.links = [{**NEAR, "way": "none", "for": None, "times": [None] * 10}]
         self.assertEqual(self.run_it(), (1, "efefefefef    0/100  no path yet  does not reply\n"))
 
     def test_no_peer(self) -> None:
-        """A node without peers is reported with the next command."""
+        """If a node has no peers, the output suggests the next command."""
         self.links = []
         self.assertEqual(self.run_it(), (0, "this node has no peers; run swarm doctor to see why\n"))
 
@@ -92,13 +92,13 @@ class TeamTests(SynchronousTestCase):
         self.dog = self.team.services["dog1"].assembly.node
 
     def tell(self, statement: bytes) -> None:
-        """Distribute a statement of the operator."""
+        """Distribute a statement that the operator signed."""
         assert self.laptop.team is not None
         self.laptop.later(0.0, lambda: Deferred.fromCoroutine(self.laptop.team.publish(statement)))  # type: ignore[union-attr]
         self.team.clock.advance(3.0)
 
     def test_members(self) -> None:
-        """A closed team reports its kind, its public fingerprint, and its members with their roles."""
+        """The output contains the kind of the team, its public fingerprint, and its members with their roles."""
         told = describe_team(self.laptop)
         assert self.laptop.team is not None
         self.assertEqual((told["kind"], told["me"]), ("closed", self.laptop.uuid))
@@ -109,7 +109,7 @@ class TeamTests(SynchronousTestCase):
         self.assertTrue(told["is_renewable"] and all(member["is_renewable"] for member in told["members"]))
 
     def test_ending_certificate(self) -> None:
-        """A certificate that ends within two weeks is listed first and marked."""
+        """A certificate that expires within two weeks is listed first and marked."""
         dog = self.team.services["dog2"].assembly.node
         begin = int(self.team.clock.seconds()) + 1
         public = dog.entangled.identity.public
@@ -121,7 +121,7 @@ class TeamTests(SynchronousTestCase):
         self.assertEqual([member["is_renewable"] for member in told["members"]], [False, True, True])
 
     def test_refusals(self) -> None:
-        """A revoked node is reported with the remedy, by the nodes that reject it and by itself."""
+        """The nodes that refuse a revoked node report the refusal with a remedy, and so does the revoked node."""
         self.tell(self.team.operator.revoke(self.dog.entangled.identity.public, "dog1", self.team.clock.seconds()))
         self.team.clock.advance(3.0)
         ours, theirs = describe_links(self.laptop)["refusals"], describe_links(self.dog)["refusals"]
@@ -131,7 +131,7 @@ class TeamTests(SynchronousTestCase):
         self.assertNotIn("dog1", [member["name"] for member in describe_team(self.laptop)["members"]])
 
     def test_refused_call(self) -> None:
-        """A call that the caller's role does not allow is reported by the called node."""
+        """If a role does not allow a call, the called node reports the call."""
         asked = self.dog.entangled.call(self.laptop.entangled.contact, "device.message", "sit", changes=True)
         self.team.clock.advance(1.0)
         self.failureResultOf(asked, Refused)

@@ -26,7 +26,7 @@ from twisted.internet import reactor
 
 class MemorySavingsTests(SynchronousTestCase):
     def said(self, *words: str) -> str:
-        """Run Python with a stub of pyOpenSSL that prints a line when it is imported, and return the output."""
+        """Run Python with a stub of pyOpenSSL that prints a line when it is imported; return the output."""
         folder = Path(self.mktemp()) / "OpenSSL"
         folder.mkdir(parents=True)
         text = f"print({LOADED!r})\nraise ImportError('it is none')\n"
@@ -65,7 +65,7 @@ class MemorySavingsTests(SynchronousTestCase):
             self.assertNotIn("Traceback", told)
 
     def test_look_at_what_is_new_only(self) -> None:
-        """After ``release_memory`` the garbage collector skips older objects and checks newer ones."""
+        """After ``release_memory`` the garbage collector skips objects created earlier, and checks newer objects."""
         self.addCleanup(gc.unfreeze)
         before: list[object] = [[]]
         release_memory()

@@ -18,7 +18,7 @@ class HostsTests(SynchronousTestCase):
         skip = f"THE PAGE IS NOT TESTED: missing {', '.join(MISSING)}"
 
     def test_name_the_machine(self) -> None:
-        """The page accepts the names of machine and node, bare and on the LAN, and those in the settings only."""
+        """The page accepts the names of machine and node, with or without the LAN's suffix, and configured names."""
         web = {"names": ["robots.lan", "page.example.org"]}
         settings = Settings.from_mapping({"node": {"name": "Dog1", "team_key": "t"}, "web": web}, "")
         found = list_host_names(settings, "Vaio.corp.example")

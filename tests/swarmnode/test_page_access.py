@@ -19,12 +19,12 @@ OWN = PageAccess("vaio", "http://127.0.0.1:8080/", "quiet-otter", os.getpid())
 
 class PageAccessTests(SynchronousTestCase):
     def setUp(self) -> None:
-        # The note is next to a control socket, so its path must be short, outside the test folder.
+        # The note is next to a control socket, whose path must be short, so it is outside the test folder.
         self.where = Path(self.mktemp())
         self.patch(os, "environ", {**os.environ, "XDG_RUNTIME_DIR": str(self.where)})
 
     def test_leave_a_note(self) -> None:
-        """A web node writes its address and code to a private file; the next start replaces it."""
+        """A web node writes its address and code to a private file, which the next start replaces."""
         self.patch(sys.modules["middleware.entangled.control.socket_path"], "MAX_PATH_BYTES", 4096)
         for code in ("quiet-otter", "loud-otter"):
             announce_page("vaio", "0.0.0.0", lambda: 8080, code)
@@ -35,7 +35,7 @@ class PageAccessTests(SynchronousTestCase):
         self.assertEqual(stat.S_IMODE(note.stat().st_mode), 0o600)
 
     def test_show_the_code_at_a_terminal(self) -> None:
-        """A node that is started at a terminal prints the code; other or closed streams get none."""
+        """A node that is started at a terminal prints the code; to other or closed streams it prints no code."""
         self.patch(sys.modules["middleware.entangled.control.socket_path"], "MAX_PATH_BYTES", 4096)
         screen = io.StringIO()
         announce_page("vaio", "0.0.0.0", lambda: 8080, "quiet-otter", terminal=screen)
@@ -49,7 +49,7 @@ class PageAccessTests(SynchronousTestCase):
             self.assertIsNone(find_terminal())
 
     def test_pass_over_what_is_no_note(self) -> None:
-        """The note of a node that has ended, and invalid notes, are ignored."""
+        """The note of a node that has ended is ignored, and so are invalid notes."""
         (self.where / "swarm-node").mkdir(mode=0o700, parents=True)
         for name, words in (
             ("a", "{}"),
@@ -60,7 +60,7 @@ class PageAccessTests(SynchronousTestCase):
         self.assertEqual(list_pages(), [])
 
     def test_name_an_address_for_this_machine(self) -> None:
-        """A wildcard address is shown as an address that a browser on this machine can open."""
+        """A wildcard address is replaced by an address that a browser on this machine can open."""
         self.assertEqual(make_url("0.0.0.0", 80), "http://127.0.0.1:80/")
         self.assertEqual(make_url("::", 80), "http://[::1]:80/")
         self.assertEqual(make_url("192.168.0.2", 8080), "http://192.168.0.2:8080/")
@@ -74,7 +74,10 @@ class WebCodeTests(SynchronousTestCase):
         return code, out.getvalue(), errors.getvalue()
 
     def test_tell_the_code(self) -> None:
-        """The code and a link with it are printed, also as JSON; without sign-in the output says so."""
+        """The code and a link that contains the code are printed, also as JSON.
+
+        If sign-in is off, the output says so.
+        """
         code, out, _ = self.asked()
         self.assertEqual(code, 0)
         self.assertIn("vaio: http://127.0.0.1:8080/  code quiet-otter, or open", out)
@@ -85,7 +88,7 @@ class WebCodeTests(SynchronousTestCase):
         self.assertIn("no sign-in", self.asked(here=[PageAccess("a", "http://127.0.0.1:1/", "", 1)])[1])
 
     def test_tell_that_there_is_none(self) -> None:
-        """If no page or no such node runs, one line lists the nodes with a page, and the exit code is 2."""
+        """If no page or no such node is running, one line lists the nodes that have a page, and the exit code is 2."""
         code, out, errors = self.asked("--node", "dog1")
         self.assertEqual((code, out), (2, ""))
         self.assertIn("no node 'dog1' with a page runs on this machine; nodes with a page: vaio", errors)

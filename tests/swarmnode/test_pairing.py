@@ -1,4 +1,4 @@
-"""Tests of table 5.1 of the thesis as configuration: each robot has its laptop and its agent."""
+"""Tests of Table 5.1 of the thesis as settings files: each robot has a laptop and an agent."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ class PairingTests(SynchronousTestCase):
         self.settings = {file.stem: Settings.load(str(file)) for file in sorted(FOLDER.glob("*.toml"))}
 
     def test_files_are_the_table(self) -> None:
-        """Each row has a file with device, laptop and agent; each dog has its own address, each laptop one dog."""
+        """Each row has a file with device, laptop and agent; each dog has its own address, and each laptop one dog."""
         self.assertEqual(list(self.settings), ["dog1", "dog2", "dog3", "vaio"])
         dogs = [self.settings[name] for name, _, _ in ROWS]
         self.assertEqual([(each.node.name, each.node.laptop, each.agent.name) for each in dogs], ROWS)
@@ -46,7 +46,7 @@ class PairingTests(SynchronousTestCase):
         self.assertEqual(len({each.node.host for each in self.settings.values()}), 4)
 
     def test_files_are_a_team(self) -> None:
-        """All nodes have the same key, and each dog joins through the laptop vaio, a bootstrap and web node."""
+        """All nodes have the same key; each dog joins through the laptop vaio, which is a bootstrap and web node."""
         vaio = self.settings["vaio"]
         self.assertEqual((set(vaio.node.roles), vaio.driver.kind), ({"bootstrap", "edge", "web"}, ""))
         for each in self.settings.values():
@@ -55,7 +55,7 @@ class PairingTests(SynchronousTestCase):
             self.assertEqual([(address.host, address.port) for address in each.node.known_nodes], known)
 
     def test_team_tells_who_belongs_together(self) -> None:
-        """With nodes from the files and emulated dogs, page and log show device, laptop and agent; all connect."""
+        """With these files and emulated dogs, page and log contain device, laptop and agent, and all dogs connect."""
         lines: list[str] = []
 
         @implementer(ILogObserver)
@@ -93,7 +93,7 @@ class PairingTests(SynchronousTestCase):
             self.assertEqual(driver.state, "ready")
 
     def test_names_cost_nothing_where_there_are_none(self) -> None:
-        """The record of a device without these names has no such keys, and names that are not text are ignored."""
+        """The record of a device without these names lacks their keys; names that are not text are ignored."""
         bare, named = Device("ab", "dog1"), Device("ab", "dog1", laptop="dog1_laptop", agent="dog1_agent")
         keys = [set(msgpack.unpackb(device.pack())) for device in (bare, named)]
         self.assertEqual(keys[0] ^ keys[1], {"laptop", "agent"})

@@ -25,7 +25,7 @@ class PasswordCommandTests(SynchronousTestCase):
         return main([], out, ask, bytes), out.getvalue(), errors.getvalue()
 
     def test_print_a_line_for_the_settings(self) -> None:
-        """The output is a line of TOML for the settings, and its hash matches the password."""
+        """The output is a line of TOML for the settings; it contains a hash that matches the password."""
         code, out, _ = self.typed("correct horse", "correct horse")
         self.assertEqual(code, 0)
         path = self.mktemp()
@@ -35,7 +35,7 @@ class PasswordCommandTests(SynchronousTestCase):
         self.assertNotIn("horse", out)
 
     def test_refuse_in_one_line(self) -> None:
-        """A short, mistyped, untypable or missing password is rejected in one line with exit code 1."""
+        """A short, mistyped, untypable or missing password gives one error line and exit code 1."""
         for answers, words in (
             (("short",), "5 characters"),
             (("correct horse", "correct hors"), "not the same"),

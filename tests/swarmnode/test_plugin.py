@@ -39,7 +39,7 @@ class RefusalTests(SynchronousTestCase):
         return str(path)
 
     def refusal(self, *arguments: str, is_made: bool = False) -> str:
-        """Return the one line with which the command line is rejected."""
+        """Return the line with which the arguments are rejected."""
         errors = io.StringIO()
         with contextlib.redirect_stderr(errors), self.assertRaises(SystemExit) as caught:
             options = Options()
@@ -51,12 +51,12 @@ class RefusalTests(SynchronousTestCase):
         return errors.getvalue().strip()
 
     def assert_says(self, line: str, *parts: str) -> None:
-        """Check that the line has each part."""
+        """Check that the error line contains each part."""
         for part in ("swarm-node: ", *parts):
             self.assertIn(part, line)
 
     def test_refuse_before_the_start(self) -> None:
-        """Invalid files and flags are rejected with place, problem and remedy."""
+        """Invalid files and flags are rejected; the error contains location, problem and remedy."""
         node = '[node]\nname = "a"\nteam_key = "t"\n'
         texts: tuple[tuple[str, tuple[str, ...]], ...] = (
             (f"{node}prot = 7\n", ("[node] prot", "the nearest is port")),
@@ -77,7 +77,10 @@ class RefusalTests(SynchronousTestCase):
             self.assert_says(self.refusal(*words), *parts)
 
     def test_refuse_what_cannot_be_made(self) -> None:
-        """Unknown agents, drivers and stores, and invalid combinations, are rejected with the valid values."""
+        """Unknown agents, drivers and stores, and invalid combinations, are rejected.
+
+        The error lists the valid values.
+        """
         known = "known are " + ", ".join(list_kinds())
         (self.folder / "text.sqlite").write_text("this is a letter " * 99, encoding="utf-8")
         driver = '[driver]\nkind = "sim"\n'
@@ -94,7 +97,7 @@ class RefusalTests(SynchronousTestCase):
             self.assert_says(self.refusal("--config", path, is_made=True), path, *parts)
 
     def test_refuse_foreign_store(self) -> None:
-        """A SQLite file of another program is rejected by name and not changed."""
+        """An SQLite file of another program is rejected and not changed; the error contains its name."""
         foreign = self.folder / "foreign.sqlite"
         with contextlib.closing(sqlite3.connect(foreign)) as connection:
             connection.execute("CREATE TABLE birds(name TEXT)")
@@ -104,7 +107,7 @@ class RefusalTests(SynchronousTestCase):
         self.assertEqual(foreign.read_bytes(), before)
 
     def test_refuse_name_without_address(self) -> None:
-        """A known node without an address is rejected with the key and the name."""
+        """The error for a known node without an address contains the key and the name."""
 
         def nothing(*_: object, **__: object) -> Any:
             raise socket.gaierror(socket.EAI_NONAME, "Name or service not known")
@@ -119,7 +122,7 @@ class RefusalTests(SynchronousTestCase):
         )
 
     def test_say_which_setting_to_mend(self) -> None:
-        """An error without a file is reported in one line after the file and the key."""
+        """An error that does not refer to a file is reported in one line that begins with the file and the key."""
         self.assertEqual(format_error(PortInUse("UDP 1:2: taken"), "a.toml"), "a.toml: [node] port: UDP 1:2: taken")
         self.assertEqual(
             format_error(TunnelPortInUse("TCP 1:2: taken"), "a.toml"), "a.toml: [node] tunnel_port: TCP 1:2: taken"
@@ -130,7 +133,7 @@ class RefusalTests(SynchronousTestCase):
 
 class CheckedServiceTests(SynchronousTestCase):
     def test_take_the_next_port(self) -> None:
-        """A node with a default port that is in use starts at the next port; a configured port is rejected."""
+        """A node whose default port is in use starts on the next free port; a configured port in use is rejected."""
         team = MemoryTeam()
         team.switchboard.make_network("127.0.0.1", NODE_PORT).listen(lambda datagram, source: None)
 
@@ -163,7 +166,7 @@ class CheckedServiceTests(SynchronousTestCase):
 
 class OptionsTests(SynchronousTestCase):
     def test_flags_win_over_the_file(self) -> None:
-        """A flag overrides a value of the file and no other value."""
+        """A flag overrides its own value in the file, and no other value."""
         path = Path(self.mktemp())
         path.write_text('[node]\nname = "a"\nteam_key = "t"\nport = 7001\nkind = "dog"\n', encoding="utf-8")
         options = Options()
@@ -172,7 +175,7 @@ class OptionsTests(SynchronousTestCase):
         self.assertEqual((node.name, node.port, node.kind, node.roles), ("a", 7002, "dog", ("edge", "bootstrap")))
 
     def test_flags_alone_are_enough(self) -> None:
-        """Flags are sufficient to configure a node."""
+        """A node can be configured with flags alone."""
         options = Options()
         options.parseOptions(["--name", "b", "--known-nodes", "10.0.0.1:7000,10.0.0.2:7000", "--web-port", "0"])
         settings = options.settings
@@ -180,7 +183,7 @@ class OptionsTests(SynchronousTestCase):
         self.assertEqual(settings.node.known_nodes, (Address("10.0.0.1", 7000), Address("10.0.0.2", 7000)))
 
     def key_file(self) -> str:
-        """Return a file with a team's secret."""
+        """Return the path of a file with a team's secret."""
         path = Path(self.mktemp())
         path.touch(mode=0o600)
         path.write_text("t\n", encoding="utf-8")
@@ -198,7 +201,7 @@ class OptionsTests(SynchronousTestCase):
         Options().parseOptions([word for name, value in values.items() for word in (f"--{name}", value)])
 
     def test_names_become_addresses_once(self) -> None:
-        """Host names of known nodes and of the simulator are resolved once, in the family of the node's address."""
+        """The host names of known nodes and of the simulator are resolved once, in the family of the node's address."""
         asked: list[tuple[str, int]] = []
 
         def look_up(host: str, port: int, family: int, type: int) -> Any:  # noqa: A002

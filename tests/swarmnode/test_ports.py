@@ -23,10 +23,10 @@ def settings(node: Collection[tuple[str, object]] = (), web: Collection[tuple[st
 
 
 class PortsTests(SynchronousTestCase):
-    """Tests of ``given_way``."""
+    """Tests of ``replace_busy_ports``."""
 
     def test_free_ports_are_taken_as_usual(self) -> None:
-        """If no port is in use, each port has its default."""
+        """If no port is in use, each port has its default value."""
         found = replace_busy_ports(settings(), busy())
         self.assertEqual((found.node.port, found.web.port, found.web.tls_port), (NODE_PORT, 8080, 8443))
 
@@ -36,12 +36,12 @@ class PortsTests(SynchronousTestCase):
         self.assertEqual((found.node.port, found.web.port, found.web.tls_port), (NODE_PORT + 2, 8081, 8444))
 
     def test_many_busy_ports_leave_any(self) -> None:
-        """If the next ports are in use as well, the system chooses the port."""
+        """If the next ports are in use as well, the operating system chooses the port."""
         found = replace_busy_ports(settings(), busy(*range(NODE_PORT, NODE_PORT + PORT_COUNT)))
         self.assertEqual(found.node.port, 0)
 
     def test_a_port_that_was_set_stays(self) -> None:
-        """A port from the file or the command line is not changed, even if it equals the default."""
+        """A port from the file or the command line is not replaced, even if it equals the default."""
         of_file = settings([("port", NODE_PORT)], [("port", 8080), ("tls_port", 8443)])
         of_flags = settings().with_flags(port=NODE_PORT, web_port="8080", web_tls_port="8443")
         for wanted in (of_file, of_flags):
@@ -49,7 +49,7 @@ class PortsTests(SynchronousTestCase):
             self.assertEqual((found.node.port, found.web.port, found.web.tls_port), (NODE_PORT, 8080, 8443))
 
     def test_a_node_without_page_looks_for_none(self) -> None:
-        """Only a web node checks ports for its pages."""
+        """A node without a page does not check the page's ports."""
         asked: list[socket.SocketKind] = []
 
         def is_free(kind: socket.SocketKind, host: str, port: int) -> bool:

@@ -26,7 +26,7 @@ STEP = 0.05
 
 
 class Stand:
-    """A behaviour that never finishes, with a random cost."""
+    """A behaviour with a random cost that never finishes."""
 
     def __init__(self, parameters: Mapping[str, float | str], rng: random.Random) -> None:
         self.cost = round(1.0 + rng.random(), 3)
@@ -43,7 +43,7 @@ class Stand:
         return STAND
 
     def execute(self, context: Context) -> Action:
-        """Stand still, without an end."""
+        """Stand still forever."""
         return STAND
 
 
@@ -63,7 +63,7 @@ class ReportersTests(SynchronousTestCase):
         Deferred.fromCoroutine(node.submit(task))
 
     def heard(self, records: list[Record]) -> None:
-        """Store the records under the task's key."""
+        """Store the records under the key of the task."""
         self.records = records
 
     def engagements(self) -> dict[str, Engagement]:
@@ -77,7 +77,10 @@ class ReportersTests(SynchronousTestCase):
         return [name for name, one in self.engagements().items() if one.state_machine.state is State.EXECUTING]
 
     def run_until_one_acts(self, limit: float) -> tuple[str, float]:
-        """Run until an agent acts, never two at once; return its name and the seconds."""
+        """Run until an agent acts; check that two agents never act simultaneously.
+
+        Return the agent's name and the seconds.
+        """
         began = self.team.clock.seconds()
         while not (acting := self.acting()):
             self.team.clock.advance(STEP)
@@ -86,12 +89,15 @@ class ReportersTests(SynchronousTestCase):
         return acting[0], self.team.clock.seconds() - began
 
     def ranked(self) -> list[str]:
-        """Return the running agents, the best first."""
+        """Return the running agents in the order of their costs, the lowest cost first."""
         every = self.engagements()
         return sorted(every, key=lambda name: (every[name].me.cost or 0.0, every[name].me.uuid))
 
     def test_best_acts_and_the_next_takes_over(self) -> None:
-        """The best agent acts with few records and datagrams, all agree, and the next best takes over within 3 s."""
+        """The best agent acts with few records and datagrams, and all agents agree; later the next best takes over.
+
+        The takeover takes at most 3 s.
+        """
         name, _ = self.run_until_one_acts(5.0)
         self.assertEqual(name, self.ranked()[0])
         self.team.clock.advance(2.0)
@@ -99,7 +105,8 @@ class ReportersTests(SynchronousTestCase):
         sent = self.team.switchboard.counters["sent"] - self.sent
         self.assertLess(sent / AGENTS, 1000)
         members = {member.uuid for record in self.records if (member := parse_member(record)) is not None}
-        self.assertLessEqual(len(members), ENOUGH_RECORDS + 2 * ANNOUNCED)  # some write before the last announcement
+        # Some agents write a report before the last announcement reaches them.
+        self.assertLessEqual(len(members), ENOUGH_RECORDS + 2 * ANNOUNCED)
         uuid = self.engagements()[name].me.uuid
         self.assertEqual({one.me.assigned for one in self.engagements().values()}, {uuid})
         self.team.services[name].vanish()

@@ -1,4 +1,4 @@
-"""Tests of ``swarmnode.sandbox``: the libraries that are imported before the process drops its rights."""
+"""Tests of ``swarmnode.sandbox``: the libraries that are imported before the process gives up its rights."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ text = "import json"
 
 class SandboxTests(SynchronousTestCase):
     def test_only_listed_libraries_are_imported(self) -> None:
-        """Only listed libraries that a source imports at the beginning of a line are imported."""
+        """Of the libraries that a source imports at the beginning of a line, only permitted libraries are preloaded."""
         self.assertEqual(
             find_allowed_imports(SOURCE),
             [
@@ -39,7 +39,7 @@ class SandboxTests(SynchronousTestCase):
         )
 
     def test_any_bytes(self) -> None:
-        """Bytes that are not Python result in no imports, in linear time."""
+        """Bytes that are not Python give no imports, and take linear time."""
         for source in (
             b"",
             b"\xff" * 1000,

@@ -16,7 +16,7 @@ class SchemaTests(SynchronousTestCase):
     """The schema describes the settings."""
 
     def test_has_every_setting(self) -> None:
-        """Each table lists exactly its keys, with their bounds; only the name is required."""
+        """Each table lists exactly its keys with their bounds; only the name is required."""
         out = io.StringIO()
         self.patch(__import__("sys"), "stdout", out)
         self.assertEqual(main(["schema"]), 0)

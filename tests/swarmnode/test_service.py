@@ -1,4 +1,4 @@
-"""Tests of ``swarmnode.service``: start, stop, failure and return of a node."""
+"""Tests of ``swarmnode.service``: the start, stop, failure and return of a node."""
 
 from __future__ import annotations
 
@@ -22,16 +22,16 @@ class NodeServiceTests(SynchronousTestCase):
         self.team.clock.advance(0.5)
 
     def end(self, service: NodeService) -> None:
-        """Stop the service if it runs."""
+        """Stop the service if it is running."""
         if service.running:
             self.successResultOf(service.stopService())
 
     def seen(self) -> int:
-        """Return the number of devices that the first node sees."""
+        """Return the number of devices that the first node knows."""
         return len(self.devices.records)
 
     def test_service_leaves_in_order(self) -> None:
-        """A node that stops leaves the directory before its lease ends, and stops its page."""
+        """A node that stops leaves the directory before its lease expires, and stops its page."""
         self.assertEqual(self.seen(), 2)
         self.end(self.second)
         self.team.clock.advance(0.1)
@@ -39,7 +39,7 @@ class NodeServiceTests(SynchronousTestCase):
         self.assertFalse(self.team.pages[0].running)
 
     def test_service_vanishes_without_a_word(self) -> None:
-        """A node that loses power stays in the directory until its lease ends, and sends nothing more."""
+        """A node that loses power stays in the directory until its lease expires, and sends no more datagrams."""
         self.second.vanish()
         self.team.clock.advance(0.3)
         sent = self.team.switchboard.counters["unsent"]
@@ -49,7 +49,7 @@ class NodeServiceTests(SynchronousTestCase):
         self.assertEqual(self.team.switchboard.counters["unsent"], sent)
 
     def test_service_leaves_and_returns(self) -> None:
-        """A node that leaves for a time stops its page, and returns with its identity and a new page."""
+        """A node that leaves for some time stops its page, and returns with the same identity and a new page."""
         before = self.second.assembly.node
         self.second.leave_for(3.0)
         self.assertFalse(self.team.pages[0].running)
@@ -62,7 +62,7 @@ class NodeServiceTests(SynchronousTestCase):
         self.assertEqual([page.running for page in self.team.pages], [0, 1])
 
     def test_second_wish_to_leave_changes_nothing(self) -> None:
-        """Two requests to leave within a short time restart the node once."""
+        """Two requests to leave that follow each other closely restart the node only once."""
         self.second.leave_for(2.0)
         self.second.leave_for(3.0)
         self.team.clock.advance(2.5)
@@ -72,7 +72,7 @@ class NodeServiceTests(SynchronousTestCase):
         self.assertEqual(self.seen(), 2)
 
     def test_stopped_while_away_stays_away(self) -> None:
-        """A node that is stopped while it is away does not return."""
+        """A node that is stopped during its absence does not return."""
         self.second.leave_for(2.0)
         self.end(self.second)
         self.team.clock.advance(5.0)

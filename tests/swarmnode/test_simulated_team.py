@@ -1,4 +1,4 @@
-"""Tests of ``swarmnode.simulated_team``: a simulated team that a seed reproduces."""
+"""Tests of ``swarmnode.simulated_team``: equal seeds give equal runs of a simulated team."""
 
 from __future__ import annotations
 
@@ -18,7 +18,10 @@ print(team.switchboard.digest())
 
 class ReplayTests(SynchronousTestCase):
     def test_seed_replays_a_team_exactly(self) -> None:
-        """Processes with different hash seeds exchange the same datagrams; another seed gives another digest."""
+        """Processes with different hash seeds exchange the same datagrams.
+
+        A different seed gives a different digest.
+        """
         digest = replayed(self, RUN)
         self.assertEqual(len(digest), 64)
         team = SimulatedTeam(8)

@@ -30,21 +30,21 @@ class WiringTests(SynchronousTestCase):
         return network, find_alternate_paths(FaultyNetwork(network, HeapClock(), random.Random(1))), reactor
 
     def test_nothing_without_tunnels(self) -> None:
-        """A node without tunnels and tunnel port has a plain network and opens no TCP port."""
+        """A node without tunnels and without a tunnel port has a plain network and opens no TCP port."""
         for node in ({}, {"known_nodes": ["127.0.0.1:7000"]}, {"known_nodes": ["10.0.0.7:7000"], "tunnels": []}):
             network, addresses, reactor = self.wired(**node)
             self.assertNotIsInstance(network, JointNetwork)
             self.assertEqual((addresses, reactor.tcpServers), ([], []))
 
     def test_known_nodes_may_be_dialled(self) -> None:
-        """A node has a virtual tunnel address for each known node, and connects to none of them at once."""
+        """A node has a virtual tunnel address for each known node, but does not connect to these addresses yet."""
         network, addresses, reactor = self.wired(known_nodes=["10.0.0.7:7000"])
         self.assertIsInstance(network, JointNetwork)
         self.assertEqual(addresses, [Url.parse("wss://10.0.0.7").address])
         self.assertEqual((reactor.tcpServers, reactor.tcpClients), ([], []))
 
     def test_port(self) -> None:
-        """The tunnel port opens on the node's address, without TLS on the loopback address only."""
+        """The tunnel port is opened on the node's address; it works without TLS only on the loopback address."""
         for tls, host in ((True, "10.0.0.5"), (False, "127.0.0.1")):
             reactor = MemoryReactorClock()
             settings = Settings.from_mapping(
@@ -66,7 +66,7 @@ class WiringTests(SynchronousTestCase):
             self.assertEqual((opened, find_alternate_paths(network)), ([(443, host)], []))
 
     def test_proxy(self) -> None:
-        """A valid proxy of the environment is used for TLS, except for hosts in ``no_proxy``."""
+        """A valid proxy in the environment is used for TLS, except for hosts in ``no_proxy``."""
         url, plain = Url.parse("wss://node.example"), Url.parse("ws://node.example")
         said = {"https_proxy": "http://10.0.0.1:8080"}
         self.assertEqual(find_proxy(said, url), Proxy("10.0.0.1", 8080))

@@ -16,7 +16,7 @@ from tests.swarmnode.team import MemoryTeam
 
 class WebRoleTests(SynchronousTestCase):
     def test_tls_without_its_libraries_names_the_extra(self) -> None:
-        """If the libraries for TLS are missing, TLS is rejected with the command that installs them."""
+        """If the libraries for TLS are missing, TLS is rejected; the error contains the command that installs them."""
         loaded = [name for name in sys.modules if name == "webnode.tls" or name.split(".")[0] == "OpenSSL"]
         hidden = {name: sys.modules.pop(name) for name in loaded}
 
@@ -36,7 +36,7 @@ class WebRoleTests(SynchronousTestCase):
             self.assertIn(words, str(error))
 
     def test_web_role_without_flask_names_the_extra(self) -> None:
-        """If Flask is not installed, the web role is rejected with the command that installs it."""
+        """If Flask is not installed, the web role is rejected; the error contains the command that installs Flask."""
 
         def needing() -> list[str]:
             return [n for n in sys.modules if n.split(".")[0] in ("flask", "webnode") or n == "swarmnode.page"]

@@ -22,13 +22,13 @@ class WhyTests(SynchronousTestCase):
         self.shell = Shell(self.team, self.team.services["vaio"].assembly.node)
 
     def why(self, line: str) -> str:
-        """Run ``swarm why LINE``, which must succeed, and return its output."""
+        """Run ``swarm why LINE``, which must succeed; return its output."""
         code, output = self.shell.run(main, line.split())
         self.assertEqual((code, self.shell.said), (0, ""))
         return output
 
     def until(self, status: str) -> str:
-        """Run the team until a dog has ``status``, and return its name."""
+        """Run the team until a dog has ``status``; return the name of that dog."""
         for _ in range(400):
             self.team.clock.advance(0.2)
             for device in self.team.state()["devices"]:
@@ -37,7 +37,7 @@ class WhyTests(SynchronousTestCase):
         self.fail(f"nobody was ever {status}")
 
     def test_takeover_is_explained(self) -> None:
-        """Both epochs are explained: first agent, successor, agreement, tokens and reports."""
+        """Both epochs are explained: the first agent, its successor, the agreement, the tokens and the reports."""
         task = self.team.run_demo()
         first = self.until("EXECUTING")
         self.team.clock.advance(1.5)
@@ -62,7 +62,7 @@ class WhyTests(SynchronousTestCase):
         self.assertEqual([(each["chosen"], each["agree"]) for each in card["why"]], [(second, 2), (first, 3)])
 
     def test_errors_by_name(self) -> None:
-        """No task, no decision, an unknown id and an unknown node are reported in one line with the known values."""
+        """If there is no task or decision, or the id or node is unknown, one error line lists the known values."""
         self.assertEqual(self.shell.run(main, ["last"]), (1, ""))
         self.assertEqual(self.shell.said, "swarm why: the team has no task; assign one on the page of its web node\n")
         task = self.team.run_demo()
@@ -93,7 +93,10 @@ class WhyTests(SynchronousTestCase):
         self.assertEqual(self.shell.said, "swarm why: 2 tasks begin with 'a': a , a [2J; give more of the id\n")
 
     def test_prefix(self) -> None:
-        """An ambiguous prefix is rejected with the matching ids; a complete id matches even if it is a prefix."""
+        """An ambiguous prefix is rejected with the matching ids.
+
+        A complete id matches even if it is a prefix of another.
+        """
         tasks = [Task(name, "k", name, created=float(n)) for n, name in enumerate(("ab", "abc", "b"))]
         self.assertEqual(select_task("last", tasks).task_id, "b")
         self.assertEqual(select_task("ab", tasks).task_id, "ab")

@@ -1,4 +1,4 @@
-"""HTTP requests as bytes through a real ``Site`` to a transport in memory, in virtual time."""
+"""Send HTTP requests as bytes through a real ``Site`` with a transport in memory, in virtual time."""
 
 from __future__ import annotations
 
@@ -59,7 +59,10 @@ class Connection:
 
 
 def site_of(root: IResource, clock: Clock, limits: AddressLimits | None = None) -> Site:
-    """Create a site on ``clock`` with the web node's requests and, if ``limits`` are given, its connections."""
+    """Create a site on ``clock`` that serves requests.
+
+    With ``limits``, its connections are limited as on a web node.
+    """
     site = QuietSite(root, requestFactory=LimitedRequest, reactor=clock, timeout=None)
     if limits is not None:
         limit_connections(site, limits)

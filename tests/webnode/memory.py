@@ -21,7 +21,7 @@ from webnode.team_control import TeamControl
 
 
 class MemoryDiagnostics(Diagnostics):
-    """Diagnostics that return fixed answers for the network, each device, the links and the team."""
+    """Diagnostics that return fixed results for the network, each device, the links and the team."""
 
     def __init__(self, network: Json, inventories: Mapping[str, Json], links: Json = None, team: Json = None) -> None:
         self._network = network
@@ -42,14 +42,17 @@ class MemoryDiagnostics(Diagnostics):
         return self._team
 
     def query_inventory(self, uuid: str) -> Deferred[Json]:
-        """Return the inventory, or fail with 504 for a device that does not answer."""
+        """Return the inventory, or fail with status 504 for a device that does not reply."""
         if uuid not in self._inventories:
             return fail(Refusal("device", "it did not answer", "wait a moment, then try again", 504))
         return succeed(self._inventories[uuid])
 
 
 class MemoryStopControl(StopControl):
-    """The emergency stop of a team that obeys: ``devices`` are the answering uuids, ``said`` the requests."""
+    """The emergency stop of a team that always obeys.
+
+    ``devices`` are the uuids of the devices, ``said`` the requests.
+    """
 
     def __init__(self, *devices: str) -> None:
         self.devices = devices
@@ -71,7 +74,10 @@ class MemoryStopControl(StopControl):
 
 
 class MemoryFaults(FaultControl):
-    """Fault control that only records: ``injected`` has (uuid, kind, seconds, amount), ``rows`` the active faults."""
+    """Fault control that only records faults.
+
+    ``injected`` contains (uuid, kind, seconds, amount), ``rows`` the active faults.
+    """
 
     def __init__(self, *kinds: str) -> None:
         self.injected: list[tuple[str, str, float, float | None]] = []
@@ -83,7 +89,7 @@ class MemoryFaults(FaultControl):
         return self._allowed
 
     def inject(self, uuid: str, kind: str, seconds: float, amount: float | None) -> Deferred[None]:
-        """Record the fault without an effect."""
+        """Record the fault; it has no effect."""
         self.injected.append((uuid, kind, seconds, amount))
         row: dict[str, Json] = {
             "n": len(self.injected),
@@ -97,12 +103,12 @@ class MemoryFaults(FaultControl):
         return succeed(None)
 
     def list_active(self) -> list[dict[str, Json]]:
-        """Return the recorded faults, the newest first."""
+        """Return the recorded faults, newest first."""
         return self.rows
 
 
 class MemoryPhones:
-    """Phones that are only counted: ``registered`` maps uuids to names, ``pictures`` has (uuid, bytes, values).
+    """Phones that are only recorded: ``registered`` maps uuids to names, ``pictures`` has (uuid, bytes, values).
 
     ``check`` raises ``Refusal`` for data that is not a picture.
     """
@@ -141,7 +147,7 @@ class MemoryPhones:
 
 
 class MemoryInvites(Invites):
-    """Invitations with given pages, and drawings that contain only their text."""
+    """Invitations with given pages; a QR code contains only its text."""
 
     def __init__(self, *urls: str, authority: bytes = b"", fingerprint: str = "") -> None:
         self.pages = list(urls)
@@ -161,14 +167,14 @@ class MemoryInvites(Invites):
 
 
 class MemoryFrames:
-    """A frame source in memory: ``show`` delivers a picture; ``watched`` has the watched devices."""
+    """A frame source in memory: ``show`` delivers a picture; ``watched`` contains the watched devices."""
 
     def __init__(self) -> None:
         self.watched: dict[str, OnFrame] = {}
         self.opened = 0
 
     def watch(self, uuid: str, on_frame: OnFrame) -> Callable[[], None]:
-        """Watch ``uuid``; every device has a camera."""
+        """Watch ``uuid``; every device in this fake has a camera."""
         self.watched[uuid] = on_frame
         self.opened += 1
         return lambda: self.watched.pop(uuid, None) and None
@@ -180,7 +186,7 @@ class MemoryFrames:
 
 
 class MemoryTeamControl(TeamControl):
-    """A control that records each request in ``asked``, and has a small map."""
+    """A team control that records each request in ``asked``, and has a small map."""
 
     def __init__(self, catalogue: Sequence[Mapping[str, Any]] = (), robot_map: Mapping[str, Any] | None = None) -> None:
         self.asked: list[tuple[Any, ...]] = []
@@ -203,7 +209,7 @@ class MemoryTeamControl(TeamControl):
         *arguments: Any,
         refused: Callable[[Refused], Refusal | None] = lambda refused: None,
     ) -> Deferred[Any]:
-        """Apply the changes to ``settings`` and return its rows; fail for an unknown setting."""
+        """Apply the changes to ``settings`` and return the rows of the device; fail for an unknown setting."""
         rows = self.settings.get(uuid, [])
         for changes in arguments:
             for key, value in changes.items():
@@ -220,14 +226,14 @@ class MemoryTeamControl(TeamControl):
         return task_id or recorded
 
     def assign(self, name: str, tolerates: int = 1, group: str = "", task_id: str = "") -> dict[str, Any]:
-        """Return ``assign-N``, or the given id, without any able or refused device."""
+        """Return ``assign-N``, or the given id, with empty lists of able and refused devices."""
         if name not in [task["name"] for task in self.tasks]:
             raise Refusal("name", f"there is no task {name!r}", "choose one of /api/v1/catalogue", 404)
         recorded = self._record("assign", name)
         return {"id": task_id or recorded, "able": [], "refused": {}}
 
     def preview(self, name: str, group: str = "") -> dict[str, Any]:
-        """Return the entry of ``previews``, or a result without any able or refused device."""
+        """Return the entry of ``previews``, or a result with empty lists of able and refused devices."""
         if name not in [task["name"] for task in self.tasks]:
             raise Refusal("name", f"there is no task {name!r}", "choose one of /api/v1/catalogue", 404)
         entry = self.previews.get(name, {"able": [], "refused": {}, "likely": None})
@@ -250,7 +256,7 @@ class MemoryTeamControl(TeamControl):
         self._record("resume", task_id)
 
     def send_message(self, uuid: str, text: str) -> Deferred[dict[str, Any]]:
-        """Record the request; the message reaches no device."""
+        """Record the request; the message is delivered to no device."""
         self._record("message", uuid, text)
         return succeed({"delivered": [], "failed": {}})
 

@@ -1,4 +1,4 @@
-"""Tests of operator routes: stop of the team, preview of tasks, moves of robots, settings and messages."""
+"""Tests of the operator routes: emergency stop, preview of tasks, moves of robots, settings and messages."""
 
 from __future__ import annotations
 
@@ -34,13 +34,13 @@ class ActionTests(SynchronousTestCase):
         self.client: FlaskClient = app.test_client()
 
     def ask(self, method: str, path: str, body: Any = None, role: str = "operator") -> tuple[int, Any]:
-        """Send a request and return status and JSON of the answer."""
+        """Send a request; return the status and the JSON of the response."""
         headers = {"Authorization": f"Bearer {role}", "X-Swarm": "1"}
         answer = self.client.open(f"{API}/{path}", method=method, json=body, headers=headers)
         return answer.status_code, answer.get_json()
 
     def test_stop_and_go_on(self) -> None:
-        """Stop and release return the state of each device and are audited; viewers can read the stop state."""
+        """Stop and release return the state of each device and are audited; viewers can read the state of the stop."""
         stopped = (200, {"halted": True, "devices": {"01": "stands", "02": "stands"}})
         self.assertEqual(self.ask("POST", "halt", {}), stopped)
         self.assertEqual(self.ask("GET", "halt", role="viewer"), (200, {"halted": True}))
@@ -51,7 +51,7 @@ class ActionTests(SynchronousTestCase):
         )
 
     def test_stop_is_for_operators(self) -> None:
-        """A viewer cannot stop the team, and a node without the function rejects the request with an explanation."""
+        """A viewer cannot stop the team; a web node without this function rejects the request and explains why."""
         for method in ("POST", "DELETE"):
             self.assertEqual(self.ask(method, "halt", {}, "viewer")[0], 403)
         self.assertEqual(self.stop_control.said, [])
@@ -60,7 +60,7 @@ class ActionTests(SynchronousTestCase):
         self.assertEqual((status, answer["error"]["field"]), (409, "halt"))
 
     def test_preview_is_for_viewers(self) -> None:
-        """A viewer can read which devices would take a task; an unknown task is rejected by name."""
+        """A viewer can read which devices would take a task; the error for an unknown task contains its name."""
         preview = {"able": [{"uuid": "01", "name": "dog1", "busy": ""}], "refused": {"vaio": ["no camera"]}}
         self.control.previews["search"] = {**preview, "likely": None}
         told = {**preview, "likely": None, "together": []}
@@ -70,13 +70,16 @@ class ActionTests(SynchronousTestCase):
         self.assertEqual(self.control.asked, [])
 
     def test_lift_a_robot(self) -> None:
-        """A robot is moved to the given place, and keeps its heading unless another one is given."""
+        """A robot is moved to the given place, and keeps its heading unless the request contains a heading."""
         self.assertEqual(self.ask("PUT", "yard/robots/dog1", {"x": 1, "y": 2})[0], 202)
         self.assertEqual(self.ask("PUT", "yard/robots/dog1", {"x": 1, "y": 2, "heading": -1.5})[0], 202)
         self.assertEqual(self.control.asked, [("robot", "dog1", 1.0, 2.0, 0.25), ("robot", "dog1", 1.0, 2.0, -1.5)])
 
     def test_refuse_what_no_robot_can(self) -> None:
-        """An unknown robot, a place outside the map and an invalid heading are rejected with field and remedy."""
+        """An unknown robot, a place outside the map and an invalid heading are rejected.
+
+        The error has field and remedy.
+        """
         wrong: list[tuple[str, Any, int, str]] = [
             ("cat", {"x": 1, "y": 1}, 404, "name"),
             ("dog1", {"x": 9, "y": 1}, 400, "robot"),
@@ -93,7 +96,7 @@ class ActionTests(SynchronousTestCase):
         self.assertEqual(self.ask("PUT", "yard/robots/dog1", {"x": 1, "y": 1})[0], 409)
 
     def test_settings(self) -> None:
-        """A viewer reads the settings of a device, an operator changes them, and the device's errors are forwarded."""
+        """A viewer reads the settings of a device, an operator changes them; errors of the device are forwarded."""
         status, rows = self.ask("GET", "devices/01/settings", role="viewer")
         self.assertEqual(
             (status, rows[0]["key"], rows[0]["value"], rows[0]["most"]), (200, "description", "a dog", 200.0)
@@ -112,7 +115,7 @@ class ActionTests(SynchronousTestCase):
             self.assertEqual((status, answer["error"]["field"]), (expected, field), body)
 
     def test_orders_answer_what_became_of_them(self) -> None:
-        """A message is answered with its recipients; a device that left in the meantime is reported as an error."""
+        """The response to a message lists its recipients; for a device that has left, it is an error."""
         self.assertEqual(self.ask("POST", "message", {"text": "sit"}), (202, {"delivered": [], "failed": {}}))
         self.assertEqual(self.ask("POST", "devices/01/message", {"text": "sit"})[1]["id"], "01")
         left = Refusal("device", "dog1 left during the request", "wait until it is back", 409)
@@ -127,7 +130,7 @@ class ActionTests(SynchronousTestCase):
         self.assertEqual(self.event_log.list_since(0), [])
 
     def test_disconnecting_is_a_fault_on_purpose(self) -> None:
-        """A device that is disconnected is a fault in the event log, so the takeover is timed from that moment."""
+        """Disconnecting a device is logged as an injected fault, so the takeover time counts from that moment."""
         self.ask("POST", "devices/01/disconnect", {"seconds": 5})
         (entry,) = self.event_log.list_since(0)
         self.assertEqual((entry.kind, entry.uuid, entry.at), ("fault", "01", 1e9))

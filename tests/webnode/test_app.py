@@ -41,7 +41,7 @@ class AppTests(SynchronousTestCase):
         return app.test_client()
 
     def test_serve_page(self) -> None:
-        """The page names its node, has the strict headers, and is revalidated by ETag."""
+        """The page contains the name of its node, has the strict headers, and is revalidated by ETag."""
         page = self.client.get("/")
         self.assertIn(b'<b id="node">vaio</b>', page.data)
         for name, value in HEADERS.items():
@@ -63,7 +63,7 @@ class AppTests(SynchronousTestCase):
         self.assertEqual([task["name"] for task in self.client.get("/api/v1/catalogue").get_json()], ["search"])
 
     def test_grant(self) -> None:
-        """Every valid request reaches the team control and is answered with 202."""
+        """Every valid request reaches the team control and gets status 202."""
         wishes: list[tuple[str, Any]] = [
             ("/api/v1/demo", {}),
             ("/api/v1/tasks", {"name": "search"}),
@@ -97,7 +97,7 @@ class AppTests(SynchronousTestCase):
         )
 
     def test_tell_who_can(self) -> None:
-        """Assigning returns the id, the able devices, and the refused devices with reasons."""
+        """The response to an assignment contains the id, the able devices, and the refused devices with reasons."""
         answer = {"id": "t2", "able": ["dog1"], "refused": {"dog2": ["no camera"]}}
         self.control.assign = lambda name, tolerates=1, group="", task_id="": {**answer, "for": tolerates}  # type: ignore
         told = self.client.post("/api/v1/tasks", json={"name": "search"}).get_json()
@@ -114,7 +114,7 @@ class AppTests(SynchronousTestCase):
         self.assertEqual(asked, [("search", 1, "yard", ""), ("search", 1, "", "")])
 
     def test_id_of_a_named_wish(self) -> None:
-        """The id of a task follows from the request's idempotency key, equally on every web node."""
+        """The id of a task is derived from the request's idempotency key, identically on every web node."""
         other = self.client_of(lambda: self.state)
 
         def asked(client: FlaskClient, path: str, key: str) -> str:
@@ -128,7 +128,7 @@ class AppTests(SynchronousTestCase):
         self.assertEqual([asked(other, path, key) for path, key in wishes], ids)
 
     def test_refuse(self) -> None:
-        """Every invalid request gets its status and an error with field, problem and remedy, and has no effect."""
+        """Every invalid request gets its status and an error with field, problem and remedy, but has no effect."""
         wishes: list[tuple[str, Any, int, str]] = [
             ("/api/v1/tasks", {"name": "fly"}, 404, "name"),
             ("/api/v1/tasks", {}, 400, "name"),
@@ -157,14 +157,14 @@ class AppTests(SynchronousTestCase):
         self.assertEqual(self.control.asked, [])
 
     def test_refuse_broken_bodies(self) -> None:
-        """Malformed, deeply nested and non-finite bodies are answered with 400."""
+        """Malformed, deeply nested and non-finite bodies get status 400."""
         headers = {"Content-Type": "application/json"}
         for body in (b"{", b"\xff", b'{"x": NaN, "y": 1}', b'{"x": 1e999, "y": 1}', b"[" * 60000):
             answer = self.client.post("/api/v1/target", data=body, headers=headers)
             self.assertEqual(answer.status_code, 400, body[:20])
 
     def test_do_once_what_is_asked_twice(self) -> None:
-        """A request that is repeated with its idempotency key runs once; an invalid key is rejected."""
+        """A request that is repeated with its idempotency key is executed once; an invalid key is rejected."""
         answers = [self.client.post("/api/v1/demo", json={}, headers={"Idempotency-Key": "a1"}) for _ in range(2)]
         self.assertEqual([answer.status_code for answer in answers], [202, 202])
         self.assertEqual(answers[0].get_json(), answers[1].get_json())
@@ -173,7 +173,10 @@ class AppTests(SynchronousTestCase):
         self.assertEqual((bad.status_code, bad.get_json()["error"]["field"]), (400, "Idempotency-Key"))
 
     def test_share_with_the_team(self) -> None:
-        """Pages of other web nodes of the team may read and send requests, also by CORS preflight; others may not."""
+        """Pages of the team's other web nodes may read and send requests, also after a CORS preflight.
+
+        Other pages may not.
+        """
         other, evil = {"Origin": "http://other:8080"}, {"Origin": "http://evil:8080"}
         for headers, told in ((other, "http://other:8080"), (evil, None)):
             answer = self.client.get("/api/v1/state", headers=headers)
@@ -183,7 +186,7 @@ class AppTests(SynchronousTestCase):
         self.assertEqual(self.client.post("/api/v1/demo", json={}, headers=other).status_code, 202)
 
     def test_hide_failures(self) -> None:
-        """An internal error is answered with 500 without details; unknown paths and methods get JSON errors, too."""
+        """An internal error gives status 500 without details. Unknown paths and methods also give errors in JSON."""
 
         def fail() -> State:
             raise RuntimeError("secret path")
@@ -197,7 +200,7 @@ class AppTests(SynchronousTestCase):
         self.assertEqual(self.client.get("/api/state").status_code, 404)
 
     def test_weigh_page(self) -> None:
-        """The first load stays below 100 kB, compressed below 36 kB, and no file of the page names another origin."""
+        """The first load stays below 100 kB, or 36 kB compressed, and no file of the page refers to another origin."""
         room = Path(__file__).parents[2] / "webnode"
         first, wanted = [], [room / "templates" / "index.html"]
         for path in wanted:
@@ -206,7 +209,7 @@ class AppTests(SynchronousTestCase):
             found = [room / "static" / (here or beside) for here, beside in named]
             wanted += [each for each in dict.fromkeys(found) if each not in wanted]
         self.assertIn(room / "static" / "stream.js", first)
-        # The page loads the texts of one language, here the largest ones.
+        # The page loads the texts of one language; the largest catalogue is counted.
         first.append(max((room / "static" / "texts").iterdir(), key=lambda path: path.stat().st_size))
         self.assertLess(sum(len(read_static(path)) for path in first), 100_000)
         self.assertLess(sum(len(gzip.compress(read_static(path))) for path in first), 36_000)

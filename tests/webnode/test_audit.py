@@ -1,4 +1,4 @@
-"""Tests of ``webnode.audit``: the log of changes, in a file that outlives the node."""
+"""Tests of ``webnode.audit``: the log of changes, in a file that survives restarts of the node."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ class AuditTests(SynchronousTestCase):
         self.assertEqual(stat.S_IMODE(self.path.stat().st_mode), 0o600)
 
     def test_outlive_the_node(self) -> None:
-        """After a restart earlier lines are returned, the newest first, and invalid lines are skipped."""
+        """After a restart earlier lines are returned, newest first; invalid lines are skipped."""
         first = self.audit()
         for number in range(3):
             first.write(ANN, "h", "POST /x", str(number), "202")
@@ -51,7 +51,7 @@ class AuditTests(SynchronousTestCase):
         self.assertEqual(again.get_counts(), {("operator", "202"): 1})
 
     def test_stay_within_its_room(self) -> None:
-        """A full file is rotated once, so both files stay below twice the limit; the newest lines remain."""
+        """A full file is rotated: the two files together stay below twice the limit, and the newest lines remain."""
         audit = self.audit(2000)
         for number in range(200):
             audit.write(ANN, "h", "POST /x", str(number), "202")
@@ -62,7 +62,7 @@ class AuditTests(SynchronousTestCase):
         self.assertEqual(len(audit.list_newest(1000)), MAX_LINES)
 
     def test_let_nobody_flood_it(self) -> None:
-        """Repeated requests of an unknown user are one line a minute with a count; other lines remain."""
+        """Repeated requests of an unknown user give one line per minute with a count; other lines remain."""
         audit = self.audit()
         audit.write(ANN, "h", "POST /x", "", "202")
         for _ in range(1000):
@@ -76,7 +76,7 @@ class AuditTests(SynchronousTestCase):
         self.assertEqual(audit.get_counts()["anyone", "429"], 1002)
 
     def test_go_on_without_a_file(self) -> None:
-        """Without a file, or if it cannot be written, the newest lines are still available."""
+        """Without a file, or if the file cannot be written, the newest lines are still available."""
         self.path = Path(self.mktemp()) / "missing" / "audit"
         audit = self.audit()
         for number in range(2):
@@ -89,7 +89,7 @@ class AuditTests(SynchronousTestCase):
 
 class AuditRouteTests(SynchronousTestCase):
     def test_tell_operators(self) -> None:
-        """An operator reads the requested number of lines, the newest first; a viewer may not."""
+        """An operator reads the requested number of lines, newest first; a viewer must not read them."""
         state = format_state([], [], {}, node="vaio")
         client = create_app(lambda: state, Services(MemoryTeamControl(), Guests())).test_client()
         bearer = {"Authorization": "Bearer operator"}

@@ -40,7 +40,7 @@ class AuthorityTests(SynchronousTestCase):
         skip = SKIP
 
     def test_be_the_same_after_each_start(self) -> None:
-        """A secret always gives the same authority, byte for byte; another secret another one with another name."""
+        """Equal secrets give exactly equal authorities; a different secret gives a different authority and name."""
         first, second, other = (
             make_authority(SECRET, "vaio"),
             make_authority(SECRET, "vaio"),
@@ -90,7 +90,7 @@ class LeafTests(SynchronousTestCase):
         return self.leaf.find_flaw(self.signer, self.names if names is None else names, now)
 
     def test_serve_for_a_year_less_a_month(self) -> None:
-        """A certificate is valid until a month before its end; after that, and before its start, it has a flaw."""
+        """A certificate is valid until a month before its end; later, and before its start, it has a flaw."""
         self.assertEqual(self.flaw(), "")
         self.assertEqual(self.flaw(NOW + (VALIDITY - RENEWAL_MARGIN).total_seconds() - 3 * DAY), "")
         self.assertEqual(self.flaw(NOW + (VALIDITY - RENEWAL_MARGIN).total_seconds()), "it expires soon")
@@ -99,26 +99,29 @@ class LeafTests(SynchronousTestCase):
         self.assertEqual(lasts, timedelta(days=365))
 
     def test_name_what_it_lacks(self) -> None:
-        """A missing address is a flaw; a name that the authority cannot sign is not."""
+        """A missing address is a flaw; a missing name that the authority cannot sign is not."""
         self.assertEqual(self.flaw(names=["192.168.0.8"]), "it lacks 192.168.0.8")
         self.assertEqual(self.flaw(names=["8.8.8.8", "example.org", "fe80::1%eth0", "", "a b.local", "-"]), "")
         self.assertEqual(self.flaw(names=["::ffff:192.168.0.7", "VAIO.local.", "127.0.0.1", "localhost"]), "")
 
     def test_tell_a_foreign_one(self) -> None:
-        """A certificate of another authority, or with the key of another certificate, is rejected."""
+        """A certificate of a different authority, or with a key that does not belong to it, is rejected."""
         self.assertIn("another authority", self.leaf.find_flaw(make_authority(bytes(32), "vaio"), self.names, NOW))
         other = make_leaf(self.signer, "vaio", self.names, NOW, random.Random(2))
         self.assertIn("key", Leaf(other.key, self.leaf.certificate).find_flaw(self.signer, self.names, NOW))
 
     def test_bear_any_clock(self) -> None:
-        """With a clock that is decades wrong a valid certificate is created, and replaced after the clock is set."""
+        """With a clock that is wrong by decades a valid certificate is created.
+
+        It is replaced when the clock is set.
+        """
         for now in (0.0, -1e12, 9e9, 1e300):
             made = make_leaf(self.signer, "pi", [], now, random.Random(1))
             self.assertLess(made.certificate.not_valid_before_utc, made.certificate.not_valid_after_utc)
             self.assertNotEqual(made.find_flaw(self.signer, [], NOW), "")
 
     def test_read_what_was_kept(self) -> None:
-        """A stored certificate is read again; truncated, empty, binary and other PEM data are rejected."""
+        """A stored certificate is read again; truncated, empty, binary and unrelated PEM data are rejected."""
         again = parse_leaf(self.leaf.pem_with_key)
         self.assertEqual((again.names, again.pem_with_key), (self.leaf.names, self.leaf.pem_with_key))
         key = rsa.generate_private_key(65537, 2048)

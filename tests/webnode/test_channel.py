@@ -20,7 +20,7 @@ HEAD = b"POST / HTTP/1.1\r\nHost: vaio\r\nContent-Length: %d\r\n\r\n"
 
 
 class Echo(Resource):
-    """A resource that answers GET at once, POST with the length of its body, and never answers ``/held``."""
+    """A resource that answers GET immediately and POST with the length of the body, and never answers ``/held``."""
 
     isLeaf = True
 
@@ -64,7 +64,7 @@ class ChannelTests(SynchronousTestCase):
         return connection.transport.disconnecting or connection.transport.disconnected
 
     def assert_refused(self, connection: Connection, status: int, words: str) -> None:
-        """Check that the connection got an error in JSON with the usual headers, and was closed."""
+        """Check that the connection received an error in JSON with the usual headers, and was closed."""
         head, _, body = connection.taken().partition(b"\r\n\r\n")
         self.assertTrue(head.startswith(b"HTTP/1.1 %d " % status), head)
         self.assertEqual(set(json.loads(body)["error"]), {"field", "problem", "remedy"})
@@ -74,7 +74,7 @@ class ChannelTests(SynchronousTestCase):
         self.assertTrue(self.is_closed(connection))
 
     def drip(self, connection: Connection, data: bytes, pause: float) -> float:
-        """Send byte by byte with pauses until the connection is closed; return the seconds."""
+        """Send byte by byte with pauses until the connection is closed; return the seconds that passed."""
         began = self.clock.seconds()
         for byte in data:
             if self.is_closed(connection):
@@ -96,7 +96,7 @@ class ChannelTests(SynchronousTestCase):
         self.assertEqual(self.echo.served, 7)
 
     def test_end_who_dribbles_a_head(self) -> None:
-        """A connection that sends a byte a second is closed with 408 ten seconds after its first byte."""
+        """A connection that sends one byte per second is closed with status 408 ten seconds after its first byte."""
         for before in (False, True):
             connection = self.opened()
             if before:
@@ -106,7 +106,7 @@ class ChannelTests(SynchronousTestCase):
             self.assert_refused(connection, 408, "in time")
 
     def test_end_who_dribbles_a_body(self) -> None:
-        """A body of less than 1 kB a second is rejected after the grace period; a steady body is accepted."""
+        """A body that arrives at less than 1 kB/s is rejected after the grace period; a steady body is accepted."""
         slow, steady = self.opened(), self.opened("10.0.0.2")
         slow.send(HEAD % 5000)
         self.assertLess(self.drip(slow, b"x" * 100, 0.5), GRACE_S + 2.0)
@@ -118,7 +118,7 @@ class ChannelTests(SynchronousTestCase):
         self.assertIn(b"5000 bytes", steady.taken())
 
     def test_end_who_says_nothing(self) -> None:
-        """A connection without a request is closed after ten seconds, an idle one after fifteen."""
+        """A connection without a request is closed after ten seconds, an idle connection after fifteen."""
         silent, idle = self.opened(), self.opened("10.0.0.2")
         idle.ask("/")
         self.clock.advance(HEADERS_LIMIT_S)
@@ -129,7 +129,7 @@ class ChannelTests(SynchronousTestCase):
         self.assertTrue(self.is_closed(idle))
 
     def test_abort_who_does_not_hang_up(self) -> None:
-        """A rejected client that does not close is disconnected soon after, and its further data is ignored."""
+        """A rejected client that does not close the connection is soon disconnected; its further data is ignored."""
         connection = self.opened()
         connection.send(b"GET / HTTP/1.1\r\n")
         self.clock.advance(HEADERS_LIMIT_S)
@@ -152,7 +152,10 @@ class ChannelTests(SynchronousTestCase):
         self.assertEqual((slow.transport.disconnected, deaf.transport.disconnected), (False, True))
 
     def test_bear_few_unfinished_of_an_address(self) -> None:
-        """The third incomplete request of an address is rejected; complete requests and other addresses are not."""
+        """The third incomplete request from an address is rejected.
+
+        Complete requests and other addresses are accepted.
+        """
         for _ in range(2):
             self.opened().send(b"GET / HT")
         third = self.opened()
@@ -166,7 +169,7 @@ class ChannelTests(SynchronousTestCase):
         self.assertFalse(self.is_closed(self.opened().send(b"GET / HT")))
 
     def test_bear_some_streams_of_an_address(self) -> None:
-        """The third open answer of an address is rejected; after one of them ends, the next is accepted."""
+        """The third open response to an address is rejected; when one of them ends, the next request is accepted."""
         held = [self.opened().ask("/held") for _ in range(2)]
         third = self.opened().ask("/held")
         self.assert_refused(third, 503, "open requests")
@@ -176,14 +179,14 @@ class ChannelTests(SynchronousTestCase):
         self.assertFalse(self.is_closed(self.opened().ask("/held")))
 
     def test_bear_some_connections_of_an_address(self) -> None:
-        """An address at its limit gets no further connection; another address does."""
+        """An address at its limit gets no further connection; a different address does."""
         for _ in range(5):
             self.opened()
         self.assertTrue(self.opened().transport.disconnected)
         self.assertFalse(self.is_closed(self.opened("10.0.0.2")))
 
     def test_refuse_in_json_with_all_headers(self) -> None:
-        """Errors of Twisted itself, and too large bodies, are answered like all other errors."""
+        """Errors that Twisted detects, and too large bodies, are answered like all other errors."""
         for data, status in (
             (b"nonsense\r\n\r\n", 400),
             (b"GET / HTTP/1.1\r\nno colon\r\n\r\n", 400),
@@ -201,7 +204,7 @@ class ChannelTests(SynchronousTestCase):
         self.assertEqual(self.echo.served, 0)
 
     def test_be_called_by_twisted(self) -> None:
-        """The overridden methods exist in this version of Twisted, and Twisted calls them."""
+        """The overridden methods exist in the installed version of Twisted, and Twisted calls them."""
         self.assertTrue(issubclass(Channel, HTTPChannel))
         for name in (
             *("connectionMade", "dataReceived", "allHeadersReceived", "allContentReceived", "requestDone"),

@@ -37,7 +37,7 @@ class DiagnosticsTests(FleetCase):
         return self.done(self.team, self.diagnostics.query_network(), ANSWER_LIMIT_S + 1)
 
     def test_tell_who_knows_whom(self) -> None:
-        """Each of three nodes, in the order of joining, lists the two others with round trip and last contact."""
+        """Each of three nodes, in the order of joining, lists the two other nodes with round trip and last contact."""
         told = self.network()
         self.assertEqual((list(told["devices"]), told["silent"]), (self.dogs, []))
         for place, view in enumerate(told["devices"].values()):
@@ -47,7 +47,7 @@ class DiagnosticsTests(FleetCase):
             self.assertTrue(all(contact["heard_s"] < 3 for contact in view["contacts"]), view)
 
     def test_ask_once_for_all_who_look(self) -> None:
-        """Concurrent and closely following reads cause one request to each device."""
+        """Reads that are concurrent or follow closely cause only one request to each device."""
         asked: list[str] = []
 
         def expose(node: SwarmNode) -> None:
@@ -69,7 +69,7 @@ class DiagnosticsTests(FleetCase):
         self.assertEqual(len(asked), 4)
 
     def test_name_the_silent(self) -> None:
-        """A device that does not answer is listed as silent, and the others are shown in time."""
+        """A device that does not reply is listed as silent; the other devices are shown in time."""
         self.team.nodes[2].stop_silently()
         waiting = self.diagnostics.query_network()
         self.team.run(ANSWER_LIMIT_S + 0.3)
@@ -77,14 +77,14 @@ class DiagnosticsTests(FleetCase):
         self.assertEqual((list(told["devices"]), told["silent"]), (self.dogs[:2], self.dogs[2:]))
 
     def test_go_on_beside_one_without_an_address(self) -> None:
-        """A device without a valid address is listed as silent, and the others are shown."""
+        """A device without a valid address is listed as silent; the other devices are shown."""
         self.team.nodes[2].presence.change(address="nowhere")
         self.team.run(1)
         told = self.network()
         self.assertEqual((list(told["devices"]), told["silent"]), (self.dogs[:2], self.dogs[2:]))
 
     def test_believe_nothing_unlawful(self) -> None:
-        """Answers of the wrong shape are replaced by empty ones."""
+        """Replies with an invalid structure are replaced by empty replies."""
         for told in ({"contacts": [3, {"uuid": 5}, {"uuid": "ab", "rtt_ms": "x"}], "lookups": 7, "sent": []}, "no", {}):
             self.team.nodes[1].entangled.endpoint.expose(NETWORK_METHOD, lambda peer, told=told: told)
             self.team.run(2)
@@ -100,7 +100,7 @@ class DiagnosticsTests(FleetCase):
         return self.done(self.team, self.diagnostics.query_links(), ANSWER_LIMIT_S + 1)
 
     def test_tell_how_each_is_reached(self) -> None:
-        """Each of three nodes lists its paths to the two others; a later read has their scores."""
+        """Each of three nodes lists its paths to the two others; the next read contains the scores of the paths."""
         told = self.links()
         self.assertEqual((told["here"], list(told["devices"]), told["silent"]), (self.dogs[0], self.dogs, []))
         self.assertEqual({way["score"] for view in told["devices"].values() for way in view["links"]}, {None})
@@ -113,7 +113,7 @@ class DiagnosticsTests(FleetCase):
                 self.assertTrue(5 < way["rtt_ms"] < 8 and way["jitter_ms"] < 1 and way["for_s"] > 1, way)
 
     def test_tell_what_got_worse(self) -> None:
-        """A path with loss and delay has a lower score than a good one, by the same rule as ``swarm links``."""
+        """A path with loss and delay has a lower score than a good path, by the same rule as in ``swarm links``."""
         self.links()
         self.team.run(3)
         far = self.team.address(2)
@@ -132,7 +132,7 @@ class DiagnosticsTests(FleetCase):
         self.assertEqual(way["score"], judged)
 
     def test_carrying_costs(self) -> None:
-        """Of two paths with equal measurements the relayed one has the lower score, and names its relay."""
+        """Of two paths with equal measurements the relayed path has the lower score; its relay is listed."""
         ways = [
             {"id": uuid, "way": way, "by": by, "loss": 0.0, "round_trip": 0.002, "jitter": 0.0}
             for uuid, way, by in ((self.dogs[0], "punched", ""), (self.dogs[2], "carried", self.dogs[0]))
@@ -144,7 +144,7 @@ class DiagnosticsTests(FleetCase):
         self.assertLess(carried["score"], 100)
 
     def test_believe_no_unlawful_way(self) -> None:
-        """Invalid kinds, sides and numbers of a device's paths are replaced by valid ones."""
+        """Invalid kinds, sides and numbers in the paths of a device are replaced by valid values."""
         way = {"id": "ab", "way": "magic", "loss": 7, "round_trip": float("nan"), "for": -1, "by": 3, "address": ["x"]}
         refusal = {"who": "x\n" * 99, "side": 3, "code": None, "reason": "why; do; this", "ago": "y", "count": 1.5}
         answer = {"links": [way, {"id": 4}, 5], "refusals": [refusal, "x"]}
@@ -156,12 +156,12 @@ class DiagnosticsTests(FleetCase):
         self.assertEqual((refused["ago_s"], refused["count"], len(refused["who"]) <= 64), (0.0, 1, True))
 
     def test_open_team(self) -> None:
-        """An open team lists the protections that it lacks."""
+        """The diagnostics of an open team list which protections are missing."""
         told: Any = self.diagnostics.describe_team()
         self.assertEqual((told["kind"], told["unprotected"]), ("open", OPEN_TEAM_WARNING))
 
     def test_tell_what_is_stored(self) -> None:
-        """The inventory of another node and of the own node counts records by kind and lists the newest."""
+        """The inventory of this node and of another node counts the records by kind and lists the newest record."""
         self.done(self.team, self.team.nodes[1].entangled.put(hash_key("a"), "note", b"\xa1x", "team"), 1)
         for uuid in self.dogs[:2]:
             told: Any = self.done(self.team, self.diagnostics.query_inventory(uuid), 1)
@@ -172,7 +172,7 @@ class DiagnosticsTests(FleetCase):
             self.assertTrue(0 < size < told["bytes"] < told["most_bytes"])
 
     def test_say_who_did_not_answer(self) -> None:
-        """A silent device is answered with 504, a device without the method and a missing device with 409."""
+        """A silent device gives status 504; a device without the method, and a missing device, give status 409."""
         self.assertEqual(self.assertRaises(Refusal, self.diagnostics.query_inventory, "ff").status, 409)
         self.team.nodes[1].entangled.endpoint.expose("device.inventory", _refuse)
         waiting = self.diagnostics.query_inventory(self.dogs[1])
@@ -196,7 +196,10 @@ class DiagnosticsTests(FleetCase):
             self.assertTrue(1 <= each["hops"] <= each["asked"] and each["found"] == 8 and each["ms"] > 0, each)
 
     def test_ask_by_http(self) -> None:
-        """Viewers read the diagnostics; an unknown device gives 404, a silent one 504, a node without them 409."""
+        """Viewers read the diagnostics.
+
+        An unknown device gives 404, a silent device 504, a node without diagnostics 409.
+        """
         state = format_state([{"uuid": "01", "name": "dog1"}, {"uuid": "02", "name": "dog2"}], [], {})
         others: Any = ({"here": "01", "devices": {}, "silent": []}, {"kind": "open", "unprotected": "much"})
         diagnostics = MemoryDiagnostics({"devices": {}, "silent": ["02"]}, {"01": {"records": 4}}, *others)
@@ -216,4 +219,4 @@ class DiagnosticsTests(FleetCase):
 
 
 def _refuse(peer: object, too: int, many: int) -> None:
-    """Take more arguments than the caller passes."""
+    """Raise an exception, because it takes more arguments than the caller passes."""

@@ -43,7 +43,7 @@ class DispatchTests(SynchronousTestCase):
         )
 
     def test_do_once_what_is_asked_twice(self) -> None:
-        """A request with a used id gets the answer of the first one, even if that is pending or an error."""
+        """A request with a used id gets the response of the first request, even if that is pending or an error."""
         self.assertEqual(self.successResultOf(self.asked("a")), {"id": 1})
         self.told = waiting = Deferred[Any]()
         self.assertEqual(self.successResultOf(self.asked("a")), {"id": 1})
@@ -57,14 +57,14 @@ class DispatchTests(SynchronousTestCase):
         self.assertEqual(len(self.called), 3)
 
     def test_tell_ids_apart(self) -> None:
-        """An id counts per user and route; requests without an id are all different."""
+        """An id identifies a request only for its user and route; requests without an id are all different."""
         for each in (self.asked("a"), self.asked("a", name="bob"), self.asked("a", path="/others"), self.asked()):
             self.successResultOf(each)
         self.successResultOf(self.asked())
         self.assertEqual(len(self.called), 5)
 
     def test_forget_old_ids(self) -> None:
-        """Only the newest ``MAX_ANSWERS`` ids are known."""
+        """The responses for the newest ``MAX_ANSWERS`` ids are remembered."""
         for number in range(MAX_ANSWERS + 1):
             self.successResultOf(self.asked(str(number)))
         self.successResultOf(self.asked("1"))
@@ -73,7 +73,7 @@ class DispatchTests(SynchronousTestCase):
         self.assertEqual(len(self.called), MAX_ANSWERS + 2)
 
     def test_note_each_change(self) -> None:
-        """Each change is audited with user, address, route, target and outcome; reads are not."""
+        """Each change is audited with user, address, route, target and outcome; reads are not audited."""
         self.successResultOf(self.asked("a"))
         self.successResultOf(self.asked("a"))
         self.successResultOf(self.asked(method="GET"))

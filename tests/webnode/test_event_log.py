@@ -33,7 +33,7 @@ class EventLogTests(SynchronousTestCase):
         self.heard = 0
 
     def saw(self, now: float, *devices: dict[str, Any], tasks: Any = (), groups: Any = None, **more: Any) -> list[str]:
-        """Return the new entries for a team of these devices; ``more`` is added to the state."""
+        """Return the new entries for a team of these devices; ``more`` is merged into the state."""
         gone = self.departed.update(devices, now)
         state: State = {**format_state(devices, tasks, groups or {}, departed=gone, node="vaio"), **more}
         self.event_log.record_state(state, now)
@@ -45,7 +45,7 @@ class EventLogTests(SynchronousTestCase):
         return [entry.text for entry in entries]
 
     def test_begin_with_who_is_here(self) -> None:
-        """The event log begins with its start and the present devices; an equal state adds nothing."""
+        """The event log begins with its start and the present devices; an unchanged state adds nothing."""
         self.assertEqual(
             self.saw(1.0, dog(1), dog(2)),
             ["vaio starts to observe", "dog1 is here, number 1: idle", "dog2 is here, number 2: idle"],
@@ -53,7 +53,7 @@ class EventLogTests(SynchronousTestCase):
         self.assertEqual(self.saw(2.0, dog(1), dog(2)), [])
 
     def test_tell_of_devices(self) -> None:
-        """Each status change, message, loss and return of a device is described once."""
+        """Each status change, message, loss and return of a device is logged once."""
         self.saw(1.0, dog(1, messages=[[0.5, "ready"]]))
         told = self.saw(2.0, dog(1, "SEARCHING", "t1", messages=[[0.5, "ready"], [1.5, "seen"]]))
         self.assertEqual(told, ["dog1: idle → searching", "dog1: seen"])
@@ -62,7 +62,7 @@ class EventLogTests(SynchronousTestCase):
         self.assertEqual(self.saw(5.0, dog(1)), ["dog1 is back: idle"])
 
     def test_tell_of_tasks(self) -> None:
-        """A task is described from its start to its end, with the finishing device and the duration."""
+        """A task is logged from its start to its end, with the finishing device and the duration."""
         self.saw(1.0)
         self.assertEqual(self.saw(2.0, tasks=[job("OPEN")]), ["Find it: open"])
         self.assertEqual(self.saw(3.0, tasks=[job("OPEN", paused=True)]), ["Find it: paused"])
@@ -73,7 +73,7 @@ class EventLogTests(SynchronousTestCase):
         self.assertEqual(self.event_log.list_since(0)[-1].seconds, 13.24)
 
     def test_tell_of_consensus(self) -> None:
-        """An agreement of all members is described once with the bids, and not before all have decided."""
+        """An agreement of all members is logged once with the bids, but not before all members have decided."""
         first = {**dog(1), "cost": 1.04, "assigned": uuid(2)}
         second = {**dog(2), "cost": 0.62, "assigned": ""}
         self.saw(1.0)
@@ -83,7 +83,7 @@ class EventLogTests(SynchronousTestCase):
         self.assertEqual(self.saw(4.0, groups=agreed), [])
 
     def test_tell_of_no_consensus_on_what_is_over(self) -> None:
-        """After the end of a task the remaining reports are not described as an agreement."""
+        """After the end of a task the remaining reports are not logged as an agreement."""
         bids = [{**dog(n), "cost": float(n), "assigned": uuid(1)} for n in (1, 2)]
         self.saw(1.0, tasks=[job("EXECUTING")])
         self.assertEqual(len(self.saw(2.0, tasks=[job("EXECUTING")], groups={"t1": bids})), 1)
@@ -92,7 +92,7 @@ class EventLogTests(SynchronousTestCase):
             self.assertEqual([line for line in told if "agree" in line], [], status)
 
     def test_tell_of_halting(self) -> None:
-        """The stop and the release of the whole team are described."""
+        """The stop and the release of the whole team are logged."""
         self.saw(1.0)
         self.assertEqual(self.saw(2.0, halted=True), ["the team is halted"])
         self.assertEqual(self.saw(3.0, halted=False), ["the team is released"])
@@ -112,12 +112,12 @@ class EventLogTests(SynchronousTestCase):
         told = self.saw(11.3, dog(2, "EXECUTING", "t1"), tasks=tasks)
         self.assertIn("dog2 takes over Find it from dog1: 1.3 s", told)
         self.assertEqual(self.takeover(), [("takeover", uuid(2), 1.3)])
-        # The lost device returns and waits, which is not another takeover.
+        # The lost device returns and waits; that is not a takeover.
         self.saw(20.0, dog(1, "WAITING", "t1"), dog(2, "EXECUTING", "t1"), tasks=tasks)
         self.assertEqual(len(self.takeover()), 1)
 
     def test_time_a_takeover_from_the_fault(self) -> None:
-        """For an injected fault the takeover is timed from the injection, not from the loss that follows."""
+        """After an injected fault the takeover time counts from the injection, not from the loss that follows."""
         tasks = [job("EXECUTING")]
         both = dog(1, "EXECUTING", "t1"), dog(2, "WAITING", "t1")
         self.saw(1.0, *both, tasks=tasks)
@@ -128,19 +128,19 @@ class EventLogTests(SynchronousTestCase):
         self.assertEqual(self.takeover(), [("takeover", uuid(2), 1.5)])
 
     def test_take_no_handover_for_a_takeover(self) -> None:
-        """A change from a present device, or long after a fault, is a handover without a time."""
+        """If the acting device changes without a loss, or long after a fault, a handover without a time is logged."""
         tasks = [job("EXECUTING")]
         self.saw(1.0, dog(1, "EXECUTING", "t1"), dog(2, "WAITING", "t1"), tasks=tasks)
         self.event_log.record_fault(uuid(1), "skew", 2.0)
         self.saw(70.0, dog(1, "EXECUTING", "t1"), dog(2, "WAITING", "t1"), tasks=tasks)
         self.saw(71.0, dog(1, "WAITING", "t1"), dog(2, "EXECUTING", "t1"), tasks=tasks)
         self.assertEqual(self.takeover(), [("handover", uuid(2), None)])
-        # A second device that acts at the same time replaces no device.
+        # A second device that acts at the same time has replaced no device.
         self.saw(72.0, dog(1, "EXECUTING", "t1"), dog(2, "EXECUTING", "t1"), tasks=tasks)
         self.assertEqual(len(self.takeover()), 1)
 
     def test_forget_a_loss_that_mends(self) -> None:
-        """A device that returns and continues was not replaced, even if another device follows later."""
+        """A device that returns and continues was not replaced, even if a different device takes over later."""
         tasks = [job("EXECUTING")]
         self.saw(1.0, dog(1, "EXECUTING", "t1"), tasks=tasks)
         self.saw(2.0, tasks=tasks)
@@ -149,7 +149,7 @@ class EventLogTests(SynchronousTestCase):
         self.assertEqual(self.takeover(), [("handover", uuid(2), None)])
 
     def test_keep_so_many(self) -> None:
-        """Only the newest entries are kept, with increasing numbers; they can be filtered by device or task."""
+        """Only the newest entries are kept; their numbers increase, and they can be filtered by device or task."""
         self.event_log = EventLog(max_entries=3)
         self.saw(1.0, dog(1), dog(2), tasks=[job("OPEN")])
         self.assertEqual([entry.n for entry in self.event_log.list_since(0)], [2, 3, 4])
@@ -158,7 +158,10 @@ class EventLogTests(SynchronousTestCase):
         self.assertEqual([entry.n for entry in self.event_log.list_since(0, "t1")], [4])
 
     def test_ask_by_http(self) -> None:
-        """A viewer reads all entries, entries after a number, or entries of one device; a wrong number is rejected."""
+        """A viewer reads all entries, entries after a number, or entries of one device.
+
+        An invalid number is rejected.
+        """
         self.saw(1.0, dog(1), dog(2))
         app = create_app(
             lambda: format_state([], [], {}), Services(MemoryTeamControl(), Guests(), event_log=self.event_log)

@@ -11,7 +11,10 @@ from webnode.failover import ORIGIN_KEPT_S, Page, TeamFallbacks, find_pages, get
 
 class UrlTests(SynchronousTestCase):
     def test_name_an_origin_as_browsers_do(self) -> None:
-        """Case, default ports and names of this machine do not change an origin; a URL with a path is no page."""
+        """Case, default ports and the names of this machine do not change an origin.
+
+        A URL with a path is not an origin.
+        """
         for url, origin in (
             ("http://192.168.0.5:8080", "http://192.168.0.5:8080"),
             ("http://VAIO.local:8080/", "http://vaio.local:8080"),
@@ -22,7 +25,7 @@ class UrlTests(SynchronousTestCase):
             self.assertEqual(get_origin(url), origin)
 
     def test_follow_no_url_out_of_the_house(self) -> None:
-        """A URL that is no page of a machine in the local network is ignored."""
+        """A URL that is not the page of a machine in the local network is ignored."""
         for url in (
             "https://evil.example",
             "javascript:alert(1)",
@@ -40,7 +43,7 @@ class UrlTests(SynchronousTestCase):
         self.assertEqual(find_pages([device]), [Page("01", "http://192.168.0.5:8080")])
 
     def test_give_every_name_of_an_open_page(self) -> None:
-        """A page at one address has one URL; a page on all interfaces has a URL for each name of the machine."""
+        """A page on one address has one URL; a page on all interfaces has one URL for each name of the machine."""
         self.assertEqual(make_urls("127.0.0.1", 8080, ["vaio.local"]), ["http://127.0.0.1:8080"])
         self.assertEqual(
             make_urls("0.0.0.0", 80, ["10.0.0.5", "", "v.local"]), ["http://10.0.0.5:80", "http://v.local:80"]
@@ -50,7 +53,7 @@ class UrlTests(SynchronousTestCase):
 
 class TeamFallbacksTests(FleetCase):
     def web_nodes(self) -> tuple[SwarmTeam, list[TeamFallbacks]]:
-        """Return two nodes, each of which serves the page on its own port."""
+        """Return a team of two nodes and the web fallbacks of each; each node serves the page on its own port."""
         swarm = self.swarm(2)
         webs = [TeamFallbacks(node, swarm.clock.seconds) for node in swarm.nodes]
         for place, web in enumerate(webs):
@@ -59,7 +62,7 @@ class TeamFallbacksTests(FleetCase):
         return swarm, webs
 
     def test_know_each_other(self) -> None:
-        """Each web node lists its own page first and the other's page next, and accepts requests from it."""
+        """Each web node lists its own page first, then the page of the other, and accepts requests from that page."""
         _, (first, second) = self.web_nodes()
         self.assertEqual([page.url for page in first.list_pages()], ["http://127.0.0.1:8080", "http://127.0.0.1:8081"])
         self.assertEqual([page.is_self for page in second.list_pages()], [True, False])
@@ -69,7 +72,7 @@ class TeamFallbacksTests(FleetCase):
         self.assertFalse(first.is_allowed_origin("http://192.168.0.9:8081"))
 
     def test_vouch_in_an_open_team(self) -> None:
-        """In an open team a node may vouch if it serves the page, or served it within the last hour."""
+        """In an open team a node may vouch for sessions if it serves the page, or has served it in the last hour."""
         swarm = self.swarm(3)
         first, second = (TeamFallbacks(node, swarm.clock.seconds) for node in swarm.nodes[:2])
         for place, web in enumerate((first, second)):
@@ -87,7 +90,7 @@ class TeamFallbacksTests(FleetCase):
         self.assertFalse(second.can_authenticate(keys[0]))
 
     def test_let_in_the_page_of_the_dead(self) -> None:
-        """A dead web node is not listed, but its page in a browser is accepted for an hour."""
+        """A failed web node is not listed, but for an hour requests from its page in a browser are accepted."""
         swarm, (first, second) = self.web_nodes()
         swarm.nodes[0].stop_silently()
         swarm.run(3)

@@ -32,7 +32,7 @@ class FaultControlTests(SynchronousTestCase):
         return self.team.services[name].assembly.node.uuid
 
     def cause(self, uuid: str, kind: str, seconds: float = 4.0, amount: float | None = None) -> Any:
-        """Return the outcome of a fault request within two seconds: None, or the refusal."""
+        """Request a fault and wait two seconds; return the refusal, or None."""
         came: list[Any] = []
         self.control.inject(uuid, kind, seconds, amount).addCallbacks(came.append, lambda f: came.append(f.value))
         for _ in range(40):
@@ -51,7 +51,7 @@ class FaultControlTests(SynchronousTestCase):
         self.fail("nobody ever acted")
 
     def test_learn_what_can_fail(self) -> None:
-        """The possible faults of each device are queried; an unknown device has none."""
+        """The possible faults of each device are listed; an unknown device has none."""
         self.assertEqual(list(self.control.get_kinds(self.uuid("dog1"))), list(KINDS))
         self.assertNotIn("battery", self.control.get_kinds(self.uuid("vaio")))
         self.assertEqual(list(self.control.get_kinds("00" * 20)), [])
@@ -63,7 +63,7 @@ class FaultControlTests(SynchronousTestCase):
         self.assertIsNone(self.cause(self.uuid("dog1"), "loss"))
 
     def test_takeover_clock(self) -> None:
-        """After a fault in the acting device the takeover time stops below two seconds, and names the successor."""
+        """After a fault in the acting device the takeover time stops below two seconds; the successor is listed."""
         self.team.control.assign("turn-around")
         lost = self.acting()
         self.assertIsNone(self.cause(lost, "radio"))
@@ -85,7 +85,7 @@ class FaultControlTests(SynchronousTestCase):
         self.assertEqual((row["task"], row["watched"], row["amount"]), ("", False, 0.3))
 
     def test_refuse(self) -> None:
-        """Invalid amounts give 400, impossible faults and lost devices 409, a silent device 504."""
+        """Invalid amounts give status 400, impossible faults and lost devices 409, a silent device 504."""
         dog = self.uuid("dog3")
         for uuid, kind, amount, status, field in (
             (dog, "loss", 7.0, 400, "amount"),
@@ -102,7 +102,7 @@ class FaultControlTests(SynchronousTestCase):
         self.assertEqual(self.control.list_active(), [])
 
     def test_only_where_allowed(self) -> None:
-        """A device that does not allow faults is reported with the setting that allows them."""
+        """For a device that does not allow faults, the error contains the setting that allows them."""
         plain = SimulatedTeam(4, dogs=("dog1",))
         self.addCleanup(plain.stop)
         control = FaultControl(plain.services["vaio"].assembly.node, plain.clock.seconds)
@@ -120,7 +120,7 @@ class RouteTests(SynchronousTestCase):
         self.open(self.faults)
 
     def open(self, faults: MemoryFaults | None) -> None:
-        """Serve a dog with these faults."""
+        """Serve the page for a dog that allows these faults."""
         state = format_state([{"uuid": "01", "name": "dog1", "joined": 1}], [], {}, node="vaio")
         services = Services(MemoryTeamControl(), OpenSessions(), event_log=self.event_log, faults=faults)
         app = create_app(lambda: state, services, wall=lambda: 1e9)
@@ -128,7 +128,7 @@ class RouteTests(SynchronousTestCase):
         self.client = app.test_client()
 
     def test_cause_and_tell(self) -> None:
-        """A fault is accepted with 202, added to the event log, and listed with the possible faults."""
+        """A fault is accepted with status 202, added to the event log, and listed together with the possible faults."""
         answer = self.client.post("/api/v1/devices/01/faults", json={"kind": "loss", "amount": 0.3})
         self.assertEqual((answer.status_code, answer.get_json()), (202, {"id": "01", "kind": "loss", "seconds": 15.0}))
         assert self.faults is not None
@@ -140,7 +140,7 @@ class RouteTests(SynchronousTestCase):
         self.assertEqual([row["kind"] for row in told["active"]], ["loss"])
 
     def test_refuse(self) -> None:
-        """Invalid requests are rejected by field and have no effect."""
+        """Invalid requests are rejected with the invalid field and have no effect."""
         for path, body, code, field in (
             ("01", {}, 400, "kind"),
             ("01", {"kind": "fly"}, 400, "kind"),
@@ -155,7 +155,7 @@ class RouteTests(SynchronousTestCase):
         self.assertEqual(self.faults.injected, [])
 
     def test_node_without_faults(self) -> None:
-        """A node without fault injection lists no faults, and names the setting that enables it."""
+        """A node without fault injection lists no faults; its error contains the setting that enables them."""
         self.open(None)
         self.assertEqual(self.client.get("/api/v1/faults").get_json(), {"kinds": [], "can": {}, "active": []})
         answer = self.client.post("/api/v1/devices/01/faults", json={"kind": "kill"})

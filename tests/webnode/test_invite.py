@@ -16,14 +16,14 @@ LINK = "https://192.168.0.7:8443/#code=AQUAagJ8oCVYkDIF5Q4LZ3Vlc3TsjPp7rFj9hsoSg
 
 class InviteTests(SynchronousTestCase):
     def test_offer_the_best_first(self) -> None:
-        """Pages on the network come before pages on this machine, and TLS before plain HTTP."""
+        """Pages in the network come before pages on this machine, and pages over TLS before pages over HTTP."""
         here, plain, name = "https://127.0.0.1:8443", "http://192.168.0.7:8080", "https://vaio.local:8443"
         self.assertEqual(sort_by_reach([here, plain, name, plain]), [name, plain, here])
         anything: Any = None
         self.assertEqual(Invites(lambda: [here, plain], b"", "", anything, anything).urls(), [plain, here])
 
     def test_draw_what_a_camera_reads(self) -> None:
-        """A decoder reads the link from the QR code, which has a margin and no style attribute."""
+        """A decoder reads the link in the QR code, which has a margin and no style attribute."""
         import cv2
         import numpy as np
 
@@ -43,10 +43,10 @@ class InviteTests(SynchronousTestCase):
         self.assertEqual(cv2.QRCodeDetector().detectAndDecode(large)[0], LINK)
 
     if missing := [name for name in ("cv2", "segno") if find_spec(name) is None]:
-        test_draw_what_a_camera_reads.skip = f"NO CODE IS READ: missing {missing}"  # type: ignore[attr-defined]
+        test_draw_what_a_camera_reads.skip = f"THE QR CODE IS NOT TESTED: missing {missing}"  # type: ignore[attr-defined]
 
     def test_draw_nothing_where_it_cannot(self) -> None:
-        """An empty link, or a missing library, gives no drawing."""
+        """An empty link gives no drawing; nor does a missing library."""
         self.assertEqual(make_qr_code(""), "")
         self.addCleanup(sys.modules.update, {"segno": sys.modules["segno"]} if "segno" in sys.modules else {})
         self.addCleanup(sys.modules.pop, "segno", None)

@@ -1,4 +1,4 @@
-"""Tests of ``webnode.keyfile``: private keys are stored with private modes only."""
+"""Tests of ``webnode.keyfile``: private keys are stored only in files with private modes."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ class KeyfileTests(SynchronousTestCase):
         return str(self.assertRaises(UnsafeFile, read_key_file, self.path))
 
     def test_keep_for_the_user_alone(self) -> None:
-        """A stored key replaces an older one and is private, with any umask."""
+        """A stored key replaces an older key, and is private whatever the umask is."""
         self.addCleanup(os.umask, os.umask(0))
         self.assertIsNone(read_key_file(self.path))
         for content in (b"first", b"second"):
@@ -31,7 +31,7 @@ class KeyfileTests(SynchronousTestCase):
         self.assertEqual([each.name for each in self.path.parent.iterdir()], [self.path.name])
 
     def test_refuse_what_others_may_read(self) -> None:
-        """A file that group or others can read or write is rejected with its mode."""
+        """A file that group or others can read or write is rejected; the error contains the mode."""
         write_key_file(self.path, b"secret")
         for mode in (0o640, 0o604, 0o620, 0o602):
             self.path.chmod(mode)

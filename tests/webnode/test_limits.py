@@ -9,7 +9,10 @@ from webnode.limits import AddressLimits
 
 class AddressLimitsTests(SynchronousTestCase):
     def test_count_each_address_for_itself(self) -> None:
-        """An address at its limit gets no more of that kind until one ends; other addresses are not affected."""
+        """An address at its limit gets no more connections of that kind until one ends.
+
+        Other addresses are not affected.
+        """
         limits = AddressLimits({"unfinished": 2, "stream": 1, "open": 9})
         for _ in range(2):
             self.assertTrue(limits.can_open("unfinished", "a"))

@@ -24,7 +24,7 @@ from webnode.state import State
 from webnode.state_journal import MAX_CHANGES
 
 MORE = "x" * 999
-"""What makes a state longer than a few changes."""
+"""Text that makes a state longer than a few changes."""
 JPEG = jpeg()
 
 
@@ -41,7 +41,7 @@ def last_id(data: bytes) -> str:
 
 
 class Quiet(EventLog):
-    """An event log that describes injected faults only."""
+    """An event log that contains only injected faults."""
 
     def record_state(self, state: State, now: float) -> None:
         """Ignore the state."""
@@ -72,7 +72,7 @@ class EventStreamsTests(SynchronousTestCase):
         return Connection(self.site).ask(f"/events{query}", **headers)
 
     def test_start_with_everything(self) -> None:
-        """A new page gets state, map, pages and beat at once, in a stream that is not cached."""
+        """A new page receives state, map, pages and beat immediately, in a stream that is not cached."""
         data = self.connected().taken()
         self.assertIn(b"text/event-stream", data)
         self.assertIn(b"no-store", data)
@@ -81,7 +81,7 @@ class EventStreamsTests(SynchronousTestCase):
         self.assertEqual(events_in(data), told)
 
     def test_tell_changes_only(self) -> None:
-        """A change is sent once within a tenth of a second; without changes only five beats a second are sent."""
+        """A change is sent once, within a tenth of a second; without changes only five beats per second are sent."""
         page = self.connected()
         page.taken()
         self.state["n"] = 1
@@ -93,7 +93,7 @@ class EventStreamsTests(SynchronousTestCase):
         self.assertIn(len(told), (9, 10, 11))
 
     def test_spare_the_node_of_a_large_team(self) -> None:
-        """If the state takes a quarter of a second to build, it is built once a second, and no change is lost."""
+        """If building the state takes a quarter of a second, it is built once per second, and no change is lost."""
         read = self.read
 
         def slow() -> dict[str, Any]:
@@ -113,7 +113,7 @@ class EventStreamsTests(SynchronousTestCase):
         self.assertEqual(told[-1], self.state["n"])
 
     def test_tell_programs_whole_states(self) -> None:
-        """A program that requests whole states gets one at each change."""
+        """A program that requests whole states receives a state after each change."""
         program = self.connected("?whole=1")
         program.taken()
         self.state["n"] = 1
@@ -121,7 +121,7 @@ class EventStreamsTests(SynchronousTestCase):
         self.assertEqual(events_in(program.taken()), [("state", {"resync": False, "n": 1})])
 
     def test_resume(self) -> None:
-        """A page that reconnects with its last id, as header or query, gets only the changes that it missed."""
+        """A page that reconnects with its last id, in a header or the query, receives only the changes it missed."""
         self.state["more"] = MORE
         page = self.connected()
         heard = last_id(page.taken())
@@ -138,7 +138,10 @@ class EventStreamsTests(SynchronousTestCase):
         watcher.leave()
 
     def test_end_with_the_session(self) -> None:
-        """A stream warns once, an hour before its session ends, if a renewal is possible; then it ends."""
+        """An hour before its session ends, a stream warns once if the session can be renewed.
+
+        At the end the stream ends.
+        """
         whos = {"short": (10.0, 10.0), "long": (RENEWAL_LEAD_S + 5.0, 2e9), "open": (2e9, 2e9)}
 
         class Sessions(OpenSessions):
@@ -162,7 +165,7 @@ class EventStreamsTests(SynchronousTestCase):
         self.assertEqual(self.events.viewers, 1)
 
     def test_tell_pages(self) -> None:
-        """Every open page learns of a web node that joins the team."""
+        """Every open page is notified of a web node that joins the team."""
         page = self.connected()
         page.taken()
         self.services.fallbacks.pages.append(Page("01", "http://127.0.0.1:8081"))
@@ -171,7 +174,7 @@ class EventStreamsTests(SynchronousTestCase):
         self.assertEqual(events_in(page.taken()), [("pages", [row])])
 
     def test_tell_what_happened(self) -> None:
-        """Each entry of the event log is sent once to each page, and all entries to a new page."""
+        """Each entry of the event log is sent to each page once; a new page receives all entries."""
         page = self.connected()
         page.taken()
         self.services.event_log.record_fault("01", "kill", 1e9)
@@ -183,7 +186,7 @@ class EventStreamsTests(SynchronousTestCase):
         self.assertIn("event", [name for name, _ in events_in(self.connected().taken())])
 
     def test_read_what_changed_only(self) -> None:
-        """While the version stays equal the state is read once a second; a new version is sent at once."""
+        """While the version is unchanged, the state is read once per second; a new version is sent immediately."""
         self.version = 1
         page = self.connected()
         reads = self.reads
@@ -195,7 +198,7 @@ class EventStreamsTests(SynchronousTestCase):
         self.assertIn(("change", {"n": 1}), events_in(page.taken()))
 
     def test_keep_the_event_log_without_a_page(self) -> None:
-        """Between ``start`` and ``close`` the event log gets the state each second, even without a page."""
+        """Between ``start`` and ``close`` the event log receives the state every second, even if no page is open."""
         self.events.start()
         self.clock.pump([0.5] * 6)
         self.assertEqual(self.reads, 3)
@@ -203,7 +206,7 @@ class EventStreamsTests(SynchronousTestCase):
         self.assertEqual(self.clock.getDelayedCalls(), [])
 
     def test_limit_pace(self) -> None:
-        """A page gets at most ten changes a second, in order."""
+        """A page receives at most ten changes per second, in order."""
         page = self.connected()
         page.taken()
         for n in range(1, 101):
@@ -215,7 +218,10 @@ class EventStreamsTests(SynchronousTestCase):
         self.assertEqual(told, sorted(told))
 
     def test_put_off_slow_pages(self) -> None:
-        """A page that does not read gets nothing; later it gets the missed changes and their number."""
+        """A page that does not read receives nothing.
+
+        When it reads again, it receives the missed changes and their number.
+        """
         self.state["more"] = MORE
         slow, quick = self.connected(), self.connected()
         slow.taken()
@@ -232,7 +238,7 @@ class EventStreamsTests(SynchronousTestCase):
         self.assertGreaterEqual([words for name, words in told if name == "beat"][-1]["skipped"], 5)
 
     def test_spare_slow_pages_the_past(self) -> None:
-        """If the missed changes are too many or longer than the state, the page gets the state, marked as such."""
+        """A page that has missed too many changes, or more data than the state, receives the state as a resync."""
         for more, missed in ((MORE, MAX_CHANGES + 2), ("", 4)):
             self.state.update({"more": more, "n": 0})
             slow = self.connected()
@@ -247,7 +253,7 @@ class EventStreamsTests(SynchronousTestCase):
             self.assertEqual(told, [("state", {"resync": True, "n": missed, "more": more})])
 
     def test_rest_when_nobody_looks(self) -> None:
-        """Without pages nothing is read and no timer is left."""
+        """If no page is open, nothing is read and no timer remains."""
         pages = [self.connected(), self.connected()]
         for page in pages:
             page.leave()
@@ -257,7 +263,7 @@ class EventStreamsTests(SynchronousTestCase):
         self.assertEqual(self.reads, reads)
 
     def test_live_through_failures(self) -> None:
-        """A state that cannot be serialized ends no stream and is logged once."""
+        """A state that cannot be serialized ends no stream, and is logged once."""
         page = self.connected()
         page.taken()
         self.state["n"] = float("nan")
@@ -269,14 +275,14 @@ class EventStreamsTests(SynchronousTestCase):
         self.assertIn(("change", {"n": 2}), events_in(page.taken()))
 
     def test_cap_pages(self) -> None:
-        """A page beyond ``MAX_VIEWERS`` is answered with 503."""
+        """A page beyond ``MAX_VIEWERS`` gets status 503."""
         for _ in range(MAX_VIEWERS):
             self.connected()
         self.assertIn(b" 503 ", self.connected().taken())
         self.assertEqual(self.events.viewers, MAX_VIEWERS)
 
     def test_close(self) -> None:
-        """``close`` ends every stream and leaves no timer."""
+        """``close`` ends every stream, and no timer remains."""
         page = self.connected()
         self.events.close()
         self.assertTrue(page.taken().endswith(b"0\r\n\r\n"))
@@ -284,7 +290,7 @@ class EventStreamsTests(SynchronousTestCase):
 
 
 def blind(uuid: str, on_frame: OnFrame) -> Callable[[], None]:
-    """Refuse to watch: no device has a camera."""
+    """Refuse to watch, because no device has a camera."""
     raise Refusal("device", "it has no camera", "choose another", 404)
 
 
@@ -304,7 +310,7 @@ class CameraImagesTests(SynchronousTestCase):
         return Connection(self.site).ask(f"/shot/ab?after={after}&viewer={viewer}")
 
     def test_wait_for_the_next(self) -> None:
-        """A request waits for the next picture and returns it with its number."""
+        """A request waits for the next picture; the response contains the picture and its number."""
         page = self.asked()
         self.assertEqual(page.taken(), b"")
         self.frames.show("ab", 7, JPEG)
@@ -314,7 +320,7 @@ class CameraImagesTests(SynchronousTestCase):
         self.assertTrue(data.endswith(JPEG))
 
     def test_answer_with_the_newest(self) -> None:
-        """A request gets the newest picture at once, with its age, and no older one."""
+        """A request receives the newest picture immediately, with its age, but not a picture that it already has."""
         self.asked()
         for seq in (1, 2, 3):
             self.frames.show("ab", seq, JPEG, 0.5)
@@ -325,13 +331,13 @@ class CameraImagesTests(SynchronousTestCase):
         self.assertEqual(self.asked("3").taken(), b"")
 
     def test_take_a_lower_number_for_new(self) -> None:
-        """A picture with a lower number is new, because a restarted camera counts from one."""
+        """A picture with a lower number is treated as new, because a restarted camera counts from one."""
         page = self.asked("900")
         self.frames.show("ab", 1, JPEG)
         self.assertIn(b"X-Seq: 1", page.taken())
 
     def test_give_up_after_five_seconds(self) -> None:
-        """Without a picture a request is answered with 204 after five seconds, so the page knows that the node runs."""
+        """Without a picture the response after five seconds is 204, so the page knows that the node is running."""
         page = self.asked()
         self.clock.advance(4.9)
         self.assertEqual(page.taken(), b"")
@@ -339,7 +345,7 @@ class CameraImagesTests(SynchronousTestCase):
         self.assertIn(b" 204 ", page.taken())
 
     def test_open_a_silent_upstream_anew(self) -> None:
-        """A silent upstream is reopened during requests, because its device may have another address."""
+        """A silent upstream is opened again while requests wait, because the device may have a new address."""
         self.asked()
         self.clock.advance(5)
         page = self.asked()
@@ -348,7 +354,7 @@ class CameraImagesTests(SynchronousTestCase):
         self.assertEqual(self.frames.opened, 2)
 
     def test_hold_one_question_a_viewer(self) -> None:
-        """A viewer's new request ends its older one with 204; other viewers keep theirs."""
+        """A new request of a viewer ends the older request of this viewer with 204; other viewers are not affected."""
         first, other = self.asked(viewer="a"), self.asked(viewer="b")
         second = self.asked(viewer="a")
         self.assertIn(b" 204 ", first.taken())
@@ -357,7 +363,7 @@ class CameraImagesTests(SynchronousTestCase):
         self.assertIn(b" 200 ", other.taken())
 
     def test_watch_only_while_somebody_looks(self) -> None:
-        """The upstream starts with the first request and stops two seconds after the last one, without a timer."""
+        """The upstream starts with the first request and stops two seconds after the last request; no timer remains."""
         self.assertEqual(list(self.frames.watched), [])
         page = self.asked(viewer="a")
         again = self.asked(viewer="a")
@@ -389,7 +395,7 @@ class CameraImagesTests(SynchronousTestCase):
         self.assertEqual(page.taken(), b"")
 
     def test_tell_of_no_camera(self) -> None:
-        """A request to a device without a camera is answered with 404 and leaves no state."""
+        """A request to a device without a camera gets status 404 and leaves no state."""
         images = CameraImages(blind, self.clock)
         data = Connection(self.site_with(images)).ask("/shot/cd?after=").taken()
         self.assertIn(b" 404 ", data)
@@ -397,13 +403,13 @@ class CameraImagesTests(SynchronousTestCase):
         self.assertEqual(images.watched, [])
 
     def test_cap_waiting(self) -> None:
-        """A request beyond ``MAX_WAITING`` is answered with 503."""
+        """A request beyond ``MAX_WAITING`` gets status 503."""
         for _ in range(MAX_WAITING):
             self.asked()
         self.assertIn(b" 503 ", self.asked().taken())
 
     def test_ignore_late_pictures(self) -> None:
-        """A picture after the stop of the upstream has no effect."""
+        """A picture that arrives after the upstream has stopped has no effect."""
         self.asked()
         late = self.frames.watched["ab"]
         self.images.close()
@@ -411,7 +417,7 @@ class CameraImagesTests(SynchronousTestCase):
         self.assertEqual((self.clock.getDelayedCalls(), self.images.watched), ([], []))
 
     def test_close(self) -> None:
-        """``close`` answers waiting requests and stops the upstream."""
+        """``close`` ends waiting requests with a response, and stops the upstream."""
         page = self.asked()
         self.images.close()
         self.assertIn(b" 204 ", page.taken())

@@ -45,7 +45,10 @@ class MetricsTests(SynchronousTestCase):
         }
 
     def test_tell_the_team(self) -> None:
-        """Devices and tasks by status, network counters and groups are exported, with any device name."""
+        """The export contains the numbers of devices and tasks by status, the network counters, and the groups.
+
+        A device name may contain any characters.
+        """
         told = self.read()
         self.assertEqual(told["swarm_devices", ("IDLE",)], 1)
         self.assertEqual(told["swarm_tasks", ("EXECUTING",)], 1)
@@ -57,7 +60,7 @@ class MetricsTests(SynchronousTestCase):
         self.assertEqual(told["swarm_page_time_seconds", ()], 9.5)
 
     def test_tell_the_page(self) -> None:
-        """Connections by kind, and requests by role and status, are counted; reading the metrics is not."""
+        """Connections are counted by kind, requests by role and status; requests for the metrics are not counted."""
         self.limits.count("stream", "10.0.0.1", 2)
         self.services.audit.write(User("ann", "operator"), "h", "POST /x", "", "409 it left")
         told = self.read()
@@ -66,7 +69,7 @@ class MetricsTests(SynchronousTestCase):
         self.assertEqual(self.read(), told)
 
     def test_tell_of_a_missing_library(self) -> None:
-        """If the library is not installed, the answer names the command that installs it."""
+        """If the library is not installed, the response contains the command that installs it."""
         hidden = {
             name: sys.modules.pop(name) for name in list(sys.modules) if name.split(".")[0] == "prometheus_client"
         }

@@ -1,4 +1,4 @@
-"""Tests of ``webnode.routes.openapi``: the document corresponds to the table of routes."""
+"""Tests of ``webnode.routes.openapi``: the document matches the table of routes."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ class DocumentTests(SynchronousTestCase):
         self.assertEqual(json.loads(json.dumps(told)), told)
 
     def test_say_what_a_field_may_be(self) -> None:
-        """Bounds, choices, defaults, units and places of fields are documented as they are checked."""
+        """Bounds, choices, defaults, units and locations of fields are documented as they are checked."""
         told = self.operation(Route("POST", "/api/v1/things/{uuid}", "About", "operator", lambda ask: {}, FIELDS))
         by_name = {each["name"]: each for each in told["parameters"]}
         self.assertEqual(by_name["uuid"]["schema"]["maxLength"], 64)
@@ -55,7 +55,7 @@ class DocumentTests(SynchronousTestCase):
         self.assertFalse(by_name["X-Swarm"]["required"])
 
     def test_say_who_may(self) -> None:
-        """Public routes need nothing, reads by viewers a token or ticket, operator routes a token."""
+        """Public routes need no credentials, routes for viewers a token or ticket, operator routes a token."""
         for role, method, wanted in (
             ("anyone", "GET", ()),
             ("viewer", "GET", ("token", "ticket")),
@@ -67,7 +67,7 @@ class DocumentTests(SynchronousTestCase):
             self.assertEqual((told["security"], told["x-role"]), ([{each: []} for each in wanted], role))
 
     def test_say_what_is_given(self) -> None:
-        """A media type is documented as such, other answers as JSON with a description, errors by reference."""
+        """A media type is documented as such, other responses as JSON with a description, errors by reference."""
         picture = self.operation(Route("GET", "/shot", "A picture", "viewer", None, response="image/jpeg"))
         self.assertEqual(list(picture["responses"]["200"]["content"]), ["image/jpeg"])
         order = self.operation(Route("POST", "/api/v1/x", "X", "operator", lambda ask: {}, response="id", status=202))
@@ -75,7 +75,7 @@ class DocumentTests(SynchronousTestCase):
         self.assertEqual(order["responses"]["default"], {"$ref": "#/components/responses/Refused"})
 
     def test_refer_to_what_is_there(self) -> None:
-        """Every reference in the document points to an existing part."""
+        """The target of every reference in the document exists."""
         told = make_document(TABLE)
         for reference in re.findall(r'"\$ref": "#/([^"]+)"', json.dumps(told)):
             part: Any = told
@@ -84,7 +84,7 @@ class DocumentTests(SynchronousTestCase):
             self.assertTrue(part)
 
     def test_be_served(self) -> None:
-        """A viewer gets the document of the served routes, with the node's name."""
+        """A viewer receives the document, which contains the served routes and the node's name."""
         state = format_state([], [], {}, node="vaio")
         client = create_app(lambda: state, Services(MemoryTeamControl(), Guests())).test_client()
         self.assertEqual(client.get("/api/v1/openapi.json").status_code, 401)

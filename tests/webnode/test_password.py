@@ -9,7 +9,7 @@ from webnode.password import LOG_N, P, R, hash_password, parse_hash, verify_pass
 
 class PasswordTests(SynchronousTestCase):
     def test_know_the_password_again(self) -> None:
-        """A hash matches its password only, and depends on the salt."""
+        """A hash matches only its own password, and depends on the salt."""
         text = hash_password("correct horse", bytes(16), 4)
         self.assertTrue(verify_password(text, "correct horse"))
         for other in ("correct hors", "Correct horse", "", text):

@@ -62,7 +62,7 @@ class PhoneRouteTests(SynchronousTestCase):
         return dict(answer.get_json())
 
     def send(self, path: str, body: bytes = b"", **headers: str) -> tuple[int, Any]:
-        """Send a request to a native route and return status and JSON."""
+        """Send a request to a native route; return the status and the JSON of the response."""
         connection = Connection(self.site)
         head = {"Host": "localhost", "Content-Length": str(len(body)), **headers}
         lines = "".join(f"{name}: {value}\r\n" for name, value in head.items())
@@ -91,7 +91,10 @@ class PhoneRouteTests(SynchronousTestCase):
         self.assertEqual([line["outcome"] for line in self.services.audit.list_newest(9)], ["200"] * 3)
 
     def test_ask_for_the_role(self) -> None:
-        """Phones and operators join; viewers, unknown users and phones with another phone's ticket do not."""
+        """Phones and operators may join.
+
+        Viewers, unknown users, and phones with the ticket of another phone may not.
+        """
         self.assertEqual(self.join(self.token_of("operator")).status_code, 200)
         self.assertEqual(self.join(self.token_of("viewer")).status_code, 403)
         self.assertEqual(self.client.post("/api/v1/phones", json=JOIN).status_code, 401)
@@ -100,7 +103,10 @@ class PhoneRouteTests(SynchronousTestCase):
         self.assertEqual((answer.status_code, answer.get_json()["error"]["field"]), (403, "ticket"))
 
     def test_ticket_is_of_one_phone(self) -> None:
-        """The ticket of a phone is valid only at that phone's routes; the token of an operator at all of them."""
+        """The ticket of a phone is valid only at the routes of that phone.
+
+        The token of an operator is valid at the routes of all phones.
+        """
         one, other = self.joined(), self.joined(secret="1e" * 32, name="ben")
         self.assertEqual(self.look(one, jpeg(), ticket=other["ticket"])[0], 403)
         self.assertEqual(self.send(f"phones/{one['uuid']}/leave?ticket={other['ticket']}")[0], 403)
@@ -112,7 +118,10 @@ class PhoneRouteTests(SynchronousTestCase):
         self.assertEqual(self.send(f"phones/{one['uuid']}/look", jpeg(), **bearer)[0], 200)
 
     def test_refuse_wrong_fields(self) -> None:
-        """Each invalid field of a joining phone is rejected by name, and so is a phone beyond the limit."""
+        """For each invalid field of a joining phone the error contains the field.
+
+        A phone beyond the limit is rejected.
+        """
         wrong: list[tuple[str, Any]] = [
             ("secret", "xyz"),
             ("secret", "0f" * 31),
@@ -134,7 +143,7 @@ class PhoneRouteTests(SynchronousTestCase):
         self.assertEqual(self.join(secret="2d" * 32).status_code, 409)
 
     def test_refuse_wrong_looks(self) -> None:
-        """Invalid pictures and values are rejected, and nothing of them reaches the team."""
+        """Invalid pictures and values are rejected, and no part of them reaches the team."""
         phone = self.joined()
         for body in (b"", b"GIF89a", b"\xff\xd8\xff\xd9", jpeg(641, 10), jpeg()[:-1]):
             status, told = self.look(phone, body)
@@ -159,7 +168,7 @@ class PhoneRouteTests(SynchronousTestCase):
         self.assertEqual(self.look(phone, jpeg(), json.dumps(at_bounds))[0], 200)
 
     def test_answer_posts_alone(self) -> None:
-        """Other methods are answered with 405 and ``Allow``, and paths below with 404."""
+        """Methods except POST get status 405 with ``Allow``; longer paths get status 404."""
         self.services.sessions = OpenSessions()
         for method, path, status in (("GET", "look", 405), ("PUT", "leave", 405), ("POST", "look/more", 404)):
             asked = Connection(self.site).ask(f"/api/v1/phones/01/{path}", method, X_Swarm="1").taken()
@@ -168,7 +177,10 @@ class PhoneRouteTests(SynchronousTestCase):
             self.assertEqual(b"Allow: POST" in asked, status == 405)
 
     def test_share_with_the_team(self) -> None:
-        """A page of another web node of the team may send pictures here; a page of an unknown origin may not."""
+        """A page of another web node of the team may send pictures to this node.
+
+        A page of an unknown origin may not.
+        """
         self.services.fallbacks = Fallbacks(Page("02", "http://other:8080"))
         phone = self.joined()
         path = f"phones/{phone['uuid']}/look?ticket={phone['ticket']}"
@@ -176,7 +188,7 @@ class PhoneRouteTests(SynchronousTestCase):
         self.assertEqual(self.send(path, jpeg(), Origin="http://evil:8080")[0], 403)
 
     def test_node_without_phones(self) -> None:
-        """A node without phone support rejects phones with 409."""
+        """A node without support for phones rejects phones with status 409."""
         phone = self.joined()
         self.services.phones = None
         self.assertEqual(self.join().status_code, 409)

@@ -17,13 +17,13 @@ from webnode.request_guard import (
 
 class GuardTests(SynchronousTestCase):
     def test_know_local_names(self) -> None:
-        """Addresses, bare names and names of the local network can belong to a local machine."""
+        """An address, a bare name and a name of the local network can belong to a local machine."""
         hosts = ["10.0.0.7:8080", "[::1]:8080", "[fe80::1]", "localhost:8080", "vaio", "vaio.local:80", "VAIO.LAN"]
         for host in hosts:
             self.assertTrue(is_local_name(host), host)
 
     def test_know_own_names(self) -> None:
-        """An address, localhost and the machine's names are own hosts; other names of the LAN are not."""
+        """An address, localhost and the machine's names are hosts of this node; other names in the LAN are not."""
         for host in ("10.0.0.7:8080", "[::1]:8080", "localhost:80", "a.localhost", "VAIO.local", "vaio.local."):
             self.assertTrue(is_own_host(host, {"vaio.local"}), host)
         for host in ("evil.local", "vaio", "evil.lan:8080", "vaio.local.evil.lan", "evil-vaio.local", "", "a b", "["):
@@ -35,14 +35,14 @@ class GuardTests(SynchronousTestCase):
             self.assertFalse(is_local_name(host), host)
 
     def test_compare_origins(self) -> None:
-        """Only the page's own origin is accepted, or a request without an origin."""
+        """A request is accepted only if it has the page's own origin or no origin."""
         self.assertTrue(is_own_origin(None, "vaio:8080"))
         self.assertTrue(is_own_origin("http://vaio:8080", "vaio:8080"))
         for origin in ("http://vaio:9090", "http://evil.example", "null", ""):
             self.assertFalse(is_own_origin(origin, "vaio:8080"), origin)
 
     def test_be_strict(self) -> None:
-        """The content security policy allows neither inline code nor other origins."""
+        """The content security policy permits neither inline code nor other origins."""
         policy = HEADERS["Content-Security-Policy"]
         self.assertIn("default-src 'self'", policy)
         self.assertNotIn("unsafe", policy)
@@ -50,14 +50,17 @@ class GuardTests(SynchronousTestCase):
         self.assertEqual(HEADERS["Cross-Origin-Opener-Policy"], "same-origin")
 
     def test_read_the_token(self) -> None:
-        """A bearer header has priority over a ticket in the query."""
+        """A bearer header takes precedence over a ticket in the query."""
         self.assertEqual(choose_token("Bearer abc", "t"), "abc")
         self.assertEqual(choose_token("bearer  abc ", ""), "abc")
         for header in ("", "Basic abc", "Bearer ", "abc"):
             self.assertEqual(choose_token(header, "t"), "t")
 
     def test_let_in(self) -> None:
-        """Changes need the own origin or a team page's, and the ``X-Swarm`` header; reads only need an own host."""
+        """A change needs the origin of the page or of another page of the team, and the header ``X-Swarm``.
+
+        A read only needs a host of this node.
+        """
 
         def refused(method: str, origin: str | None = None, is_marked: bool = True, host: str = "vaio") -> str:
             no = find_refusal(method, host, origin, is_marked, ("vaio",), lambda origin: origin == "http://other")

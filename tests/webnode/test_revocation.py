@@ -1,4 +1,4 @@
-"""Tests of ``webnode.revocation``: a sign-out at one web node is valid at all of them."""
+"""Tests of ``webnode.revocation``: a sign-out at one web node takes effect at all web nodes."""
 
 from __future__ import annotations
 
@@ -37,7 +37,10 @@ class TeamRevocationsTests(SynchronousTestCase):
         return TeamRevocations(self.team.services[name].assembly.node)
 
     def test_hold_at_every_web_node(self) -> None:
-        """A token that one web node revokes is invalid at the others, and at a node that starts after both died."""
+        """A token that one web node revokes is invalid at all others.
+
+        It is also invalid at a node that starts after both have failed.
+        """
 
         def at(revoked: TeamRevocations, key: TokenKey) -> SignedSessions:
             return SignedSessions(key, lambda _: True, "quiet-otter", "", random.Random(1), check, revoked)
@@ -63,7 +66,7 @@ class TeamRevocationsTests(SynchronousTestCase):
         self.assertEqual(late.authenticate(given[uuids[2]].text, now), User())
 
     def test_stay_small(self) -> None:
-        """The record always fits a datagram, holds the newest revocations, and drops expired ones."""
+        """The record always fits into a datagram: it contains the newest revocations, but no expired ones."""
         now = self.team.clock.seconds()
         self.vaio.revoke("ee" * 8, now + 1.0)
         self.team.clock.advance(2.0)
@@ -89,7 +92,7 @@ class TeamRevocationsTests(SynchronousTestCase):
             self.assertEqual(read_revocations(record), {})
 
     def test_remember_so_many(self) -> None:
-        """The revocations in memory drop the oldest as well."""
+        """The revocations in memory are limited as well: the oldest revocation is dropped."""
         twin = Revocations()
         for number in range(MAX_KNOWN + 1):
             twin.revoke(str(number), 1.0)

@@ -48,7 +48,7 @@ class CheckRequestTests(SynchronousTestCase):
         self.assertIs(type(given["n"]), int)
 
     def test_refuse_each_kind(self) -> None:
-        """An invalid value of each kind is rejected with field, problem and remedy."""
+        """An invalid value of each kind is rejected; the error has field, problem and remedy."""
         wrong: list[tuple[Field, list[Any]]] = [
             (Field("name", "text", "", maximum=5), [5, None, "", " \x00", "abcdef", ["a"], {}]),
             (Field("code", "text", "", minimum=3), ["ab"]),
@@ -72,13 +72,13 @@ class CheckRequestTests(SynchronousTestCase):
                 self.assertTrue(refusal.problem and refusal.remedy, refusal)
 
     def test_ask_for_what_is_missing(self) -> None:
-        """A missing field is rejected if it is required, otherwise it has its default."""
+        """A missing field is rejected if it is required; otherwise its default is used."""
         name, seconds = Field("name", "text", ""), Field("s", "number", "", default=15.0)
         self.assertEqual(self.assertRaises(Refusal, check_request, route(name), {}, {}, {}).field, "name")
         self.assertEqual(check_request(route(seconds), {}, {}, {}), {"s": 15.0})
 
     def test_refuse_unknown_fields(self) -> None:
-        """An unknown field is rejected with the nearest known name, and a body that is not an object is rejected."""
+        """The error for an unknown field suggests the nearest known name; a body that is not an object is rejected."""
         refusal = self.assertRaises(
             Refusal, check_request, route(Field("tolerates", "whole", "")), {}, {}, {"toleratse": 1}
         )
@@ -92,7 +92,7 @@ class CheckRequestTests(SynchronousTestCase):
 
 class CheckRoleTests(SynchronousTestCase):
     def test_let_in_by_role(self) -> None:
-        """Each role may use the routes that ``ALLOWED_ROLES`` lists; an unknown user gets 401, others 403."""
+        """Each role may use the routes in ``ALLOWED_ROLES``; an unknown user gets status 401, other users 403."""
         for wanted, lawful in ALLOWED_ROLES.items():
             for role in ALLOWED_ROLES:
                 if role in lawful:
@@ -104,7 +104,7 @@ class CheckRoleTests(SynchronousTestCase):
 
 class DeviceTests(SynchronousTestCase):
     def test_find_the_device(self) -> None:
-        """A present device is found; a lost device is answered with 409, an unknown one with 404."""
+        """A present device is found; a lost device gives status 409, an unknown device 404."""
         departed, dogs = DepartedDevices(), [{"uuid": f"0{n}", "name": f"dog{n}", "joined": n} for n in (1, 2)]
         departed.update(dogs, 1.0)
         state = format_state(dogs[:1], [], {}, departed=departed.update(dogs[:1], 2.0))
@@ -117,7 +117,7 @@ class DeviceTests(SynchronousTestCase):
 
 class TableTests(SynchronousTestCase):
     def test_each_route_is_whole(self) -> None:
-        """Every route has a description, a field for each part of its path, and is unique."""
+        """Every route is unique, and has a description and a field for each parameter of its path."""
         for each in TABLE:
             named = {field.name for field in each.fields if field.where == "path"}
             self.assertEqual(named, set(re.findall(r"\{(\w+)\}", each.path)), each.name)
@@ -128,7 +128,7 @@ class TableTests(SynchronousTestCase):
         self.assertEqual(len(names), len(set(names)))
 
     def test_orders_are_for_operators(self) -> None:
-        """Changes require an operator, except for signing in and phones; reads require a viewer."""
+        """Changes require the role operator, except signing in and phones; reads require the role viewer."""
         for each in TABLE:
             if each.method != "GET" and each.role != "operator":
                 self.assertTrue(each.role == "phone" or each.path in FOR_ALL, each.name)
@@ -137,4 +137,4 @@ class TableTests(SynchronousTestCase):
 
 
 FOR_ALL = ("/api/v1/node", "/api/v1/session", "/api/v1/tasks/preview", "/api/v1/ca.crt", "/static/{file}", "/sw.js")
-"""What is no secret, and what a user needs before signing in."""
+"""The routes that are public: they reveal no secret, or are needed before signing in."""

@@ -31,7 +31,7 @@ class SanitizeTests(SynchronousTestCase):
         self.assertIsNone(clean_distance(-1.0))
 
     def test_clean_text(self) -> None:
-        """Control characters become spaces, and text is cut at its limit."""
+        """Control characters become spaces, and text is truncated at its limit."""
         self.assertEqual(clean_text("a\x00\x1b[31mb"), "a  [31mb")
         self.assertEqual(clean_text("x" * 500, limit=10), "x" * 10)
         self.assertEqual(clean_text("\x07", "nothing"), "nothing")
@@ -45,7 +45,7 @@ class SanitizeTests(SynchronousTestCase):
         )
     )
     def test_survive_anything(self, value: object) -> None:
-        """Any value of a record is converted to valid JSON in UTF-8."""
+        """Any value in a record is converted to valid JSON in UTF-8."""
         outcome = [
             clean_text(value),
             clean_number(value),

@@ -45,7 +45,7 @@ NATIVE: dict[str, Resource] = {"/stream": Stream()}
 
 class ReadStaticTests(SynchronousTestCase):
     def test_send_no_comments(self) -> None:
-        """Scripts are sent without full-line comments, with unchanged line numbers and strings."""
+        """Scripts are sent without full-line comments; line numbers and strings are unchanged."""
         script = Path(self.mktemp()).with_suffix(".js")
         script.write_text("// About it.\nconst a = 1; // one\n  // More.\nexport const URL = `http://a`;\n")
         self.assertEqual(read_static(script), b"\nconst a = 1; // one\n\nexport const URL = `http://a`;\n")
@@ -67,14 +67,14 @@ class RootTests(SynchronousTestCase):
         self.assertIn(b"flask  0", self.asked("/"))
 
     def test_tell_all_files(self) -> None:
-        """A browser that stores the page gets the list of its files, and each file exists."""
+        """A browser that stores the page receives the list of its files, and each file exists."""
         paths = json.loads(self.asked("/static/files.json").partition(b"\r\n\r\n")[2])
         self.assertLess({"/static/page.js", "/static/sw.js", "/static/base.css", "/static/texts/en.js"}, set(paths))
         for path in paths:
             self.assertIn(b" 200 ", self.asked(path)[:15], path)
 
     def test_refuse_in_json(self) -> None:
-        """Errors of native routes are JSON with the strict headers and without the server's version."""
+        """Errors of native routes are JSON with the strict headers, and do not contain the server's version."""
         self.site = site_of(
             Root(PathResource(), {**NATIVE, "/static": StaticFiles()}, self.services, lambda: 1e9), Clock()
         )
@@ -103,7 +103,7 @@ class RootTests(SynchronousTestCase):
                 self.assertIn(b"Allow: GET", data)
 
     def test_ask_for_the_role(self) -> None:
-        """A native route checks its role by header or ticket, and does not repeat an invalid ticket."""
+        """A native route checks the role by header or ticket; its error does not contain an invalid ticket."""
         self.services.sessions = Guests()
         self.assertIn(b" 401 ", self.asked("/events"))
         self.assertIn(b" 401 ", self.asked("/events?ticket=nonsense"))
@@ -114,7 +114,7 @@ class RootTests(SynchronousTestCase):
         self.assertIn(b" 200 ", self.asked("/static/page.js"))
 
     def test_find_deep_routes(self) -> None:
-        """A native route can be below the API: its whole path must match, and its role is checked."""
+        """A native route can be below the API: its whole path must match, and the role is checked."""
         native: dict[str, Resource] = {"/api/v1/phones/{uuid}/look": Data(b"seen", "text/plain")}
         self.site = site_of(Root(PathResource(), native, self.services, lambda: 1e9), Clock())
         self.assertIn(b"seen", self.asked("/api/v1/phones/01/look"))
@@ -124,7 +124,7 @@ class RootTests(SynchronousTestCase):
         self.assertIn(b" 403 ", self.asked("/api/v1/phones/01/look?ticket=viewer"))
 
     def test_share_with_the_team(self) -> None:
-        """A page of another web node of the team may send requests, also with a preflight; other origins may not."""
+        """A page of another web node of the team may send requests, also after a preflight; other origins may not."""
         self.services.fallbacks = Fallbacks(Page("02", "http://other:8080"))
         for method in ("GET", "OPTIONS"):
             data = self.asked("/events", method, Origin="http://other:8080")
@@ -133,7 +133,7 @@ class RootTests(SynchronousTestCase):
         self.assertIn(b" 403 ", self.asked("/events", "OPTIONS", Origin="http://evil:8080"))
 
     def test_pack_files(self) -> None:
-        """A file is compressed if the client accepts gzip, and each variant has its own ETag."""
+        """A file is compressed if the client accepts gzip; each variant has its own ETag."""
         plain = self.asked("/static/page.js")
         packed = self.asked("/static/page.js", Accept_Encoding="br, gzip;q=0.8")
         self.assertIn(b"Content-Encoding: gzip", packed)
@@ -144,7 +144,7 @@ class RootTests(SynchronousTestCase):
             self.assertNotIn(b"Content-Encoding", self.asked("/static/page.js", Accept_Encoding=refused))
 
     def test_serve_files(self) -> None:
-        """A file is revalidated by ETag at each visit; a missing file is not found."""
+        """A file is revalidated by ETag at each visit; a missing file gives status 404."""
         data = self.asked("/static/page.js")
         self.assertIn(b"text/javascript", data)
         self.assertIn(b"Cache-Control: no-cache", data)
@@ -162,7 +162,7 @@ class RootTests(SynchronousTestCase):
         self.assertIn(b"flask api/x %d" % MAX_BODY, Connection(self.site).send(head + body).taken())
 
     def test_cut_large_bodies(self) -> None:
-        """A too large body is rejected by its announced length, or as soon as it exceeds the limit."""
+        """A too large body is rejected because of its declared length, or as soon as it exceeds the limit."""
         announced = Connection(self.site).send(b"POST /api/x HTTP/1.1\r\nHost: vaio\r\nContent-Length: 65537\r\n\r\n")
         growing = Connection(self.site).send(
             b"POST /api/x HTTP/1.1\r\nHost: vaio\r\nTransfer-Encoding: chunked\r\n\r\n"
@@ -184,7 +184,7 @@ class QuickReactor:
 
 class CallerTests(SynchronousTestCase):
     def test_bring_the_answer(self) -> None:
-        """The caller returns the call's result, also from a Deferred, and raises its refusals."""
+        """The caller receives the result of the call, also from a Deferred, and raises its refusals."""
 
         def refuse() -> None:
             raise Refusal("name", "no", "ask another", 404)
@@ -195,7 +195,7 @@ class CallerTests(SynchronousTestCase):
         self.assertEqual(self.assertRaises(Refusal, on_reactor, refuse).status, 404)
 
     def test_wait_no_longer_than_the_limit(self) -> None:
-        """A call that does not answer is given up after the limit, with 503."""
+        """If a call does not return within the limit, the response is 503."""
         never: Deferred[None] = Deferred()
         for usual_s, given in ((0.0, {}), (1e6, {"limit_s": 0.0})):
             error = self.assertRaises(Refusal, make_caller(QuickReactor(), usual_s), lambda: never, **given)

@@ -11,7 +11,7 @@ from webnode.services import Services
 
 class ServicesTests(SynchronousTestCase):
     def test_let_everybody_in(self) -> None:
-        """Open sessions give every user the role of operator, with or without a token."""
+        """Open sessions give every user the role operator, with or without a token."""
         sessions = OpenSessions()
         token = self.successResultOf(sessions.sign_in("whatever", "10.0.0.9", 5.0))
         sessions.revoke(sessions.authenticate(token.text, 6.0).token_id)
@@ -19,7 +19,7 @@ class ServicesTests(SynchronousTestCase):
         self.assertGreater(token.until, 5.0)
 
     def test_say_what_it_has(self) -> None:
-        """``feature_names`` lists only the optional parts that the node has; the map counts if it exists."""
+        """``feature_names`` lists only optional parts that the node has; the map is listed if it exists."""
         self.assertEqual(Services(MemoryTeamControl(), OpenSessions()).feature_names, [])
         control = MemoryTeamControl(robot_map={"walls": [3.0, 2.4], "dogs": [], "target": None})
         self.assertEqual(Services(control, OpenSessions()).feature_names, ["yard"])

@@ -32,7 +32,7 @@ KEYS = {name: TokenKey(Identity(name.encode().ljust(32))) for name in ("vaio", "
 
 
 def uuid(name: str) -> str:
-    """Return the id of a node as the page shows it."""
+    """Return the id of a node as used by the page."""
     return KEYS[name].node_id.hex()
 
 
@@ -55,7 +55,10 @@ class SignedSessionsTests(SynchronousTestCase):
         return refusal
 
     def test_sign_in_by_the_code(self) -> None:
-        """The code, in any notation, signs in an operator for twelve hours; its ticket a viewer for the same time."""
+        """The code, in any notation, signs in an operator for twelve hours.
+
+        The ticket signs in a viewer for the same time.
+        """
         for words in ("quiet-otter", " Quiet Otter ", "QUIETOTTER"):
             token = self.signed(words)
             self.assertEqual((token.role, token.until), ("operator", SESSION_S))
@@ -67,7 +70,10 @@ class SignedSessionsTests(SynchronousTestCase):
             self.assertEqual(self.sessions.authenticate(text, SESSION_S), User())
 
     def test_go_on_at_another_web_node(self) -> None:
-        """A pass is valid for minutes at the web node that it names; a renewal there continues the session."""
+        """A peer token is valid for minutes, only at one web node.
+
+        If it is renewed there, the session continues there.
+        """
         pi, nuc = self.node("pi"), self.node("nuc")
         token = self.signed()
         self.assertEqual(pi.authenticate(token.text, 1.0), User())
@@ -89,7 +95,10 @@ class SignedSessionsTests(SynchronousTestCase):
         self.assertEqual(refusal.status, 401)
 
     def test_believe_gateways_alone(self) -> None:
-        """A session is invalid while one of its vouchers is no gateway, and only gateways allow signing in."""
+        """A session is invalid while one of its vouching nodes is not a gateway.
+
+        Only gateways allow signing in.
+        """
         pi, token = self.node("pi"), self.signed()
         given = self.sessions.issue_peer_tokens(self.sessions.authenticate(token.text, 1.0), [uuid("pi")], 1.0)[
             uuid("pi")
@@ -107,7 +116,7 @@ class SignedSessionsTests(SynchronousTestCase):
         self.assertEqual(self.sessions.authenticate(token.text, 3.0).role, "operator")
 
     def test_end_what_was_made_of_it(self) -> None:
-        """Revoking an invitation ends its sessions, and revoking a session ends its derived tickets."""
+        """Revoking an invitation ends its sessions; revoking a session ends the tickets derived from it."""
         user = self.sessions.authenticate(self.signed().text, 1.0)
         invitation = self.sessions.issue_guest_token(user, "guest", "phone", 1.0, 600.0)
         guest = self.sessions.authenticate(self.signed(invitation.text, 2.0).text, 2.0)
@@ -118,7 +127,7 @@ class SignedSessionsTests(SynchronousTestCase):
         self.assertEqual(self.refused(invitation.text, 3.0).status, 401)
 
     def test_refuse_what_is_not_the_code(self) -> None:
-        """A wrong code is rejected with 401 and a hint to ``swarm web``; a user without a token is anonymous."""
+        """A wrong code gives status 401 with a hint to ``swarm web``; a user without a token is anonymous."""
         for words in ("", "quiet", "quiet-otter1", "\N{DOG FACE}", "A" * 60):
             refusal = self.refused(words)
             self.assertEqual((refusal.status, refusal.field), (401, "code"))
@@ -126,7 +135,7 @@ class SignedSessionsTests(SynchronousTestCase):
         self.assertEqual(self.sessions.authenticate("", 0.0), User())
 
     def test_slow_guesses_down(self) -> None:
-        """After ten guesses a source must wait even with the correct code; other sources sign in at once."""
+        """After ten wrong codes a source must wait, even with the right code; other sources sign in immediately."""
         told = [self.refused(f"guess {n}").status for n in range(1000)]
         self.assertEqual((told.count(401), told.count(429)), (10, 990))
         self.assertIn("wait 4 s", self.refused("quiet-otter").remedy)
@@ -135,14 +144,14 @@ class SignedSessionsTests(SynchronousTestCase):
         self.assertEqual(self.refused("wrong", 4.0).status, 401)
 
     def test_sign_in_by_the_password(self) -> None:
-        """If a password is set, both password and code sign in, and a wrong password does not."""
+        """If a password is set, both password and code sign in; a wrong password does not."""
         self.sessions = self.node(password=HASH)
         self.assertEqual(self.signed("correct horse").role, "operator")
         self.assertEqual(self.signed().role, "operator")
         self.assertEqual(self.refused("correct hors").status, 401)
 
     def test_check_two_passwords_at_once(self) -> None:
-        """Two passwords are checked at once, some wait, the others get 503; each counts as a guess."""
+        """Two passwords are checked at a time, some wait, and the rest get status 503; each counts as an attempt."""
         asked: list[Deferred[bool]] = []
 
         def check(text: str, word: str) -> Deferred[bool]:
@@ -164,7 +173,7 @@ class SignedSessionsTests(SynchronousTestCase):
             each.addErrback(lambda _: None)
 
     def test_invite(self) -> None:
-        """An invitation signs in with its role and until its end; its ticket and an expired one do not."""
+        """An invitation signs in with its role until its end; its ticket does not, nor does an expired invitation."""
         invitation = self.sessions.issue_guest_token(OPERATOR, "guest", "viewer", 0.0, 100.0)
         token = self.signed(invitation.text, 10.0)
         self.assertEqual((token.role, token.until), ("viewer", 100.0))
@@ -176,7 +185,7 @@ class SignedSessionsTests(SynchronousTestCase):
         self.assertEqual(self.signed(long.text, 1.0).until, SESSION_S + 1.0)
 
     def test_renew(self) -> None:
-        """A valid token can be renewed up to thirty days after signing in, within the same session."""
+        """A valid token can be renewed within the same session, until thirty days after signing in."""
         token, now = self.signed(), 0.0
         while token.until < MAX_SESSION_S:
             now = token.until - 1.0
@@ -189,7 +198,7 @@ class SignedSessionsTests(SynchronousTestCase):
         self.assertEqual(self.sessions.authenticate(token.text, now), User())
 
     def test_renew_no_further_than_invited(self) -> None:
-        """A guest cannot renew beyond the invitation; a ticket and an unknown user cannot renew."""
+        """A guest cannot renew a token beyond the invitation; with a ticket, or as an unknown user, renewing fails."""
         invitation = self.sessions.issue_guest_token(OPERATOR, "guest", "viewer", 0.0, SESSION_S + 10.0)
         token = self.signed(invitation.text, 1.0)
         self.assertEqual(token.until, SESSION_S + 1.0)
@@ -209,20 +218,20 @@ OPERATOR = User("operator", "operator")
 
 class FactoryTests(SynchronousTestCase):
     def made(self, **web: object) -> Any:
-        """Return the sessions of a gateway with these settings."""
+        """Return the sessions of a gateway for these settings."""
         settings = Settings.from_mapping({"node": {"name": "vaio", "team_key": "x" * 20}, "web": web}, "vaio.toml")
         entangled = SimpleNamespace(watch=lambda *what, **how: None, identity=Identity(bytes(32)))
         node, team = SimpleNamespace(entangled=entangled), SimpleNamespace(can_authenticate=lambda public: True)
         return make_sessions(settings, cast(Any, node), None, random.Random(1), cast(Any, team))
 
     def test_have_the_code_of_the_settings(self) -> None:
-        """The code comes from the settings; otherwise a random code without ambiguous letters is used."""
+        """The code is that in the settings, or else a random code without ambiguous letters."""
         self.assertEqual(self.made(code="quiet-otter").code, "quiet-otter")
         self.assertRegex(self.made().code, r"^[a-hj-km-np-z]{4}-[a-hj-km-np-z]{4}$")
         self.assertNotEqual(draw_code(random.Random(1)), draw_code(random.Random(2)))
 
     def test_do_without_on_this_machine_alone(self) -> None:
-        """A page without sign-in is allowed on the loopback address only; otherwise the setting is rejected."""
+        """A page without sign-in is permitted only on the loopback address; otherwise the setting is rejected."""
         self.assertIsInstance(self.made(sign_in=False), OpenSessions)
         self.assertIsInstance(self.made(sign_in=False, host="::1"), OpenSessions)
         for host in ("0.0.0.0", "192.168.0.2", "::"):
@@ -230,7 +239,7 @@ class FactoryTests(SynchronousTestCase):
             self.assertIn("vaio.toml: [web] sign_in", str(error))
 
     def test_refuse_a_password_that_is_no_hash(self) -> None:
-        """A plain-text password in the settings is rejected without showing it."""
+        """A plain-text password in the settings is rejected; the error does not contain the password."""
         error = self.assertRaises(BadSetting, self.made, password="correct horse")
         self.assertIn("swarm password", str(error))
         self.assertNotIn("horse", str(error))

@@ -41,7 +41,10 @@ class SessionRouteTests(SynchronousTestCase):
         return {"Authorization": f"Bearer {token}"}
 
     def test_sign_in_and_out(self) -> None:
-        """Code and password sign in; the token allows changes, the ticket reads, and neither after signing out."""
+        """Code and password sign in.
+
+        The token permits changes, the ticket reads; after signing out neither is valid.
+        """
         for body in ({"code": "quiet-otter"}, {"password": "correct horse"}):
             told = self.signed(**body)
             self.assertEqual((told["role"], told["until"]), ("operator", 1000.0 + 12 * 3600))
@@ -56,7 +59,7 @@ class SessionRouteTests(SynchronousTestCase):
             self.assertEqual(self.client.get(f"/api/v1/state?{ticket}").status_code, 401)
 
     def test_renew(self) -> None:
-        """A token renews its session, and signing out with the old token ends the renewed one as well."""
+        """A token renews its session; signing out with the old token also ends the renewed session."""
         told = self.signed(code="quiet-otter")
         bearer = {**self.bearer(told["token"]), "X-Swarm": "1"}
         anew = self.client.put("/api/v1/session", headers=bearer)
@@ -68,7 +71,10 @@ class SessionRouteTests(SynchronousTestCase):
         self.assertEqual(self.client.get("/api/v1/session", headers=headers).get_json()["role"], "anyone")
 
     def test_go_on_elsewhere(self) -> None:
-        """A session gets a pass for each other web node by its uuid, none for this node; a ticket gets none."""
+        """A session receives a token for each other web node by uuid, but none for this node.
+
+        A ticket receives none.
+        """
         told = self.signed(code="quiet-otter")
         other = "ab" * 20
         self.services.fallbacks = Fallbacks(Page("here", "http://10.0.0.7:80", is_self=True), Page(other, "http://x"))
@@ -81,7 +87,7 @@ class SessionRouteTests(SynchronousTestCase):
             self.assertEqual(self.client.get("/api/v1/session/passes", headers=headers).status_code, 401)
 
     def test_refuse_bad_words(self) -> None:
-        """No proof, two proofs and a wrong one are rejected, and the proof is in no answer and no audit line."""
+        """No proof, two proofs and a wrong proof are rejected; no response and no audit line contains the proof."""
         for body, status in (
             ({}, 400),
             ({"code": "quiet-otter", "password": "correct horse"}, 400),
@@ -97,14 +103,14 @@ class SessionRouteTests(SynchronousTestCase):
         self.assertIn("401", str(self.audit.list_newest(100)))
 
     def test_answer_each_user_for_itself(self) -> None:
-        """Two users with the same idempotency key get separate answers."""
+        """Two users with the same idempotency key get separate responses."""
         key = {"Idempotency-Key": "1"}
         first = self.client.post("/api/v1/session", json={"code": "quiet-otter"}, headers=key)
         second = self.client.post("/api/v1/session", json={"code": "a wrong one"}, headers=key)
         self.assertEqual((first.status_code, second.status_code), (200, 401))
 
     def test_invite(self) -> None:
-        """An operator's invitation signs in a viewer, which cannot invite others, until its end."""
+        """An operator's invitation signs in a viewer, which cannot invite users itself, until the invitation ends."""
         bearer = self.bearer(self.signed(code="quiet-otter")["token"])
         body = {"role": "viewer", "name": "Ada", "seconds": 60}
         invited = self.client.post("/api/v1/invitations", json=body, headers=bearer).get_json()
@@ -119,7 +125,7 @@ class SessionRouteTests(SynchronousTestCase):
             self.assertEqual(self.client.post("/api/v1/invitations", json=wrong, headers=bearer).status_code, 400)
 
     def test_invite_by_a_link(self) -> None:
-        """An invitation has a link to the best page; the link for a phone opens the phone view."""
+        """An invitation has a link to the best page; the link for a phone opens the phone's view."""
         bearer = self.bearer(self.signed(code="quiet-otter")["token"])
         self.services.invites = MemoryInvites("https://10.0.0.7:8443", "http://10.0.0.7:8080", "http://127.0.0.1:8080")
 
@@ -142,7 +148,10 @@ class SessionRouteTests(SynchronousTestCase):
         self.assertIn("http://10.0.0.7:8080", refused["error"]["remedy"])
 
     def test_give_the_authority(self) -> None:
-        """The authority's certificate is public, and its link uses plain HTTP; a missing one is answered with 404."""
+        """The authority's certificate is public, and its link uses plain HTTP.
+
+        A missing certificate gives status 404.
+        """
         missing = self.client.get("/api/v1/ca.crt")
         self.assertEqual((missing.status_code, missing.get_json()["error"]["field"]), (404, "certificate"))
         pages = ("https://10.0.0.7:8443", "http://10.0.0.7:8080")

@@ -1,4 +1,4 @@
-"""Tests of ``webnode.routes.settings`` and ``config.tuning``: settings of running devices."""
+"""Tests of ``webnode.routes.settings`` and ``config.tuning``: the settings of running devices."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ class TunerTests(SynchronousTestCase):
         return {str(row["key"]): row["value"] for row in self.successResultOf(asked)}
 
     def change(self, **changes: Any) -> dict[str, Any]:
-        """Change settings of dog1 and return the settings that it reports."""
+        """Change settings of dog1; return the settings that dog1 reports."""
         asked = change_settings(self.team.control, self.node.uuid, changes)
         self.team.clock.advance(0.1)
         return {str(row["key"]): row["value"] for row in self.successResultOf(asked)}
@@ -43,11 +43,11 @@ class TunerTests(SynchronousTestCase):
         return refusal
 
     def row(self) -> dict[str, Any]:
-        """Return dog1 as the page shows it."""
+        """Return the row of dog1 on the page."""
         return next(dict(row) for row in self.team.state()["devices"] if row["name"] == "dog1")
 
     def test_tell_what_can_be_changed(self) -> None:
-        """A robot with a camera has four settings, a laptop three, each with bounds and unit."""
+        """A robot with a camera has four settings and a laptop three, each with bounds and a unit."""
         self.assertEqual(list(self.told()), KEYS)
         self.assertEqual(list(self.told("vaio")), KEYS[:3])
         asked = read_settings(self.team.control, self.node.uuid)
@@ -56,7 +56,7 @@ class TunerTests(SynchronousTestCase):
         self.assertEqual([lease[key] for key in ("value", "unit", "least", "most")], [1.0, "s", 0.1, 60.0])
 
     def test_change_what_others_see(self) -> None:
-        """The whole team sees a changed description and a changed capability."""
+        """A changed description, and a changed capability, are visible to the whole team."""
         told = self.change(description="lame", capabilities={"gripper": {"width": 0.1}})
         self.assertEqual((told["description"], told["capabilities"]), ("lame", {"gripper": {"width": 0.1}}))
         self.team.clock.advance(1.0)
@@ -68,7 +68,7 @@ class TunerTests(SynchronousTestCase):
         self.assertNotIn("gripper", self.row()["capabilities"])
 
     def test_lease_says_how_soon_a_loss_is_seen(self) -> None:
-        """A lease of 4 s delays the loss of a dead device to 3 to 5 s; a short lease to less than one."""
+        """With a lease of 4 s the loss of a failed device is noticed after 3 to 5 s, with a short lease within 1 s."""
         for lease, earliest, latest in ((4.0, 2.6, 5.0), (0.4, 0.2, 1.0)):
             self.change(presence_lease=lease)
             self.team.clock.advance(6.0)
@@ -84,7 +84,7 @@ class TunerTests(SynchronousTestCase):
             self.node = self.team.services["dog1"].assembly.node
 
     def test_camera_takes_as_many_pictures(self) -> None:
-        """The camera follows its frame rate, also 0, and the driver stays ready."""
+        """The camera uses its new frame rate, even 0, and the driver stays ready."""
         driver: Any = self.team.services["dog1"].assembly.driver
         for fps in (2.0, 0.0, 10.0):
             self.assertEqual(self.change(camera_fps=fps)["camera_fps"], fps)
@@ -95,7 +95,7 @@ class TunerTests(SynchronousTestCase):
             self.assertEqual(driver.state, "ready")
 
     def test_refuse_what_is_wrong(self) -> None:
-        """Each invalid value is rejected by the device with key, problem and remedy; nothing is changed."""
+        """The device rejects each invalid value with key, problem and remedy, and changes nothing."""
         before = self.told()
         wrong: list[tuple[str, Any]] = [
             ("presence_lease", 0.01),
@@ -115,14 +115,14 @@ class TunerTests(SynchronousTestCase):
         self.assertEqual(self.told(), before)
 
     def test_device_that_is_gone_is_told(self) -> None:
-        """The settings of a device that has just died are answered with 409."""
+        """Reading the settings of a device that has just failed gives status 409."""
         self.team.kill("dog1")
         asked = read_settings(self.team.control, self.node.uuid)
         self.team.clock.advance(2.0)
         self.assertEqual(self.failureResultOf(asked, Refusal).value.status, 409)
 
     def test_kept_for_the_next_life(self) -> None:
-        """Changed settings survive a restart from the store, and an invalid stored value is ignored."""
+        """Changed settings are stored and survive a restart; an invalid stored value is ignored."""
         self.change(description="lame", presence_lease=2.5)
         service = self.team.services["dog1"]
         seams = replace(service._dependencies, rng=random.Random(1))

@@ -25,7 +25,7 @@ def member(number: int, cost: float | None, assigned: int | None) -> dict[str, A
 
 class StateTests(SynchronousTestCase):
     def test_order_by_joining(self) -> None:
-        """Devices are listed in the order of joining, for any order of the records."""
+        """Devices are listed in the order of joining, whatever the order of the records."""
         records = [device(1, joined=3), device(2, joined=1), device(3, joined=2), device(4, joined=2)]
         rng = random.Random(1)
         for _ in range(6):
@@ -34,13 +34,13 @@ class StateTests(SynchronousTestCase):
             self.assertEqual(names, ["dog2", "dog3", "dog4", "dog1"])
 
     def test_name_objective(self) -> None:
-        """A device's objective is the title of its task, or the id of an unknown task."""
+        """A device's objective is the title of its task, or the task's id if the task is unknown."""
         tasks = [{"id": "t1", "title": "Find it", "created": 5}]
         views = format_state([device(1, task="t1"), device(2, task="t9"), device(3)], tasks, {})["devices"]
         self.assertEqual([view["objective"] for view in views], ["Find it", "t9", ""])
 
     def test_tell_where_devices_are(self) -> None:
-        """A position is in metres on the map or in degrees on the globe; other values give no position."""
+        """A position is in metres on the map or in degrees on the globe; any other value gives no position."""
         for said, told in (
             ({"x": 1, "y": -2.5, "heading": 0.5}, {"x": 1.0, "y": -2.5, "heading": 0.5}),
             ({"x": 1, "y": 2}, {"x": 1.0, "y": 2.0, "heading": None}),
@@ -53,7 +53,7 @@ class StateTests(SynchronousTestCase):
             self.assertEqual(view["position"], told, said)
 
     def test_list_newest_task_first(self) -> None:
-        """Tasks are listed newest first, and a result keeps the finishing device and the duration."""
+        """Tasks are listed newest first; a result contains the finishing device and the duration."""
         result = {"by": "dog2", "took": 41.5}
         tasks = [{"id": "a", "created": 1, "result": result, "status": "COMPLETED"}, {"id": "b", "created": 2}]
         views = format_state([], tasks, {})["tasks"]
@@ -62,7 +62,7 @@ class StateTests(SynchronousTestCase):
         self.assertEqual([view["status"] for view in views], ["UNKNOWN", "COMPLETED"])
 
     def test_survive_unlawful_records(self) -> None:
-        """Invalid records do not break the view and do not reach the page."""
+        """Invalid records do not break the view, and do not reach the page."""
         bad: dict[str, Any] = {
             "uuid": "ab",
             "name": 7,
@@ -85,14 +85,14 @@ class StateTests(SynchronousTestCase):
 
 class GroupTests(SynchronousTestCase):
     def test_agree(self) -> None:
-        """If all members name the same agent, it is the assigned agent, and the costs share one scale."""
+        """If all members choose the same agent, that agent is the assigned agent, and the costs share one scale."""
         view = make_group_view("t", "T", [member(3, 2.0, 2), member(1, 1.0, 2), member(2, 0.5, 2)])
         self.assertEqual((view["assigned"], view["agree"], view["of"]), ("dog2", 3, 3))
         self.assertEqual([each["share"] for each in view["members"]], [0.5, 0.25, 1.0])
         self.assertEqual((view["differ"], view["undecided"]), ([], []))
 
     def test_differ(self) -> None:
-        """Members with another choice and undecided members are listed by name; no cost means no share."""
+        """Members with a different choice, and undecided members, are listed; a member without a cost has no share."""
         view = make_group_view(
             "t", "T", [member(1, 1.0, 1), member(2, 0.5, 2), member(3, 0.7, 2), member(4, None, None)]
         )
@@ -101,13 +101,13 @@ class GroupTests(SynchronousTestCase):
         self.assertIsNone(view["members"][3]["share"])
 
     def test_decide_even_votes(self) -> None:
-        """Equal votes give the lowest uuid, in any order of the members."""
+        """If the votes are equal, the lowest uuid is assigned, whatever the order of the members."""
         members = [member(1, 1.0, 2), member(2, 1.0, 1)]
         self.assertEqual(make_group_view("t", "T", members)["assigned"], "dog1")
         self.assertEqual(make_group_view("t", "T", members[::-1])["assigned"], "dog1")
 
     def test_be_undecided(self) -> None:
-        """A group without a named winner has no assigned agent, and zero costs cause no division by zero."""
+        """If no member has chosen an agent, no agent is assigned; zero costs cause no division by zero."""
         view = make_group_view("t", "T", [member(1, 0.0, None)])
         self.assertEqual((view["assigned"], view["agree"]), ("", 0))
         self.assertEqual(view["members"][0]["share"], 0.0)
@@ -115,7 +115,7 @@ class GroupTests(SynchronousTestCase):
 
 class WhyTests(SynchronousTestCase):
     def test_rows_of_a_decision(self) -> None:
-        """A decision has a row for each reporting, silent or differing device, with a note."""
+        """A decision has a row with a note for each reporting, silent or differing device."""
         reports = [RecordedReport("02" * 20, "dog2", 0.5), RecordedReport("01" * 20, "dog1", 1.5)]
         differ = (Difference("dog1", "names dog1"), Difference("dog4", "names dog1"))
         head = (2, "02" * 20, "dog2", ("dog2", "dog3"), 4, differ, "nearest", "1", "nobody acted before")
@@ -139,7 +139,7 @@ class WhyTests(SynchronousTestCase):
 
 class DepartedDevicesTests(SynchronousTestCase):
     def test_remember_for_a_minute(self) -> None:
-        """A device that left is listed as gone at its place for sixty seconds."""
+        """A device that left is listed as gone, at its position in the list, for sixty seconds."""
         departed = DepartedDevices()
         both = [device(1), device(2, status="EXECUTING")]
         departed.update(both, 100.0)
@@ -149,7 +149,7 @@ class DepartedDevicesTests(SynchronousTestCase):
         self.assertEqual(departed.update(both[1:], 161.0), [])
 
     def test_forget_when_back(self) -> None:
-        """A device that returns is present at once, and its next loss has a new time."""
+        """A device that returns is present immediately; if it is lost again, the time of loss is new."""
         departed = DepartedDevices()
         departed.update([device(1)], 1.0)
         self.assertEqual(len(departed.update([], 2.0)), 1)

@@ -1,4 +1,4 @@
-"""Tests of ``webnode.state_builder``; tests of whole teams check its states."""
+"""Tests of ``webnode.state_builder``; the tests of whole teams check the states that it builds."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from webnode.state_builder import MAX_AGE_S, StateCache, _make_stop_view
 
 class StateCacheTests(SynchronousTestCase):
     def test_read_once_for_many(self) -> None:
-        """Reads within a tenth of a second share one state; a later read makes a new one."""
+        """Reads within a tenth of a second share one state; a later read builds a new state."""
         clock, read = Clock(), [0]
 
         def state() -> dict[str, Any]:
@@ -29,7 +29,7 @@ class StateCacheTests(SynchronousTestCase):
 
 class StopViewTests(SynchronousTestCase):
     def test_more_stops_than_a_robot_reports(self) -> None:
-        """A robot that reports as many stops as its record can hold stands still, also if more stops are in force."""
+        """A robot that reports as many stops as fit into its record is shown as stopped, even if more are in force."""
         stops = {f"{number:032x}": "ann" for number in range(MAX_STOPS + 1)}
         for count, is_halted in ((MAX_STOPS, True), (MAX_STOPS - 1, False)):
             robot = {"name": "dog1", "capabilities": {"base2d": {}}, "status": "IDLE", "obeys": STANDS_STILL}

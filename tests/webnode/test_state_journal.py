@@ -16,7 +16,7 @@ def state(**devices: Any) -> dict[str, Any]:
 
 
 def applied(known: dict[str, Any], content: Any) -> dict[str, Any]:
-    """Return the state of a page after a change, with each list as a table."""
+    """Return the state of a page after a change; each list becomes a table."""
     now = {name: dict(value) if name in KEYS else value for name, value in known.items()}
     for name, value in content.items():
         if name in KEYS:
@@ -39,7 +39,7 @@ class JournalTests(SynchronousTestCase):
         return None if change is None else change.content
 
     def test_tell_what_differs(self) -> None:
-        """A change contains new or different rows, removed rows, and nothing else."""
+        """A change contains only new or different rows, and removed rows."""
         self.taken(state(a="IDLE", b="IDLE"))
         self.assertEqual(self.taken(state(a="DONE", b="IDLE")), {"devices": [{"uuid": "a", "status": "DONE"}]})
         self.assertEqual(self.taken(state(a="DONE")), {"devices": [], "without": {"devices": ["b"]}})
@@ -47,14 +47,14 @@ class JournalTests(SynchronousTestCase):
         self.assertIsNone(self.taken({**state(a="DONE"), "halted": True}))
 
     def test_resume(self) -> None:
-        """A page that sends its last id gets the later changes in order."""
+        """A page that sends its last id receives the later changes in order."""
         self.taken(state(a="IDLE"), state(a="DONE"), state(b="DONE"))
         missed = self.journal.list_since(self.journal.parse_event_id("ab-1"))
         self.assertEqual([change.n for change in missed or []], [2, 3])
         self.assertEqual(self.journal.list_since(self.journal.parse_event_id(self.journal.make_event_id(3))), [])
 
     def test_tell_all_after_a_gap(self) -> None:
-        """An id that is too old, from another node or start, in the future or invalid requires the whole state."""
+        """If an id is too old, in the future, invalid, or from another node or run, the whole state is sent."""
         for n in range(MAX_CHANGES + 3):
             self.taken(state(a=n))
         for name in ("ab-1", "ab-2", "ac-60", "ab-999", "ab-", "ab-x", "ab--1", "", "ab-" + "9" * 40, "ab-²"):
@@ -62,14 +62,14 @@ class JournalTests(SynchronousTestCase):
         self.assertEqual(len(self.journal.list_since(self.journal.parse_event_id("ab-3")) or []), MAX_CHANGES)
 
     def test_take_nothing_that_json_cannot_carry(self) -> None:
-        """A state that is not valid JSON is rejected, and the next change refers to the last valid state."""
+        """A state that is not valid JSON is rejected; the next change is relative to the last valid state."""
         self.taken(state(a="IDLE"))
         self.assertRaises(ValueError, self.journal.add_state, state(a=float("nan")))
         self.assertRaises(ValueError, self.journal.add_state, {**state(a="IDLE"), "halted": float("nan")})
         self.assertEqual((self.journal.n, self.taken(state(a="IDLE"))), (1, None))
 
     def test_end_where_the_state_is(self) -> None:
-        """Any kept state and its later changes result in the newest state."""
+        """Any kept state plus its later changes gives the newest state."""
         dice = random.Random(5)
         known = []
         for _ in range(200):

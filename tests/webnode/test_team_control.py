@@ -1,4 +1,4 @@
-"""Tests of ``webnode.team_control``: the answers of devices to requests, in a small team in memory."""
+"""Tests of ``webnode.team_control``: the replies of devices to requests, in a small team in memory."""
 
 from __future__ import annotations
 
@@ -28,14 +28,14 @@ class TeamControlTests(SynchronousTestCase):
         return str(self.team.services[name].assembly.node.uuid)
 
     def refusal(self, asked: Deferred[Any], seconds: float = ANSWER_LIMIT_S + 0.2) -> Refusal:
-        """Return the error of a request."""
+        """Return the error of a failed request."""
         self.team.clock.advance(seconds)
         refusal = self.failureResultOf(asked, Refusal).value
         assert isinstance(refusal, Refusal)
         return refusal
 
     def test_say_who_has_a_message(self) -> None:
-        """A message to all returns its recipients, and the reason for each device without it."""
+        """A message to all devices returns its recipients, and for each other device the reason."""
         told = self.control.send_message("", "sit")
         self.team.clock.advance(0.1)
         self.assertEqual(self.successResultOf(told), {"delivered": ["dog1", "dog2", "vaio"], "failed": {}})
@@ -47,7 +47,7 @@ class TeamControlTests(SynchronousTestCase):
         self.assertEqual(list(answer["failed"]), ["dog2"])
 
     def test_device_that_vanishes_is_told(self) -> None:
-        """A device that dies during a request is reported within the patience of the page."""
+        """If a device fails during a request, the error reaches the page within the page's time limit."""
         orders: list[tuple[Any, Any]] = [(self.control.send_message, "sit"), (self.control.disconnect, 5.0)]
         for order, what in orders:
             uuid = self.uuid("dog2")
@@ -59,21 +59,21 @@ class TeamControlTests(SynchronousTestCase):
             self.team.clock.advance(3.0)
 
     def test_device_that_is_silent_is_told(self) -> None:
-        """A device that is present but does not answer is reported with 504."""
+        """A device that is present but does not reply gives status 504."""
         presence = self.team.services["dog2"].assembly.node
         presence.entangled.endpoint.expose("device.message", lambda peer, text: Deferred(), changes=True)
         refusal = self.refusal(self.control.send_message(self.uuid("dog2"), "sit"))
         self.assertEqual((refusal.status, refusal.problem), (504, "dog2 did not answer"))
 
     def test_device_that_says_no_is_told(self) -> None:
-        """A device's refusal is forwarded in its words, and an unknown uuid is reported as a lost device."""
+        """A device's refusal is forwarded with its own text; an unknown uuid is reported as a lost device."""
         refusal = self.refusal(self.control.send_message(self.uuid("dog2"), "x" * 300))
         self.assertEqual(refusal.status, 409)
         self.assertIn("dog2 refused: a message is a text of 1 to 200 characters", refusal.problem)
         self.assertIn("has left the network", self.refusal(self.control.disconnect("ab" * 16, 5.0)).problem)
 
     def test_disconnect_is_answered_before_it_leaves(self) -> None:
-        """A device answers the request to disconnect before it leaves."""
+        """A device replies to the request to disconnect before it disconnects."""
         gone = self.control.disconnect(self.uuid("dog2"), 5.0)
         self.team.clock.advance(0.03)
         self.assertEqual(self.successResultOf(gone), "leaving")
@@ -82,7 +82,7 @@ class TeamControlTests(SynchronousTestCase):
         self.assertEqual([row["status"] for row in self.team.state()["devices"] if row["name"] == "dog2"], ["GONE"])
 
     def test_preview(self) -> None:
-        """The preview lists able and refused devices with reasons, and assigns nothing."""
+        """The preview lists able devices, and refused devices with reasons, and assigns nothing."""
         preview = self.control.preview("find-red-target")
         self.assertEqual([(row["name"], row["busy"]) for row in preview["able"]], [("dog1", ""), ("dog2", "")])
         self.assertIn("vaio", preview["refused"])
@@ -91,7 +91,7 @@ class TeamControlTests(SynchronousTestCase):
         self.assertEqual(self.assertRaises(Refusal, self.control.preview, "fly").status, 404)
 
     def test_preview_of_a_group(self) -> None:
-        """A task of a group is previewed together with the open tasks of the group that need the same."""
+        """A task in a group is previewed together with the group's open tasks that have the same requirements."""
         wishes = [("turn-around", "yard"), ("find-red-target", "yard"), ("turn-around", "attic"), ("turn-around", "")]
         ids = [self.control.assign(name, group=group)["id"] for name, group in wishes]
         self.team.clock.advance(1.0)
@@ -105,7 +105,7 @@ class TeamControlTests(SynchronousTestCase):
         self.assertEqual(self.control.preview("turn-around", "yard")["together"], [])
 
     def test_preview_by_what_is_reported(self) -> None:
-        """While an equal task runs, its reports show the busy devices and the nearest one."""
+        """While an equal task is running, the preview uses its reports to show busy devices and the nearest device."""
         self.team.run_demo()
         for _ in range(60):
             self.team.clock.advance(0.5)
@@ -120,7 +120,7 @@ class TeamControlTests(SynchronousTestCase):
         self.assertIsNone(self.control.preview("turn-around")["likely"])
 
     def test_target_comes_without_the_node_that_ordered_it(self) -> None:
-        """If the web node dies after it started the demonstration, the simulator still places the target."""
+        """If the web node fails after it started the demonstration, the simulator still places the target."""
         self.team.run_demo()
         self.team.clock.advance(1.0)
         self.assertIsNone(self.team.get_true_state()["target"])
@@ -129,7 +129,7 @@ class TeamControlTests(SynchronousTestCase):
         self.assertIsNotNone(self.team.get_true_state()["target"])
 
     def test_lift_a_robot(self) -> None:
-        """A robot is moved to the given place, and a taken place is rejected with the simulator's error."""
+        """A robot is moved to the given place; for an occupied place the simulator's error is returned."""
         moved = self.control.move_robot("dog1", 1.0, 1.0, 0.5)
         self.team.clock.advance(0.1)
         self.assertIsNone(moved.addCallback(lambda _: None).result)
@@ -141,7 +141,7 @@ class TeamControlTests(SynchronousTestCase):
 
 
 class RepeatedWishTests(SynchronousTestCase):
-    """One request, sent to two web nodes."""
+    """One request that is sent to two web nodes."""
 
     def setUp(self) -> None:
         self.team = SimulatedTeam(3, dogs=("dog1", "dog2"), others=("pi",))
@@ -151,7 +151,7 @@ class RepeatedWishTests(SynchronousTestCase):
         self.team.clock.advance(1.0)
 
     def test_wish_that_is_repeated_elsewhere(self) -> None:
-        """A request that another web node has carried out is not repeated, even if this node missed it."""
+        """A request that another web node has executed is not executed again, even if this node has not heard of it."""
         wishes: list[Callable[[TeamControl], Any]] = [
             lambda control: control.assign("find-red-target", 2, "yard", task_id="a1").addCallback(itemgetter("id")),
             lambda control: control.run_demo("b2"),
@@ -172,7 +172,7 @@ class RepeatedWishTests(SynchronousTestCase):
         self.assertEqual(statuses, ["ASSIGNED", "CANCELLED"])
 
     def test_wish_that_the_first_node_died_of(self) -> None:
-        """If the first node died without an effect, the next node carries out the request in time."""
+        """If the first node fails before the request has an effect, the next node executes the request in time."""
         self.team.kill("vaio")
         wish = self.reserve.assign("turn-around", task_id="a1")
         self.team.clock.advance(LOOKUP_S + 0.1)

@@ -1,4 +1,4 @@
-"""The texts of the page: the catalogues of its languages, and the modules and the template that use their keys."""
+"""Tests of the page's texts: the catalogue of each language, and the modules and the template that use its keys."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ CODE = re.compile(
     r"(?:\b(?:class|d|for|href|id|rel|role|type|viewBox)\"?: "
     r"|(?:querySelector(?:All)?|closest|closest\?\.|matchMedia|matches)\()$"
 )
-"""What stands in front of a string that is a class, an attribute or a selector."""
+"""Matches the code in front of a string that is a class, an attribute or a selector."""
 NO_TEXT = {
     " KiB": "a unit",
     " MiB": "a unit",
@@ -38,18 +38,18 @@ NO_TEXT = {
     "light dark": "a value of the property color-scheme",
     "swarm revoke ": "a command",
 }
-"""The strings that look like a text and are not translated, with the reason."""
+"""The strings that look like text shown to users but are not translated, with the reason."""
 
 
 def forms(text: Any) -> list[str]:
-    """The plural forms of a text; one form if it has none."""
+    """Return the plural forms of a text; a text without plural forms has one form."""
     return list(text.values()) if isinstance(text, dict) else [text]
 
 
 def strings(source: str) -> Iterator[tuple[str, str]]:
-    """Each string and each constant part of a template in a module, with the code before it."""
+    """Yield each string, and each constant part of a template string, in a module, with the code in front of it."""
     at = start = 0
-    depths: list[int] = []  # the depth of braces in each template that is open
+    depths: list[int] = []  # the depth of braces in each open template string
     while at < len(source):
         char = source[at]
         is_in_template = bool(depths) and depths[-1] == 0
@@ -79,9 +79,10 @@ def strings(source: str) -> Iterator[tuple[str, str]]:
 
 
 def is_text(string: str) -> bool:
-    """Whether a string looks like one for people.
+    """Return whether a string looks like text shown to users.
 
-    It has two words in a row, or one that begins with a capital letter, or one that continues a sentence.
+    Such a string has two consecutive words, is a capitalised word, or begins with a space or punctuation followed by a
+    word, as if it continued a sentence.
     """
     found = (
         re.search(r"[A-Za-z]{2,}[,.:;]? \(?[A-Za-z]{2,}", string)
@@ -100,7 +101,10 @@ class TextsTests(SynchronousTestCase):
         self.languages: list[str] = json.loads(listed[1])
 
     def test_languages(self) -> None:
-        """Each catalogue is a language of the page, and has the keys of the English one with the same placeholders."""
+        """The catalogues match the languages of the page.
+
+        Each has the keys and placeholders of the English catalogue.
+        """
         self.assertEqual(sorted(path.stem for path in (STATIC / "texts").iterdir()), sorted(self.languages))
         for language in self.languages:
             texts = catalogue(language)
@@ -114,7 +118,7 @@ class TextsTests(SynchronousTestCase):
                     self.assertIn("other", text, key)
 
     def test_keys(self) -> None:
-        """Each key that a module or the template uses is in the catalogue, and each one there is used."""
+        """Each key that a module or the template uses is in the catalogue, and each key in the catalogue is used."""
         source = "\n".join(MODULES.values())
         named = {each for text in (source, TEMPLATE) for each in LITERAL.findall(text) if KEY.fullmatch(each)}
         groups = {key.rpartition(".")[0] for key in self.english}
@@ -131,21 +135,21 @@ class TextsTests(SynchronousTestCase):
         self.assertEqual(set(self.english) - named - dynamic, set())
 
     def test_no_text_in_modules(self) -> None:
-        """No module contains a text for people; those are in the catalogue."""
+        """No module contains text shown to users; such text is in the catalogue."""
         for name, source in MODULES.items():
             for string, before in strings(source):
                 if is_text(string) and string not in NO_TEXT and not CODE.search(before[-40:]):
-                    self.fail(f"{name}: {string!r} belongs into texts/en.js")
+                    self.fail(f"{name}: {string!r} must be moved to texts/en.js")
 
     def test_no_text_in_template(self) -> None:
-        """The template contains no text but the page's name and what a browser without JavaScript shows."""
+        """The template contains no text except the page's name and the notice for browsers without JavaScript."""
         body = re.sub(r"<noscript>.*</noscript>|\{\{.*?\}\}|\{%.*?%\}", "", TEMPLATE, flags=re.DOTALL)
         texts = {text.strip() for text in re.findall(r">([^<>]*)<", body)} - {""}
         self.assertEqual(texts, {"Swarm"})
         self.assertEqual(re.findall(r' (?:title|aria-label|placeholder)="[^"]', body), [])
 
     def test_find_text(self) -> None:
-        """The scan of the modules finds texts in strings and in templates, also in nested ones."""
+        """The scan of the modules finds texts in strings and in template strings, including nested ones."""
         source = 'f("No devices", `${n} of ${a ? `in all there` : "Done"} and that`); // "Not this"\n'
         self.assertEqual(
             [each for each, _ in strings(source) if is_text(each)],

@@ -38,7 +38,7 @@ if not MISSING:
 SKIP = f"TLS IS NOT TESTED: missing {', '.join(MISSING)} (pip install 'swarm-node[tls]')"
 NOW = 1.8e9
 NO_CHECK_TIME = 0x200000
-"""X509_V_FLAG_NO_CHECK_TIME of OpenSSL: the client's clock is the machine's, the certificate's is the test's."""
+"""X509_V_FLAG_NO_CHECK_TIME of OpenSSL: the client uses the real time, but the certificate the time of the test."""
 DAY = 86400.0
 
 
@@ -55,7 +55,7 @@ class CertificateProviderTests(SynchronousTestCase):
         self.now = NOW
 
     def provider(self, seed: int = 1) -> tuple[CertificateProvider, str]:
-        """Return the certificate of a node after its start, and its log lines."""
+        """Return the certificate provider of a node after its start, and the node's log lines."""
         with capturedLogs() as said:
             made = CertificateProvider(
                 self.signer, "a", self.path, lambda: self.names, lambda: self.now, random.Random(seed)
@@ -68,7 +68,7 @@ class CertificateProviderTests(SynchronousTestCase):
         return provider.names
 
     def test_make_it_once(self) -> None:
-        """The first start creates a private certificate file, and the next start uses it."""
+        """The first start writes a private certificate file, which the next start uses."""
         _, said = self.provider()
         self.assertIn("there is none yet", said)
         pem = self.path.read_bytes()
@@ -78,7 +78,10 @@ class CertificateProviderTests(SynchronousTestCase):
         self.assertEqual(self.path.read_bytes(), pem)
 
     def test_make_it_anew(self) -> None:
-        """A certificate that is exposed, truncated, old, incomplete or of another authority is replaced and logged."""
+        """A certificate that is exposed, truncated, old, incomplete or of a different authority is replaced.
+
+        The log contains the reason.
+        """
 
         def cut() -> None:
             self.path.write_bytes(self.path.read_bytes()[:300])
@@ -111,14 +114,14 @@ class CertificateProviderTests(SynchronousTestCase):
             self.assertEqual(stat.S_IMODE(self.path.stat().st_mode), 0o600)
 
     def test_go_on_without_a_place(self) -> None:
-        """If the certificate cannot be stored, it is used nevertheless, and the log gives the reason."""
+        """If the certificate cannot be stored, it is used nevertheless; the log contains the reason."""
         self.path = self.path.parent / "nowhere" / "a.tls"
         provider, said = self.provider()
         self.assertIn("cannot store", said)
         self.assertIn("192.168.0.7", self.served(provider))
 
     def test_follow_the_machine(self) -> None:
-        """A running node replaces its certificate for new local addresses and before its end."""
+        """A running node replaces its certificate when local addresses are added, and before the certificate ends."""
         provider, _ = self.provider()
         self.names = ["10.0.0.5"]
         self.assertNotIn("10.0.0.5", provider.names)
@@ -134,7 +137,7 @@ class CertificateProviderTests(SynchronousTestCase):
         self.assertNotEqual(self.path.read_bytes(), before)
 
     def test_look_once_a_minute(self) -> None:
-        """The node checks its addresses at most once a minute, for any number of connections."""
+        """The node checks its addresses at most once per minute, however many connections there are."""
         provider, _ = self.provider()
         looks: list[int] = []
         provider._names = lambda: looks.append(1) or self.names  # type: ignore[func-returns-value]
@@ -168,7 +171,7 @@ class TlsPortTests(SynchronousTestCase):
         )
 
     def test_have_an_authority_of_its_own(self) -> None:
-        """Each node has its own authority, which stays the same after a restart."""
+        """Each node has its own authority, which is the same after a restart."""
         kept = MemoryStore()
         first = self.tls_port("a.sqlite", kept)
         self.assertEqual(self.tls_port("a.sqlite", kept, 2).signer.pem, first.signer.pem)
@@ -176,7 +179,7 @@ class TlsPortTests(SynchronousTestCase):
         self.assertEqual(sorted(os.listdir(self.folder)), ["a.sqlite.tls", "b.sqlite.tls"])
 
     def test_migrate(self) -> None:
-        """A certificate of an authority from an earlier version is replaced."""
+        """A certificate that an authority of an earlier version signed is replaced."""
         path = self.folder / "a.sqlite.tls"
         old = make_leaf(make_authority(b"7" * 32, "a"), "a", ["192.168.0.7"], NOW, random.Random(1))
         write_key_file(path, old.pem_with_key)
@@ -184,12 +187,12 @@ class TlsPortTests(SynchronousTestCase):
         self.assertEqual(parse_leaf(path.read_bytes()).find_flaw(made.signer, ["192.168.0.7"], NOW), "")
 
     def test_keep_nothing_in_memory(self) -> None:
-        """A node with a store in memory leaves no file."""
+        """A node with a store in memory writes no file."""
         self.tls_port(store=":memory:")
         self.assertEqual(os.listdir(self.folder), [])
 
     def test_tell_of_a_taken_port(self) -> None:
-        """A port in use is reported with the setting for it."""
+        """If the port is in use, the error contains the setting of the port."""
 
         class Taken(MemoryReactorClock):
             def listenTCP(self, port: int, *others: Any, **more: Any) -> Any:  # noqa: N802
@@ -210,7 +213,7 @@ class Line(StringTransport):
 
 
 class HandshakeTests(SynchronousTestCase):
-    """A real TLS client connects to the port, in virtual time and without a socket."""
+    """A real TLS client connects to the port in virtual time, without a socket."""
 
     if MISSING:
         skip = SKIP
@@ -227,7 +230,7 @@ class HandshakeTests(SynchronousTestCase):
         self.connections = self.reactor.tcpServers[0][1]
 
     def connected(self) -> Connection:
-        """Return a connection before the first byte."""
+        """Return a connection that has not received any data yet."""
         connection = Connection.__new__(Connection)
         local = IPv4Address("TCP", "10.0.0.9", 8443)
         connection.transport = Line(hostAddress=local, peerAddress=IPv4Address("TCP", "10.0.0.1", 54321))
@@ -245,7 +248,7 @@ class HandshakeTests(SynchronousTestCase):
         return context.wrap_bio(incoming, outgoing, server_hostname="10.0.0.9"), incoming, outgoing
 
     def test_answer_over_tls(self) -> None:
-        """A client that trusts the authority gets the page over HTTP/1.1 with TLS 1.2 and 1.3."""
+        """A client that trusts the authority receives the page over HTTP/1.1 with TLS 1.2 and 1.3."""
         for newest in (ssl.TLSVersion.TLSv1_2, ssl.TLSVersion.TLSv1_3):
             self.assertIn(b"hello", self.asked(newest))
 
@@ -254,7 +257,7 @@ class HandshakeTests(SynchronousTestCase):
         self.assertRaises(ssl.SSLError, self.asked, ssl.TLSVersion.TLSv1_1)
 
     def asked(self, newest: ssl.TLSVersion) -> bytes:
-        """Return the answer to one request."""
+        """Return the response to one request."""
         connection = self.connected()
         client, incoming, outgoing = self.client(newest=newest)
         is_asked = False
@@ -275,7 +278,7 @@ class HandshakeTests(SynchronousTestCase):
         return b""
 
     def test_let_little_wait_for_a_slow_reader(self) -> None:
-        """Over TLS the send buffers are as small as without, because the option is set on the socket below TLS."""
+        """With TLS the send buffers are as small as without TLS: the option is set on the socket below TLS."""
         connection = self.connected()
         with socket.socket() as below:
             connection.transport.getHandle = lambda: below  # type: ignore[attr-defined]
@@ -287,7 +290,7 @@ class HandshakeTests(SynchronousTestCase):
         connection.leave()
 
     def test_let_go_who_dribbles_a_handshake(self) -> None:
-        """A silent or slow handshake is closed in time, and leaves no connection and no timer."""
+        """A silent or slow handshake is closed in time; no connection and no timer remain."""
         client, _, outgoing = self.client()
         self.assertRaises(ssl.SSLWantReadError, client.do_handshake)
         hello = outgoing.read()

@@ -1,4 +1,4 @@
-"""Tests of ``webnode.token``: signed tokens, which only the addressed web node accepts."""
+"""Tests of ``webnode.token``: signed tokens, each accepted only by the web node to which it is addressed."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ CLAIM = Claim("ab" * 8, "operator", "operator", 2_000_000_000, limit=2_000_100_0
 
 class TokenTests(SynchronousTestCase):
     def test_read_what_was_signed(self) -> None:
-        """A node accepts its own token, with itself as voucher; another node does not."""
+        """A node accepts a token that it signed, and adds itself as a voucher; other nodes reject the token."""
         for claim in (CLAIM, CLAIM.ticket, replace(CLAIM, role="phone", name="Z\N{SNOWMAN}", parents=("cd" * 8,))):
             text = VAIO.sign_token(claim)
             self.assertRegex(text, r"^[\w.-]+$")
@@ -29,7 +29,7 @@ class TokenTests(SynchronousTestCase):
             self.assertIsNone(PI.read_claim(text))
 
     def test_read_what_is_for_it(self) -> None:
-        """Only the addressed node accepts a token, and earlier vouchers are kept."""
+        """Only the node to which a token is addressed accepts it; the list of earlier vouchers is kept."""
         claim = replace(CLAIM, vouchers=(EVE.public,))
         text = VAIO.sign_token(claim, PI.node_id)
         self.assertEqual(PI.read_claim(text), replace(claim, vouchers=(EVE.public, VAIO.public)))
@@ -37,14 +37,14 @@ class TokenTests(SynchronousTestCase):
         self.assertEqual(VAIO.sign_token(CLAIM, VAIO.node_id), VAIO.sign_token(CLAIM))
 
     def test_a_ticket_lets_less(self) -> None:
-        """The ticket of an operator has the role viewer; the ticket of a phone stays a phone."""
+        """The ticket of an operator has the role viewer; the ticket of a phone has the role phone."""
         roles: dict[Any, str] = {"operator": "viewer", "viewer": "viewer", "phone": "phone"}
         for role, less in roles.items():
             ticket = replace(CLAIM, role=role).ticket
             self.assertEqual((ticket.role, ticket.is_ticket), (less, True))
 
     def test_fit_into_its_places(self) -> None:
-        """An invitation fits a QR code, the longest token is accepted, and a long name is cut."""
+        """An invitation fits into a QR code, the longest token is accepted, and a long name is truncated."""
         self.assertLess(len(VAIO.sign_token(replace(CLAIM, name="guest"))), 140)
         others = tuple(bytes([n]) * 32 for n in range(MAX_VOUCHERS))
         longest = replace(CLAIM, name="\N{SNOWMAN}" * 99, parents=("cd" * 8,) * 3, vouchers=others)
@@ -55,10 +55,10 @@ class TokenTests(SynchronousTestCase):
         self.assertEqual((len(read.name), len(read.vouchers)), (MAX_NAME, MAX_VOUCHERS + 1))
 
     def test_refuse_each_change(self) -> None:
-        """A token that is changed, truncated or extended at any place is invalid."""
+        """A token that is changed, truncated or extended anywhere is invalid."""
         for text in (VAIO.sign_token(CLAIM), VAIO.sign_token(CLAIM, PI.node_id)):
             reader = VAIO if VAIO.read_claim(text) else PI
-            for at in range(len(text) - 2):  # not every bit of the last letter counts
+            for at in range(len(text) - 2):  # not every bit of the last letter is significant
                 changed = text[:at] + ("A" if text[at] != "A" else "B") + text[at + 1 :]
                 self.assertIsNone(reader.read_claim(changed), at)
             for other in (text[:-4], text + "AAAA", f"A.{text}", text.replace(".", ".."), text * 5):
@@ -76,7 +76,7 @@ class TokenTests(SynchronousTestCase):
         self.assertEqual(found, [True, False, False, False])
 
     def test_refuse_unlawful_content(self) -> None:
-        """Signed but invalid content is rejected."""
+        """Content that is signed but invalid is rejected."""
         identity = Identity(bytes([3]) * 32)
         lawful: list[Any] = msgpack.unpackb(encode_claim(CLAIM, PI.node_id))
         contents: list[Any] = [7, [], {}, None, lawful[:-1], [*lawful, 1]]

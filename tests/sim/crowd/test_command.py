@@ -28,7 +28,10 @@ from sim.robots.crowd.simulator import CrowdSimulator
 
 
 class PlayedTeam:
-    """A stub team: agents know their distance to the target and name the nearest, which then reaches it."""
+    """A stub team whose agents know their distance to the target.
+
+    They choose the nearest agent, which then reaches the target.
+    """
 
     def __init__(
         self,
@@ -50,7 +53,7 @@ class PlayedTeam:
         self.switchboard.counters["sent"] += 10
 
     def get_statuses(self) -> Mapping[str, AgentStatus]:
-        """Return no costs before the target is placed; afterwards the distances and the chosen agent."""
+        """Return the status of each agent. There is no cost before the target is placed."""
         crowd, target = self.simulator.crowd, self.simulator.crowd.target
         if target is None:
             return {name: AgentStatus(None, "") for name in self.simulator.names}
@@ -60,7 +63,7 @@ class PlayedTeam:
         return {name: AgentStatus(cost, chosen) for name, cost in costs.items()}
 
     def find_finisher(self) -> str | None:
-        """Return the agent at the target."""
+        """Return the chosen agent once it has reached the target."""
         return next(iter(self.get_statuses().values())).assigned if self.clock.seconds() > 7.0 else None
 
     def stop(self) -> None:
@@ -77,7 +80,7 @@ class ImpatientTeam(PlayedTeam):
 
 class SearchTests(SynchronousTestCase):
     def test_moments_are_noted(self) -> None:
-        """``search`` records the times of engagement, first sight, agreement and arrival, and checks the agent."""
+        """``search`` records when agents take part, see the target, agree and arrive, and whether the right one did."""
         outcome = run_search(PlayedTeam(1, 4, make_square_scene(9)), 1, 60.0, lambda: 0.0)
         self.assertEqual((outcome.engaged, outcome.first, outcome.found), (0.5, 5.0, 4))
         self.assertEqual((outcome.agree, outcome.reach, outcome.right), (6.5, 7.5, True))
@@ -87,7 +90,7 @@ class SearchTests(SynchronousTestCase):
         self.assertEqual((wrong.right, "NO" in format_table(wrong)), (False, True))
 
     def test_limit_and_end_leave_a_report(self) -> None:
-        """A search that ends early, by its limit or by ``is_over``, reports the results so far."""
+        """A search that ends early, at its limit or because of ``is_over``, reports the results so far."""
         team = PlayedTeam(1, 4, make_square_scene(9))
         short = run_search(team, 1, 2.0, lambda: 0.0)
         ended = run_search(team, 1, 60.0, lambda: 0.0, is_over=lambda: team.clock.seconds() > 3.22)
@@ -108,7 +111,7 @@ class CommandTests(SynchronousTestCase):
         return code, told.getvalue()
 
     def test_crowd_alone(self) -> None:
-        """A crowd without agents prints its results, writes both files, and gives the same digest twice."""
+        """A crowd without agents prints its results, writes both files, and gives the same digest in two runs."""
         folder = Path(self.mktemp())
         folder.mkdir()
         picture, figures = folder / "a.svg", folder / "a.json"
@@ -123,7 +126,7 @@ class CommandTests(SynchronousTestCase):
         self.assertTrue(ET.fromstring(picture.read_text(encoding="utf-8")).tag.endswith("svg"))
 
     def test_search_with_agents(self) -> None:
-        """With agents the table of the search is printed, and the exit code is 0 if an agent arrived, else 1."""
+        """With agents the table of the search is printed; the exit code is 0 if an agent arrived, and 1 otherwise."""
         code, told = self.run_with("--bodies", "9", "--agents", "4", team=PlayedTeam)
         self.assertEqual(code, 0, told)
         self.assertIn("4 agents joined", told)
@@ -132,7 +135,7 @@ class CommandTests(SynchronousTestCase):
         self.assertEqual(code, 1, told)
 
     def test_interrupt_leaves_the_table(self) -> None:
-        """Ctrl-C ends a search with its table and its file, and the previous signal handler is restored."""
+        """Ctrl-C ends a search; its table and file are written, and the previous signal handler is restored."""
         folder, usual = Path(self.mktemp()), signal.getsignal(signal.SIGINT)
         folder.mkdir()
         words = ("--bodies", "9", "--agents", "4", "--json", str(folder / "a.json"))
@@ -142,7 +145,7 @@ class CommandTests(SynchronousTestCase):
         self.assertEqual(signal.getsignal(signal.SIGINT), usual)
 
     def test_wrong_words_are_refused(self) -> None:
-        """Invalid arguments are rejected with a remedy in one line, before the simulation starts."""
+        """Invalid arguments are rejected before the simulation starts; one line contains a remedy."""
         for words, problem in (
             (("--bodies", "0"), "bodies must be"),
             (("--room", "0.01"), "room must be"),
@@ -165,7 +168,7 @@ class CommandTests(SynchronousTestCase):
 
 class PictureTests(SynchronousTestCase):
     def test_draws_everybody(self) -> None:
-        """Each robot is drawn once, in the colour of its state, with target, caption and a legend of the states."""
+        """Each robot is drawn once in the colour of its state; the target, a caption and a legend are drawn as well."""
         crowd = Crowd(1, make_square_scene(30))
         crowd.place_target_at_random()
         going = "the one that goes"

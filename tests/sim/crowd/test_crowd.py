@@ -28,7 +28,7 @@ print(crowd.digest())
 
 
 def press(crowd: Crowd, seconds: float) -> float:
-    """Drive all robots to the middle of the map and return the largest overlap, in metres."""
+    """Drive all robots towards the middle of the map; return the largest overlap in metres."""
     worst = 0.0
     for _ in range(round(seconds / TICK_S)):
         towards = np.arctan2(crowd.scene.height / 2 - crowd.y, crowd.scene.width / 2 - crowd.x)
@@ -42,7 +42,7 @@ def press(crowd: Crowd, seconds: float) -> float:
 
 class CrowdTests(SynchronousTestCase):
     def test_nobody_overlaps_or_leaves(self) -> None:
-        """Three hundred robots that press to the middle overlap by at most 6 mm and stay inside the walls."""
+        """Three hundred robots that push towards the middle overlap by at most 6 mm and stay inside the walls."""
         crowd = Crowd(1, make_square_scene(300, 0.15))
         worst = press(crowd, 20.0)
         self.assertGreater(worst, 0.0)
@@ -63,7 +63,7 @@ class CrowdTests(SynchronousTestCase):
         self.assertAlmostEqual(float(crowd.ranges[0, 0]), FOOTPRINT_RADIUS_M, 3)
 
     def test_walks_as_a_dog_of_the_yard(self) -> None:
-        """The same commands move a crowd robot and a robot of ``World`` to the same place, within 2 cm in 6 s."""
+        """With the same commands, a crowd robot and a robot of ``World`` end within 2 cm of each other after 6 s."""
         scene = Scene("one", 6.0, 6.0, 0.4, 0.08, 0.22, (DogPlacement("dog", 3.0, 3.0, 0.3, 1),))
         world, crowd = World(Random(1), scene), Crowd(1, CrowdScene(1, 6.0, 6.0))
         crowd.move(0, 3.0, 3.0, 0.3)
@@ -80,12 +80,15 @@ class CrowdTests(SynchronousTestCase):
         self.assertLess(float(np.hypot(crowd.vx, crowd.vy)[0]), 1e-9)
 
     def test_same_seed_gives_the_same_hash(self) -> None:
-        """A run with collisions gives the same digest in two processes; another seed gives another digest."""
+        """A run with collisions gives the same digest in two processes; a different seed gives a different digest."""
         replayed(self, RUN)
         self.assertNotEqual(Crowd(7, make_square_scene(50)).digest(), Crowd(8, make_square_scene(50)).digest())
 
     def test_things_are_placed_where_there_is_room(self) -> None:
-        """Target and robots cannot be placed in walls or on each other, and a full map has no place for a target."""
+        """Target and robots cannot be placed in walls or on each other.
+
+        On a full map a target cannot be placed at all.
+        """
         crowd = Crowd(1, CrowdScene(2, 3.0, 3.0))
         crowd.move(0, 1.0, 1.0, 0.0)
         for place in ((0.0, 1.0), (1.1, 1.0), (math.nan, 1.0)):
@@ -98,14 +101,14 @@ class CrowdTests(SynchronousTestCase):
 
 class CrowdSceneTests(SynchronousTestCase):
     def test_too_small_is_refused_with_the_remedy(self) -> None:
-        """The error for a map that is too small names the number of robots that fit and a size that is large enough."""
+        """The error for a map that is too small contains the number of robots that fit, and a sufficient size."""
         error = self.assertRaises(SceneError, CrowdScene, 1000, 5.0, 5.0)
         self.assertIn("there is room for 361; use at most 361 robots, or 8.4 x 8.4 m", str(error))
         self.assertEqual(CrowdScene(361, 5.0, 5.0).robots, 361)
         self.assertEqual(CrowdScene(1000, 8.4, 8.4).robots, 1000)
 
     def test_wrong_numbers_are_refused(self) -> None:
-        """Invalid numbers of robots and invalid lengths are rejected with the valid range."""
+        """Invalid numbers of robots and invalid lengths are rejected; the error contains the valid range."""
         for bodies in (0, -1, 2.5, True, "10", MAX_ROBOTS + 1):
             self.assertIn("whole number", str(self.assertRaises(SceneError, CrowdScene, bodies, 9.0, 9.0)))
             self.assertRaises(SceneError, make_square_scene, bodies)
@@ -116,7 +119,7 @@ class CrowdSceneTests(SynchronousTestCase):
         self.assertIn("target_radius", str(self.assertRaises(SceneError, CrowdScene, 1, 9.0, 9.0, target_radius=2.0)))
 
     def test_everybody_has_a_place(self) -> None:
-        """On maps from empty to full, square or long, all robots start inside the walls and without overlap."""
+        """On maps of any density and shape all robots start inside the walls and without overlap."""
         for seed, (bodies, width, height) in enumerate(
             ((1, 1.0, 1.0), (361, 5.0, 5.0), (90, 40.0, 1.0), (500, 30.0, 7.0))
         ):
@@ -128,7 +131,7 @@ class CrowdSceneTests(SynchronousTestCase):
 
 class ControllerTests(SynchronousTestCase):
     def run_with(self, name: str, crowd: Crowd, seconds: float) -> Readings:
-        """Run a controller for some seconds and return its senses."""
+        """Run a controller for some seconds; return the sensor values of the robots."""
         senses = Readings(crowd)
         for _ in range(round(seconds / TICK_S)):
             crowd.commands[:] = CONTROLLERS[name](senses)
@@ -136,7 +139,7 @@ class ControllerTests(SynchronousTestCase):
         return senses
 
     def test_disperse(self) -> None:
-        """``disperse`` increases the mean range between robots that start close together."""
+        """``disperse`` increases the mean range of robots that start close together."""
         crowd = Crowd(1, CrowdScene(60, 9.0, 9.0))
         number = np.arange(60)
         crowd.x[:], crowd.y[:], crowd.heading[:] = 2.5 + 0.3 * (number % 8), 2.5 + 0.3 * (number // 8), 0.4 * number
@@ -156,7 +159,10 @@ class ControllerTests(SynchronousTestCase):
         self.assertLess(float(np.median(np.hypot(crowd.x - target.x, crowd.y - target.y))), 2.0)
 
     def test_search(self) -> None:
-        """``search`` leads robots that see the target to it, where they stop; the other robots continue to wander."""
+        """``search`` leads robots that see the target to the target, where they stop.
+
+        The other robots continue to wander.
+        """
         crowd = Crowd(1, make_square_scene(40))
         crowd.place_target_at_random()
         senses = self.run_with("search", crowd, 180.0)
@@ -167,7 +173,7 @@ class ControllerTests(SynchronousTestCase):
         self.assertGreater(int((speed > 0.1).sum()), 10)
 
     def test_sight(self) -> None:
-        """A robot sees the target ahead and near, but not behind it, far away or hidden by another robot."""
+        """A robot sees a target close ahead, but not a target that is behind, far away or hidden by another robot."""
         crowd = Crowd(1, CrowdScene(5, 12.0, 12.0))
         for body, (x, y, heading) in enumerate(
             (

@@ -16,7 +16,7 @@ from sim.robots.world import World
 
 
 def twin(crowd: Crowd) -> World:
-    """Build a ``World`` with the same robots and target at the same places."""
+    """Build a ``World`` with the robots and the target at the same positions."""
     crowd_scene = crowd.scene
     placements = tuple(
         DogPlacement(f"dog{n}", float(crowd.x[n]), float(crowd.y[n]), float(crowd.heading[n]), 1)
@@ -38,7 +38,7 @@ def twin(crowd: Crowd) -> World:
 
 
 def one_by_one(world: World, crowd: Crowd, body: int) -> list[float]:
-    """Return the distances that ``segment_query_first`` measures from ``body``, turned to the direction of each ray."""
+    """Return the lengths of the rays from ``body`` that ``segment_query_first`` measures one by one."""
     x, y, heading = (float(row[body]) for row in (crowd.x, crowd.y, crowd.heading))
     dog, found = world.dogs[f"dog{body}"], []
     for ray in range(RAYS):
@@ -57,7 +57,7 @@ class TwinTests(SynchronousTestCase):
         return int((rows < RAY_LENGTH_M).sum())
 
     def test_random_scenes(self) -> None:
-        """On sparse and dense maps, with and without target, each ray matches ``World`` within a millimetre."""
+        """On sparse and dense maps, with and without a target, each ray matches ``World`` within a millimetre."""
         met = 0
         for seed, (bodies, side) in enumerate([(12, 3.0), (40, 4.0), (80, 4.0), (60, 9.0), (30, 12.0)] * 4):
             crowd = Crowd(seed, CrowdScene(bodies, side, side + 0.7))
@@ -67,7 +67,7 @@ class TwinTests(SynchronousTestCase):
         self.assertGreater(met, 2000)
 
     def test_still_holds_after_they_have_moved(self) -> None:
-        """Rays still match after 120 steps: the neighbours cached in earlier steps hide no robot that came near."""
+        """Rays still match after 120 steps: no robot that has come close is missing from the cached neighbours."""
         crowd = Crowd(3, CrowdScene(40, 5.0, 5.0))
         for turn in range(120):
             crowd.commands[:] = (0.16, 0.0, 0.4 * math.sin(turn / 20))

@@ -27,7 +27,7 @@ from sim.robots.world import TICK_S
 
 
 class DrivenTests(SynchronousTestCase):
-    """Five robots on a map of 6 x 4 m; drivers control two of them."""
+    """Five robots on a map of 6 x 4 m; two of them are controlled by drivers."""
 
     def setUp(self) -> None:
         """Place the first robot at the left, facing right, and the others behind it."""
@@ -52,14 +52,14 @@ class DrivenTests(SynchronousTestCase):
         return seen
 
     def act(self, driver: SimDriver, seconds: float, ttl: float = 0.3, **motion: float) -> None:
-        """Drive for some seconds, with a command each 0.1 s."""
+        """Drive for some seconds with a command every 0.1 s."""
         for _ in range(round(seconds / 0.1)):
             permit = Permit(1, self.clock.seconds() + ttl)
             driver.act({f"base.{key}": value for key, value in motion.items()}, permit)
             self.clock.advance(0.1)
 
     def test_tells_what_a_dog_tells(self) -> None:
-        """A crowd robot sends the keys, value types and samples of ``RobotSimulator``, in a frame each 32 ms."""
+        """A crowd robot sends the same keys, value types and samples as ``RobotSimulator``, in a frame every 32 ms."""
         dogs = RobotSimulator(self.clock, Random(1), load_scene("three-dogs"))
         dogs.start()
         dog = SimDriver({"robot": "dog1"}, dogs.connector(), self.clock)
@@ -76,7 +76,7 @@ class DrivenTests(SynchronousTestCase):
             simulator.stop()
 
     def test_obeys_its_driver(self) -> None:
-        """The robot and its odometry follow the commands until their time to live ends; other robots stay."""
+        """The robot and its odometry follow a command until its time to live ends; the other robots do not move."""
         driver = self.driver()
         others = self.crowd.x[1:].tolist()
         self.act(driver, 2.0, vx=0.5)
@@ -90,7 +90,7 @@ class DrivenTests(SynchronousTestCase):
         self.assertEqual(self.crowd.x[1:].tolist(), others)
 
     def test_stands_when_nothing_is_heard(self) -> None:
-        """A robot stops at the end of the time to live if its link falls silent without being closed."""
+        """A robot whose link falls silent but stays open stops at the end of the command's time to live."""
         connector = self.simulator.connector()
         driver = SimDriver({"robot": "robot1", "camera_fps": 0.0}, connector, self.clock)
         driver.connect().addCallback(lambda _: driver.enable())
@@ -105,7 +105,7 @@ class DrivenTests(SynchronousTestCase):
         self.assertEqual(self.simulator.driven_robots, [])
 
     def test_ranges(self) -> None:
-        """The near and far sensors measure from the nose to the obstacle, and return NaN beyond their range."""
+        """The near and far rangers measure from the robot's front to an obstacle, and return NaN beyond their range."""
         driver = self.driver()
         for gap, near in ((0.3, True), (1.0, False)):
             self.crowd.place_target(1.0 + NOSE_M + gap + 0.08, 2.0)
@@ -119,7 +119,7 @@ class DrivenTests(SynchronousTestCase):
             self.assertLess(abs(float(rows[-1].values["range.chest"]) - 0.204), 0.02)
 
     def test_feels_how_it_moves(self) -> None:
-        """The accelerometer measures the start, compass and odometry the turn, and the battery level falls."""
+        """The accelerometer measures the start; compass and odometry measure the turn; the battery level falls."""
         driver = self.driver()
         felt: list[float] = []
         end = driver.subscribe(lambda seen: felt.append(float(seen.values["imu.ax"])))
@@ -135,7 +135,7 @@ class DrivenTests(SynchronousTestCase):
         self.assertTrue(0.999 < float(values["power.level"]) < 1.0)
 
     def test_pictures_show_the_target(self) -> None:
-        """The agents' vision locates the target in the camera pictures, unless other robots hide it."""
+        """The agents' vision locates the target in the camera pictures, unless another robot hides the target."""
         driver = self.driver(fps=10.0)
         self.crowd.place_target(3.0, 2.3)
         self.clock.advance(0.5)
@@ -163,7 +163,7 @@ class DrivenTests(SynchronousTestCase):
             self.assertIsNone(find_target(picture, TargetSize(0.08, 0.22)))
 
     def test_body_for_an_emulator(self) -> None:
-        """A robot that is lent to an emulator moves, stops, senses and detects bumps, and rejects drivers."""
+        """A robot that is lent to an emulator moves, stops, senses and detects bumps. Drivers cannot control it."""
         robot = self.simulator.reserve_for_emulator("robot2")
         robot.drive(0.16, 0.0, 0.0)
         self.clock.advance(1.0)
@@ -190,7 +190,7 @@ class DrivenTests(SynchronousTestCase):
         return values["bump.left"], values["bump.right"]
 
     def test_wrong_numbers_are_refused(self) -> None:
-        """Invalid numbers of drivers, a driver for an undriven robot, and one connection too many are rejected."""
+        """Invalid numbers of drivers, a driver for a robot without one, and one connection too many are rejected."""
         for driven in (-1, 6, 1.5, True):
             self.assertRaises(SceneError, CrowdSimulator, self.clock, Random(1), CrowdScene(5, 6.0, 4.0), driven)
         self.assertEqual(self.driver("robot3").state, "closed")
@@ -202,7 +202,7 @@ class DrivenTests(SynchronousTestCase):
         self.assertEqual(callers[-1].diagnostics()["refused"], 1)
 
     def test_costs_are_counted_apart(self) -> None:
-        """The stopwatch counts the time for motion and the time for observations separately."""
+        """The stopwatch measures the time for motion separately from the time for observations."""
         moments = iter(np.arange(0.0, 1000.0, 1.0).tolist())
         simulator = CrowdSimulator(self.clock, Random(1), CrowdScene(5, 6.0, 4.0), 1, stand, lambda: next(moments))
         simulator.start()
@@ -210,7 +210,7 @@ class DrivenTests(SynchronousTestCase):
         self.assertEqual((simulator.moving_s, simulator.reporting_s), (10.0, 10.0))
 
     def test_time_lost_is_not_made_up_for(self) -> None:
-        """After a pause of the machine the simulation does not catch up, and drops commands from before it."""
+        """After a pause of the machine the simulation does not catch up, and drops commands from before the pause."""
         clock = Clock()
         simulator = CrowdSimulator(clock, Random(1), CrowdScene(5, 6.0, 4.0), 1, stand)
         simulator.start()

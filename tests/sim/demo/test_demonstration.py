@@ -1,4 +1,4 @@
-"""Tests of the demonstration: configurations, log lines, verdicts of experiments, and the event stream."""
+"""Tests of the demonstration: configurations, log lines, results of experiments, and the event stream."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ def snapshot(*xs: float, moving: str = "", target: bool = True) -> dict[str, Any
 
 
 def state(task: str, by: str = "", gone: float | None = None, **statuses: str) -> dict[str, Any]:
-    """Return the page's state: task status, finishing agent, status of each dog, and the time of their loss."""
+    """Return the page's state: task status, finishing agent, and the status and time of loss of each dog."""
     return {
         "devices": [
             {"uuid": name, "name": name, "status": status, "task": TASK, "gone": gone}
@@ -51,10 +51,13 @@ RUNS = state("EXECUTING", dog1="EXECUTING", dog2="WAITING")
 
 
 class ExperimentTests(SynchronousTestCase):
-    """The verdict of an experiment depends on the positions of the dogs."""
+    """The result of an experiment depends on the positions of the dogs."""
 
     def test_verdicts(self) -> None:
-        """The nearest dog at the target passes; a false claim, another dog, no loss, or the lost dog fails."""
+        """An experiment passes if the nearest dog reaches the target.
+
+        It fails if the claim is false, another dog finishes, no dog was lost, or the lost dog finishes.
+        """
         wrong = state("EXECUTING", dog2="EXECUTING")
         for kills, looks, held, words in (
             (False, [(RUNS, (1.0, 1.5)), (state("COMPLETED", "dog1"), (0.30, 1.5))], True, "(gap 0.10 m)"),
@@ -73,7 +76,10 @@ class ExperimentTests(SynchronousTestCase):
             self.assertEqual(list(row["checks"].values()), [check.is_met for check in run.list_checks()])
 
     def test_who_is_killed(self) -> None:
-        """``update`` names the moving dog once, 0.1 m nearer or half way; never in experiment 1 or if it is gone."""
+        """``update`` returns the moving dog once, after 0.1 m or half of its way.
+
+        It never does so in experiment 1, or if the dog has left.
+        """
         gone = state("EXECUTING", gone=1.0, dog1="EXECUTING")
         for kills, seen, ways, named in (
             (True, RUNS, (1.05, 1.0, 0.94, 0.85), ["", "", "dog1", ""]),
@@ -85,7 +91,10 @@ class ExperimentTests(SynchronousTestCase):
             self.assertEqual([run.update(float(now), seen, snapshot(x, 1.5)) for now, x in enumerate(ways)], named)
 
     def test_takeover_is_timed_until_another_dog_moves(self) -> None:
-        """The takeover lasts from the kill until another dog executes and moves; the killed dog is ignored."""
+        """The takeover lasts from the kill until a different dog executes and moves.
+
+        Motion of the killed dog is ignored.
+        """
         run = Experiment("two", TASK, True, 0.0)
         run.update(0.0, RUNS, snapshot(1.0, 1.5))
         self.assertEqual(run.update(1.0, RUNS, snapshot(0.8, 1.5)), "dog1")
@@ -99,7 +108,7 @@ class ExperimentTests(SynchronousTestCase):
         self.assertTrue(run.has_passed, format_table([run]))
 
     def test_experiment_ends_when_time_is_up(self) -> None:
-        """An experiment is over after the time limit, and its table shows the last status of the task."""
+        """An experiment ends at its time limit, and its table shows the last status of the task."""
         run = Experiment("one", TASK, False, 0.0)
         run.update(LIMIT_S - 1, state("OPEN"), None)
         self.assertFalse(run.is_over)
@@ -115,10 +124,10 @@ class ExperimentTests(SynchronousTestCase):
 
 
 class StateChangesTests(SynchronousTestCase):
-    """Log lines describe the changes between two states of the page."""
+    """Log lines describe the differences between two states of the page."""
 
     def test_told(self) -> None:
-        """Each join, status change, loss, return, task result and agreement is described once."""
+        """Each join, status change, loss, return, task result and agreement is logged once."""
         idle, busy = state("OPEN", dog1="IDLE"), state("OPEN", dog1="SEARCHING")
         gone = state("OPEN", gone=3.0, dog1="GONE")
         agreed = state("OPEN")
@@ -141,7 +150,7 @@ class StateChangesTests(SynchronousTestCase):
 
 
 class ConfigurationTests(SynchronousTestCase):
-    """The configurations are valid TOML with the planned values."""
+    """The configurations are valid TOML and contain the planned values."""
 
     def setUp(self) -> None:
         ports = {"vaio": 7000, "pi": 7004, "dog1": 7001, "dog2": 7002, "dog3": 7003}
@@ -155,7 +164,7 @@ class ConfigurationTests(SynchronousTestCase):
         return {name: tomllib.loads(text) for name, text in plan.make_configs().items()}
 
     def test_every_node_has_a_file_in_lawful_toml(self) -> None:
-        """Two web nodes and three dogs have their own ports, stores and robots, and know the first node."""
+        """Each of two web nodes and three dogs has its own ports, store and robot, and knows the first node."""
         self.assertEqual(list(self.tables), ["vaio", "pi", *DOGS])
         nodes = [table["node"] for table in self.tables.values()]
         self.assertEqual([node["port"] for node in nodes], [7000, 7004, 7001, 7002, 7003])
@@ -169,14 +178,14 @@ class ConfigurationTests(SynchronousTestCase):
         self.assertEqual((dog["driver"]["kind"], dog["driver"]["options"]["robot"]), ("sim", "dog2"))
 
     def test_every_node_is_a_member(self) -> None:
-        """The founding arguments list each node that has a file, and no configuration contains a team key."""
+        """The arguments that found the team list each node that has a file; no configuration contains a team key."""
         words = self.plan.make_init_arguments()
         members = [word.partition("=")[0] for flag, word in zip(words, words[1:], strict=False) if flag == "--member"]
         self.assertEqual([words[words.index("--first") + 1], *members], list(self.tables))
         self.assertNotIn("team_key", str(self.tables))
 
     def test_every_cast_is_known_to_its_drivers(self) -> None:
-        """Emulators match the drivers of each cast, ports are unique, and one Aibo speaks the older dialect."""
+        """The emulators of each cast match the drivers, all ports differ, and one Aibo speaks the older dialect."""
         self.assertEqual(self.plan.emulated_robots, "")
         for wish in ROBOT_SETS:
             ports = iter(range(9000, 9000 + MAX_PORTS * len(DOGS)))
@@ -196,7 +205,7 @@ class ConfigurationTests(SynchronousTestCase):
             self.assertEqual(dialects, [None, None, "T2" if wish == "aibo" else None])
 
     def test_two_nodes_serve_the_page(self) -> None:
-        """The laptop and its reserve serve the page and the map, each on its own ports, also over TLS if planned."""
+        """Laptop and reserve serve the page and the map, each on its own ports, and over TLS if the plan says so."""
         web = {"host": "127.0.0.1", "port": 8080, "yard": "127.0.0.1:7400", "code": "quiet-otter"}
         secure = self.read(replace(self.plan, tls_ports=(8443, 8444)))
         for name, wanted, tls_port in (("vaio", web, 8443), ("pi", {**web, "port": 8081}, 8444)):
@@ -220,7 +229,7 @@ class EventStreamTests(SynchronousTestCase):
         self.assertEqual(pieces, wanted)
 
     def test_endless_line_is_dropped(self) -> None:
-        """The parser drops a line without end and parses the events after it."""
+        """The parser drops a line that does not end, and parses the events after it."""
         stream = EventParser()
         stream.feed(b"data: " + b"x" * (MAX_EVENT_BYTES + 1))
         self.assertEqual(stream.feed(b"\n\ndata: y\n\n"), [("message", b"y")])
@@ -233,7 +242,7 @@ class PreparationTests(SynchronousTestCase):
         self.folder = Path(self.mktemp())
 
     def test_ports_of_one_plan_differ(self) -> None:
-        """A requested port for the page is not used for the page over TLS as well."""
+        """The port requested for the page is not used for the page over TLS as well."""
         (wanted,) = free_ports.find_free_ports("tcp", "127.0.0.1", 1)
         self.patch(preparation, "TLS_PORT", wanted)
         plan = make_plan(self.folder, "127.0.0.1", wanted, True, lambda line: None, True)
@@ -241,7 +250,7 @@ class PreparationTests(SynchronousTestCase):
         self.assertEqual((plan.web_port, len(set(ports))), (wanted, 5))
 
     def test_free_ports_stay_free(self) -> None:
-        """Free ports lie below the range for outgoing connections, so no other process takes them at random."""
+        """Free ports lie below the range for outgoing connections, so another process does not get one at random."""
         lowest_given = 32_768
         for kind in ("tcp", "udp", free_ports.TCP_AND_UDP):
             ports = free_ports.find_free_ports(kind, "127.0.0.1", 20)
@@ -249,7 +258,7 @@ class PreparationTests(SynchronousTestCase):
             self.assertLess(max(ports), lowest_given)
 
     def test_ports_are_free_for_both_kinds(self) -> None:
-        """A port for both TCP and UDP is skipped if one of them is in use."""
+        """A port is skipped if it is in use for TCP or for UDP."""
         first, last = free_ports.find_free_ports(free_ports.TCP_AND_UDP, "127.0.0.1", 2)
         self.patch(free_ports, "PORT_RANGE", [first, last])
         for kind in (socket.SOCK_STREAM, socket.SOCK_DGRAM):
@@ -261,7 +270,10 @@ class PreparationTests(SynchronousTestCase):
                 self.assertRaises(OSError, free_ports.find_free_ports, free_ports.TCP_AND_UDP, "127.0.0.1", 2)
 
     def test_only_a_free_folder_of_ours_is_emptied(self) -> None:
-        """The folder of an earlier demonstration is emptied; a folder with other files, or in use, stays unchanged."""
+        """The folder of an earlier demonstration is emptied.
+
+        A folder with other files, or in use, remains unchanged.
+        """
         lock_run_dir(self.folder).close()
         (self.folder / "dog1.sqlite").write_text("old")
         (self.folder / "inner").mkdir()
@@ -273,7 +285,7 @@ class PreparationTests(SynchronousTestCase):
         self.assertTrue((self.folder / "thesis.txt").exists())
 
     def test_what_is_no_folder_is_refused(self) -> None:
-        """A file at the path of the folder or of its parent is rejected with a remedy."""
+        """If the folder or its parent is a file, the path is rejected with a remedy."""
         self.folder.write_text("mine")
         for folder in (self.folder, self.folder / "inner"):
             said = str(self.assertRaises(DemoError, lock_run_dir, folder))
@@ -281,7 +293,7 @@ class PreparationTests(SynchronousTestCase):
             self.assertIn("choose another --run-dir", said)
 
     def test_foreign_address_is_refused(self) -> None:
-        """An address of another machine is rejected with a hint to ``--web-host``, not as a busy port."""
+        """The error for an address of another machine suggests ``--web-host``, and does not report a busy port."""
         for wanted in (None, 8080):
             error = self.assertRaises(DemoError, make_plan, self.folder, "192.0.2.1", wanted, True, lambda line: None)
             self.assertRegex(str(error), r"cannot serve the page on 192\.0\.2\.1 \(.*\); set --web-host")
@@ -289,7 +301,7 @@ class PreparationTests(SynchronousTestCase):
 
 class CommandLineTests(SynchronousTestCase):
     def test_wrong_words_are_refused(self) -> None:
-        """An unknown option, an invalid port, and a report path in a missing folder are rejected at the start."""
+        """An unknown option, an invalid port, and a report path in a missing folder are rejected before the start."""
         for words, said in (
             (["--nonsense"], "unrecognized arguments: --nonsense"),
             (["--web-port", "99999"], "--web-port: must be 0 to 65535, is '99999'"),

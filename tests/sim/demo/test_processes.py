@@ -1,4 +1,4 @@
-"""Tests of the processes of the demonstration, with a reactor in memory."""
+"""Tests of the processes of the demonstration, with a fake reactor."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from sim.demo.processes import RESTART_S, ProcessGroup, make_child_command
 
 
 class MemoryProcess:
-    """A process that ends on any signal, or, if ``stubborn``, only on KILL."""
+    """A process that ends on any signal, or, if ``stubborn`` is set, only on KILL."""
 
     def __init__(self, clock: Clock, pid: int, arguments: list[str], protocol: ProcessProtocol, stubborn: bool) -> None:
         self._clock = clock
@@ -43,7 +43,7 @@ class MemoryProcess:
 
 @implementer(IReactorProcess)
 class MemoryProcesses(Clock):
-    """A reactor that starts ``MemoryProcess`` objects instead of processes."""
+    """A reactor that starts ``MemoryProcess`` objects instead of real processes."""
 
     def __init__(self, stubborn: bool = False) -> None:
         super().__init__()
@@ -78,7 +78,7 @@ class TeamTests(SynchronousTestCase):
         return team, reactor
 
     def test_processes_start_on_a_leash_and_are_heard(self) -> None:
-        """Each process starts on a leash; its lines reach the listener, its log file and its tail."""
+        """Each process ends with its parent; its output lines reach the listener, its log file and its tail."""
         team, reactor = self.team()
         self.assertEqual(reactor.started[0].arguments, make_child_command(["-m", "x"]))
         self.assertEqual((team.get_pid("dog1"), team.get_pid("dog2"), team.list_ended()), (100, 101, []))
@@ -89,7 +89,7 @@ class TeamTests(SynchronousTestCase):
         self.assertEqual(team.get_tail("dog1"), ["one", "two"])
 
     def test_killed_process_stays_away_for_the_delay(self) -> None:
-        """A killed process restarts after ``RESTART_S`` and not before; the other process keeps running."""
+        """A killed process restarts after exactly ``RESTART_S``; the other process keeps running."""
         team, reactor = self.team()
         reactor.advance(100.0)
         team.kill("dog1")
@@ -103,7 +103,10 @@ class TeamTests(SynchronousTestCase):
         self.assertEqual((team.get_pid("dog1"), team.get_pid("dog2")), (102, 101))
 
     def test_stop_ends_all_and_starts_none(self) -> None:
-        """After ``stop`` no process runs or restarts, and no timer is left; later calls complete as well."""
+        """After ``stop`` no process runs or restarts, and no timer remains.
+
+        Further calls of ``stop`` complete as well.
+        """
         team, reactor = self.team()
         team.kill("dog2")
         reactor.advance(0.0)
@@ -115,7 +118,7 @@ class TeamTests(SynchronousTestCase):
         self.assertEqual((team.list_ended(), reactor.getDelayedCalls()), (["dog1", "dog2"], []))
 
     def test_stop_waits_for_the_stubborn_and_kills_them(self) -> None:
-        """``stop`` kills a process that ignores TERM for four seconds, and waits for its end."""
+        """``stop`` kills a process that ignores TERM for four seconds, and waits until the process has ended."""
         team, reactor = self.team(stubborn=True)
         done = team.stop()
         reactor.pump([0.1] * 30)

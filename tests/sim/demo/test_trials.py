@@ -15,7 +15,7 @@ from sim.demo.trials import Outcome, format_table, main, percentile, run_trial
 
 
 class PlayedTeam:
-    """A stub team of two dogs: with an even seed the task completes, with an odd seed it never does."""
+    """A stub team of two dogs: the task completes with an even seed, and never with an odd seed."""
 
     def __init__(self, seed: int) -> None:
         self.clock = HeapClock()
@@ -26,7 +26,7 @@ class PlayedTeam:
         self._began: float | None = None
 
     def digest(self) -> str:
-        """Return a digest, in the role of the board."""
+        """Return a digest, like the switchboard of a real team."""
         return f"digest {self._seed}"
 
     def run_demo(self) -> str:
@@ -35,7 +35,7 @@ class PlayedTeam:
         return "t1"
 
     def scatter(self, seed: int) -> None:
-        """Leave all dogs at their places."""
+        """Leave all dogs where they are."""
 
     def kill(self, name: str) -> None:
         """Kill a dog."""
@@ -74,7 +74,7 @@ class PlayedTeam:
 
 class TrialTests(SynchronousTestCase):
     def test_trial_notes_what_came_of_it(self) -> None:
-        """A trial records the finishing dog, the checks of finding and agreement, and the digest of the trace."""
+        """A trial records the finishing dog, the results of its checks, and the digest of the trace."""
         outcome = run_trial(PlayedTeam, 1, 2)
         self.assertEqual(outcome.broken, [])
         self.assertTrue(outcome.held and outcome.found and outcome.agreed and outcome.right)
@@ -94,12 +94,12 @@ class TrialTests(SynchronousTestCase):
         self.assertTrue(all(path.read_bytes()[:4] == b"\x89PNG" for path in folder.iterdir()))
 
     def test_percentile_is_a_value_that_was(self) -> None:
-        """The percentile is the smallest measured value that covers the share; it is never interpolated."""
+        """A percentile is the smallest measured value that covers the share, without interpolation."""
         values = [5.0, 1.0, 4.0, 2.0, 3.0]
         self.assertEqual([percentile(values, share) for share in (0.0, 0.2, 0.21, 0.5, 0.95, 1.0)], [1, 1, 2, 3, 5, 5])
 
     def test_table_counts_and_measures(self) -> None:
-        """Each experiment has one line with counts, medians and 95th percentiles, and a dash for no value."""
+        """Each experiment has one line with counts, medians and 95th percentiles; a missing value is a dash."""
         good: dict[str, Any] = {"held": True, "found": True, "agreed": True, "right": True}
         outcomes = [Outcome(n, 1, **good, find=1.0 + n, agree=2.0, reach=10.0) for n in range(3)]
         outcomes.append(Outcome(1, 2, takeover=1.25))
@@ -109,7 +109,7 @@ class TrialTests(SynchronousTestCase):
         self.assertEqual(lines[2], ["experiment", "2", "1", "0", "0", "0", "0", "-", "-", "-", "1.25", "(1.25)"])
 
     def run_main(self, *words: str) -> tuple[int, str, Path]:
-        """Run the command with a new output folder and return exit code, output and folder."""
+        """Run the command with a new output folder; return exit code, output and folder."""
         folder = Path(self.mktemp())
         output = io.StringIO()
         with contextlib.redirect_stdout(output):
@@ -117,7 +117,10 @@ class TrialTests(SynchronousTestCase):
         return code, output.getvalue(), folder
 
     def test_exit_code(self) -> None:
-        """The exit code is 0 if every trial passes; otherwise it is 1, and the trial's line names the failed check."""
+        """The exit code is 0 if every trial passes.
+
+        Otherwise it is 1, and the line of a trial lists its failed check.
+        """
         code, output, folder = self.run_main("--count", "1", "--seed", "2")
         self.assertEqual(code, 0, output)
         self.assertIn("   1/2 ok   experiment 1 seed 2: dog1 reached it", output)
@@ -130,7 +133,7 @@ class TrialTests(SynchronousTestCase):
         self.assertIn("1/2 FAIL experiment 1 seed 1: nobody reached it  (task completed (", output)
 
     def test_wrong_arguments_are_refused(self) -> None:
-        """A negative or non-numeric count and a folder that cannot be created are rejected in one line with code 2."""
+        """A negative or non-numeric count, and a folder that cannot be created, give one error line and exit code 2."""
         blocked = Path(self.mktemp())
         blocked.write_text("a file", encoding="utf-8")
         for words in (["--count", "-1"], ["--count", "many"], ["--out", str(blocked / "below")]):

@@ -1,4 +1,4 @@
-"""Tests of the invariant checker with handmade histories: violations of each invariant, and similar valid ones."""
+"""Tests of the invariant checker with handmade histories: violations of each invariant, and similar valid histories."""
 
 from __future__ import annotations
 
@@ -57,24 +57,24 @@ SURVEY = Asked(5.0, 9, 2, "survey", "job")
 
 
 def command(at: float, token: int, is_accepted: bool = True, place: int = 1) -> CommandReceived:
-    """Return a command for t0 that is in force for one second."""
+    """Return a command for the task t0 that is valid for one second."""
     return CommandReceived(at, "t0", place, token, is_accepted, at + 1.0, at + 1.0)
 
 
 def write(at: float, number: int, is_known: bool = True, what: str = "write") -> list[Event]:
-    """Return a write of the slot, and its acknowledgement."""
+    """Return a write of the slot and the acknowledgement of the write."""
     asked = Asked(at, number, 1, what, SLOT, number)
     return [asked, Answered(at + 0.1, number)] if is_known else [asked, Unanswered(at + 0.1, number, "silence")]
 
 
 def read(at: float, shown: dict[Slot, int], concern: str = "majority") -> list[Event]:
-    """Return a read of the slot's key, and its answer."""
+    """Return a read of the slot's key and the result of the read."""
     number = int(at * 1000)
     return [Asked(at, number, (2, 1), "read", b"key", concern), Answered(at + 0.1, number, shown)]
 
 
 def decided(place: int, assigned: str, cost: float = 1.0, serial: int = 5, holder: str | None = None) -> Decided:
-    """Return a decision between the agents a and b, in which b bids 2."""
+    """Return a decision between the agents a and b; the cost of b is 2."""
     me = Report(str(place), f"dog{place}", 1, 1, None)
     reports = (me, Report("a", "dog-a", 1, serial, cost), Report("b", "dog-b", 1, 5, 2.0))
     return Decided(1.0 + place / 10, place, "t0", reports, ("basis", cost, serial), assigned, holder, 0.1)
@@ -190,7 +190,7 @@ BROKEN: dict[str, list[list[Event]]] = {
     "R3": [[shot(answers=((True, 11),))], [shot(answers=((False, 1),))], [UnvalidatedTraffic(1.0, 11, 10)]],
     "R4": [[TableSize(1.0, 1, "peers", 11, 10)]],
 }
-"""Of each invariant, histories that break it and nothing else."""
+"""For each invariant, histories that violate this invariant and no other."""
 
 LAWFUL: dict[str, list[Event]] = {
     "tokens grow, and a refused command harms nobody": [
@@ -257,12 +257,12 @@ LAWFUL: dict[str, list[Event]] = {
     ],
     "of other reports another may be named": [decided(1, "a"), decided(2, "b", 2.5)],
 }
-"""Histories that look as if they broke something."""
+"""Valid histories that resemble violations of an invariant."""
 
 
 class CheckerTests(SynchronousTestCase):
     def test_each_is_broken_alone(self) -> None:
-        """Each history in ``BROKEN`` violates its invariant and no other."""
+        """Each history in ``BROKEN`` violates its own invariant and no other invariant."""
         for name, histories in BROKEN.items():
             for history in histories:
                 found = {line.partition(":")[0] for line in find_violations(history)}
@@ -277,7 +277,7 @@ class CheckerTests(SynchronousTestCase):
         self.assertEqual({why: found for why, history in LAWFUL.items() if (found := find_violations(history))}, {})
 
     def test_no_line_twice(self) -> None:
-        """A violation that repeats in the same way is reported once."""
+        """A violation that occurs several times in the same way is reported once."""
         self.assertEqual(len(find_violations([TERMS, *[LeaseHeld(1.0, "t0", 1, (2,))] * 3])), 1)
 
 
@@ -292,7 +292,7 @@ class HistoryTests(SynchronousTestCase):
         return history
 
     def test_order(self) -> None:
-        """A history lists the events in the order in which they happened, each with its time."""
+        """A history lists the events in their order of time."""
         wanted = [Asked(1.0, 1, "client", "put", ("job", 1)), Died(2.0, 3), Answered(2.5, 1, "done")]
         self.assertEqual(list(self.made("done")), wanted)
 

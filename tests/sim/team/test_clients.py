@@ -20,7 +20,7 @@ KEY = b"k" * 32
 
 
 class Peer:
-    """A stub node that answers at once with a given result or error."""
+    """A stub node that returns a given result or error immediately."""
 
     def __init__(self) -> None:
         self.identity = Identity(b"i" * 32)
@@ -28,16 +28,16 @@ class Peer:
         self.answer: Exception | list[Record] = []
 
     def put(self, key: bytes, name: str, value: bytes, lifetime: str, concern: str) -> Deferred[Any]:
-        """Answer a write."""
+        """Return the result of a write."""
         self.puts.append(value)
         return self.remove(key, name, concern)
 
     def remove(self, key: bytes, name: str, concern: str) -> Deferred[Any]:
-        """Answer a removal."""
+        """Return the result of a removal."""
         return fail(self.answer) if isinstance(self.answer, Exception) else succeed(None)
 
     def get(self, key: bytes, concern: str) -> Deferred[Any]:
-        """Answer a read."""
+        """Return the result of a read."""
         return fail(self.answer) if isinstance(self.answer, Exception) else succeed(self.answer)
 
 
@@ -53,7 +53,7 @@ class ClientTests(SynchronousTestCase):
         self.clients = Clients(self.history)
 
     def test_changes_of_a_slot_are_numbered(self) -> None:
-        """Writes and removals are numbered per slot, and the history contains the outcome of each."""
+        """The writes and removals of a slot are numbered, and the history contains the outcome of each of them."""
         for name, act in (("a", WRITE), ("a", REMOVE), ("b", WRITE), ("a", WRITE)):
             self.clients.write(2, self.node, KEY, name, act=act)
         self.assertEqual(self.peer.puts, [b"1", b"1", b"3"])
@@ -62,7 +62,7 @@ class ClientTests(SynchronousTestCase):
         self.assertEqual(self.clients.list_slots(b"somebody else"), [])
 
     def test_reads(self) -> None:
-        """A read returns the records, and the history contains the number in each slot, 0 for an empty slot."""
+        """A read returns the records; the history contains the number read from each slot, 0 for an empty slot."""
         owner = self.peer.identity.public
         self.peer.answer = [
             Record(KEY, name, owner, 1, "team", 60.0, value, b"") for name, value in (("a", b"3"), ("b", None))
@@ -73,7 +73,10 @@ class ClientTests(SynchronousTestCase):
         self.assertEqual(self.history.events, [Asked(1.0, 1, (2, 4), READ, KEY, "majority"), Answered(1.0, 1, shown)])
 
     def test_what_fails_may_have_been_done(self) -> None:
-        """A failed operation stays open, a read without a majority is unavailable, and neither counts as answered."""
+        """A failed operation may still have been executed; a read without a majority is unavailable.
+
+        Neither is recorded as successful.
+        """
         self.peer.answer = NotAcknowledged(1, 3)
         self.clients.write(2, self.node, KEY, "a")
         self.peer.answer = Unavailable(1, 3)

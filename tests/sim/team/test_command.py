@@ -33,7 +33,7 @@ class CommandTests(SynchronousTestCase):
     """Tests of ``run``."""
 
     def setUp(self) -> None:
-        """Create a folder for the scenario, and a clock that advances at each call."""
+        """Create a folder for the scenario, and a clock that advances on each call."""
         self.folder = Path(self.mktemp())
         self.folder.mkdir()
         self.path = self.folder / "small.toml"
@@ -63,7 +63,7 @@ class CommandTests(SynchronousTestCase):
         return run(["--scenario", str(self.path), *words], world, KINDS)
 
     def test_report_is_for_people_and_programs(self) -> None:
-        """Table, hash and command are printed; the JSON file adds time series; trace and picture show the fault."""
+        """Table, hash and command are printed; the JSON file adds time series; trace and figure show the fault."""
         files = [str(self.folder / name) for name in ("r.json", "t.jsonl", "p.svg")]
         self.assertEqual(self.run_it("--seed", "3", "--json", files[0], "--trace", files[1], "--picture", files[2]), 0)
         report = json.loads(Path(files[0]).read_text())
@@ -82,13 +82,13 @@ class CommandTests(SynchronousTestCase):
         self.assertIn("crash", "".join(picture.itertext()))
 
     def test_missed_target_fails(self) -> None:
-        """A missed target is reported and sets the exit code."""
+        """A missed target is reported and gives exit code 1."""
         text = SCENARIO + '[targets]\n"nodes" = ">= 5"\n'
         self.assertEqual(self.run_it(text=text), EXIT_MISSED)
         self.assertIn("MISSED    nodes: >= 5", self.out.getvalue())
 
     def test_target_without_figure_is_refused(self) -> None:
-        """A target that no workload of the scenario measures is rejected with its line, before the first step."""
+        """A target that no workload of the scenario measures is rejected with its line number before the first step."""
         text = SCENARIO + "[load.lookups]\n[load.traffic]\n[targets]\n"
         kept = self.folder / "kept.json"
         kept.write_text("{}")
@@ -99,7 +99,7 @@ class CommandTests(SynchronousTestCase):
         self.assertEqual(kept.read_text(), "{}")
 
     def test_ending_leaves_a_valid_partial_report(self) -> None:
-        """An interrupted run leaves a report as text, JSON, trace and picture, each marked as partial."""
+        """An interrupted run writes its report as text, JSON, trace and figure; each of them is marked as partial."""
         files = [str(self.folder / name) for name in ("r.json", "t.jsonl", "p.svg")]
         code = self.run_it("--json", files[0], "--trace", files[1], "--picture", files[2], stop_after=3)
         self.assertEqual(code, EXIT_INTERRUPTED)
@@ -110,7 +110,10 @@ class CommandTests(SynchronousTestCase):
         self.assertIn("partial", ElementTree.fromstring(Path(files[2]).read_text())[0].text or "")
 
     def test_progress_is_a_bar_or_lines(self) -> None:
-        """On a terminal progress is a bar that is erased at the end; elsewhere it is an occasional line."""
+        """On a terminal the progress is a bar that is erased at the end.
+
+        Otherwise a line is printed from time to time.
+        """
         self.run_it(columns=120)
         drawn = self.err.getvalue()
         self.assertRegex(drawn, r"\r\[#+\.+\]  ?\d+% running, \d+\.\d of 17 s, [34] alive, [\d,]+ datagrams, ")
@@ -135,7 +138,7 @@ class TraceTests(SynchronousTestCase):
     """Tests of ``Trace``."""
 
     def test_each_event_is_a_line_up_to_a_bound(self) -> None:
-        """The trace has one JSON object per line; events beyond the limit are only counted."""
+        """The trace has one JSON object per line; events beyond the limit are counted only."""
         out = io.StringIO()
         trace = Trace(out, 2)
         trace.begin(seed=3)

@@ -34,7 +34,7 @@ class DiskTests(SynchronousTestCase):
         return restore_store(self.disk, SimulatedDisk(self.clock, random.Random(2)), self.clock.seconds())
 
     def test_last_moment_goes_with_the_power(self) -> None:
-        """Records that ``wait_for_write`` confirmed survive a power loss; unconfirmed records and leases do not."""
+        """A record confirmed by ``wait_for_write`` survives a power loss; unconfirmed records and leases do not."""
         self.disk.put(_record("safe"), 60.0)
         self.disk.put(_record("lease", lifetime="leased"), 60.0)
         self.disk.set_note("fact", b"1")
@@ -65,7 +65,10 @@ class DiskTests(SynchronousTestCase):
         self.assertEqual(self._names(self._reborn()), ["last"])
 
     def test_full_disk_refuses_by_name_and_recovers(self) -> None:
-        """A full disk fails pending and new writes but serves reads; after that it writes pending records."""
+        """A full disk rejects pending and new writes but serves reads.
+
+        When it has space, pending records are written.
+        """
         self.disk.put(_record("before"), 60.0)
         self.clock.advance(0.1)
         self.disk.is_full = True
@@ -84,7 +87,7 @@ class DiskTests(SynchronousTestCase):
         self.assertEqual(sorted(self._names(self._reborn())), ["before", "owed"])
 
     def test_memory_outlives_the_power_but_for_leases(self) -> None:
-        """In a scenario without disks everything but the leases survives a restart."""
+        """In a scenario without disks, everything except the leases survives a restart."""
         memory = SurvivingMemory()
         memory.put(_record("team"), 60.0)
         memory.put(_record("lease", lifetime="leased"), 60.0)

@@ -1,4 +1,4 @@
-"""Tests of the simulated links between nodes, and of barriers."""
+"""Tests of the simulated links and barriers between nodes."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ class TeamLinkTests(SynchronousTestCase):
         self.assertTrue(all(abs(delay / link.distance(A, B) - 1) <= 0.0501 for delay in delays))
 
     def test_lan_and_radio_are_near(self) -> None:
-        """A LAN delays by 0.2 to 0.6 ms, WiFi by 5 ms on average, and ``none`` not at all."""
+        """A LAN adds a delay of 0.2 to 0.6 ms, WiFi 5 ms on average, and ``none`` no delay."""
         self.assertTrue(all(0.0002 <= delay <= 0.0006 for (delay,) in _sent(TeamLink(LinkSettings("lan"), "1"), 500)))
         self.assertApproximates(
             fmean(delay for (delay,) in _sent(TeamLink(LinkSettings("wifi"), "1"), 5000)), 0.005, 5e-4
@@ -45,7 +45,7 @@ class TeamLinkTests(SynchronousTestCase):
         self.assertEqual(_sent(TeamLink(LinkSettings("none"), "1"), 3), [[0.0]] * 3)
 
     def test_loss_comes_one_by_one_or_in_bursts(self) -> None:
-        """Bursts do not change the loss rate, but only with bursts one loss follows another."""
+        """Bursts do not change the loss rate; only with bursts are losses consecutive."""
         for burst, follow in ((0.0, 0.1), (0.02, 0.95)):
             lost = [not delays for delays in _sent(TeamLink(LinkSettings("lan", loss=0.1, burst=burst), "1"), 60_000)]
             self.assertApproximates(sum(lost) / len(lost), 0.1, 0.015)
@@ -53,7 +53,7 @@ class TeamLinkTests(SynchronousTestCase):
             self.assertApproximates(sum(pairs) / len(pairs), follow, 0.02, f"burst {burst}")
 
     def test_one_direction_is_worse(self) -> None:
-        """With asymmetry one direction of a pair loses more than the other, and the mean loss stays the same."""
+        """With asymmetry one direction of a pair loses more datagrams than the other; the mean loss does not change."""
         link = TeamLink(LinkSettings("lan", loss=0.2, asymmetry=0.5), "1")
         there = sum(not delays for delays in _sent(link, 20_000))
         back = sum(not delays for delays in _sent(link, 20_000, source=B, to=A))
@@ -61,7 +61,7 @@ class TeamLinkTests(SynchronousTestCase):
         self.assertApproximates(back / 20_000, 0.1, 0.02)
 
     def test_datagrams_are_doubled_and_overtaken(self) -> None:
-        """The shares of duplicated and reordered datagrams match the settings."""
+        """The rates of duplicated and reordered datagrams match the settings."""
         link = TeamLink(LinkSettings("lan", duplicate=0.1, reorder=0.2), "1")
         sent = _sent(link, 10_000)
         self.assertApproximates(sum(len(delays) == 2 for delays in sent) / 10_000, 0.1, 0.02)
@@ -69,7 +69,7 @@ class TeamLinkTests(SynchronousTestCase):
         self.assertApproximates(sum(delay > 0.0006 for delay in all_delays) / len(all_delays), 0.2, 0.02)
 
     def test_a_line_carries_so_much_and_no_more(self) -> None:
-        """Datagrams beyond the bandwidth wait in the queue, and datagrams beyond the queue limit are lost."""
+        """Datagrams beyond the bandwidth wait in a queue; datagrams beyond the queue limit are lost."""
         link = TeamLink(LinkSettings("none", bandwidth=1000.0, queue=0.5), "1")  # 100 bytes take 0.1 s
         sent = _sent(link, 10, gap=0.0)
         self.assertEqual([round(delays[0], 3) for delays in sent[:6]], [0.1, 0.2, 0.3, 0.4, 0.5, 0.6])
@@ -80,7 +80,7 @@ class TeamLinkTests(SynchronousTestCase):
         self.assertApproximates(link.draw_delays(A, B, 100, 10.0, random.Random(1))[0], 0.1, 1e-9)
 
     def test_bad_weather_is_lost_besides(self) -> None:
-        """``extra_loss`` adds loss while it is set."""
+        """If ``extra_loss`` is set, it adds to the loss of the link."""
         link = TeamLink(LinkSettings("lan"), "1")
         link.extra_loss = 0.5
         self.assertApproximates(sum(not delays for delays in _sent(link, 4000)) / 4000, 0.5, 0.03)
@@ -92,7 +92,10 @@ class BarrierTests(SynchronousTestCase):
     """Barriers block datagrams between nodes."""
 
     def test_each_kind_stops_what_it_should(self) -> None:
-        """``isolate`` blocks both directions of a group, ``block_incoming``/``outgoing`` one, ``block_host`` a host."""
+        """``isolate`` blocks both directions of a group, ``block_incoming`` and ``block_outgoing`` block one direction.
+
+        ``block_host`` blocks a host.
+        """
         table = {
             isolate([A.host, B.host]): {(A, C), (C, A), (B, C), (C, B)},
             block_incoming([A.host, B.host]): {(C, A), (C, B)},
@@ -104,7 +107,10 @@ class BarrierTests(SynchronousTestCase):
             self.assertEqual(found, stopped)
 
     def test_pairs_are_a_share_and_the_same_both_ways(self) -> None:
-        """``pairs`` cuts the given share of all pairs in both directions, and other pairs with another salt."""
+        """``pairs`` blocks the given share of all pairs in both directions.
+
+        A different salt selects different pairs.
+        """
         nodes = NODES[:150]
         barrier, other = block_pairs(0.05, "1"), block_pairs(0.05, "2")
         cut_off = [(a, b) for a, b in combinations(nodes, 2) if barrier(a, b)]

@@ -23,7 +23,7 @@ class MachineTests(SynchronousTestCase):
         self.seen: list[object] = []
 
     def test_clock_runs_at_its_own_rate(self) -> None:
-        """A fast clock runs ahead, its timers are due earlier, and a new rate does not change past times."""
+        """The timers of a fast clock fire early; a new rate does not change the times that have passed."""
         machine = Machine(self.world, 2.0, 100.0)
         verifyObject(IReactorTime, machine)
         machine.callLater(4.0, lambda: self.seen.append(self.world.seconds()))
@@ -34,10 +34,10 @@ class MachineTests(SynchronousTestCase):
         self.assertEqual(machine.seconds(), 107.0)
 
     def test_waiting_for_what_is_left_ends(self) -> None:
-        """A timer that is set again for the remaining time reaches its deadline in spite of rounding."""
+        """A timer that is repeatedly set for the remaining time reaches its deadline despite rounding."""
         rng = random.Random(1)
         for _ in range(300):
-            self.world = HeapClock(1e6 + rng.random())  # coarser resolution than a clock that starts at 0
+            self.world = HeapClock(1e6 + rng.random())  # floats are coarser here than near 0
             rate = rng.uniform(0.99, 1.01)
             machine = Machine(self.world, rate, -rate * self.world.seconds())
             turns: list[int] = []
@@ -53,7 +53,7 @@ class MachineTests(SynchronousTestCase):
             self.assertLess(len(turns), 5, f"rate {rate}")
 
     def test_what_was_due_waits_for_the_thaw(self) -> None:
-        """A frozen machine runs nothing; after the thaw overdue timers run in order, then datagrams arrive."""
+        """A frozen machine runs nothing; after the thaw the overdue timers run in order, and then datagrams arrive."""
         board = Switchboard(self.world, random.Random(1))
         machine = Machine(self.world)
         network = MachineNetwork(machine, board.make_network("10.0.0.1", 7000))
@@ -71,7 +71,7 @@ class MachineTests(SynchronousTestCase):
         self.assertEqual(self.seen, ["first", "second", b"hello"])
 
     def test_overdue_timer_can_be_cancelled(self) -> None:
-        """An overdue timer is still active, and an overdue timer that runs before it can cancel it."""
+        """An overdue timer is still active: an overdue timer that runs earlier can cancel it."""
         machine = Machine(self.world)
         first = machine.callLater(1.0, lambda: second.cancel())
         second = machine.callLater(1.0, self.seen.append, "second")
@@ -84,7 +84,7 @@ class MachineTests(SynchronousTestCase):
         self.assertRaises(AlreadyCalled, first.cancel)
 
     def test_clock_that_stops_while_suspended(self) -> None:
-        """A clock counts a suspension, unless ``COUNTS_SUSPENSION`` is false; then it stays late by that time."""
+        """A clock includes the time of a suspension. If ``COUNTS_SUSPENSION`` is false, the clock lags by that time."""
         for counts, shown in ((True, 8.0), (False, 2.0)):
             self.world = HeapClock()
             machine = Machine(self.world, 2.0)
@@ -98,7 +98,7 @@ class MachineTests(SynchronousTestCase):
             self.assertEqual(machine.to_unsuspended_time(shown), shown / 2.0)
 
     def test_buffer_holds_so_many_datagrams(self) -> None:
-        """A frozen machine buffers the first ``MAX_QUEUED_DATAGRAMS`` datagrams and drops the rest."""
+        """A frozen machine buffers the first ``MAX_QUEUED_DATAGRAMS`` datagrams and drops all later ones."""
         machine = Machine(self.world)
         machine.freeze()
         for number in range(MAX_QUEUED_DATAGRAMS + 50):
@@ -119,7 +119,7 @@ class MachineTests(SynchronousTestCase):
         self.assertEqual(self.seen, [])
 
     def test_calls_can_be_moved_and_taken_back_once(self) -> None:
-        """A call is rescheduled in the machine's own seconds; a finished or cancelled call cannot be changed."""
+        """A call is rescheduled in seconds of the machine's clock; a finished or cancelled call cannot be changed."""
         machine = Machine(self.world, 2.0)
         call = machine.callLater(2.0, self.seen.append, "moved")
         call.reset(6.0)

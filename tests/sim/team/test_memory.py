@@ -32,10 +32,13 @@ def _machine(files: dict[str, str]) -> Callable[[str], str]:
 
 
 class MemoryTests(SynchronousTestCase):
-    """The memory limit and the estimate are checked before a run."""
+    """The memory estimate is compared with the memory limit before a run."""
 
     def test_machine_and_groups_set_the_limit(self) -> None:
-        """The limit is the minimum of the free memory and of each cgroup, v1 or v2; ``max`` is no limit."""
+        """The limit is the minimum of the free memory and the limits of all cgroups (v1 or v2).
+
+        ``max`` means no limit.
+        """
         files = {"/proc/meminfo": MEMINFO}
         self.assertEqual(measure_free_bytes(_machine(files)), 4_000_000 * 1024)
         files |= {
@@ -53,7 +56,7 @@ class MemoryTests(SynchronousTestCase):
         self.assertEqual(measure_free_bytes(_machine({})), NO_LIMIT_BYTES)
 
     def test_team_that_does_not_fit_is_refused(self) -> None:
-        """The error names a number of nodes that fits; nodes that join during the run count as well."""
+        """The error contains a number of nodes that fits; nodes that join during the run are included."""
         files = {"/proc/meminfo": MEMINFO}
         check_memory(Scenario(nodes=10_000), _machine(files))
         error = self.assertRaises(BadSetting, check_memory, Scenario(nodes=20_000), _machine(files))
@@ -65,7 +68,7 @@ class MemoryTests(SynchronousTestCase):
         self.assertEqual(estimate_bytes(crowd), BASE_BYTES + 100 * KIB_PER_NODE["entangled"] * 1024)
 
     def test_own_size_is_read(self) -> None:
-        """The memory of the process is reported in bytes, or as 0 if the system does not report it."""
+        """The memory of the process is reported in bytes; it is 0 if the operating system does not report it."""
         self.assertEqual(
             measure_resident_bytes(_machine({"/proc/self/status": "Name: x\nVmRSS:\t  100 kB\n"})), 102_400
         )

@@ -1,4 +1,4 @@
-"""Tests of the reduction of failing runs, with rules instead of runs."""
+"""Tests of the reduction of failing runs; a rule decides whether a reduced run fails."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from sim.team.shrinking import NO_REDUCTION, Reduction, minimize, reduce_run
 
 class MinimizeTests(SynchronousTestCase):
     def test_those_that_are_needed(self) -> None:
-        """``minimize`` finds exactly the faults that the failure needs, in fewer than 60 tries."""
+        """``minimize`` finds exactly the faults that cause the failure, in fewer than 60 attempts."""
         rng = random.Random(1)
         for _ in range(50):
             needed = set(rng.sample(range(16), rng.randrange(4)))
@@ -27,7 +27,7 @@ class MinimizeTests(SynchronousTestCase):
             self.assertLess(next(tries), 60)
 
     def test_none_can_be_dropped(self) -> None:
-        """If several sets of faults fail, the result fails, and no fault of it can be removed."""
+        """If several sets of faults cause the failure, the result causes it too, and contains no superfluous fault."""
 
         def fails(kept: tuple[int, ...]) -> bool:
             return {1, 2} <= set(kept) or {5, 6, 7} <= set(kept)
@@ -39,7 +39,7 @@ class MinimizeTests(SynchronousTestCase):
 
 class ReduceRunTests(SynchronousTestCase):
     def test_all_that_can_go_goes(self) -> None:
-        """Faults, link impairments, workloads and seconds that the failure does not need are removed."""
+        """Faults, link impairments, workloads and seconds are removed if the run fails without them."""
 
         def fails(trim: Reduction) -> bool:
             is_long = trim.limit_duration(20.0) >= 5.0
@@ -49,7 +49,7 @@ class ReduceRunTests(SynchronousTestCase):
         self.assertEqual(found, Reduction((3,), True, ("records",), 5.0))
 
     def test_what_is_needed_stays(self) -> None:
-        """A failure that needs everything is not shrunk."""
+        """A failing run of which every part is needed is not reduced."""
         whole = Reduction((0, 1), False, ("records", "wire"))
         self.assertEqual(
             reduce_run(NO_REDUCTION, 2, ["records", "wire"], 20.0, lambda trim: trim == NO_REDUCTION).keep, (0, 1)
@@ -57,7 +57,7 @@ class ReduceRunTests(SynchronousTestCase):
         self.assertEqual(reduce_run(whole, 2, ["records", "wire"], 20.0, lambda trim: trim == whole), whole)
 
     def test_no_more_time(self) -> None:
-        """When the time for tries is over, the last failing trim is the result."""
+        """When the time limit is reached, the smallest run that has failed is the result."""
         tries = iter([False, True])
         found = reduce_run(NO_REDUCTION, 4, ["records"], 20.0, lambda trim: next(tries, False))
         self.assertEqual(found, Reduction((2, 3)))

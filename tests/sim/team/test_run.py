@@ -24,7 +24,7 @@ class _Nothing:
 
 
 class _Steps(Workload):
-    """A workload that counts its steps and reports given violations."""
+    """A workload that counts its steps and reports the given violations."""
 
     found: tuple[str, ...] = ()
 
@@ -59,7 +59,7 @@ class RunTests(SynchronousTestCase):
     """Tests of ``Run``, its faults and its sessions."""
 
     def record_events(self, scenario: Scenario, seed: int = 1) -> tuple[Run, list[tuple[float, str, int]]]:
-        """Run a scenario to its end; return the run and the events since the team was complete."""
+        """Run a scenario to its end; return the run and the events after the team was complete."""
         run = Run(scenario, seed, KINDS)
         events: list[tuple[float, str, int]] = []
         run.team.event_listeners.append(lambda now, event, place, more: events.append((now, event, place)))
@@ -68,7 +68,7 @@ class RunTests(SynchronousTestCase):
         return run, [(round(now - began, 6), event, place) for now, event, place in events if now >= began]
 
     def test_workloads_act_while_it_lasts(self) -> None:
-        """Workloads step at the scenario's pace, learn the end of the repair, and are compared to the targets."""
+        """Workloads step at the scenario's interval, are told when the repair ends, and are compared to the targets."""
         run = Run(replace(BASE, repair=5.0, targets=(("steps", Bound(19)),)), 1, KINDS)
         outcome = run.run()
         workload = run.workloads[0][1]
@@ -80,7 +80,7 @@ class RunTests(SynchronousTestCase):
         self.assertAlmostEqual(outcome.seconds, run.expected_end)
 
     def test_workloads_wait_for_their_lead(self) -> None:
-        """With a lead the workloads start after it."""
+        """Workloads with a lead start after the lead."""
         run = Run(replace(BASE, lead=7.5), 1, KINDS)
         run.run()
         workload = run.workloads[0][1]
@@ -89,13 +89,13 @@ class RunTests(SynchronousTestCase):
         self.assertEqual(len(workload.steps), 5)
 
     def test_violations_and_unknown_targets_are_told(self) -> None:
-        """The outcome lists the violations of workloads; a target without a measurement is a violation as well."""
+        """The outcome lists the violations of the workloads; a target without a measured value is also a violation."""
         scenario = replace(BASE, loads=(("finds", _Nothing()),), targets=(("stops", Bound(1)),))
         found = Run(scenario, 1, KINDS).run().violations
         self.assertEqual(found, ["targets: nothing measured 'stops'; there are steps", "E1: something is wrong"])
 
     def test_it_can_be_ended_at_any_moment(self) -> None:
-        """A run that ends early, while nodes join or while it runs, has a partial outcome."""
+        """A run that is ended while nodes join, or later, has a partial outcome."""
         for end, phase in ((0.5, JOINING), (6.0, RUNNING)):
             run = Run(BASE, 1, KINDS, lambda run, end=end: run.team.clock.seconds() >= end)  # type: ignore[misc]
             outcome = run.run()
@@ -104,7 +104,7 @@ class RunTests(SynchronousTestCase):
             self.assertEqual(len(outcome.digest), 32)
 
     def test_slow_machine_is_watched_as_often(self) -> None:
-        """On a slow machine steps get shorter, so ``watched`` stays responsive; the digest does not change."""
+        """On a slow machine the steps become shorter, so ``watched`` stays responsive; the digest does not change."""
         watched: dict[bool, list[float]] = {False: [], True: []}
         digests = []
         for is_slow, seen in watched.items():
@@ -126,13 +126,13 @@ class RunTests(SynchronousTestCase):
         self.assertTrue(end.is_partial)
 
     def test_who_is_not_in_is_a_violation(self) -> None:
-        """A node that does not join within the time limit is a violation."""
+        """A node that does not join within the time limit causes a violation."""
         link = LinkSettings("none", loss=0.9)
         scenario = replace(BASE, link=link, join=replace(JOIN, within=1.0), seconds=0.0)
         self.assertIn("nodes have not joined", Run(scenario, 1, KINDS).run().violations[0])
 
     def test_exception_is_a_violation(self) -> None:
-        """An exception in a call and a logged failure are violations, and do not end the run."""
+        """An exception in a call and a logged failure are violations; neither ends the run."""
         run = Run(BASE, 1, KINDS)
         run.team.schedule(3.0, lambda: 1 // 0)
         run.team.schedule(4.0, lambda: Logger().failure("a node's own", Failure(KeyError("x"))))
@@ -154,7 +154,7 @@ class RunTests(SynchronousTestCase):
         self.assertEqual(born, [(at + 3.0, place) for at, place in killed])
 
     def test_healing_brings_all_back(self) -> None:
-        """Before the repair every fault ends: no node is cut off, frozen or gone, and no disk is full."""
+        """Every fault ends before the repair: no node is cut off, frozen or down, and no disk is full."""
         faults = tuple(
             Fault(kind, 1.0, lasts=99.0, count=2, amount=1.1 if kind == "rate" else 0.0)
             for kind in ("crash", "leave", "freeze", "cut", "deaf", "mute", "clog", "rate", "full")
@@ -178,7 +178,7 @@ class RunTests(SynchronousTestCase):
         self.assertEqual(known, [9] * 10)
 
     def test_what_lasts_ends_at_its_time(self) -> None:
-        """A cut, more loss, a fast clock, a full disk and a frozen node last for the time of the fault."""
+        """A partition, more loss, a fast clock, a full disk and a frozen node last for the duration of the fault."""
         faults = tuple(
             Fault(kind, 2.0, lasts=3.0, places=(1,), amount=1.5 if kind == "rate" else -60.0 if kind == "step" else 0.0)
             for kind in ("cut", "freeze", "rate", "full", "step")
@@ -205,7 +205,7 @@ class RunTests(SynchronousTestCase):
         self.assertEqual({seen[at] for at in seen if 2.1 < at < 4.9}, {bad})
 
     def test_crowd_comes_and_goes(self) -> None:
-        """New nodes join over the time that the fault gives, at new places, and leave after their time."""
+        """New nodes join at new places within the time ``over`` of the fault, and leave after the time ``lasts``."""
         run, events = self.record_events(replace(BASE, faults=(Fault("crowd", 1.0, lasts=4.0, count=4, over=2.0),)))
         self.assertEqual(
             [(at, p) for at, event, p in events if event == "born"], [(1 + n / 2, 6 + n) for n in range(4)]
@@ -216,7 +216,7 @@ class RunTests(SynchronousTestCase):
         self.assertEqual(run.team.alive(), list(range(6)))
 
     def test_sessions_end_and_others_begin(self) -> None:
-        """Nodes leave at the rate that follows from the mean, and return after their breaks; two always stay."""
+        """Nodes leave at the rate that follows from the mean durations, and return after a break; at least two stay."""
         sessions = Sessions("exponential", 10.0, 2.0)
         run, events = self.record_events(replace(BASE, nodes=12, seconds=60.0, sessions=sessions))
         ended = [event for _, event, _ in events if event == "killed"]
@@ -228,14 +228,14 @@ class RunTests(SynchronousTestCase):
         self.assertGreater(len([1 for _, event, _ in events if event == "born"]), 0.7 * len(ended))
 
     def test_sessions_may_bring_others(self) -> None:
-        """With ``same`` false another node takes the place of a node that left."""
+        """If ``same`` is false, a different node takes the place of a node that left."""
         run = Run(replace(BASE, seconds=40.0, sessions=Sessions("fixed", 15.0, 2.0, 0.5, same=False)), 1, KINDS)
         before = [run.team.identity(place) for place in range(6)]
         run.run()
         self.assertTrue(all(run.team.identity(place) != before[place] for place in range(6)))
 
     def test_same_seed_gives_the_same_hash(self) -> None:
-        """Two runs of a seed with faults and sessions have equal digests; another seed has another one."""
+        """Two runs of a seed with faults and sessions have equal digests; a different seed gives a different digest."""
         scenario = replace(
             BASE,
             link=LinkSettings("wifi", loss=0.05, burst=0.05, duplicate=0.05, reorder=0.05),

@@ -111,10 +111,10 @@ def _read(text: str, **changes: object) -> Scenario:
 
 
 class ScenarioTests(SynchronousTestCase):
-    """A scenario file is read completely or rejected before the first step."""
+    """A scenario file is either read completely or rejected before the first step."""
 
     def test_file_means_what_it_says(self) -> None:
-        """Tables, faults in order, workloads and targets are read; missing values have defaults."""
+        """Tables, faults in order, workloads and targets are read; missing values get their defaults."""
         scenario = _read(WHOLE)
         self.assertEqual((scenario.nodes, scenario.kind, scenario.join.size), (50, "swarm", 10))
         self.assertEqual([fault.kind for fault in scenario.faults], ["crash", "cut"])
@@ -124,7 +124,7 @@ class ScenarioTests(SynchronousTestCase):
         self.assertEqual(scenario.sessions.session_durations, None)
 
     def test_wrong_values_are_named_with_their_line(self) -> None:
-        """Each invalid value is rejected with file, line, key and a remedy."""
+        """The error for each invalid value contains file, line, key and a remedy."""
         for text, (line, key) in WRONG.items():
             error = self.assertRaises(BadSetting, _read, text)
             self.assertEqual((error.file, error.key), (f"bad.toml:{line}", key), text)
@@ -154,12 +154,12 @@ class ScenarioTests(SynchronousTestCase):
         self.assertGreater(refused, 300)
 
     def test_what_is_no_toml_says_where(self) -> None:
-        """A file that is not TOML is rejected with the line that the parser names."""
+        """The error for a file that is not TOML contains the line that the TOML parser reports."""
         error = self.assertRaises(BadSetting, _read, "nodes = 5\nseconds = = 3")
         self.assertIn("line 2", str(error))
 
     def test_command_line_comes_before_the_file(self) -> None:
-        """``--nodes`` overrides the value of the file and is checked in the same way."""
+        """``--nodes`` overrides the value in the file, and is checked like that value."""
         self.assertEqual(_read(WHOLE, nodes=70).nodes, 70)
         error = self.assertRaises(BadSetting, _read, WHOLE, nodes=0)
         self.assertEqual((error.file, error.key), ("command line", "--nodes"))
@@ -179,7 +179,7 @@ class ScenarioTests(SynchronousTestCase):
         self.assertEqual(len(parse_scenario(found[0], "docs/how-to/simulate-teams.md", "example", sorts).faults), 1)
 
     def test_unknown_names_are_refused_with_the_nearest(self) -> None:
-        """An unknown name is rejected with the nearest name, and an unreadable file is rejected."""
+        """The error for an unknown name suggests the nearest name; an unreadable file is rejected."""
         self.assertIn("steady", self.assertRaises(BadSetting, load_scenario, "stedy", {}).remedy)
         self.assertIn("cannot be read", self.assertRaises(BadSetting, load_scenario, "/nowhere/x.toml", {}).problem)
 
@@ -196,7 +196,7 @@ class DurationDistributionTests(SynchronousTestCase):
             self.assertApproximates(fmean(drawn) / stays.mean, 1.0, 0.06, kind)
 
     def test_rate_of_leaving_is_the_same_from_the_start(self) -> None:
-        """Sessions that are already under way end at a constant rate from the start: n / mean per second."""
+        """Sessions that have begun before the start end at a constant rate from the start: n / mean per second."""
         for kind in durations.KINDS:
             stays, rng = durations.DurationDistribution(kind, 60.0), random.Random(2)
             ends = []

@@ -1,4 +1,4 @@
-"""Tests of the seed log of long runs: its entries, and the seeds that are left to run."""
+"""Tests of the seed log of long runs: its entries, and the seeds that remain to be run."""
 
 from __future__ import annotations
 
@@ -36,17 +36,17 @@ class SeedLogTests(SynchronousTestCase):
         self.assertEqual(parse_entries(book.read_text(), "book"), [ENTRY, ENTRY])
 
     def test_no_seed_log(self) -> None:
-        """A complete line that is no entry is rejected with its line number."""
+        """A complete line that is not a valid entry is rejected; the error contains the line number."""
         told = ENTRY.to_json() + "\nhello\n" + ENTRY.to_json() + "\n"
         error = self.assertRaises(BadSetting, parse_entries, told, "book")
         self.assertIn("line 2", str(error))
 
     def test_missing(self) -> None:
-        """Seeds in the seed log are not run again, except for seeds that ran with other workloads."""
+        """A seed in the seed log is not run again, unless its workloads differ."""
         logged = [ENTRY, replace(ENTRY, first=6), replace(ENTRY, first=4, what="wire")]
         self.assertEqual(find_missing(range(1, 11), logged, ""), [4, 5, 9, 10])
 
     def test_stretches(self) -> None:
-        """Seeds are grouped into ranges without gaps, up to a maximum length."""
+        """Consecutive seeds are grouped into ranges of limited length."""
         self.assertEqual(split_ranges([1, 2, 3, 7, 8, 10], 2), [[1, 2], [3], [7, 8], [10]])
         self.assertEqual(split_ranges([], 2), [])

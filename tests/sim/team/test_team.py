@@ -26,14 +26,14 @@ class TeamTests(SynchronousTestCase):
             team.stop()
 
     def team(self, scenario: Scenario, seed: int = 1) -> Team:
-        """Start a team that stops with the test."""
+        """Start a team that is stopped at the end of the test."""
         team = Team(scenario, seed)
         self.teams.append(team)
         team.form()
         return team
 
     def test_all_come_in_whatever_the_way(self) -> None:
-        """Nodes join one by one, in batches and all at once; in a small team each then knows all others."""
+        """Nodes join one by one, in batches or simultaneously; in a small team each then knows all others."""
         for join in (QUICK, Join("batches", 0.5, 3, settle=3.0), Join("at once", 0.5, settle=5.0)):
             team = self.team(Scenario(nodes=8, join=join))
             self.assertEqual((team.alive(), sorted(team.get_joined())), (list(range(8)),) * 2, join.how)
@@ -42,7 +42,7 @@ class TeamTests(SynchronousTestCase):
             self.assertEqual(known, [7] * 8, join.how)
 
     def test_batches_come_in_their_size(self) -> None:
-        """The first node starts alone, then one batch after each ``pause``."""
+        """The first node starts alone, followed by one batch after each ``pause``."""
         team = Team(Scenario(nodes=6, join=Join("batches", 1.0, 2)), 1)
         self.teams.append(team)
         born: list[tuple[float, int]] = []
@@ -54,7 +54,7 @@ class TeamTests(SynchronousTestCase):
         self.assertEqual(born, [(0.0, 0), (1.0, 1), (1.0, 2), (2.0, 3), (2.0, 4), (3.0, 5)])
 
     def test_next_life_is_the_same_node_on_its_disk(self) -> None:
-        """A restarted node keeps its identity and its store, and listeners learn of its end and its start."""
+        """A restarted node keeps its identity and its store; listeners are notified of its end and its start."""
         team = self.team(Scenario(nodes=4, join=QUICK))
         lives: list[tuple[str, int]] = []
         team.watch_lives(
@@ -80,7 +80,7 @@ class TeamTests(SynchronousTestCase):
         self.assertEqual(team.get_entangled(2).identity, former.identity)
 
     def test_another_node_may_take_the_place(self) -> None:
-        """A replaced node has another identity and an empty store."""
+        """A replaced node has a different identity and an empty store."""
         team = self.team(Scenario(nodes=4, join=QUICK))
         former = team.identity(3)
         team.leave(3)
@@ -96,7 +96,7 @@ class TeamTests(SynchronousTestCase):
         self.assertRaises(ValueError, team.replace, 3)
 
     def test_who_ends_before_it_is_in_says_so(self) -> None:
-        """``entered`` gives False for a node that ends before it has joined, and for a node that is not running."""
+        """``when_joined`` gives False for a node that ends before it has joined, and for a node that is not running."""
         team = self.team(Scenario(nodes=3, join=QUICK))
         place = team.add()
         waiting = team.when_joined(place)
@@ -107,7 +107,7 @@ class TeamTests(SynchronousTestCase):
         self.assertEqual(list(team.places), [0, 1, 2, 3])
 
     def test_still_node_is_lost_and_comes_back(self) -> None:
-        """A frozen node leaves the routing tables, and returns after the thaw without a restart."""
+        """A frozen node is removed from the routing tables; after the thaw it is added again without a restart."""
         team = self.team(Scenario(nodes=4, join=QUICK, clocks=Clocks(drift=0.001)))
         node = team.node(1)
         key = team.identity(1).node_id
@@ -120,12 +120,12 @@ class TeamTests(SynchronousTestCase):
         self.assertIs(team.node(1), node)
 
     def test_freezing_needs_machines(self) -> None:
-        """In a scenario without simulated machines a freeze is rejected with the missing setting."""
+        """In a scenario without simulated machines, a freeze is rejected; the error contains the missing setting."""
         team = self.team(Scenario(nodes=3, join=QUICK))
         self.assertIn("drift", str(self.assertRaises(ValueError, team.freeze, 1)))
 
     def test_traffic_is_counted_by_place_over_all_lives(self) -> None:
-        """The traffic of all places, earlier runs of a node included, adds up to the traffic of the switchboard."""
+        """The traffic of all places, including earlier runs of a node, adds up to the traffic of the switchboard."""
         team = self.team(Scenario(nodes=5, join=QUICK, link=LinkSettings("none")))
         team.kill(4)
         team.start(4)
@@ -146,14 +146,14 @@ class TeamTests(SynchronousTestCase):
         self.assertEqual(seen[-1], 3)
 
     def test_nodes_behind_routers_come_in(self) -> None:
-        """Some nodes, never the first two, are behind a NAT, and join the network nevertheless."""
+        """Nodes behind a NAT join the network; the first two nodes are never behind a NAT."""
         team = self.team(Scenario(nodes=6, join=QUICK, nat=Nats(0.5, ("port",))))
         behind = [place for place in team.places if team.get_state(place).nat is not None]
         self.assertTrue(behind and not {0, 1} & set(behind))
         self.assertEqual(sorted(team.get_joined()), list(range(6)))
 
     def test_everything_follows_from_the_seed(self) -> None:
-        """The same scenario and seed give the same digest; another seed gives another one."""
+        """Equal scenarios and seeds give equal digests; a different seed gives a different digest."""
         scenario = Scenario(nodes=6, join=Join("at once", 0.1, settle=3.0), link=LinkSettings("wifi", loss=0.1))
         first, second, other = (self.team(scenario, seed).digest() for seed in (7, 7, 8))
         self.assertEqual(first, second)

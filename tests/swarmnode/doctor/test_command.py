@@ -37,7 +37,7 @@ LINKS = [
 
 
 class CommandTests(SynchronousTestCase):
-    """Tests of the command."""
+    """Tests of the command ``swarm doctor``."""
 
     def setUp(self) -> None:
         self.folder = Path(self.mktemp()).absolute()
@@ -54,11 +54,11 @@ class CommandTests(SynchronousTestCase):
         (self.folder / FOLDER_NAME / f"{name}{SUFFIX}").touch()
 
     def ask(self, path: Path, request: dict[str, Any]) -> Iterator[dict[str, Any]]:
-        """Answer in place of the node."""
+        """Return the reply of a running node."""
         yield {"answer": self.health if request["verb"] == "health" else LINKS}
 
     def measure(self, settings: Settings, is_running: bool, health: Health | None) -> Facts:
-        """Return the prepared facts."""
+        """Return the prepared facts instead of measured facts."""
         self.measured.append((settings.node.name, is_running, health))
         return replace(self.facts, health=health, is_running=is_running)
 
@@ -70,7 +70,7 @@ class CommandTests(SynchronousTestCase):
         return code, out.getvalue(), errors.getvalue()
 
     def test_exit_code(self) -> None:
-        """Without findings the exit code is 0; with a finding the reason and the remedy are printed and it is 1."""
+        """Without findings the exit code is 0. With a finding it is 1, and the reason and the remedy are printed."""
         code, printed, _ = self.run_it(str(self.settings))
         self.assertEqual((code, printed), (0, "no problem found; run it again while the node runs\n"))
         self.assertEqual(self.measured, [("dog1", False, None)])
@@ -81,7 +81,7 @@ class CommandTests(SynchronousTestCase):
             self.assertIn(part, printed)
 
     def test_running_node_is_asked(self) -> None:
-        """A running node of the settings is queried over its control socket, and each of its links gets a score."""
+        """The running node of the settings is queried over its control socket, and each of its links gets a score."""
         self.runs("dog1")
         code, printed, _ = self.run_it(str(self.settings))
         self.assertEqual((code, self.measured[0][1]), (0, True))
@@ -89,7 +89,7 @@ class CommandTests(SynchronousTestCase):
         self.assertIn("~ef:1    0/100  does not reply\n", printed)
 
     def test_running_node_without_settings(self) -> None:
-        """Without settings the only running node is queried, and its recorded refusals are findings."""
+        """Without settings the only running node is queried, and the refusals that it recorded are findings."""
         self.runs("dog1")
         self.health = {**HEALTH, "address": "127.0.0.1:8484", "refusals": [["revoked", "192.168.1.9:8484"]]}
         code, printed, _ = self.run_it()
@@ -107,7 +107,7 @@ class CommandTests(SynchronousTestCase):
         self.assertEqual([each["score"] for each in read["links"]], [100, 0])
 
     def test_refusals(self) -> None:
-        """Missing settings without a running node, and invalid settings, are rejected in one line with code 2."""
+        """Missing settings without a running node, and invalid settings, give one error line and exit code 2."""
         code, _, complaint = self.run_it()
         self.assertEqual(code, 2)
         self.assertIn("swarm doctor SETTINGS", complaint)

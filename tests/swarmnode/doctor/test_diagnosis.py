@@ -34,18 +34,18 @@ WELL = Facts(
     is_gateway_resolved=True,
 )
 CALLED = LanDiscovery((), is_sent=True, has_received_own=True)
-"""A call to the LAN without an answer."""
+"""A discovery on the LAN without a reply from another node."""
 DAY = 86400.0
 OFF = Probe(Address("192.168.1.33", 8484), is_near=True, is_resolved=False)
 STRANGER = Probe(FAR, Answer(FAR, fingerprint=b"b" * 8, offset=0.0))
 NO_MARK = Probe(FAR, Answer(FAR, offset=0.0))
 UNREADABLE = Certificate(problem="others can read it")
 Case = tuple[dict[str, Any], str, str]
-"""What is other than with the healthy node, the weight and the cause of the one finding, and words that it says."""
+"""The facts that differ from the healthy node's facts; the severity and text of the only finding."""
 
 
 def seen_at(*ports: int) -> dict[str, Any]:
-    """Return the facts of known nodes that see this machine at these ports of a router."""
+    """Return the facts of known nodes that see this machine at these external ports of its router."""
     probes = [
         Probe(at, Answer(at, seen=Address("198.51.100.1", port)), is_member=True)
         for at, port in zip((FAR, Address("203.0.113.6", 8484)), ports, strict=False)
@@ -54,7 +54,7 @@ def seen_at(*ports: int) -> dict[str, Any]:
 
 
 class DiagnosisTests(SynchronousTestCase):
-    """Each cause is found with reason and remedy, and a healthy node has no finding."""
+    """Each cause is found and has a reason and a remedy; a healthy node has no finding."""
 
     def check(self, *cases: Case) -> None:
         """Check that each case has exactly one finding."""
@@ -70,7 +70,7 @@ class DiagnosisTests(SynchronousTestCase):
             self.assertEqual(diagnose(replace(WELL, **changes)), [], changes)
 
     def test_way(self) -> None:
-        """Problems on the path to known nodes are found: firewalls, client isolation, wrong addresses."""
+        """Problems on the path to known nodes are found: firewalls, client isolation and wrong addresses."""
         blocked = {"known": (replace(SILENT, is_tcp=True),), "lan": None}
         guarded = replace(SILENT_NEAR, is_resolved=True)
         unplugged = (LO, WLAN, replace(CABLE, is_running=False))
@@ -99,12 +99,15 @@ class DiagnosisTests(SynchronousTestCase):
             (alone, "error no-bootstrap", "203.0.113.5:8484"),
             ({"known": (), "lan": CALLED}, "warning no-bootstrap", "known_nodes is empty"),
         )
-        # A reply over UDP shows that UDP is not blocked, and a running node with contacts is not alone.
+        # A reply over UDP shows that UDP is not blocked, and a running node that has contacts is not isolated.
         other = Probe(Address("203.0.113.6", 1), is_tcp=True)
         self.check_well({}, {"known": (OUTSIDE, other)}, {**alone, "health": Health(2), "is_running": True})
 
     def test_multicast(self) -> None:
-        """Multicast blocked by the network differs from multicast blocked by this machine; own replies do not count."""
+        """Multicast blocked by the network is distinguished from multicast blocked by this machine.
+
+        Replies of this machine itself do not count.
+        """
         own = LanDiscovery((Answer(Address("192.168.1.7", 8485), offset=0.0),), True, True)
         self.check(
             ({"lan": CALLED}, "warning multicast-blocked", "This network does not forward multicast"),
@@ -114,7 +117,10 @@ class DiagnosisTests(SynchronousTestCase):
         )
 
     def test_kind_of_router(self) -> None:
-        """Equal external ports for all peers mean a cone NAT, different ones a symmetric NAT; one peer is too few."""
+        """Equal external ports for all peers mean a cone NAT, different ports a symmetric NAT.
+
+        One peer is not enough.
+        """
         self.check(
             (seen_at(5000, 5000), "note nat-cone", ""),
             (seen_at(5000, 6000), "warning nat-symmetric", "198.51.100.1:6000"),
@@ -122,7 +128,7 @@ class DiagnosisTests(SynchronousTestCase):
         )
 
     def test_team(self) -> None:
-        """Another team, another version and an invalid certificate each have their own cause."""
+        """A different team, a different version and an invalid certificate are separate causes."""
         newer = Probe(FAR, Answer(FAR, version=VERSION + 1, offset=0.0))
         self.check(
             ({"known": (STRANGER,), "fingerprint": b"a" * 8, "lan": None}, "error wrong-team", "swarm join"),
@@ -133,13 +139,13 @@ class DiagnosisTests(SynchronousTestCase):
             ({"certificate": Certificate(WALL + DAY, WALL + 9 * DAY)}, "error certificate-early", ""),
             ({"certificate": Certificate(0.0, WALL + DAY)}, "warning certificate-ends", ""),
             ({"certificate": UNREADABLE}, "error certificate-unreadable", ""),
-            # If the membership cannot be read, no node can be verified, so unknown fingerprints are not a finding.
+            # Without a readable membership no node can be verified, so unknown fingerprints are not a finding.
             ({"known": (STRANGER,), "lan": None, "certificate": UNREADABLE}, "error certificate-unreadable", ""),
         )
         self.check_well({"certificate": Certificate(WALL - DAY, WALL + 30 * DAY)})
 
     def test_refusals_that_the_running_node_met(self) -> None:
-        """Each reason for which peers refused the node has a finding with a remedy."""
+        """Each reason for which peers have refused the node has a finding with a remedy."""
         causes = {
             "revoked": "certificate-revoked",
             "expired": "certificate-expired",
@@ -152,7 +158,9 @@ class DiagnosisTests(SynchronousTestCase):
             self.check(({"health": health}, f"error {cause}", "203.0.113.5:8484"))
 
     def test_clock(self) -> None:
-        """A clock that differs from the peers' median is found; own nodes and one wrong peer do not count.
+        """A clock that differs from the median clock of the peers is found.
+
+        The node's own clock and one wrong peer do not count.
 
         A certificate that is valid by the peers' clocks is not reported as expired, because the local clock is wrong.
         """
@@ -174,7 +182,7 @@ class DiagnosisTests(SynchronousTestCase):
         self.check_well(offset(0.0, 1e9, 1.0))
 
     def test_machine(self) -> None:
-        """A port in use, a store without space, and secrets that other users can read are found."""
+        """A port in use, a store without free space, and secrets that other users can read are found."""
         taken = {"port_problem": "Another program listens at 192.168.1.7:8484."}
         self.check(
             (taken, "error port-in-use", "8484"),

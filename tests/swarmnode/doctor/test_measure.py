@@ -20,12 +20,12 @@ class MeasureTests(SynchronousTestCase):
         self.file = self.folder / "a.toml"
 
     def settings(self, **node: object) -> Settings:
-        """Return settings from the file."""
+        """Return settings with the content of a file."""
         self.file.touch(mode=0o600)
         return Settings.from_mapping({"node": {"name": "a", "team_key": "k", **node}}, str(self.file))
 
     def test_well(self) -> None:
-        """A node with a private folder and private files has no problem."""
+        """For a node whose folder and files are private, no problem is measured."""
         facts = measure_facts(self.settings(store="a.sqlite"))
         assert facts.storage is not None
         self.assertEqual((facts.storage.problem, facts.open_files, facts.lan, facts.known), ("", (), None, ()))
@@ -37,7 +37,7 @@ class MeasureTests(SynchronousTestCase):
         self.assertEqual([probe.error for probe in facts.known], ["refused"])
 
     def test_open_files(self) -> None:
-        """Settings with a key, and a store, that other users can read are listed with their modes."""
+        """Settings that contain a key, and a store, are listed with their modes if other users can read them."""
         settings = self.settings(store="a.sqlite")
         (self.folder / "a.sqlite").touch(mode=0o600)
         os.chmod(self.folder / "a.sqlite", 0o640)

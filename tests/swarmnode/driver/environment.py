@@ -18,7 +18,7 @@ PATIENCE_S = 60.0
 
 
 class ScriptedTerminal:
-    """A terminal that presses ``keys``, each at its time after the start, and records the output."""
+    """A terminal on which ``keys`` are pressed, each at its time after the start; it records the output."""
 
     def __init__(self, clock: Clock, keys: Sequence[tuple[float, str]]) -> None:
         self.lines: list[tuple[float, str]] = []
@@ -42,7 +42,7 @@ class ScriptedTerminal:
 
 
 class MemoryEnvironment:
-    """An environment in memory; ``pass_time`` is called at each step, for a robot that moves."""
+    """An environment in memory; each step calls ``pass_time``, for a robot that moves."""
 
     def __init__(self, clock: Clock, connector: Any, pass_time: Callable[[float], None] = lambda _: None) -> None:
         self.clock = clock

@@ -38,7 +38,7 @@ class DriverCommandTests(SynchronousTestCase):
         self.ground = MemoryEnvironment(self.clock, self.connector, self.pass_time)
 
     def tearDown(self) -> None:
-        """After each command the robot stands with disabled motors, and no timer is left."""
+        """After each command the robot stands still with disabled motors, and no timer remains."""
         for _ in range(100):
             self.clock.advance(0.01)
         self.assertEqual((self.body.motion, self.dog.is_engaged), ((0.0, 0.0, 0.0), True))
@@ -51,7 +51,7 @@ class DriverCommandTests(SynchronousTestCase):
         self.speeds.append((round(self.clock.seconds(), 3), *self.body.motion[::2]))
 
     def moving(self, began: float, ended: float) -> list[float]:
-        """Return the forward speeds between two times."""
+        """Return the forward speeds of the robot between two times."""
         return [vx for at, vx, _ in self.speeds if began <= at <= ended]
 
     def test_list_names_every_kind(self) -> None:
@@ -64,7 +64,7 @@ class DriverCommandTests(SynchronousTestCase):
         self.assertEqual([entry["kind"] for entry in entries], list_kinds())
 
     def test_info_describes_before_connecting(self) -> None:
-        """Limits with units, skills and rates are printed without a robot, by kind or from a node's settings."""
+        """Without a connection, limits with units, skills and rates are printed for a kind or a node's settings."""
         code, output, _ = self.ground.swarm_driver("info aibo")
         self.assertEqual(code, 0)
         self.assertRegex(output, r"base\.vx +-0\.156 to \+0\.16 m/s")
@@ -81,7 +81,7 @@ class DriverCommandTests(SynchronousTestCase):
         self.assertIn("compass", told["capabilities"])
 
     def test_probe_says_what_came(self) -> None:
-        """A probe reports the time to the first observation, rate, dialect, battery and bad frames."""
+        """A probe reports the time to the first observation, the rate, dialect, battery and invalid frames."""
         code, output, complaint = self.ground.swarm_driver(f"probe {ROBOT}")
         self.assertEqual((code, complaint), (0, ""))
         self.assertRegex(output, r"first observation after 0\.\d\d s")
@@ -94,7 +94,7 @@ class DriverCommandTests(SynchronousTestCase):
         self.assertEqual((finding["is_there"], finding["readings"]["mode"]), (True, "T4"))
 
     def test_probe_names_what_is_wrong(self) -> None:
-        """A probe of a robot that is off ends with exit code 1 and the problem of the link or the driver."""
+        """A probe of a robot that is off exits with code 1, and prints the problem of the link or the driver."""
         self.connector.is_open = False
         self.ground.problems = ["dog1:10020: it does not answer; is it switched on?"]
         code, output, _ = self.ground.swarm_driver(f"probe {BLIND}")
@@ -119,7 +119,10 @@ class DriverCommandTests(SynchronousTestCase):
         self.assertIn("first observation", output)
 
     def test_drive_by_keys(self) -> None:
-        """A held key moves the robot at 30 % speed; after its release the robot stops within 0.4 s; x ends."""
+        """A held key moves the robot at 30 % speed; 0.4 s after its release the robot stands still.
+
+        The key x ends the drive.
+        """
         held = [(1.0 + 0.1 * n, "w") for n in range(10)]
         self.ground.keys = [*held, (3.0, "a"), (3.1, "w"), (4.0, "+"), (4.1, "s"), (4.2, " "), (5.0, "x")]
         code, _, complaint = self.ground.swarm_driver(f"drive {BLIND}")
@@ -139,7 +142,7 @@ class DriverCommandTests(SynchronousTestCase):
         self.assertTrue(any("near 0.25 m" in line for line in lines))
 
     def test_drive_ends_at_rest_however_it_ends(self) -> None:
-        """The end of input and Ctrl-C end the drive like x does: the robot stands with disabled motors."""
+        """The end of input and Ctrl-C end the drive like the key x: the robot stands still with disabled motors."""
         for ending in ([(1.2, "")], [(1.2, "\x04")], []):
             began = self.clock.seconds()
             self.ground.keys = [(1.0, "w"), *ending]
@@ -149,7 +152,7 @@ class DriverCommandTests(SynchronousTestCase):
             self.assertEqual((self.body.motion, self.dog.is_engaged), ((0.0, 0.0, 0.0), True))
 
     def test_drive_says_why_it_does_not_move(self) -> None:
-        """The status line shows that the motors were switched off at the robot, and m enables them again."""
+        """The status line shows that the motors were switched off at the robot; the key m enables them again."""
         self.ground.keys = [(1.5, "w"), (2.0, "m"), (3.0, "w"), (4.0, "x")]
         self.clock.callLater(1.0, self.dog.press_back_button)
         self.ground.swarm_driver(f"drive {BLIND}")
@@ -159,7 +162,7 @@ class DriverCommandTests(SynchronousTestCase):
         self.assertTrue(any(self.moving(3.05, 3.3)))
 
     def test_drive_is_refused_by_name(self) -> None:
-        """A missing terminal, an immobile robot, no robot and two robots are rejected in one line with code 2."""
+        """A missing terminal, an immobile robot, no robot and two robots each give one error line and exit code 2."""
         for words, told in (
             (["drive", *BLIND.split()], "is not a terminal"),
             (["drive", "--kind", "camera"], "a robot of kind camera does not move"),
@@ -178,14 +181,14 @@ class DriverCommandTests(SynchronousTestCase):
                 self.assertEqual(complaint.count("\n"), 1)
 
     def complaint(self, words: list[str]) -> str:
-        """Run an invalid command and return its error message."""
+        """Run an invalid command; return its error message."""
         said = io.StringIO()
         with contextlib.redirect_stderr(said):
             self.assertEqual(main(words, io.StringIO()), 2)
         return said.getvalue()
 
     def test_monitor_shows_and_saves(self) -> None:
-        """Readings with units are printed each second, and the newest picture is saved completely."""
+        """Sensor values with units are printed every second, and the newest picture is saved as a complete file."""
         picture = Path(self.mktemp())
         code, output, _ = self.ground.swarm_driver(f"monitor {ROBOT} --seconds 2 --picture {picture}")
         self.assertEqual((code, picture.read_bytes()), (0, JPEG))
@@ -197,7 +200,7 @@ class DriverCommandTests(SynchronousTestCase):
         self.assertIsNone(json.loads(lines[0])["values"]["range.far"])
 
     def test_monitor_says_what_it_lacks(self) -> None:
-        """A missing picture, an unwritable file and an unreachable robot are reported with exit code 1."""
+        """A missing picture, an unwritable file and an unreachable robot are reported, and the exit code is 1."""
         code, output, _ = self.ground.swarm_driver(f"monitor {BLIND} --seconds 1 --picture {self.mktemp()}")
         self.assertEqual((code, "! no picture received" in output), (1, True))
         code, output, _ = self.ground.swarm_driver(f"monitor {ROBOT} --seconds 5 --picture /no/such/folder/x.jpg")
@@ -207,7 +210,7 @@ class DriverCommandTests(SynchronousTestCase):
         self.assertEqual((code, "! no data within 8 s" in output), (1, True))
 
     def test_pilot_speaks_with_the_robots_own_token(self) -> None:
-        """A robot that has obeyed token 7 is driven with token 7, because a higher one would lock out the team."""
+        """A robot that accepted token 7 is driven with token 7: a higher token would lock out the team."""
         driver = create_driver("aibo", {"host": "dog1", "camera": False}, "dog1", self.clock, self.connector)
         driver.connect()
         self.turn(1.0)

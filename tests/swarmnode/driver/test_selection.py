@@ -30,7 +30,7 @@ from swarmnode.driver.selection import parse_options
 
 class OptionTests(SynchronousTestCase):
     def test_words_become_options(self) -> None:
-        """A value is parsed as TOML if possible, otherwise it is text; dots create tables."""
+        """A value that is valid TOML is parsed as TOML; any other value is text. Dots in a key create tables."""
         words = ["host=192.168.0.51", "port=7400", "camera=false", "speed=[0.1, 0.2]", "ports.walk=1", "ports.head=2"]
         self.assertEqual(
             parse_options([*words, "name=a=b", "when=2020-01-01", "empty="]),
@@ -41,14 +41,14 @@ class OptionTests(SynchronousTestCase):
         )
 
     def test_other_words_are_refused(self) -> None:
-        """A word that is not KEY=VALUE, and a key that is both a value and a table, are rejected."""
+        """An argument that is not KEY=VALUE, and a key that is both a value and a table, are rejected."""
         for words in (["host"], ["=1"], ["a..b=1"], ["ports=1", "ports.walk=2"]):
             self.assertIn("--option", str(self.assertRaises(UsageError, parse_options, words)))
 
 
 class SerialDeviceTests(SynchronousTestCase):
     def test_serial_devices_are_shown(self) -> None:
-        """Each serial device is listed with its description, the next command, and the remedy if access is denied."""
+        """Each serial device is listed with its description and the next command, or the remedy if access is denied."""
         found = list_serial_devices(
             lambda: [("/dev/ttyUSB1", "FTDI"), ("/dev/ttyUSB0", "")], lambda device: "1" in device
         )
@@ -58,13 +58,13 @@ class SerialDeviceTests(SynchronousTestCase):
         self.assertEqual(told.count("no permission"), 1)
 
     def test_nothing_is_said_as_well(self) -> None:
-        """Without serial devices the output says that a robot in the network must be named."""
+        """If there is no serial device, the output says that a robot in the network has to be specified."""
         self.assertIn("has to be named", "\n".join(format_serial_devices([])))
 
 
 class UnitTests(SynchronousTestCase):
     def test_readings_have_their_units(self) -> None:
-        """Values have SI units by their key, angles also degrees, and NaN is described in words."""
+        """Values have SI units according to their key. Angles are also in degrees, and NaN is described in words."""
         for key, value, told in (
             ("base.vx", 0.1, "0.100 m/s"),
             ("base.wz", -0.5, "-0.500 rad/s"),
@@ -85,14 +85,14 @@ class UnitTests(SynchronousTestCase):
 
 class CatalogueTests(SynchronousTestCase):
     def test_says_what_is_missing(self) -> None:
-        """A kind with a missing library names the package to install; other kinds are ready."""
+        """A kind with a missing library is listed with the package to install; other kinds are ready."""
         bare = {entry.kind: entry for entry in list_kind_entries(lambda library: False)}
         self.assertIn("pip install 'swarm-node[serial]'", bare["create2"].needs)
         self.assertEqual((bare["create2"].is_ready, bare["aibo"].is_ready), (False, True))
         self.assertTrue(all(entry.is_ready for entry in list_kind_entries(lambda library: True)))
 
     def test_names_the_broken_kinds_of_others(self) -> None:
-        """A driver of another distribution is listed with its docstring; one that cannot be imported is broken."""
+        """A driver of another distribution is listed with its docstring; a driver that cannot be imported is broken."""
         folder = Path(self.mktemp()).resolve()
         (folder / "odd-1.dist-info").mkdir(parents=True)
         (folder / "odd-1.dist-info" / "METADATA").write_text("Name: odd\nVersion: 1\n")
@@ -111,7 +111,10 @@ class CatalogueTests(SynchronousTestCase):
 
 class RecordingConnectorTests(SynchronousTestCase):
     def test_remembers_what_is_wrong_with_each_line(self) -> None:
-        """Serial devices and addresses use different connectors, and a link's problem is reported while it lasts."""
+        """Serial devices and addresses use different connectors.
+
+        The problem of a link is reported until the problem ends.
+        """
         line = SimpleNamespace(problem="it is off")
         tcp = SimpleNamespace(connect=lambda host, port, client: line)
         cable = SimpleNamespace()
@@ -124,7 +127,7 @@ class RecordingConnectorTests(SynchronousTestCase):
         self.assertEqual(connector.list_problems(), [])
 
     def test_knows_a_serial_device_by_its_name(self) -> None:
-        """Every path is a serial device, links included; a host name that begins like one is not."""
+        """Every path is a serial device, including a link; a host name that begins like a device name is not."""
         tcp = SimpleNamespace(connect=lambda host, port, client: "tcp")
         serial = SimpleNamespace(connect=lambda host, port, client: "serial")
         connector = RecordingConnector(tcp, serial)
@@ -134,7 +137,7 @@ class RecordingConnectorTests(SynchronousTestCase):
             self.assertEqual(connector.connect(name, 10020, None), "tcp", name)
 
     def test_keeps_one_line_to_each_place(self) -> None:
-        """A robot that is queried with one connection per request does not fill the memory."""
+        """Repeated connections to the same robot do not use more and more memory."""
         tcp = SimpleNamespace(connect=lambda host, port, client: SimpleNamespace(problem=client))
         connector = RecordingConnector(tcp, None)
         for number in range(1000):
@@ -143,7 +146,7 @@ class RecordingConnectorTests(SynchronousTestCase):
         self.assertEqual(connector.list_problems(), ["dog1:80: problem 999"])
 
     def test_hears_the_warnings_of_drivers(self) -> None:
-        """Each warning of a driver is recorded once; messages of other modules and of lower levels are not."""
+        """Each warning of a driver is recorded once; messages of other modules and of lower levels are ignored."""
         collector = WarningCollector()
         for namespace in ("drivers.aibo.driver", "drivers.aibo.driver", "middleware.node"):
             Logger(namespace).warn("{robot}: it\nis off", robot=namespace[:7])
@@ -153,7 +156,7 @@ class RecordingConnectorTests(SynchronousTestCase):
         self.assertEqual(collector.warnings, ["drivers: it is off"])
 
     def test_tcp_line_says_why_there_is_no_link(self) -> None:
-        """A refused connection, a timeout and similar errors are reported with a remedy until the link is up."""
+        """A refused connection, a timeout and similar errors are reported with a remedy until the link is open."""
         connected: list[object] = []
 
         class Reactor(Clock):

@@ -1,4 +1,4 @@
-"""Tests of ``swarm service``: the unit, its installation and the calls of systemctl."""
+"""Tests of ``swarm service``: the unit, its installation and the calls of ``systemctl``."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ class UnitTests(SynchronousTestCase):
     """The text of a unit."""
 
     def test_a_node_may_little(self) -> None:
-        """A system unit has no fixed user, no capability and no device, and writes only its own folders."""
+        """A system unit runs as a dynamic user without capabilities and devices, and can write only its own folders."""
         lines = unit().text.splitlines()
         for line in (
             "DynamicUser=yes",
@@ -49,7 +49,7 @@ class UnitTests(SynchronousTestCase):
             self.assertIn(line, lines)
 
     def test_what_the_settings_need_is_let_through(self) -> None:
-        """The unit allows exactly the device, the low port and the home that the settings need."""
+        """The unit grants access to exactly the device, the low port and the home folder that the settings require."""
         robot = unit(driver={"kind": "create2", "options": {"port": "/dev/ttyUSB0"}})
         low = unit({"roles": ["web"]}, web={"tls": "auto", "tls_port": 443})
         homes = [
@@ -71,9 +71,9 @@ class UnitTests(SynchronousTestCase):
         self.assertIn('--config "/a b/50%%\\"/a.toml"\n', made.text)
 
     def test_systemd_takes_it(self) -> None:
-        """The unit passes the checks of systemd, which rates its exposure below 2 of 10."""
+        """The unit passes the checks of systemd, which rate its exposure below 2 of 10."""
         if shutil.which("systemd-analyze") is None:
-            raise SkipTest("there is no systemd-analyze here")
+            raise SkipTest("systemd-analyze is not installed")
         folder = Path(self.mktemp())
         folder.mkdir()
         file = folder / "swarm-node-dog1.service"
@@ -89,7 +89,7 @@ class UnitTests(SynchronousTestCase):
 
 
 class CommandTests(SynchronousTestCase):
-    """Tests of the verbs below a temporary root."""
+    """Tests of the verbs with a temporary folder as root."""
 
     def setUp(self) -> None:
         self.root = Path(self.mktemp()).absolute()
@@ -122,7 +122,7 @@ class CommandTests(SynchronousTestCase):
         return code, out.getvalue(), errors.getvalue()
 
     def install(self) -> tuple[int, str, str]:
-        """Install as root."""
+        """Run ``install`` with root rights."""
         return self.run_it("install", str(self.settings))
 
     def test_install(self) -> None:
@@ -141,7 +141,7 @@ class CommandTests(SynchronousTestCase):
         )
 
     def test_install_again_keeps_the_store(self) -> None:
-        """A second installation replaces the settings and keeps the store of the service."""
+        """A second installation replaces the settings, but not the store of the service."""
         self.install()
         (self.state / "dog1.sqlite").write_bytes(b"newer")
         (self.settings.parent / "dog1.sqlite").write_bytes(b"older")
@@ -151,7 +151,7 @@ class CommandTests(SynchronousTestCase):
         self.assertIn("kind", (self.state / "node.toml").read_text(encoding="utf-8"))
 
     def test_refused_settings(self) -> None:
-        """A store outside the settings' folder and invalid settings are rejected by name."""
+        """A store outside the settings' folder, and invalid settings, are rejected; the error contains the reason."""
         for text, words in (
             ('[node]\nname = "dog1"\nstore = "/srv/dog1.sqlite"\n', "/srv/dog1.sqlite is outside"),
             ("[node]\n", "[node] name: is missing"),
@@ -172,7 +172,7 @@ class CommandTests(SynchronousTestCase):
         self.assertEqual(self.run_it("show", str(self.settings), "--user")[0], 0)
 
     def test_the_python_behind_the_environment_counts(self) -> None:
-        """If the environment's Python is a link into a home, the unit may read homes."""
+        """If the Python of the virtual environment is a link into a home folder, the unit can read home folders."""
         Path(self.program).symlink_to("/home/ann/.pyenv/bin/python3")
         code, printed, _ = self.run_it("show", str(self.settings))
         self.assertEqual(code, 0)
@@ -188,7 +188,10 @@ class CommandTests(SynchronousTestCase):
         self.assertTrue((self.state / "node.toml").exists())
 
     def test_refusals_of_restart_and_systemd(self) -> None:
-        """An unknown service is rejected without systemctl; if systemctl fails, the exit code is 1 with a hint."""
+        """An unknown service is rejected without calling ``systemctl``; if ``systemctl`` fails, the exit code is 1.
+
+        The error contains a hint.
+        """
         for verb in ("restart", "remove"):
             code, _, complaint = self.run_it(verb, "cat")
             self.assertEqual((code, self.told), (2, []))
@@ -199,7 +202,7 @@ class CommandTests(SynchronousTestCase):
         self.assertIn("journalctl -u swarm-node-dog1", complaint)
 
     def test_without_root_it_is_the_users_own(self) -> None:
-        """Without root the unit belongs to the user's manager, and uses the settings in place."""
+        """Without root rights the unit is a unit of the user's systemd, and uses the settings where they are."""
         self.patch(os, "environ", {**os.environ, "XDG_CONFIG_HOME": "/home/ann/.config"})
         code, printed, _ = self.run_it("install", str(self.settings), uid=1000)
         self.assertEqual(code, 0)
