@@ -1,4 +1,4 @@
-"""Chat over the tuple space: a line is one tuple for each participant, and each participant takes its own tuples.
+"""Chat over the tuple space: each line is put as one tuple per receiver, and each participant takes the tuples for it.
 
 ``python examples/chat.py --port 7000 ann``, and in another terminal ``... --port 7001 --known 127.0.0.1:7000 bob``.
 Type lines; end with Ctrl-C or Ctrl-D.
@@ -18,7 +18,7 @@ from middleware.entangled.control.conversion import remove_control_characters
 from middleware.entangled.space.tuplespace import TupleSpace
 
 LINE_TTL_S = 60.0
-"""Seconds after which an undelivered line expires."""
+"""Time after which a line that was not delivered expires, in seconds."""
 
 
 class Keyboard(LineReceiver):

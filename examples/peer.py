@@ -1,4 +1,4 @@
-"""A node for the examples: over UDP on this machine, with a new key for each run."""
+"""A node for the examples, which uses UDP on this machine and a new key for each run."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from middleware.entangled.network.udp import UdpNetwork
 from middleware.entangled.node import EntangledNode
 
 TEAM_KEY = b"everybody who runs the examples."
-"""A real team has 32 secret bytes here: a node without them can neither read nor write."""
+"""Use 32 secret bytes in a real team: a node that does not know them can neither read nor write records."""
 
 
 async def joined(reactor: Any, port: int, known: str = "") -> EntangledNode:

@@ -1,7 +1,8 @@
-"""A work queue that survives its workers: the job of a dead worker returns to the queue.
+"""A work queue that tolerates the loss of workers: the job of a failed worker returns to the queue.
 
-``python examples/workqueue.py --port 7000 boss 20`` puts twenty jobs and waits for their results.  In other terminals
-``... --port 7001 --known 127.0.0.1:7000 worker ann --dies 0.2``: each job kills the worker with that probability.
+``python examples/workqueue.py --port 7000 boss 20`` puts twenty jobs and waits for their results.  Start workers in
+other terminals with ``... --port 7001 --known 127.0.0.1:7000 worker ann --dies 0.2``.  ``--dies`` is the probability
+that a worker fails during a job.
 """
 
 from __future__ import annotations
@@ -18,7 +19,7 @@ from middleware.entangled.space.tuplespace import TupleSpace
 
 WORK_S = 0.2
 LEASE_S = 1.5
-"""Longest duration of a job in seconds; the job of a dead worker returns after this time."""
+"""Longest duration of a job in seconds; the job of a failed worker returns to the queue after this time."""
 
 
 async def boss(space: TupleSpace, jobs: int) -> None:
@@ -29,14 +30,14 @@ async def boss(space: TupleSpace, jobs: int) -> None:
     done: dict[object, object] = {}
     while len(done) < jobs:
         _, number, worker, result = await space.get(("done", int, str, int))
-        # A worker that dies between its result and confirm() causes a second result.
+        # If a worker fails after it put its result and before confirm(), another worker puts a second result.
         if number not in done:
             done[number] = result
             print(f"{number} squared is {result}, says {worker} ({len(done)} of {jobs})", flush=True)
 
 
 async def work(reactor: Any, space: TupleSpace, name: str, dies: float) -> None:
-    """Do jobs until the worker dies."""
+    """Do jobs; exit during a job with the probability ``dies``, without confirming the job."""
     rng = random.SystemRandom()
     while True:
         claim = await space.claim(("job", int), lease=LEASE_S)

@@ -1,4 +1,4 @@
-"""Emulator of the rover, on an endless floor; ``python emulator.py`` serves it on port 4000."""
+"""Emulator of the rover, on an unlimited floor; ``python emulator.py`` serves the emulator on port 4000."""
 
 import math
 
@@ -6,7 +6,7 @@ PERIOD_S = 0.05
 
 
 class Emulator:
-    """One rover, timed by ``clock``; with several clients it obeys the latest command."""
+    """One rover, timed by ``clock``; it executes the latest command of any client."""
 
     def __init__(self, clock):
         self._clock = clock
@@ -17,12 +17,12 @@ class Emulator:
         self._report()
 
     def accept(self, link):
-        """Serve a new link."""
+        """Add ``link`` to the clients; return the object that receives its data."""
         self._links.append(link)
         return _Client(self, link)
 
     def true_speed(self):
-        """Return its speed in m/s."""
+        """Return the speed of the rover in m/s."""
         return abs(self._vx)
 
     def obey(self, line):
@@ -35,7 +35,7 @@ class Emulator:
             self._vx, self._wz = map(float, numbers)
 
     def leave(self, link):
-        """Remove a link and stop."""
+        """Remove ``link`` from the clients, and stop the rover."""
         self._links.remove(link)
         self._vx = self._wz = 0.0
 

@@ -1,4 +1,4 @@
-"""Template of a driver.  The rover sends ``t x y yaw bumped motors`` 20 times per second and obeys ``V`` and ``M``."""
+"""Template of a driver.  The rover sends ``t x y yaw bumped motors`` 20 times per second, and obeys ``V`` and ``M``."""
 
 import re
 
@@ -13,7 +13,7 @@ NUMBER = re.compile(rb"-?\d{1,9}(\.\d{1,9})?")
 
 
 class Rover(BaseDriver):
-    """One rover, over TCP."""
+    """Driver of one rover, over TCP."""
 
     def __init__(self, options, name, clock, connector):
         super().__init__(ROVER, name, clock)

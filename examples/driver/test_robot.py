@@ -10,6 +10,6 @@ from drivers.conformance import Conformance, MemoryRig
 
 
 class RoverTests(Conformance, SynchronousTestCase):
-    """The template conforms."""
+    """The driver of the rover passes the conformance tests."""
 
     rig = partial(MemoryRig, Rover, Emulator, {"host": "rover"})

@@ -1,4 +1,4 @@
-"""A brain that wanders and avoids obstacles.  ``python examples/pyro/avoid.py`` or ``--host ROBOT``."""
+"""A brain that wanders and avoids obstacles; run ``python examples/pyro/avoid.py [--host ROBOT]``."""
 
 from __future__ import annotations
 
@@ -7,13 +7,13 @@ import math
 from drivers.pyro.brain import Brain, Engine
 
 NEAR, FREE = 0.55, 0.9
-"""Distance in metres at which the robot turns away, and the free distance it needs to continue."""
+"""Distance in metres at which the robot turns away, and free distance in metres at which it continues."""
 CRUISE, TURN, SWING = 0.7, 0.4, 0.45
-"""Fractions of the robot's limits."""
+"""Speeds ahead, when turning away and when swinging, as fractions of the robot's limits."""
 
 
 class Avoid(Brain):
-    """Drives straight while nothing is ahead; swings from side to side, as an AIBO ranges only straight ahead."""
+    """Drives ahead and swings, because an AIBO measures only straight ahead; turns away from obstacles."""
 
     def setup(self) -> None:
         """Reset the state."""

@@ -1,4 +1,4 @@
-"""Common code of the two brains: connects to a robot, or simulates a world with an emulated AIBO."""
+"""Common code of the two brains: connect to a robot, or simulate a world with an emulated AIBO."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ STEPS = 2
 
 
 class Pen:
-    """A world with a red target and an emulated AIBO, its first dog; ``seed`` determines their positions."""
+    """A simulated world with a red target, whose first dog is an emulated AIBO; ``seed`` determines the positions."""
 
     def __init__(self, clock: IReactorTime, seed: int = 1) -> None:
         self.world = World(random.Random(seed), load_scene("three-dogs"))
@@ -43,12 +43,12 @@ class Pen:
         self._loop.clock = clock
 
     def start(self) -> None:
-        """Start the dog and simulated time."""
+        """Start the simulation and the emulated dog."""
         self._loop.start(STEPS * SUBSTEP_S)
         self._emulator.start()
 
     def stop(self) -> None:
-        """Stop both."""
+        """Stop the simulation and the emulated dog."""
         self._emulator.stop()
         self._loop.stop()
 
@@ -63,15 +63,15 @@ class Pen:
 
 
 def main(init: Callable[[Engine], Brain], about: str) -> None:
-    """Run a brain from the command line, until it quits, ``--seconds`` pass, or Ctrl-C; then stop the robot."""
+    """Run a brain until it quits, ``--seconds`` pass or Ctrl-C is pressed; then stop the robot."""
     parser = argparse.ArgumentParser(description=about)
     parser.add_argument("--kind", default="aibo", choices=list_kinds(), help="the kind of robot (default %(default)s)")
-    parser.add_argument("--host", help="its address; without options an emulated AIBO runs in this process")
+    parser.add_argument("--host", help="address of the robot; without options an emulated AIBO runs in this process")
     parser.add_argument(
-        "--option", action="append", default=[], metavar="KEY=VALUE", help="an option of its driver; repeatable"
+        "--option", action="append", default=[], metavar="KEY=VALUE", help="an option of the driver; repeatable"
     )
     parser.add_argument("--seconds", type=float, default=30.0, help="duration of the run (default %(default)s)")
-    parser.add_argument("--seed", type=int, default=1, help="of the simulated world (default %(default)s)")
+    parser.add_argument("--seed", type=int, default=1, help="random seed of the simulated world (default %(default)s)")
     args = parser.parse_args()
 
     from twisted.internet import reactor as running

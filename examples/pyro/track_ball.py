@@ -1,4 +1,4 @@
-"""A brain that turns towards a red ball.  ``python examples/pyro/track_ball.py`` or ``--host ROBOT``."""
+"""A brain that turns towards a red ball; run ``python examples/pyro/track_ball.py [--host ROBOT]``."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ LEAST = 12
 
 
 class TrackBall(Brain):
-    """Turns until the ball is in sight, and then faces it."""
+    """Turns until the ball is visible, and then keeps it in the middle of the picture."""
 
     def setup(self) -> None:
         """Add filters that find red pixels."""
@@ -24,7 +24,7 @@ class TrackBall(Brain):
         self.cam.clearFilters()
 
     def step(self) -> None:
-        """Turn to the largest red blob, or continue to search."""
+        """Turn towards the largest red area, or, if there is none, continue to turn."""
         results = self.cam.filterResults
         if len(results) > 1 and len(results[-1]) > 0:  # both filters have run
             x1, y1, x2, y2, area = results[-1][0]

@@ -1,4 +1,4 @@
-"""A strategy in ten lines: of all robots that are near enough, select the one with the fullest battery."""
+"""A strategy in ten lines: of the robots at about the same distance, select the robot with the fullest battery."""
 
 from __future__ import annotations
 
@@ -7,11 +7,11 @@ from middleware.consensus.strategy import Report
 
 
 class Spare(CapabilityCost):
-    """Distances that differ by less than ten metres count as equal; then the battery decides, and then the id."""
+    """Compare distances in steps of ten metres; within one step the battery decides, and then the agent's id."""
 
     name = "spare"
     version = "1"
 
     def weigh(self, report: Report) -> float:
-        """Return tens of metres plus half of the missing charge."""
+        """Return the number of whole ten metres of the cost, plus half of the missing charge."""
         return report.cost // 10.0 + (1.0 - report.battery) / 2.0

@@ -1,4 +1,4 @@
-"""Template with every method of a strategy; this one selects the farthest robot.
+"""Template with every method of a strategy; this strategy selects the farthest robot.
 
 Run its tests in this folder with ``python -m twisted.trial test_strategies``; README.md explains its installation.
 """
@@ -11,13 +11,13 @@ from middleware.consensus.strategy import Consensus, Report, digest_of, refusal,
 
 
 class Farthest:
-    """The highest cost wins, ties are broken by the agent's id; pure: no clock, no randomness, no network."""
+    """Select the highest cost, and among equal costs the lowest agent id; pure: no clock, no randomness, no network."""
 
     name = "farthest"
     version = "1"
 
     def find(self, contacts: Sequence[Report]) -> Consensus:
-        """Select the agent that should act, from all reports including its own; their order has no effect."""
+        """Return the agent that should act, given the reports of all agents; their order has no effect."""
         order = sorted(standing(contacts, self.rank), key=lambda r: (self.rank(r), r.agent))
         if not order:
             return Consensus(None, reason="no report counts")
@@ -29,9 +29,9 @@ class Farthest:
         return not refusal(offer) and offer.cost * (1.0 - hysteresis) > current.cost
 
     def merge(self, a: Sequence[Report], b: Sequence[Report]) -> tuple[Report, ...]:
-        """Return the reports that have to be forwarded, so that ``find`` gives the same result as with all reports."""
+        """Return reports with which ``find`` gives the same result as with all reports of ``a`` and ``b``."""
         return standing((*a, *b), self.rank)
 
     def rank(self, report: Report) -> float:
-        """Return the rank of a report; the lowest wins."""
+        """Return the rank of a report; the agent with the lowest rank is selected."""
         return -report.cost
