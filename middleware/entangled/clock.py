@@ -47,8 +47,7 @@ def use_monotonic_time() -> None:
 
 @implementer(IDelayedCall)
 class _HeapCall:
-    """A call of a ``HeapClock``; ``order`` is its position among simultaneous calls, 0 after it ran or was
-    cancelled."""
+    """A call of a ``HeapClock``; ``order`` is its position among simultaneous calls, 0 once it is over."""
 
     __slots__ = ("time", "order", "_clock", "_function", "_arguments", "_keywords", "_is_cancelled")
 

@@ -33,8 +33,10 @@ OnFrame = Callable[[int, bytes, float], None]
 
 @dataclass
 class _IncomingFrame:
-    """The parts of a channel's newest frame; ``age_s`` is the frame's age at ``arrived_at``, when its first part
-    came."""
+    """The parts of a channel's newest frame.
+
+    The first part came at ``arrived_at``, when the frame's age was ``age_s``.
+    """
 
     sequence: int = -1
     count: int = 0
