@@ -1,4 +1,4 @@
-"""Exceptions of the peer-to-peer library; the class determines how the caller should react.
+"""Exceptions of the peer-to-peer library; the class determines the reaction of the caller.
 
 ::
 

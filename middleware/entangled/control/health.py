@@ -96,7 +96,7 @@ async def _ping_repeatedly(node: EntangledNode, clock: IReactorTime, contact: Co
 
 
 class LinkMetrics:
-    """Measures the paths from ``node`` to its peers as long as ``read`` is called regularly.
+    """Measures the paths from ``node`` to its peers while ``read`` is called regularly.
 
     The first call returns immediately, without results; later calls return more results.  Each peer gets several pings
     in quick succession, and then one ping per second, until ``read`` has not been called for ``IDLE_S`` seconds.

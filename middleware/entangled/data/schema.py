@@ -103,7 +103,7 @@ def check_version(path: str, connection: sqlite3.Connection) -> int:
             raise BadStore(f"store {path}: belongs to another program; choose a different file")
         return 0
     if version > SCHEMA_VERSION:
-        raise BadStore(f"store {path}: has the newer schema {version}; update this program, or name another file")
+        raise BadStore(f"store {path}: has the newer schema {version}; update this program, or choose a different file")
     if (CREATE_RECORDS if version == SCHEMA_VERSION else CREATE_RECORDS_1) not in tables:
         raise CorruptStore(f"the tables of schema {version} are missing")
     (result,) = connection.execute("PRAGMA integrity_check(1)").fetchone()

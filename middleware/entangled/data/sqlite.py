@@ -41,8 +41,8 @@ MAX_LOG_BYTES = 4 * 2**20
 class SqliteStore(Store):
     """A ``Store`` backed by the file ``path``; use ``open`` to create one.
 
-    As long as the file is not writable, for example on a full disk, reads continue, ``put`` raises ``Unwritable`` with
-    the reason, and the writer retries the pending changes.
+    If the file is not writable, for example on a full disk, reads continue, ``put`` raises ``Unwritable`` with the
+    reason, and the writer retries the pending changes.
     """
 
     _log = Logger()

@@ -3,7 +3,7 @@
 A serving node has one tunnel per client, and a dialling node has one tunnel per configured URL.  Both kinds of tunnels
 are identified by virtual addresses, ``~wss-`` and 12 hexadecimal digits, which are meaningless to other nodes.  A URL
 is dialled when a datagram is sent to its address, and the tunnel is closed after a time without traffic, so the sender
-controls how long the tunnel exists.  The tunnel does not authenticate peers, because the wire protocol inside it does.
+controls the lifetime of the tunnel.  The tunnel does not authenticate peers, because the wire protocol inside it does.
 TLS is used only because other traffic on port 443 may be blocked.
 """
 

@@ -26,7 +26,7 @@ class ReplyKind(Enum):
     SEALED = "sealed"
     """The ballot is promised, but a value was already accepted: only this value may be proposed."""
     MOVED = "moved"
-    """The requested configuration was replaced; ``configuration`` and ``proof`` are those of the current one."""
+    """The requested configuration was replaced; ``configuration`` and ``proof`` describe the current one."""
     OVER = "over"
     """The register is closed."""
 

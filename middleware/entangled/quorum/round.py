@@ -91,8 +91,8 @@ class Round:
     seconds, the request is repeated when the lease ends, or earlier if that takes long.  ``outcome`` also fires,
     undecided, when all members have answered, after ``timeout_s`` seconds, and shortly after a majority has answered.
     A silent member is asked every ``RETRY_INTERVAL_S`` seconds until the round is decided, and at least ``MIN_TRIES``
-    times.  With ``single`` a member is asked once, the transport retransmits the request, and a failure is treated as
-    the member's answer.
+    times.  With ``single`` the round sends one request to each member, the transport retransmits the request, and a
+    failure is treated as the member's answer.
     """
 
     def __init__(

@@ -1,7 +1,7 @@
 """Batching of a node's own records for their replicas.
 
-The algorithm is that of Nagle (RFC 896): as long as a replica has not answered the last request, further records wait,
-and they are then sent in one request.  A single write is therefore not delayed, and many writes share datagrams.
+As in Nagle's algorithm (RFC 896), further records wait until the replica has answered the last request, and are then
+sent in one request.  A single write is therefore not delayed, and many writes share datagrams.
 """
 
 from __future__ import annotations

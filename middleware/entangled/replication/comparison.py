@@ -60,7 +60,7 @@ class Comparison:
         endpoint.expose("lacking", self._answer_lacking)
 
     def find_shared(self, peer: Contact) -> tuple[list[list[Record]], list[Record]]:
-        """Return the records that both nodes should store, by groups, and those that only the peer should store."""
+        """Return the records that both nodes should store, by groups, and the records for the peer only."""
         groups: list[list[Record]] = [[] for _ in range(GROUPS)]
         extra = []
         if self._members_version != self._overlay.members.version or not self._overlay.is_complete:

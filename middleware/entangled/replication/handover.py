@@ -231,9 +231,9 @@ class Handover:
             self._replica.store_locally(record, left)
 
     async def _send_lacking(self, contact: Contact, records: list[Record]) -> None:
-        """Send ``contact`` those of ``records`` that it lacks; only ``contact`` should store them, not this node.
+        """Send ``contact`` the ``records`` that it lacks; only ``contact`` should store them, not this node.
 
-        Once ``contact`` has all of them, it is asked again only when the set of these records changes.
+        Once ``contact`` has all of them, this node asks it again only when the set of these records changes.
         """
         digest = digest_of(records)
         if not records or self._sent_digests.get(contact.node_id) == digest:

@@ -1,9 +1,9 @@
 """Requests for the certificates of record owners, to the node that sends their records.
 
 A node checks a record against its owner's certificate.  The node knows most certificates from a session with the owner
-or from the team's membership list.  It requests any other certificate, for example that of a guest with sessions to
-only some members, from the node that sent the record.  A node that cannot send a certificate is not asked again for
-``RETRY_AFTER_S`` seconds, so invalid records cause few requests.
+or from the team's membership list.  It requests any other certificate, for example the certificate of a guest with
+sessions to only some members, from the node that sent the record.  A node that cannot send a certificate is not asked
+again for ``RETRY_AFTER_S`` seconds, so invalid records cause few requests.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""The sync state of a replica: whether its replies are counted in majorities, and how it becomes synced.
+"""The sync state of a replica: whether its replies are counted in majorities, and when it becomes synced.
 
 A replica in the state NEVER_SYNCED has never caught up with other replicas.  A replica in the state STALE has caught up
 at some time, and stores all records that it has acknowledged since.  A replica in the state CURRENT has caught up, and

@@ -87,10 +87,10 @@ class View:
 class Watch:
     """One subscription to one key; ``records`` are the currently known records.
 
-    ``requested`` contains the node ids of the replicas that were asked to push; pushes of other nodes are ignored.
-    ``has_copies``: the records are also stored in the node's own store.  ``push_numbers`` maps replicas to the number
-    of their last push.  ``due_at`` is the time of the next renewal in a large network.  ``on_stop`` is called when the
-    subscription ends.
+    ``requested`` contains the node ids of the replicas to which a request to push was sent; pushes of other nodes are
+    ignored.  ``has_copies``: the records are also stored in the node's own store.  ``push_numbers`` maps replicas to
+    the number of their last push.  ``due_at`` is the time of the next renewal in a large network.  ``on_stop`` is
+    called when the subscription ends.
     """
 
     def __init__(

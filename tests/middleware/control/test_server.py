@@ -148,8 +148,8 @@ class ControlTests(SynchronousTestCase):
         for verb, given, said in (
             ("dht fly", {}, "dht get"),
             (None, {}, "no verb"),
-            ("dht get", {}, "key: is missing"),
-            ("dht get", {"key": 7}, "key: must be a text"),
+            ("dht get", {}, "key is missing"),
+            ("dht get", {"key": 7}, "key must be a string"),
             ("dht get", {"key": "id:12"}, "40"),
             ("dht get", {"key": "id:xy"}, "40"),
             ("dht get", {"key": "a", "concern": "some"}, "concern"),
