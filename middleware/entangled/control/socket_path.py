@@ -63,7 +63,7 @@ def find_socket(name: str | None) -> Path:
     existing = ", ".join(names)
     if name is None:
         raise NoControl(f"several nodes have run on this machine; choose one with --node NAME: {existing}")
-    raise NoControl(f"no node {name!r} runs on this machine; nodes that have run here: {existing}")
+    raise NoControl(f"no node {name!r} runs on this machine; nodes that have run: {existing}")
 
 
 def check_socket(path: Path) -> None:

@@ -141,7 +141,7 @@ class ControlTests(SynchronousTestCase):
         self.assertIn("no known node", self.refusal("rpc", node="zz", method="add", arguments=[]))
         for port in ("0", "65536", "9" * 5000):
             told = self.refusal("rpc", node=f"10.0.0.1:{port}", method="add", arguments=[])
-            self.assertTrue(told.endswith(": the port must be 1 to 65535"), told)
+            self.assertTrue(told.endswith(": the port must be from 1 to 65535"), told)
 
     def test_wrong_requests(self) -> None:
         """An invalid request is rejected with the name of the argument."""
