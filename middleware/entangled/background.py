@@ -57,7 +57,7 @@ class Background:
         self.later(period, again)
 
     def sleep(self, seconds: float) -> Deferred[None]:
-        """Return a Deferred that fires after ``seconds``; it never fires if the node stops before."""
+        """Return a Deferred that fires after ``seconds``; it never fires if the node stops earlier."""
         woken: Deferred[None] = Deferred()
         self.later(seconds, woken.callback, None)
         return woken
@@ -81,9 +81,9 @@ class Background:
 
 
 async def gather_until(enough: Callable[[list[Any]], bool], work: Iterable[Coroutine[Any, Any, Any]]) -> list[Any]:
-    """Return the results of ``work`` as soon as they are ``enough``, or all of it has ended; the rest continues.
+    """Return the results of ``work`` when ``enough(results)`` is true, or when all coroutines have ended.
 
-    Work that ends with an ``EntangledError`` gives no result.
+    The remaining coroutines continue.  A coroutine that ends with an ``EntangledError`` gives no result.
     """
     results: list[Any] = []
     begun = list(work)
@@ -129,5 +129,5 @@ async def run_limited(width: int, work: Iterable[Coroutine[Any, Any, Any]]) -> N
 
 
 async def gather_first(needed: int, work: Iterable[Coroutine[Any, Any, Any]]) -> list[Any]:
-    """Return the first ``needed`` results of ``work``, or fewer if all has ended; the rest continues."""
+    """Return the first ``needed`` results of ``work``, or fewer if all coroutines have ended; the rest continues."""
     return await gather_until(lambda results: len(results) >= needed, work)

@@ -1,4 +1,4 @@
-"""Limit the size of tables of state about other nodes."""
+"""Limit the size of tables that store state of other nodes."""
 
 from __future__ import annotations
 

@@ -1,8 +1,8 @@
 """Provide simulated time on a heap, and make Twisted's real time monotonic.
 
-Protocol code receives an object with ``seconds()`` and ``callLater()`` and does not depend on its kind.  A simulation
-of ten thousand nodes has tens of thousands of timers; Twisted's test clock sorts its whole list at every call, this one
-uses a heap.
+Protocol code receives an object with ``seconds()`` and ``callLater()``, which may be the simulated clock or the real
+reactor.  A simulation of ten thousand nodes has tens of thousands of timers.  Twisted's test clock sorts its whole list
+at every call, whereas ``HeapClock`` uses a heap.
 """
 
 from __future__ import annotations
@@ -35,10 +35,10 @@ def use_monotonic_time() -> None:
     """Make every Twisted reactor of this process use ``find_boot_clock`` for its timers.
 
     Twisted uses ``time.time``: if the wall clock is set back a minute (NTP, a robot that gets GPS time), every timer
-    stops for that minute; if it is set forward, every pending timeout expires at once and all nodes suspect each other.
-    ``time.monotonic`` stops while the machine is suspended: a node that resumes would consider a lease valid that
-    another node holds by now.  With this clock timers that expired meanwhile fire at once, as after any long pause, and
-    a late timer indicates a pause.
+    stops for that minute; if it is set forward, every pending timeout expires immediately and all nodes suspect each
+    other.  ``time.monotonic`` stops while the machine is suspended, so a node that resumes would consider its lease
+    valid although another node has obtained it.  With ``find_boot_clock``, timers that expired during a suspension fire
+    immediately after it, and a late timer indicates a pause.
 
     Call this before timers are created; repeated calls have no effect.
     """
@@ -47,7 +47,7 @@ def use_monotonic_time() -> None:
 
 @implementer(IDelayedCall)
 class _HeapCall:
-    """A pending call of a ``HeapClock``; ``order`` is its position among calls at the same time, 0 when it is over."""
+    """A call of a ``HeapClock``; ``order`` is its position among simultaneous calls, 0 once it is over."""
 
     __slots__ = ("time", "order", "_clock", "_function", "_arguments", "_keywords", "_is_cancelled")
 
@@ -77,7 +77,7 @@ class _HeapCall:
         self._check()
         self.order = 0
         self._is_cancelled = True
-        # The entry stays in the heap for a while; release the objects that it refers to.
+        # The entry stays in the heap for some time; release the objects that it refers to.
         self._function, self._arguments, self._keywords = _do_nothing, (), {}
         self._clock._count_dead_entry()
 
@@ -163,7 +163,7 @@ class HeapClock:
         self.run_until(self._now + seconds)
 
     def suspend(self, seconds: float) -> None:
-        """Simulate a suspension of ``seconds``: the time advances without running calls, which are late then."""
+        """Simulate a suspension of ``seconds``: advance the time without running the calls that become due."""
         self._now += seconds
 
     def pump(self, steps: Iterable[float]) -> None:
@@ -173,11 +173,11 @@ class HeapClock:
 
     def _move(self, call: _HeapCall, moment: float) -> None:
         call.time, call.order = moment, next(self._orders)
-        heapq.heappush(self._heap, (moment, call.order, call))  # the older entry has another order, and is skipped
+        heapq.heappush(self._heap, (moment, call.order, call))  # an older entry of this call is skipped by its order
         self._count_dead_entry()
 
     def _count_dead_entry(self) -> None:
-        # Timeouts are mostly cancelled; without this, dead entries would make up nearly all of the heap.
+        # Most timeouts are cancelled; unless cancelled entries are removed, they make up nearly all of the heap.
         self._dead_entries += 1
         if self._dead_entries > _COMPACT_FROM and self._dead_entries * 2 > len(self._heap):
             self._heap = [entry for entry in self._heap if entry[2].order == entry[1]]

@@ -20,7 +20,7 @@ class Contact:
         object.__setattr__(self, "node_id", derive_node_id(self.public))
 
     def pack(self) -> list[object]:
-        """Encode the contact for a message; a virtual address of this node (a tunnel) becomes a relayed one."""
+        """Encode the contact for a message; replace a virtual address of this node (a tunnel) by a relayed address."""
         host, port = relayed_address(self.node_id) if self.address.is_virtual else self.address
         return [self.public, host, port]
 
@@ -37,5 +37,5 @@ def parse_contact(fields: object) -> Contact | None:
     if not (type(port) is int and 0 < port < 65536):
         return None
     contact = Contact(public, Address(host, port))
-    # A peer cannot name a virtual address of this node: any such host only means that the contact needs a relay.
+    # A virtual address from a peer is meaningless at this node: such a host only means that the contact needs a relay.
     return Contact(public, relayed_address(contact.node_id)) if host[0] == "~" else contact

@@ -1,4 +1,4 @@
-"""Exceptions of the peer-to-peer library; the class tells the cause, and so how to react.
+"""Exceptions of the peer-to-peer library; the class determines the reaction of the caller.
 
 ::
 
@@ -6,25 +6,12 @@
       RemoteError     the peer violated the protocol: count and drop
         Malformed
         Forged
-      WeatherError    the network or a peer is unavailable: retry with backoff
-        NoAnswer
-          NotAcknowledged
-        Crowded
-        Unavailable
-      LocalError      the caller made an error: propagate
-        NotRunning
-        TooLarge
-        PortInUse
-          TunnelPortInUse
-        BadStore
-      Refused         the peer answered, and rejected the request
-        Full
-        Unwritable
-        Conflict
-        NotAdmitted
+      TransientError the network or a peer is unavailable: retry with backoff NoAnswer NotAcknowledged Crowded
+      Unavailable LocalError the caller made an error: propagate NotRunning TooLarge PortInUse TunnelPortInUse BadStore
+      Refused the peer answered, and rejected the request Full Unwritable Conflict NotAdmitted
 """
 
-_WAIT = "try again when members are back, or in two minutes, when absent members no longer count"
+_WAIT = "try again when members have returned, or in two minutes, when absent members are no longer counted"
 
 
 class EntangledError(Exception):
@@ -52,14 +39,14 @@ class NoAnswer(TransientError):
 
 
 class NotAcknowledged(NoAnswer):
-    """Fewer replicas stored a write than its consistency level requires; the write may still spread from them.
+    """Fewer replicas stored a write than its consistency level requires; these replicas may still spread the write.
 
-    ``acknowledged`` replicas confirmed that they have it, ``needed`` were required.
+    ``acknowledged`` replicas confirmed the write, ``needed`` confirmations were required.
     """
 
     def __init__(self, acknowledged: int, needed: int) -> None:
         super().__init__(
-            f"{acknowledged} replicas acknowledged the record, {needed} are needed; {_WAIT}, or write with 'one'"
+            f"only {acknowledged} of {needed} needed replicas acknowledged the record; {_WAIT}, or write with 'one'"
         )
         self.acknowledged = acknowledged
         self.needed = needed
@@ -72,7 +59,7 @@ class Unavailable(TransientError):
     """
 
     def __init__(self, answered: int, needed: int) -> None:
-        super().__init__(f"{answered} replicas of the key answered, {needed} are needed; {_WAIT}, or read 'fast'")
+        super().__init__(f"only {answered} of {needed} needed replicas answered; {_WAIT}, or read with 'fast'")
         self.answered = answered
         self.needed = needed
 
@@ -94,19 +81,19 @@ class TooLarge(LocalError):
 
 
 class PortInUse(LocalError):
-    """Another program uses the port, or the address is not one of this machine; the message has the remedy."""
+    """Another program uses the port, or this machine does not have the address; the message contains the remedy."""
 
 
 class TunnelPortInUse(PortInUse):
-    """The same for the TCP port of tunnels; also if the node may not open a port below 1024."""
+    """The TCP port of tunnels is in use, or is below 1024 and the node may not open it."""
 
 
 class BadStore(LocalError):
-    """The data store is unusable; the message has the reason and the remedy."""
+    """The data store is unusable; the message contains the reason and the remedy."""
 
 
 class Refused(EntangledError):
-    """The peer rejected the request; ``str()`` is the reason for people, ``code`` the one for programs."""
+    """The peer rejected the request; ``str()`` gives the reason as text, ``code`` identifies it for programs."""
 
     code = "refused"
 
@@ -117,31 +104,31 @@ class Refused(EntangledError):
 
 
 OWNER_FULL = "owner-full"
-"""The code of ``Full`` if the store has room, but not for more records of this owner."""
+"""The code of ``Full`` if the store has free space, but not for more records of this owner."""
 
 
 class Full(Refused):
-    """The store is full and has nothing that it may delete; remove records, or allow more rows or bytes.
+    """The store is full and may delete nothing; remove records, or raise its limits of rows or bytes.
 
-    With the code ``OWNER_FULL`` the owner of the record has reached the limit per owner.
+    With the code ``OWNER_FULL``, the owner of the record has reached the limit per owner.
     """
 
 
 class Unwritable(Refused):
-    """The store's file cannot be written (full disk, read-only, corrupt); reads continue, writes resume when it can."""
+    """The store's file is not writable (full disk, read-only, corrupt); reads continue, writes resume when it is."""
 
 
 class Conflict(Refused):
-    """A compare-and-set failed: the slot has the number ``sequence`` already."""
+    """A compare-and-set failed: the slot has the sequence number ``sequence`` instead of ``expected``."""
 
     def __init__(self, expected: int, sequence: int) -> None:
-        super().__init__(f"the slot has number {sequence}, expected was {expected}; read it again and retry")
+        super().__init__(f"the slot has the number {sequence}, not the expected {expected}; read it again and retry")
         self.expected = expected
         self.sequence = sequence
 
 
 class NotAdmitted(Refused):
-    """One of two nodes rejects the other: ``code`` is the reason, the text names both sides and the remedy."""
+    """One of two nodes rejects the other: ``code`` is the reason; the text identifies both nodes and gives a remedy."""
 
     def __init__(self, text: str, code: str) -> None:
         super().__init__(text, code)

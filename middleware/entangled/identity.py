@@ -1,7 +1,7 @@
 """Derive a node's key pairs and its node id from a seed.
 
 One 32-byte seed determines the Ed25519 key pair that signs records and the X25519 key pair that opens sessions.  The
-node id is the hash of the public key, so a node can neither choose an id nor use another node's.
+node id is the hash of the public key, so a node can neither choose its id nor use the id of another node.
 """
 
 from __future__ import annotations
@@ -43,13 +43,13 @@ def derive_node_id(public: bytes) -> bytes:
     return hashlib.blake2s(public, digest_size=ID_BYTES).digest()
 
 
-@lru_cache(maxsize=128)  # a handshake calls it twice, and it costs as much as a key exchange
+@lru_cache(maxsize=128)  # a handshake needs two conversions, each as expensive as a key exchange
 def derive_exchange_key(public: bytes) -> bytes:
-    """Convert an Ed25519 public key to its X25519 key; raise ``ValueError`` if it is invalid."""
+    """Convert an Ed25519 public key to its X25519 key; raise ``ValueError`` if the key is invalid."""
     try:
         return bindings.crypto_sign_ed25519_pk_to_curve25519(public)
     except CryptoError as error:
-        raise ValueError("not an Ed25519 public key") from error
+        raise ValueError("the key is not an Ed25519 public key") from error
 
 
 def is_signature_valid(public: bytes, message: bytes, signature: bytes) -> bool:

@@ -11,8 +11,8 @@ P = ParamSpec("P")
 class Listeners(Generic[P]):
     """The listeners of one event, called in the order in which they were added.
 
-    Only the owner of the event calls it.  A listener that is added during a notification is not called in it.  An
-    exception of a listener propagates to the owner.
+    Only the owner of the event calls this object.  A listener that is added during a notification is called from the
+    next notification on.  An exception of a listener propagates to the owner.
     """
 
     __slots__ = ("_all",)

@@ -1,7 +1,8 @@
 """EntangledNode: the public interface of the peer-to-peer library.
 
-It connects the parts: ``overlay`` and ``membership`` know the other nodes, ``replica`` and ``handover`` hold records
-for other owners, ``owner`` maintains the node's records, ``reader`` and ``subscriber`` read and watch.
+The node connects the parts of the library.  ``overlay`` and ``membership`` find the other nodes; ``replica`` and
+``handover`` store the records of other owners; ``owner`` maintains the node's own records; ``reader`` and
+``subscriber`` read and watch records.
 """
 
 from __future__ import annotations
@@ -58,11 +59,11 @@ if TYPE_CHECKING:
     from middleware.entangled.space.take_acceptor import TakeAcceptor
 
 NOTE_INTERVAL_S = 30.0
-"""Seconds between two notes of time and contacts; a new or lost contact is noted at once."""
+"""Seconds between two notes of the time and the contacts; a new or lost contact is noted immediately."""
 CONTACTS_NOTE = "contacts"
 LAST_SEEN_NOTE = "last seen"
 INCARNATION_NOTE = "decree/incarnation"
-"""Name of the note of a node that was a member of tuple councils in an earlier run."""
+"""The name of the note that exists if the node was a member of tuple councils in an earlier run."""
 MAX_NOTED_CONTACTS = 64
 
 Answers = TypeVar("Answers", bound=Callable[..., object])
@@ -71,11 +72,11 @@ Answers = TypeVar("Answers", bound=Callable[..., object])
 class EntangledNode:
     """One node of the network; it runs once, from ``start`` to ``stop``.
 
-    ``lease`` is the time in seconds that leased records outlive the node's last sign of life; more means fewer false
-    failures, less means faster detection.  ``rng`` and ``clock`` are the only sources of randomness and time.  ``wall``
-    returns seconds that continue while the node is off, to measure its absence (None: assume a short one).
-    ``admission`` is the admission check.  ``lan`` is the multicast group in which the node finds its team without known
-    nodes.
+    ``lease`` is the time in seconds after which leased records expire when the node is silent.  A higher value causes
+    fewer false failures, a lower value faster detection.  ``rng`` and ``clock`` are the only sources of randomness and
+    time.  ``wall`` returns seconds that continue while the node is off, to measure its absence (None: assume a short
+    absence).  ``admission`` is the admission check.  ``lan`` is the multicast group in which the node finds its team if
+    it has no known nodes.
     """
 
     _log = Logger()
@@ -133,7 +134,7 @@ class EntangledNode:
     @cached_property
     def take_acceptor(self) -> TakeAcceptor:
         """This node's acceptor for takes in tuple spaces."""
-        # Imported on first use: a node without councils saves half a MiB.
+        # Imported on first use, which saves half a MiB in a node without councils.
         from middleware.entangled.space.take_acceptor import TakeAcceptor
 
         take_acceptor = TakeAcceptor(self.endpoint, self.store, *self._acceptor_arguments)
@@ -165,16 +166,17 @@ class EntangledNode:
         """Join the network through ``known`` nodes (thesis, Algorithm 4.1), with back-off until one answers.
 
         The node also tries the contacts of earlier runs from its store and, after 1.5 s without an answer or on loss of
-        all contacts, the alternate paths of the network (tunnels).  Fires when a node has answered, so that keys can be
-        read.  Without known nodes and contacts it fires at once (the first node of a network) or, with a ``lan``, as
-        soon as a team member answers there or none did for a short time.  The node then looks up its own id, meets the
-        others, and fetches the records it should hold.
+        all contacts, the alternate paths of the network (tunnels).  The Deferred fires when a node has answered; from
+        then on keys can be read.  Without known nodes and contacts, this may be the first node of its network.  Then
+        the Deferred fires immediately; with a ``lan`` it fires when a team member answers on the LAN, or when none did
+        for a short time.  Afterwards the node looks up its own id, contacts the other nodes, and fetches the records
+        for which it is a replica.
         """
         self.nat.selector.bootstrap_addresses |= {*known, *find_alternate_paths(self._network)}
         return _run(self._join(known))
 
     def stop(self) -> None:
-        """Send goodbye, so that this node's leased records are removed at once, and close the port."""
+        """Send goodbye, so that this node's leased records are removed immediately, and close the port."""
         if self._running:
             self._note_contacts()
             for contact in self.overlay.contacts():
@@ -182,7 +184,7 @@ class EntangledNode:
         self.stop_silently()
 
     def stop_silently(self) -> None:
-        """Stop without sending anything, as after a failure of power or radio."""
+        """Stop without sending anything, like a node whose power or radio fails."""
         if self._running:
             self._running = False
             self._subscriber.stop()
@@ -199,13 +201,13 @@ class EntangledNode:
     def evict(self, public: bytes, code: str = REVOKED) -> None:
         """Remove the node with this key, which the admission check rejects: send it ``code``, and drop its leases.
 
-        It is no longer a member, and counts in no majority.
+        The node is no longer a member and is not counted in majorities.
         """
         self.endpoint.evict(public, code)
         self._drop_member(public)
 
     def recheck(self) -> None:
-        """Check all held, owned and watched records again, after a change of their owners' authority."""
+        """Check all stored, owned and watched records again, after the authority of an owner changed."""
         for part in (self._owner, self.replica, self._subscriber):
             part.recheck()
 
@@ -223,20 +225,21 @@ class EntangledNode:
     ) -> Deferred[Stored]:
         """Store ``value`` in the slot (key, this node, name); fires with the number of replicas that have stored it.
 
-        ``concern`` is the required number of replicas: ``one``, a ``majority`` of the k closest members, absent ones
-        included, or ``all`` of them.  Fails with ``NotAcknowledged`` if too few are reachable; the record may spread
-        nevertheless.  ``expect`` makes it a compare-and-set: it is stored only if the slot has that sequence number
-        (0: never used), and fails with ``Conflict`` otherwise.  The result is an integer with the new number in its
-        attribute ``sequence``.  A leased record may have a longer ``lease`` than the node's, in seconds.
+        ``concern`` is the consistency level: ``one`` replica, or a ``majority`` or ``all`` of the k closest members,
+        including absent members.  Fails with ``NotAcknowledged`` if too few replicas are reachable; the record may
+        spread nevertheless.  With ``expect`` the write is a compare-and-set: the value is stored only if the slot has
+        this sequence number (0: never used); otherwise the write fails with ``Conflict``.  The result is an integer
+        whose attribute ``sequence`` is the new sequence number.  A leased record may have a longer ``lease`` than the
+        node's, in seconds.
 
-        Fails with ``Refused``, code ``role``, if this node's role, as known here or at the replicas, does not allow
-        the record.
+        Fails with ``Refused`` and the code ``role`` if this node or the replicas find that this node's role does not
+        allow the record.
 
-        Raises ``TooLarge`` at once for a value over ``MAX_VALUE_BYTES`` or a name over ``MAX_NAME_BYTES`` bytes, and
-        ``ValueError`` for an invalid key.
+        Raises ``TooLarge`` immediately if the value has more than ``MAX_VALUE_BYTES`` bytes or the name more than
+        ``MAX_NAME_BYTES`` bytes, and ``ValueError`` if the key is invalid.
         """
         if len(value) > MAX_VALUE_BYTES:
-            raise TooLarge(f"value of {len(value)} bytes; a record carries at most {MAX_VALUE_BYTES}")
+            raise TooLarge(f"the value has {len(value)} bytes; a record has at most {MAX_VALUE_BYTES}")
         return self._put(key, name, value, lifetime, concern, expect, lease)
 
     def release(self, key: bytes, name: str) -> None:
@@ -256,9 +259,9 @@ class EntangledNode:
         """Read the records under ``key``.
 
         A ``majority`` read returns at least all records acknowledged by a majority write or returned by an earlier
-        majority read.  A ``fast`` read asks one replica, and another if it is slow: the result may be slightly old and
-        lack a slot that this replica missed.  An empty result is confirmed by a majority.  Fails with ``Unavailable``
-        if too few replicas answer.
+        majority read.  A ``fast`` read asks one replica, and a second one if the first is slow.  Its result may be
+        slightly old, and may lack a record that this replica has not received.  An empty result is confirmed by a
+        majority.  Fails with ``Unavailable`` if too few replicas answer.
         """
         self._check_key(key)
         return _run(self._reader.read(key, concern))
@@ -266,21 +269,23 @@ class EntangledNode:
     def watch(self, key: bytes, changed: OnChanged, keep: bool = False) -> Watch:
         """Call ``changed`` with all records of ``key`` on each change, until ``stop()`` of the returned watch.
 
-        With ``keep`` the node's own store also has them during the watch, for readers of the store's file.
+        With ``keep`` the node also stores these records in its own store during the watch, for programs that read the
+        store's file.
         """
         self._check_key(key)
         return self._subscriber.watch(key, changed, keep)
 
     def refresh(self, watch: Watch) -> None:
-        """Poll the replicas of a watched key now, instead of at the next interval of 2 s."""
+        """Poll the replicas of a watched key now; otherwise they are polled every 2 s."""
         if self._running:
             self._subscriber.refresh(watch)
 
     def rpc(self, name: str, changes: bool = False) -> Callable[[Answers], Answers]:
         """Make the decorated function ``answer(peer, *arguments)`` callable by peers under ``name``.
 
-        Its annotations of plain types are checked before it runs.  With ``changes`` it runs once per call, even if the
-        request is retransmitted.  ``Endpoint.expose`` describes results, errors and ``deadline``.
+        Arguments are checked against the function's annotations of plain types before it runs.  With ``changes`` the
+        function runs once per call, even if the request is retransmitted.  ``Endpoint.expose`` describes results,
+        errors and ``deadline``.
         """
 
         def expose(answer: Answers) -> Answers:
@@ -292,9 +297,10 @@ class EntangledNode:
     def call(
         self, contact: Contact, name: str, *arguments: object, timeout: float | None = None, changes: bool = False
     ) -> Deferred[Any]:
-        """Call a method of a peer; set ``changes`` if it was exposed with it.
+        """Call a method of a peer; set ``changes`` if the peer exposed the method with ``changes``.
 
-        Fails with ``Refused``, an error that the method names, or ``NoAnswer``; cancelling notifies the peer.
+        Fails with ``Refused`` if the method raised an error, or with ``NoAnswer``.  Cancelling the Deferred notifies
+        the peer.
         """
         if not self._running:
             raise NotRunning("the node is not running; start it first")
@@ -306,7 +312,7 @@ class EntangledNode:
         return _run(self.overlay.lookup(node_id))
 
     def find_newest(self, contact: Contact) -> Contact:
-        """Return ``contact`` with the last address it was observed at."""
+        """Return ``contact`` with the last address at which it was observed."""
         return self.overlay.table.get(contact.node_id) or contact
 
     # -- inside -----------------------------------------------------------------------------------------------------
@@ -323,9 +329,9 @@ class EntangledNode:
     ) -> Deferred[Stored]:
         self._check_key(key)
         if len(name.encode()) > MAX_NAME_BYTES:
-            raise TooLarge(f"name of {len(name.encode())} bytes; a record's name has at most {MAX_NAME_BYTES}")
+            raise TooLarge(f"the name has {len(name.encode())} bytes; a record's name has at most {MAX_NAME_BYTES}")
         if not self.replica.may_store(Slot(key, self.identity.public, name)):
-            return fail(Refused(f"this node may not write {name!r} there: {explain(ROLE)}", ROLE))
+            return fail(Refused(f"this node may not write {name!r} under this key: {explain(ROLE)}", ROLE))
         if expect is not None:
             return _run(self._compare_and_set(Slot(key, self.identity.public, name), value, lifetime, concern, expect))
         return _run(self._owner.put(self._owner.make_record(key, name, value, lifetime, lease=lease), concern))
@@ -333,7 +339,7 @@ class EntangledNode:
     async def _compare_and_set(
         self, slot: Slot, value: bytes | None, lifetime: Lifetime, concern: ConsistencyLevel, expect: int
     ) -> Stored:
-        # Only this node writes the slot, but an earlier run may have done so.
+        # Only this node writes the slot, but an earlier run of the node may have written it already.
         read = None if self._owner.owns(slot) else (await self._reader.read_newest(slot.key)).get(slot)
         record = self._owner.make_record(slot.key, slot.name, value, lifetime, expect, read)
         return await self._owner.put(record, concern)
@@ -360,7 +366,7 @@ class EntangledNode:
         self._subscriber.handle_stored(record)
 
     def _drop_records_after_absence(self) -> bool:
-        """Drop all records after an absence longer than tombstones are kept; return whether that was so."""
+        """Drop all records after an absence longer than tombstones are stored; return whether they were dropped."""
         try:
             absent_s = self._wall() - float(self.store.get_note(LAST_SEEN_NOTE) or b"nan") if self._wall else 0.0
         except ValueError:  # a corrupt file may hold anything
@@ -387,11 +393,11 @@ class EntangledNode:
         self.nat.paths.forget_path(contact)
 
     def _handle_rejection(self, contact: Contact, code: str) -> None:
-        """Count a member that rejects this node as absent."""
+        """Mark a member that rejects this node as absent."""
         self.overlay.mark_rejecting(contact)
 
     def _handle_rejected_peer(self, contact: Contact, code: str) -> None:
-        if code not in (DOUBLED, SUPERSEDED):  # for these the other node with that identity stays a member
+        if code not in (DOUBLED, SUPERSEDED):  # with these codes the other node with that identity stays a member
             self._drop_member(contact.public)
 
     def _drop_member(self, public: bytes) -> None:
@@ -411,7 +417,7 @@ class EntangledNode:
         known = {c.node_id: c for c in [*self.overlay.contacts(), *self.overlay.members.list_absent()]}
         contacts = sorted(known.values(), key=lambda c: c.node_id)[:MAX_NOTED_CONTACTS]
         if contacts:
-            # A node without contacts keeps the last note of them.
+            # A node that has lost all contacts does not overwrite its last note of contacts.
             self.store.set_note(CONTACTS_NOTE, msgpack.packb([c.pack() for c in contacts]))
 
     def _load_contacts(self) -> list[Contact]:
@@ -426,7 +432,7 @@ class EntangledNode:
         if not self._running:
             raise NotRunning("the node is not running; start it first")
         if len(key) != KEY_BYTES:
-            raise ValueError(f"a key has {KEY_BYTES} bytes, this one {len(key)}")
+            raise ValueError(f"a key must have {KEY_BYTES} bytes, not {len(key)}")
 
 
 def _run(work: Coroutine[Any, Any, Any]) -> Deferred[Any]:

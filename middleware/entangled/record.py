@@ -1,8 +1,9 @@
 """Records: signed values under a key, and the order between two records of one slot.
 
-A record lives in a slot (key, owner, name).  Many owners may write under one key, each in its own slots, so the set of
-records under a key merges without read-modify-write.  Within a slot the higher sequence number wins; a record without
-a value is a tombstone.  The owner signs each record (Ed25519).  Records carry durations, not times of day.
+A record has a slot (key, owner, name).  Many owners may write under one key, each in its own slots, so sets of records
+under a key can be merged without read-modify-write.  Within a slot the record with the higher sequence number
+supersedes the other; a record without a value is a tombstone.  The owner signs each record (Ed25519).  Records contain
+durations, not times of day.
 """
 
 from __future__ import annotations
@@ -22,19 +23,22 @@ MAX_VALUE_BYTES = 2**20
 MAX_NAME_BYTES = 64
 MAX_CACHED = 512
 FRAME_BYTES = 160
-"""Bytes of a record in a message in addition to its name and value."""
+"""The size of a record in a message in bytes, in addition to its name and value."""
 MAX_TTL_S = 30 * 86400.0
 TEAM_TTL_S = 86400.0
-"""Seconds that a team record stays after it was stored or refreshed."""
+"""Seconds after which a team record expires if it was not stored or refreshed again."""
 TOLERATED_ABSENCE_S = 6 * 86400.0
-"""Seconds; a node that was away for longer joins with an empty store, because tombstones of records that it still holds
-may have expired meanwhile."""
+"""The longest absence of a node in seconds after which it joins with its store.
+
+After a longer absence it joins with an empty store, because tombstones of records that it still stores may have
+expired.
+"""
 TOMBSTONE_TTL_S = TOLERATED_ABSENCE_S + 86400.0
-"""Seconds that a tombstone stays: a day longer than ``TOLERATED_ABSENCE_S``, for clock errors and late delivery."""
+"""Seconds until a tombstone expires: a day more than ``TOLERATED_ABSENCE_S``, for clock errors and late delivery."""
 
 
 class Slot(NamedTuple):
-    """The place of one record."""
+    """The identification of one record: its key, owner and name."""
 
     key: bytes
     owner: bytes
@@ -45,9 +49,9 @@ class Slot(NamedTuple):
 class Record:
     """One signed value in its slot.
 
-    ``owner`` is the public key (32 bytes).  ``ttl`` is in seconds and counts from arrival: a ``leased`` record expires
-    that long after the owner's last sign of life, a ``team`` record that long after it was stored.  ``value`` is at
-    most ``MAX_VALUE_BYTES`` bytes of msgpack, or None for a tombstone.
+    ``owner`` is the public key (32 bytes).  ``ttl`` is in seconds: a ``leased`` record expires when its owner has been
+    silent for this time, a ``team`` record this time after it was stored or refreshed.  ``value`` is at most
+    ``MAX_VALUE_BYTES`` bytes of msgpack, or None for a tombstone.
     """
 
     key: bytes
@@ -65,7 +69,7 @@ class Record:
 
     @property
     def is_tombstone(self) -> bool:
-        """Whether this record marks its slot as empty."""
+        """Whether this record marks its slot as deleted."""
         return self.value is None
 
     @property
@@ -74,7 +78,7 @@ class Record:
         return len(self.value or b"") + len(self.name.encode()) + FRAME_BYTES
 
     def supersedes(self, other: Record | None) -> bool:
-        """Return whether this record replaces ``other`` in their slot; a total order, so replicas converge."""
+        """Return whether this record replaces ``other`` in their slot; the order is total, so replicas converge."""
         if other is None:
             return True
         return (self.sequence, self.signature) > (other.sequence, other.signature)
@@ -131,7 +135,7 @@ def parse_slot(fields: object) -> Slot | None:
 
 
 class SignatureCache:
-    """A cache of the last ``MAX_CACHED`` records with a valid signature; verifying one takes 80 us."""
+    """A cache of the last ``MAX_CACHED`` records with a valid signature; each verification takes 80 us."""
 
     def __init__(self) -> None:
         self._digests: OrderedDict[bytes, None] = OrderedDict()

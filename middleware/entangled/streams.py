@@ -1,8 +1,8 @@
-"""Stream camera frames in the node's encrypted sessions, always the newest one.
+"""Stream camera frames in the node's encrypted sessions; a newer frame replaces older ones.
 
 A viewer subscribes to a channel of a publisher and renews the subscription; the publisher sends each frame in a few
-datagrams without acknowledgement.  Incomplete and late frames are dropped, so there is never a backlog.  Nothing is
-sent without viewers.  A frame carries its age, so that a viewer need not know the publisher's clock.
+datagrams without acknowledgement.  Incomplete and late frames are dropped, so there is never a backlog.  A publisher
+without viewers sends nothing.  A frame carries its age, so that a viewer need not know the publisher's clock.
 """
 
 from __future__ import annotations
@@ -23,17 +23,20 @@ MAX_VIEWERS = 64
 SUBSCRIPTION_TTL_S = 3.0
 RENEW_INTERVAL_S = 1.0
 RESTART_AFTER_S = 1.0
-"""The seconds without a newer frame after which a lower number is accepted, because the publisher restarted."""
+"""The seconds without a newer frame after which a lower number is accepted, because the publisher has restarted."""
 MAX_CHANNEL_CHARS = 32
 
 MAX_AGE_S = 600.0
 OnFrame = Callable[[int, bytes, float], None]
-"""Called with the number, the frame, and its age in seconds."""
+"""Called with the frame's number, its bytes, and its age in seconds."""
 
 
 @dataclass
 class _IncomingFrame:
-    """The parts of a channel's newest frame; ``arrived_at`` is when its first part came, ``age_s`` its age then."""
+    """The parts of a channel's newest frame.
+
+    The first part came at ``arrived_at``, when the frame's age was ``age_s``.
+    """
 
     sequence: int = -1
     count: int = 0
@@ -96,12 +99,12 @@ class Streams:
 
     def _answer_open(self, peer: Contact, channel: str) -> bool:
         if len(channel) > MAX_CHANNEL_CHARS:
-            raise Refused(f"the name of a channel has at most {MAX_CHANNEL_CHARS} characters")
+            raise Refused(f"the name of the channel must have at most {MAX_CHANNEL_CHARS} characters")
         for other in list(self._viewers):
             self.has_viewers(other)  # deletes expired viewers
         viewers = self._viewers.get(channel, {})
         if peer.node_id not in viewers and sum(map(len, self._viewers.values())) >= MAX_VIEWERS:
-            raise Refused("too many viewers")
+            raise Refused("this node has too many viewers; try again later")
         viewers[peer.node_id] = (peer, self._clock.seconds() + SUBSCRIPTION_TTL_S)
         self._viewers[channel] = viewers
         return True
@@ -111,7 +114,8 @@ class Streams:
     def view(self, publisher: Contact, channel: str, on_frame: OnFrame) -> Callable[[], None]:
         """Call ``on_frame(sequence, frame, age)`` for each complete new frame; return a function that stops it.
 
-        ``age`` is the seconds since the frame was taken: its age at the publisher and half a measured round trip.
+        ``age`` is the time in seconds since the frame was taken: its age at the publisher plus half a measured round
+        trip.
         """
         place = (publisher.node_id, channel)
         look = self._views.get(place)
@@ -153,7 +157,7 @@ class Streams:
 
 
 class _View:
-    """One viewed channel, renewed while it has watchers."""
+    """One viewed channel; its subscription is renewed as long as a listener views it."""
 
     def __init__(self, streams: Streams, publisher: Contact, channel: str) -> None:
         self.listeners: list[OnFrame] = []

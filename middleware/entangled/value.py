@@ -1,6 +1,7 @@
 """Decode and check the values of records.
 
-A peer may write any bytes as a value; these functions return names, texts and finite numbers, or reject the value.
+A peer may write any bytes as a value; these functions accept only names, strings and finite numbers, and reject any
+other value.
 """
 
 from __future__ import annotations
@@ -13,13 +14,13 @@ from middleware.entangled.errors import TooLarge
 from middleware.entangled.record import Record
 
 MAX_VALUE_BYTES = 1000
-"""Bytes of a value that all devices of the team store; its record fits into one datagram."""
+"""The maximum size in bytes of a value that all devices of the team store; its record fits into one datagram."""
 MAX_NUMBER = 2**53
-"""Largest absolute value of a number: JavaScript represents integers exactly up to here."""
+"""The maximum absolute value of a number: up to this value JavaScript represents integers exactly."""
 
 
 def parse_mapping(record: Record, most: int = MAX_VALUE_BYTES) -> dict[str, Any] | None:
-    """Return the mapping in a record's value; None if it is no mapping or longer than ``most`` bytes; never raises."""
+    """Return the mapping in a record's value; None if it is not a mapping or exceeds ``most`` bytes."""
     if record.value is None or len(record.value) > most:
         return None
     try:
@@ -33,7 +34,7 @@ def check_size(value: bytes) -> bytes:
     """Return ``value``; raise ``TooLarge`` if it has more than ``MAX_VALUE_BYTES`` bytes."""
     if len(value) > MAX_VALUE_BYTES:
         raise TooLarge(
-            f"{len(value)} bytes; a value that all devices store has at most {MAX_VALUE_BYTES}; shorten the texts"
+            f"the value has {len(value)} bytes; all devices store it, so {MAX_VALUE_BYTES} is the limit; shorten it"
         )
     return value
 
@@ -57,7 +58,7 @@ def are_capabilities(value: object) -> bool:
 
 
 def are_properties(value: object) -> bool:
-    """Return whether ``value`` maps names to numbers and texts."""
+    """Return whether ``value`` maps names to numbers and strings."""
     return isinstance(value, dict) and all(
         isinstance(name, str) and (isinstance(content, str) or is_number(content)) for name, content in value.items()
     )

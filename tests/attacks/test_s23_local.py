@@ -85,7 +85,7 @@ class ControlSocketTests(SynchronousTestCase):
         link = find_folder() / "link.control"
         link.symlink_to(path)
         for each in (file, link):
-            self.assertIn("is no socket", str(self.assertRaises(NoControl, list, send_request(each, {}))))
+            self.assertIn("is not a socket", str(self.assertRaises(NoControl, list, send_request(each, {}))))
         self.be_another()
         self.assertIn("accessible to other users", str(self.assertRaises(NoControl, list, send_request(path, {}))))
 

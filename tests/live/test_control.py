@@ -36,7 +36,7 @@ class ControlTests(NodeCase):
         self.assertEqual(self.swarm("tuple", "get", "job", "?number").returncode, 2)
 
         node.kill()
-        self.assertIn("does not answer (Connection refused); start it", self.swarm("dht", "get", "colour").stderr)
+        self.assertIn("does not answer (Connection refused); start the node", self.swarm("dht", "get", "colour").stderr)
         self.joined()
         until(lambda: not self.swarm("dht", "get", "colour").returncode)
         self.assertIn("red", self.said("dht", "get", "colour"))

@@ -1,6 +1,6 @@
 """The commands ``swarm dht``, ``swarm tuple``, ``swarm keyword`` and ``swarm rpc``.
 
-They talk to the node of this machine, and import only the standard library to start fast.
+The commands send requests to the node of this machine, and import only the standard library to start fast.
 """
 
 from __future__ import annotations
@@ -64,10 +64,15 @@ def _add_dht_commands(verb: Callable[[str, str], argparse.ArgumentParser]) -> No
     put.add_argument("value", help="text, - for standard input, or @FILE")
     put.add_argument("--name", default="", help="name of this node's slot under the key")
     put.add_argument(
-        "--lifetime", choices=("team", "leased"), default="team", help="keep it when this node leaves, or remove it"
+        "--lifetime",
+        choices=("team", "leased"),
+        default="team",
+        help="keep the value when this node leaves (team), or remove it (leased)",
     )
     put.add_argument("--concern", choices=("one", "majority", "all"), default="majority", help="required replicas")
-    put.add_argument("--expect", type=int, metavar="SEQUENCE", help="store only if the slot has it; 0: empty slot")
+    put.add_argument(
+        "--expect", type=int, metavar="SEQUENCE", help="store only if the slot has this sequence number; 0: never used"
+    )
     remove = verb("remove", "Remove this node's value under a key.")
     remove.add_argument("key")
     remove.add_argument("--name", default="")
@@ -79,7 +84,7 @@ def _add_keyword_commands(verb: Callable[[str, str], argparse.ArgumentParser]) -
     publish = verb("publish", "Publish data under every word of a name.")
     publish.add_argument("name")
     publish.add_argument("value", help="text, - for standard input, or @FILE")
-    verb("search", "Print the publications with all of the words.").add_argument("words", nargs="+")
+    verb("search", "Print the publications whose names contain all of the words.").add_argument("words", nargs="+")
     verb("watch", "Print the publications with a word on each change, until Ctrl-C.").add_argument("words")
     verb("remove", "Remove this node's publication under a name.").add_argument("name")
 
@@ -87,7 +92,7 @@ def _add_keyword_commands(verb: Callable[[str, str], argparse.ArgumentParser]) -
 def _add_tuple_commands(verb: Callable[[str, str], argparse.ArgumentParser]) -> None:
     put = verb("put", "Put a tuple into the space.")
     put.add_argument("fields", nargs="+", metavar="FIELD")
-    put.add_argument("--ttl", type=float, metavar="SECONDS", help="remove it after that time")
+    put.add_argument("--ttl", type=float, metavar="SECONDS", help="remove the tuple after that time")
     get = verb("get", "Take a matching tuple out of the space.")
     read = verb("read", "Print a matching tuple without taking it.")
     for each in (get, read):
@@ -128,22 +133,24 @@ def send_request(path: Path, request: dict[str, Any]) -> Iterator[dict[str, Any]
                     yield json.loads(line)
         except (OSError, ValueError) as error:
             why = getattr(error, "strerror", None) or error
-            raise NoControl(f"the node behind {path} does not answer ({why}); start it, or remove that file") from error
+            raise NoControl(
+                f"the node of {path} does not answer ({why}); start the node, or remove this file"
+            ) from error
 
 
 def check_peer(connection: socket.socket, path: Path) -> None:
-    """Raise ``NoControl`` if a process of another user listens; no check without ``SO_PEERCRED``."""
+    """Raise ``NoControl`` if a process of another user listens; systems without ``SO_PEERCRED`` are not checked."""
     option = getattr(socket, "SO_PEERCRED", None)
     if option is None:
         return
     credentials = struct.Struct("3i")
     _, user, _ = credentials.unpack(connection.getsockopt(socket.SOL_SOCKET, option, credentials.size))
     if user not in (check_owner(path.parent), 0):
-        raise NoControl(f"another user's process listens at {path}; remove it and restart the node")
+        raise NoControl(f"another user's process listens at {path}; remove this file and restart the node")
 
 
 def main(group: str, words: Sequence[str], out: TextIO | None = None, ask: SendRequest = send_request) -> int:
-    """Run one command; return 0, 1 (nothing found, or the node refused), or 2 (wrong command)."""
+    """Run one command; return 0, 1 (nothing found, or the node rejected the request), or 2 (wrong command)."""
     out = out or sys.stdout
     options = make_parser(group).parse_args(words)
     try:

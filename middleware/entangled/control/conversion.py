@@ -1,10 +1,10 @@
 """Conversion of values between shell words, JSON and tuples, for all verbs.
 
-JSON has no bytes: bytes that are valid UTF-8 become text, others ``{"base64": "..."}``, which is also accepted as
-input.  In a tuple, where text and bytes differ, bytes always become ``{"base64": ...}``.
+JSON has no bytes: bytes that are valid UTF-8 become strings; other bytes become ``{"base64": "..."}``, which is also
+accepted as input.  In a tuple, where strings and bytes differ, bytes always become ``{"base64": ...}``.
 
-Members of the team choose their texts freely, and records keep them unchanged.  Control characters are removed only
-when a text is printed, because a node that rejected such records would differ from the others.
+Records contain strings exactly as members of the team wrote them.  Control characters are removed only when a string is
+printed, because a node that rejected such records would store different records than other nodes.
 """
 
 from __future__ import annotations
@@ -23,11 +23,11 @@ ANY_WORD = "_"
 
 
 class InvalidValue(ValueError):
-    """A word that is no valid value."""
+    """A word is not a valid value."""
 
 
 def text_or_base64(data: bytes) -> Any:
-    """Convert bytes to JSON: text if they are valid UTF-8, otherwise base64."""
+    """Convert bytes to JSON: a string if they are valid UTF-8, otherwise base64."""
     try:
         return data.decode()
     except UnicodeDecodeError:
@@ -53,20 +53,20 @@ def from_json(field: Any) -> Any:
         try:
             return base64.b64decode(field["base64"], validate=True)
         except (binascii.Error, TypeError, ValueError) as error:
-            raise InvalidValue(f"no base64: {json.dumps(field)[:60]}") from error
+            raise InvalidValue(f"the value is not valid base64: {json.dumps(field)[:60]}") from error
     if isinstance(field, list):
         return [from_json(each) for each in field]
     return field
 
 
 def parse_field(word: str) -> Any:
-    """Parse a word as a field: valid JSON (``7``, ``true``, ``null``, ``"7"``), otherwise the text itself."""
+    """Parse a word as a field: valid JSON (``7``, ``true``, ``null``, ``"7"``), otherwise a string."""
     try:
         read = json.loads(word, parse_constant=_reject_constant)
     except (ValueError, RecursionError):
         return word
     if isinstance(read, list) or (isinstance(read, dict) and set(read) != {"base64"}):
-        raise InvalidValue(f'a field is a number, text, true, false, null or {{"base64": ...}}, not {word[:60]}')
+        raise InvalidValue(f'a field must be a number, string, true, false, null or {{"base64": ...}}, not {word[:60]}')
     return read
 
 
@@ -94,7 +94,7 @@ def format_tuple(fields: Sequence[Any]) -> str:
 
 
 def remove_control_characters(text: str) -> str:
-    """Replace control characters by spaces, for printing a text of a peer on one line of a terminal."""
+    """Replace control characters by spaces, for printing a string of a peer on one line of a terminal."""
     return "".join(c if c.isprintable() else " " for c in text)
 
 

@@ -18,22 +18,22 @@ from middleware.entangled.network.network import is_relayed
 from middleware.entangled.node import EntangledNode
 
 PINGS = 10
-"""Pings to each peer."""
+"""The number of pings to each peer."""
 PING_INTERVAL_S = 0.1
 PING_TIMEOUT_S = 1.5
 MAX_LINKS = 32
-"""Peers that are measured: 32 x 10 pings in a second are 50 kB in each direction."""
+"""The maximum number of peers that are measured: 32 x 10 pings in a second are 50 kB in each direction."""
 SLOW_INTERVAL_S = 1.0
-"""Seconds between two pings to a peer, after the first ``PINGS`` ones."""
+"""Seconds between two pings to a peer, after the first ``PINGS`` pings."""
 FEW_PEERS = 10
-"""Peers up to which that holds.  With more peers the interval grows, so that a node sends at most 10 pings per second,
-and 100 at first: 1 and 10 kB in each direction."""
+"""The number of peers up to which the interval is ``SLOW_INTERVAL_S``.  With more peers the interval grows, so that a
+node sends at most 10 pings per second (1 kB in each direction), and at first 100 (10 kB)."""
 IDLE_S = 12.0
 """Seconds after the last call of ``LinkMetrics.read`` until the measurement stops."""
 
 
 def read_health(node: EntangledNode) -> Mapping[str, Any]:
-    """Return the number of contacts, the store's usage and limits, and the nodes that reject this one."""
+    """Return the number of contacts, the store's usage and limits, and the nodes that reject this node."""
     usage = node.store.usage
     return {
         "id": node.identity.node_id.hex(),
@@ -49,9 +49,9 @@ def read_health(node: EntangledNode) -> Mapping[str, Any]:
 
 
 async def measure_links(node: EntangledNode, clock: IReactorTime) -> list[Mapping[str, Any]]:
-    """Return the path to each peer with the durations of ``PINGS`` pings, None for a lost one.
+    """Return the path to each peer with the durations of ``PINGS`` pings, None for a lost ping.
 
-    All times are seconds; ``for`` is the time since the path came into use, None if the peer is unreachable.
+    All times are seconds; ``for`` is the time for which the path has been in use, None if the peer is unreachable.
     """
     contacts = sorted(node.overlay.contacts(), key=lambda contact: contact.node_id)[:MAX_LINKS]
     pings = [Deferred.fromCoroutine(_ping_repeatedly(node, clock, contact)) for contact in contacts]
@@ -96,10 +96,10 @@ async def _ping_repeatedly(node: EntangledNode, clock: IReactorTime, contact: Co
 
 
 class LinkMetrics:
-    """Measures the paths from ``node`` to its peers, only while ``read`` is called.
+    """Measures the paths from ``node`` to its peers while ``read`` is called regularly.
 
-    The first call returns at once, without figures; later calls have more.  Each peer gets several pings in quick
-    succession, then one per second, until ``read`` has not been called for ``IDLE_S`` seconds.
+    The first call returns immediately, without results; later calls return more results.  Each peer gets several pings
+    in quick succession, and then one ping per second, until ``read`` has not been called for ``IDLE_S`` seconds.
     """
 
     def __init__(self, node: EntangledNode, clock: IReactorTime, background: Background) -> None:
@@ -112,7 +112,7 @@ class LinkMetrics:
         self._is_running = False
 
     def read(self) -> list[dict[str, Any]]:
-        """Return the path to each peer with the figures measured so far, and keep measuring.
+        """Return the path to each peer with the current results, and continue to measure.
 
         Each entry has the fields of ``describe_path``, ``loss``, ``round_trip`` and ``jitter`` (None: unknown).
         """

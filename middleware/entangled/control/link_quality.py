@@ -1,7 +1,8 @@
-"""Quality of the path to one peer, computed from round-trip times; pure.
+"""Quality of the path to one peer, computed from round-trip times; without I/O.
 
 Several pings are sent one after the other.  If the first datagram of a ping or of its answer is lost, it is
-retransmitted and takes much longer than the others, so losses show even though retransmission repairs them.
+retransmitted, and the ping takes much longer than other pings.  Losses can therefore be detected although
+retransmission repairs them.
 """
 
 from __future__ import annotations
@@ -10,7 +11,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 RETRANSMISSION_S = 0.045
-"""Minimum extra seconds of a retransmitted ping: the wire waits 50 ms before it retransmits."""
+"""The minimum additional seconds of a retransmitted ping; a request is retransmitted after at least 50 ms."""
 
 
 @dataclass(frozen=True)
@@ -24,9 +25,10 @@ class LinkQuality:
 
     @property
     def score(self) -> int:
-        """A score from 0 (no answers) to 100 (near, steady, direct).
+        """A score from 0 (no answers) to 100 (no loss, short round trips without jitter, no relay).
 
-        10 % loss costs 30 points, 100 ms of round trip 10 (at most 25), 20 ms of jitter 8 (at most 15), a relay 15.
+        It is reduced by 30 points for 10 % loss, by 10 for 100 ms of round trip (at most 25), by 8 for 20 ms of jitter
+        (at most 15), and by 15 for a relay.
         """
         if self.round_trip is None or self.jitter is None:
             return 0
@@ -36,7 +38,7 @@ class LinkQuality:
 
 
 def compute_quality(times: Sequence[float | None], is_relayed: bool) -> LinkQuality:
-    """Return the link with these round-trip times in seconds, None for a ping without an answer."""
+    """Return the quality of a path with these round-trip times in seconds, None for a ping without an answer."""
     answered = sorted(seconds for seconds in times if seconds is not None)
     if not answered:
         return LinkQuality(1.0, None, None, is_relayed)

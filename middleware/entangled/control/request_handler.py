@@ -50,16 +50,17 @@ class RequestHandler:
         return cls(node, TupleSpace(node, clock, rng), Keywords(node), clock)
 
     def run(self, name: object, args: object, send_event: SendEvent) -> Deferred[Any]:
-        """Run the verb ``name``; call ``send_event`` with events, fire with the answer; can be cancelled.
+        """Run the verb ``name``; call ``send_event`` with each event; the Deferred fires with the answer.
 
-        All errors are failures of the Deferred: ``BadRequest`` for an invalid verb or argument.
+        The Deferred can be cancelled.  It fails with the error of the verb, or with ``BadRequest`` for an invalid verb
+        or argument.
         """
         return maybeDeferred(self._run, name, args, send_event)
 
     def _run(self, name: object, args: object, send_event: SendEvent) -> object:
         verb = self._find_handlers().get(name) if isinstance(name, str) else None
         if verb is None:
-            raise BadRequest(f"no verb {name!r}; there are {', '.join(sorted(self._find_handlers()))}")
+            raise BadRequest(f"there is no verb {name!r}; the verbs are {', '.join(sorted(self._find_handlers()))}")
         if not isinstance(args, dict):
             raise BadRequest("the arguments of a verb must be a JSON object")
         return verb(Arguments(args), send_event)
@@ -154,14 +155,14 @@ class RequestHandler:
         if colon and port.isdecimal():
             number = int(port) if len(port) <= 5 else 0
             if not 0 < number < 65536:
-                raise BadRequest(f"{target!r:.80}: the port must be 1 to 65535")
+                raise BadRequest(f"{target!r:.80}: the port must be from 1 to 65535")
             return await self.node.endpoint.discover(Address(host.strip("[]"), number))
         known = self.node.overlay.table.list_contacts()
         matching = [contact for contact in known if contact.node_id.hex().startswith(target.lower())] if target else []
         if len(matching) == 1:
             return matching[0]
         problem = f"{len(matching)} known nodes begin with" if matching else "no known node begins with"
-        raise BadRequest(f"{problem} {target!r}; give HOST:PORT, or more digits of the node's id (swarm dht find)")
+        raise BadRequest(f"{problem} {target!r}; use HOST:PORT, or more digits of the node's id (swarm dht find)")
 
 
 class Arguments:
@@ -171,33 +172,33 @@ class Arguments:
         self._given = given
 
     def text(self, name: str, default: str | None = None) -> str:
-        """Return a text."""
+        """Return a string argument."""
         value = self._given.get(name, default)
         if not isinstance(value, str):
-            raise BadRequest(f"{name}: must be a text" if name in self._given else f"{name}: is missing")
+            raise BadRequest(f"{name} must be a string" if name in self._given else f"{name} is missing")
         return value
 
     def choice(self, name: str, default: str, choices: Sequence[str]) -> str:
         """Return one of ``choices``."""
         value = self.text(name, default)
         if value not in choices:
-            raise BadRequest(f"{name}: must be one of {', '.join(choices)}, is {value!r}")
+            raise BadRequest(f"{name} must be one of {', '.join(choices)}, not {value!r}")
         return value
 
     def data(self, name: str) -> bytes:
-        """Return bytes, given as text or as ``{"base64": ...}``."""
+        """Return bytes, given as a string or as ``{"base64": ...}``."""
         value = self._value(name)
         if isinstance(value, str):
             return value.encode()
         if not isinstance(value, bytes):
-            raise BadRequest(f'{name}: must be a text or {{"base64": ...}}')
+            raise BadRequest(f'{name} must be a string or {{"base64": ...}}')
         return value
 
     def integer(self, name: str) -> int | None:
         """Return a non-negative integer, or None if absent."""
         value = self._given.get(name)
         if value is not None and (type(value) is not int or value < 0):
-            raise BadRequest(f"{name}: must be a non-negative integer")
+            raise BadRequest(f"{name} must be a non-negative integer")
         return value
 
     def seconds(self, name: str) -> float | None:
@@ -206,11 +207,11 @@ class Arguments:
         if value is None or value == 0:
             return None
         if type(value) not in (int, float) or not 0 < value <= MAX_WAIT_S:
-            raise BadRequest(f"{name}: must be seconds, above 0 and at most {MAX_WAIT_S:.0f}")
+            raise BadRequest(f"{name} must be a number of seconds above 0 and at most {MAX_WAIT_S:.0f}")
         return float(value)
 
     def flag(self, name: str) -> bool:
-        """Return whether it is true."""
+        """Return whether the argument is true."""
         return self._given.get(name) is True
 
     def fields(self, name: str) -> list[Any]:
@@ -256,7 +257,7 @@ def _parse_field(given: Any) -> Field:
                 return KINDS[given["kind"]]
             if "operator" in given:
                 return where(given["operator"], conversion.from_json(given.get("operand")))
-            raise BadRequest(f"template: {given!r:.80} is no field")
+            raise BadRequest(f"template: {given!r:.80} is not a template field")
         return conversion.from_json(given)  # type: ignore[no-any-return]
     except (conversion.InvalidValue, TypeError) as error:
         raise BadRequest(f"template: {error}") from error

@@ -1,8 +1,8 @@
 """The control socket of one node; each connection carries one request and its answers as lines of JSON.
 
-A request is ``{"verb": "dht get", "with": {"key": "a"}}``.  The reply is any number of lines ``{"event": ...}``, then
-one line ``{"answer": ...}`` or ``{"error": "Unavailable", "text": "..."}``, after which the node closes the connection.
-A client that closes it earlier cancels the request.
+A request is ``{"verb": "dht get", "with": {"key": "a"}}``.  The node replies with any number of lines ``{"event":
+...}`` and one line ``{"answer": ...}`` or ``{"error": "Unavailable", "text": "..."}``, and then closes the connection.
+A client cancels the request by closing the connection earlier.
 """
 
 from __future__ import annotations
@@ -42,7 +42,12 @@ class ControlProtocol(Protocol):
     def connectionMade(self) -> None:  # noqa: D102 (Twisted's)
         self._server.connections.add(self)
         if len(self._server.connections) > MAX_CONNECTIONS:
-            self._end({"error": "Busy", "text": f"more than {MAX_CONNECTIONS} connections; close some of them"})
+            self._end(
+                {
+                    "error": "Busy",
+                    "text": f"the limit of {MAX_CONNECTIONS} connections is reached; close some of them",
+                }
+            )
 
     def dataReceived(self, data: bytes) -> None:  # noqa: D102 (Twisted's)
         if self._has_request:
@@ -51,7 +56,7 @@ class ControlProtocol(Protocol):
         line, newline, _ = self._buffer.partition(b"\n")
         if len(line) > MAX_REQUEST_BYTES:
             self._has_request = True
-            self._end({"error": "BadRequest", "text": f"a request has at most {MAX_REQUEST_BYTES} bytes"})
+            self._end({"error": "BadRequest", "text": f"the request must have at most {MAX_REQUEST_BYTES} bytes"})
         elif newline:
             self._has_request = True
             self._buffer.clear()
@@ -69,7 +74,7 @@ class ControlProtocol(Protocol):
         except (ValueError, RecursionError):
             request = None
         if not isinstance(request, dict):
-            self._end({"error": "BadRequest", "text": "a request is one line with a JSON object"})
+            self._end({"error": "BadRequest", "text": "the request must be one line with a JSON object"})
             return
         work = self._server.handler.run(request.get("verb"), request.get("with", {}), self._send_event)
         self._work = work
@@ -106,7 +111,7 @@ class RequestRunner(Shape):
 class ControlServer(Service):
     """The control socket of one node, open while the service runs.
 
-    ``make_handler`` is called at the first request, so that a node without requests does not load them.
+    ``make_handler`` is called at the first request, so a node without requests does not load the verbs.
     """
 
     _log = Logger()
@@ -131,7 +136,7 @@ class ControlServer(Service):
         super().startService()
         factory = _ConnectionFactory(self)
         try:
-            # The lock file lets Twisted remove the socket of a killed node, but not of a running one.
+            # With the lock file, Twisted removes the socket of a killed node, but not the socket of a running node.
             self._port = self._reactor.listenUNIX(str(self._path), factory, mode=0o600, wantPID=True)
         except (CannotListenError, OSError) as error:
             self._log.warn("cannot listen at the control socket {path}: {error}", path=self._path, error=error)

@@ -1,6 +1,6 @@
-"""Location of the control sockets of this machine's nodes: one file per node, accessible to its user only.
+"""Location of the control sockets of this machine's nodes: one file per node, accessible only to its user.
 
-Any user may create a folder, a link or a socket in ``/tmp``, so node and client check the owner of each.
+Any user may create a folder, a link or a socket in ``/tmp``, so node and client check who owns each of these.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ MAX_PATH_BYTES = 107
 
 
 class NoControl(LocalError):
-    """The control socket does not exist or cannot be created."""
+    """The control socket does not exist, cannot be created, or is unsafe."""
 
 
 def find_folder() -> Path:
@@ -38,7 +38,9 @@ def prepare_path(name: str) -> Path:
         raise _make_unsafe_error(directory)
     path = directory / f"{name}{SUFFIX}"
     if len(os.fsencode(path)) > MAX_PATH_BYTES:
-        raise NoControl(f"{path} exceeds the {MAX_PATH_BYTES} bytes of a socket's path; set a shorter XDG_RUNTIME_DIR")
+        raise NoControl(
+            f"{path} has more than {MAX_PATH_BYTES} bytes, the limit for a socket; set a shorter XDG_RUNTIME_DIR"
+        )
     return path
 
 
@@ -50,7 +52,7 @@ def list_files(ending: str) -> list[Path]:
 
 
 def find_socket(name: str | None) -> Path:
-    """Return the socket of node ``name``, or of the only node; raise ``NoControl`` with the existing names."""
+    """Return the socket of node ``name`` (None: the only node); raise ``NoControl`` with the existing names."""
     names = [path.name.removesuffix(SUFFIX) for path in list_files(SUFFIX)]
     if name is None and len(names) == 1:
         name = names[0]
@@ -61,19 +63,21 @@ def find_socket(name: str | None) -> Path:
     existing = ", ".join(names)
     if name is None:
         raise NoControl(f"several nodes have run on this machine; choose one with --node NAME: {existing}")
-    raise NoControl(f"no node {name!r} runs on this machine; these have run: {existing}")
+    raise NoControl(f"no node {name!r} runs on this machine; nodes that have run: {existing}")
 
 
 def check_socket(path: Path) -> None:
-    """Raise ``NoControl`` if ``path`` is no socket, or its owner is not the owner of its folder."""
+    """Raise ``NoControl`` if ``path`` is not a socket, or has a different owner than its folder."""
     owner = check_owner(path.parent)
     try:
         state = path.lstat()
     except OSError as error:
         reason = error.strerror
-        raise NoControl(f"the node behind {path} does not answer ({reason}); start it, or remove that file") from error
+        raise NoControl(
+            f"the node of {path} does not answer ({reason}); start the node, or remove this file"
+        ) from error
     if not stat.S_ISSOCK(state.st_mode):
-        raise NoControl(f"{path} is no socket; remove it and restart the node")
+        raise NoControl(f"{path} is not a socket; remove this file and restart the node")
     if state.st_uid != owner:
         raise _make_unsafe_error(path)
 
@@ -81,7 +85,8 @@ def check_socket(path: Path) -> None:
 def check_owner(path: Path) -> int:
     """Return the user id of the folder ``path``; raise ``NoControl`` if other users have access.
 
-    The owner must be this user, or for root the user of a service whose folder ``XDG_RUNTIME_DIR`` names.
+    The owner must be this user.  For root the owner may also be the user of a service, if ``XDG_RUNTIME_DIR`` is set to
+    the service's folder.
     """
     try:
         state = path.lstat()

@@ -6,4 +6,4 @@ from middleware.entangled.data.store import Store
 
 
 class MemoryStore(Store):
-    """A store without a file; its contents end with the process."""
+    """A store without a file; its contents are lost when the process ends."""

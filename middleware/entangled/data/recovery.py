@@ -1,7 +1,7 @@
 """Recovery from a corrupt store file.
 
-The file is renamed and never removed.  Notes in it with a valid checksum are copied to the new store; the node's
-identity is one of them.
+The corrupt file is renamed and never removed.  Its notes with a valid checksum are copied to the new store; one of the
+notes is the node's identity.
 """
 
 from __future__ import annotations
@@ -26,12 +26,12 @@ CHUNK_BYTES = 2**20
 
 
 def is_store(path: str) -> bool:
-    """Return whether an unreadable file was a store: by its header, its tables, or because it is all zeros."""
+    """Return whether an unreadable file was a store: by its header, by its tables, or because all bytes are zero."""
     return _has_store_header(path) or _is_blank(path) or any(_has_trace(path + suffix) for suffix in FILE_SUFFIXES[:2])
 
 
 def set_aside(path: str) -> str:
-    """Rename the file and its write-ahead log to the first free name, ``PATH.rotten-1`` and so on; return that."""
+    """Rename the file and its write-ahead log to the first free name ``PATH.rotten-1`` and so on; return the name."""
     number = 1
     while os.path.lexists(f"{path}.rotten-{number}"):
         number += 1
@@ -58,7 +58,7 @@ def _has_store_header(path: str) -> bool:
 
 
 def _is_blank(path: str) -> bool:
-    """Return whether all bytes are zero, as after lost pages of a flash card."""
+    """Return whether all bytes are zero, as on an SD card that lost power before it wrote the pages."""
     with open(path, "rb") as file:
         return not any(chunk.strip(b"\0") for chunk in iter(lambda: file.read(CHUNK_BYTES), b""))
 

@@ -1,6 +1,7 @@
 """Tables of the SQLite file, checksums of rows, and migration from older schemas.
 
-Each row carries a CRC-32 of its fields, because SQLite's structural checks miss bit errors of the flash inside values.
+Each row contains a CRC-32 of its fields, because SQLite's structural checks do not detect bit errors of flash memory
+inside values.
 """
 
 from __future__ import annotations
@@ -17,15 +18,15 @@ from middleware.entangled.errors import BadStore
 from middleware.entangled.record import Record, parse_record
 
 APPLICATION_ID = 0x53574E31
-"""Identifies the file in its header as a store ("SWN1")."""
+"""The application id in the header of the file, which identifies it as a store ("SWN1")."""
 SCHEMA_VERSION = 2
 FILE_MARK = bytes.fromhex("a9531c4e5fd0428fb1e7706d2c8834f6")
-"""Value of a note that identifies a store file with a damaged header."""
+"""The value of a note by which a store file with a damaged header is identified."""
 CREATE_RECORDS_1 = (
     "CREATE TABLE records(key BLOB, owner BLOB, name TEXT, sequence INTEGER, lifetime TEXT, ttl REAL, value BLOB,"
     " signature BLOB, PRIMARY KEY(key, owner, name)) WITHOUT ROWID"
 )
-"""Schema 1; large values slow it down, because they are stored in the tree that SQLite searches."""
+"""The table of schema 1, which is slow with large values, because they are stored in the tree that SQLite searches."""
 CREATE_RECORDS = (
     "CREATE TABLE records(id INTEGER PRIMARY KEY, key BLOB, owner BLOB, name TEXT, sequence INTEGER, lifetime TEXT,"
     " ttl REAL, signature BLOB, crc INTEGER, value BLOB, UNIQUE(key, owner, name))"
@@ -36,7 +37,7 @@ CREATE_ROTTEN = (
     " ttl REAL, signature BLOB, crc INTEGER, value BLOB)"
 )
 MAX_CORRUPT_ROWS = 16
-"""Number of corrupt rows kept for diagnosis; more of them cost space on the card."""
+"""The number of corrupt rows that are kept for diagnosis; it limits the space that they use on the SD card."""
 
 FIELDS = "key, owner, name, sequence, lifetime, ttl, signature, crc, value"
 SELECT_RECORDS = f"SELECT {FIELDS} FROM records"
@@ -52,12 +53,12 @@ Statement = tuple[str, Sequence[Any]]
 
 
 class CorruptStore(Exception):
-    """The file is a damaged store; ``str()`` is the symptom."""
+    """The file is a damaged store; ``str()`` describes the damage."""
 
 
 @dataclass
 class Contents:
-    """The contents of a file; ``repairs`` are the statements that set aside corrupt rows and remove leased records."""
+    """The contents of a file; ``repairs`` are SQL statements that set aside corrupt rows and remove leased records."""
 
     records: list[Record] = field(default_factory=list)
     notes: dict[str, bytes] = field(default_factory=dict)
@@ -72,7 +73,7 @@ def make_row(record: Record) -> tuple[object, ...]:
 
 
 def parse_row(row: Sequence[Any]) -> Record | None:
-    """Return the record in a row of ``FIELDS`` with texts as bytes; None if the row is corrupt."""
+    """Return the record in a row of ``FIELDS`` whose strings are bytes; None if the row is corrupt."""
     record = _parse_unchecked(row)
     return record if record is not None and _crc(record.pack()) == row[7] else None
 
@@ -83,28 +84,28 @@ def make_note_row(name: str, value: bytes) -> tuple[str, bytes, int]:
 
 
 def use_bytes(connection: sqlite3.Connection) -> None:
-    """Make ``connection`` return texts as bytes, because a corrupt text may not be UTF-8."""
+    """Make ``connection`` return strings as bytes, because a corrupt string may not be UTF-8."""
     connection.text_factory = bytes
 
 
 def check_version(path: str, connection: sqlite3.Connection) -> int:
     """Return the schema version of the file, 0 if it is empty.
 
-    Raises ``BadStore`` if it is no store or has a newer schema, ``CorruptStore`` if it is a damaged store.
+    Raises ``BadStore`` if the file is not a store or has a newer schema, ``CorruptStore`` if it is a damaged store.
     """
     (application,) = connection.execute("PRAGMA application_id").fetchone()
     (version,) = connection.execute("PRAGMA user_version").fetchone()
     tables = [_decode_text(sql) for (sql,) in connection.execute("SELECT sql FROM sqlite_schema WHERE type = 'table'")]
     if application != APPLICATION_ID:
         if CREATE_RECORDS in tables or CREATE_RECORDS_1 in tables:
-            raise CorruptStore("its header has another application id")
+            raise CorruptStore("the header has a different application id")
         if application or version or tables:
-            raise BadStore(f"store {path}: belongs to another program; name another file")
+            raise BadStore(f"store {path}: belongs to another program; choose a different file")
         return 0
     if version > SCHEMA_VERSION:
-        raise BadStore(f"store {path}: has the newer schema {version}; update this program, or name another file")
+        raise BadStore(f"store {path}: has the newer schema {version}; update this program, or choose a different file")
     if (CREATE_RECORDS if version == SCHEMA_VERSION else CREATE_RECORDS_1) not in tables:
-        raise CorruptStore(f"it lacks the tables of schema {version}")
+        raise CorruptStore(f"the tables of schema {version} are missing")
     (result,) = connection.execute("PRAGMA integrity_check(1)").fetchone()
     if _decode_text(result) != "ok":
         raise CorruptStore(str(_decode_text(result)))
@@ -136,7 +137,7 @@ def create_tables(connection: sqlite3.Connection, version: int) -> None:
 def read_contents(connection: sqlite3.Connection) -> Contents:
     """Read the whole file, records in order of insertion."""
     found = Contents()
-    # Many rows share an owner or a key; share their bytes objects.
+    # Many rows have the same owner or key; let them share one bytes object to save memory.
     known: dict[bytes, bytes] = {}
     for row_id, key, owner, *rest in connection.execute(f"SELECT id, {FIELDS} FROM records ORDER BY id"):
         record = parse_row([known.setdefault(key, key), known.setdefault(owner, owner), *rest])
@@ -145,7 +146,7 @@ def read_contents(connection: sqlite3.Connection) -> Contents:
             found.repairs += _set_aside(row_id)
         elif record.lifetime == "team":
             found.records.append(record)
-    # Leases end with the process that received the owners' signs of life.
+    # Leases end with the process that received their renewals.
     found.repairs.append(("DELETE FROM records WHERE lifetime = 'leased'", ()))
     found.notes, bad = read_notes(connection)
     found.corrupt_rows += bad

@@ -1,7 +1,7 @@
 """A data store in a SQLite file.
 
-Reads are served from memory; one ``writer`` writes changes to the file.  ``read_records`` reads the file from any
-thread, for the pages.
+Reads are served from memory; one ``Writer`` writes changes to the file.  ``read_records`` reads the file from any
+thread, for the web pages.
 """
 
 from __future__ import annotations
@@ -33,21 +33,21 @@ from middleware.entangled.record import Record, Slot
 
 SYNCHRONOUS: dict[Durability, str] = {"power": "FULL", "crash": "NORMAL"}
 EPOCH_NOTE = "epoch"
-"""The note that holds the store's epoch; it is not copied from a corrupt file to the new one."""
+"""The name of the note with the store's epoch, which is not copied from a corrupt file to the new store."""
 MAX_LOG_BYTES = 4 * 2**20
-"""Bytes to which the write-ahead log is truncated after a burst of writes."""
+"""The size in bytes to which the write-ahead log is truncated after a burst of writes."""
 
 
 class SqliteStore(Store):
     """A ``Store`` backed by the file ``path``; use ``open`` to create one.
 
-    While the file is not writable (a full disk, say), reads continue, ``put`` raises ``Unwritable`` with the reason,
-    and the writer retries pending changes until it succeeds.
+    If the file is not writable, for example on a full disk, reads continue, ``put`` raises ``Unwritable`` with the
+    reason, and the writer retries the pending changes.
     """
 
     _log = Logger()
     make_writer: Callable[[str, sqlite3.Connection, CallInThread | None], Writer] = Writer
-    """Factory of the writer; simulations replace it by one without a thread."""
+    """The factory of the writer; simulations replace it by a factory of writers without a thread."""
 
     def __init__(
         self,
@@ -80,12 +80,12 @@ class SqliteStore(Store):
     ) -> SqliteStore:
         """Open the store in the file ``path``, or create it; raise ``BadStore`` with the reason and a remedy.
 
-        Team records expire a whole ttl after ``now``, because the time since it was closed is unknown; leased
+        Team records expire a whole ttl after ``now``, because the time since the store was closed is unknown.  Leased
         records are removed.  A corrupt file is renamed, and the store starts empty except for the notes that could be
         read.  ``deliver`` is ``reactor.callFromThread``, or None if the caller never waits for ``wait_for_write``.
         ``fresh_epoch`` is the epoch of a new store, random if None.  With ``durable`` set to ``power``, written data
-        survives a power failure.  With ``crash`` it survives a crash of the process: commits do not wait for the disk,
-        and a power failure may lose the last of them, without other damage.
+        survives a power failure.  With ``crash``, written data survives only a crash of the process: commits do not
+        wait for the disk, and a power failure may lose the last commits, without further damage.
         """
         path = os.fspath(path)
         fresh_epoch = os.urandom(8) if fresh_epoch is None else fresh_epoch
@@ -121,23 +121,23 @@ class SqliteStore(Store):
         return store
 
     def put(self, record: Record, expires_at: float) -> bool:
-        """Store ``record`` if it beats the record in its slot; see ``Store.put``."""
+        """Store ``record`` if it supersedes the record in its slot; see ``Store.put``."""
         self._check_open()
         if self._writer.error and record.supersedes(self.get_slot(record.slot)):
             raise self._writer.make_error(self._writer.error)
         return super().put(record, expires_at)
 
     def wait_for_write(self) -> Deferred[None]:
-        """Fire when all changes made so far are in the file; fail with ``Unwritable`` if it is not writable."""
+        """Fire when all previous changes are in the file; fail with ``Unwritable`` if it is not writable."""
         return self._writer.wait_for_write()
 
     @property
     def write_error(self) -> str:
-        """The reason why the file is not writable at present; empty if it is."""
+        """The reason why the file is currently not writable; empty if it is writable."""
         return self._writer.error
 
     def set_note(self, name: str, value: bytes) -> None:
-        """Store a small value for the node's own use under ``name``; it is durable once ``wait_for_write`` fires."""
+        """Store a small value for the node's own use under ``name``; it is durable when ``wait_for_write`` fires."""
         self._check_open()
         if self.get_note(name) != value:
             super().set_note(name, value)
@@ -150,7 +150,7 @@ class SqliteStore(Store):
     def close(self) -> None:
         """Write pending changes and close the file; may be called twice.
 
-        If the file is not writable the pending changes are lost and the reason is logged.
+        If the file is not writable, the pending changes are lost, and the reason is logged.
         """
         if self._writer.close():
             self._connection.close()
@@ -183,7 +183,8 @@ class SqliteStore(Store):
 def read_records(path: str | os.PathLike[str], key: bytes) -> list[Record]:
     """Return the records under ``key`` in the file ``path``, in the order of (owner, name); from any thread or process.
 
-    Never blocks the writer; sees committed changes, up to ``writer.COMMIT_AFTER_S`` late.  Raises ``BadStore``.
+    The call never blocks the writer.  It reads only committed changes, which are up to ``writer_thread.COMMIT_AFTER_S``
+    seconds late.  Raises ``BadStore``.
     """
     path = os.fspath(path)
     connection = None
@@ -200,22 +201,23 @@ def read_records(path: str | os.PathLike[str], key: bytes) -> list[Record]:
 
 
 def _open_file(path: str, durable: Durability) -> tuple[sqlite3.Connection, int, int, Contents]:
-    """Lock and open the file; return the connection, the lock, the version that it had, and its contents.
+    """Lock and open the file; return the connection, the lock, the previous schema version, and the contents.
 
-    Raises ``BadStore`` if it is not usable, ``CorruptStore`` if it is a damaged store.
+    Raises ``BadStore`` if the file is not usable, ``CorruptStore`` if it is a damaged store.
     """
     lock = _lock_file(path)
     connection = None
     try:
-        # Autocommit: the code begins transactions explicitly.  One thread at a time uses the connection, this one until
-        # the writer starts.
+        # Autocommit: the code begins transactions explicitly.  Only one thread at a time uses the connection; until the
+        # writer starts, this is the current thread.
         connection = sqlite3.connect(path, isolation_level=None, check_same_thread=False, timeout=5.0)
         use_bytes(connection)
         version = check_version(path, connection)
-        # Only now, to leave another program's file unchanged.
+        # Done only after the check, to leave another program's file unchanged.
         os.fchmod(lock, 0o600)
         connection.execute("PRAGMA journal_mode = WAL")
-        # Robots lose power at any time; less than FULL loses the last commits, less than NORMAL may damage the file.
+        # Robots lose power at any time; levels below FULL lose the last commits, levels below NORMAL may damage the
+        # file.
         connection.execute(f"PRAGMA synchronous = {SYNCHRONOUS[durable]}")
         connection.execute("PRAGMA cache_size = -512")
         connection.execute(f"PRAGMA journal_size_limit = {MAX_LOG_BYTES}")
@@ -232,10 +234,10 @@ def _open_file(path: str, durable: Durability) -> tuple[sqlite3.Connection, int,
             os.close(lock)
             if ours:
                 raise CorruptStore(_join_lines(error)) from error
-            raise _make_error(path, str(error), "name another file") from error
+            raise _make_error(path, str(error), "choose a different file") from error
         os.close(lock)
         if isinstance(error, sqlite3.Error | OSError):
-            raise _make_error(path, str(error), "make room, or name another file") from error
+            raise _make_error(path, str(error), "free disk space, or choose a different file") from error
         raise
 
 
@@ -251,12 +253,12 @@ def _make_error(path: str, problem: str, remedy: str) -> BadStore:
 def _lock_file(path: str) -> int:
     """Create or open the file and lock it against other nodes; return the descriptor."""
     if os.path.isdir(path):
-        raise _make_error(path, "is a directory", "name a file in it")
+        raise _make_error(path, "the path is a directory", "choose a file in it")
     try:
-        # Readable by its owner only: it holds the seed of the node's identity.
+        # Readable only by its owner, because it contains the seed of the node's identity.
         lock = os.open(path, os.O_RDWR | os.O_CREAT, 0o600)
     except OSError as error:
-        raise _make_error(path, error.strerror or str(error), "name a file that can be written") from error
+        raise _make_error(path, error.strerror or str(error), "choose a file that can be written") from error
     try:
         fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
     except BlockingIOError as error:
@@ -264,11 +266,13 @@ def _lock_file(path: str) -> int:
         os.close(lock)
         problem = "another node uses it" + (f" (process {holder})" if holder else "")
         raise _make_error(
-            path, problem, "stop it, or give each node its own store, which holds its identity"
+            path, problem, "stop that node, or configure a separate store, with its own identity, for each node"
         ) from error
     except OSError as error:
         os.close(lock)
-        raise _make_error(path, error.strerror or str(error), "name a file on a local disk that is yours") from error
+        raise _make_error(
+            path, error.strerror or str(error), "the store must be your own file on a local disk"
+        ) from error
     return lock
 
 

@@ -1,15 +1,15 @@
-"""The records that a node holds, and small values for its own use (notes).
+"""The records that a node stores, and small values for its own use (notes).
 
-``memory.MemoryStore`` keeps them in memory; ``sqlite.SqliteStore`` also writes them to a file.  Times are in seconds of
-the caller's clock; the caller passes expiry times and the current time.
+``memory.MemoryStore`` stores them only in memory; ``sqlite.SqliteStore`` also writes them to a file.  Times are in
+seconds of the caller's clock; the caller passes expiry times and the current time.
 
-To make room for a record the store removes tombstones older than ``hold``, the oldest first, and no more than needed: a
-node that was away for longer joins with an empty store.  It evicts nothing else: if that is not enough, ``put`` raises
-``Full`` and changes nothing.
+If there is not enough space for a record, the store removes tombstones older than ``hold``, the oldest first, and no
+more than needed.  This is safe because a node with a longer absence joins with an empty store.  The store evicts
+nothing else: if the space is still not enough, ``put`` raises ``Full`` and changes nothing.
 
-Each owner may use as much as is left free: a dynamic threshold, as in switches with a shared buffer (Choudhury and
-Hahne, 1998).  A single owner gets up to half of the rows and bytes; k owners that write without end leave 1 in 2**k
-free.  An owner above its share is refused, and only its own tombstones make room for it.
+Each owner may use as much space as is left free: a dynamic threshold, as in switches with a shared buffer (Choudhury
+and Hahne, 1998).  A single owner gets up to half of the rows and bytes; k owners that write without end leave 1 in 2**k
+free.  A record of an owner above its share is rejected unless removing tombstones of the same owner frees enough space.
 """
 
 from __future__ import annotations
@@ -26,26 +26,28 @@ from middleware.entangled.errors import OWNER_FULL, Full
 from middleware.entangled.record import Record, Slot
 
 MAX_ROWS = 12_000
-"""Slots of a store.  More serve a larger network; each takes 1.2 KiB of memory in addition to its ``count_bytes``.
-Together with ``MAX_BYTES`` a full store adds 22 MiB to a node of 40 MiB, the limit for a device with 64 MB."""
+"""The maximum number of slots of a store.  A larger network needs more slots; each slot takes 1.2 KiB of memory in
+addition to the ``count_bytes`` of its record.  With this value and ``MAX_BYTES``, a full store adds 22 MiB to a node of
+40 MiB, which is the limit for a device with 64 MB."""
 MAX_BYTES = 8 * 2**20
-"""Bytes of a store by ``count_bytes``.  More hold more large values, at the cost of memory and flash."""
+"""The maximum bytes of a store, counted by ``count_bytes``.  A higher value allows more large values, but uses more
+memory and flash."""
 TOMBSTONE_HOLD_S = 86_400.0
-"""Seconds before a tombstone may be removed for room: the longest absence after which a returning node does not bring
-back a deleted record.  More is safer; less frees space earlier."""
+"""Seconds before a tombstone may be removed to free space: the longest absence after which a returning node does not
+restore a deleted record.  A higher value is safer; a lower value frees space earlier."""
 MIN_OWNER_ROWS = 250
 MIN_OWNER_BYTES = 65_536
-"""Minimum share of each owner while the store has room, independent of the others."""
+"""The minimum share of each owner in bytes, independent of other owners, as long as the store has space."""
 FIXED_BYTES = 17
-"""Bytes of a record's sequence (8), ttl (8) and lifetime (1)."""
+"""The bytes of a record's sequence number (8), ttl (8) and lifetime (1)."""
 
 MAX_SEARCHED = 1000
-"""Tombstones searched, oldest first, for ones of a given owner."""
+"""The number of tombstones, oldest first, that are searched for tombstones of a given owner."""
 
 Origin = Literal["new", "kept", "replaced"]
-"""Origin of a store: newly created, read from its file, or created because the file was corrupt."""
+"""The origin of a store: newly created, read from its file, or created because the file was corrupt."""
 Durability = Literal["power", "crash"]
-"""Event that written data survives: a power failure, or only a crash of the process."""
+"""The event that written data survives: a power failure, or only a crash of the process."""
 
 
 class Usage(NamedTuple):
@@ -72,15 +74,16 @@ class _StoredRecord:
 class Store:
     """The records of one node, in memory; one thread uses it.
 
-    It has at most ``max_rows`` slots and ``max_bytes``.  A tombstone is stored above these limits, so that a delete
-    never fails for lack of space, up to twice ``max_rows`` slots, so that tombstones cannot fill the memory.
-    ``epoch`` is a random number of this store.
+    The store has at most ``max_rows`` slots and ``max_bytes`` bytes.  A tombstone may exceed these limits, so a delete
+    never fails for lack of space, but only up to twice ``max_rows`` slots, so tombstones cannot fill the memory.
+    ``epoch`` is a random number that identifies this store.
     """
 
     origin: Origin = "new"
-    """Origin of the store; records of one that is not ``new`` may be stale or missing until they are reconciled."""
+    """The origin of the store; unless it is ``new``, records may be stale or missing until they are reconciled."""
     corrupt_rows = 0
-    """Corrupt rows when the store was opened; their records are missing until other replicas send them."""
+    """The number of corrupt rows when the store was opened; their records are missing until other replicas send
+    them."""
 
     def __init__(
         self,
@@ -112,7 +115,7 @@ class Store:
 
     @property
     def write_error(self) -> str:
-        """The reason why the store is not writable at present; empty if it is."""
+        """The reason why the store is currently not writable; empty if it is writable."""
         return ""
 
     @property
@@ -121,11 +124,11 @@ class Store:
         return Usage(len(self._slots), self._max_rows, self._bytes, self._max_bytes)
 
     def put(self, record: Record, expires_at: float) -> bool:
-        """Store ``record`` if it beats the record in its slot; return whether it did.
+        """Store ``record`` if it supersedes the record in its slot; return whether it was stored.
 
-        Storing an equal record again only extends its life.  Raises ``Full`` if there is no room or the owner is above
-        its share, ``Unwritable`` if the file is not writable.  The record is durable, and may be acknowledged, once
-        ``wait_for_write`` has fired.
+        Storing an equal record again only extends its lifetime.  Raises ``Full`` if there is no space or the owner is
+        above its share, and ``Unwritable`` if the file is not writable.  The record is durable, and may be
+        acknowledged, once ``wait_for_write`` has fired.
         """
         slot = record.slot
         held = self._slots.get(slot)
@@ -143,7 +146,7 @@ class Store:
         return True
 
     def wait_for_write(self) -> Deferred[None]:
-        """Fire when all changes made so far are durable; fail with ``Unwritable`` if they cannot be."""
+        """Fire when all previous changes are durable; fail with ``Unwritable`` if they cannot be written."""
         return succeed(None)
 
     def get(self, key: bytes, tombstones: bool = False) -> list[Record]:
@@ -153,7 +156,7 @@ class Store:
             slots = self._by_key.get(key)
             if slots is None:
                 return []
-            # Large keys are read page by page: cache the order until the next change.
+            # Keys with many records are read page by page: cache the order until the next change.
             holding = self._sorted[key] = [slots[slot] for slot in sorted(slots)]
         return [held.record for held in holding if tombstones or held.record.value is not None]
 
@@ -181,13 +184,16 @@ class Store:
         leased = 0
         for held in self._by_owner.get(owner, {}).values():
             if held.record.lifetime == "leased":
-                # The heap keeps the old time; ``expire`` then queues the record again.
+                # The heap still contains the old time; at that time ``expire`` queues the record again.
                 held.expires_at = max(held.expires_at, expires_at)
                 leased += 1
         return leased
 
     def expire(self, now: float) -> list[Record]:
-        """Remove records that expired by ``now``; return those removed for room, then the expired, earliest first."""
+        """Remove records that expired by ``now``.
+
+        Returns the records that were removed to free space, and then the expired records, the earliest first.
+        """
         self._now = max(self._now, now)
         removed, self._removed_for_room = self._removed_for_room, []
         expired: list[tuple[float, Slot, Record]] = []
@@ -200,7 +206,7 @@ class Store:
                 self._queue(held)
             else:
                 expired.append((held.expires_at, slot, self._remove(slot)))
-        # The heap yields a record with an extended lease at its old time.
+        # The heap returns a record with an extended lease at its old time.
         expired.sort(key=lambda ended: ended[:2])
         return removed + [record for _, _, record in expired]
 
@@ -239,13 +245,13 @@ class Store:
     # -- room --------------------------------------------------------------------------------------------------------
 
     def _fits(self, record: Record, rows: int, size: int) -> bool:
-        """Return whether ``rows`` and ``size`` more are within the limits for ``record``."""
+        """Return whether ``rows`` more rows and ``size`` more bytes are within the limits for ``record``."""
         if record.is_tombstone:
             return len(self._slots) + rows <= 2 * self._max_rows
         return len(self._slots) + rows <= self._max_rows and self._bytes + size <= self._max_bytes
 
     def _make_room(self, record: Record, held: _StoredRecord | None) -> None:
-        """Remove old tombstones until ``record`` fits instead of ``held``; raise ``Full`` if that is not enough."""
+        """Remove old tombstones until ``record`` fits in place of ``held``; raise ``Full`` if it still does not fit."""
         rows = 1 if held is None else 0
         size = count_bytes(record) - (0 if held is None else count_bytes(held.record))
         if not rows and size <= 0:
@@ -275,7 +281,7 @@ class Store:
         self._removed_for_room += [self._remove(slot) for slot in leaving]
 
     def _is_within_share(self, record: Record, rows: int, size: int) -> bool:
-        """Return whether the owner, with ``rows`` and ``size`` more, is within its share."""
+        """Return whether the owner is within its share with ``rows`` more rows and ``size`` more bytes."""
         has_rows = len(self._by_owner.get(record.owner, ())) + rows
         has_bytes = self._bytes_of.get(record.owner, 0) + size
         free_rows = self._max_rows - len(self._slots) - rows
@@ -320,7 +326,7 @@ class Store:
             self._queue(held)
 
     def _index_tombstone(self, slot: Slot, held: _StoredRecord) -> None:
-        """Append ``held`` to the removable tombstones if it is one."""
+        """Append ``held`` to the removable tombstones if it is a tombstone."""
         self._tombstones.pop(slot, None)
         if held.record.is_tombstone:
             self._tombstones[slot] = held
@@ -329,7 +335,7 @@ class Store:
         held.queued_at = held.expires_at
         heapq.heappush(self._heap, (held.expires_at, held.record.slot))
         if len(self._heap) > 2 * len(self._slots) + 64:
-            # Removed and shortened records leave stale entries; rebuild the heap before these fill the memory.
+            # Removed records and shortened lifetimes leave stale entries; rebuild the heap before they fill the memory.
             self._heap = [(other.queued_at, slot) for slot, other in self._slots.items()]
             heapq.heapify(self._heap)
 
@@ -349,6 +355,6 @@ class Store:
 
 
 def count_bytes(record: Record) -> int:
-    """Return the size of ``record`` in bytes of all its fields, as the limits count it."""
+    """Return the size of all fields of ``record`` in bytes; the limits of the store use this size."""
     name = len(record.name.encode())
     return len(record.key) + len(record.owner) + name + len(record.value or b"") + len(record.signature) + FIXED_BYTES

@@ -1,8 +1,8 @@
-"""The thread that writes a SQLite file, with many changes to a commit.
+"""The thread that writes a SQLite file, with many changes in one commit.
 
-A single commit can stall for a quarter of a second on a busy flash card, so callers do not block on it: changes are
-queued, and ``wait_for_write`` fires when they are durable.  A change that a caller waits for is committed at once,
-together with all changes queued during the commit before; other changes share a later commit.
+A single commit can stall for a quarter of a second on a busy flash card, so callers do not block on commits: changes
+are queued, and ``wait_for_write`` fires when they are durable.  A change that a caller waits for is committed
+immediately, together with all changes queued during the previous commit; other changes share a later commit.
 """
 
 from __future__ import annotations
@@ -21,20 +21,20 @@ from middleware.entangled.errors import BadStore, NotRunning, Unwritable
 from middleware.entangled.record import Record, Slot
 
 COMMIT_AFTER_S = 0.02
-"""Seconds that a change may wait for others if no caller waits for it.  More means fewer writes to the card; less means
-fewer changes lost in a power failure."""
+"""Seconds for which a change may wait for further changes if no caller waits for it.  A higher value causes fewer
+writes to the flash card; with a lower value fewer changes are lost in a power failure."""
 MAX_BATCH = 200
-"""Pending changes that are committed without waiting."""
+"""The number of pending changes from which they are committed without waiting."""
 RETRY_INTERVAL_S = 0.5
 """Seconds between two attempts after a failed commit, as on a full disk."""
 
 CallInThread = Callable[[Callable[[], None]], object]
-"""Calls a function in the thread of the store's user: ``reactor.callFromThread``."""
+"""Calls a function in the thread that uses the store, such as ``reactor.callFromThread``."""
 
 
 @dataclass
 class _Batch:
-    """Pending changes: only the last one of each slot and note, so they never exceed the store's size."""
+    """Pending changes: only the last change of each slot and note, so a batch is never larger than the store."""
 
     statements: list[Statement] = field(default_factory=list)
     changes: dict[Slot, Record | None] = field(default_factory=dict)
@@ -53,7 +53,8 @@ class _Batch:
 class Writer:
     """Writes changes to ``connection``, the file ``path``, from ``start`` to ``close``.
 
-    ``call_in_thread`` notifies of written changes in the caller's thread; if it is None, ``flush`` and ``close`` do.
+    ``call_in_thread`` is used to notify callers of written changes in their thread; if it is None, ``flush`` and
+    ``close`` notify them.
     """
 
     _log = Logger()
@@ -63,14 +64,14 @@ class Writer:
         self._connection = connection
         self._call_in_thread = call_in_thread
         self._condition = threading.Condition()
-        # Access to these needs the lock of ``_condition``.
+        # Access to the following attributes needs the lock of ``_condition``.
         self._pending = _Batch()
         self._waiting: list[Deferred[None]] = []
         self._is_writing = False
         self._is_urgent = False
         self._is_closing = False
         self._error = ""
-        # The writer appends, the caller's thread pops.
+        # The writer's thread appends items, the caller's thread removes them.
         self._notifications: deque[tuple[Deferred[None], str]] = deque()
         self._thread = threading.Thread(target=self._run, name=f"writer of {path}", daemon=True)
 
@@ -104,7 +105,7 @@ class Writer:
             self._condition.notify_all()
 
     def wait_for_write(self) -> Deferred[None]:
-        """Fire once all changes queued so far are in the file; fail with ``Unwritable`` as soon as a commit fails."""
+        """Fire once all queued changes are in the file; fail with ``Unwritable`` as soon as a commit fails."""
         with self._condition:
             if self._is_closing:
                 return fail(NotRunning(f"store {self._path} is closed"))
@@ -130,9 +131,9 @@ class Writer:
             raise BadStore(f"store {self._path}: not written within {timeout} s: {why}; free disk space and retry")
 
     def close(self) -> bool:
-        """Write queued changes and end the thread; return False if that was done before.
+        """Write queued changes and end the thread; return False if the writer was already closed.
 
-        If the file is not writable the queued changes are lost and the reason is logged.
+        If the file is not writable, the queued changes are lost, and the reason is logged.
         """
         with self._condition:
             if self._is_closing:
@@ -144,8 +145,8 @@ class Writer:
         return True
 
     def make_error(self, why: str) -> Unwritable:
-        """Return the error for callers while the file is not writable."""
-        # Sent to peers as well: without the path, which is in the log.
+        """Return the error for callers if the file is not writable."""
+        # The text is also sent to peers, so it does not contain the path, which is in the log.
         return Unwritable(f"the data store cannot be written: {why}")
 
     def _notify_waiting(self) -> None:
@@ -153,7 +154,7 @@ class Writer:
         while self._notifications:
             waiting, error = self._notifications.popleft()
             if waiting.called:
-                continue  # cancelled by its caller
+                continue  # the caller has cancelled the Deferred
             if error:
                 waiting.errback(self.make_error(error))
             else:
@@ -218,7 +219,7 @@ class Writer:
             connection.executemany(PUT_RECORD, (make_row(r) for r in batch.changes.values() if r is not None))
             connection.executemany(PUT_NOTE, (make_note_row(*note) for note in batch.notes.items()))
             connection.execute("COMMIT")
-        except Exception as error:  # whatever the error, the waiting callers must be notified
+        except Exception as error:  # after any error the waiting callers must be notified
             return f"{' '.join(str(error).split()) or type(error).__name__}{self._roll_back()}"
         return ""
 

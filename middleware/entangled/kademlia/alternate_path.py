@@ -1,7 +1,7 @@
 """Enter the network through a tunnel when UDP is blocked, and return to UDP as soon as it works.
 
-A tunnel takes memory of the serving node and delays its users' datagrams, so it is used only when no known node answers
-over UDP, and abandoned as soon as its node does.
+A tunnel uses memory of the serving node and delays datagrams.  Therefore a node opens a tunnel only if no known node
+answers over UDP, and abandons it as soon as the serving node answers over UDP.
 """
 
 from __future__ import annotations
@@ -26,7 +26,8 @@ FALLBACK_AFTER_S = 1.5
 TUNNEL_TIMEOUT_S = 4.0
 """The timeout of a discovery request through a tunnel in seconds: it includes DNS, TCP, TLS and WebSocket."""
 BACKOFF_S = (0.2, 0.8)
-"""The shortest and longest pause in seconds between two tries; the tunnel limits the rate of dialling itself."""
+"""The shortest and longest pause in seconds between two tries; the tunnel network itself limits the rate of
+dialling."""
 DIRECT_RETRY_INTERVALS_S = (5.0, 15.0, 60.0)
 """The seconds between the attempts to return to UDP; the last one repeats."""
 CHECK_INTERVAL_S = 1.0
@@ -73,7 +74,10 @@ class AlternatePaths:
             self._background.every(CHECK_INTERVAL_S, self._try_direct)
 
     async def enter_with_fallback(self, join: Coroutine[Any, Any, None] | None) -> None:
-        """Enter by ``join``, or by a tunnel if that takes too long, waiting for the first; None: only by a tunnel."""
+        """Enter the network by ``join``, or by a tunnel if ``join`` takes too long; None: only by a tunnel.
+
+        Returns when one of the two has succeeded.
+        """
         begun = [] if join is None else [Deferred.fromCoroutine(join)]
         try:
             await DeferredList(
@@ -89,13 +93,13 @@ class AlternatePaths:
             error.subFailure.raiseException()
 
     async def try_once(self) -> bool:
-        """Return whether a node of the team answers through any tunnel; the first answer is enough."""
+        """Return whether a node of the team answers through any tunnel; return after the first answer."""
         return bool(await gather_first(1, [self._enter_by(tunnel) for tunnel in self._tunnels]))
 
     # -- private ----------------------------------------------------------------------------------------------------
 
     async def _try_repeatedly(self, wait: float, others: Sequence[Deferred[None]]) -> None:
-        """Try all tunnels repeatedly, until one leads into the network or another path did."""
+        """Try all tunnels repeatedly, until this node has entered the network by a tunnel or a different path."""
         pause = BACKOFF_S[0]
         while True:
             if wait:

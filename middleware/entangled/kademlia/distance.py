@@ -13,7 +13,10 @@ def distance(a: bytes, b: bytes) -> int:
 
 
 def bucket_index(own: bytes, other: bytes) -> int:
-    """Return the i of the k-bucket for distances from 2**i to below 2**(i+1); raise ``ValueError`` for equal ids."""
+    """Return the index i of the k-bucket for distances from 2**i to below 2**(i+1).
+
+    Raises ``ValueError`` if the ids are equal.
+    """
     apart = distance(own, other)
     if not apart:
         raise ValueError("a node has no bucket for itself")

@@ -1,10 +1,10 @@
 """Discover nodes of the team on the LAN without a configured address, and merge separate parts of a team.
 
-A node multicasts DISCOVERY to the LAN, often while it has no contacts and rarely afterwards; some receivers reply from
-their own port after a random delay, and the node then sends a discovery request to each reply's address, which proves
-its membership.  A receiver replies with a probability that decreases with the number of members and senders that it
-knows, so that about ``TARGET_REPLIES`` replies are sent in a team of any size, even if all nodes start at the same
-moment.
+A node multicasts DISCOVERY to the LAN, often as long as it has no contacts and rarely afterwards.  Some receivers reply
+from their own port after a random delay.  The node then sends a discovery request to the source address of each reply,
+and the answer proves that the replying node is a member.  A receiver replies with a probability that decreases with the
+number of members and senders that it knows.  Therefore about ``TARGET_REPLIES`` replies are sent in a team of any size,
+even if all nodes start at the same moment.
 """
 
 from __future__ import annotations
@@ -34,7 +34,8 @@ MAX_REPLY_DELAY_S = 0.1
 ALONE_INTERVALS_S = (0.2, 0.3, 0.5, 1.0, 2.0, 5.0)
 """The seconds between the multicasts of a node without contacts; the last one repeats."""
 SHARED_INTERVAL_S = 30.0
-"""The mean seconds between two multicasts of all members together: each node waits this long per member."""
+"""The mean seconds between two multicasts of the whole team: each node waits this time multiplied by the number of
+members."""
 MAX_INTERVAL_S = 900.0
 LISTEN_S = 0.8
 """The seconds after which a node without known nodes and without replies considers itself the first of its network."""
@@ -42,18 +43,19 @@ RECENT_S = 2.0
 RETRY_INTERVAL_S = 4.0
 """The seconds before a discovery request to the same address is repeated."""
 MAX_PARALLEL = 3
-"""The number of simultaneous discovery requests; the first node to answer names the others of its network."""
+"""The number of simultaneous discovery requests; the first node that answers also sends the other contacts of its
+network."""
 MAX_PENDING = 64
-"""The number of delayed replies, and so of replies within ``MAX_REPLY_DELAY_S``."""
+"""The maximum number of delayed replies, and therefore of replies within ``MAX_REPLY_DELAY_S``."""
 MAX_RECORDED = 256
 
 
 class LanDiscovery:
     """One node's discovery on its LAN.
 
-    ``counters`` counts the multicasts sent (calls), received from the team (heard), answered and not answered (left);
-    the datagrams of other teams (foreign), duplicates (repeated) and surplus ones (crowded); and the addresses that got
-    a discovery request (contacted).
+    ``counters`` counts the multicasts that were sent (calls), received from the team (heard), answered, and not
+    answered (left).  It also counts datagrams of other teams (foreign), duplicates (repeated) and surplus datagrams
+    (crowded), and the addresses to which a discovery request was sent (contacted).
     """
 
     def __init__(
@@ -88,7 +90,7 @@ class LanDiscovery:
     def start(self) -> None:
         """Join the multicast group and send the first DISCOVERY."""
         self._group.listen(self._on_datagram, self._on_moved)
-        # The nodes of a team that are switched on together do not multicast at the same moment.
+        # The delay prevents nodes that are switched on together from multicasting at the same moment.
         self._cancel_multicast = self._background.later(
             self._rng.random() * MAX_REPLY_DELAY_S / 5, self._multicast_if_due
         )
@@ -110,7 +112,7 @@ class LanDiscovery:
     # -- sending ----------------------------------------------------------------------------------------------------
 
     def _multicast_if_due(self) -> None:
-        """Multicast if it is due; the interval also suits a node that lost all its contacts meanwhile."""
+        """Multicast if a multicast is due; the interval depends on whether this node currently has contacts."""
         company = len(self._overlay.contacts())
         now, wait = self._clock.seconds(), ALONE_INTERVALS_S[-1]
         if company == 0:
@@ -118,7 +120,7 @@ class LanDiscovery:
             self._tries += 1
             self._multicast()
         elif self._tries or now >= self._due_at:
-            if not self._tries:  # otherwise it multicast just before it found them
+            if not self._tries:  # otherwise this node sent a multicast just before it found its contacts
                 self._multicast()
             self._tries = 0
             self._due_at = now + min(MAX_INTERVAL_S, SHARED_INTERVAL_S * (company + 1)) * self._draw_factor()
@@ -132,7 +134,7 @@ class LanDiscovery:
     def _on_moved(self) -> None:
         self._cancel_multicast()
         self._due_at, self._tries = 0.0, 0
-        self._multicast_if_due()  # multicasts, even with contacts
+        self._multicast_if_due()  # sends a multicast even if this node has contacts
 
     def _draw_factor(self) -> float:
         return 0.75 + self._rng.random() / 2
@@ -140,7 +142,7 @@ class LanDiscovery:
     def _on_reply(self, source: Address) -> None:
         """Send a discovery request to the source of a reply, unless it is a known contact."""
         now, overlay = self._clock.seconds(), self._overlay
-        # The first contact may not have named the other members yet.
+        # The first contact may not have sent the other members yet.
         if (overlay.has_all_members or overlay.is_large) and any(
             known.address == source for known in overlay.contacts()
         ):
@@ -162,7 +164,7 @@ class LanDiscovery:
             if await self._membership.contact_address(address):
                 self._fire_waiting()
         except EntangledError:
-            # The node may have left the port, or it only listens to the multicasts of the team.
+            # The node may have closed the port, or may only listen to the multicasts of the team.
             self.counters["unmet"] += 1
         finally:
             self._contacting -= 1
@@ -200,7 +202,7 @@ class LanDiscovery:
         self._background.later(self._rng.random() * MAX_REPLY_DELAY_S, self._answer, datagram, source)
 
     def _answer(self, datagram: bytes, source: Address) -> None:
-        """Reply to a DISCOVERY, or leave it to other nodes; simultaneous senders are counted by now."""
+        """Reply to a DISCOVERY, or leave the reply to other nodes; simultaneous senders have been counted by now."""
         self._pending -= 1
         since = self._clock.seconds() - RECENT_S
         callers = sum(1 for moment in self._multicast_times if moment > since)

@@ -1,7 +1,7 @@
 """Probe the contacts of a node in a network that is too large to know all its members.
 
-A node probes its neighbours often, because they hold the same records, and of the others the one with the longest
-silence, at a ``interval`` that adapts to the rate of failures.
+A node often probes its neighbours, because they store the same records.  Of the other contacts it probes those with the
+longest silence, at an ``interval`` that adapts to the rate of failures.
 """
 
 from __future__ import annotations
@@ -18,9 +18,11 @@ from middleware.entangled.wire.endpoint import Endpoint
 STEP_S = 1.0
 """The seconds between two steps."""
 DISCONNECTED_S = 3.0
-"""The silence of all nodes in seconds after which distant contacts are not probed: this node itself is disconnected."""
+"""The silence of all nodes in seconds after which distant contacts are not probed, because this node itself is probably
+disconnected."""
 LOOKUP_INTERVALS_S = (3.0, 60.0)
-"""The first and longest interval in seconds between a newcomer's lookups of its neighbours; it doubles each time."""
+"""The first and the longest interval in seconds between a newcomer's lookups of its neighbours; the interval doubles
+each time."""
 NEIGHBOUR_SILENCE_S = 12.0
 """The silence in seconds after which a neighbour, or a contact that ``needs_keep_alive``, is probed in a large network.
 """
@@ -29,7 +31,8 @@ PROBES_PER_STEP = 2
 MAINTENANCE_S = 15.0
 """The seconds between two runs of infrequent maintenance in a large network."""
 SESSION_S = 120.0
-"""The silence in seconds after which a session is deleted in a large network: there are too many peers to keep all."""
+"""The silence in seconds after which a session is deleted in a large network, where there are too many peers for
+permanent sessions."""
 
 MIN_SILENCE_S, INITIAL_SILENCE_S, MAX_SILENCE_S = 15.0, 60.0, 300.0
 """The silence in seconds after which a distant contact is probed: minimum, initial and maximum."""
@@ -41,10 +44,10 @@ GROWTH_FACTOR = 2.0 ** (TARGET_FAILURES / (1 - TARGET_FAILURES))
 class ProbeInterval:
     """The adaptive interval between probes of distant contacts; ``wait`` is their silence in seconds before a probe.
 
-    In a stable network nearly every probe is unnecessary, in a changing one most contacts fail within a minute.
-    Therefore the interval is halved for each lost contact and grows slightly with each answer: in equilibrium a share
-    of ``TARGET_FAILURES`` of the probed contacts has failed.  By the measurements of Kademlia and Bamboo this share
-    does not slow lookups.
+    In a stable network nearly every probe is unnecessary; in a network with high churn most contacts fail within a
+    minute.  Therefore the interval is halved for each lost contact and grows slightly with each answer.  In equilibrium
+    the fraction ``TARGET_FAILURES`` of the probed contacts has failed.  According to the measurements of Kademlia and
+    Bamboo this fraction does not slow lookups.
     """
 
     __slots__ = ("silence_s",)
@@ -53,7 +56,7 @@ class ProbeInterval:
         self.silence_s = INITIAL_SILENCE_S
 
     def record_answer(self) -> None:
-        """Record that a contact answered after this silence."""
+        """Record that a contact answered after a silence of ``wait`` seconds."""
         self.silence_s = min(MAX_SILENCE_S, self.silence_s * GROWTH_FACTOR)
 
     def record_loss(self) -> None:
@@ -65,7 +68,7 @@ class LivenessProber:
     """The probes of one node's contacts in a large network.
 
     ``on_maintenance`` is called with the time at each run of infrequent maintenance.  ``needs_keep_alive`` returns
-    whether the path to a contact stays open only while it is used.
+    whether the path to a contact closes when it is unused.
     """
 
     def __init__(
@@ -88,7 +91,7 @@ class LivenessProber:
         self._keep_alive_contacts: list[Contact] = []
 
     async def lookup_neighbours(self) -> None:
-        """Look up this node's id until no nearer contacts are found: simultaneous newcomers know few nodes."""
+        """Look up this node's id until no nearer contacts are found, because simultaneous newcomers know few nodes."""
         overlay, pause = self._overlay, LOOKUP_INTERVALS_S[0]
         while not self._background.is_stopped and overlay.is_large:
             await self._background.sleep(pause * (0.75 + self._rng.random() / 2))
@@ -120,7 +123,7 @@ class LivenessProber:
         return True
 
     def record_loss(self) -> None:
-        """Record that a contact was lost, and probe the next ones immediately."""
+        """Record that a contact was lost, and probe the next contacts immediately."""
         self.interval.record_loss()
         self._next_distant_at = float("-inf")
 
@@ -164,7 +167,7 @@ class LivenessProber:
             self._background.fork(self._probe_contact(contact, is_near))
 
     async def _probe_contact(self, contact: Contact, is_near: bool) -> None:
-        """Check whether a contact is alive, without a handshake if it has no session."""
+        """Check whether a contact is alive; if there is no session with it, do so without a handshake."""
         overlay = self._overlay
         silence = overlay.silence(contact)
         try:
@@ -186,7 +189,7 @@ class LivenessProber:
         try:
             found = await self._endpoint.discover(contact.address)
             if found.public != contact.public:
-                raise NoAnswer(f"{contact.address} belongs to another node now")
+                raise NoAnswer(f"the address {contact.address} now belongs to a different node")
         except NoAnswer:
             self._overlay.record_miss(contact)
             raise

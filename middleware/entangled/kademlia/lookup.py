@@ -1,8 +1,8 @@
 """Track one iterative search for the k nodes closest to an id (Kademlia, section 2.3), without I/O.
 
-The caller asks the contacts that ``take_next`` returns and reports the results.  The lookup ends when the k closest
-known contacts that have not failed have answered, so in a stable connected network it finds exactly the k closest
-nodes.
+The caller sends requests to the contacts that ``take_next`` returns, and reports the results.  The lookup ends when the
+k closest known contacts, except failed ones, have answered.  In a stable connected network it therefore finds exactly
+the k closest nodes.
 """
 
 from __future__ import annotations
@@ -28,8 +28,9 @@ class _State(Enum):
 class Lookup:
     """A search for ``target`` that starts from ``seeds``.
 
-    ``k`` is the number of contacts to find, ``alpha`` the number of parallel requests: more is faster on lossy links
-    and costs more datagrams.  ``exclude`` is the id of the searching node; it is never asked and never found.
+    ``k`` is the number of contacts to find.  ``alpha`` is the number of parallel requests; a higher number is faster on
+    lossy links, but needs more datagrams.  ``exclude`` is the id of the searching node, which is never asked and never
+    found.
     """
 
     def __init__(
@@ -48,13 +49,13 @@ class Lookup:
 
     @property
     def is_finished(self) -> bool:
-        """Whether the k closest candidates that have not failed have answered; True without candidates."""
+        """Whether the k closest candidates, except failed ones, have answered; True if there are no candidates."""
         return all(self._states[node_id] is _State.ANSWERED for node_id in self._nearest(_State.FAILED))
 
     def take_next(self) -> list[Contact]:
         """Return the contacts to ask now, closest first, and mark them as asked."""
         asked = []
-        # While a slow contact has time left, the next closest is asked too, in case the slow one fails.
+        # While a slow contact may still answer, the next closest contact is also asked, in case the slow contact fails.
         for node_id in self._nearest(_State.FAILED, _State.SLOW):
             if self._in_flight >= self._alpha:
                 break
@@ -64,7 +65,7 @@ class Lookup:
         return asked
 
     def record_answer(self, contact: Contact, contacts: Iterable[Contact]) -> None:
-        """Record that ``contact`` answered with ``contacts``, of which at most the k closest are used."""
+        """Record that ``contact`` answered with ``contacts``; use at most the k closest of them."""
         if self._was_asked(contact):
             self._set_state(contact.node_id, _State.ANSWERED)
             for found in select_closest(contacts, self._target, self._k):

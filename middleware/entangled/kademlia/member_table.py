@@ -1,14 +1,16 @@
-"""Keep all members of a small team, and determine the voters for majorities.
+"""Store all members of a small team, and determine the voters for majorities.
 
-Records are stored at the closest *live* members; majorities are counted among the closest of all members, including
-absent ones, because a failed member is indistinguishable from a partitioned one.  Then two majorities share a member
-even if they were formed on different sides.  An absent member stops counting in two cases: after
-``ABSENT_WITH_MAJORITY_S`` if a majority of all members is in touch without it (dynamic voting; Jajodia and Mutchler,
-1990), so that members may leave one after the other; or after ``MAX_ABSENT_S`` in any case, which limits the tolerated
-duration of a partition.
+Records are stored at the closest *live* members.  Majorities are counted among the closest of all members, including
+absent members, because a failed member is indistinguishable from a partitioned one.  Therefore two majorities share a
+member even if they are formed on different sides of a partition.
 
-A newcomer is *settled* when it has synchronised with a majority of the members before it; until then it does not count
-in majorities, or a minority behind a partition could strike the majority with the help of newcomers.
+An absent member is removed from the voters in two cases.  It is removed after ``ABSENT_WITH_MAJORITY_S`` if the other
+members that are in contact are a majority of all members (dynamic voting; Jajodia and Mutchler, 1990); thus members may
+leave one after the other.  In any case it is removed after ``MAX_ABSENT_S``, which limits the tolerated duration of a
+partition.
+
+A newcomer is *settled* when it has synchronised with a majority of the earlier members.  Until then it is not counted
+in majorities; otherwise a minority behind a partition could become a majority with the help of newcomers.
 """
 
 from __future__ import annotations
@@ -18,12 +20,14 @@ from collections.abc import Iterable
 from middleware.entangled.contact import Contact
 
 MAX_MEMBERS = 64
-"""The size of a team up to which all members are known; beyond it Kademlia lookups cost less than complete knowledge.
+"""The size of a team up to which each node knows all members; in a larger team Kademlia lookups are cheaper than
+complete knowledge.
 """
 ABSENT_WITH_MAJORITY_S = 30.0
-"""Three rounds of repair: by then other replicas hold the records of the absent member."""
+"""The duration of three rounds of repair, after which other replicas store the records of the absent member."""
 MAX_ABSENT_S = 120.0
-"""The longest partition in which majorities remain valid; longer is safer, shorter allows writes earlier."""
+"""The longest partition in seconds in which majorities remain valid.  A higher value is safer; a lower value allows
+writes earlier."""
 
 
 class _Member:
@@ -40,7 +44,7 @@ class _Member:
 
 
 class MemberTable:
-    """The members that the node ``own_id`` knows, without itself; times are seconds of one clock.
+    """The members that the node ``own_id`` knows, except itself; times are seconds of one clock.
 
     ``version`` changes whenever a member appears or disappears; ``is_settled`` is the state of this node itself.
     """
@@ -59,7 +63,7 @@ class MemberTable:
 
     @property
     def is_full(self) -> bool:
-        """Whether there is no room for another member, so that the team may be larger than the table."""
+        """Whether the table is full, so the team may be larger than the table."""
         return len(self._members) >= MAX_MEMBERS
 
     def get(self, node_id: bytes) -> Contact | None:
@@ -68,7 +72,10 @@ class MemberTable:
         return member.contact if member is not None and member.lost_at is None else None
 
     def mark_alive(self, contact: Contact, now: float) -> bool:
-        """Record that ``contact`` is alive; return whether it is new or was absent.  A full table adds no member."""
+        """Record that ``contact`` is alive; return whether it is new or was absent.
+
+        Nothing is added to a full table.
+        """
         member = self._members.get(contact.node_id)
         if member is None:
             if self.is_full and not self._make_room():
@@ -83,7 +90,7 @@ class MemberTable:
         return True
 
     def add_absent(self, contact: Contact, now: float) -> None:
-        """Count ``contact``, known from storage or from others, as absent since ``now`` until it answers."""
+        """Add ``contact``, known from storage or other nodes, as absent since ``now`` until it answers."""
         if contact.node_id not in self._members and not self.is_full:
             self._members[contact.node_id] = _Member(contact, now, lost_at=now)
             self._sort()
@@ -98,18 +105,18 @@ class MemberTable:
         return True
 
     def remove(self, node_id: bytes) -> None:
-        """Delete a member that left; it no longer counts."""
+        """Delete a member that left, which is then no longer a voter."""
         if self._members.pop(node_id, None) is not None:
             self._sort()
 
     def remove_all(self, node_ids: Iterable[bytes]) -> None:
-        """Delete members of a large network, in which majorities are not counted here."""
+        """Delete members when the network is large, because majorities are then not counted in this table."""
         found = [self._members.pop(node_id) for node_id in node_ids if node_id in self._members]
         if found:
             self._sort()
 
     def set_voter(self, node_id: bytes, is_settled: bool = True) -> None:
-        """Record whether a member has synchronised, so that it counts; the default is True."""
+        """Record whether a member has synchronised and is therefore counted as a voter."""
         member = self._members.get(node_id)
         if member is not None:
             member.is_voter = is_settled
@@ -119,11 +126,11 @@ class MemberTable:
         return [member.contact for member in self._live]
 
     def list_absent(self) -> list[Contact]:
-        """Return the absent members that still count, in the order of their ids."""
+        """Return the absent members that are still voters, in the order of their ids."""
         return [member.contact for member in self._absent]
 
     def list_voters(self, now: float) -> list[tuple[Contact, float]]:
-        """Return the settled members, and the seconds of their absence."""
+        """Return the settled members, each with the seconds of its absence."""
         present = [(m.contact, 0.0) for m in self._live if m.is_voter]
         return present + [(m.contact, now - m.lost_at) for m in self._absent if m.lost_at is not None and m.is_voter]
 
@@ -140,11 +147,11 @@ class MemberTable:
         return self._digest
 
     def is_majority_alive(self, now: float, within: float) -> bool:
-        """Return whether a majority of the settled members was heard in the last ``within`` seconds, with this node."""
+        """Return whether this node and members heard in the last ``within`` seconds are a majority of the settled."""
         return self._is_majority([member for member in self._live if now - member.last_received_at <= within])
 
     def remove_expired(self, now: float) -> list[Contact]:
-        """Delete the absent members that stop counting, and return them."""
+        """Delete the absent members that are no longer voters, and return them."""
         wait = ABSENT_WITH_MAJORITY_S if self._is_majority(self._live) else MAX_ABSENT_S
         struck = [m for m in self._absent if m.lost_at is not None and now - m.lost_at > wait]
         for member in struck:
@@ -154,7 +161,7 @@ class MemberTable:
         return [member.contact for member in struck]
 
     def _is_majority(self, present: list[_Member]) -> bool:
-        """Return whether these and this node are a majority of the settled members; True if none is settled."""
+        """Return whether ``present`` and this node are a majority of the settled members; True if none is settled."""
         total = self.is_voter + sum(member.is_voter for member in self._members.values())
         return not total or 2 * (self.is_voter + sum(member.is_voter for member in present)) > total
 

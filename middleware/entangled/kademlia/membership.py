@@ -1,10 +1,11 @@
 """Join the network, learn all its members, and detect members that appear, fail and return.
 
-Every ping contains a digest of the live members; when two nodes differ, one requests the other's list and pings the
-members that it does not know (no member is added without authentication).  So in a small team all nodes know each
-other, and after a partition the two sides merge through any pair of nodes, even without the original bootstrap node.
+Every ping contains a digest of the live members.  When the digests of two nodes differ, each node requests the list of
+the other and pings the members that it does not know; a member is added only after authentication.  Therefore all nodes
+of a small team know each other, and after a partition the two sides merge through any pair of nodes, even without the
+original bootstrap node.
 
-A network of more than ``MAX_MEMBERS`` nodes is too large for that.  There a node probes its contacts
+A network of more than ``MAX_MEMBERS`` nodes is too large for complete lists.  There a node only probes its contacts
 (``liveness_probe``).
 """
 
@@ -36,22 +37,23 @@ REFRESH_INTERVAL_S = 3600.0
 """The seconds after which a bucket without a lookup is refreshed (Kademlia, section 2.3)."""
 BACKOFF_S = (0.2, 5.0)
 HINT_AFTER = 4
-"""The failed tries after which the log suggests a diagnosis, once: a node of another team gets no answer at all."""
+"""The number of failed tries after which the log suggests a diagnosis, once; a node of another team gets no answer."""
 MAX_FORMER_ADDRESSES = 32
-"""The addresses of known nodes and lost contacts that are tried when no contact is left."""
+"""The number of remembered addresses of known nodes and lost contacts, which are tried when no contact is left."""
 RETRY_INTERVAL_S = 4.0
-"""The seconds before an absent member, or one that was only named, is tried again."""
+"""The seconds before an absent member, or a member that is only known from other nodes, is tried again."""
 LARGE_REPORT_S = 60.0
-"""The seconds for which one notification that the network is large is valid.  A node that gets no further one for as
-long again starts to learn all members again."""
+"""The seconds for which a notification that the network is large is valid.  A node without a further notification for
+this time starts to learn all members again."""
 NEWCOMER_DELAY_S = 0.02
-"""The seconds that a newcomer waits before it contacts the next few unknown members, so that first reads are not
-delayed; up to as much again is added at random."""
+"""The seconds that a newcomer waits before it contacts the next few unknown members, so as not to delay the first
+reads.  A random delay of up to the same length is added."""
 MAX_PARALLEL = 8
-"""The number of unknown members that are contacted at the same time: a handshake takes 0.3 ms of a core on each side.
+"""The number of unknown members that are contacted at the same time.  It is limited because a handshake takes 0.3 ms of
+a core on each side.
 """
 _LARGE_DIGEST = b"-"
-"""The digest of a node without a list, because its network is large; it differs from every other digest."""
+"""The digest of a node in a large network, which has no list of members; it differs from every other digest."""
 PAGE_MEMBERS = 20
 """The number of members in one message."""
 
@@ -89,8 +91,8 @@ class Membership:
     async def join(self, known: Sequence[Address], remembered: Sequence[Contact] = ()) -> None:
         """Contact the known nodes, with exponential backoff until one answers.
 
-        ``remembered`` contacts are tried too, but waited for only if there are known nodes: otherwise this may be the
-        first node of its network.  A known node that turns out to be this node is skipped.
+        ``remembered`` contacts are also tried, but the node waits for them only if there are known nodes, because
+        otherwise it may be the first node of its network.  A known address that is this node's own is skipped.
         """
         others, pause, tries = list(known), BACKOFF_S[0], 0
         for contact in remembered:
@@ -111,19 +113,19 @@ class Membership:
                 self._log.warn("no known node admits this node; run: swarm doctor SETTINGS")
             await self._background.sleep(pause * (0.75 + self._rng.random() / 2))
             pause = min(pause * 2, BACKOFF_S[1])
-        # Other nodes may have joined meanwhile and reported that the network is large.
+        # While this node waited, another node may have joined through it and reported that the network is large.
         if not self._has_entered and not self._overlay.is_large:
             self._overlay.has_all_members = True
 
     @property
     def has_entered(self) -> bool:
-        """Whether a path other than a known node led into the network."""
+        """Whether this node has entered the network by a path other than a known node."""
         return self._has_entered
 
     async def contact_address(self, address: Address) -> bool:
-        """Contact the node of the team at ``address``, which merges its network with this node's.
+        """Contact the node of the team at ``address``, to merge its network with the network of this node.
 
-        Returns whether it is another node; raises ``NoAnswer``.
+        Returns False if the address is this node's own; raises ``NoAnswer``.
         """
         found = await self._endpoint.discover(address)
         if found.node_id == self._overlay.own_id:
@@ -132,7 +134,7 @@ class Membership:
         return True
 
     async def lookup_neighbours(self) -> None:
-        """Look up this node's id (Kademlia, section 2.3), so that it learns its neighbours and they learn it."""
+        """Look up this node's id (Kademlia, section 2.3), so that this node and its neighbours learn each other."""
         if not self._overlay.has_all_members:
             await self._background.sleep(self._draw_pause())
         if not self._overlay.has_all_members:
@@ -173,11 +175,11 @@ class Membership:
         self._has_entered = True
 
     async def _ping(self, contact: Contact) -> None:
-        # Without all members there is no list to compare.
+        # A node that does not know all members has no list to compare.
         digest = self._overlay.members.digest() if self._overlay.has_all_members else b""
         answer = await self._overlay.ask(contact, "ping", digest, changes=True)
         if answer == b"" and not self._overlay.has_found_neighbours and not self._overlay.has_all_members:
-            # its network is large; the duration is requested as soon as this node has its neighbours
+            # the network is large; the remaining duration is requested after this node has found its neighbours
             self._set_large(0.0)
         self._compare(contact, _LARGE_DIGEST if answer == b"" else answer)
 
@@ -200,8 +202,7 @@ class Membership:
     async def _fetch_first_members(self, contact: Contact) -> None:
         """Contact the members of the network that was just joined, after a delay for the first reads of other nodes.
 
-        A newcomer has no vote before that, so a request that gets no answer is repeated, to another member if there is
-        one.
+        Until then a newcomer has no vote, so an unanswered request is repeated, if possible to a different member.
         """
         self._is_joining = True
         try:
@@ -212,7 +213,7 @@ class Membership:
                 except NoAnswer:
                     live = self._overlay.members.list_live()
                     if not live:
-                        return  # the next contact will be asked
+                        return  # the next contact is asked instead
                     contact = live[self._rng.randrange(len(live))]
         finally:
             self._is_joining = False
@@ -228,7 +229,7 @@ class Membership:
             if answer is None or (type(answer) is int and answer > 0):
                 return self._set_large(LARGE_REPORT_S if answer is None else min(float(answer), LARGE_REPORT_S))
             if self._overlay.is_large or type(answer) is int:
-                return None  # it has not learned yet that the network is large, or its notification has expired
+                return None  # ``contact`` has no valid notification that the network is large
             found = parse_contacts(answer)
             for named in found:
                 self._overlay.on_named(named, contact)
@@ -256,21 +257,21 @@ class Membership:
                 self._background.fork(self.prober.lookup_neighbours())
 
     async def _count_absent(self) -> None:
-        """Count members as absent that others know and this newcomer cannot reach.
+        """Add the members that other nodes know and this newcomer cannot reach, as absent members.
 
-        Otherwise a newcomer would take its side of a partition for the whole team.  A member counts only if more than
-        half of the answers name it, so a lying node cannot invent members.  The answers of newcomers count only if
-        there are no others.  Raises ``NoAnswer`` if no node answers.
+        Otherwise a newcomer would mistake its side of a partition for the whole team.  A member is added only if more
+        than half of the answers contain it, so a malicious node cannot invent members.  The answers of newcomers are
+        used only if there are no other answers.  Raises ``NoAnswer`` if no node answers.
         """
         live = self._overlay.members.list_live()[:MAX_PARALLEL]
         requests = [Deferred.fromCoroutine(self._overlay.ask(contact, "known")) for contact in live]
         answers = await DeferredList(requests, consumeErrors=True)
         answers_by_id: dict[bytes, dict[Contact, int]] = {}
         for contact, (ok, answer) in zip(live, answers, strict=True):
-            if ok or not answer.check(NoAnswer):  # a node that refuses has no opinion
+            if ok or not answer.check(NoAnswer):  # a node that rejects the request does not vote
                 answers_by_id[contact.node_id] = _decode_known(answer)
         if live and not answers_by_id:
-            raise NoAnswer("no member answered with the members that it knows")
+            raise NoAnswer("no member sent its list of members; try again later")
         settled = [opinion for own, opinion in answers_by_id.items() if any(named.node_id == own for named in opinion)]
         opinions = settled or list(answers_by_id.values())
         for contact in dict.fromkeys(contact for opinion in opinions for contact in opinion):
@@ -290,7 +291,7 @@ class Membership:
         return True
 
     async def _rejoin(self) -> None:
-        """Try the remembered addresses: a radio failure costs a node all its contacts."""
+        """Try the remembered addresses, because a node loses all its contacts in a radio failure."""
         self._is_rejoining = True
         try:
             if await self._contact_any([], list(self._former_addresses)) or await self.alternate_paths.try_once():
@@ -299,7 +300,7 @@ class Membership:
             self._is_rejoining = False
 
     async def _check_absent(self, contact: Contact) -> None:
-        """Check whether an absent member answers at its address; a discovery request costs a sixth of a handshake."""
+        """Check by a discovery request, cheaper than a handshake, whether an absent member answers at its address."""
         found = await self._endpoint.discover(contact.address)
         if found.node_id != self._overlay.own_id:
             await self._ping(found)
@@ -358,13 +359,16 @@ class Membership:
         return b"" if self._overlay.is_large else self._overlay.members.digest()
 
     def _answer_known(self, peer: Contact) -> list[object]:
-        """KNOWN: the voters, and the seconds of their absence; a newcomer does not include itself."""
+        """Answer KNOWN: return the voters and the seconds of their absence; a newcomer does not include itself."""
         members = self._overlay.members
         known = [(self._overlay.own_contact(), 0.0)] if members.is_voter else []
         return [[contact.pack(), int(away)] for contact, away in known + members.list_voters(self._clock.seconds())]
 
     def _answer_members(self, peer: Contact, after: bytes) -> list[object] | int | None:
-        """MEMBERS: the next page; None if the network is large, or the seconds for which reports of that are valid."""
+        """Answer MEMBERS: return the page of members after the id ``after``.
+
+        In a large network return None, or the seconds for which this node's notification of that is still valid.
+        """
         if len(after) not in (0, len(peer.node_id)):
             raise Refused("members: the argument must be empty or a node id of 20 bytes")
         overlay = self._overlay
@@ -377,7 +381,7 @@ class Membership:
 
 
 def _decode_known(answer: object) -> dict[Contact, int]:
-    """Decode an answer to KNOWN: the members, and the seconds of their absence; invalid items are skipped."""
+    """Decode an answer to KNOWN: the members and the seconds of their absence; skip invalid items."""
     found: dict[Contact, int] = {}
     for fields in answer[:MAX_MEMBERS] if isinstance(answer, list) else ():
         named, away = fields if isinstance(fields, list) and len(fields) == 2 else (None, None)

@@ -1,8 +1,8 @@
-"""Keep the contacts of a node, and find the nodes closest to an id (Kademlia, sections 2.2 to 2.4).
+"""Manage the contacts of a node, and find the nodes closest to an id (Kademlia, sections 2.2 to 2.4).
 
-A contact is added only after it has answered from its address with its key.  Records are stored at the k closest live
-nodes of their key.  A node that knows all members of its team (``members``) determines these without a search; in a
-larger network iterative lookups find them.
+A contact is added only after it has proved its key in an answer from its address.  A record is stored at the k live
+nodes closest to its key.  A node that knows all members of its team (``members``) determines these nodes without a
+search; in a larger network iterative lookups find them.
 """
 
 from __future__ import annotations
@@ -33,29 +33,31 @@ ALPHA = 3
 CHECK_INTERVAL_S = 4.0
 """The seconds before this node pings an unknown node, or a contact at a new address, again to authenticate it."""
 MISS_INTERVAL_S = 0.5
-"""The seconds in which several unanswered requests count as one miss: a failed burst is no evidence of a failed node.
+"""The seconds in which several unanswered requests are counted as one miss, because the loss of a burst of requests is
+not evidence of a failed node.
 """
 RECORD_INTERVAL_S = 0.1
-"""The seconds within which further datagrams of a contact are not recorded."""
+"""The seconds after a recorded datagram of a contact during which further datagrams are not recorded."""
 INITIAL_HEDGE_S, MAX_HEDGE_S = 0.01, 0.15
-"""The delay of a hedged request in seconds: before the first measurement, and at most.  Otherwise it is the time within
-which nearly all answers arrive."""
+"""The delay of a hedged request in seconds before the first measurement, and the maximum delay.  After measurements the
+delay is the time within which nearly all answers arrive."""
 MIN_LOOKUP_TIMEOUT_S, MAX_LOOKUP_TIMEOUT_S, TIMEOUTS_PER_REQUEST = 0.4, 2.5, 2.6
-"""The minimum and maximum timeout in seconds of a lookup's request in a large network, and the number of initial
-timeouts that it lasts: enough for two tries; at a high loss rate it lasts longer."""
+"""The minimum and maximum timeout in seconds of a request of a lookup in a large network, and the factor by which it
+exceeds the initial timeout.  This factor is enough for two tries; at a high loss rate the timeout is longer."""
 MAX_FOUND = 512
 """The number of keys for which the result of the last lookup is cached."""
 MAX_RECORDED = 4096
-"""The number of contacts with a recorded time of the last datagram or miss; the oldest is deleted first."""
+"""The number of contacts for which the time of the last datagram or miss is recorded; the oldest is deleted first."""
 
 CONTACT_WAIT_STEPS, CONTACT_WAIT_STEP_S = 15, 0.1
 MEMBERS_WAIT_STEPS, MEMBERS_WAIT_STEP_S = 75, 0.02
-"""The steps for which an operation that needs a majority waits until the members are known, and the seconds of each."""
+"""The maximum number of steps for which an operation that needs a majority waits until the members are known, and the
+seconds of each step."""
 MAX_LOOKUP_STATS = 16
 
 
 class Voters(NamedTuple):
-    """The nodes among which a majority is counted: the known ``ids``, and the number of all (``size``)."""
+    """The nodes among which a majority is counted: the known ``ids``, and the number of all voters (``size``)."""
 
     ids: frozenset[bytes]
     size: int
@@ -83,14 +85,16 @@ class LookupStats(NamedTuple):
 class Overlay:
     """The contacts of a node.
 
-    ``max_silence`` is the silence in seconds up to which a contact is not pinged when a new one would take its place.
-    ``on_new_contact`` and ``on_lost`` are called with contacts that appear and disappear, ``on_named`` with each
-    contact in an answer and the contact that named it.
+    A contact heard within the last ``max_silence`` seconds keeps its place in a full bucket without a ping.
+    ``on_new_contact`` and ``on_lost`` are called with contacts that appear and disappear.  ``on_named`` is called with
+    each contact in an answer and the contact that sent the answer.
 
-    ``has_all_members``: all members of the team are known; ``is_large``: there are too many for that;
-    ``has_found_neighbours``: this node has looked up its neighbours, so if it knows few nodes there are few.
-    ``Membership`` and ``LivenessProber`` set them.  In a large network the routing table is authoritative, and the
-    member table has only contacts without a place in the table, while few are known.
+    ``Membership`` and ``LivenessProber`` set the following attributes.  ``has_all_members``: all members of the team
+    are known.  ``is_large``: there are too many members for complete knowledge.  ``has_found_neighbours``: this node
+    has looked up its neighbours, so if it knows few nodes, the network has few nodes.
+
+    In a large network the routing table is used.  The member table then contains only contacts that have no place in
+    the routing table, and only as long as this node knows few contacts.
     """
 
     def __init__(
@@ -124,8 +128,8 @@ class Overlay:
 
     @cached_property
     def _rng(self) -> random.Random:
-        # It only distributes load, so its numbers may be predictable; the system generator costs a system call per
-        # number.
+        # This generator only distributes load, so its numbers may be predictable; the system generator would need a
+        # system call per number.
         return random.Random(int.from_bytes(self.own_id))
 
     # -- placement of records ---------------------------------------------------------------------------------------
@@ -137,11 +141,11 @@ class Overlay:
 
     @property
     def is_sparse(self) -> bool:
-        """Whether there are more nodes than are known here, so that the nodes close to a key must be looked up."""
+        """Whether there are more nodes than this node knows, so the nodes close to a key must be looked up."""
         return not self.is_complete and (len(self.table) >= K or not self.has_found_neighbours)
 
     def find_responsible(self, key: bytes) -> list[Contact]:
-        """Return the k closest live nodes to ``key`` that are known here, including this one, closest first."""
+        """Return the k live nodes closest to ``key`` that this node knows, including itself, closest first."""
         if self.is_complete:
             return self.members.closest(key, K, self.own_contact())
         known = [
@@ -153,7 +157,7 @@ class Overlay:
         return _closest(known, key)
 
     def find_neighbours(self) -> list[Contact]:
-        """Return the k contacts closest to this node, which hold mostly the same records."""
+        """Return the k contacts closest to this node, which store mostly the same records."""
         version = self.table.version, self.members.version
         if self._neighbours_version != version:
             self._neighbours_version, self._neighbours = version, self.find_nearest(self.own_id)
@@ -165,9 +169,10 @@ class Overlay:
         return self.members.is_full or len(self.table) + len(self.members) >= MAX_MEMBERS
 
     def find_possible_replicas(self, key: bytes) -> list[Contact]:
-        """Return the other nodes that may hold records of ``key``: the responsible ones, and the last ones found.
+        """Return the other nodes that may store records of ``key``.
 
-        A bucket has room for only k contacts, so in a large network not all nodes that were found are in the table.
+        These are the k closest known nodes, and the nodes that the last lookup found.  A bucket has only k places, so
+        in a large network not all nodes that a lookup found are in the routing table.
         """
         if self.is_complete:
             return [c for c in self.find_responsible(key) if c.node_id != self.own_id]
@@ -183,7 +188,7 @@ class Overlay:
         return any(c.node_id == contact.node_id for c in self.find_responsible(key))
 
     async def lookup_replicas(self, key: bytes) -> list[Contact]:
-        """Return the k closest live nodes to ``key``, including this one; looks them up if not all nodes are known.
+        """Return the k live nodes closest to ``key``, including this one; look them up if not all nodes are known.
 
         A node that is still joining waits for its first contacts.
         """
@@ -211,17 +216,18 @@ class Overlay:
     def find_voters(self, key: bytes, targets: list[Contact]) -> Voters:
         """Return the voters for ``key`` with the replicas ``targets``.
 
-        In a team with a member table absent members are voters too; in a larger network the voters are the nodes found.
+        In a team with a member table, absent members are also voters; in a larger network the voters are the nodes that
+        the lookup found.
         """
         if not (self.has_all_members or self.is_large):
-            # It has not met its team yet: the few nodes that it knows must not count as all.
+            # This node has not entered its team yet: the few nodes that it knows must not be treated as the whole team.
             return Voters(frozenset([self.own_id]), 2)
         absent = [] if self.members.is_full or self.is_large else self.members.list_absent()
         ids = frozenset(contact.node_id for contact in (_closest([*targets, *absent], key) if absent else targets))
         return Voters(ids, len(ids))
 
     async def lookup(self, target: bytes) -> list[Contact]:
-        """Return the k live nodes closest to ``target``, without this one (Kademlia, section 2.3)."""
+        """Return the k live nodes closest to ``target``, except this node (Kademlia, section 2.3)."""
         seeds = [
             *self.table.closest(target),
             *(self.members.closest(target, K, self.own_contact()) if len(self.members) else ()),
@@ -249,7 +255,7 @@ class Overlay:
     async def run_lookup(
         self, lookup: Lookup, visit: Callable[[Contact], Any], is_done: Callable[[], bool] = lambda: False
     ) -> None:
-        """Visit the contacts that ``lookup`` names, alpha in parallel and another for each slow one, until it ends."""
+        """Ask the contacts that ``lookup`` returns, alpha in parallel plus one for each slow contact, until it ends."""
         done: Deferred[None] = Deferred()
 
         def step() -> None:
@@ -289,7 +295,7 @@ class Overlay:
         timeout: float | None = None,
         is_light: bool = False,
     ) -> Any:
-        """Send a request to ``contact``; a missing answer counts as a miss."""
+        """Send a request to ``contact``; record a miss if there is no answer."""
         began = self._clock.seconds()
         has_session = self._endpoint.has_session(contact)
         try:
@@ -299,16 +305,16 @@ class Overlay:
         except NoAnswer:
             self.record_miss(contact)
             raise
-        if has_session:  # otherwise the time includes a handshake
+        if has_session:  # otherwise the measured time would include a handshake
             self._round_trip.add_sample(self._clock.seconds() - began)
         return answer
 
     async def _request_contacts(self, contact: Contact, target: bytes) -> Any:
         """Request the contacts that ``contact`` knows near ``target``.
 
-        If the contact was heard during an unanswered request, the request is repeated once: when several lookups meet
-        an unknown contact at the same moment, only one request rides in the handshake, and the others may time out
-        after it.
+        If a datagram of the contact arrived during an unanswered request, the request is repeated once.  The reason:
+        when several lookups ask an unknown contact at the same moment, only one request is sent inside the handshake,
+        and the other requests may time out after it.
         """
         began = self._clock.seconds()
         try:
@@ -319,10 +325,10 @@ class Overlay:
             return await self.ask(contact, "find_node", target, timeout=self.lookup_timeout)
 
     def hedge_delay(self) -> float:
-        """Return the seconds after which others are asked in parallel with a contact that does not answer.
+        """Return the seconds after which other contacts are asked in parallel with a contact that has not answered.
 
-        It is measured over all contacts, because a single contact has few and old samples; hedging a distant contact
-        costs only a few more requests.
+        The delay is measured over all contacts, because a single contact has few and old samples.  For a distant
+        contact, which always exceeds the delay, this costs only a few more requests.
         """
         if self.is_large:  # unknown contacts need a handshake, and may be distant
             guess = self._endpoint.peers.initial_timeout
@@ -335,7 +341,8 @@ class Overlay:
     def lookup_timeout(self) -> float | None:
         """The timeout of one request of a lookup in seconds; None: the default.
 
-        In a large network there are always alternatives, and some of the named contacts have failed.
+        In a large network the timeout is short, because there are always alternatives and some of the returned contacts
+        have failed.
         """
         if not self.is_large:
             return None
@@ -346,19 +353,19 @@ class Overlay:
         )
 
     def mark_slow(self, contact: Contact) -> None:
-        """Record that ``contact`` exceeded the usual time; until it is heard, others are asked first."""
+        """Record that ``contact`` exceeded the usual time; until it answers, other contacts are asked first."""
         if len(self._slow) >= MAX_RECORDED:
             self._slow.clear()
         self._slow.add(contact.node_id)
 
     def order_by_speed(self, contacts: Iterable[Contact]) -> list[Contact]:
-        """Return ``contacts`` in a random order that spreads the load, with slow ones last."""
+        """Return ``contacts`` in a random order that distributes the load, with slow contacts last."""
         shuffled = list(contacts)
         self._rng.shuffle(shuffled)
         return sorted(shuffled, key=lambda contact: contact.node_id in self._slow)
 
     def silence(self, contact: Contact) -> float:
-        """Return the seconds since ``contact`` was heard."""
+        """Return the seconds since the last datagram of ``contact``."""
         return self._clock.seconds() - self._last_received_at.get(contact.node_id, float("-inf"))
 
     def mark_authenticated(self, contact: Contact) -> None:
@@ -373,7 +380,7 @@ class Overlay:
             and node_id not in self._slow
             and self.find_contact(node_id) == contact
         ):
-            return  # it was recorded a moment ago
+            return  # the contact was recorded a moment ago
         is_new = self.table.get(contact.node_id) is None and self.members.get(contact.node_id) is None
         put_bounded(self._last_received_at, node_id, now, MAX_RECORDED)
         self._misses.pop(contact.node_id, None)
@@ -384,7 +391,8 @@ class Overlay:
         is_in_table = self.table.get(node_id) is not None
         is_new_here = self._belongs_to_members(node_id, is_in_table) and self.members.mark_alive(contact, now)
         if is_new_here or (is_new and is_in_table):
-            # One reactor turn later: messages to a newcomer must not overtake the answer to its own request.
+            # Called one reactor turn later, because messages to a newcomer must not overtake the answer to its own
+            # request.
             self._background.later(0.0, self.on_new_contact, contact)
 
     def process_message(self, contact: Contact) -> None:
@@ -399,7 +407,7 @@ class Overlay:
             contact.node_id == self.own_id
             or now - self._checked_at.get(contact.node_id, -CHECK_INTERVAL_S) < CHECK_INTERVAL_S
         ):
-            # in a large network not all contacts find a place here: two such nodes must not ping each other forever
+            # in a large network two nodes without a place in each other's table must not ping each other forever
             return
         if len(self._checked_at) > MAX_FOUND:
             self._checked_at.clear()
@@ -413,7 +421,7 @@ class Overlay:
         self._forget(contact)
 
     def mark_rejecting(self, contact: Contact) -> None:
-        """Record that ``contact`` rejects this node; a member is then absent."""
+        """Record that ``contact`` rejects this node; if it is a member, it is then absent."""
         now = self._clock.seconds()
         self.table.remove(contact, now)
         if self.members.mark_absent(contact.node_id, now):
@@ -446,10 +454,10 @@ class Overlay:
         return self.find_contact(contact.node_id) == contact
 
     def record_miss(self, contact: Contact, is_over: bool = False) -> None:
-        """Record that ``contact`` did not answer; ``is_over``: delete it at once.
+        """Record that ``contact`` did not answer; ``is_over``: delete it immediately.
 
-        In a large network one miss makes a distant contact stale: others of its range are equivalent, and a lookup that
-        waits for a failed node costs more than one that skips a live one.
+        In a large network one miss makes a distant contact stale.  Other contacts of the same range are equivalent, and
+        a lookup that waits for a failed node is more expensive than a lookup that skips a live node.
         """
         now = self._clock.seconds()
         count, at = self._misses.get(contact.node_id, (0, -MISS_INTERVAL_S))
@@ -500,7 +508,10 @@ class Overlay:
             self.members.mark_alive(contact, self._clock.seconds())
 
     def delete_unneeded(self) -> None:
-        """Delete state that is unnecessary in a large network: members in the table or absent, and old records."""
+        """Delete state that is unnecessary in a large network.
+
+        This is members that are absent or also in the routing table, and old times of datagrams and misses.
+        """
         table, live = self.table, self.members.list_live()
         spare = max(0, MAX_MEMBERS - len(table))
         extra = [contact.node_id for contact in live if table.get(contact.node_id) is None]
@@ -545,7 +556,7 @@ class Overlay:
         return [c.pack() for c in self.find_nearest(target) if c.node_id != peer.node_id]
 
     def find_nearest(self, target: bytes) -> list[Contact]:
-        """Return the k closest contacts to ``target`` that are known here, without this node."""
+        """Return the k contacts closest to ``target`` that this node knows, except itself."""
         members, near = self.members.list_live(), self.table.closest(target)
         if not members:
             return near
@@ -553,13 +564,13 @@ class Overlay:
 
 
 def parse_contacts(answer: object) -> list[Contact]:
-    """Decode the contacts in an answer; invalid ones are skipped."""
+    """Decode the contacts in an answer; skip invalid contacts."""
     found = [parse_contact(fields) for fields in answer] if isinstance(answer, list) else []
     return [contact for contact in found if contact is not None]
 
 
 def _closest(contacts: list[Contact], key: bytes) -> list[Contact]:
-    """Return the k closest of ``contacts``, each node once; of two addresses of one node the first is used."""
+    """Return the k contacts closest to ``key``, each node once; of two addresses of one node use the first."""
     once: dict[bytes, Contact] = {}
     for contact in contacts:
         once.setdefault(contact.node_id, contact)

@@ -1,10 +1,12 @@
-"""Keep a routing table with many near and few distant contacts (Kademlia, sections 2.2 and 2.4).
+"""Maintain a routing table with many near and few distant contacts (Kademlia, sections 2.2 and 2.4).
 
-It is the tree of the paper: a bucket covers a range of ids, at first all of them.  A full bucket is split if it covers
-the node's own id, or if the new contact is among the k closest to the node, so that the node knows its whole
-neighbourhood in an unbalanced tree (section 2.4).  In any other full bucket a contact that keeps answering is never
-replaced: nodes that have been up for long are likely to stay up, and an attacker cannot flush the table with invented
-ids.  The new contact waits in the bucket's replacement cache.
+The table is the tree of the paper: each bucket covers a range of ids, and the first bucket covers all ids.  A full
+bucket is split if it covers the node's own id, or if the new contact is among the k closest to the node.  Therefore the
+node knows its whole neighbourhood even in an unbalanced tree (section 2.4).
+
+In any other full bucket a contact that continues to answer is never replaced; the new contact waits in the bucket's
+replacement cache.  The reasons are that nodes with a long uptime are likely to stay up, and that an attacker must not
+be able to flush the table with invented ids.
 """
 
 from __future__ import annotations
@@ -19,11 +21,11 @@ from middleware.entangled.identity import ID_BYTES
 from middleware.entangled.kademlia.distance import bucket_index, select_closest
 
 STALE_AFTER = 3
-"""The successive misses that make a contact stale: any new contact may replace it."""
+"""The number of successive misses that make a contact stale; any new contact may replace a stale contact."""
 DROPPED_AFTER = 5
-"""The successive misses after which a contact is deleted even without a replacement."""
+"""The number of successive misses after which a contact is deleted even if there is no replacement."""
 PING_INTERVAL_S = 1.0
-"""The seconds for which a contact that was heard, or returned for a ping, is not returned again."""
+"""The seconds for which a contact is not returned for a ping again after it answered or was returned for a ping."""
 
 
 @dataclass(slots=True)
@@ -79,20 +81,20 @@ class RoutingTable:
         return entry.contact if entry else None
 
     def list_contacts(self) -> list[Contact]:
-        """Return all contacts, nearest bucket first and in each the least recently seen first."""
+        """Return all contacts: the nearest bucket first, and within a bucket the least recently seen contact first."""
         nearest_first = sorted(self._buckets, key=lambda bucket: bucket.low ^ self._own & -(bucket.high - bucket.low))
         return [entry.contact for bucket in nearest_first for entry in bucket.entries.values()]
 
     def closest(self, target: bytes, count: int | None = None) -> list[Contact]:
         """Return the ``count`` (default k) contacts closest to ``target``, closest first.
 
-        Stale contacts are used only if there are not enough others; they allow a node that lost all contacts at once to
-        recover, so that a radio failure does not empty the table.
+        Stale contacts are used only if there are not enough other contacts.  With stale contacts, a node can recover
+        from a radio failure, in which all contacts become stale at the same time.
         """
         wanted, goal = self._k if count is None else count, int.from_bytes(target)
         stale: list[Contact] = []
         chosen: list[Contact] = []
-        # All contacts in a bucket nearer to the target are nearer than all contacts in a farther one.
+        # All contacts in a bucket nearer to the target are nearer than all contacts in a more distant bucket.
         for bucket in sorted(self._buckets, key=lambda bucket: (bucket.low ^ goal) & -(bucket.high - bucket.low)):
             live: list[Contact] = []
             for entry in bucket.entries.values():
@@ -115,8 +117,8 @@ class RoutingTable:
         bucket = self._find_bucket(contact.node_id)
         entry = bucket.entries.pop(contact.node_id, None)
         if entry is not None:
-            bucket.entries[contact.node_id] = entry  # the most recently seen is last
-            if entry.contact != contact:  # otherwise keep the existing object, which others share
+            bucket.entries[contact.node_id] = entry  # the most recently seen contact is last
+            if entry.contact != contact:  # otherwise keep the existing object, which is shared
                 entry.contact = contact
                 self.version += 1
             entry.seen_at = entry.pinged_at = now
@@ -139,7 +141,7 @@ class RoutingTable:
         return None
 
     def has_room(self, node_id: bytes) -> bool:
-        """Return whether a contact with this id has, or would find, a place in its bucket."""
+        """Return whether a contact with this id is in its bucket or would be added to it."""
         bucket = self._bucket(node_id)
         if bucket is None:
             return False
@@ -151,8 +153,9 @@ class RoutingTable:
     def record_miss(self, contact: Contact, now: float) -> None:
         """Record that ``contact`` did not answer at its address.
 
-        After ``STALE_AFTER`` successive misses the most recently seen waiting contact replaces it; without one it
-        stays, stale, until ``DROPPED_AFTER``.  A miss at an address that the contact has left does not count.
+        After ``STALE_AFTER`` successive misses the most recently seen waiting contact replaces ``contact``.  If no
+        contact waits, ``contact`` stays in the table as a stale contact until ``DROPPED_AFTER`` misses.  A miss at an
+        old address of a contact that has moved is ignored.
         """
         bucket = self._bucket(contact.node_id)
         if bucket is None:
@@ -180,10 +183,11 @@ class RoutingTable:
             self._searched_at[bucket_index(self._own_id, target)] = now
 
     def find_stale(self, now: float, older_than: float) -> list[int]:
-        """Return the ranges without a lookup for ``older_than`` seconds, by the i of distances from 2**i on.
+        """Return the indices of the ranges without a lookup for ``older_than`` seconds.
 
-        They extend from the nearest range with a contact to the farthest one, because nearer ranges are empty
-        (Kademlia, section 2.3).
+        The range with the index i contains the distances from 2**i to below 2**(i+1).  Only ranges from the nearest
+        range with a contact to the most distant range are returned, because nearer ranges are empty (Kademlia, section
+        2.3).
         """
         filled = [bucket_index(self._own_id, contact.node_id) for contact in self.list_contacts()]
         if not filled:

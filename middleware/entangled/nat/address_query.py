@@ -1,7 +1,7 @@
 """Learn the external address of each local port from peers.
 
-ADDRESS_REQUEST ``0x06 | token 8 | zero 18`` is answered by ADDRESS_REPLY ``0x07 | token 8 | address 16, port 2``, sent
-to its source address; both are sent in a session.
+A peer replies to ADDRESS_REQUEST ``0x06 | token 8 | zero 18`` with ADDRESS_REPLY ``0x07 | token 8 | address 16, port
+2``, which it sends to the source address of the request.  Both messages are sent in a session.
 """
 
 from __future__ import annotations
@@ -29,7 +29,8 @@ REPLIES_PER_S, REPLY_BURST = 50.0, 100.0
 class AddressQuery:
     """Asks peers for this node's external address, and answers such requests.
 
-    ``send`` seals a message and sends it to an address; ``rng`` returns the random generator when needed.
+    ``send`` encrypts a message and sends it to an address; ``rng`` is called on first use and returns the random
+    generator.
     """
 
     def __init__(
@@ -49,7 +50,7 @@ class AddressQuery:
         self._pending: dict[bytes, Callable[[Address | None], None]] = {}
 
     def ask(self, session: Session, port: int = 0) -> Deferred[Address | None]:
-        """Return this node's address as the peer of ``session`` sees it for ``port``; None if it does not answer."""
+        """Return the address at which the peer of ``session`` sees this node's ``port``; None without a reply."""
         seen: Deferred[Address | None] = Deferred()
         token = self._rng().randbytes(_TOKEN_BYTES)
         to = session.contact.address
@@ -84,7 +85,7 @@ class AddressQuery:
         self._send(session, bytes([ADDRESS_REPLY]) + plain[1 : 1 + _TOKEN_BYTES] + pack_address(source), source)
 
     def on_reply(self, session: Session, plain: bytes, source: Address) -> None:
-        """Process the answer to an ADDRESS_REQUEST."""
+        """Process the reply to an ADDRESS_REQUEST."""
         done = self._pending.get(plain[1 : 1 + _TOKEN_BYTES])
         if len(plain) == _MESSAGE_BYTES and done is not None:
             done(parse_address(plain[1 + _TOKEN_BYTES :]))

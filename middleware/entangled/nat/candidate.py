@@ -1,6 +1,6 @@
 """Encode, decode and filter candidates: addresses at which a peer may be reachable.
 
-A named address causes this node to send there, so multicast, broadcast and unspecified ones are dropped.
+This node sends datagrams to the candidates in a message, so multicast, broadcast and unspecified addresses are dropped.
 """
 
 from __future__ import annotations
@@ -23,12 +23,12 @@ _SITE_RANGES: tuple[tuple[IPv4Network | IPv6Network, int], ...] = (
     (IPv6Network("fc00::/7"), 48),
     (IPv6Network("fe80::/10"), 10),
 )
-"""The ranges that RFC 1918, 3927, 4193 and 4291 reserve for one site or link, and the prefix length that two neighbours
-share at least."""
+"""The ranges that RFC 1918, 3927, 4193 and 4291 reserve for one site or link, and the minimum length of the prefix that
+the addresses of two neighbours have in common."""
 
 
 def pack_candidates(addresses: Iterable[Address]) -> list[object]:
-    """Encode addresses for a message, each once."""
+    """Encode addresses for a message, without duplicates."""
     return [[address.host, address.port] for address in list(dict.fromkeys(addresses))[:MAX_CANDIDATES]]
 
 
@@ -59,10 +59,10 @@ def is_loopback(host: str) -> bool:
 
 
 def is_near(host: str, own: str, is_translated: bool = False) -> bool:
-    """Return whether no NAT is between ``host`` and ``own``: they are one machine, or neighbours in a private network.
+    """Return whether ``host`` and ``own`` are one machine or neighbours in a private network, without NAT in between.
 
-    The private network of a node that ``is_translated`` by a router is small and may be part of a larger one with the
-    same range: there only addresses that differ in the last byte are neighbours.
+    If this node ``is_translated`` by a router, its private network is small and may be part of a larger network with
+    the same range.  Then only addresses that differ in no more than the last byte are neighbours.
     """
     one, other = _parse_numeric(host), _parse_numeric(own)
     if one is None or other is None or one.version != other.version:
@@ -78,7 +78,7 @@ def is_near(host: str, own: str, is_translated: bool = False) -> bool:
 
 
 class _NumericAddress(NamedTuple):
-    """An address as a number, and the index of its range in ``_SITE_RANGES`` (with 0 ``bits``: in none)."""
+    """An address as a number, and the index of its range in ``_SITE_RANGES``; ``bits`` is 0 if it is in no range."""
 
     version: int
     number: int

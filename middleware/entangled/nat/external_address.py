@@ -1,6 +1,6 @@
-"""Keep the external addresses of this node, which differ from its local ones behind a router.
+"""Track the external addresses of this node; behind a router they differ from its local addresses.
 
-REACH.SEEN notifies a peer that its datagrams come from a new address, which it cannot detect itself.
+With REACH.SEEN a node notifies a peer that the peer's datagrams come from a new address, which the peer cannot detect.
 """
 
 from __future__ import annotations
@@ -20,20 +20,21 @@ from middleware.entangled.wire.endpoint import Endpoint
 from middleware.entangled.wire.session import Session
 
 REPORT_TTL_S = 600.0
-"""The seconds for which a reported address is used next to a newer one."""
+"""The seconds for which a reported address is still used after a newer address was reported."""
 NOTIFY_DELAY_S, NOTIFY_INTERVAL_S = 0.1, 1.0
-"""The delay in seconds of a notification that a peer's address changed, sent if it has not changed back (a replay
-changes an address only briefly), and the minimum interval between two."""
+"""The delay of a notification that a peer's address changed, and the minimum interval between two notifications, in
+seconds.  After the delay the notification is sent only if the address has not changed back: a replayed datagram changes
+an address only briefly."""
 KEEP_ALIVE_S = 2.5
-"""The silence in seconds of all possible introducers after which this node sends one of them a datagram, which keeps
-its NAT mapping open and shows its current address."""
+"""If all possible introducers were silent for these seconds, this node sends one of them a datagram.  The datagram
+keeps this node's NAT mapping open and informs the introducer of this node's current address."""
 
 
 class ExternalAddresses:
     """The addresses at which peers see this node.
 
     ``contacts`` returns the known contacts.  ``on_changed`` is called with the reporting peer when the external address
-    changed.  A node ``is_translated`` as soon as one peer saw it at an address that is not one of its interfaces.
+    changed.  A node ``is_translated`` as soon as a peer has reported an address that none of the node's interfaces has.
     """
 
     def __init__(
@@ -65,7 +66,7 @@ class ExternalAddresses:
         return list(dict.fromkeys(address for address, at in recent if recent[0][1] - at < REPORT_TTL_S))
 
     def is_far(self, address: Address) -> bool:
-        """Return whether other nodes may know another path to an address that does not answer."""
+        """Return whether other nodes may know a different path to the peer at an address that does not answer."""
         if address.host[:1] == "~":
             return is_relayed(address)
         return not is_near(address.host, self._network.source_address(address).host, self.is_translated)
@@ -78,7 +79,7 @@ class ExternalAddresses:
     # -- reports of peers -------------------------------------------------------------------------------------------
 
     def answer_seen(self, peer: Contact, host: str, port: int) -> None:
-        """REACH.SEEN: this node's address changed, so the NAT mappings of its other paths are lost."""
+        """Answer REACH.SEEN: this node's address changed, so the NAT mappings of its other paths are lost."""
         if is_possible(Address(host, port)):
             self.record(peer, Address(host, port), is_change=True)
 
@@ -93,7 +94,7 @@ class ExternalAddresses:
         self._last = address
         put_bounded(self._reports, peer.public, (address, now), MAX_KNOWN)
         self.is_translated = self.is_translated or address.host not in self._network.local_hosts()
-        # From an additional port of this node its address differs anyway.
+        # Datagrams from an additional port of this node have a different external address in any case.
         is_usual = self._network.source_address(peer.address).port == self._network.address.port
         if is_usual and address != before and (is_change or before is not None):
             self._on_changed(peer)
@@ -101,7 +102,7 @@ class ExternalAddresses:
     # -- reports to peers -------------------------------------------------------------------------------------------
 
     def report_change(self, session: Session) -> None:
-        """Notify a peer that its address changed, which it cannot detect itself."""
+        """Notify a peer that its address changed, which the peer cannot detect."""
         contact, now = session.contact, self._clock.seconds()
         if not self.is_far(contact.address) or is_relayed(contact.address):
             return
@@ -116,7 +117,7 @@ class ExternalAddresses:
             self._endpoint.notify(contact, "reach.seen", contact.address.host, contact.address.port)
 
     def keep_mapping_open(self, now: float) -> None:
-        """Send a datagram to a possible introducer if none was heard lately, which shows this node's address."""
+        """Send a datagram to a possible introducer, to keep the NAT mapping open, if all were silent recently."""
         if now <= self._quiet_until:
             return
         sessions = [s for c in self._contacts() if (s := self._peers.find_direct_session(c.public)) is not None]

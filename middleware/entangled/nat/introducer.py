@@ -1,7 +1,7 @@
 """Introduce two peers: send each the other's addresses, so that both send INITs at the same time (hole punching).
 
-``IntroductionLimits`` limits the rate at which a peer may request introductions, and cause this node to send INITs to
-others.
+``IntroductionLimits`` limits the rate at which a peer may request introductions, and the rate at which it may cause
+this node to send INITs to other nodes.
 """
 
 from __future__ import annotations
@@ -21,15 +21,16 @@ from middleware.entangled.token_bucket import TokenBucket
 from middleware.entangled.wire.endpoint import Endpoint
 
 USUAL_PORTS = 0
-"""The order in which both peers send from their usual ports; in all other orders they use additional ports."""
+"""The order in which both peers send INITs from their usual ports; in all other orders they use additional ports."""
 REQUEST_TIMEOUT_S = 1.0
 """The timeout of a request in seconds."""
 INTRODUCTIONS_PER_S = 20.0
 """The introductions per second that one peer may request; twice as many in one burst."""
 ATTEMPTS_PER_S, ATTEMPT_BURST = 1.0, 60.0
-"""The attempts per second, and in one burst, that one peer may cause this node to make to nodes that do not answer.
-Successful ones do not count.  So a member that names addresses of strangers causes 0.2 MB/s there from this node, and a
-team that starts behind routers still connects quickly."""
+"""The number of connection attempts, per second and in one burst, to nodes that do not answer, which one peer may cause
+this node to make.  Successful attempts are not counted.  A malicious member that sends addresses of strangers can
+therefore cause at most 0.2 MB/s of traffic from this node to these addresses, but a team that starts behind routers
+still connects quickly."""
 
 
 class IntroductionLimits:
@@ -44,11 +45,11 @@ class IntroductionLimits:
         return len(self._buckets)
 
     def may_introduce(self, requester: bytes) -> bool:
-        """Return whether that peer may request another introduction, and count it."""
+        """Return whether that peer may request another introduction; if so, count this introduction."""
         return self._take_token("introduce", requester, INTRODUCTIONS_PER_S, 2 * INTRODUCTIONS_PER_S)
 
     def may_meet(self, introducer: bytes) -> bool:
-        """Return whether that peer may cause another attempt of this node, and count it."""
+        """Return whether that peer may cause another attempt of this node; if so, count this attempt."""
         return self._take_token("meet", introducer, ATTEMPTS_PER_S, ATTEMPT_BURST)
 
     def record_introducer(self, public: bytes, introducer: bytes) -> None:
@@ -56,7 +57,7 @@ class IntroductionLimits:
         put_bounded(self._introducers, public, introducer, MAX_KNOWN)
 
     def refund(self, public: bytes) -> None:
-        """Refund the attempt to its introducer, because the peer has answered."""
+        """Remove an attempt from the count of the peer's introducer, because the peer has answered."""
         bucket = self._buckets.get(("meet", self._introducers.pop(public, b"")))
         if bucket is not None:
             bucket.refund()
@@ -69,7 +70,7 @@ class IntroductionLimits:
 
 
 class Introducer:
-    """Introduces peers to each other, within the ``limits``; ``relay`` forwards for them if there is room."""
+    """Introduces peers to each other, within the ``limits``; ``relay`` forwards their datagrams if it has capacity."""
 
     def __init__(
         self,
@@ -90,9 +91,12 @@ class Introducer:
     async def answer_introduce(
         self, peer: Contact, wanted: bytes, candidates: list[object], order: int
     ) -> list[object] | None:
-        """REACH.INTRODUCE: send the addresses of ``peer`` to the node with that id, return its; nil: unknown node."""
+        """Answer REACH.INTRODUCE: send the addresses of ``peer`` to the node with that id, and return its addresses.
+
+        Returns None if the node is unknown.
+        """
         if len(wanted) != ID_BYTES or not self._limits.may_introduce(peer.public):
-            raise Refused("no introduction: the node id is invalid, or the rate limit is exceeded")
+            raise Refused("the introduction is rejected: the node id is invalid, or the rate limit is exceeded")
         session = self._known.find_session(wanted)
         if session is None or self._clock.seconds() - session.last_received_at > LIVE_S:
             return None

@@ -18,14 +18,14 @@ from middleware.entangled.wire.peer import Peers
 MAX_INTRODUCERS = 3
 """The number of peers that are asked at the same time for an introduction."""
 MAX_NAMERS = 3
-"""The number of peers remembered as having named the same node."""
+"""The number of peers that are remembered for each node because they sent its contact."""
 
 
 class IntroducerSelector:
-    """The peers that may introduce this node, and the ones that named each contact.
+    """Selects the peers that may introduce this node, and remembers which peers sent each contact.
 
     ``contacts`` returns the known contacts; ``bootstrap_addresses`` are the addresses of nodes that are asked first.
-    ``rng`` returns the random generator when it is needed.
+    ``rng`` is called on first use and returns the random generator.
     """
 
     def __init__(
@@ -52,7 +52,7 @@ class IntroducerSelector:
         return len(self._namers)
 
     def record_namer(self, contact: Contact, by: Contact) -> None:
-        """Remember that the peer ``by`` named ``contact``, and so may know a path to it."""
+        """Remember that the peer ``by`` sent ``contact`` to this node, and may therefore know a path to it."""
         if not self._external.is_far(contact.address):
             return
         namers = self._namers.pop(contact.node_id, None) or {}
@@ -60,10 +60,10 @@ class IntroducerSelector:
         put_bounded(self._namers, contact.node_id, namers, MAX_KNOWN)
 
     def select(self, wanted: bytes, hinted: Collection[Contact], asked: Collection[bytes]) -> list[Contact]:
-        """Return the peers to ask about the node with that id, without the ones in ``asked``.
+        """Return the peers to ask about the node with the id ``wanted``, except those in ``asked``.
 
-        First are the peers in ``hinted``, then the ones that named the node or relay to it, bootstrap nodes, and
-        others.
+        The peers in ``hinted`` are first, followed by the peers that sent the node's contact or relay to it, by
+        bootstrap nodes, and by other peers.
         """
         now = self._clock.seconds()
         first = [*hinted]

@@ -1,4 +1,4 @@
-"""Keep bounded state of other nodes for NAT traversal."""
+"""Store bounded state of other nodes for NAT traversal."""
 
 from __future__ import annotations
 
@@ -8,13 +8,13 @@ from middleware.entangled.wire.peer import MAX_PEERS, Peers
 from middleware.entangled.wire.session import Session
 
 LIVE_S = 20.0
-"""The seconds since the latest datagram of a peer within which it is asked for help."""
+"""A peer is asked for help only if its latest datagram arrived within these seconds."""
 MAX_KNOWN = 1024
-"""The number of peers with remembered namers, relays and similar state."""
+"""The number of peers for which introducers, relays and similar state are remembered."""
 
 
 class KnownPeers:
-    """Maps node ids to peers with sessions, or that are about to have one."""
+    """Maps the ids of peers that have a session, or will have one soon, to their public keys."""
 
     def __init__(self, peers: Peers) -> None:
         self._peers = peers

@@ -14,9 +14,10 @@ PATH_KINDS: tuple[PathKind, ...] = ("none", "machine", "lan", "direct", "punched
 class PeerPath(NamedTuple):
     """The path to one peer.
 
-    ``kind`` is ``machine`` (the same one), ``lan``, ``direct`` (through the internet without help), ``punched`` (opened
-    by an introduction), ``carried`` (relayed by the node with the id ``by``; empty: no relay at present), ``tunnel``
-    (TLS, if UDP is blocked) or ``none``.  ``since`` is the time from which the path has this kind, None with ``none``.
+    ``kind`` is ``machine`` (the same machine), ``lan``, ``direct`` (through the internet without help), ``punched``
+    (opened by hole punching), ``carried`` (relayed), ``tunnel`` (TLS, if UDP is blocked) or ``none``.  ``by`` is the id
+    of the relay of a ``carried`` path, empty if there is currently no relay.  ``since`` is the time since which the
+    path has had this kind; None if ``kind`` is ``none``.
     """
 
     kind: PathKind
@@ -26,7 +27,7 @@ class PeerPath(NamedTuple):
 
 
 def classify_path(address: Address, own: Address, is_translated: bool, was_introduced: bool) -> PathKind:
-    """Return the kind of a session with a peer at ``address``; datagrams to it are sent from ``own``."""
+    """Return the kind of the path to a peer at ``address``, to which datagrams are sent from ``own``."""
     if is_relayed(address):
         return "carried"
     if address.is_virtual:

@@ -18,7 +18,7 @@ from middleware.entangled.wire.session import Session
 EXTENSION_S = 5.0
 """The seconds for which a handshake continues while other nodes help."""
 MAX_REOPENED = 64
-"""The number of sessions that are reopened when this node's address changes."""
+"""The maximum number of sessions that are reopened when this node's address changes."""
 MAX_PORTS = 16
 """The maximum number of additional local ports."""
 UNUSED_PORT_S = 60.0
@@ -26,7 +26,7 @@ UNUSED_PORT_S = 60.0
 
 
 class PathTracker:
-    """The paths to peers with present or former sessions."""
+    """The paths to peers that have or had a session."""
 
     def __init__(
         self,
@@ -46,7 +46,7 @@ class PathTracker:
         self._mapped_peers: dict[bytes, None] = {}
 
     def find_path(self, contact: Contact) -> PeerPath:
-        """Return the path to a peer at present, with its relay and its start."""
+        """Return the current path to a peer, with its relay and the time since which it is used."""
         session = self._peers.find_session(contact.public)
         if session is None:
             return PeerPath("none")
@@ -57,7 +57,7 @@ class PathTracker:
         return PeerPath(kind, session.contact.address, by, since if noted == kind else session.opened_at)
 
     def needs_keep_alive(self, contact: Contact) -> bool:
-        """Return whether the path to a peer stays open only while it is used, because NAT mappings expire."""
+        """Return whether the path to a peer closes when it is unused, because NAT mappings expire."""
         kind, _ = self._path_kinds.get(contact.public, ("none", 0.0))
         return self._external.is_translated or contact.address.is_virtual or kind == "punched"
 
@@ -88,7 +88,10 @@ class PathTracker:
             put_bounded(self._mapped_peers, session.contact.public, None, MAX_KNOWN)
 
     def reopen(self, reporter: bytes) -> None:
-        """Reopen the latest sessions through NAT mappings, except the one with ``reporter``, which reported it."""
+        """Reopen the latest sessions through NAT mappings, after ``reporter`` reported a new address of this node.
+
+        The session with ``reporter`` is not reopened.
+        """
         for public in list(reversed(self._mapped_peers))[:MAX_REOPENED]:
             peer = self._peers.get(public)
             if peer is None or peer.session is None:
@@ -97,7 +100,7 @@ class PathTracker:
                 self._peers.open(peer, peer.session.contact.address)
 
     def forget_path(self, contact: Contact) -> None:
-        """Forget the path to a peer that is gone."""
+        """Forget the path to a peer that has left or does not answer."""
         self._path_kinds.pop(contact.public, None)
 
     def forget(self, public: bytes) -> None:
@@ -106,7 +109,7 @@ class PathTracker:
             table.pop(public, None)
 
     def _record_path(self, session: Session) -> None:
-        """Record the start of the present kind of path; a renewed session does not change it."""
+        """Record when the path to a peer changed its kind; a renewed session of the same kind changes nothing."""
         public = session.contact.public
         peer = self._peers.get(public)
         if peer is None or peer.session is not session:
@@ -115,7 +118,7 @@ class PathTracker:
         if noted is None and len(peer.sessions) > 1:
             former = peer.sessions[-2]
             noted = (self._classify(former), former.opened_at)
-        if noted is not None or kind == "punched":  # otherwise the session has this information
+        if noted is not None or kind == "punched":  # otherwise the kind of path follows from the session
             since = noted[1] if noted is not None and noted[0] == kind else self._clock.seconds()
             put_bounded(self._path_kinds, public, (kind, since), MAX_KNOWN)
 
@@ -129,7 +132,7 @@ class PathTracker:
 
 
 class AdditionalPorts:
-    """Additional local ports for hole punching, if early INITs may have spoilt the usual port."""
+    """Additional local ports for hole punching, used if early INITs may have made the usual port unusable."""
 
     def __init__(self, network: RelayedNetwork, tracker: PathTracker, clock: IReactorTime) -> None:
         self._network = network
@@ -162,7 +165,7 @@ class AdditionalPorts:
             self._close(port)
 
     def _unused_since(self, before: float) -> list[int]:
-        """Return the ports without a session that were opened before a time, the oldest first."""
+        """Return the ports without a session that were opened before the time ``before``, the oldest first."""
         return [port for port, at in self._opened_at.items() if at < before and not self._tracker.is_port_used(port)]
 
     def _close(self, port: int) -> None:

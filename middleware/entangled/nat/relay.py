@@ -1,8 +1,8 @@
 """Relay datagrams between two peers that cannot reach each other, within rate limits.
 
-Only messages in a session are relayed, only to another peer with a session, and only over one hop: a node that is
-reached through relays does not relay over that path.  The content is encrypted between the two peers; the relay can
-neither read nor change it.
+A relay forwards only messages in a session, only to another peer with a session, and only over one hop: it does not
+forward datagrams to a node that it reaches through another relay.  The content is encrypted between the two peers; the
+relay can neither read nor change it.
 """
 
 from __future__ import annotations
@@ -22,8 +22,7 @@ RELAY_REQUEST = 0x03
 RELAYED_DATAGRAM = 0x05
 HEADER_BYTES = 1 + ID_BYTES
 PAIR_RATE, PAIR_BURST = 8_000.0, 65_536.0
-"""The bytes that one pair may send per second (64 kbit/s), and in one burst: enough for requests and orders, not for
-video."""
+"""The bytes that one pair may send per second (64 kbit/s), and in one burst: enough for requests, but not for video."""
 ALL_RATE, ALL_BURST = 128_000.0, 524_288.0
 MAX_PAIRS = 256
 ONE_SIDED_S = 120.0
@@ -32,7 +31,7 @@ ONE_SIDED_S = 120.0
 
 @dataclass(slots=True)
 class _Pair:
-    """Two peers; ``last_received_at`` has the time of the latest datagram of each, by its id."""
+    """Two peers; ``last_received_at`` maps the id of each peer to the time of its latest datagram."""
 
     started_at: float
     bucket: TokenBucket = field(default_factory=lambda: TokenBucket(PAIR_RATE, PAIR_BURST))
@@ -40,7 +39,7 @@ class _Pair:
 
 
 class Relay:
-    """Relays for others.  ``find_session`` returns the direct session with a peer, by its id.
+    """Relays datagrams for other nodes.  ``find_session`` returns the direct session with the peer of a given id.
 
     ``counters`` counts the datagrams that were relayed (``carried``) and rejected by the limits (``uncarried``).
     """
@@ -64,7 +63,7 @@ class Relay:
 
     @property
     def has_room(self) -> bool:
-        """Whether another pair can be relayed."""
+        """Whether the limits allow another pair."""
         self._forget_idle()
         return len(self._pairs) < MAX_PAIRS
 

@@ -1,7 +1,7 @@
-"""Send datagrams through relays to nodes that this one cannot reach directly.
+"""Send datagrams through relays to nodes that this node cannot reach directly.
 
-RELAY_REQUEST asks a relay to forward a datagram (``relay`` is the other side), and RELAYED_DATAGRAM delivers a
-forwarded datagram.
+With RELAY_REQUEST a node asks a relay to forward a datagram; the relay delivers it as RELAYED_DATAGRAM.  The module
+``relay`` implements the relay.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ MAX_RELAYS = 3
 
 
 class RelayClient:
-    """The relays to each node, by its id, and the datagrams through them."""
+    """Remembers the relays to each node, by its id, and sends and receives datagrams through them."""
 
     def __init__(self, own_id: bytes, endpoint: Endpoint, network: RelayedNetwork, clock: IReactorTime) -> None:
         self._own_id = own_id
@@ -36,7 +36,7 @@ class RelayClient:
         return len(self._relays)
 
     def add_relay(self, to: bytes, relay: bytes) -> None:
-        """Record that a peer relays to the node with that id."""
+        """Record that the peer ``relay`` relays to the node with the id ``to``."""
         relays = self._relays.pop(to, None) or {}
         relays[relay] = self._clock.seconds()
         if len(relays) > MAX_RELAYS:
@@ -48,7 +48,7 @@ class RelayClient:
         return list(self._relays.get(to, ()))
 
     def find_contacts(self, to: bytes) -> list[Contact]:
-        """Return the relays to that node that this node reaches directly."""
+        """Return the contacts of the relays to the node with that id that this node reaches directly."""
         sessions = [self._endpoint.peers.find_direct_session(public) for public in self.relay_keys(to)]
         return [session.contact for session in sessions if session is not None]
 

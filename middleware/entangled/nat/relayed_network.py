@@ -1,7 +1,7 @@
-"""Wrap a network so that nodes behind relays have addresses.
+"""Wrap a network so that nodes that are reached through relays have virtual addresses.
 
-Datagrams to such an address are passed to ``send_relayed``; relayed datagrams are passed to the receiver with such a
-source address.
+Datagrams to a virtual address are passed to ``send_relayed``; relayed datagrams are passed to the receiver with a
+virtual source address.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ class RelayedNetwork:
 
     @property
     def counters(self) -> Counter[str]:
-        """The counters of the underlying network; empty if it has none."""
+        """The counters of the underlying network; empty if the network does not count."""
         counters = getattr(self._network, "counters", None)
         return counters if isinstance(counters, Counter) else Counter()
 
@@ -74,5 +74,5 @@ class RelayedNetwork:
         return self._ports.source_address(to, port) if self._ports is not None else self._network.address
 
     def local_hosts(self) -> list[str]:
-        """Return the addresses of this machine at which it listens."""
+        """Return the addresses of this machine at which the network listens."""
         return self._ports.local_hosts() if self._ports is not None else [self._network.address.host]

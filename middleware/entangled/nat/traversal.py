@@ -1,11 +1,12 @@
 """Find paths to peers behind NAT.
 
-A router with NAT accepts only datagrams that its inside requested.  Therefore two nodes behind such routers are
-*introduced* by a third node with sessions to both: it sends each the other's external address, and both send INITs at
-the same time, which open the routers for each other (hole punching).  If that fails, they retry from additional local
-ports, and finally the third node *relays* (``relay``) while they retry periodically.
+A router with NAT accepts datagrams only from addresses to which an inner node has sent.  Therefore two nodes behind
+such routers are *introduced* by a third node, the introducer, which has sessions with both nodes.  The introducer sends
+each node the external address of the other node.  Then both nodes send INITs at the same time, so each router accepts
+the INITs of the other side (hole punching).  If this fails, the nodes retry from additional local ports.  If that also
+fails, the introducer *relays* their datagrams (``relay``) and the nodes continue to retry periodically.
 
-A peer that answers at once, or in the same private network, needs none of this.
+None of this is used for a peer that answers immediately or is in the same private network.
 """
 
 from __future__ import annotations
@@ -47,17 +48,17 @@ from middleware.entangled.wire.session import Session
 NEW_PORT_AFTER_S = 0.5
 """The age in seconds from which a handshake is also tried from an additional local port."""
 RELAY_AFTER_S = 0.9
-"""The age in seconds from which a handshake is also sent through relays: most direct paths are found by then, and a
-request with the default timeout of 1.5 s can still be answered."""
+"""The age in seconds from which a handshake is also sent through relays.  At this age most direct paths have been
+found, and a request with the default timeout of 1.5 s can still be answered."""
 PATH_WORKS_S = 3.0
-"""The seconds since the latest datagram of a peer within which its path is not changed."""
+"""The path to a peer is not changed within these seconds after the latest datagram of the peer."""
 SIMULTANEOUS = 1
 OWN_DELAYS_S = {3: 0.15, 5: 0.7}
 PEER_DELAYS_S = {2: 0.15, 4: 0.7}
 ORDERS = (2, 3, 4, 5, SIMULTANEOUS)
-"""The order in which the two peers send INITs: from their usual ports; or from additional ones, at the same time or
-with a delay.  An INIT that arrives too early spoils the port of some routers.  The kind of the router is not known, so
-all orders are tried."""
+"""The orders in which two peers send INITs from additional ports: at the same time, or one peer with a delay.  With
+some routers, an INIT that arrives too early makes the port unusable.  The kind of the router is not known, so all
+orders are tried."""
 UPGRADE_S = 1.2
 MAINTENANCE_S = 1.0
 REOPEN_INTERVAL_S = 2.0
@@ -66,7 +67,10 @@ REOPEN_INTERVAL_S = 2.0
 
 @dataclass(slots=True)
 class _Attempt:
-    """The search for a path to one peer: the nodes asked, the ones that know it, and others that they named."""
+    """The search for a path to one peer.
+
+    It records which nodes were asked, which of them know the peer, and which further nodes they suggested.
+    """
 
     peer: Peer
     node_id: bytes
@@ -131,11 +135,12 @@ class NatTraversal:
 
     @cached_property
     def _rng(self) -> random.Random:
-        # Separate from the endpoint's generator, so that the endpoint's numbers stay the same; it only spreads load.
+        # Separate from the endpoint's generator, to leave the endpoint's random numbers unchanged; it only distributes
+        # load.
         return random.Random(int.from_bytes(self._own_id))
 
     def _forget(self, public: bytes) -> None:
-        """Delete the state of a peer that was silent for long and has no session."""
+        """Delete the state of a peer that was silent for a long time and has no session."""
         self._known.forget(public)
         self.external.forget(public)
         self.paths.forget(public)
@@ -152,7 +157,7 @@ class NatTraversal:
         self._background.later(max(0.0, since + RELAY_AFTER_S - now), self._send_by_relay, opening)
         await self._ask_introducers(attempt)
         if not attempt.introducers and self._is_pending(opening):
-            await self._ask_introducers(attempt)  # other helpers, or the ones that the first named
+            await self._ask_introducers(attempt)  # other introducers, or the nodes that the first introducers suggested
         if not self._is_pending(opening):
             return
         if not attempt.introducers:
@@ -179,7 +184,7 @@ class NatTraversal:
             await self._punch_from_new_port(attempt, ORDERS[step % len(ORDERS)])
 
     async def _ask_introducers(self, attempt: _Attempt) -> None:
-        """Request introductions from some helpers, and send INITs to the addresses in the first answers."""
+        """Request introductions from several peers, and send INITs to the addresses in the first answers."""
         helpers = self._select_introducers(attempt)
         attempt.asked |= {helper.public for helper in helpers}
 
@@ -194,7 +199,7 @@ class NatTraversal:
         return self.selector.select(attempt.node_id, attempt.suggested, attempt.asked)
 
     async def _punch_from_new_port(self, attempt: _Attempt, order: int) -> None:
-        """Retry from an additional local port, because early INITs of the other side may have spoilt the usual one."""
+        """Retry from an additional local port, because early INITs may have made the usual port unusable."""
         opening = attempt.handshake
         if opening is None or not self._is_pending(opening) or not attempt.introducers:
             return
@@ -250,13 +255,13 @@ class NatTraversal:
         return found
 
     def _send_by_relay(self, opening: OutgoingHandshake) -> None:
-        """Send a handshake through a relay too, if there is one."""
+        """Send the INIT of a handshake also through a relay, if there is one."""
         peer_id = derive_node_id(opening.peer.public)
         if self._is_pending(opening) and self._relays.find_session(peer_id) is not None:
             self._peers.punch(opening, [relayed_address(peer_id)])
 
     def _start_punching(self, public: bytes, candidates: list[Address], port: int, seconds: float) -> bool:
-        """Send INITs to the addresses of a peer from a local port; return whether that started."""
+        """Start to send INITs from a local port to the addresses of a peer; return False if that is not possible."""
         try:
             peer = self._peers.get_or_create(Contact(public, candidates[0]))
         except ValueError:
@@ -283,9 +288,12 @@ class NatTraversal:
     # -- requests of peers ------------------------------------------------------------------------------------------
 
     async def _answer_meet(self, peer: Contact, public: bytes, candidates: list[object], order: int) -> list[object]:
-        """REACH.MEET: send INITs to the candidates of ``public``, introduced by ``peer``; return this node's."""
+        """Answer REACH.MEET: send INITs to the candidates of ``public``; return this node's candidates.
+
+        The introducer is ``peer``.
+        """
         if not self._limits.may_meet(peer.public):
-            raise Refused("too many introductions to nodes that do not answer")
+            raise Refused("the peer requested too many introductions to nodes that do not answer; try again later")
         found = [address for address in parse_candidates(candidates) if self._is_usable(address)]
         wanted_id = derive_node_id(public)
         if wanted_id == self._own_id:
@@ -302,8 +310,8 @@ class NatTraversal:
             if seen is not None:
                 port, own = additional, [seen, self._network.source_address(peer.address, additional)]
         if found:
-            # The other peer gets our addresses later, through the introducer: both must send at the same time, because
-            # an INIT that arrives too early may spoil the port of a router.
+            # The other peer gets this node's addresses later, through the introducer.  Both peers must send at the same
+            # time, because an INIT that arrives too early may make the port of a router unusable.
             wait = (self._endpoint.round_trip(peer) or 0.0) + PEER_DELAYS_S.get(order, 0.0)
             self._background.later(wait, self._start_punching, public, found, port, EXTENSION_S)
         return [pack_candidates(own), bool(port)]

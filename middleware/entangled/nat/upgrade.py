@@ -1,4 +1,4 @@
-"""Schedule the attempts to replace relayed paths by direct ones."""
+"""Schedule the attempts to replace relayed paths by direct paths."""
 
 from __future__ import annotations
 
@@ -10,13 +10,14 @@ from middleware.entangled.nat.known_peers import MAX_KNOWN
 from middleware.entangled.wire.peer import Peer, Peers
 
 RETRY_INTERVALS_S = (1.0, 2.0, 5.0, 5.0, 15.0, 60.0)
-"""The seconds between attempts of a relayed pair to connect directly; the last one is repeated.
+"""The seconds between attempts of a relayed pair to connect directly; the last interval is repeated.
 
-There are as many short ones as orders of sending with additional ports, because only one order may succeed."""
+There are as many short intervals as orders of sending from additional ports, because possibly only one order succeeds.
+"""
 TURN_DELAY_S = 0.5
-"""The seconds by which one of the two peers is delayed, so that only the other one tries."""
+"""The seconds by which one of the two peers delays its attempt, so that normally only the other peer tries."""
 SILENCE_LIMIT_S = 60.0
-"""The silence in seconds after which a relayed peer is given up."""
+"""The silence in seconds after which the attempts to a relayed peer end."""
 
 
 @dataclass(slots=True)
@@ -28,7 +29,7 @@ class _Upgrade:
 
 
 class PathUpgrades:
-    """The relayed peers."""
+    """The relayed peers and the schedule of their direct attempts."""
 
     def __init__(self, peers: Peers) -> None:
         self._peers = peers
@@ -38,7 +39,7 @@ class PathUpgrades:
         return len(self._upgrades)
 
     def add(self, public: bytes, is_behind: bool, now: float) -> None:
-        """Schedule direct attempts to a peer; of the two, the node that ``is_behind`` starts later."""
+        """Schedule direct attempts to a peer; with ``is_behind`` this node starts later than the peer."""
         if public not in self._upgrades:
             put_bounded(
                 self._upgrades,
@@ -63,7 +64,7 @@ class PathUpgrades:
             upgrade.due_at, upgrade.step = now, 0
 
     def due(self, now: float) -> Iterator[tuple[Peer, int]]:
-        """Yield each peer that is due and the number of its earlier attempts; silent peers are given up."""
+        """Yield each peer whose attempt is due and the number of its earlier attempts; drop silent peers."""
         for public, upgrade in list(self._upgrades.items()):
             peer = self._peers.get(public)
             if peer is None or peer.session is None or now - peer.session.last_received_at > SILENCE_LIMIT_S:

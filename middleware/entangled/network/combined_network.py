@@ -25,7 +25,7 @@ class JointNetwork:
 
     @property
     def counters(self) -> Counter[str]:
-        """The sum of both counters (sent, received, unsent, ...), and the tunnel's counters prefixed by ``tunnel``."""
+        """The sums of the counters of UDP and tunnels, and the counters of the tunnels prefixed by ``tunnel``."""
         counted: Counter[str] = Counter(getattr(self.udp, "counters", {}))
         counted.update({f"tunnel {name}": number for name, number in self.tunnel.counters.items()})
         for name in ("sent", "received", "unsent"):
@@ -48,7 +48,7 @@ class JointNetwork:
         return getattr(self.udp, "closed", None)
 
     def listen(self, receiver: Receiver) -> None:
-        """Open both; raises ``PortInUse`` if either port is in use."""
+        """Open both networks; raises ``PortInUse`` if either port is in use."""
         self.udp.listen(receiver)
         try:
             self.tunnel.listen(receiver)
@@ -57,13 +57,13 @@ class JointNetwork:
             raise
 
     def send(self, datagram: bytes, to: Address) -> None:
-        """Send over the network to which the address belongs."""
+        """Send a datagram over the network to which the address belongs."""
         if to.host.startswith(VIRTUAL_PREFIX):
             self.tunnel.send(datagram, to)
         else:
             self.udp.send(datagram, to)
 
     def close(self) -> None:
-        """Close both; may be called twice."""
+        """Close both networks; may be called twice."""
         self.tunnel.close()
         self.udp.close()

@@ -73,7 +73,7 @@ def select_interfaces(found: list[Interface], host: str) -> list[Interface]:
 
 
 def is_any(host: str) -> bool:
-    """Return whether ``host`` is an unspecified address, which stands for every interface."""
+    """Return whether ``host`` is an unspecified address, which means every interface."""
     return host in ("", "*", "0.0.0.0", "::")
 
 

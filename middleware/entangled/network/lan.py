@@ -1,8 +1,8 @@
 """Join the multicast group of the LAN on every interface, with IPv4 and IPv6.
 
-Each family has two ports: a receiving port, shared with the other nodes of this machine, and a sending port, to which
-replies go.  Interfaces appear and disappear (a cable, another Wi-Fi), so they are listed again every
-``LIST_INTERVAL_S`` seconds.
+Each address family has two ports: a receiving port, shared with the other nodes of this machine, and a sending port,
+which also receives the replies.  Interfaces appear and disappear (a cable, a different Wi-Fi), so they are listed again
+every ``LIST_INTERVAL_S`` seconds.
 """
 
 from __future__ import annotations
@@ -47,7 +47,7 @@ class LanMulticast:
         self._timer: IDelayedCall | None = None
 
     def listen(self, receiver: Receiver, on_moved: Callable[[], None]) -> None:
-        """Join on every interface and pass each datagram to ``receiver``; an unavailable address family is skipped."""
+        """Join the group on every interface and pass datagrams to ``receiver``; skip unavailable address families."""
         self._on_move = on_moved
         for kind in (_Ipv4, _Ipv6):
             try:
@@ -108,7 +108,7 @@ class _Family:
     def join(self, interface: Interface) -> None:
         """Join the group on ``interface``."""
         if self._receiving_port is not None:
-            # Fails if it is a member already, or has no addresses of this family.
+            # Fails if the interface is a member already, or has no addresses of this family.
             with suppress(OSError):
                 self._join(self._receiving_port.socket, interface.index)
 

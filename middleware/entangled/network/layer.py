@@ -13,7 +13,7 @@ _READ_BYTES = 16384
 
 
 class StreamLayer(Protocol):
-    """A transformation between a transport and a protocol.  After a ``fault`` it produces nothing more."""
+    """A transformation between a transport and a protocol; after a ``fault`` it produces no more bytes."""
 
     is_open: bool
     fault: str
@@ -22,7 +22,7 @@ class StreamLayer(Protocol):
         """Return the first bytes to send."""
 
     def decode(self, data: bytes) -> tuple[bytes, bytes]:
-        """Process received bytes; return the decoded bytes, and the bytes to send back at once."""
+        """Process received bytes; return the decoded bytes, and the bytes to send back immediately."""
 
     def encode(self, data: bytes) -> bytes:
         """Encode ``data`` for sending; call it only while the layer is open."""
@@ -43,7 +43,7 @@ class TlsLayer:
         return self._out.read()
 
     def decode(self, data: bytes) -> tuple[bytes, bytes]:
-        """Process received bytes; return the decrypted bytes, and the bytes to send back at once."""
+        """Process received bytes; return the decrypted bytes, and the bytes to send back immediately."""
         self._in.write(data)
         if not self.is_open and not self.fault:
             self._do_handshake()
@@ -122,7 +122,7 @@ class ProxyLayer:
 
 
 def make_client_context() -> ssl.SSLContext:
-    """Return a client's TLS context; it verifies no certificate, because Noise authenticates the peer."""
+    """Return a client's TLS context, which verifies no certificate, because Noise authenticates the peer."""
     context = ssl.SSLContext(ssl.PROTOCOL_TLS_CLIENT)
     context.check_hostname = False
     context.verify_mode = ssl.CERT_NONE
@@ -134,12 +134,12 @@ def make_server_context(pem: str) -> ssl.SSLContext:
     """Return the TLS context of a server; ``pem`` is a key with its certificate."""
     context = ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER)
     _configure(context)
-    # Python reads them only from files; this one has mode 0600 and is deleted at once.
+    # Python reads keys and certificates only from files; this file has mode 0600 and is deleted immediately.
     with NamedTemporaryFile("w", suffix=".pem") as file:
         file.write(pem)
         file.flush()
         context.load_cert_chain(file.name)
-    # A tunnel is dialled once and stays open, so session tickets would waste 500 bytes.
+    # A tunnel is dialled once and stays open, so the 500 bytes of session tickets would be useless.
     context.num_tickets = 0
     context.options |= ssl.OP_NO_TICKET
     return context

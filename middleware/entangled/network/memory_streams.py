@@ -1,8 +1,8 @@
 """Simulate the byte streams between many nodes in one process, in place of ``tcp``.
 
-A stream delivers in order, after ``delay_s`` seconds, at most ``rate`` bytes per second; the rest waits in its buffer,
-and a producer is paused while the buffer is full.  Neither end notices a cut: bytes wait, as in TCP.  The same happens
-on a single stalled stream (``Pipe.is_stalled``), which retransmits in vain.
+A stream delivers bytes in order, after ``delay_s`` seconds, at most ``rate`` bytes per second.  Further bytes wait in
+the stream's buffer, and a producer is paused while the buffer is full.  Neither end notices a cut: bytes wait, as in
+TCP.  The bytes of a single stalled stream (``Pipe.is_stalled``) also wait; this stream retransmits without success.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ class PipeNetwork:
         self.delay_s = delay_s
         self.rate = rate
         self.dialled: list[tuple[str, Address]] = []
-        """The dialling host and the destination of each connection so far."""
+        """The dialling host and the destination of each connection since the start."""
         self.streams: list[Pipe] = []
         """The dialling ends of the open connections."""
         self.clock = clock
@@ -121,8 +121,8 @@ class _Host:
 class Pipe:
     """One end of a stream, with the interface of a Twisted transport.
 
-    With ``is_reading`` False nothing more is read from it; ``is_stalled`` drops everything that this end sends;
-    ``acknowledged`` is the number of bytes that the other end has acknowledged.
+    If ``is_reading`` is False, the application reads nothing more from this end.  If ``is_stalled`` is True, everything
+    that this end sends is lost.  ``acknowledged`` is the number of bytes that the other end has acknowledged.
     """
 
     bufferSize = 65536  # noqa: N815
@@ -190,7 +190,7 @@ class Pipe:
         self.pump()
 
     def abortConnection(self) -> None:  # noqa: N802
-        """Close the stream at once; the other end is notified unless the path is cut."""
+        """Close the stream immediately; the other end is notified unless the path is cut."""
         if not self.is_lost:
             if self._pipes._is_connected(self.host, self.other.host):
                 self._pipes.clock.callLater(self._pipes.delay_s, self.other._close, ConnectionAborted())

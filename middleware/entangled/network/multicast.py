@@ -50,10 +50,10 @@ class SimulatedLan:
 
 
 class SimulatedMulticast:
-    """One node's membership on a ``SimulatedLan``; a ``Multicast``.
+    """One node's membership in the group of a ``SimulatedLan``; a ``Multicast``.
 
-    As with sockets, it receives at one port and sends from another; ``addresses`` are both.  A test calls ``moved``
-    when it moves the node to another LAN.
+    As with sockets, the membership has one port to receive from the group and a second port to send; ``addresses``
+    contains both.  A test calls ``moved`` when it moves the node to another LAN.
     """
 
     def __init__(
@@ -66,7 +66,7 @@ class SimulatedMulticast:
 
     @property
     def addresses(self) -> tuple[Address, Address]:
-        """The address that receives from the group, and the one that sends and receives replies."""
+        """The address that receives from the group, and the address that sends datagrams and receives replies."""
         return self._receiving_network.address, self._sending_network.address
 
     def listen(self, receiver: Receiver, on_moved: Callable[[], None]) -> None:

@@ -1,6 +1,6 @@
 """Simulate a router with network address translation on a switchboard.
 
-The kinds differ in their mapping and filtering, in the terms of RFC 4787; two further kinds are common too:
+The kinds differ in their mapping and filtering, in the terms of RFC 4787; two further kinds are also common:
 
 | kind    | mapping                                | accepts from                   |
 |---------|----------------------------------------|--------------------------------|
@@ -11,8 +11,9 @@ The kinds differ in their mapping and filtering, in the terms of RFC 4787; two f
 | `sym`   | one port per inner address and target  | the same                       |
 | `noudp` | none                                   | no address                     |
 
-A *leaky* router takes an unsolicited datagram for its own and remembers the sender: an inner node that then sends to
-that sender gets another port, because the usual one is occupied (a Linux router with MASQUERADE and without firewall).
+A *leaky* router treats an unsolicited datagram as addressed to the router itself and remembers the sender.  An inner
+node that then sends to this sender gets a different port, because its usual port is occupied.  An example is a Linux
+router with MASQUERADE and without a firewall.
 """
 
 from __future__ import annotations
@@ -29,7 +30,7 @@ _FIRST_PORT, _LAST_PORT = 20_000, 60_000
 
 @dataclass(slots=True)
 class _Mapping:
-    """A port of the router for an inner address; ``last_sent_at`` has the time of the last datagram to each target."""
+    """A port of the router for an inner address; ``last_sent_at`` maps targets to the time of the last datagram."""
 
     inner: Address
     port: int
@@ -37,7 +38,7 @@ class _Mapping:
 
 
 class NatRouter:
-    """One router.  ``host`` is its external address, ``lifetime`` the seconds that a mapping lives without traffic."""
+    """A router.  ``host`` is its external address; a mapping without traffic expires after ``lifetime`` seconds."""
 
     def __init__(self, kind: NatKind, host: str, rng: random.Random, lifetime: float = 30.0) -> None:
         self.kind = kind
@@ -72,7 +73,7 @@ class NatRouter:
         return mapping.inner
 
     def rebind(self) -> None:
-        """Forget every mapping, as after a restart; new ones get other ports."""
+        """Forget every mapping, as after a restart; new mappings get different ports."""
         self._mappings.clear()
         self._occupied.clear()
         self._port_offset = self._rng.randrange(1, 10_000)

@@ -1,7 +1,7 @@
 """Define the interface by which a node sends and receives datagrams.
 
-``udp`` implements it with UDP, ``switchboard`` in memory; ``joint`` adds tunnels.  Protocol code receives a ``Network``
-and never opens a socket.
+``udp`` implements the interface with UDP, ``switchboard`` in memory; ``combined_network`` adds tunnels.  Protocol code
+receives a ``Network`` and never opens a socket.
 """
 
 from __future__ import annotations
@@ -12,9 +12,10 @@ from typing import NamedTuple, Protocol, runtime_checkable
 
 MAX_DATAGRAM_BYTES = 1400
 MAX_RELAYED_BYTES = 1452
-"""The length of a relayed datagram, which contains another one: 1500 bytes without the headers of IPv6 and UDP."""
+"""The maximum length of a relayed datagram, which contains another datagram: 1500 bytes minus the headers of IPv6 and
+UDP."""
 ANY_HOST = "*"
-"""The host that stands for every interface of both families."""
+"""The host that means every interface of both address families."""
 MAX_ASSIGNED = 1024
 """The number of addresses for which a network remembers the local port to send from."""
 _RELAYED_LENGTH = 41
@@ -32,7 +33,7 @@ class Address(NamedTuple):
 
     @property
     def is_virtual(self) -> bool:
-        """Whether it stands for a path that only this node has (a tunnel, a relay), and is useless to other nodes."""
+        """Whether this address means a path of this node (a tunnel, a relay) and is useless to other nodes."""
         return self[0][:1] == "~"
 
     def __str__(self) -> str:
@@ -94,10 +95,10 @@ class Network(Protocol):
 
 @runtime_checkable
 class LocalPorts(Protocol):
-    """A network that can use several local ports: 0 stands for the listening port.
+    """A network that can use several local ports; the number 0 means the listening port.
 
-    A datagram leaves by the port that was assigned to its target, otherwise by the port that first received from the
-    target.
+    A datagram is sent from the port that was assigned to its target, otherwise from the port that first received a
+    datagram of the target.
     """
 
     def open_port(self) -> int:
@@ -113,11 +114,11 @@ class LocalPorts(Protocol):
         """Return the local source address of datagrams to ``to`` (from ``port``, if given)."""
 
     def local_hosts(self) -> list[str]:
-        """Return the addresses of this machine at which ``listen`` receives, without the loopback."""
+        """Return the addresses of this machine at which ``listen`` receives, except the loopback address."""
 
 
 def find_ports(network: object) -> LocalPorts | None:
-    """Return the local ports of a network, or of the network that it wraps (its ``ports``); None if it has only one."""
+    """Return the local ports of a network or of the network in its ``ports``; None if it has only one port."""
     return network if isinstance(network, LocalPorts) else getattr(network, "ports", None)
 
 

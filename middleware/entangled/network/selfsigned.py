@@ -1,7 +1,7 @@
 """Create a private key and a self-signed certificate for TLS; they authenticate no node.
 
-An Ed25519 certificate (RFC 8410) has so few fields that it is encoded here: a node that serves tunnels needs neither
-``cryptography`` nor a file.
+An Ed25519 certificate (RFC 8410) has so few fields that this module encodes it directly.  A node that serves tunnels
+therefore needs neither the package ``cryptography`` nor a certificate file.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ _ED25519 = bytes.fromhex("300506032b6570")
 """The AlgorithmIdentifier of 1.3.101.112, which has no parameters."""
 _COMMON_NAME = bytes.fromhex("0603550403")
 _SUBJECT_ALTERNATIVE = bytes.fromhex("0603551d11")
-# No node verifies it, so it does not start today: the clock of a robot may be wrong.
+# The validity starts in the past, because the clock of a robot may be wrong; no node verifies the certificate.
 _FROM, _UNTIL = b"20200101000000Z", b"20991231235959Z"
 
 

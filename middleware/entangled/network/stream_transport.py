@@ -1,6 +1,6 @@
 """Define the interface that opens the byte streams of tunnels.
 
-``tcp`` implements it with TCP, ``pipes`` in memory.
+``tcp`` implements the interface with TCP, ``memory_streams`` in memory.
 """
 
 from __future__ import annotations
@@ -21,8 +21,8 @@ Accept = Callable[[str], IProtocol | None]
 class StreamState:
     """The state of the stream at one end.
 
-    ``unacked`` are the bytes that the other end has not acknowledged (each segment may count as a full one), ``acked``
-    the bytes that it has acknowledged; ``retransmissions`` counts the retransmissions.
+    ``unacked`` is the number of bytes that the other end has not acknowledged; each segment may be counted as a full
+    segment.  ``acked`` is the number of acknowledged bytes, and ``retransmissions`` the number of retransmissions.
     """
 
     unacked: int
@@ -37,7 +37,7 @@ class StreamTransport(Protocol):
         """Accept connections; raises ``PortInUse``."""
 
     def dial(self, to: Address, protocol: IProtocol, failed: Callable[[str], None]) -> None:
-        """Connect ``protocol`` to the listener at ``to``; ``failed`` is called with the reason if that fails."""
+        """Connect ``protocol`` to the listener at ``to``; on failure call ``failed`` with the reason."""
 
     def read_state(self, transport: Any) -> StreamState | None:
         """Return the state of the stream of a transport; None if it is unknown."""

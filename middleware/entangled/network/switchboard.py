@@ -1,7 +1,8 @@
 """Simulate the datagram networks of many nodes in one process, with delay, loss and partitions.
 
-It has the interface of ``udp`` without sockets.  Its behaviour depends only on the clock, the random generator and the
-order of sending, so a run can be reproduced from its seed; ``digest`` shows whether two runs are identical.
+The switchboard's networks have the same interface as ``udp``, but use no sockets.  The behaviour depends only on the
+clock, the random generator and the order of sending, so a run can be reproduced from its seed.  Two runs are identical
+if their ``digest`` is equal.
 """
 
 from __future__ import annotations
@@ -42,7 +43,7 @@ class LinkConditions:
     reorder: float = 0.0
 
     def draw_delays(self, rng: random.Random) -> list[float]:
-        """Return the delay of each copy of one datagram in seconds: none if it is lost, two if it is duplicated."""
+        """Return the delay in seconds of each copy of one datagram: none if it is lost, two if it is duplicated."""
         if self.loss and rng.random() < self.loss:
             return []
         copies = 2 if self.duplicate and rng.random() < self.duplicate else 1
@@ -63,11 +64,12 @@ PERFECT = LinkConditions()
 class LinkModel(Protocol):
     """A model of the links between all nodes, for distances, bursts and queues.
 
-    There is one object for the whole switchboard, because pairs are too many; it keeps state per sender and receiver.
+    One object serves the whole switchboard, because there would be too many pairs for an object per link.  It stores
+    state per sender and per receiver.
     """
 
     def draw_delays(self, source: Address, to: Address, size: int, now: float, rng: random.Random) -> Sequence[float]:
-        """Return the delay in seconds of each copy of a datagram of ``size`` bytes sent at ``now``; none if lost."""
+        """Return the delay in seconds of each copy of a datagram of ``size`` bytes sent at ``now``; empty if lost."""
 
 
 Barrier = Callable[[Address, Address], bool]
@@ -84,9 +86,9 @@ class TrafficCounters:
 
 
 class SwitchboardNetwork:
-    """One node's port on a ``Switchboard``, behind the router ``router``; a ``Network`` and ``Ports``.
+    """One node's port on a ``Switchboard``, behind the router ``router``; a ``Network`` with ``LocalPorts``.
 
-    ``traffic`` counts its datagrams; it may be passed on to the port of a restarted node.
+    ``traffic`` counts the datagrams of the port; the counters may be passed on to the port of a restarted node.
     """
 
     def __init__(
@@ -170,10 +172,10 @@ class SwitchboardNetwork:
 
 
 class Switchboard:
-    """Connects the networks of one process; ``conditions`` applies to every link without separate conditions.
+    """Connects the networks of one process; ``conditions`` applies to every link that has no separate conditions.
 
-    A ``link`` determines the delays instead, unless two addresses have separate conditions.  Each of the ``barriers``
-    may block datagrams.
+    If a ``link`` model is given, it determines the delays instead of ``conditions``.  Each of the ``barriers`` may
+    block datagrams.
 
     ``counters`` counts the datagrams that were sent, delivered, lost, cut, duplicated, unheard (no listener at the
     address), unsent (the sender is closed or unplugged), blocked (by a router) and oversized.
@@ -204,7 +206,7 @@ class Switchboard:
         home: NatRouter | None = None,
         traffic: TrafficCounters | None = None,
     ) -> SwitchboardNetwork:
-        """Create a network at that address, behind the router ``home``; port 0 takes the next free one."""
+        """Create a network at that address, behind the router ``home``; port 0 selects the next free port."""
         return SwitchboardNetwork(self, Address(host, port or self._free_port(host, home)), home, traffic)
 
     def add_router(self, nat: NatRouter, conditions: LinkConditions = PERFECT) -> NatRouter:
@@ -228,7 +230,7 @@ class Switchboard:
             self._cuts.add((b, a))
 
     def partition(self, *groups: Iterable[Address]) -> None:
-        """Block datagrams between groups; all addresses that are in none form another group."""
+        """Block datagrams between ``groups``; the addresses that are in no group form a further group."""
         self._sides = {address: number for number, group in enumerate(groups, start=1) for address in group}
 
     def heal(self) -> None:
@@ -238,13 +240,13 @@ class Switchboard:
         self.barriers.clear()
 
     def kill(self, address: Address) -> None:
-        """Unplug the network at ``address`` without notification; a new network may take the address."""
+        """Unplug the network at ``address`` without notification; a new network may use the same address."""
         network = self._ports.pop((None, address), None)
         if network is not None:
             network.is_unplugged = True
 
     def digest(self) -> str:
-        """Return a hash, in hex, of (time, from, to, datagram) of every delivery so far."""
+        """Return a hash, in hex, of (time, from, to, datagram) of all deliveries since the start."""
         self._hash_trace()
         return self._trace.hexdigest()
 

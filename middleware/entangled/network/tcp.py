@@ -23,18 +23,19 @@ from middleware.entangled.network.stream_transport import Accept, StreamState
 CONNECT_S = 3.0
 _NOTSENT_LOWAT = 25
 _THIN_LINEAR_TIMEOUTS = 16
-"""Retransmit a stream with little data in flight, as here, six times without exponential backoff (Linux, tcp(7)):
-otherwise a stream would stall for seconds at 30 % loss."""
+"""The socket option that retransmits a stream with little data in flight, such as a tunnel, six times without
+exponential backoff (Linux, tcp(7)).  With backoff, a stream would stall for seconds at 30 % loss."""
 _RTO_MAX_MS = 44
 MAX_RETRANSMIT_MS = 1000
 """The maximum retransmission timeout in milliseconds (Linux 6.15 and later)."""
 _INFO_BYTES = 148
 MAX_UNSENT_BYTES = 16 * 1024
-"""The bytes of a stream that the system may buffer (Linux): buffered bytes cannot be dropped, so they arrive late."""
+"""The bytes of a stream that the system may buffer (Linux).  The limit is low, because buffered bytes cannot be dropped
+and arrive late."""
 
 
 class TcpTransport:
-    """Byte streams over TCP; it listens at ``host`` (a numeric address; ``*``: all of IPv4 and IPv6) and ``port``."""
+    """Byte streams over TCP; listens at ``port`` of ``host``, a numeric address or ``*`` (all of IPv4 and IPv6)."""
 
     def __init__(self, reactor: Any, host: str = ANY_HOST, port: int = 0) -> None:
         self._reactor = reactor
@@ -46,7 +47,7 @@ class TcpTransport:
 
     @property
     def port(self) -> int:
-        """The port at which it listens."""
+        """The port at which the transport listens."""
         return self._requested_port if self._port is None else int(self._port.getHost().port)  # type: ignore[attr-defined]
 
     def listen(self, accept: Accept) -> None:
@@ -91,7 +92,7 @@ class TcpTransport:
         try:
             info = transport.getHandle().getsockopt(socket.IPPROTO_TCP, socket.TCP_INFO, _INFO_BYTES)
         except OSError:
-            return None  # the connection was lost meanwhile
+            return None  # the connection has just been lost
         if len(info) < _INFO_BYTES:
             return None  # Linux before 4.6
         segment, unacked = struct.unpack_from("=I4xI", info, 16)
@@ -109,7 +110,7 @@ class TcpTransport:
 
     def _listen_on_families(self, accept: Accept) -> Any:
         if self._host == ANY_HOST:
-            # One port for both families, if the machine has both.
+            # One port for both address families, if the machine has both.
             with suppress(CannotListenError):
                 return self._reactor.listenTCP(self._requested_port, _AcceptFactory(accept), 128, "::")
         return self._reactor.listenTCP(
@@ -140,10 +141,10 @@ class _SingleFactory(Factory):
 
 
 def _configure(stream: Any) -> None:
-    """Limit the send buffer of a stream, send without delay, and retransmit soon."""
+    """Limit the send buffer of a stream, disable the delay of small segments, and shorten retransmissions."""
     options = [(socket.TCP_NODELAY, 1)]
     if sys.platform == "linux":
         options += [(_NOTSENT_LOWAT, MAX_UNSENT_BYTES), (_THIN_LINEAR_TIMEOUTS, 1), (_RTO_MAX_MS, MAX_RETRANSMIT_MS)]
     for option, value in options:
-        with suppress(OSError):  # the connection was lost meanwhile, or the system does not have the option
+        with suppress(OSError):  # the connection has just been lost, or the system does not have the option
             stream.setsockopt(socket.IPPROTO_TCP, option, value)

@@ -1,10 +1,10 @@
 """Carry datagrams as WebSocket messages over TLS, for networks where a firewall blocks UDP.
 
-A serving node has a tunnel per client, a dialling node one per configured URL.  Both are identified by virtual
-addresses, ``~wss-`` and 12 hexadecimal digits, which are meaningless to other nodes.  A URL is dialled when a datagram
-is sent to its address, and closed after a time without traffic, so the sender controls its lifetime.  A tunnel
-authenticates no peer: the wire protocol inside does, and TLS is used only because other traffic on port 443 may be
-blocked.
+A serving node has one tunnel per client, and a dialling node has one tunnel per configured URL.  Both kinds of tunnels
+are identified by virtual addresses, ``~wss-`` and 12 hexadecimal digits, which are meaningless to other nodes.  A URL
+is dialled when a datagram is sent to its address, and the tunnel is closed after a time without traffic, so the sender
+controls the lifetime of the tunnel.  The tunnel does not authenticate peers, because the wire protocol inside it does.
+TLS is used only because other traffic on port 443 may be blocked.
 """
 
 from __future__ import annotations
@@ -40,19 +40,20 @@ CHECK_INTERVAL_S = 1.0
 ACCEPT_TIMEOUT_S = 8.0
 """The time in seconds from the connection to the end of the TLS and WebSocket handshakes."""
 DIAL_TIMEOUT_S = 12.0
-"""The same for the dialling side, possibly through a proxy."""
+"""The same time for the dialling side, whose connection may go through a proxy."""
 UNANSWERED_TIMEOUT_S = 10.0
-"""The time in seconds without an answer after which a client is no member: the wire protocol answers only members."""
+"""The time in seconds without an answer after which a client is considered a non-member, because the wire protocol
+answers only members."""
 IDLE_TIMEOUT_S = 60.0
 """The time in seconds without traffic after which the dialling side closes a tunnel."""
 MAX_TOTAL_CONNECTIONS = 256
 MAX_HANDSHAKES = 64
-"""The maximum number of connections that are not open yet; beyond it the oldest is closed."""
+"""The maximum number of connections that are not open yet; if there are more, the oldest is closed."""
 MAX_PER_HOST = 32
-"""The maximum number of connections of one address to which the node has sent nothing.  Because a team behind one NAT
-shares an address, all its connections together may be as many as this number of tunnels has."""
+"""The maximum number of connections from one address to which the node has sent nothing.  A team behind one NAT shares
+an address, so the limit for all connections from one address is the number of connections of this many tunnels."""
 MIN_REDIAL_S, MAX_REDIAL_S = 0.5, 10.0
-"""The delay in seconds before a URL that failed is dialled again: first and longest."""
+"""The first and the longest delay in seconds before a URL that failed is dialled again."""
 
 
 @dataclass(slots=True, eq=False)
@@ -68,10 +69,10 @@ class _Target:
 class TunnelNetwork:
     """Tunnels to ``urls``, and from clients if ``is_served``.
 
-    With ``is_plain`` it is served without TLS, for a reverse proxy on the same machine, which sends the client's
+    With ``is_plain`` tunnels are served without TLS, for a reverse proxy on the same machine that sends the client's
     address in ``X-Forwarded-For``.  ``proxy_for`` returns the HTTP proxy for a URL.  ``counters`` counts datagrams:
-    sent, received, unsent (no such tunnel), dropped (no room); and links: opened, lost, refused (no valid handshake, or
-    not in time), crowded.
+    sent, received, unsent (no such tunnel), dropped (the queue was full).  It also counts connections: opened, lost,
+    refused (no valid handshake in time), crowded (too many connections).
     """
 
     _log = Logger()
@@ -102,7 +103,7 @@ class TunnelNetwork:
 
     @property
     def address(self) -> Address:
-        """The address of this end; no datagram can be sent to it."""
+        """The address of this end; no datagram can be sent to this address."""
         return Address(VIRTUAL_PREFIX + "0" * 12, 1)
 
     @property
@@ -122,7 +123,7 @@ class TunnelNetwork:
         self._receiver = receiver
 
     def send(self, datagram: bytes, to: Address) -> None:
-        """Send a datagram; if its tunnel is being opened the datagram is queued, or lost."""
+        """Send a datagram; while its tunnel is being opened, the datagram is queued, or lost if the queue is full."""
         tunnel = self._tunnels.get(to) or self._open_tunnel(to)
         if tunnel is None or self._receiver is None or len(datagram) > MAX_PAYLOAD_BYTES:
             self.counters["unsent"] += 1
@@ -136,17 +137,17 @@ class TunnelNetwork:
         self._receiver = None
         self._transport.close()
         for connection in self._connections:
-            connection.close("the node stops")
+            connection.close("the node is stopping")
         for connection in list(self._closing):
             connection.cancel_close()
         self._closing.clear()
         cancel(self._timer)
         self._timer = None
 
-    # -- called by the links ----------------------------------------------------------------------------------------
+    # -- called by the connections ----------------------------------------------------------------------------------
 
     def on_connection_open(self, connection: TunnelConnection) -> bool:
-        """Register a link that is open, unless there are too many from its address."""
+        """Register a connection that is open; return False if there are too many from its address."""
         if self._is_plain and connection.address not in self._targets:
             host = _address_block(connection.socket.forwarded) or connection.host
             if connection.socket.forwarded and self._is_crowded(host):
@@ -174,7 +175,7 @@ class TunnelNetwork:
             self._receiver(datagram, connection.address)
 
     def on_connection_closed(self, connection: TunnelConnection, why: str) -> None:
-        """Forget a link, and delay the next attempt if it was dialled."""
+        """Forget a connection; if this node dialled it, delay the next attempt."""
         now = self._clock.seconds()
         tunnel = self._tunnels.get(connection.address)
         if tunnel is not None:
@@ -191,7 +192,7 @@ class TunnelNetwork:
             return
         if connection.socket.is_open and now - connection.started_at > MAX_REDIAL_S:
             target.redial_delay_s = MIN_REDIAL_S
-        # Measured from the attempt: an attempt that took long to fail has waited already.
+        # The delay is measured from the start of the attempt, because an attempt that fails late has already waited.
         target.redial_at = connection.started_at + target.redial_delay_s * (0.75 + self._rng.random() / 2)
         target.redial_delay_s = min(2 * target.redial_delay_s, MAX_REDIAL_S)
         if connection.socket.is_open or target.last_failure != why:
@@ -213,7 +214,7 @@ class TunnelNetwork:
         return [connection for tunnel in self._tunnels.values() for connection in tunnel.connections]
 
     def _open_tunnel(self, to: Address) -> TunnelConnections | None:
-        """Open a tunnel to a URL with one connection; return None if it may not be dialled now."""
+        """Open a tunnel to a URL with one connection; return None if the URL may not be dialled now."""
         target, now = self._targets.get(to), self._clock.seconds()
         if target is None or self._receiver is None or now < target.redial_at:
             return None
@@ -223,7 +224,7 @@ class TunnelNetwork:
         return self._tunnels.get(to)
 
     def _adjust_connections(self, tunnel: TunnelConnections, now: float) -> None:
-        """Adjust the number of connections of a dialled tunnel to its loss."""
+        """Adjust the number of connections of a dialled tunnel to the loss on its path."""
         target = self._targets.get(tunnel.address)
         if target is None or len(tunnel.connections) == tunnel.target_count(now) == 1:
             return
@@ -234,7 +235,7 @@ class TunnelNetwork:
             self._dial(target, tunnel)
 
     def _group_connection(self, connection: TunnelConnection, tunnel: TunnelConnections, now: float) -> None:
-        """Add an accepted connection to the tunnel that it names; if there are too many, close the most stalled."""
+        """Add an accepted connection to the tunnel of its token; if there are too many, close the most stalled one."""
         token = connection.socket.token
         if not token:
             return
@@ -265,9 +266,10 @@ class TunnelNetwork:
         self._transport.dial(where, connection, lambda why: connection.close(why, is_rude=True))
 
     def _accept(self, host: str) -> TunnelConnection | None:
-        """Return a link for a client at ``host``; None if there is no room for it."""
+        """Return a connection for a client at ``host``; None if there are too many."""
         place = _address_block(host)
-        # All clients of a reverse proxy share its address: they are counted when the proxy sends theirs.
+        # All clients of a reverse proxy share its address; they are counted when the proxy has sent the client's
+        # address.
         if self._receiver is None or (not self._is_plain and self._is_crowded(place)):
             self.counters["crowded"] += 1
             return None
@@ -303,7 +305,7 @@ class TunnelNetwork:
         return connection
 
     def _is_crowded(self, host: str) -> bool:
-        """Return whether there are too many connections of one address for another one."""
+        """Return whether one address already has the maximum number of connections."""
         there = [self._tunnels[connection.address] for connection in self._connections if connection.host == host]
         return (
             len(there) >= MAX_CONNECTIONS * MAX_PER_HOST or sum(not each.is_answered for each in there) >= MAX_PER_HOST
@@ -334,7 +336,7 @@ class TunnelNetwork:
 
 
 def _address_block(host: str) -> str:
-    """Return the unit of rate limits: an IPv4 address, or the /64 prefix of an IPv6 address; "" for any other text."""
+    """Return the unit of rate limits: an IPv4 address or the /64 prefix of an IPv6 address; "" for any other string."""
     try:
         ip = ip_address(host)
     except ValueError:

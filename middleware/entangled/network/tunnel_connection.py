@@ -1,7 +1,7 @@
 """Carry datagrams over one WebSocket connection of a tunnel, with bounded queues.
 
-A stream delivers everything in order, however late; a late heartbeat is worse than a lost one.  Therefore queues are
-short: datagrams that do not fit are dropped, newest first, and short datagrams are sent before long ones.
+A stream delivers everything in order, however late, but a late heartbeat is worse than a lost heartbeat.  Therefore
+queues are short: a new datagram that does not fit is dropped, and short datagrams are sent before long datagrams.
 """
 
 from __future__ import annotations
@@ -25,37 +25,39 @@ SHORT_BYTES = 300
 """The length limit of short datagrams: heartbeats, receipts, discovery and most requests; full fragments have 1400
 bytes."""
 MAX_QUEUED_BYTES, MAX_LONG_QUEUED_BYTES = 40 * 1024, 32 * 1024
-"""The bytes that may wait in the transport, which cannot reorder them; with the queues less than 64 KiB."""
+"""The bytes in the queues up to which a short datagram, and a long datagram, is accepted."""
 MAX_SEND_BUFFER_BYTES = 16 * 1024
-"""The bytes that may wait in the transport, where nothing overtakes them; with the queues less than 64 KiB."""
+"""The bytes that may wait in the transport, where short datagrams cannot overtake long ones.  Queues and transport
+together buffer less than 64 KiB."""
 QUIET_S, IDLE_S = 5.0, 20.0
-"""The silence in seconds after which a link is pinged, while datagrams are sent on it and otherwise."""
+"""The silence in seconds after which a connection is pinged: first if datagrams are sent on it, second if not."""
 PONG_S = 5.0
-"""The time in seconds without a pong after which the peer counts as gone although the connection is open."""
+"""The time in seconds without a pong after which the peer is considered unreachable although the connection is open."""
 STALL_S = 30.0
-"""The time in seconds without progress in sending after which the link is closed."""
+"""The time in seconds without progress in sending after which the connection is closed."""
 CLOSE_S = 2.0
 """The time in seconds for the closing handshake."""
 
 
 class ConnectionListener(Protocol):
-    """Receives the events of its links."""
+    """Receives the events of tunnel connections."""
 
     def on_connection_open(self, connection: TunnelConnection) -> bool:
-        """Called when datagrams can be sent; returning False closes the link."""
+        """Called when datagrams can be sent; if it returns False, the connection is closed."""
 
     def on_connection_datagram(self, connection: TunnelConnection, datagram: bytes) -> None:
         """Process a datagram."""
 
     def on_connection_closed(self, connection: TunnelConnection, why: str) -> None:
-        """Called once when the link is closed."""
+        """Called once when the connection is closed."""
 
 
 @implementer(IPushProducer)
 class TunnelConnection(StreamProtocol):
     """One connection; ``address`` is the virtual address of its peer, ``host`` the source of its stream.
 
-    ``layers`` surround the WebSocket, the outermost first.  ``dropped`` counts the datagrams that did not fit.
+    ``layers`` are the layers around the WebSocket, the outermost first.  ``dropped`` counts the datagrams that did not
+    fit into the queues.
     """
 
     def __init__(
@@ -116,7 +118,7 @@ class TunnelConnection(StreamProtocol):
         self._queued_bytes += len(datagram)
 
     def check(self, now: float) -> None:
-        """Check whether the other end is alive; called about once per second."""
+        """Check whether the other end still answers and accepts data; called about once per second."""
         if not self.is_open:
             return
         if self._pinged_at is not None and now - self._pinged_at > PONG_S:
@@ -181,7 +183,7 @@ class TunnelConnection(StreamProtocol):
             self._process(data)
 
     def connectionLost(self, reason: Failure | None = None) -> None:
-        """Close the link."""
+        """Report that the connection was closed."""
         cancel(self._close_timer)
         self._finish(
             "the connection was lost"
@@ -190,7 +192,7 @@ class TunnelConnection(StreamProtocol):
         )
 
     def pauseProducing(self) -> None:
-        """Queue datagrams, because the buffer of the transport is full."""
+        """Queue datagrams from now on, because the buffer of the transport is full."""
         if self._paused_at is None:
             self._paused_at = self._clock.seconds()
 

@@ -1,8 +1,8 @@
-"""Manage the connections of one tunnel: one, or up to three redundant ones on a lossy path.
+"""Manage the connections of one tunnel: one, or up to three redundant connections on a lossy path.
 
-A TCP stream stalls while lost segments are retransmitted, often for seconds at 30 % loss in each direction, and
-everything behind them is delayed.  Parallel streams seldom stall at the same time.  Therefore a tunnel has three
-connections after a recent stall, and sends each datagram over the two that make progress; the receiving endpoint drops
+A TCP stream stalls while lost segments are retransmitted, often for seconds at 30 % loss in each direction, and all
+later segments are delayed.  Parallel streams seldom stall at the same time.  Therefore a tunnel uses three connections
+after a recent stall, and sends each datagram over two connections that make progress; the receiving endpoint drops
 duplicates.
 """
 
@@ -19,28 +19,29 @@ from middleware.entangled.network.tunnel_connection import TunnelConnection
 MAX_CONNECTIONS = 3
 """The maximum number of connections of one tunnel."""
 COPIES = 2
-"""The number of connections that carry each datagram, if there are several."""
+"""The number of connections over which each datagram is sent, if the tunnel has several."""
 STALLED_S = 0.3
-"""The time in seconds after which a stream that retransmits without progress counts as stalled."""
+"""The time in seconds after which a stream that retransmits without progress is considered stalled."""
 REPLACE_STALLED_S = 1.5
-"""The time in seconds after which a stalled stream is dialled again, if another one makes progress."""
+"""The time in seconds after which a stalled stream is replaced by a new one, if another stream makes progress."""
 LOSSY_RETRANSMISSIONS = 2
-"""The number of retransmissions before a stream is open that indicates a lossy path."""
+"""The number of retransmissions that indicates a lossy path, if they occur before the stream is open."""
 REDUNDANCY_S = 30.0
 """The time in seconds for which a tunnel has several connections after a stall."""
 DIAL_NEXT_S = 1.2
 """The time in seconds after which another connection is dialled if none opens."""
 REDIAL_DELAY_S = 1.0
-"""The minimum time in seconds between the loss of a connection and the next one, if there are others."""
+"""The minimum time in seconds between the loss of a connection and the next dialling, if the tunnel has other
+connections."""
 MAX_STALLED_BYTES = 4096
-"""The bytes that a stalled stream may hold; further datagrams would be late and delay the ones after them."""
+"""The bytes that a stalled stream may buffer; further datagrams would be late and would delay later datagrams."""
 
 ReadState = Callable[[Any], StreamState | None]
 
 
 @dataclass(slots=True)
 class _Progress:
-    """The progress of a stream: when it last delivered something, and its counts at that time."""
+    """The progress of a stream: the time when it last delivered bytes, and its counters at that time."""
 
     moved_at: float
     acked: int = -1
@@ -55,7 +56,7 @@ class TunnelConnections:
     def __init__(self, address: Address, read_state: ReadState, now: float) -> None:
         self.address = address
         self.token = b""
-        """Identifies the tunnel to the other end, which groups its connections by it."""
+        """Identifies the tunnel: the other end groups connections with the same token."""
         self.connections: list[TunnelConnection] = []
         self.is_answered = False
         self.started_at = self.active_at = now
@@ -97,7 +98,7 @@ class TunnelConnections:
         return sent > 0
 
     def order_by_progress(self, now: float) -> list[TunnelConnection]:
-        """Return the open connections, first the ones that make progress and hold the fewest bytes."""
+        """Return the open connections: with progress first, and then in the order of the bytes that they buffer."""
         connections = [connection for connection in self.connections if connection.is_open]
         for connection in connections:
             self._measure_progress(connection, now)

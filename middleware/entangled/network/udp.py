@@ -21,18 +21,19 @@ from middleware.entangled.errors import PortInUse
 from middleware.entangled.network.interface import is_any, list_interfaces
 from middleware.entangled.network.network import ANY_HOST, MAX_ASSIGNED, MAX_RELAYED_BYTES, Address, Receiver
 
-# Bursts arrive faster than Python reads: the usual 208 KiB hold 160 full datagrams, this buffer five times as many.
+# Bursts arrive faster than Python reads.  The usual buffer of 208 KiB has space for 160 full datagrams; this buffer has
+# space for five times as many.
 RECEIVE_BUFFER_BYTES = 1 << 20
 ROUTE_CACHE_S = 5.0
-"""The seconds for which routes and addresses are cached: they change when a laptop moves."""
+"""The seconds for which routes and addresses are cached; they change, for example, when a laptop moves."""
 _PORT_ATTEMPTS = 8
 
 
 class UdpNetwork:
-    """One UDP port at ``host`` and ``port`` (0: any free one), and additional ones that are opened later.
+    """One UDP port at ``host`` and ``port`` (0: any free port), and additional ports that are opened later.
 
-    ``host`` is an IP address ("0.0.0.0" or "::" for every interface of one family), or ``ANY_HOST`` for every
-    interface of both families; IPv6 is omitted on machines without it.
+    ``host`` is an IP address ("0.0.0.0" or "::" for every interface of one address family), or ``ANY_HOST`` for every
+    interface of both families; IPv6 is omitted on machines that do not support it.
 
     ``counters`` counts the datagrams that were sent, received, unsent (no route, invalid address, full buffer) and
     oversized.  ``closed`` fires when every port is closed.
@@ -73,7 +74,7 @@ class UdpNetwork:
             try:
                 self._open_ipv6(self._number)
                 return
-            except PortInUse:  # without a configured port any will do, but it must be the same in both families
+            except PortInUse:  # if no port is configured, any port is suitable that is free in both address families
                 self._close_port(0)
                 if not left:
                     raise
@@ -86,14 +87,14 @@ class UdpNetwork:
         is_six = ":" in to.host
         number = self._port_by_target.get(to, 0) if self._port_by_target else 0
         port = self._ports.get((number, is_six)) or self._ports.get((0, is_six))
-        # The address comes from a peer: the system would resolve a name and block until the answer.
+        # The address comes from a peer and may be a name, which the system would resolve and block until the answer.
         if port is None or not _is_ip(to.host):
             self.counters["unsent"] += 1
             return
         try:
-            # Bypasses the port's ``write``, which checks the address each time, at half of the cost of a send.
+            # Bypasses the port's ``write``, whose check of the address takes half of the time of a send.
             port.socket.sendto(datagram, to)
-        # Invalid port numbers and a full buffer each raise another type.
+        # An invalid port number and a full buffer raise different types.
         except (OSError, ValueError, OverflowError, TypeError):
             self.counters["unsent"] += 1
         else:
@@ -110,7 +111,7 @@ class UdpNetwork:
     # -- additional ports -------------------------------------------------------------------------------------------
 
     def open_port(self) -> int:
-        """Open an additional local port, with IPv4 if enabled, and return it; 0 if that fails."""
+        """Open an additional local port, with IPv4 if enabled, and return its number; 0 if that fails."""
         if not self._ports:
             return 0
         host = "0.0.0.0" if self._host == ANY_HOST else self._host
@@ -164,7 +165,7 @@ class UdpNetwork:
         return own
 
     def _open_ipv6(self, wanted: int) -> None:
-        """Open the IPv6 port next to the IPv4 one; Twisted would open one that receives both."""
+        """Open an IPv6 port in addition to the IPv4 port; Twisted alone would open a port that receives both."""
         try:
             with socket.socket(socket.AF_INET6, socket.SOCK_DGRAM) as sock:
                 sock.setsockopt(socket.IPPROTO_IPV6, socket.IPV6_V6ONLY, 1)
@@ -194,7 +195,7 @@ class UdpNetwork:
                 maybeDeferred(port.stopListening)
 
     def _own_host(self) -> str:
-        # Any address outside this machine will do, because nothing is sent there (RFC 5737 and 3849).
+        # Any address outside this machine is suitable, because nothing is sent to it (RFC 5737 and 3849).
         six = self._host == "::"
         own = [host for host in _list_own_hosts() if (":" in host) == six]
         return _ask_route("2001:db8::1" if six else "192.0.2.1") or next(iter(own), "::1" if six else "127.0.0.1")
@@ -229,7 +230,7 @@ def _make_port_error(host: str, port: int, error: Any) -> PortInUse:
 
 
 def _list_own_hosts() -> list[str]:
-    """Return the addresses of this machine that other nodes may reach: no loopback or link-local ones."""
+    """Return the addresses of this machine that other nodes may reach, except loopback and link-local addresses."""
     found = [host for interface in list_interfaces() if not interface.is_loopback for host in interface.addresses]
     return sorted(found, key=lambda host: ":" in host)
 
@@ -252,7 +253,7 @@ def _is_ip(host: str) -> bool:
 
 
 class _Protocol(DatagramProtocol):
-    """Passes on the datagrams of one port, with the key ``number`` of its network."""
+    """Passes the datagrams of one port to its network, in which the port has the key ``number``."""
 
     def __init__(self, network: UdpNetwork, number: int) -> None:
         self._network = network
@@ -263,4 +264,4 @@ class _Protocol(DatagramProtocol):
         self._network._receive(datagram, Address(addr[0], addr[1]), self.number)
 
     def connectionRefused(self) -> None:
-        """Ignore the ICMP message, because it may be forged, and timeouts detect the same failure."""
+        """Ignore the ICMP message, which may be forged; timeouts detect the same failure."""

@@ -1,4 +1,4 @@
-"""Parse tunnel URLs, ``wss://host:443/swarm`` or, within one machine, ``ws://127.0.0.1:8000/swarm``, and proxies."""
+"""Parse proxies and tunnel URLs: ``wss://host:443/swarm`` or, on one machine, ``ws://127.0.0.1:8000/swarm``."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ _PATTERN = re.compile(r"(wss?)://(\[[0-9a-fA-F:.]{2,45}\]|[A-Za-z0-9._-]{1,253})
 
 
 class Url(NamedTuple):
-    """The parts of a tunnel URL; ``ws`` is without TLS."""
+    """The parts of a tunnel URL; the scheme ``ws`` means a connection without TLS."""
 
     scheme: str
     host: str
@@ -30,17 +30,17 @@ class Url(NamedTuple):
         found = _PATTERN.fullmatch(text)
         port = int(found[3] or DEFAULT_PORTS[found[1]]) if found else 0
         if found is None or not 0 < port < 65536:
-            raise ValueError(f"{text[:80]!r} is no wss://host:port/path")
+            raise ValueError(f"{text[:80]!r} is not a tunnel URL of the form wss://host:port/path")
         return cls(found[1], found[2].strip("[]"), port, found[4] or PATH)
 
     @property
     def is_tls(self) -> bool:
-        """Whether it uses TLS."""
+        """Whether the tunnel uses TLS."""
         return self.scheme == "wss"
 
     @property
     def authority(self) -> str:
-        """Host and port as in HTTP; a default port is omitted, as browsers do."""
+        """Host and port in the form of HTTP; a default port is omitted, as in browsers."""
         host = f"[{self.host}]" if ":" in self.host else self.host
         return host if self.port == DEFAULT_PORTS[self.scheme] else f"{host}:{self.port}"
 
@@ -66,5 +66,5 @@ class Proxy(NamedTuple):
         found = re.fullmatch(r"(?:http://)?(?:([^@/]+)@)?(\[[0-9a-fA-F:.]+\]|[^:@/\[\]]+)(?::([0-9]{1,5}))?/?", text)
         port = int(found[3] or 3128) if found else 0
         if found is None or not 0 < port < 65536:
-            raise ValueError("it is no http://host:port")
+            raise ValueError("the proxy must have the form http://host:port")
         return cls(found[2].strip("[]"), port, unquote(found[1] or ""))

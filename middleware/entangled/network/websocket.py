@@ -1,4 +1,4 @@
-"""Exchange datagrams as binary WebSocket messages; text and messages longer than a datagram are errors."""
+"""Exchange datagrams as binary WebSocket messages; text messages and messages longer than a datagram are errors."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ class WebSocket(WebSocketEnd):
         self.forwarded = ""
         """The last address in ``X-Forwarded-For``, which a reverse proxy in front of the server adds."""
         self.token = token
-        """The client's identifier of its tunnel."""
+        """The identifier of the client's tunnel."""
 
     def _make_response(self, request: Request) -> AcceptConnection | RejectConnection:
         fields = dict(request.extra_headers)

@@ -1,8 +1,9 @@
 """The acceptor: promises ballots, grants leases and accepts values; ``TABLE`` determines each vote.
 
-A decision is Lamport's single-decree Paxos: prepare, then accept permanently.  A lease is PaxosLease: prepare, then
+A decision uses Lamport's single-decree Paxos: prepare, then accept permanently.  A lease uses PaxosLease: prepare, then
 lease for ``ttl`` seconds, and renew by leasing again under the same ballot.  A change of the configuration is a
-decision that ends all leases (Vertical Paxos).  ``docs/explanation/quorum.md`` lists the invariants named here.
+decision that ends all leases (Vertical Paxos).  The comments refer to invariants by the labels of
+``docs/explanation/quorum.md``, such as L1.
 """
 
 from __future__ import annotations
@@ -18,7 +19,7 @@ from middleware.entangled.quorum.ballot import FIRST_CONFIGURATION, NO_BALLOT, B
 from middleware.entangled.quorum.register import Register, Reply, ReplyKind
 
 NO_ROOM_REPLY = Reply(ReplyKind.QUIET, remaining=1.0)
-"""The reply if there is no room for a register: ask again in a second."""
+"""The reply if the acceptor has no space for another register: ask again in a second."""
 
 
 class State(Enum):
@@ -43,23 +44,23 @@ class BallotRelation(Enum):
     """The relation of a ballot to a register at one time."""
 
     BEHIND = "behind"
-    """Its configuration is newer than the acceptor's."""
+    """The configuration of the ballot is newer than the acceptor's."""
     MOVED = "moved"
-    """Its configuration has been replaced."""
+    """The configuration of the ballot has been replaced."""
     HELD = "held"
     """Another proposer's lease is valid."""
     LOWER = "lower"
-    """A higher ballot or token exists, it was released, or its numbers are implausibly high."""
+    """A higher ballot or token exists, the ballot was released, or its numbers are implausibly high."""
     OVERTAKEN = "overtaken"
-    """It is the holder's, but the time after the lease is promised to another proposer."""
+    """The ballot is the holder's, but the time after the lease is promised to another proposer."""
     OWN = "own"
-    """It is the holder's, and the lease is valid."""
+    """The ballot is the holder's, and the lease is valid."""
     ENDING = "ending"
-    """Another proposer's lease is about to expire, or was released while its device still moves."""
+    """Another proposer's lease is about to expire, or was released, but the holder's device may still move."""
     RESERVED = "reserved"
     """Another proposer's reservation is valid."""
     FOREIGN = "foreign"
-    """It has no promise or lease to release here."""
+    """The ballot has no promise or lease to release at this acceptor."""
     FREE = "free"
 
 
@@ -86,9 +87,9 @@ _G, _H, _O = ReplyKind.GRANTED, ReplyKind.HELD, ReplyKind.OUTBID
 _VOTES = {
     # L3: a prepare during a lease changes nothing.
     Event.PREPARE: (_H, _O, _O, _G, _G, _H, _G),
-    # L1: no lease is granted before the lease of another has ended and its device is at rest.
-    # L4: a promise for the time after a lease does not end it.
-    # A ballot that a majority promised may arrive during another's reservation: then the reservation has lost.
+    # L1: no lease is granted before the previous holder's lease has ended and its device is at rest.  L4: a promise for
+    # the time after a lease does not end it.  A ballot that a majority promised may arrive during another proposer's
+    # reservation: it overrides the reservation.
     Event.LEASE: (_H, _O, _G, _G, _H, _G, _G),
     # C2: no value is accepted during a lease.
     Event.ACCEPT: (_H, _O, _O, _H, _H, _G, _G),
@@ -127,16 +128,16 @@ def _make_rows() -> Iterator[tuple[tuple[State, Event, BallotRelation], tuple[Re
 
 
 TABLE = dict(_make_rows())
-"""(state, event, stand) to (answer, next state)."""
+"""Maps (state, event, ballot relation) to (reply kind, next state)."""
 
 
 @dataclass(frozen=True)
 class AcceptorSettings:
     """Parameters of one use of registers.
 
-    During the last ``early_share`` share of a lease the time after it may be promised.  Only its proposer may complete
-    an accepted value within ``completion_s`` seconds.  With ``must_prepare`` an unknown register has to be prepared
-    first.
+    During the last part of a lease, the fraction ``early_share`` of its duration, the time after the lease may be
+    promised.  For ``completion_s`` seconds only the proposer of an accepted value may complete it.  With
+    ``must_prepare`` an unknown register has to be prepared first.
     """
 
     early_share: float = 0.0
@@ -145,7 +146,7 @@ class AcceptorSettings:
 
 
 class Acceptor(Generic[Key]):
-    """An acceptor started at ``born_at``; if its log is incomplete it grants nothing for the longest ttl."""
+    """An acceptor that started at ``born_at``; if its log is incomplete, it grants nothing for the longest ttl."""
 
     def __init__(self, log: RegisterLog[Key], settings: AcceptorSettings, born_at: float = -math.inf) -> None:
         self.log = log
@@ -157,8 +158,9 @@ class Acceptor(Generic[Key]):
     ) -> Reply:
         """Promise to accept nothing under a lower ballot, and reserve the promise for ``reserve`` seconds.
 
-        ``ttl`` is the duration of the lease to follow.  A ballot with counter 0 is a read without a promise: an
-        acceptor whose lease expired because it missed a renewal must not be lost to the healthy holder.
+        ``ttl`` is the duration in seconds of the lease that the proposer will request.  A ballot with counter 0 only
+        reads, without a promise.  Otherwise an acceptor that missed a renewal could promise to a reader, and its vote
+        would be lost to the holder.
         """
         register, reply = self._decide(key, _Request(Event.PREPARE, ballot, now, configuration, ttl=ttl))
         if reply.kind in (ReplyKind.GRANTED, ReplyKind.SEALED):
@@ -198,8 +200,8 @@ class Acceptor(Generic[Key]):
     ) -> Reply:
         """Accept ``value`` permanently.
 
-        With ``gives_back`` a holder whose device is at rest allows the acceptance during its own lease.
-        ``token`` is the highest token that the proposer knows.
+        With ``gives_back``, the proposer is the holder, its device is at rest, and the value is accepted during its own
+        lease.  ``token`` is the highest token that the proposer knows.
         """
         register, reply = self._decide(key, _Request(Event.ACCEPT, ballot, now, configuration, token, 0.0, gives_back))
         if reply.kind is not ReplyKind.GRANTED:
@@ -214,9 +216,9 @@ class Acceptor(Generic[Key]):
         return self._reply(ReplyKind.GRANTED, register, now)
 
     def release(self, key: Key, ballot: Ballot, now: float, rest: float = 0.0) -> Reply:
-        """Release promises and leases under ``ballot`` and older ballots of its life; accepted values stay.
+        """Release promises and leases under ``ballot`` and older ballots of the same process; accepted values stay.
 
-        ``rest`` is the time in seconds in which the holder's device may still move: meanwhile the lease can be
+        ``rest`` is the time in seconds in which the holder's device may still move.  During this time the lease can be
         promised but not granted.
         """
         request = _Request(Event.RELEASE, ballot, now)
@@ -224,10 +226,10 @@ class Acceptor(Generic[Key]):
         if reply.kind is not ReplyKind.GRANTED:
             return reply
         if self._find_relation(register, request) is BallotRelation.HELD:
-            # The promise was for the time after another's lease, which stays valid.
+            # The promise was for the time after another proposer's lease; this lease stays valid.
             register.promised = max(register.promised, Ballot(ballot.counter + 1, self.log.codec.lowest_name))
         else:
-            # B3: a delayed request under this ballot is refused.
+            # B3: a delayed request under this ballot is rejected.
             register.released = ballot
         if register.promised <= ballot:
             register.reserve, register.reserved_until = 0.0, now
@@ -240,14 +242,14 @@ class Acceptor(Generic[Key]):
     def close(self, key: Key, proposer: ProposerName, configuration: int, token: int, now: float) -> Reply:
         """Close the register, so that it grants nothing; ``remaining`` is the time in which a holder may still act.
 
-        A proposer proves itself by the token that it was granted here, even if it has released the lease since; token
-        0 is for callers without a lease.  If the reply shows that the configuration has changed or may have, the
-        caller must close the next configuration as well.
+        A proposer proves its right to close the register by the token that it was granted here, even if it has already
+        released the lease; callers without a lease pass token 0.  If the reply indicates that the configuration has
+        changed, or may have changed, the caller must also close the next configuration.
         """
         register = self._get_or_enter(key, now)
         if register is None:
             return NO_ROOM_REPLY
-        if token and (register.token, register.grantee) != (token, proposer):  # C5: a proof names the granted token
+        if token and (register.token, register.grantee) != (token, proposer):  # C5: it must have been granted
             return self._reply(ReplyKind.OUTBID if token < register.token else ReplyKind.BEHIND, register, now)
         if not register.is_closed:
             register.is_closed, register.touched_at = True, now
@@ -270,15 +272,15 @@ class Acceptor(Generic[Key]):
         ttl: float = 0.0,
         proof: bytes = b"",
     ) -> Reply:
-        """Store the decision of the previous configuration for ``value``, and the token above which it continues.
+        """Store ``value``, which the previous configuration decided, and the token above which new tokens start.
 
-        The caller has checked the certificate ``proof``.  The lease is reserved for the proposer of ``ballot`` for
-        ``ttl`` seconds.
+        The caller has checked the certificate ``proof`` of the decision.  The lease is reserved for the proposer of
+        ``ballot`` for ``ttl`` seconds.
         """
         register = self._get_or_enter(key, now)
         if register is None:
             return NO_ROOM_REPLY
-        if configuration > register.configuration:  # C3: configurations only rise
+        if configuration > register.configuration:  # C3: configuration numbers only increase
             register.configuration, register.value, register.accepted = configuration, value, NO_BALLOT
             register.holder, register.lease_until = ballot, now if ballot == NO_BALLOT else now + ttl
             register.touched_at, register.proof = now, proof
@@ -292,12 +294,12 @@ class Acceptor(Generic[Key]):
     # -- inside -----------------------------------------------------------------------------------------------------
 
     def _decide(self, key: Key, request: _Request) -> tuple[Register, Reply]:
-        """Return the register and the reply by the table; store a new register only if something is granted."""
+        """Return the register, and the reply by ``TABLE``; store a new register only if something is granted."""
         event, ballot, now, *_ = request
         known = self.log.get(key)
         register = known or self.log.make_register(now)
         quiet = self._quiet_until(request.ttl) - now
-        if quiet > 0.0 and event is not Event.RELEASE:  # R1: it may have forgotten a grant
+        if quiet > 0.0 and event is not Event.RELEASE:  # R1: this acceptor may have forgotten a grant
             return register, Reply(ReplyKind.QUIET, remaining=quiet)
         is_unknown = known is None and (self._settings.must_prepare or event is Event.RELEASE)
         state = State.UNKNOWN if is_unknown else find_state(register)
@@ -310,7 +312,7 @@ class Acceptor(Generic[Key]):
         event, ballot, now, configuration, token, _, gives_back = request
         lives = self.log.codec.lives
         left = register.lease_until - now
-        is_own = ballot.is_same_life(register.holder, lives)  # L2: an earlier life of the holder is another holder
+        is_own = ballot.is_same_life(register.holder, lives)  # L2: its earlier process is a different holder
         is_held = left > 0.0 and not is_own and not register.is_released
         if event is Event.RELEASE:
             if not (is_own or ballot.is_same_life(register.promised, lives)):
@@ -343,11 +345,11 @@ class Acceptor(Generic[Key]):
         return BallotRelation.RESERVED if is_reserved else BallotRelation.FREE
 
     def _quiet_until(self, ttl: float) -> float:
-        """Return the time until which nothing is granted."""
+        """Return the seconds during which this acceptor still grants nothing."""
         return -math.inf if self.log.is_complete else self._started_at + max(ttl, self.log.floor.longest)
 
     def _get_or_enter(self, key: Key, now: float) -> Register | None:
-        """Return the register, a new one if needed, or None if there is no room."""
+        """Return the register, or a new one if it does not exist; None if there is no space for it."""
         register = self.log.get(key) or self.log.make_register(now)
         return register if key in self.log.registers or self.log.add(key, register, now) else None
 

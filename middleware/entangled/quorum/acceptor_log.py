@@ -1,7 +1,7 @@
-"""The durable log of an acceptor: a restart lowers no token and forgets no promise.
+"""The durable log of an acceptor, which preserves tokens and promises over a restart.
 
-Registers are grouped into buckets, each stored as one note.  Evicted registers leave a lower bound (floor) of ballots
-and tokens.
+Registers are grouped into buckets; each bucket is stored as one note.  When registers are evicted, their highest
+ballots and tokens are recorded in a ``Floor``, below which nothing is granted.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from middleware.entangled.quorum.register import Register
 
 MAX_REGISTERS = 4096
 MAX_SEARCHED = 256
-"""Oldest registers examined for eviction; all of them would take too long."""
+"""The number of oldest registers that are examined for eviction; examining all of them would take too long."""
 
 Key = TypeVar("Key", bound=Hashable)
 
@@ -40,11 +40,11 @@ class NoteStore(Protocol):
 
 @dataclass(frozen=True)
 class Codec(Generic[Key]):
-    """The encoding of the registers of one use as notes; no decoder raises.
+    """The encoding of the registers of one use as notes; decoders return None instead of raising.
 
     ``name`` is the format of the names of the ``buckets``; ``lowest_name`` is a name below all names of proposers.  The
-    counters of two lives of a proposer differ modulo ``lives`` (1 if their names differ).  ``unpack`` also returns
-    whether the note was complete.
+    ballot counters of two processes of one proposer differ modulo ``lives`` (1 if the processes have different names).
+    ``unpack`` also returns whether the note was complete.
     """
 
     floor_name: str
@@ -67,7 +67,7 @@ class Codec(Generic[Key]):
 class RegisterLog(Generic[Key]):
     """The registers of one acceptor, in memory and in ``notes``.
 
-    ``is_whole`` is False if notes of an earlier process are missing or corrupt; ``may_forget`` returns whether a
+    ``is_whole`` is False if notes of an earlier process are missing or corrupt.  ``may_forget`` returns whether a
     register may be evicted.
     """
 
@@ -102,20 +102,20 @@ class RegisterLog(Generic[Key]):
     def make_register(self, now: float) -> Register:
         """Return a new register that is not in the log yet."""
         counter, token, _ = self.floor
-        # R3: ballots that an evicted register may have promised or outbid are lower.
+        # R3: this ballot is higher than every ballot that an evicted register may have promised.
         promised = Ballot(counter + 1, self.codec.lowest_name) if counter else NO_BALLOT
         ceiling = Ceiling(now, self.codec.lives, counter, token)
         return Register(ceiling, promised=promised, token=token, touched_at=now)
 
     def add(self, key: Key, register: Register, now: float) -> bool:
-        """Add a register; return False if there is no room."""
+        """Add a register; return False if there is no space."""
         if len(self.registers) >= MAX_REGISTERS and not self._make_room(now):
             return False
         self._add(key, register)
         return True
 
     def write(self, key: Key) -> None:
-        """Write the present state of a register to the notes."""
+        """Write the current state of a register to the notes."""
         longest = self.registers[key].ttl
         if longest > self.floor.longest:
             self.floor = self.floor._replace(longest=longest)
@@ -137,7 +137,7 @@ class RegisterLog(Generic[Key]):
         self._buckets.setdefault(self.codec.bucket_of(key), {})[key] = None
 
     def _make_room(self, now: float) -> bool:
-        """Evict old registers that are no longer needed; return whether there is room."""
+        """Evict old registers that are no longer needed; return whether there is space for another."""
         buckets = set()
         for key in list(self.registers)[:MAX_SEARCHED]:
             register = self.registers.pop(key)

@@ -1,4 +1,4 @@
-"""Ballots, and limits on the numbers that members accept from each other; pure."""
+"""Ballots, and limits on the numbers that members accept from each other; without I/O."""
 
 from __future__ import annotations
 
@@ -11,11 +11,12 @@ FIRST_CONFIGURATION = 1
 """The first configuration of a register."""
 INITIAL_CEILING = 2**32
 CEILING_RATE_PER_S = 2**10
-"""An acceptor refuses tokens and attempts above ``INITIAL_CEILING``, or above its own at its start, plus
-``CEILING_RATE_PER_S`` per second.  A proposer cannot exhaust them: the 2**42 attempts last for 136 years, and there are
-more tokens."""
+"""The rate at which the ceilings of tokens and attempts at an acceptor rise.  An acceptor rejects tokens and attempts
+above its ceiling.  The ceiling starts at ``INITIAL_CEILING``, or at the acceptor's own number at its start if that is
+higher.  A proposer cannot exhaust the numbers: the 2**42 attempts last for 136 years, and there are more tokens."""
 MAX_UNCONFIRMED = INITIAL_CEILING // 2
-"""A proposer believes a higher number only from two acceptors: a single one may have invented it."""
+"""A proposer believes a higher number only if two acceptors report it, because a single acceptor may have invented
+it."""
 
 ProposerName = Any
 """The name of a proposer: ``str`` or ``bytes``, the same in all ballots of a register."""
@@ -28,7 +29,7 @@ class Ballot(NamedTuple):
     proposer: ProposerName
 
     def is_same_life(self, other: Ballot, lives: int) -> bool:
-        """Return whether both are from the same life (process) of a proposer, which ``counter % lives`` identifies."""
+        """Return whether both ballots are from the same process of a proposer, identified by ``counter % lives``."""
         return self.proposer == other.proposer and self.counter % lives == other.counter % lives
 
 

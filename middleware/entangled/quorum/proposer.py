@@ -21,7 +21,7 @@ class Result(Enum):
     WON = "won"
     """A majority agrees."""
     DECIDED = "decided"
-    """A majority has accepted ``value``, proposed by any proposer."""
+    """A majority has accepted ``value``, which any proposer may have proposed."""
     HELD = "held"
     OUTBID = "outbid"
     SILENT = "silent"
@@ -66,8 +66,8 @@ async def decide(
 ) -> tuple[Ballot, Any]:
     """Retry from ``ballot`` on until a value is decided; return the last ballot and the decided value.
 
-    Proposes ``value`` if no other value was accepted.  With None it proposes none, and returns None if no value was
-    accepted.
+    Proposes ``value`` if no other value was accepted.  If ``value`` is None, no new value is proposed, and the decided
+    value is None if no value was accepted.
     """
     pause = BACKOFF_S[0]
     while True:
@@ -83,7 +83,7 @@ async def decide(
                 return ballot, chosen
         if outcome.result is Result.DECIDED:
             return ballot, outcome.value
-        # Shorter than another's lease, which may be released early or end in a decision.
+        # The pause is limited, because another proposer's lease may be released early or end in a decision.
         await sleep(max(min(outcome.remaining, BACKOFF_S[1]), pause * (0.5 + rng.random())))
         pause = min(2 * pause, BACKOFF_S[1])
         ballot = Ballot(counter + 1, ballot.proposer)

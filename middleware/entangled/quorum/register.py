@@ -20,13 +20,13 @@ class ReplyKind(Enum):
     UNPREPARED = "unprepared"
     """The register or the ballot is unknown here: prepare first."""
     QUIET = "quiet"
-    """The acceptor may have forgotten a grant, or has no room; ask again in ``remaining`` seconds."""
+    """The acceptor may have forgotten a grant, or has no space; ask again in ``remaining`` seconds."""
     BEHIND = "behind"
-    """The acceptor does not know that configuration yet."""
+    """The acceptor does not know the requested configuration yet."""
     SEALED = "sealed"
-    """The ballot is promised, but a value was accepted before: only that value may be proposed."""
+    """The ballot is promised, but a value was already accepted: only this value may be proposed."""
     MOVED = "moved"
-    """That configuration was replaced; ``configuration`` and ``proof`` are of the present one."""
+    """The requested configuration was replaced; ``configuration`` and ``proof`` describe the current one."""
     OVER = "over"
     """The register is closed."""
 
@@ -54,10 +54,11 @@ class Register:
     """The promises, the lease and the accepted value of one register at an acceptor.
 
     ``promised`` is the highest promised ballot, reserved for ``reserve`` seconds, until ``reserved_until``.  ``holder``
-    is the ballot of the lease, granted for ``ttl`` seconds, until ``lease_until``; ``released`` is the highest released
-    ballot. ``token`` is the fencing token, ``grantee`` the proposer to which it was granted here, empty if only
-    reported by others.  ``value`` was accepted under ``accepted``; if that is ``NO_BALLOT``, ``value`` is the newest
-    configuration known here and ``proof`` its certificate.  Times are on the clock of one process and are not stored.
+    is the ballot of the lease, granted for ``ttl`` seconds, until ``lease_until``.  ``released`` is the highest
+    released ballot.  ``token`` is the fencing token; ``grantee`` is the proposer to which this acceptor granted it, or
+    empty if other acceptors reported the token.  ``value`` was accepted under ``accepted``; if that is ``NO_BALLOT``,
+    ``value`` is the newest configuration known here and ``proof`` its certificate.  Times are on the clock of one
+    process and are not stored.
     """
 
     ceiling: Ceiling
@@ -85,7 +86,7 @@ class Register:
 
     def record_token(self, token: int, grantee: ProposerName = "") -> None:
         """Record a token that other acceptors granted, to ``grantee`` if known."""
-        if token > self.token:  # T1: the token never falls
+        if token > self.token:  # T1: the token never decreases
             self.token, self.grantee = token, grantee
 
     def restart_leases(self, now: float, lives: int) -> None:

@@ -15,8 +15,8 @@ from middleware.entangled.quorum.ballot import NO_BALLOT, majority
 from middleware.entangled.quorum.register import Reply, ReplyKind
 
 MIN_TRIES = 3
-"""Minimum number of requests to a member: a majority would be enough, but a member that missed a renewal may promise to
-another proposer."""
+"""The minimum number of requests to a member.  The round needs only a majority, but a member that missed a renewal may
+promise to another proposer."""
 RETRY_INTERVAL_S = 0.1
 """Seconds between two requests to a member that has not answered."""
 NEWS_INTERVAL_S = 0.03
@@ -25,11 +25,14 @@ MIN_PAUSE_S = 0.005
 """Minimum seconds before the next request to a member with a lease about to expire."""
 
 Decode = Callable[[int, object], "Sequence[Reply | None] | None"]
-"""Decodes (place, answer) of a member to one reply per tally; None if the answer is invalid."""
+"""Called with a member's place and answer; returns one reply per tally, or None if the answer is invalid."""
 
 
 class Tally:
-    """The replies of a quorum of ``size`` members about one register; replies of ``kinds`` agree."""
+    """The replies of a quorum of ``size`` members about one register; replies of these ``kinds`` agree to the request.
+
+    The place of a member is its index in the list of members.
+    """
 
     def __init__(self, size: int, kinds: tuple[ReplyKind, ...] = (ReplyKind.GRANTED,)) -> None:
         self.replies: dict[int, Reply] = {}
@@ -39,7 +42,7 @@ class Tally:
         self.needed = majority(size)  # Q1
 
     def add(self, place: int, reply: Reply | None) -> None:
-        """Count the reply of one member, which counts once (Q1); None for an unreachable member."""
+        """Add the reply of one member, None if it is unreachable; each member is counted once (Q1)."""
         if reply is None:
             self._unreachable.add(place)
         else:
@@ -71,7 +74,7 @@ class Tally:
 
     @property
     def value_to_complete(self) -> Any:
-        """The value accepted under the highest ballot among agreeing members, which must be proposed; or None."""
+        """The value that must be proposed: accepted under the highest ballot among agreeing members; or None."""
         accepted = [reply for place in self.agreeing_places if (reply := self.replies[place]).accepted != NO_BALLOT]
         return max(accepted, key=lambda reply: reply.accepted).value if accepted else None  # A2
 
@@ -82,13 +85,14 @@ class Tally:
 
 
 class Round:
-    """Fires ``outcome`` with itself as soon as each of its ``tallies`` is decided.
+    """One request to all members; fires ``outcome`` with this round as soon as each of its ``tallies`` is decided.
 
-    ``ask`` sends the request to the member of a place.  If another proposer's lease at a member ends within ``short``
-    seconds, the request is repeated then, or sooner if that is long.  ``outcome`` also fires, undecided, when all
-    members have answered, after ``timeout_s`` seconds, and shortly after a majority has answered.  A silent member is
-    asked every ``RETRY_INTERVAL_S`` seconds until the round is decided, and at least ``MIN_TRIES`` times.  With
-    ``single`` it is asked once, the transport retransmits, and a failure counts as its answer.
+    ``ask`` sends the request to the member at a place.  If another proposer's lease at a member ends within ``short``
+    seconds, the request is repeated when the lease ends, or earlier if that takes long.  ``outcome`` also fires,
+    undecided, when all members have answered, after ``timeout_s`` seconds, and shortly after a majority has answered.
+    A silent member is asked every ``RETRY_INTERVAL_S`` seconds until the round is decided, and at least ``MIN_TRIES``
+    times.  With ``single`` the round sends one request to each member, the transport retransmits the request, and a
+    failure is treated as the member's answer.
     """
 
     def __init__(
@@ -137,14 +141,14 @@ class Round:
 
     @property
     def silent_places(self) -> list[int]:
-        """The places without an answer after ``MIN_TRIES`` requests."""
+        """The places of the members that have not answered after ``MIN_TRIES`` requests."""
         return [
             place for place in range(self.tally.size) if place not in self._answer_times and self._attempts >= MIN_TRIES
         ]
 
     @property
     def sent_at(self) -> float:
-        """The time at which the request to a majority was sent, and so the earliest start of its grants (L5)."""
+        """The time when the request to a majority was sent; the grants of this majority do not start earlier (L5)."""
         times = sorted((self._sent_times[place] for place in self.tally.agreeing_places), reverse=True)
         return times[self.tally.needed - 1]
 
@@ -158,10 +162,10 @@ class Round:
     def estimate_wait(self) -> float:
         """Return the estimated seconds until a majority may be free to agree.
 
-        The time of a member's reply is taken as half way between its request and its arrival.
+        A member is assumed to have replied half way between the request and the arrival of the reply.
         """
         free_at = {p: (sent + received) / 2 + left for p, (sent, received, left) in self._answer_times.items()}
-        # Silent members are not counted as free, unless all are silent: then ask at once.
+        # Silent members are not counted as free, unless all members are silent: then ask again immediately.
         unknown = math.inf if self.tally.replies else -math.inf
         waits = sorted(free_at.get(place, unknown) for place in range(self.tally.size))
         return max(0.0, waits[self.tally.needed - 1] - self._clock.seconds()) if waits else 0.0
@@ -203,7 +207,7 @@ class Round:
         if self._is_closed or all(tally.is_decided for tally in self.tallies):
             self._fire_outcome()
         elif len(self._sent_times) == self.tally.needed and not self._single and not self.outcome.called:
-            # The other members decide; a member that is down must not delay a proposer that lost to another.
+            # The answers of the other members decide; a member that is down must not delay a proposer that lost.
             if self._end_timer is not None and self._end_timer.active():
                 self._end_timer.cancel()
             self._end_timer = self._clock.callLater(min(RETRY_INTERVAL_S, self._patience), self._finish)

@@ -1,7 +1,7 @@
-"""Batching of a node's own records on the way to their replicas.
+"""Batching of a node's own records for their replicas.
 
-After Nagle (RFC 896): while a replica has not answered the last request, further records wait and then share one
-request.  A single write is not delayed, and many writes share datagrams.
+As in Nagle's algorithm (RFC 896), further records wait until the replica has answered the last request, and are then
+sent in one request.  A single write is therefore not delayed, and many writes share datagrams.
 """
 
 from __future__ import annotations
@@ -17,9 +17,9 @@ from middleware.entangled.kademlia.overlay import Overlay
 from middleware.entangled.record import Record
 
 MAX_LOAD_BYTES = 1300
-"""Bytes of records in one datagram."""
+"""The maximum bytes of records in one datagram."""
 MAX_WAITING = 2048
-"""Maximum records that wait for one replica."""
+"""The maximum number of records that wait for one replica."""
 
 
 Waiting = deque[tuple[Record, Deferred[object]]]
@@ -37,7 +37,8 @@ class RecordBatcher:
     async def store(self, contact: Contact, record: Record, lifetime_s: float | None = None) -> object:
         """Send STORE for ``record`` and return the reply; raise the errors of the request.
 
-        A record of another owner, with ``lifetime_s`` seconds of remaining lifetime, is sent at once by itself.
+        If ``lifetime_s`` (the remaining lifetime in seconds) is given, another node owns the record, and the record is
+        sent immediately in its own request.
         """
         if lifetime_s is not None:
             return (await self._send(contact, [record], [lifetime_s]))[0]
@@ -46,7 +47,9 @@ class RecordBatcher:
         waiting = self._waiting.get(contact.node_id)
         if waiting is not None:
             if len(waiting) >= MAX_WAITING:
-                raise Crowded(f"more than {MAX_WAITING} records wait for {contact.address}; write more slowly")
+                raise Crowded(
+                    f"the limit of {MAX_WAITING} records that wait for {contact.address} is reached; write more slowly"
+                )
             result: Deferred[object] = Deferred()
             waiting.append((record, result))
             return await result
@@ -63,14 +66,14 @@ class RecordBatcher:
     # -- inside -----------------------------------------------------------------------------------------------------
 
     def _finish_request(self, waiting: Waiting, contact: Contact) -> None:
-        """Send the next request after the last one ended, if records wait."""
+        """Send the next request after the last request ended, if records wait."""
         if waiting:
             self._background.fork(self._send_next(waiting, contact))
         else:
             del self._waiting[contact.node_id]
 
     def _send_all(self, waiting: Waiting, contact: Contact) -> None:
-        """Send all waiting records at once after a request was not answered."""
+        """Send all waiting records immediately, after a request was not answered."""
         while waiting:
             self._background.fork(self._deliver(contact, _take_batch(waiting)))
 
@@ -89,7 +92,7 @@ class RecordBatcher:
         except Refused as error:
             if len(load) == 1:
                 load[0][1].errback(error)
-            else:  # send each by itself, so that only the refused one fails
+            else:  # send each record separately, so that only the rejected record fails
                 for one in load:
                     self._background.fork(self._deliver(contact, [one]))
         except EntangledError as error:
@@ -105,7 +108,7 @@ class RecordBatcher:
         packed = [record.pack() for record in records]
         answer = await self._overlay.ask(contact, "store", packed, *lives, changes=True)
         if not isinstance(answer, list) or len(answer) != len(records):
-            raise Refused(f"{contact.address} refuses the record")
+            raise Refused(f"{contact.address} rejects the record")
         return answer
 
 

@@ -1,6 +1,7 @@
 """Cached copies of popular records on the lookup path to their replicas (Kademlia, section 2.3).
 
-A copy is no replica: it counts in no majority, is never handed over, is kept in memory only, and is evicted first.
+A cached copy is not a replica: it is not counted in majorities, is never handed over, is stored only in memory, and is
+evicted first.
 """
 
 from __future__ import annotations
@@ -10,11 +11,14 @@ from middleware.entangled.record import Record
 MAX_KEYS = 256
 MAX_BYTES = 256 * 1024
 MAX_AGE_S = 60.0
-"""Seconds that a copy is kept at the node next to the closest; each node in between halves it."""
+"""The maximum age of a copy in seconds, at the node next to the closest one.  Each node in between halves the age."""
 
 
 class PathCache:
-    """The cached copies of one node, at most ``MAX_KEYS`` keys and ``MAX_BYTES``, with least-recently-read eviction."""
+    """The cached copies of one node; the least recently read key is evicted first.
+
+    There are at most ``MAX_KEYS`` keys and ``MAX_BYTES`` bytes.
+    """
 
     def __init__(self) -> None:
         self._copies: dict[bytes, tuple[float, int, list[Record]]] = {}

@@ -1,4 +1,4 @@
-"""The records that this node and a peer should both hold: digests of parts, lists of slots, and pages of records.
+"""The records that this node and a peer should both store: digests of groups, lists of slots, and pages of records.
 
 Answers DIGESTS, PLACES, FETCH and LACKING; ``handover`` sends these requests.
 """
@@ -20,16 +20,18 @@ from middleware.entangled.replication.watch import digest_of
 from middleware.entangled.wire.endpoint import Endpoint
 
 GROUPS = 16
-"""Parts of the id space with a digest each, so that a difference in one does not require comparing all."""
+"""The number of groups into which the id space is divided.  Each group has a digest, so if one group differs, only its
+slots are compared."""
 PAGE_RECORDS = 12
-"""Maximum slots or records in one message."""
+"""The maximum number of slots or records in one message."""
 SNAPSHOT_S = 2.0
-"""Seconds that a snapshot of the slots is kept for a peer after its request for digests."""
+"""Seconds for which a snapshot of the slots is stored for a peer after its request for digests."""
 MAX_SNAPSHOTS = 8
 MAX_PEERS = 1024
-"""Peers whose last request is remembered; the oldest is dropped first."""
+"""The number of peers whose last request is remembered; the oldest is dropped first."""
 SIGNATURE_BITS = 512
-"""Bits of a signature; the requester picks one at random to select the records in a sum of lifetimes."""
+"""The number of bits of a signature.  The requester chooses a random bit, and only records with this bit set in their
+signature are included in a sum of lifetimes."""
 
 Mark = tuple[int, bytes]
 """Version of a slot: the record's sequence and the first bytes of its signature; (-1, b"") if empty."""
@@ -38,8 +40,8 @@ Mark = tuple[int, bytes]
 class Comparison:
     """The team records of one node as its peers see them.
 
-    ``requested_at`` maps peers to the time of their last request for digests; ``standing`` returns this node's sync
-    state.
+    ``requested_at`` maps peers to the time of their last request for digests; ``get_sync_state`` returns this node's
+    sync state.
     """
 
     def __init__(self, replica: Replica, overlay: Overlay, endpoint: Endpoint, clock: IReactorTime) -> None:
@@ -58,7 +60,7 @@ class Comparison:
         endpoint.expose("lacking", self._answer_lacking)
 
     def find_shared(self, peer: Contact) -> tuple[list[list[Record]], list[Record]]:
-        """Return the records that both nodes should hold, by parts, and the records only the peer should hold."""
+        """Return the records that both nodes should store, by groups, and the records for the peer only."""
         groups: list[list[Record]] = [[] for _ in range(GROUPS)]
         extra = []
         if self._members_version != self._overlay.members.version or not self._overlay.is_complete:
@@ -76,11 +78,11 @@ class Comparison:
         return groups, extra
 
     def sum_lifetimes(self, group: list[Record], bit: int) -> int:
-        """Return the whole seconds left, summed over the records of ``group`` with ``bit`` set in their signature.
+        """Return the sum of the remaining whole seconds of the records in ``group`` with ``bit`` set in the signature.
 
-        The owner does not sign the remaining lifetime, so the digest cannot cover it.  A node that reported a short
-        lifetime to one replica could balance a sum over all records by its own records, but not a sum over a random
-        subset.
+        The owner does not sign the remaining lifetime, so the digest does not contain it.  A malicious node that
+        reported a short lifetime to one replica could compensate this in a sum over all records with records of its
+        own, but not in a sum over a random subset.
         """
         byte, mask = bit >> 3, 1 << (bit & 7)
         return sum(
@@ -92,12 +94,12 @@ class Comparison:
     # -- requests of peers ---------------------------------------------------------------------------------------------
 
     def _answer_digests(self, peer: Contact, bit: int, sync_state: int) -> list[object]:
-        """DIGESTS: the digest of each part, the number of records that only the peer should hold, and the lifetimes.
+        """Answer DIGESTS: return each group's digest, the number of records for the peer only, and the lifetimes.
 
-        Both nodes exchange their sync states as well.
+        The two nodes also exchange their sync states.
         """
         if not 0 <= bit < SIGNATURE_BITS:
-            raise Refused(f"a signature has the bits 0 to {SIGNATURE_BITS - 1}")
+            raise Refused(f"the bit of a signature must be from 0 to {SIGNATURE_BITS - 1}")
         *groups, extra = self._make_snapshot(peer)
         self.requested_at.pop(peer.node_id, None)
         self.requested_at[peer.node_id] = self._clock.seconds()
@@ -108,12 +110,15 @@ class Comparison:
         return [[digest_of(group) for group in groups], len(extra), lives, self.get_sync_state()]
 
     def _answer_places(self, peer: Contact, group: int, after: list[object]) -> list[object]:
-        """PLACES: a page of slots with marks in one part (-1: records for the peer only), in order."""
+        """Answer PLACES: return a sorted page of slots with marks in one group.
+
+        The group -1 contains the records that only the peer should store.
+        """
         if not -1 <= group < GROUPS:
-            raise Refused(f"a group is a number from -1 to {GROUPS - 1}")
+            raise Refused(f"the group must be a number from -1 to {GROUPS - 1}")
         cursor = parse_slot(after)
         if after and cursor is None:
-            raise Refused("a page begins after a key, an owner and a name")
+            raise Refused("the start of a page must be empty or a key, an owner and a name")
         listed_at, lists = self._snapshots.get(peer.node_id, (-SNAPSHOT_S, []))
         if self._clock.seconds() - listed_at >= SNAPSHOT_S:
             lists = self._make_snapshot(peer)
@@ -125,13 +130,13 @@ class Comparison:
         ]
 
     def _answer_fetch(self, peer: Contact, slots: list[object]) -> list[object]:
-        """FETCH: the record in each slot and its seconds left, or None; cut to one page."""
+        """Answer FETCH: return the record in each slot and its remaining seconds, or None, up to one page."""
         page: list[object] = []
         size = 0
         for place in slots[:PAGE_RECORDS]:
             slot = parse_slot(place)
             if slot is None:
-                raise Refused("a slot is a key, an owner and a name")
+                raise Refused("a slot must consist of a key, an owner and a name")
             record = self._replica.get_visible(slot)
             size += 0 if record is None else record.message_bytes
             if page and size > PAGE_BYTES:
@@ -140,29 +145,34 @@ class Comparison:
         return page
 
     def _answer_lacking(self, peer: Contact, places: list[object]) -> list[bool]:
-        """LACKING: whether the record of each given slot and mark is newer than the local one."""
+        """Answer LACKING: return for each given slot and mark whether that record is newer than the local record."""
         answer = []
         for place in places[:PAGE_RECORDS]:
             if not (isinstance(place, list) and [type(part) for part in place] == [bytes, bytes, str, int, bytes]):
-                raise Refused("a place is a key, an owner, a name, a number and a signature's first bytes")
+                raise Refused(
+                    "an item must consist of a key, an owner, a name, a number and the first bytes of a signature"
+                )
             answer.append((place[3], place[4]) > mark_of(self._replica.get_visible(Slot(*place[:3]))))
         return answer
 
     # -- inside -----------------------------------------------------------------------------------------------------
 
     def _make_snapshot(self, peer: Contact) -> list[list[Record]]:
-        """Return ``find_shared`` as sorted lists, records for the peer only last; keep them as its snapshot."""
+        """Return ``find_shared`` as sorted lists, and store them as the snapshot for ``peer``.
+
+        The last list contains the records that only the peer should store.
+        """
         groups, extra = self.find_shared(peer)
         lists = [sorted(records, key=lambda record: record.slot) for records in (*groups, extra)]
         now = self._clock.seconds()
         self._snapshots.pop(peer.node_id, None)
         for other, (at, _) in list(self._snapshots.items()):
             if now - at >= SNAPSHOT_S or len(self._snapshots) >= MAX_SNAPSHOTS:
-                del self._snapshots[other]  # snapshots keep replaced records in memory
+                del self._snapshots[other]  # because snapshots keep replaced records in memory
         self._snapshots[peer.node_id] = (now, lists)
         return lists
 
 
 def mark_of(record: Record | None) -> Mark:
-    """Return the version mark of ``record``; a newer record has a higher one."""
+    """Return the version mark of ``record``; a newer record has a higher mark."""
     return (-1, b"") if record is None else (record.sequence, record.signature[:8])

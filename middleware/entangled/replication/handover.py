@@ -1,9 +1,10 @@
 """Transfer of records between replicas as nodes join, leave and return (anti-entropy).
 
-Two nodes *reconcile*: they compare digests of the records that both should hold, then the slots of parts that differ,
-and each sends the other the newer records.  A node reconciles with each new node, and periodically with a random one.
-A node that is new or was away is not *synced* until it has reconciled with a majority; until then its replies count in
-no majority.  When a node is lost, its records are sent to the next closest node.
+Two nodes *reconcile* their records: they compare digests of the records that both should store, then the slots of the
+groups that differ, and each node sends the newer records to the other.  A node reconciles with each new node, and
+periodically with a random node.  A node that is new or was absent is not *synced* until it has reconciled with a
+majority.  Until then its replies are not counted in majorities.  When a node is lost, its records are sent to the next
+closest node.
 """
 
 from __future__ import annotations
@@ -33,16 +34,18 @@ from middleware.entangled.wire.endpoint import Endpoint
 FIRST_REPLICAS = 2
 RECONCILE_INTERVAL_S = 10.0
 MAX_SILENCE_S = ABSENT_WITH_MAJORITY_S / 2
-"""Seconds without contact to a majority after which this node may have been removed, and is no longer synced."""
+"""Seconds without contact to a majority after which this node is no longer synced, because the other nodes may have
+removed it from the voters."""
 CHECK_INTERVAL_S = 1.0
 LIFETIME_SLACK_S = 60.0
-"""Seconds by which the remaining lifetime named by another replica must exceed the local one to extend it: a transfer
-does not age a record, but may take seconds."""
+"""Seconds by which the remaining lifetime at another replica must exceed the local remaining lifetime to extend it.
+The slack is needed because the time of a transfer, which may be seconds, is not subtracted from the lifetime."""
 LIFETIME_SUM_SLACK_S = 1800
-"""Seconds by which the summed lifetimes of a part may differ before its slots are compared."""
+"""Seconds by which the sums of lifetimes of a group may differ before the slots of the group are compared."""
 CONTACTS_INTERVAL_S = 0.1
 NEW_NODE_DELAY_S = 1.0
-"""Seconds that a new node gets to catch up by itself; up to twice as many, by random delay."""
+"""Seconds for which a new node may catch up by itself, before this node reconciles with it.  The delay is random, up to
+twice this value."""
 
 
 class Handover:
@@ -81,7 +84,7 @@ class Handover:
     def start(self, forgot: bool = False) -> None:
         """Start the periodic reconciliation, and the check for contact to a majority.
 
-        ``forgot``: the node dropped the records of its earlier run, which other nodes may still count on.
+        ``forgot``: the node dropped the records of its earlier run, although other nodes may rely on them.
         """
         self._sync_state.start(forgot)
         self._overlay.members.is_voter = self._sync_state.value != NEVER_SYNCED
@@ -90,20 +93,20 @@ class Handover:
         self._background.every(CHECK_INTERVAL_S, self._check_contact)
 
     def is_synced(self) -> bool:
-        """Return whether this node has caught up with the others and has been in contact with a majority since."""
+        """Return whether this node has caught up with the other nodes, and has stayed in contact with a majority."""
         if self._sync_state.is_synced and self._clock.seconds() - self._contact_at > MAX_SILENCE_S:
             self._lose_sync()
         return self._sync_state.is_synced
 
     def start_catch_up(self) -> None:
-        """Catch up with the other nodes after the join; a node alone in its network is synced at once."""
+        """Catch up with the other nodes after the join; a node alone in its network is synced immediately."""
         if not len(self._overlay.members) and not self._overlay.members.list_absent():
             self._become_synced()
         else:
             self._background.fork(self._catch_up())
 
     def handle_new_contact(self, contact: Contact) -> None:
-        """Reconcile with a new node after a delay, unless it has done so by itself."""
+        """Reconcile with a new node after a delay, unless the new node has reconciled with this node by then."""
         if self._is_near(contact):
             self._background.later(
                 NEW_NODE_DELAY_S * (1 + self._rng.random()), self._reconcile_if_new, contact, self._clock.seconds()
@@ -128,7 +131,7 @@ class Handover:
             self._background.fork(self._send_all(successor, records))
 
     def record_republication(self, record: Record) -> None:
-        """Note that another node has just republished ``record``, so this node need not."""
+        """Note that another node has just republished ``record``, so this node need not republish it."""
         self._stored_at[record.slot] = self._clock.seconds()
 
     # -- inside -----------------------------------------------------------------------------------------------------
@@ -141,15 +144,15 @@ class Handover:
             self._background.fork(self._reconcile(contact))
 
     def _is_near(self, contact: Contact) -> bool:
-        """Return whether this node and ``contact`` may share records."""
+        """Return whether this node and ``contact`` may be replicas of the same keys."""
         return self._overlay.is_complete or contact in self._near_nodes()
 
     def _near_nodes(self) -> list[Contact]:
-        """Return the nodes that may share records with this one."""
+        """Return the nodes that may be replicas of the same keys as this node."""
         return self._overlay.members.list_live() if self._overlay.is_complete else self._overlay.find_neighbours()
 
     async def _reconcile(self, contact: Contact) -> None:
-        """Exchange with ``contact`` the records that either lacks."""
+        """Exchange with ``contact`` the records that one of the two nodes lacks."""
         if contact.node_id in self._reconciling:
             return
         self._reconciling.add(contact.node_id)
@@ -164,7 +167,7 @@ class Handover:
             )
             own, for_peer = self._comparison.find_shared(contact)
             if not (_is_list_of(digests, bytes) and _is_list_of(lives, int)):
-                raise Refused(f"{contact.address} sends an invalid reply to digests")
+                raise Refused(f"{contact.address} sent an invalid answer to the request 'digests'")
             for group, (digest, life) in enumerate(zip(digests, lives, strict=True)):
                 is_longer = life > self._comparison.sum_lifetimes(own[group], bit) + LIFETIME_SUM_SLACK_S
                 if is_longer or digest != digest_of(own[group]):
@@ -198,9 +201,9 @@ class Handover:
         await self._send_all(contact, newer)
 
     def _extend_life(self, slot: Slot, mark: Mark, left: float) -> None:
-        """Extend the life of the record in ``slot`` to ``left`` seconds, if it has this mark and expires earlier.
+        """Extend the lifetime of the record in ``slot`` to ``left`` seconds, if it has this mark and expires earlier.
 
-        The longest lifetime named by any replica wins; a short one ends nothing.
+        The longest lifetime that any replica reports is used; a shorter lifetime has no effect.
         """
         record = self._replica.get_visible(slot)
         if record is None or record.lifetime != "team" or mark_of(record) != mark:
@@ -219,7 +222,7 @@ class Handover:
             wanted = wanted[len(page) :] if page else []
 
     def _store_fetched(self, slot: Slot, found: object) -> None:
-        """Store a fetched record if it is valid and beats the local one."""
+        """Store a fetched record if it is valid and supersedes the local record."""
         fields, left = found if isinstance(found, list) and len(found) == 2 else (None, None)
         record = parse_record(fields)
         if record is None or record.slot != slot or type(left) is not float or record.lifetime != "team":
@@ -228,9 +231,9 @@ class Handover:
             self._replica.store_locally(record, left)
 
     async def _send_lacking(self, contact: Contact, records: list[Record]) -> None:
-        """Send ``contact`` the records that it lacks and this node should not hold.
+        """Send ``contact`` the ``records`` that it lacks; only ``contact`` should store them, not this node.
 
-        Once it has all of them, it is not asked again until there are others.
+        Once ``contact`` has all of them, this node asks it again only when the set of these records changes.
         """
         digest = digest_of(records)
         if not records or self._sent_digests.get(contact.node_id) == digest:
@@ -240,19 +243,19 @@ class Handover:
             places = [[*record.slot, *mark_of(record)] for record in page]
             answer = await self._overlay.ask(contact, "lacking", places)
             if not (isinstance(answer, list) and len(answer) == len(page)):
-                raise Refused(f"{contact.address} sends an invalid reply to lacking")
+                raise Refused(f"{contact.address} sent an invalid answer to the request 'lacking'")
             await self._send_all(contact, [record for record, lacks in zip(page, answer, strict=True) if lacks])
         self._sent_digests[contact.node_id] = digest
 
     async def _send_all(self, contact: Contact, records: list[Record]) -> None:
-        """Store ``records`` at ``contact``, page by page; ignore refusals, as for lack of room."""
+        """Store ``records`` at ``contact``, page by page; ignore rejections, for example because its store is full."""
         for page in split_pages(records, PAGE_RECORDS):
             lives = [self._replica.remaining_lifetime(record) for record in page]
             with suppress(Refused):
                 await self._overlay.ask(contact, "store", [r.pack() for r in page], lives, changes=True)
 
     async def _catch_up(self) -> None:
-        """Reconcile with near nodes until their number implies that no acknowledged record is missing."""
+        """Reconcile with near nodes until they are enough to guarantee that no acknowledged record is missing."""
         if self._is_catching_up:
             return
         self._is_catching_up = True
@@ -263,7 +266,7 @@ class Handover:
                     continue
                 began = self._clock.seconds()
                 others = self._near_nodes()
-                # The first nodes have most records; the others need not send those again.
+                # The first nodes have most records, which the other nodes then need not send again.
                 reached = [await self._try_reconcile(contact) for contact in others[:FIRST_REPLICAS]]
                 work = [Deferred.fromCoroutine(self._try_reconcile(contact)) for contact in others[FIRST_REPLICAS:]]
                 reached += [await each for each in work]
@@ -288,14 +291,14 @@ class Handover:
         return self._sync_state.value
 
     def _become_synced(self) -> None:
-        """Mark this node as synced, and announce it if that is the first time."""
+        """Mark this node as synced; the first time, announce this to the other nodes."""
         self._overlay.members.is_voter = True
         if self._sync_state.set_synced() and not self._overlay.is_large:
             for contact in self._overlay.members.list_live():
                 self._background.fork(self._overlay.ask(contact, "settled", changes=True))
 
     def _answer_settled(self, peer: Contact) -> None:
-        """SETTLED: count the peer, which has caught up for the first time, as a voter."""
+        """Answer SETTLED: record that the peer has caught up for the first time and is now a voter."""
         self._overlay.members.set_voter(peer.node_id)
 
     def _lose_sync(self) -> None:
@@ -321,7 +324,7 @@ class Handover:
         slots = {record.slot for record in records}
         self._stored_at = {slot: at for slot, at in self._stored_at.items() if slot in slots}
         for record in records:
-            # At random times, so that one replica republishes and the others see it.
+            # Replicas republish at random times, so that one replica republishes and the other replicas notice it.
             due = (
                 self._stored_at.setdefault(record.slot, now - self._rng.random() * REPUBLISH_INTERVAL_S / 2)
                 + REPUBLISH_INTERVAL_S
@@ -342,7 +345,7 @@ def _is_list_of(parts: object, kind: type) -> bool:
 
 
 def _parse_entry(fields: object) -> tuple[Slot, Mark, float] | None:
-    """Parse an entry of a PLACES reply: slot, mark, seconds left; None if malformed."""
+    """Parse an item of an answer to PLACES: slot, mark and remaining seconds; None if it is malformed."""
     if not isinstance(fields, list) or [type(part) for part in fields[3:]] != [int, bytes, int]:
         return None
     slot = parse_slot(fields[:3])

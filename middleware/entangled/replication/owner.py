@@ -1,7 +1,7 @@
 """Writing and maintenance of a node's own records.
 
-The owner numbers and signs them, stores them at their replicas until the consistency level is met and then at the
-rest, renews leases, and restores records that replicas have lost.
+The owner numbers and signs its records and stores them at their replicas: first at as many as the consistency level
+requires, then at the remaining replicas.  It also renews leases, and restores records that replicas have lost.
 """
 
 from __future__ import annotations
@@ -32,27 +32,28 @@ from middleware.entangled.wire.endpoint import Endpoint
 ConsistencyLevel = Literal["one", "majority", "all"]
 """Consistency level: the number of replicas that must store a record before ``put`` succeeds."""
 RETRY_INTERVAL_S = 10.0
-"""Seconds between attempts to store a record at replicas that missed it."""
+"""Seconds between two attempts to store a record at replicas that have not received it."""
 REPUBLISH_INTERVAL_S = 3600.0
 """Seconds between two publications of a team record by its owner: 24 per lifetime (Kademlia, section 2.5).  A replica
-republishes a record that no other node republished for as long."""
+republishes a record that no other node has republished for this time."""
 RENEWALS_PER_LEASE = 3
 RENEWAL_TOLERANCE_S = 1e-6
-"""Seconds that a renewal may be early, for rounding errors in sums of times."""
+"""Seconds by which a renewal may be early, to tolerate rounding errors in sums of times."""
 MAX_ATTEMPTS = 3
 UNSYNCED_RETRIES_S = (0.1, 0.2, 0.4, 0.8)
-"""Seconds between repeated requests to a voter that is not synced yet."""
+"""The seconds before each repeated request to a voter that is not synced yet."""
 MAX_PARALLEL = 32
-"""Own records republished at the same time; more finish earlier but delay other requests."""
+"""The number of own records that are republished at the same time.  With more, all records are republished earlier, but
+other requests are delayed."""
 MIN_TWO_WAVES_BYTES = 2**16
-"""Bytes of a value from which its copies are sent in two waves."""
+"""The size of a value in bytes from which its copies are sent in two waves."""
 SECOND_WAVE_S = 0.5
-"""Seconds after which the second wave is sent even if the first has not finished."""
+"""Seconds after which the second wave is sent even if the first wave has not finished."""
 OWNER_FAULT_CODES = (ROLE, OWNER_FULL)
-"""Codes of refusals caused by the owner of the record, not by the replica."""
+"""The codes of rejections that are caused by the owner of the record, not by the replica."""
 SEQUENCES_NOTE = "sequences"
 SEQUENCE_BLOCK = 1024
-"""Sequence numbers reserved by one note in the store, so that not every write has to write one."""
+"""The number of sequence numbers that one note in the store reserves, so that not every write needs a note."""
 
 
 class Stored(int):
@@ -114,7 +115,7 @@ class Owner:
         self._background.every(RETRY_INTERVAL_S, self._republish)
 
     def set_lease(self, lease: float) -> None:
-        """Set the duration of own leases to ``lease`` seconds and renew them at once."""
+        """Set the duration of own leases to ``lease`` seconds and renew them immediately."""
         self._lease = lease
         self._due_at.clear()
         if self._cancel_renewal is not None:
@@ -153,7 +154,7 @@ class Owner:
         """Return the next signed record for the own slot (key, name), and maintain it from now on.
 
         A ``lease`` in seconds applies if it is longer than the node's.  Raises ``Conflict`` if the sequence number of
-        the slot is not ``expect``; ``read`` is the record that other nodes hold there.
+        the slot is not ``expect``; ``read`` is the record that other nodes store in the slot.
         """
         slot = Slot(key, self._identity.public, name)
         held = (self._own.get(slot), self._store.get_slot(slot), read)
@@ -170,8 +171,9 @@ class Owner:
     async def put(self, record: Record, concern: ConsistencyLevel = "majority") -> Stored:
         """Store ``record`` at its replicas, as many as ``concern`` requires.
 
-        If the replicas hold a higher sequence number, from an earlier run of this node, the record gets a higher one.
-        Raises ``NotAcknowledged`` if too few replicas answer; the record is stored at the others when they return.
+        If the replicas store a record of an earlier run of this node with a higher sequence number, the new record gets
+        a number above that.  Raises ``NotAcknowledged`` if too few replicas answer; the record is stored at the missing
+        replicas when they return.
         """
         for _ in range(MAX_ATTEMPTS):
             held, newest = await self.store_everywhere(record, concern)
@@ -180,15 +182,18 @@ class Owner:
             current = self._own.get(record.slot, record)
             if current.sequence <= newest:
                 current = self._sign(replace(current, sequence=self._next_sequence(newest)))
-            # If a newer value was put meanwhile, store that one.
+            # If the application has put a newer value during the attempt, store the newer value.
             record = current
-        raise NoAnswer(f"replicas still hold a higher sequence number after {MAX_ATTEMPTS} attempts; put again")
+        raise NoAnswer(
+            f"replicas still have a higher sequence number after {MAX_ATTEMPTS} attempts; put the value again"
+        )
 
     async def store_everywhere(self, record: Record, concern: ConsistencyLevel = "majority") -> tuple[int, int]:
-        """Store at all replicas; return the number that stored it, and the highest conflicting sequence (0: none).
+        """Store ``record`` at all replicas.
 
-        Raises ``NotAcknowledged`` if too few stored it and there was no conflict; ``Refused`` if the reason is the
-        owner's role or its share of the store.
+        Returns the number of replicas that stored the record, and the highest conflicting sequence number (0: none).
+        Raises ``NotAcknowledged`` if too few replicas stored it and there was no conflict.  Raises ``Refused`` if the
+        reason is the owner's role or its share of the store.
         """
         if concern != "one":
             await self._overlay.wait_for_members()
@@ -246,13 +251,13 @@ class Owner:
         if votes < needed and not newest:
             if forbidden:
                 if forbidden[0].code == ROLE:
-                    self._forget(record.slot)  # a retry would be refused again
+                    self._forget(record.slot)  # a retry would be rejected again
                 raise forbidden[0]
             raise NotAcknowledged(votes, needed)
         return held, newest
 
     async def store_at(self, contact: Contact, record: Record, left: float | None = None) -> StoreReply:
-        """Store at one replica; return STORED, UNSYNCED or SUPERSEDED.  Raises ``Refused``.
+        """Store ``record`` at one replica; return STORED, UNSYNCED or SUPERSEDED; raise ``Refused``.
 
         ``left`` is the remaining lifetime in seconds of a record that this node does not own.
         """
@@ -263,37 +268,37 @@ class Owner:
         if reply is not None and (reply.is_stored or outcome is Outcome.SUPERSEDED):
             return reply
         if outcome is Outcome.FORBIDDEN:
-            raise Refused(f"{contact.address} refuses {record.name!r} of its owner: {explain(ROLE)}", ROLE)
+            raise Refused(f"{contact.address} rejects the record {record.name!r}: {explain(ROLE)}", ROLE)
         if outcome is Outcome.NO_ROOM:
-            text = f"{contact.address} has no more room for the owner of {record.name!r}; remove some of its records"
+            text = f"{contact.address} has no space for the owner of {record.name!r}; remove records of this owner"
             raise Full(text, OWNER_FULL)
-        raise Refused(f"{contact.address} refuses the record")
+        raise Refused(f"{contact.address} rejects the record")
 
     def remaining_lifetime(self, record: Record) -> float | None:
-        """Return the seconds for which a receiver is to keep ``record``; None for an own one: its whole ttl."""
+        """Return the seconds for which a receiver must store ``record``; None (its whole ttl) for an own record."""
         return None if record.owner == self._identity.public else self._replica.remaining_lifetime(record)
 
     def handle_new_contact(self, contact: Contact) -> None:
-        """Store at a new node the own leased records it should hold; it fetches team records by itself."""
+        """Store at a new node the own leased records for which it is a replica; it fetches team records by itself."""
         lacking = [r for r in self._list_leased() if self._overlay.is_replica(r.key, contact)]
         if lacking:
             self._background.fork(self._send(contact, lacking))
 
     def restore(self, record: Record) -> bool:
-        """Store an own record again that expired here because of a late timer; return whether it is an own one."""
+        """Store ``record`` again if this node owns it and a late timer let it expire; return whether it is own."""
         own = self._own.get(record.slot)
         if own is None:
             return False
-        with suppress(Refused):  # no room here; other replicas may have some
+        with suppress(Refused):  # this node's store is full; other replicas may have space
             self._replica.store_locally(own)
         return True
 
     # -- inside -----------------------------------------------------------------------------------------------------
 
     async def _store_latest(self, contact: Contact, record: Record, left: float | None) -> StoreReply:
-        """Store as ``store_at`` does; if a later record of this run supersedes ``record``, store that one instead.
+        """Store as ``store_at`` does; if a later record of this run supersedes ``record``, store the later record.
 
-        Its reply is valid for ``record`` too, and shows whether the replica is synced.
+        The reply about the later record is also valid for ``record``, and indicates whether the replica is synced.
         """
         reply = await self.store_at(contact, record, left)
         is_own = record.owner == self._identity.public and reply.outcome is Outcome.SUPERSEDED
@@ -308,7 +313,7 @@ class Owner:
     def _choose_second_wave(
         self, record: Record, targets: list[Contact], counted: list[Contact], needed: int
     ) -> frozenset[bytes]:
-        """Return the replicas that get a long record in the second wave: copies sent at once share the bandwidth."""
+        """Return the replicas that get a long record in the second wave; simultaneous copies share the bandwidth."""
         if len(record.value or b"") < MIN_TWO_WAVES_BYTES or len(counted) < needed:
             return frozenset()
         likely = self._overlay.order_by_speed(c for c in counted if c.node_id != self._identity.node_id)
@@ -317,11 +322,11 @@ class Owner:
         return frozenset(c.node_id for c in targets if c.node_id not in at_first)
 
     def _next_sequence(self, above: int) -> int:
-        """Return a sequence number above all earlier ones of this node, in any slot or run."""
+        """Return a sequence number above all earlier sequence numbers of this node, in any slot or run."""
         if not self._reserved_sequence:
             try:
                 self._last_sequence = int(self._store.get_note(SEQUENCES_NOTE) or 0)
-            except ValueError:  # a corrupt file may hold anything
+            except ValueError:  # a corrupt file may contain anything
                 self._last_sequence = 0
             self._last_sequence = max(self._last_sequence, above)
             self._first_sequence = self._last_sequence + 1
@@ -359,7 +364,7 @@ class Owner:
         return max(self._lease, self._leases.get(slot, 0.0))
 
     def _renew_due(self) -> None:
-        """Send the renewals that are due, and schedule the next ones by the shortest lease."""
+        """Send the renewals that are due, and schedule the next renewals by the shortest lease."""
         leases = [self._lease_of(record.slot) for record in self._list_leased()]
         self._period = min(leases, default=self._lease) / RENEWALS_PER_LEASE
         self._cancel_renewal = self._background.later(self._period, self._renew_due)
@@ -387,7 +392,8 @@ class Owner:
     def _send_renewals(self) -> bool:
         """Renew the own leases that are due: send each replica its lease and the digest of its records.
 
-        A replica with several leases gets the shortest.  Returns whether there are any leases.
+        If a replica has records with several lease durations, it gets the shortest duration.  Returns whether there are
+        any leases.
         """
         now = self._clock.seconds()
         due: set[bytes] = set()
@@ -408,7 +414,7 @@ class Owner:
         return held > 0 or bool(self._list_leased())
 
     def _answer_missing(self, peer: Contact, marks: list[object]) -> None:
-        """MISSING: store at ``peer`` the own leased records that it lacks, and name those it should drop."""
+        """Answer MISSING: store at ``peer`` the own leased records that it lacks, and tell it which to drop."""
         there = [
             r
             for r in self._list_leased()
@@ -431,7 +437,7 @@ class Owner:
             self._background.fork(self._republish_all(due))
 
     async def _republish_all(self, due: list[Record]) -> None:
-        """Republish ``due`` except for records that were replaced meanwhile."""
+        """Republish the records ``due``, except records that have been replaced by then."""
         self._is_republishing = True
         try:
             await run_limited(MAX_PARALLEL, (self.store_everywhere(r) for r in due if self._own.get(r.slot) is r))
@@ -439,13 +445,13 @@ class Owner:
             self._is_republishing = False
 
     async def _send(self, contact: Contact, records: list[Record]) -> None:
-        """Store own records at ``contact``, page by page, unless such a transfer to it is running."""
+        """Store own records at ``contact``, page by page, unless such a transfer to ``contact`` is already running."""
         if contact.node_id in self._transferring:
             return
         self._transferring.add(contact.node_id)
         try:
             for page in split_pages(records):
-                with suppress(Refused):  # no room for one of them; the next page may have smaller ones
+                with suppress(Refused):  # the store is full for one record; the next page may have smaller records
                     await self._overlay.ask(contact, "store", [r.pack() for r in page], changes=True)
         finally:
             self._transferring.discard(contact.node_id)

@@ -1,8 +1,9 @@
 """Requests for the certificates of record owners, to the node that sends their records.
 
-A node checks a record against its owner's certificate.  It knows most certificates from a session with the owner or
-from the team's membership list; for others, such as guests that only some members met, it asks the node that sent the
-record.  A node that cannot send a certificate is not asked again for ``RETRY_AFTER_S`` seconds, so junk costs little.
+A node checks a record against its owner's certificate.  The node knows most certificates from a session with the owner
+or from the team's membership list.  It requests any other certificate, for example the certificate of a guest with
+sessions to only some members, from the node that sent the record.  A node that cannot send a certificate is not asked
+again for ``RETRY_AFTER_S`` seconds, so invalid records cause few requests.
 """
 
 from __future__ import annotations
@@ -17,10 +18,11 @@ from middleware.entangled.wire.admission_check import FOREIGN, AdmissionCheck
 from middleware.entangled.wire.endpoint import Endpoint
 
 MAX_OWNERS = 12
-"""Owners in one request."""
+"""The maximum number of owners in one request."""
 RETRY_AFTER_S = 2.0
 MAX_FAILED_PEERS = 1024
-"""Peers remembered as not to be asked for ``RETRY_AFTER_S`` seconds; the oldest is dropped first."""
+"""The number of peers that are remembered as not to be asked for ``RETRY_AFTER_S`` seconds; the oldest is dropped
+first."""
 OWNER_BYTES = 32
 
 
@@ -35,7 +37,7 @@ class Certificates:
         endpoint.expose("certificates", self._answer_certificates)
 
     def find_missing(self, contact: Contact, owners: Iterable[bytes]) -> list[bytes]:
-        """Return the owners with an unknown certificate; none if ``contact`` should not be asked now."""
+        """Return the owners with an unknown certificate; an empty list if ``contact`` should not be asked now."""
         lacking = [owner for owner in dict.fromkeys(owners) if self.admission.find_authority(owner).refusal == FOREIGN]
         return lacking if self._clock.seconds() >= self._retry_at.get(contact.node_id, 0.0) else []
 
@@ -48,7 +50,7 @@ class Certificates:
     # -- inside -----------------------------------------------------------------------------------------------------
 
     async def _fetch(self, contact: Contact, owners: list[bytes]) -> bool:
-        """Request the certificates of ``owners``; return whether ``contact`` sent a valid one for each."""
+        """Request the certificates of ``owners``; return whether ``contact`` sent a valid certificate of each owner."""
         try:
             answer = await self._endpoint.ask(contact, "certificates", owners)
         except EntangledError:
@@ -66,7 +68,7 @@ class Certificates:
         return True
 
     def _answer_certificates(self, peer: Contact, owners: list[object]) -> list[bytes]:
-        """CERTIFICATES: return the certificate of each owner, empty if unknown."""
+        """Answer CERTIFICATES: return the certificate of each owner, empty if it is unknown."""
         return [
             self.admission.find_certificate(owner) if isinstance(owner, bytes) and len(owner) == OWNER_BYTES else b""
             for owner in owners[:MAX_OWNERS]

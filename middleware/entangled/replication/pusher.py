@@ -1,7 +1,8 @@
 """Notification of watchers: pushes changes of a key to the peers that watch it.
 
-Soft state: a peer counts as a watcher for the seconds that it names in its request, by default ``WATCH_TTL_S``.  Pushes
-to one watcher of one key are numbered without gaps, so that the watcher notices a missed push and asks again.
+Watchers are soft state: each request to watch is valid for the seconds in the request, by default ``WATCH_TTL_S``.
+Pushes to one watcher of one key are numbered without gaps, so the watcher detects a missed push and requests the
+records again.
 """
 
 from __future__ import annotations
@@ -22,11 +23,12 @@ from middleware.entangled.wire.endpoint import Endpoint
 WATCH_TTL_S, MAX_WATCH_TTL_S = 8.0, 60.0
 MAX_WATCHERS = 1000
 MAX_IMMEDIATE, BATCH_DELAY_S = 64, 0.1
-"""Watchers of a key up to which each change is pushed at once; beyond, seconds of changes that share a push."""
+"""The number of watchers of a key up to which each change is pushed immediately.  With more watchers, the changes of
+this many seconds share a push."""
 PUSH_BYTES, MAX_REMOVED = 12_000, 100
-"""Approximate bytes, and the number of removed slots, in one push of several changes."""
+"""The approximate maximum of bytes, and the maximum number of removed slots, in one push of several changes."""
 MAX_KEYS = 10_000
-"""Keys with watchers at the same time."""
+"""The maximum number of keys that have watchers at the same time."""
 
 
 @dataclass(slots=True)
@@ -39,7 +41,7 @@ class _Watcher:
 
 
 class Pusher:
-    """The watchers of the keys that one replica holds."""
+    """The watchers of the keys for which one node is a replica."""
 
     def __init__(self, endpoint: Endpoint, clock: IReactorTime, background: Background) -> None:
         self._endpoint = endpoint
@@ -55,11 +57,11 @@ class Pusher:
     def add_watcher(self, key: bytes, peer: Contact, ttl: float = WATCH_TTL_S) -> int:
         """Add or renew a watcher of ``key``; return the number of the last push to it.  Raises ``Refused``."""
         if not 0.0 < ttl <= MAX_WATCH_TTL_S:
-            raise Refused(f"a watch lasts at most {MAX_WATCH_TTL_S:g} s")
+            raise Refused(f"the duration of a watch must be more than 0 and at most {MAX_WATCH_TTL_S:g} s")
         watchers = self._watchers.get(key, {})
         is_full = len(watchers) >= MAX_WATCHERS or (not watchers and len(self._watchers) >= MAX_KEYS)
         if peer.node_id not in watchers and is_full:
-            raise Refused("too many watchers; try again later")
+            raise Refused("this replica has too many watchers; try again later")
         until = self._clock.seconds() + ttl
         watcher = watchers.setdefault(peer.node_id, _Watcher(peer, until))
         watcher.contact, watcher.until = peer, until
@@ -67,7 +69,7 @@ class Pusher:
         return watcher.number
 
     def push(self, key: bytes, records: Iterable[Record], gone: Iterable[Record]) -> None:
-        """Notify the watchers of ``key`` that this node now holds ``records``, and no longer those in ``gone``."""
+        """Notify the watchers of ``key`` that this node now stores ``records``, and no longer those in ``gone``."""
         watchers = self._watchers.get(key)
         if not watchers:
             return

@@ -1,7 +1,7 @@
-"""Reads of a key from its replicas: fast from one of them, or consistent from a majority.
+"""Reads of a key from its replicas: fast from one replica, or consistent from a majority.
 
-A read never returns an empty result because replicas are unreachable: it fails with ``Unavailable``.  If a reply takes
-longer than nearly all replies in this team, the reader sends further requests to other replicas (hedging).
+If too few replicas are reachable, a read fails with ``Unavailable`` instead of returning an empty result.  If a reply
+takes longer than nearly all replies in this team, the reader sends further requests to other replicas (hedging).
 """
 
 from __future__ import annotations
@@ -25,12 +25,15 @@ from middleware.entangled.replication.watch import digest_of
 
 ReadConsistency = Literal["fast", "majority"]
 CATCH_UP_TIMEOUT_S, CATCH_UP_INTERVAL_S = 1.5, 0.1
-"""Seconds that a read waits for its own node to catch up, and seconds between two attempts meanwhile."""
+"""Seconds for which a read waits until its own node has caught up, and seconds between two checks during this time."""
 MAX_PAGES = 2000
 
 
 class ReplicaReply(NamedTuple):
-    """The reply of one replica: its records, tombstones included, its ``worth``, and contacts nearer to the key."""
+    """The reply of one replica.
+
+    It contains the records, tombstones included, the kind of the reply (``worth``), and contacts nearer to the key.
+    """
 
     records: list[Record]
     sync_level: int
@@ -49,8 +52,7 @@ class Reader:
     async def read(self, key: bytes, concern: ReadConsistency) -> list[Record]:
         """Return the records of ``key``, without tombstones, in the order of (owner, name); raise ``Unavailable``.
 
-        A new node has no vote until it has caught up, so its reads wait up to ``CATCH_UP_TIMEOUT_S`` seconds until it
-        has.
+        A new node has no vote until it has caught up, so its reads wait for this up to ``CATCH_UP_TIMEOUT_S`` seconds.
         """
         timed_out: list[bool] | None = None
         while True:
@@ -78,9 +80,9 @@ class Reader:
         wants_synced: bool = True,
         same: list[Record] | None = None,
     ) -> ReplicaReply:
-        """Read the records that ``contact`` holds under ``key``, from ``page`` on (None: from the first one).
+        """Read the records that ``contact`` stores under ``key``, from ``page`` on (None: from the first page).
 
-        If its records are exactly ``same``, it sends none.
+        If the records of ``contact`` are exactly ``same``, it sends no records.
         """
         records: list[Record] = []
         if page is None:
@@ -95,7 +97,8 @@ class Reader:
             received = [record for record in map(parse_record, page[0]) if record is not None]
             await self._replica.certificates.fetch_missing(contact, (record.owner for record in received))
             records += [record for record in received if self.is_credible(record, key, contact)]
-            # The last page counts: the replica may have lost contact in between.
+            # The last page determines the kind of the reply, because the replica may have lost contact between two
+            # pages.
             worth = page[2] if len(page) > 2 and page[2] in (SYNCED_REPLY, CACHED_REPLY) else UNSYNCED_REPLY
             nearer = parse_contacts(page[3]) if len(page) > 3 else []
             if page[1] is None or not page[0]:
@@ -115,7 +118,7 @@ class Reader:
 
     async def _read_fast(self, key: bytes) -> list[Record]:
         local = self._replica.get_held(key)
-        # Records from a time when this node was among the closest may be outdated.
+        # This node's records may be outdated if it is no longer among the closest nodes.
         if (
             _has_values(local)
             and self._replica.is_synced()
@@ -146,7 +149,7 @@ class Reader:
         return newest
 
     def _confirm_empty(self, answers: dict[bytes, ReplicaReply], voters: Voters) -> list[Record]:
-        """Return no records if a majority has answered; otherwise raise ``Unavailable``."""
+        """Return an empty list if a majority has answered; otherwise raise ``Unavailable``."""
         _check_votes(_count_votes(answers, voters), voters)
         return []
 
@@ -157,7 +160,7 @@ class Reader:
         voters: Voters,
         answers: dict[bytes, ReplicaReply],
     ) -> None:
-        """Store records that a minority holds at a majority before returning them, so that later reads see them too."""
+        """Store records of a minority at a majority before they are returned, so that later reads also return them."""
         has: dict[Slot, set[bytes]] = {slot: set() for slot in newest}
         for node_id, answer in answers.items():
             for record in answer.records:
@@ -165,7 +168,7 @@ class Reader:
                     has[record.slot].add(node_id)
         for slot, record in newest.items():
             if record.lifetime == "leased" or voters.count_known(has[slot]) >= voters.majority:
-                continue  # only its owner stores a leased record, with each renewal
+                continue  # only the owner stores a leased record, with each renewal
             holding = has[slot]
 
             async def repair_at(contact: Contact, record: Record = record, holding: set[bytes] = holding) -> None:
@@ -176,7 +179,7 @@ class Reader:
                 except Refused as error:
                     if error.code not in OWNER_FAULT_CODES:
                         raise
-                holding.add(contact.node_id)  # stored, superseded there, or refused because of its owner
+                holding.add(contact.node_id)  # the record was stored, superseded, or rejected because of its owner
 
             lacking = [repair_at(c) for c in targets if c.node_id not in holding]
             await gather_until(lambda _, holding=holding: voters.count_known(holding) >= voters.majority, lacking)  # type: ignore
@@ -190,9 +193,10 @@ class Reader:
         is_enough: Callable[[dict[bytes, ReplicaReply]], bool],
         width: int,
     ) -> dict[bytes, ReplicaReply]:
-        """Collect the answers of ``targets``: ask ``width`` at once, and two more for each that is slow or fails.
+        """Collect the answers of ``targets``: ask ``width`` in parallel, and two more for each that is slow or fails.
 
-        Two, because failures are correlated: with half of the team gone, every second replica is silent.
+        Two more are asked because failures are correlated: if half of the team has failed, every second replica is
+        silent.
         """
         answers: dict[bytes, ReplicaReply] = {}
         own_id = self._overlay.own_id
@@ -232,7 +236,8 @@ class Reader:
             in_time()
             pending -= 1
             settle()
-            # A fast read asks one replica first; if that has nothing, a majority, in two or three waves.
+            # A fast read asks one replica first; if this replica has no records, it asks a majority, in two or three
+            # waves.
             for _ in range(more if pending else max(more, 1)):
                 ask_next()
 
@@ -245,11 +250,11 @@ class Reader:
         return dict(answers)
 
     async def _find_value(self, key: bytes) -> list[Record]:
-        """FIND_VALUE in a large network: ask ever nearer nodes until one has the key (Kademlia, section 2.3).
+        """Find the key in a large network: ask ever nearer nodes until one has records of it (Kademlia, section 2.3).
 
-        The records of a node that is not among the closest, or not synced, may be incomplete; they are used only if no
-        other node has any.  The nearest node without the key gets a cached copy, with a lifetime that halves for each
-        node nearer to the key.
+        The records of a node that is not among the closest, or is not synced, may be incomplete; they are used only if
+        no other node has records of the key.  The nearest node that lacks the key gets a cached copy; its lifetime is
+        halved for each node that is nearer to the key.
         """
         lookup = Lookup(key, K, ALPHA, self._overlay.find_nearest(key), exclude=self._overlay.own_id)
         found: list[Record] = []
@@ -280,7 +285,7 @@ class Reader:
 
 
 def merge_newest(opinions: Iterable[list[Record]]) -> dict[Slot, Record]:
-    """Return the record of each slot that beats the others."""
+    """Return for each slot the record that supersedes the others."""
     newest: dict[Slot, Record] = {}
     for records in opinions:
         for record in records:
@@ -305,5 +310,5 @@ def _is_conclusive(answers: dict[bytes, ReplicaReply], voters: Voters) -> bool:
 
 
 def _has_values(records: list[Record]) -> bool:
-    """Return whether there is more than tombstones; a replica with only tombstones may lack records."""
+    """Return whether ``records`` are not only tombstones; a replica with only tombstones may lack records."""
     return any(not record.is_tombstone for record in records)

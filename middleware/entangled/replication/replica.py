@@ -1,7 +1,7 @@
-"""The records that a node holds as one of the replicas of their keys.
+"""The records that a node stores as one of the replicas of their keys.
 
-Answers STORE and FIND_VALUE, extends leases on renewal by their owners, passes changes to ``pusher``, and removes
-expired records.  ``overlay`` decides where records belong.
+A replica answers STORE and FIND_VALUE, extends leases when their owners renew them, passes changes to ``pusher``, and
+removes expired records.  ``overlay`` decides which nodes are the replicas of a key.
 """
 
 from __future__ import annotations
@@ -31,27 +31,27 @@ from middleware.entangled.wire.admission_check import Authority
 from middleware.entangled.wire.endpoint import Endpoint
 
 PAGE_BYTES = 12_000
-"""Bytes of a page; it fits into the first congestion window, ten datagrams."""
+"""The approximate bytes of a page, which fits into the initial congestion window of ten datagrams."""
 SWEEP_INTERVAL_S, MAX_SWEEP_INTERVAL_S = 0.1, 60.0
 """Minimum and maximum seconds between two checks for expired records."""
 MAX_LEASE_S = 3600.0
 MAX_MARKS = 100
 MAX_MISMATCHED = 4096
-"""Peers remembered whose last ALIVE did not match the records held."""
+"""The number of remembered peers whose last ALIVE did not match the stored records."""
 
 UNSYNCED_REPLY, SYNCED_REPLY, CACHED_REPLY = 0, 1, 2
-"""Worth of a reply: from a replica that is not synced, from one that is, or a cached copy."""
+"""The kinds of a reply: from a replica that is not synced, from a synced replica, or a cached copy."""
 
 
 class Replica:
-    """The records that one node holds for other owners; ``watched_copies`` are its watched copies, invisible to peers.
+    """The records that one node stores for other owners; its ``watched_copies`` are not visible to peers.
 
-    ``may_store`` returns whether the owner of a slot may write there by its present certificate; ``may_stay`` whether
-    a record in it may be kept and served, which differs for few slots.  ``is_synced`` returns whether this node is
-    synced.
+    ``may_store`` returns whether the current certificate of a slot's owner allows it to write there.  ``may_stay``
+    returns whether an existing record in the slot may still be stored and returned; the two differ for few slots.
+    ``is_synced`` returns whether this node is synced.
 
-    ``on_record`` is called with each accepted record, ``on_gone`` with each removed one, ``on_owner_expired`` with the
-    public key of each owner whose lease expired or that said goodbye.
+    ``on_record`` is called with each accepted record, and ``on_gone`` with each removed record.  ``on_owner_expired``
+    is called with the public key of each owner whose lease expired or that sent GOODBYE.
     """
 
     def __init__(
@@ -92,29 +92,29 @@ class Replica:
         self.pusher.start()
 
     def get_held(self, key: bytes) -> list[Record]:
-        """Return the records held under ``key`` as a replica, tombstones included."""
+        """Return the records stored under ``key`` as a replica, tombstones included."""
         copies = self.watched_copies.slots_of(key)
         return [r for r in self._store.get(key, tombstones=True) if r.slot not in copies and self.may_stay(r.slot)]
 
     def get_visible(self, slot: Slot) -> Record | None:
-        """Return the record held in ``slot`` as a replica, if peers may see it."""
+        """Return the record stored in ``slot`` as a replica, if peers may see it."""
         return None if slot in self.watched_copies or not self.may_stay(slot) else self._store.get_slot(slot)
 
     def team_records(self) -> list[Record]:
-        """Return the team records held as a replica that peers may see, tombstones included."""
+        """Return the team records stored as a replica that peers may see, tombstones included."""
         copies = self.watched_copies
         return [
             r for r in self._store.records() if r.lifetime == "team" and r.slot not in copies and self.may_stay(r.slot)
         ]
 
     def holds(self, record: Record) -> bool:
-        """Return whether exactly ``record`` is held as a replica."""
+        """Return whether exactly ``record`` is stored as a replica."""
         return self._store.get_slot(record.slot) == record and record.slot not in self.watched_copies
 
     def store_locally(self, record: Record, left: float | None = None) -> StoreReply:
-        """Store ``record`` if it beats the record in its slot; return STORED or SUPERSEDED.
+        """Store ``record`` if it supersedes the record in its slot; return STORED or SUPERSEDED.
 
-        It expires after ``left`` seconds, the lifetime remaining at its sender; by default after a whole ttl.
+        The record expires after ``left`` seconds, its remaining lifetime at the sender; by default after a whole ttl.
         """
         self.watched_copies.remove(record.slot)
         self.cache.drop(record.key)
@@ -129,20 +129,21 @@ class Replica:
         return STORED
 
     def store(self, record: Record, left: float | None = None) -> StoreReply:
-        """Store ``record`` as ``store_locally`` does; return UNSYNCED, not STORED, if this replica is not synced."""
+        """Store ``record`` as ``store_locally`` does; return UNSYNCED instead of STORED if this node is not synced."""
         reply = self.store_locally(record, left)
         return UNSYNCED if reply is STORED and not self.is_synced() else reply
 
     def remaining_lifetime(self, record: Record) -> float:
-        """Return the seconds until the record in this slot expires here; the ttl of ``record`` if the slot is empty."""
+        """Return the seconds until the record in this slot expires; if the slot is empty, the ttl of ``record``."""
         expiry = self._store.find_expiry(record.slot)
         return record.ttl if expiry is None else expiry - self._clock.seconds()
 
     def recheck(self) -> bool:
         """Check the records of owners with a changed authority; return whether there are any such owners.
 
-        Watchers are notified that a record is gone if its owner may no longer write it.  The record is removed if that
-        is final; if the reason is the clock or a missing certificate, it is hidden until it is allowed or expires.
+        If an owner may no longer write a record, watchers are notified that the record is gone.  If the authority is
+        final, the record is removed.  If the reason is the clock or a missing certificate, the record is hidden until
+        it is allowed or expires.
         """
         before, admission = self._authorities, self.certificates.admission
         self._authorities = {owner: admission.find_authority(owner) for owner in self._store.owners()}
@@ -156,16 +157,16 @@ class Replica:
     def answer_store(
         self, peer: Contact, packed: list[object], left: list[object] | None = None
     ) -> list[int] | Deferred[list[int]]:
-        """STORE: store records; return the code of a ``StoreReply`` for each.
+        """Answer STORE: store records; return the code of a ``StoreReply`` for each record.
 
-        ``left`` is the remaining lifetime in seconds of each record, if the sender is not its owner.  Unknown
+        ``left`` is the remaining lifetime in seconds of each record, if the sender is not the owner.  Unknown
         certificates are requested from ``peer``.
         """
         self._overlay.process_message(peer)
         records = [record for record in map(parse_record, packed) if record is not None]
         lives = [None] * len(packed) if left is None else [_check_lifetime(life) for life in left]
         if len(records) < len(packed) or len(lives) != len(packed):
-            raise Refused("not a record")
+            raise Refused("the argument is not a list of valid records")
         owners = [record.owner for record in records]
         if self.certificates.find_missing(peer, owners):
             learning = Deferred.fromCoroutine(self.certificates.fetch_missing(peer, owners))
@@ -180,12 +181,12 @@ class Replica:
         wants_synced: bool = False,
         digest: bytes = b"",
     ) -> list[object]:
-        """FIND_VALUE: return a page of the records under ``key``, the cursor of the next page or None, and its worth.
+        """Answer FIND_VALUE: return a page of the records under ``key``, the next page's cursor or None, and its kind.
 
-        Without records, the contacts closest to the key follow, and unless ``wants_synced`` a cached copy may be
-        returned.  A node that is not among the closest to the key also returns these contacts to a lookup, since its
-        records, such as its own, may be incomplete.  If ``digest`` equals the digest of all records held, None is
-        returned instead of them.
+        If this node has no records of the key, it also returns the contacts closest to the key, and unless
+        ``wants_synced`` it may return a cached copy.  If it is not among the nodes closest to the key, its records may
+        be incomplete, so it also returns these contacts to a lookup.  If ``digest`` equals the digest of all stored
+        records, None is returned instead of the records.
         """
         if digest and digest == digest_of(self.get_held(_check_key(key))):
             return [None, None, self._sync_level()]
@@ -201,26 +202,28 @@ class Replica:
         return [page, following, UNSYNCED_REPLY if is_aside else self._sync_level(), near]
 
     def answer_cache(self, peer: Contact, key: bytes, packed: list[object], ttl: float) -> None:
-        """CACHE: keep a copy of records that a lookup found, for later lookups on its path (Kademlia, section 2.3)."""
+        """Answer CACHE: cache records that a lookup found, for later lookups on its path (Kademlia, section 2.3)."""
         records = [record for record in map(parse_record, packed) if record is not None]
         if len(records) < len(packed) or any(record.key != _check_key(key) for record in records):
-            raise Refused("not records of this key")
+            raise Refused("the records do not belong to this key")
         if not self.get_held(key) and all(self.is_genuine(record) for record in records):
             self.cache.put(key, records, ttl, self._clock.seconds())
 
     def answer_watch(self, peer: Contact, key: bytes, digest: bytes, ttl: float = WATCH_TTL_S) -> list[object]:
-        """WATCH: push changes of ``key`` to ``peer`` for ``ttl`` seconds, at most one minute.
+        """Answer WATCH: push changes of ``key`` to ``peer`` for ``ttl`` seconds, at most one minute.
 
-        Returns the number of the last push and the first page of records, None if ``digest`` equals their digest.
+        Returns the number of the last push, and the first page of records; None instead of the page if ``digest``
+        equals the digest of the records.
         """
         self._overlay.process_message(peer)
         number = self.pusher.add_watcher(_check_key(key), peer, ttl)
         return [number, None if digest == digest_of(self.get_held(key)) else list(self._make_page(key, None))]
 
     def answer_alive(self, peer: Contact, lease: float, digest: bytes) -> None:
-        """ALIVE: extend the leases of ``peer``; send MISSING after two mismatches of its digest with the records held.
+        """Answer ALIVE: extend the leases of ``peer``.
 
-        If none are held, they expired here though the peer is alive, and MISSING is sent at once.
+        If ``digest`` does not match the stored records of the peer twice, this node sends MISSING.  If it stores no
+        records of the peer, they have expired although the peer is alive, and MISSING is sent immediately.
         """
         self._overlay.process_message(peer)
         held = self._list_leased(peer.public)
@@ -232,17 +235,17 @@ class Replica:
             self._endpoint.notify(peer, "missing", [digest_of([r]) for r in held[:MAX_MARKS]])
         else:
             if len(self._mismatched) >= MAX_MISMATCHED:
-                self._mismatched.clear()  # these get MISSING one renewal later
+                self._mismatched.clear()  # the forgotten peers get MISSING one renewal later
             self._mismatched.add(peer.node_id)
 
     def answer_let_go(self, peer: Contact, marks: list[object]) -> None:
-        """LET_GO: remove leased records of ``peer``, identified by their digests, that no longer belong here."""
+        """Answer LET_GO: remove leased records of ``peer`` that no longer belong here, identified by their digests."""
         self._notify_gone(
             [r for r in self._list_leased(peer.public) if digest_of([r]) in marks and self._store.discard(r.slot)]
         )
 
     def answer_goodbye(self, peer: Contact) -> None:
-        """GOODBYE: remove the leased records of ``peer``, which leaves the network (thesis, section 4.2.2)."""
+        """Answer GOODBYE: remove the leased records of ``peer``, which leaves the network (thesis, section 4.2.2)."""
         self._notify_gone(self._store.drop_leased(peer.public))
         self.on_owner_expired(peer.public)
         self.pusher.forget(peer)
@@ -257,15 +260,16 @@ class Replica:
     def may_accept(self, record: Record, peer: Contact) -> bool:
         """Return whether ``peer`` may store ``record``.
 
-        The session of its owner authenticates a record.  From another peer a team record needs a valid signature;
-        leased records are accepted from their owner only, because they must not outlive its last sign of life.
+        If ``peer`` is the owner, its session authenticates the record.  From any other peer a team record needs a valid
+        signature.  Leased records are accepted only from their owner, because they must expire when their owner is
+        silent.
         """
         return record.owner == peer.public or (record.lifetime == "team" and self.is_genuine(record))
 
     def is_genuine(self, record: Record) -> bool:
-        """Return whether the owner may write ``record`` and did.
+        """Return whether the owner may write ``record`` and has signed it.
 
-        A record that this node already holds needs no second check of its signature.
+        The signature of a record that this node already stores is not checked again.
         """
         return self.may_store(record.slot) and (self.holds(record) or self._signature_cache.is_genuine(record))
 
@@ -274,7 +278,7 @@ class Replica:
     def _wait_for_write(
         self, answer: Callable[..., list[int] | Deferred[list[int]]]
     ) -> Callable[..., Deferred[list[int]]]:
-        """Wrap ``answer`` so that its reply is sent only after the store has written the changes durably."""
+        """Wrap ``answer`` so that its result is sent only after the store has written the changes durably."""
 
         def written(answers: list[int]) -> Deferred[list[int]]:
             return self._store.wait_for_write().addCallback(lambda _: answers)
@@ -287,7 +291,7 @@ class Replica:
         return acknowledged
 
     def _store_all(self, peer: Contact, records: list[Record], lives: Sequence[float | None]) -> list[int]:
-        """Store the valid ones of ``records``; a full share of one owner does not affect the others."""
+        """Store the valid records of ``records``; an owner with a full share does not affect other owners."""
         replies = []
         for record, life in zip(records, lives, strict=True):
             try:
@@ -299,7 +303,7 @@ class Replica:
         return [reply.encode() for reply in replies]
 
     def _apply_authority(self, owner: bytes, authority: Authority, before: Authority | None) -> None:
-        """Hide or remove the records that ``owner`` may not write, and show the others again."""
+        """Hide or remove the records that ``owner`` may not write, and make its other records visible again."""
         hidden = []
         for record in self._store.find_owned(owner):
             if not self.may_stay(record.slot):
@@ -312,7 +316,7 @@ class Replica:
             self._store.discard(record.slot)
 
     def _list_leased(self, owner: bytes) -> list[Record]:
-        """Return the leased records of ``owner`` held as a replica."""
+        """Return the leased records of ``owner`` that are stored as a replica."""
         return [
             r for r in self._store.find_owned(owner) if r.lifetime == "leased" and r.slot not in self.watched_copies
         ]
@@ -338,7 +342,7 @@ class Replica:
             self.on_gone(record)
 
     def _sweep_earlier(self) -> None:
-        """Schedule the next sweep earlier if a new record expires before it."""
+        """Schedule the next sweep earlier if a new record expires before the scheduled sweep."""
         if self._swept_at >= 0 and self._store.next_expiry() <= self._sweep_at - SWEEP_INTERVAL_S:
             self._cancel_sweep()
             self._schedule_sweep()
@@ -379,7 +383,7 @@ def split_pages(records: list[Record], most: int | None = None) -> Iterator[list
 
 def _check_key(key: object) -> bytes:
     if not isinstance(key, bytes) or len(key) != KEY_BYTES:
-        raise Refused(f"a key has {KEY_BYTES} bytes")
+        raise Refused(f"the key must have {KEY_BYTES} bytes")
     return key
 
 
@@ -387,11 +391,11 @@ def _check_cursor(after: list[object] | None) -> tuple[bytes, str] | None:
     if after is None:
         return None
     if len(after) != 2 or not isinstance(after[0], bytes) or not isinstance(after[1], str):
-        raise Refused("a page begins after an owner and a name")
+        raise Refused("the start of a page must be empty or an owner and a name")
     return after[0], after[1]
 
 
 def _check_lifetime(life: object) -> float:
     if type(life) is not float or not math.isfinite(life):
-        raise Refused("a remaining lifetime is a finite float of seconds")
+        raise Refused("the remaining lifetime must be a finite float of seconds")
     return life

@@ -1,4 +1,4 @@
-"""The reply of a replica to the request to store a record.  Pure."""
+"""The reply of a replica to the request to store a record; without I/O."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from typing import NamedTuple
 from middleware.entangled.record import Record
 
 MAX_SEQUENCE = 2**62
-"""Largest sequence in a valid reply: above it an owner would run out of sequence numbers."""
+"""The highest sequence number in a valid reply; after a higher number an owner would run out of sequence numbers."""
 
 
 class Outcome(Enum):
@@ -16,15 +16,15 @@ class Outcome(Enum):
 
     STORED = 0
     SUPERSEDED = 1
-    """The slot holds a record with the same or a higher sequence, which is the code on the wire."""
+    """The slot contains a record with the same or a higher sequence number; this number is the code on the wire."""
     FORGED = -1
     """The signature is wrong, or the sender may not store this record."""
     UNSYNCED = -2
-    """Stored by a replica that has not caught up with the others, so it is no vote."""
+    """The record was stored by a replica that has not caught up with the others; the reply is not counted as a vote."""
     FORBIDDEN = -3
     """The certificate of the owner does not allow the record, or is missing."""
     NO_ROOM = -4
-    """The owner has as many records as one owner may have; only in an answer about several records."""
+    """The owner has the maximum number of records; this code is used only in an answer about several records."""
 
 
 class StoreReply(NamedTuple):
@@ -35,7 +35,7 @@ class StoreReply(NamedTuple):
 
     @property
     def is_stored(self) -> bool:
-        """Whether the replica holds the record."""
+        """Whether the replica stores the record."""
         return self.outcome in (Outcome.STORED, Outcome.UNSYNCED)
 
     def encode(self) -> int:
@@ -49,7 +49,7 @@ _REPLIES_BY_CODE = {each.value: StoreReply(each) for each in Outcome if each is 
 
 
 def decode_reply(code: object, record: Record) -> StoreReply | None:
-    """Return the reply that ``encode`` made about ``record``, or None if ``code`` cannot be one."""
+    """Return the reply about ``record`` that ``encode`` has encoded as ``code``, or None if ``code`` is invalid."""
     if type(code) is not int:
         return None
     if code > 0:

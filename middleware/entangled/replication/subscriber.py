@@ -1,6 +1,6 @@
 """The watches of a node: registration at the replicas of the keys, and processing of their pushes.
 
-Pushes are numbered.  On a gap the subscriber asks the replica at once for its records.
+Pushes are numbered.  When a number is missing, the subscriber immediately requests the records of the replica.
 """
 
 from __future__ import annotations
@@ -23,9 +23,11 @@ from middleware.entangled.wire.endpoint import Endpoint
 RENEW_INTERVAL_S = 2.0
 """Seconds between two renewals of a watch: four within ``WATCH_TTL_S``."""
 LARGE_RENEW_INTERVAL_S, LARGE_TTL_S = 20.0, 60.0
-"""Seconds between two renewals, and of a watch, in a large network, where finding the replicas takes a lookup."""
+"""Seconds between two renewals of a watch, and its duration in seconds, in a large network.  They are longer there,
+because a lookup is needed to find the replicas."""
 MAX_PUSHERS = 3
-"""Replicas that push to one watcher in a large network, where thousands may watch the same key."""
+"""The number of replicas that push to one watcher in a large network, where thousands of nodes may watch the same
+key."""
 
 
 class Subscriber:
@@ -58,7 +60,7 @@ class Subscriber:
         self._background.every(RENEW_INTERVAL_S, self._renew_all)
 
     def stop(self) -> None:
-        """End all watches without further notifications, and remove their copies."""
+        """End all watches without further notifications, and remove the watched copies."""
         self._watches.clear()
         self._replica.watched_copies.clear()
 
@@ -72,7 +74,7 @@ class Subscriber:
         return watch
 
     def refresh(self, watch: Watch) -> None:
-        """Ask all replicas of the key now for records that differ from the view."""
+        """Request from all replicas of the key, immediately, the records that differ from the view."""
         self._background.fork(self._renew(watch))
 
     # -- events ----------------------------------------------------------------------------------------
@@ -121,7 +123,7 @@ class Subscriber:
     # -- inside -----------------------------------------------------------------------------------------------------
 
     def _forget_watch(self, watch: Watch) -> None:
-        """Remove ``watch``; replicas drop it when it is not renewed."""
+        """Remove ``watch``; replicas drop it when it is no longer renewed."""
         if watch in self._watches:
             self._watches.remove(watch)
             if watch.has_copies:
@@ -151,10 +153,10 @@ class Subscriber:
         if watch not in self._watches:
             return
         if self._overlay.is_large:
-            targets = select_closest(targets, self._own_id, MAX_PUSHERS)  # watchers choose different replicas
+            targets = select_closest(targets, self._own_id, MAX_PUSHERS)  # so different watchers use different replicas
         ids = [c.node_id for c in targets]
         for replica in watch.view.replicas():
-            # A replica that is no longer asked does not report removals.
+            # A replica without a renewed watch does not report removals.
             if replica not in ids and replica != self._own_id:
                 watch.forget(replica)
         self._update(watch)
@@ -169,13 +171,13 @@ class Subscriber:
             ttl = (LARGE_TTL_S,) if self._overlay.is_large else ()
             try:
                 answer = await self._overlay.ask(contact, "watch", watch.key, digest, *ttl, changes=True)
-            except Refused:  # too many watchers there: read once instead
+            except Refused:  # the replica has too many watchers: read once instead
                 watch.view.replace(contact.node_id, (await self._reader.read_pages(contact, watch.key)).records)
                 return self._update(watch)
             number, page = answer if isinstance(answer, list) and len(answer) == 2 else (0, [[], None])
             if type(number) is not int:
                 return
-            # Pushes that overtook the reply have advanced the number already.
+            # Pushes that overtook the answer have already advanced the number.
             watch.push_numbers[contact.node_id] = max(
                 number, watch.push_numbers.get(contact.node_id, 0) if page is None else 0
             )
@@ -184,7 +186,7 @@ class Subscriber:
             records = (await self._reader.read_pages(contact, watch.key, page)).records
         except EntangledError:
             if is_first and watch in self._watches:
-                await self._renew_at(watch, contact, is_first=False)  # a lost message alone does not end the watch
+                await self._renew_at(watch, contact, is_first=False)  # a single lost message does not end the watch
             elif watch in self._watches:
                 watch.forget(contact.node_id)
                 self._update(watch)
@@ -204,11 +206,12 @@ class Subscriber:
             watch.push_numbers[peer.node_id] = max(last, number)
             for record in records:
                 watch.view.add(peer.node_id, record)
-            if number > last:  # an overtaken push may remove a record that is back
+            if number > last:  # a push that arrives late may remove a record that exists again
                 for slot in slots:
                     watch.view.remove(peer.node_id, slot)
             self._update(watch)
-            # The last push may arrive twice.  A renewal also requests unknown certificates of owners.
+            # A push with the last number is a duplicate, not a gap.  The renewal also requests unknown certificates of
+            # owners.
             if is_lacking or number not in (last, last + 1):
                 self._background.fork(self._renew_at(watch, peer))
 

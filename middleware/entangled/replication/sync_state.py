@@ -1,7 +1,8 @@
-"""Sync state of a replica: whether its replies count in a majority, and which replies it needs before they do.
+"""The sync state of a replica: whether its replies are counted in majorities, and when it becomes synced.
 
-A replica in state NEVER_SYNCED has never caught up with others.  In state STALE it once did, and holds all records that
-it acknowledged since.  In state CURRENT it has caught up and been in contact with a majority since.
+A replica in the state NEVER_SYNCED has never caught up with other replicas.  A replica in the state STALE has caught up
+at some time, and stores all records that it has acknowledged since.  A replica in the state CURRENT has caught up, and
+has stayed in contact with a majority.
 """
 
 from __future__ import annotations
@@ -12,12 +13,12 @@ from middleware.entangled.kademlia.overlay import K
 NEVER_SYNCED, STALE, CURRENT = range(3)
 
 NOTE_NAME = "settled"
-"""The note of a node that was synced once: ``SETTLED``, or ``LOST`` if it then lost its records."""
+"""The name of the note of a node that has been synced: ``SETTLED``, or ``LOST`` if it lost its records afterwards."""
 SETTLED, LOST = b"1", b"lost"
 
 
 class SyncState:
-    """The sync state of one node; its owner clears ``is_synced`` when the node loses contact to a majority."""
+    """The sync state of one node; ``Handover`` clears ``is_synced`` when the node loses contact to a majority."""
 
     def __init__(self, store: Store) -> None:
         self._store = store
@@ -26,7 +27,7 @@ class SyncState:
         self.is_synced = False
 
     def start(self, forgot: bool) -> None:
-        """Load the state of the earlier run; ``forgot``: its records were dropped, though others may count on them."""
+        """Load the state of the earlier run; ``forgot``: its records were dropped, but other nodes rely on them."""
         noted = self._store.get_note(NOTE_NAME)
         is_bare = forgot or self._store.origin == "replaced" or self._store.corrupt_rows > 0
         self._has_lost = noted == LOST or (noted == SETTLED and is_bare)
@@ -40,7 +41,7 @@ class SyncState:
         return CURRENT if self.is_synced else STALE if self._was_synced else NEVER_SYNCED
 
     def set_synced(self) -> bool:
-        """Become synced; return whether that is the first time, so that other nodes must learn of it."""
+        """Mark this node as synced; return True the first time: the caller must then notify the other nodes."""
         is_first = not self._was_synced
         self.is_synced = self._was_synced = True
         self._has_lost = False
@@ -51,11 +52,11 @@ class SyncState:
     def is_enough(self, reached: list[int | None], away: int) -> bool:
         """Return whether the nodes in ``reached`` together have every record that a majority has.
 
-        ``reached`` lists the sync states of the nodes asked (None: failed); ``away`` more are absent.  A node that was
-        never synced has no records to give and counts in no majority.  If a synced node answered, only synced nodes
-        count, because the records of a stale node may stem from a time with other members.  A node that lost its
-        records may have been one of the voters.  A new node is admitted by a majority of the nodes before it; otherwise
-        each half of a partition could grow to a majority.
+        ``reached`` contains the sync states of the nodes that were asked (None: no answer); ``away`` further nodes are
+        absent.  A node that was never synced has no records to send and is not counted in majorities.  If a synced node
+        answered, only synced nodes are counted, because the records of a stale node may be from a time with different
+        members.  A node that lost its records may have been one of the voters.  A new node is admitted by a majority of
+        the earlier nodes; otherwise each half of a partition could grow to a majority.
         """
         missing = reached.count(None) + away
         answered = reached.count(CURRENT) or reached.count(STALE)

@@ -1,8 +1,9 @@
 """The view of one watched key, merged from its replicas.
 
-``View`` merges the reports of several replicas; it is pure.  A slot is present while any valid report contains it; of
-several records of one slot the one that beats the others wins.  Reports about the reporting node's own leased records
-are ignored, except by that node, because they would outlive it.
+``View`` merges the reports of several replicas, without I/O.  A slot is present as long as any valid report contains
+it.  If reports contain different records of one slot, the record that supersedes the others is used.  A node's own
+leased records in its own report are ignored by all other nodes, because these records would remain after a failure of
+the node.
 """
 
 from __future__ import annotations
@@ -49,7 +50,7 @@ class View:
             held[record.slot] = record
 
     def remove(self, replica: bytes, slot: Slot) -> None:
-        """Remove the record of ``slot``, which expired at ``replica``, from its report."""
+        """Remove the record of ``slot``, which expired at ``replica``, from the report of this replica."""
         self._reports.get(replica, {}).pop(slot, None)
 
     def retain(self, is_lawful: Callable[[Slot], bool]) -> None:
@@ -84,12 +85,12 @@ class View:
 
 
 class Watch:
-    """One subscription to one key; ``records`` are the records known now.
+    """One subscription to one key; ``records`` are the currently known records.
 
-    ``requested`` are the node ids of the replicas that have the request to push; pushes of other nodes are ignored.
-    ``has_copies`` says whether the records are also kept in the node's own store.  ``push_numbers`` maps replicas to
-    the number of their last push; ``due_at`` is the time of the next renewal in a large network.  ``on_stop`` is called
-    at the end.
+    ``requested`` contains the node ids of the replicas to which a request to push was sent; pushes of other nodes are
+    ignored.  ``has_copies``: the records are also stored in the node's own store.  ``push_numbers`` maps replicas to
+    the number of their last push.  ``due_at`` is the time of the next renewal in a large network.  ``on_stop`` is
+    called when the subscription ends.
     """
 
     def __init__(

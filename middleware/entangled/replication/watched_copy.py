@@ -1,6 +1,7 @@
-"""Copies of watched records in the node's own store, for readers of the store's file.
+"""Copies of watched records in the node's own store, for programs that read the store's file.
 
-A copy is no replica: it is neither served nor pushed, extends no lease, and goes when the watch drops its record.
+A watched copy is not a replica: it is neither returned nor pushed to peers, extends no lease, and is removed when the
+watch drops its record.
 """
 
 from __future__ import annotations
@@ -13,7 +14,7 @@ from middleware.entangled.record import MAX_TTL_S, Record, Slot
 
 
 class WatchedCopies:
-    """The watched copies in ``store``, as distinct from records held as a replica."""
+    """The watched copies in ``store``, as distinct from records that the node stores as a replica."""
 
     def __init__(self, store: Store) -> None:
         self._store = store
@@ -28,7 +29,7 @@ class WatchedCopies:
         return self._copies.get(key, {})
 
     def replace(self, key: bytes, records: Iterable[Record], now: float) -> None:
-        """Set the copies under ``key`` to ``records``, without the records that the store holds as a replica."""
+        """Set the copies under ``key`` to ``records``, except records that the node stores as a replica."""
         copies = self._copies.setdefault(key, {})
         wanted = {record.slot: record for record in records}
         for slot in [slot for slot, copy in copies.items() if wanted.get(slot) != copy]:
@@ -38,7 +39,7 @@ class WatchedCopies:
                 try:
                     self._store.put(record, now + MAX_TTL_S)
                 except Refused:
-                    continue  # full: replicas take precedence over copies
+                    continue  # the store is full: replicas take precedence over copies
                 copies[slot] = record
         if not copies:
             del self._copies[key]

@@ -1,8 +1,8 @@
 """Publishing of data under a name, and search by the words of that name.
 
 Each word has an index under its own key; an entry is a record in the publisher's slot, so concurrent publications under
-one word do not conflict.  An entry carries the whole name, so a search for several words reads the index of one of
-them.
+one word do not conflict.  An entry contains the whole name, so a search for several words reads the index of only one
+word.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ MAX_WORDS = 16
 
 
 class BadName(LocalError):
-    """A name or a search has no word, or too many of them."""
+    """A name or a search contains no word or too many words."""
 
 
 @dataclass(frozen=True)
@@ -37,7 +37,7 @@ class Match:
 
 
 def words(text: str) -> list[str]:
-    """Return the distinct words of ``text``, in order and case-folded: runs of letters and digits."""
+    """Return the distinct words (runs of letters and digits) of ``text``, in order and case-folded."""
     folded = unicodedata.normalize("NFKC", text).casefold()
     parted = "".join(letter if letter.isalnum() else " " for letter in folded)
     return list(dict.fromkeys(parted.split()))
@@ -49,7 +49,7 @@ def keyword_key(word: str) -> bytes:
 
 
 def matches(records: Iterable[Record], wanted: Sequence[str]) -> list[Match]:
-    """Return the publications in the index ``records`` whose names have all words ``wanted``."""
+    """Return the publications in the index ``records`` whose names contain all words in ``wanted``."""
     return [
         Match(record.name, record.owner, record.value)
         for record in records
@@ -66,15 +66,15 @@ class Keywords:
     def publish(self, name: str, data: bytes) -> Deferred[None]:
         """Publish ``data`` under every word of ``name``, replacing this node's earlier publication of that name.
 
-        Raises ``BadName`` and ``TooLarge`` at once; fails with ``NoAnswer`` if the index of a word is unreachable; the
-        other indexes may have the entry.
+        Raises ``BadName`` and ``TooLarge`` immediately.  Fails with ``NoAnswer`` if the index of a word is unreachable;
+        the indexes of other words may then contain the entry.
         """
         if len(data) > MAX_VALUE_BYTES:
             raise TooLarge(
-                f"{name}: data of {len(data)} bytes; at most {MAX_VALUE_BYTES} can be published under a name"
+                f"{name}: the data has {len(data)} bytes; at most {MAX_VALUE_BYTES} can be published under a name"
             )
         if len(name.encode(errors="replace")) > MAX_NAME_BYTES:
-            raise TooLarge(f"{name}: the name is longer than {MAX_NAME_BYTES} bytes")
+            raise TooLarge(f"{name}: the name has more than {MAX_NAME_BYTES} bytes; shorten it")
         keys = [keyword_key(word) for word in _check_words(name)]
         return Deferred.fromCoroutine(_run_all(name, [self._node.put(key, name, data) for key in keys]))
 
@@ -84,9 +84,9 @@ class Keywords:
         return Deferred.fromCoroutine(_run_all(name, [self._node.remove(key, name) for key in keys]))
 
     def search(self, keywords: str | Sequence[str]) -> Deferred[list[Match]]:
-        """Fire with the publications with all ``keywords`` (a text or a sequence); raise ``BadName``."""
+        """Fire with the publications that contain all ``keywords`` (a string or a sequence); raise ``BadName``."""
         wanted = _check_words(keywords if isinstance(keywords, str) else " ".join(keywords))
-        # The longest word is likely the rarest, and its index the shortest to read.
+        # The longest word is probably the rarest word, and its index the shortest.
         found = self._node.get(keyword_key(max(wanted, key=len)))
         return found.addCallback(matches, wanted)
 
@@ -114,7 +114,9 @@ def _check_words(text: str) -> list[str]:
 async def _run_all(name: str, work: list[Deferred[Stored]]) -> None:
     done = await gather_first(len(work), [_run(each) for each in work])
     if len(done) < len(work):
-        raise NoAnswer(f"{name}: the indexes of {len(work) - len(done)} of its {len(work)} words did not answer")
+        raise NoAnswer(
+            f"{name}: the indexes of {len(work) - len(done)} of the {len(work)} words did not answer; try again"
+        )
 
 
 async def _run(work: Deferred[Stored]) -> int:

@@ -1,6 +1,6 @@
 """The interface of a node to its tuple spaces; ``EntangledNode`` implements it.
 
-A space reads and writes records, finds the nodes closest to a key and calls their methods.
+A tuple space reads and writes records, finds the nodes closest to a key, and calls their methods.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ class RecordAccess(Protocol):
         """Write the record ``name`` of this node under ``key``."""
 
     def remove(self, key: bytes, name: str) -> Deferred[Stored]:
-        """Write a tombstone in its place."""
+        """Replace the record ``name`` of this node under ``key`` by a tombstone."""
 
     def get(self, key: bytes) -> Deferred[list[Record]]:
         """Read all records under ``key``."""
@@ -49,26 +49,26 @@ class NodeInterface(RecordAccess, Protocol):
 
     @property
     def identity(self) -> Identity:
-        """Its key pair."""
+        """The node's key pair."""
 
     @property
     def contact(self) -> Contact:
-        """Its public key and address."""
+        """The node's public key and address."""
 
     @property
     def store(self) -> Store:
-        """The records and notes that it holds."""
+        """The records and notes that the node stores."""
 
     @property
     def endpoint(self) -> MethodCaller:
-        """Its endpoint."""
+        """The node's endpoint."""
 
     @property
     def take_acceptor(self) -> TakeAcceptor:
-        """Its acceptor for takes."""
+        """The node's acceptor for takes."""
 
     def find_node(self, node_id: bytes) -> Deferred[list[Contact]]:
         """Look up the k live nodes closest to ``node_id``."""
 
     def find_newest(self, contact: Contact) -> Contact:
-        """Return ``contact`` with the last address it was observed at."""
+        """Return ``contact`` with the last address at which it was observed."""

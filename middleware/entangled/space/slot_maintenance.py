@@ -1,7 +1,7 @@
 """Maintenance of a node's records in a tuple space: notes of taken tuples, and reuse of their slots.
 
-Safety does not depend on it, since the council knows the taker of a tuple.  A note only saves readers from trying a
-tuple that is taken.
+Safety does not depend on the notes, because the council of a tuple knows its taker.  A note only prevents other nodes
+from trying to take a tuple that is already taken.
 """
 
 from __future__ import annotations
@@ -26,17 +26,17 @@ from middleware.entangled.space.tuple_record import (
 )
 
 GRACE_S = 2.0
-"""Seconds that a taker has to note its take, before another node that detected it writes the note instead."""
+"""Seconds within which a taker should note its take; afterwards another node that detected the take writes the note."""
 CLEANUP_INTERVAL_S = 30.0
 EARLY_CLEANUP_S = 2.0
-"""Seconds before the slots are tidied if their number grows quickly."""
+"""Seconds before slots are freed if their number grows quickly."""
 MIN_SLOTS = 8
-"""Slots in use up to which they are not tidied early."""
+"""The number of used slots up to which slots are not freed early."""
 
 
 @dataclass
 class _Slots:
-    """The own slots under one key: their contents, and which may be reused."""
+    """The node's own slots under one key: their contents, and which of them may be reused."""
 
     contents: dict[str, TupleId] = field(default_factory=dict)
     free: list[str] = field(default_factory=list)
@@ -52,7 +52,7 @@ class SlotMaintenance:
         self._node = node
         self._rng = rng
         self._background = background
-        # Slot names are unique to this run: tuples of earlier runs must not be overwritten.
+        # Slot names are unique to this run, because tuples of earlier runs must not be overwritten.
         self._run_id = rng.randbytes(4).hex()
         self._slot_count = 0
         self._slots_by_key: dict[bytes, _Slots] = {}
@@ -60,7 +60,7 @@ class SlotMaintenance:
 
     @property
     def keys(self) -> list[bytes]:
-        """The keys maintained here."""
+        """The keys whose slots are maintained."""
         return list(self._slots_by_key)
 
     def add_key(self, key: bytes) -> None:
@@ -80,13 +80,13 @@ class SlotMaintenance:
         await self._node.put(key, name, pack_tuple(tuple_id.mark, fields, council))
 
     async def put_taken_note(self, tuple_id: TupleId, taker: bytes) -> None:
-        """Write a note that the tuple of ``tuple_id`` was taken, which hides it from readers."""
+        """Write a note that the tuple ``tuple_id`` was taken; the note hides the tuple from readers."""
         name = self._take_slot(tuple_id.key)
         self._slots_by_key[tuple_id.key].contents[name] = tuple_id
         await self._node.put(tuple_id.key, name, pack_taken(tuple_id, taker))
 
     def check_taken_note(self, tuple_id: TupleId, taker: bytes) -> None:
-        """Check after ``GRACE_S`` seconds whether ``taker`` has noted its take, and note it otherwise."""
+        """Check after ``GRACE_S`` seconds whether ``taker`` has noted its take; if not, write the note."""
         if not self._unconfirmed:
             self._background.later(GRACE_S, lambda: self._background.fork(self._check_unconfirmed()))
         self._unconfirmed[tuple_id] = taker
@@ -136,11 +136,11 @@ class SlotMaintenance:
             self._slots_by_key[key].is_cleanup_scheduled = False
 
     async def _clean_up(self, key: bytes, is_thorough: bool = False) -> None:
-        """Free the own slots under ``key`` with taken tuples, or with notes about tuples that no longer exist.
+        """Free own slots under ``key`` that contain taken tuples, or notes about tuples that no longer exist.
 
-        A slot is freed only after this node has read back its last write, because replicas may lag.  A note is freed
-        only when its tuple was missing in two reads, because one read may miss it.  A thorough run also removes the
-        records of slots that were free in the last run already, to make reads smaller.
+        A slot is freed only after this node has read back its last write, because replicas may be late.  A note is
+        freed only after its tuple was missing in two reads, because a single read may miss the tuple.  A thorough run
+        also removes the records of slots that were already free in the previous run, to make reads smaller.
         """
         slots = self._slots_by_key[key]
         idle = set(slots.free)

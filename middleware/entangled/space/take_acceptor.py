@@ -1,8 +1,8 @@
 """The acceptor of a node for takes of tuples: answers claims, confirmations and releases.
 
-It stores its votes as notes in the node's store, so they survive a restart.  A node without notes starts with a new
-incarnation.  Tuples name the incarnation of each member, so a member that lost its votes does not vote about tuples
-that it may have voted on before.
+The acceptor stores its votes as notes in the node's store, so the votes survive a restart.  A node without notes starts
+with a new incarnation.  Each tuple contains the incarnation of each council member, so a member that lost its votes
+does not vote again about tuples that it may have voted on.
 """
 
 from __future__ import annotations
@@ -33,9 +33,9 @@ from middleware.entangled.space.tuple_record import (
 )
 
 MAX_TUPLES = 12
-"""Tuples in one request: more would not fit into a datagram."""
+"""The maximum number of tuples in one request: more would not fit into a datagram."""
 UNFINISHED_S = 3.0
-"""Seconds after which a member completes a confirmation that it has not seen the end of."""
+"""Seconds after which a member completes a confirmation whose end it has not observed."""
 TERMS = AcceptorSettings(completion_s=1.0, must_prepare=True)
 _INCARNATION: Final = "decree/incarnation"
 
@@ -50,10 +50,10 @@ class MethodRegistry(Protocol):
 
 
 class TakeAcceptor:
-    """The acceptor of one node for all councils that it is a member of.
+    """The acceptor of one node for all councils of which the node is a member.
 
-    ``wait_for_write`` may be set to a function that returns a Deferred which fires when all notes are on disk; answers
-    then wait for it, so that even a power failure loses no vote that was sent.
+    ``wait_for_write`` may be set to a function that returns a Deferred, which fires when all notes are on disk.
+    Answers then wait for this Deferred, so even a power failure loses no vote that was sent.
     """
 
     def __init__(self, endpoint: MethodRegistry, store: Store, clock: IReactorTime, rng: random.Random) -> None:
@@ -75,7 +75,7 @@ class TakeAcceptor:
 
     @property
     def incarnation(self) -> bytes:
-        """The random id of this node's set of votes; it changes if the node loses them."""
+        """The random id of this node's set of votes; it changes if the node loses the votes."""
         self.load()
         return self._incarnation
 
@@ -85,13 +85,13 @@ class TakeAcceptor:
             self._acceptor = self._load()
 
     def find_vote(self, tuple_id: TupleId) -> Register | None:
-        """Return this node's vote about the tuple of ``tuple_id``, or None."""
+        """Return this node's vote about the tuple ``tuple_id``, or None."""
         return self._loaded_acceptor.log.get(tuple_id)
 
     def list_unfinished(self) -> list[StoredTuple]:
-        """Return the tuples with a take accepted here that has had no known end for ``UNFINISHED_S`` seconds.
+        """Return the tuples whose take this acceptor accepted but has not seen completed for ``UNFINISHED_S`` seconds.
 
-        Each is returned again after ``UNFINISHED_S`` seconds, until ``finish`` is called.
+        Each tuple is returned again every ``UNFINISHED_S`` seconds, until ``finish`` is called.
         """
         now = self._clock.seconds()
         late = [tuple_id for tuple_id, since in self._unfinished.items() if since + UNFINISHED_S <= now]
@@ -103,7 +103,7 @@ class TakeAcceptor:
                 self._unfinished[tuple_id] = now
                 found.append(parsed)
             else:
-                self.finish(tuple_id)  # removed, or stored at other nodes, which complete it
+                self.finish(tuple_id)  # the tuple was removed, or is stored at other nodes, which complete it
         return found
 
     def finish(self, tuple_id: TupleId) -> None:
@@ -113,7 +113,7 @@ class TakeAcceptor:
     # -- requests of claimants --------------------------------------------------------------------------------------
 
     def answer_enrol(self, peer: Contact) -> bytes:
-        """ENROL: agree to be a member of councils; return the incarnation."""
+        """Answer ENROL: agree to be a member of councils; return the incarnation."""
         return self.incarnation
 
     def answer_claim(
@@ -126,10 +126,10 @@ class TakeAcceptor:
         taker: bytes,
         lease: float,
     ) -> Answers:
-        """CLAIM: promise and lease the ballot for each of ``tuple_ids`` under ``key``, or reply with the reason."""
+        """Answer CLAIM: grant the ballot a promise and lease on each tuple in ``tuple_ids``, or return the reason."""
         wanted, ballot = self._parse_request(key, tuple_ids, incarnation, counter, taker)
         if not 0.0 < lease <= MAX_LEASE_S:
-            raise Refused(f"a lease lasts more than 0 and at most {MAX_LEASE_S:.0f} seconds")
+            raise Refused(f"the lease must be more than 0 and at most {MAX_LEASE_S:.0f} seconds")
         now = self._clock.seconds()
         return self._pack_answer(
             Event.PREPARE, [self._prepare(tuple_id, ballot, float(lease), now) for tuple_id in wanted]
@@ -145,10 +145,10 @@ class TakeAcceptor:
         taker: bytes,
         value: bytes,
     ) -> Answers:
-        """CONFIRM: accept ``value`` as the taker of each of ``tuple_ids`` under the ballot, or reply with a reason."""
+        """Answer CONFIRM: accept ``value`` as the taker of each tuple in ``tuple_ids``, or return the reason."""
         wanted, ballot = self._parse_request(key, tuple_ids, incarnation, counter, taker)
         if not is_taker_name(value):
-            raise Refused("decree.confirm needs the name of a taker")
+            raise Refused("decree.confirm: the value must be the name of a taker")
         now, acceptor = self._clock.seconds(), self._loaded_acceptor
         replies = [acceptor.accept(tuple_id, FIRST_CONFIGURATION, ballot, value, now) for tuple_id in wanted]
         for tuple_id, reply in zip(wanted, replies, strict=True):
@@ -159,7 +159,7 @@ class TakeAcceptor:
     def answer_release(
         self, peer: Contact, key: bytes, tuple_ids: list[object], incarnation: bytes, counter: int, taker: bytes
     ) -> Answers:
-        """RELEASE: end the ballot's lease on each of ``tuple_ids``."""
+        """Answer RELEASE: end the ballot's lease on each tuple in ``tuple_ids``."""
         wanted, ballot = self._parse_request(key, tuple_ids, incarnation, counter, taker)
         now = self._clock.seconds()
         replies = [self._loaded_acceptor.release(tuple_id, ballot, now) for tuple_id in wanted]
@@ -170,18 +170,20 @@ class TakeAcceptor:
     def _parse_request(
         self, key: bytes, tuple_ids: list[object], incarnation: bytes, counter: int, taker: bytes
     ) -> tuple[list[TupleId], Ballot]:
-        """Check the common arguments of a request; return the tuples and the ballot; raise ``Refused``."""
+        """Check the common arguments of a request and return the tuple ids and the ballot; raise ``Refused``."""
         if incarnation != self.incarnation:
-            raise Refused("this member has lost its votes since it joined that council")
+            raise Refused("this member has lost its votes since it joined the council of the tuple; try another tuple")
         if len(key) != KEY_BYTES or not 0 < len(tuple_ids) <= MAX_TUPLES:
-            raise Refused(f"a request names a key and 1 to {MAX_TUPLES} places")
+            raise Refused(f"the request must contain a key and 1 to {MAX_TUPLES} tuple ids")
         wanted = [
             tuple_id for tuple_id in (parse_tuple_id(key, fields) for fields in tuple_ids) if tuple_id is not None
         ]
         if len(wanted) < len(tuple_ids) or len(set(wanted)) < len(wanted):
-            raise Refused("a place is an owner, a name and a mark, and a request names each place once")
+            raise Refused(
+                "a tuple id must consist of an owner, a name and a mark, and must not occur twice in a request"
+            )
         if not (is_counter(counter) and is_taker_name(taker)):
-            raise Refused("a ballot is a positive number and the name of a taker")
+            raise Refused("the ballot must consist of a positive number and the name of a taker")
         return wanted, Ballot(counter, taker)
 
     @property
@@ -195,7 +197,7 @@ class TakeAcceptor:
             return Reply(ReplyKind.OUTBID, ballot)
         reply = self._loaded_acceptor.prepare(tuple_id, FIRST_CONFIGURATION, ballot, 0.0, now, lease)
         if reply.kind is ReplyKind.QUIET:
-            raise Refused(f"this member has room for {MAX_REGISTERS} votes and all are in use; try another tuple")
+            raise Refused(f"this member already stores the maximum of {MAX_REGISTERS} votes; try another tuple")
         return reply
 
     def _is_over(self, tuple_id: TupleId) -> bool:
@@ -207,7 +209,7 @@ class TakeAcceptor:
         return not isinstance(parsed, StoredTuple) or parsed.tuple_id != tuple_id
 
     def _may_forget(self, tuple_id: TupleId, vote: Register, now: float) -> bool:
-        """Return whether a vote is no longer needed: its lease has expired, or its tuple does not exist."""
+        """Return whether a vote is no longer needed: its lease has expired, or the tuple no longer exists."""
         return (vote.accepted == NO_BALLOT and vote.reserved_until <= now) or self._is_over(tuple_id)
 
     def _pack_answer(self, event: Event, replies: list[Reply]) -> Answers:

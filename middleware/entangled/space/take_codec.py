@@ -1,4 +1,4 @@
-"""Encoding of decisions about tuples in messages (``decree.*``) and in notes of the store; pure."""
+"""Encoding of decisions about tuples in messages (``decree.*``) and in notes of the store; without I/O."""
 
 from __future__ import annotations
 
@@ -71,7 +71,7 @@ def _pack(registers: dict[TupleId, Register]) -> bytes:
 def _unpack(noted: bytes) -> tuple[dict[TupleId, Register], bool]:
     try:
         rows = msgpack.unpackb(noted, strict_map_key=True, max_ext_len=0)
-    except Exception:  # msgpack on bytes that may be corrupt
+    except Exception:  # msgpack raises many types on corrupt bytes
         return {}, False
     pairs = [_unpack_row(row) for row in rows] if isinstance(rows, list) else [None]
     return dict(pair for pair in pairs if pair is not None), None not in pairs
@@ -102,7 +102,7 @@ def _pack_accepted(ballot: Ballot, value: object) -> list[object] | None:
 
 
 def _unpack_accepted(fields: object) -> tuple[Ballot, bytes | None] | None:
-    """Decode the accepted ballot, ``NO_BALLOT`` if there is none, and value; None if the fields are invalid."""
+    """Decode the accepted ballot (``NO_BALLOT`` if there is none) and value; None if the fields are invalid."""
     if fields is None:
         return NO_BALLOT, None
     if not isinstance(fields, list) or len(fields) != 3:

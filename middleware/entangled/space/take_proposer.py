@@ -1,6 +1,7 @@
-"""The proposer's requests to the council of a tuple, the members named in its record.
+"""The proposer's requests to the council of a tuple, whose members are listed in the tuple's record.
 
-It claims tuples, confirms takes, and completes unfinished decisions; it depends only on a function that asks a member.
+The proposer claims tuples, confirms takes, and completes unfinished decisions; it depends only on a function that sends
+a request to a member.
 """
 
 from __future__ import annotations
@@ -30,7 +31,7 @@ Ask = Callable[[Contact, str, tuple[object, ...]], "Deferred[Any]"]
 
 
 class TakeProposer:
-    """The requests of one claimant to councils; ``background`` ends with the claimant."""
+    """The requests of one claimant to councils; ``background`` stops when the claimant stops."""
 
     def __init__(self, ask: Ask, clock: IReactorTime, rng: random.Random, background: Background) -> None:
         self._ask = ask
@@ -39,16 +40,16 @@ class TakeProposer:
         self._background = background
 
     async def claim(self, tuples: Sequence[StoredTuple], ballot: Ballot, lease: float) -> list[Outcome]:
-        """Run one round of claims for tuples of one key and council; release the others afterwards."""
+        """Run one round of claims for tuples of one key and council; then release the tuples not won."""
         outcomes = await self.renew(tuples, ballot, lease)
         lost = [p for p, o in zip(tuples, outcomes, strict=True) if o.result not in (Result.WON, Result.DECIDED)]
         if lost:
-            # The promises of a minority must not delay another claimant.
+            # Promises of only a minority must not delay other claimants.
             self.release(lost, ballot)
         return outcomes
 
     async def renew(self, tuples: Sequence[StoredTuple], ballot: Ballot, lease: float) -> list[Outcome]:
-        """Run one round of claims under a ballot that has won before; if it fails, the present lease stays valid."""
+        """Run one round of claims under a ballot that has already won; if it fails, the current lease stays valid."""
         return await self._run_round(tuples, "decree.claim", Event.PREPARE, ballot, lease)
 
     async def confirm(self, tuples: Sequence[StoredTuple], ballot: Ballot, value: bytes) -> list[Outcome]:
@@ -56,7 +57,7 @@ class TakeProposer:
         return await self._run_round(tuples, "decree.confirm", Event.ACCEPT, ballot, value)
 
     def release(self, tuples: Sequence[StoredTuple], ballot: Ballot) -> None:
-        """Release the leases at all reachable members; at the others they expire."""
+        """Release the leases at all reachable members; at unreachable members the leases expire."""
         for member in tuples[0].council:
             request = self._ask(member.contact, "decree.release", _make_arguments(tuples, member, ballot))
             request.addErrback(lambda failure: failure.trap(EntangledError))
@@ -64,8 +65,8 @@ class TakeProposer:
     async def resolve(self, stored: StoredTuple, bidder: bytes, value: bytes | None, counter: int = 0) -> bytes | None:
         """Retry until the council has decided about a tuple, and return the decided value.
 
-        Proposes ``value`` if no other value was accepted.  With None it proposes none, and returns None if no value was
-        accepted.  Raises ``NotRunning`` when the claimant is stopped.
+        Proposes ``value`` if no other value was accepted.  If ``value`` is None, no new value is proposed, and the
+        result is None if no value was accepted.  Raises ``NotRunning`` when the claimant is stopped.
         """
 
         async def prepare(ballot: Ballot) -> Outcome:

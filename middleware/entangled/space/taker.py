@@ -27,11 +27,11 @@ from middleware.entangled.space.template import Template, Tuple
 from middleware.entangled.space.tuple_record import INCARNATION_BYTES, Member, StoredTuple, TupleId, parse_records
 
 CLOCK_DRIFT = 0.02
-"""Relative drift between the clocks of two correct nodes (1 % each)."""
+"""The maximum relative drift between the clocks of two correct nodes (1 % each)."""
 COUNCIL_CACHE_S = 5.0
-"""Seconds that the enrolled council of a key is reused."""
+"""Seconds for which the enrolled council of a key is reused."""
 MAX_ENROLMENTS = 3
-"""Attempts to look up and enrol the nodes closest to a key."""
+"""The number of attempts to look up and enrol the nodes closest to a key."""
 REPAIR_INTERVAL_S = 2.0
 LEASED_RETRY_S = 0.5
 CONTEST_RETRY_S = (0.02, 0.08)
@@ -45,7 +45,7 @@ class ClaimLost(Refused):
 
 
 class WaitingCall:
-    """A call that waits for a tuple; ``is_over`` when it was answered, cancelled or timed out."""
+    """A call that waits for a tuple; ``is_over`` once it has fired, was cancelled or timed out."""
 
     def __init__(self) -> None:
         self.is_over = False
@@ -83,26 +83,29 @@ class Claim:
         """Take the tuple permanently; fires when the council has decided.
 
         Fails with ``ClaimLost`` if the council decided for another claimant, which is possible only after the deadline.
-        If the call is cancelled and the council decides for it, the tuple is put back.
+        If the call is cancelled, but the council decides in its favour, the tuple is put back.
         """
         return fail(ClaimLost(OVER_TEXT)) if self.is_over else self._taker.confirm(self)
 
     def release(self) -> None:
-        """Make the tuple available to others at once."""
+        """Make the tuple available to other takers immediately."""
         if not self.is_over:
             self.is_over = True
             self._taker.release(self)
 
     def renew(self) -> Deferred[None]:
-        """Renew the lease from now; fails with ``ClaimLost``, or with ``NoAnswer`` while the lease is valid."""
+        """Renew the lease from now.
+
+        Fails with ``ClaimLost``, or with ``NoAnswer`` if too few members answer but the lease is still valid.
+        """
         return fail(ClaimLost(OVER_TEXT)) if self.is_over else Deferred.fromCoroutine(self._taker.renew(self))
 
 
 class Taker:
     """The takes of one node in one space; ``claimed`` are its claimed tuples, ``taken`` the tuples known to be taken.
 
-    ``on_freed`` is called when this node gives up a tuple that it held or failed to claim, ``on_unwanted`` with a tuple
-    that was confirmed for a call that has ended.
+    ``on_freed`` is called when this node gives up a tuple that it claimed or failed to claim.  ``on_unwanted`` is
+    called with a tuple that was confirmed for a call that has already ended.
     """
 
     def __init__(
@@ -136,10 +139,10 @@ class Taker:
     # -- councils ---------------------------------------------------------------------------------------------------
 
     async def enrol_council(self, key: bytes) -> list[Member]:
-        """Return the council for a new tuple: the live nodes closest to ``key``, this one among them.
+        """Return the council for a new tuple: the live nodes closest to ``key``, including this node.
 
-        It is smaller than configured only if the network is.  Fails with ``NoAnswer`` if other nodes do not answer,
-        because a council of one or two would not survive the loss of a member.
+        The council is smaller than configured only if the network has fewer nodes.  Fails with ``NoAnswer`` if other
+        nodes do not answer, because a council of one or two would not survive the loss of a member.
         """
         until, members = self._members.get(key, (0.0, []))
         if until > self._clock.seconds():
@@ -158,11 +161,11 @@ class Taker:
                 self._members[key] = (self._clock.seconds() + COUNCIL_CACHE_S, members)
                 return members
         raise NoAnswer(
-            f"{len(members)} of {self._council_size} nodes agreed to be in the council of a tuple; try again"
+            f"only {len(members)} of {self._council_size} nodes agreed to be in the council of the tuple; try again"
         )
 
     async def _enrol(self, contact: Contact) -> Member | None:
-        """Ask the node to be a member; return None if it refuses."""
+        """Ask the node to be a member of the council; return None if it does not agree."""
         try:
             incarnation = await self._ask(contact, "decree.enrol", ())
         except Refused:
@@ -175,7 +178,7 @@ class Taker:
         if contact.node_id == node.identity.node_id:
             answer = getattr(node.take_acceptor, method.replace("decree.", "answer_"))
             return maybeDeferred(answer, node.contact, *arguments)
-        # A member may have moved since the tuple was put; its key is still the same.
+        # A member may have a new address since the tuple was put; its key is still the same.
         return node.endpoint.ask(node.find_newest(contact), method, *arguments, changes=method != "decree.enrol")
 
     # -- choosing ---------------------------------------------------------------------------------------------------
@@ -183,7 +186,7 @@ class Taker:
     def find_candidates(
         self, tuples: Sequence[StoredTuple], template: Template, is_patient: bool = True
     ) -> tuple[list[StoredTuple], float | None]:
-        """Return the tuples to try now, in this node's order, and the seconds until another may be tried.
+        """Return the tuples to try now, in this node's order, and the seconds until another tuple may be tried.
 
         The order differs between nodes, so that takers rarely compete for a tuple.  Tuples that this node failed to
         claim come last, the oldest failure first, so that tuples with an unreachable council do not block the others.
@@ -199,7 +202,7 @@ class Taker:
         return ready, min((max(0.001, time - now) for time in times), default=None)
 
     def select_batch(self, tuples: Sequence[StoredTuple], most: int) -> list[StoredTuple]:
-        """Return the first of ``tuples`` and others with the same council, as many as fit into one request."""
+        """Return the first of ``tuples`` and further tuples of its council, as many as fit into one request."""
         same_council = [one for one in tuples if one.council == tuples[0].council]
         return same_council[: min(most, MAX_TUPLES)]
 
@@ -220,7 +223,7 @@ class Taker:
                 claims.append(Claim(one, ballot, lease, deadline, self))
                 self._expire(claims[-1])
             elif outcome.result is Result.WON:
-                # A taker failed during its confirmation: complete it in that taker's name.
+                # A taker failed during its confirmation: complete the confirmation in that taker's name.
                 self._background.fork(self._complete(one, outcome.value))
             else:
                 self._note_failed_claim(one.tuple_id, outcome)
@@ -229,10 +232,10 @@ class Taker:
         return claims, any(outcome.result is Result.SILENT for outcome in outcomes)
 
     async def decide(self, claims: Sequence[Claim], wait: WaitingCall | None = None) -> list[bool]:
-        """Confirm claims of one ballot; return for each whether this node took the tuple.
+        """Confirm claims of one ballot; return for each claim whether this node took the tuple.
 
-        Retries until the council has decided, because no other node can take a tuple that may have been given to this
-        one.  A tuple won after the call has ended is put back.
+        Retries until the council has decided, because as long as this node may have won a tuple, no other node can take
+        it.  A tuple that this node wins after the call has ended is put back.
         """
         if not claims:
             return []
@@ -292,7 +295,7 @@ class Taker:
             self._not_before[tuple_id] = now + self._rng.uniform(*CONTEST_RETRY_S)
         else:
             self._not_before[tuple_id] = now + self._rng.uniform(*SILENT_RETRY_S)
-        # Wake other calls of this node that wait because this one held the tuple.
+        # Wake other calls of this node, which wait because this call held the tuple.
         self._free_tuple(tuple_id)
 
     def _forget_taken(self, tuple_id: TupleId, winner: bytes) -> None:
@@ -307,7 +310,7 @@ class Taker:
         return self._node.identity.node_id + self._rng.randbytes(8)
 
     def _complete_unfinished(self) -> None:
-        """Complete takes that this node accepted as a council member without seeing their end."""
+        """Complete takes that this node accepted as a council member but has not seen completed."""
         late = [
             stored for stored in self._node.take_acceptor.list_unfinished() if stored.tuple_id.key in self._slots.keys
         ]
@@ -322,7 +325,7 @@ class Taker:
     # -- methods of a claim -----------------------------------------------------------------------------------------
 
     def confirm(self, claim: Claim) -> Deferred[Tuple]:
-        """Confirm a claim; if the call is cancelled and the council decides for it, put the tuple back."""
+        """Confirm a claim; if the call is cancelled, but the council decides in its favour, put the tuple back."""
         wait = WaitingCall()
 
         async def work() -> None:
@@ -347,7 +350,7 @@ class Taker:
         sent = self._clock.seconds()
         [outcome] = await self._proposer.renew([claim.stored_tuple], claim.ballot, claim.lease)
         if outcome.result is Result.SILENT:
-            raise NoAnswer("too few council members answer to renew the claim; try again before its deadline")
+            raise NoAnswer("too few council members answered to renew the claim; try again before its deadline")
         if outcome.result is not Result.WON or outcome.value is not None:
             raise ClaimLost("another node claimed the tuple after the claim had expired")
         claim.deadline = sent + claim.lease * (1.0 - CLOCK_DRIFT)
@@ -368,6 +371,6 @@ class Taker:
 
 
 def _limit_size(remembered: dict[TupleId, Any]) -> None:
-    """Drop the oldest entries above the limit; the council still knows them."""
+    """Drop the oldest entries above the limit; the councils still know these takes."""
     while len(remembered) > MAX_REMEMBERED:
         del remembered[next(iter(remembered))]

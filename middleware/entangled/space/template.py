@@ -1,8 +1,9 @@
-"""Tuples and templates: their valid fields, and matching; pure.
+"""Tuples and templates: their valid fields, and matching; without I/O.
 
-A tuple is a sequence of at most ``MAX_FIELDS`` values.  A template has as many fields, each a value, ``ANY``, a type
-(``int``, ``float``, ``str``, ``bytes``, ``bool``) or a predicate made by ``where``.  Types are strict: ``1``, ``1.0``
-and ``True`` are three values; only predicates that compare numbers treat ``int`` and ``float`` alike.
+A tuple is a sequence of at most ``MAX_FIELDS`` values.  A template matches tuples with the same number of fields.  Each
+field of a template is a value, ``ANY``, a type (``int``, ``float``, ``str``, ``bytes``, ``bool``) or a predicate made
+by ``where``.  Types are strict: ``1``, ``1.0`` and ``True`` are three different values; only predicates that compare
+numbers treat ``int`` and ``float`` alike.
 """
 
 from __future__ import annotations
@@ -22,7 +23,7 @@ Tuple = tuple[Value, ...]
 
 MAX_FIELDS = 32
 MAX_TUPLE_BYTES = 600
-"""Maximum bytes of a tuple or template in msgpack; a record also has to hold the council."""
+"""The maximum bytes of a tuple or template in msgpack; the record of a tuple also needs space for the council."""
 MAX_CHOICES = 32
 OPERATORS = ("<", "<=", ">", ">=", "!=", "in", "prefix")
 _COMPARISONS: Final[dict[str, Callable[[Any, Any], bool]]] = {"<": lt, "<=": le, ">": gt, ">=": ge}
@@ -30,7 +31,7 @@ _TYPES: Final = (bool, bytes, float, int, str)
 
 
 class BadTuple(LocalError):
-    """A field of a tuple or template is invalid; the message names it and the valid ones."""
+    """A field of a tuple or template is invalid; the message contains the field and lists what is permitted."""
 
 
 @dataclass(frozen=True)
@@ -49,7 +50,10 @@ class Predicate:
     operand: Value | Tuple
 
     def holds(self, value: Value) -> bool:
-        """Return whether ``value`` passes; a value of another type does not, except under ``!=``."""
+        """Return whether ``value`` satisfies the predicate.
+
+        A value of a type different from the operand's satisfies only ``!=``.
+        """
         operand = self.operand
         if isinstance(operand, tuple):
             return any(_are_equal(value, choice) for choice in operand)
@@ -91,16 +95,18 @@ def where(operator: str, operand: Value | Sequence[Value]) -> Predicate:
     if isinstance(operand, Sequence) and not isinstance(operand, str | bytes):
         operand = tuple(operand)
     if operator not in OPERATORS:
-        raise BadTuple(f"operator {operator!r}: only {' '.join(OPERATORS)} are known")
+        raise BadTuple(f"the operator {operator!r} is unknown; use one of {' '.join(OPERATORS)}")
     if operator == "in":
         if not isinstance(operand, tuple) or len(operand) > MAX_CHOICES or not all(map(is_value, operand)):
-            raise BadTuple(f"in: takes a sequence of at most {MAX_CHOICES} values")
+            raise BadTuple(f"in: the operand must be a sequence of at most {MAX_CHOICES} values")
     elif not is_value(operand):
-        raise BadTuple(f"{operator}: {operand!r} is no value")
+        raise BadTuple(
+            f"{operator}: {operand!r} is not a valid operand; use None, a bool, int of 64 bits, float, str or bytes"
+        )
     elif operator == "prefix" and not isinstance(operand, str | bytes):
-        raise BadTuple("prefix: takes a str or bytes")
+        raise BadTuple("prefix: the operand must be a str or bytes")
     elif operator in _COMPARISONS and (operand is None or isinstance(operand, bool)):
-        raise BadTuple(f"{operator}: {operand!r} has no order")
+        raise BadTuple(f"{operator}: {operand!r} has no order; use an int, float, str or bytes")
     return Predicate(operator, operand)
 
 
@@ -114,7 +120,7 @@ def make_template(fields: Sequence[Field] | Template) -> Template:
             isinstance(field, Wildcard | Predicate) or (isinstance(field, type) and field in _TYPES) or is_value(field)
         )
         if not is_valid:
-            raise BadTuple(f"field {place}: {field!r} is no value, ANY, type or predicate")
+            raise BadTuple(f"field {place}: {field!r} is not a value, ANY, a type or a predicate")
     _check_size([_pack_field(field) for field in fields])
     return Template(tuple(fields))
 
@@ -124,14 +130,14 @@ def make_tuple(fields: Sequence[Value]) -> Tuple:
     _check_count(fields)
     for place, field in enumerate(fields):
         if not is_value(field):
-            raise BadTuple(f"field {place}: {field!r} is no None, bool, int of 64 bits, float, str or bytes")
+            raise BadTuple(f"field {place}: {field!r} must be None, a bool, int of 64 bits, float, str or bytes")
     values = tuple(fields)
     _check_size(list(values))
     return values
 
 
 def is_value(value: object) -> TypeGuard[Value]:
-    """Return whether ``value`` may be in a tuple; NaN may not, because it equals no value."""
+    """Return whether ``value`` may be in a tuple; NaN is invalid, because it is not equal to any value."""
     if value is None or isinstance(value, bool):
         return True
     if type(value) is int:
@@ -144,9 +150,9 @@ def is_value(value: object) -> TypeGuard[Value]:
 
 
 def parse_tuple(fields: object) -> Tuple:
-    """Return the tuple in a decoded message or record; raise only ``Malformed``."""
+    """Return the tuple in a decoded message or record; for any invalid input raise ``Malformed``."""
     if not isinstance(fields, list) or not 0 < len(fields) <= MAX_FIELDS or not all(map(is_value, fields)):
-        raise Malformed("not a tuple")
+        raise Malformed("the fields are not a valid tuple")
     return tuple(fields)
 
 
@@ -181,16 +187,16 @@ def _are_numbers(a: object, b: object) -> bool:
 
 def _check_count(fields: Sequence[object]) -> None:
     if isinstance(fields, str | bytes) or not isinstance(fields, Sequence):
-        raise BadTuple(f"{fields!r}: give the fields as a tuple or list")
+        raise BadTuple(f"{fields!r}: the fields must be a tuple or list")
     if not 0 < len(fields) <= MAX_FIELDS:
-        raise BadTuple(f"{len(fields)} fields; a tuple has 1 to {MAX_FIELDS}")
+        raise BadTuple(f"the tuple has {len(fields)} fields; it must have 1 to {MAX_FIELDS}")
 
 
 def _check_size(fields: list[object]) -> None:
     size = len(msgpack.packb(fields))
     if size > MAX_TUPLE_BYTES:
         raise TooLarge(
-            f"a tuple of {size} bytes; at most {MAX_TUPLE_BYTES} fit: store large values under their own key"
+            f"the tuple has {size} bytes; the limit is {MAX_TUPLE_BYTES}: store large values under their own key"
         )
 
 

@@ -1,7 +1,7 @@
-"""The tuples of one space and arity, kept up to date while calls wait for them.
+"""The tuples of one space and arity, updated as long as calls wait for them.
 
-Pushes of a watch wake the waiting calls.  In addition the node polls the replicas, so that the loss of
-the pushing replicas delays a call by less than a second.
+Pushes of a watch wake the waiting calls.  In addition the node polls the replicas, so a failure of the pushing replicas
+delays a call by less than a second.
 """
 
 from __future__ import annotations
@@ -17,13 +17,14 @@ from middleware.entangled.space.node_interface import NodeInterface
 from middleware.entangled.space.tuple_record import RecordParser, StoredTuple
 
 POLL_INTERVAL_S = 0.7
-"""Seconds between two polls; a poll and its answers must fit into the second that a wake-up may take."""
+"""Seconds between two polls.  This interval and the duration of a poll must together be less than one second, the
+maximum delay of a waiting call."""
 LINGER_S = 5.0
-"""Seconds that a watch outlives its last waiting call, so that calls in a loop share one subscription."""
+"""Seconds for which a watch continues after its last waiting call, so that calls in a loop share one subscription."""
 
 
 class TupleCache:
-    """The tuples under ``key``; ``tuples`` are those not known to be taken."""
+    """The tuples under ``key``; ``tuples`` are the tuples that are not known to be taken."""
 
     def __init__(self, node: NodeInterface, key: bytes, background: Background) -> None:
         self.key = key
@@ -40,7 +41,7 @@ class TupleCache:
 
     @property
     def is_open(self) -> bool:
-        """Whether the tuples are kept up to date at present."""
+        """Whether the tuples are currently updated."""
         return self._watch is not None
 
     def start_waiting(self) -> None:
@@ -61,7 +62,7 @@ class TupleCache:
             self._stop_lingering = self._background.later(LINGER_S, self.close)
 
     def record_call(self) -> None:
-        """Note a call that does not wait; from the second within ``LINGER_S`` on, the tuples are kept up to date."""
+        """Record a call that does not wait; the second call within ``LINGER_S`` seconds starts the updates."""
         if self._was_called:
             self.start_waiting()
             self.stop_waiting()

@@ -1,4 +1,4 @@
-"""The records of a tuple space: tuples, and notes that a tuple was taken; pure.
+"""The records of a tuple space: tuples, and notes that a tuple was taken; without I/O.
 
 A publisher reuses the slots of taken tuples, so a tuple is identified by its slot and a random mark.
 """
@@ -34,7 +34,7 @@ class TupleId(NamedTuple):
 
     @property
     def slot(self) -> Slot:
-        """The slot of its record."""
+        """The slot of the tuple's record."""
         return Slot(self.key, self.owner, self.name)
 
     def pack(self) -> list[object]:
@@ -44,7 +44,7 @@ class TupleId(NamedTuple):
 
 @dataclass(frozen=True)
 class Member:
-    """A council member and its incarnation at its enrolment; a member that lost its votes has another one."""
+    """A council member and its incarnation at its enrolment; the incarnation changes if it loses its votes."""
 
     contact: Contact
     incarnation: bytes
@@ -61,7 +61,7 @@ class StoredTuple:
 
 @dataclass(frozen=True)
 class TakenNote:
-    """A note that ``taker`` took the tuple of ``place``, written by the taker or by a node that detected it."""
+    """A note that ``taker`` took a tuple, written by the taker or by a node that detected the take."""
 
     tuple_id: TupleId
     taker: bytes
@@ -90,7 +90,7 @@ def parse_record(record: Record) -> StoredTuple | TakenNote | None:
     """Parse a record of a space; None if it is invalid."""
     try:
         fields = msgpack.unpackb(record.value or b"", strict_map_key=True, max_ext_len=0)
-    except Exception:  # msgpack on bytes from peers
+    except Exception:  # msgpack raises many types on invalid bytes of peers
         return None
     match fields:
         case [1, bytes(mark), values, list(members)] if (
@@ -131,7 +131,7 @@ class RecordParser:
         self._parsed: dict[tuple[bytes, bytes], StoredTuple | TakenNote | None] = {}
 
     def parse(self, records: Iterable[Record]) -> SpaceContents:
-        """Return the tuples in ``records`` that were not taken, in order, and the notes of taken ones."""
+        """Return the tuples in ``records`` that were not taken, in order, and the notes of taken tuples."""
         before, self._parsed = self._parsed, {}
         stored: list[StoredTuple] = []
         taken: dict[TupleId, TakenNote] = {}
@@ -146,7 +146,7 @@ class RecordParser:
 
 
 def parse_records(records: Iterable[Record]) -> SpaceContents:
-    """Return the tuples in ``records`` that were not taken, in order, and the notes of taken ones."""
+    """Return the tuples in ``records`` that were not taken, in order, and the notes of taken tuples."""
     return RecordParser().parse(records)
 
 

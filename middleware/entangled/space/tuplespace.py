@@ -1,7 +1,8 @@
 """The tuple space: put, get, read and claim tuples by template; at most one taker gets each tuple.
 
-A tuple is a record of its publisher that names the council which decides about its taker; ``take_acceptor`` has the
-acceptors, ``taker`` the proposers.  ``docs/reference/tuple-space.md`` describes the conditions that calls wait for.
+A tuple is a record of its publisher.  The record lists the members of the council that decides about the taker of the
+tuple; ``take_acceptor`` contains the acceptors, ``taker`` the proposers.  ``docs/reference/tuple-space.md`` describes
+the conditions for which calls wait.
 """
 
 from __future__ import annotations
@@ -38,8 +39,9 @@ class NoTuple(TransientError):
 class TupleSpace:
     """The tuples of one space, used through one node.
 
-    ``council`` is the number of nodes that decide about each tuple put here: 3 survive the loss of 1, and 5 of 2, at
-    the cost of more requests.  Spaces with different names are separate.
+    ``council`` is the number of nodes that decide about each tuple that this node puts.  A council of 3 survives the
+    loss of 1 node, and a council of 5 the loss of 2 nodes, but with more requests.  Spaces with different names are
+    separate.
     """
 
     _log = Logger()
@@ -72,7 +74,7 @@ class TupleSpace:
         self._waiting_calls: dict[WaitingCall, None] = {}
 
     def stop(self) -> None:
-        """Fail all calls with ``NotRunning`` and stop all timers; claimed tuples return when their lease ends."""
+        """Fail all calls with ``NotRunning`` and stop all timers; claimed tuples are free when their lease ends."""
         if self._background.is_stopped:
             return
         self._background.stop()
@@ -86,10 +88,10 @@ class TupleSpace:
     # -- put --------------------------------------------------------------------------------------------------------
 
     def put(self, fields: Sequence[Value], ttl: float | None = None) -> Deferred[None]:
-        """Put a tuple; fires when a majority of its replicas has stored it, so that it can outlive this node.
+        """Put a tuple; fires when a majority of its replicas has stored it, so the tuple survives this node.
 
-        With ``ttl`` it is removed after that many seconds, if this node is alive.  Raises ``BadTuple`` and ``TooLarge``
-        at once.  If it fails with ``NoAnswer`` the tuple may appear nevertheless.
+        With ``ttl`` the tuple is removed after that many seconds, if this node is still running.  Raises ``BadTuple``
+        and ``TooLarge`` immediately.  If the call fails with ``NoAnswer``, the tuple may appear nevertheless.
         """
         return self._start(self._put(make_tuple(fields), ttl))
 
@@ -102,14 +104,14 @@ class TupleSpace:
     def get(self, template: Sequence[Field] | Template, timeout: float | None = None) -> Deferred[Tuple]:
         """Take a matching tuple, waiting for one; fails with ``NoTuple`` after ``timeout`` seconds; can be cancelled.
 
-        If the council decides for a call that was cancelled at that time, the tuple is put back.
+        If the call is cancelled, but the council decides in its favour, the tuple is put back.
         """
         return self._start_waiting(self._get, make_template(template), timeout)
 
     def get_if_exists(self, template: Sequence[Field] | Template) -> Deferred[Tuple | None]:
-        """Take a matching tuple; fire with None if there is none, or all are claimed by others.
+        """Take a matching tuple; fire with None if there is none, or if other takers have claimed all of them.
 
-        Fails with ``NoAnswer`` if there is one, but too few members of its council are reachable.
+        Fails with ``NoAnswer`` if a tuple matches, but too few members of its council are reachable.
         """
         many = self.get_many(template, 1)
         return many.addCallback(lambda found: found[0] if found else None)
@@ -121,7 +123,10 @@ class TupleSpace:
     def claim(
         self, template: Sequence[Field] | Template, lease: float = 10.0, timeout: float | None = None
     ) -> Deferred[Claim]:
-        """Claim a matching tuple for ``lease`` seconds, waiting for one as ``get`` does; confirm it after use."""
+        """Claim a matching tuple for ``lease`` seconds, waiting for one as ``get`` does.
+
+        Confirm the claim when the work on the tuple is done.
+        """
 
         async def work(wanted: Template, wait: WaitingCall) -> Claim | None:
             claim = await self._claim(wanted, wait, lease)
@@ -168,7 +173,7 @@ class TupleSpace:
         taken: list[Tuple] = []
         is_silent = False
         for number in range(MAX_PASSES):
-            # Tuples under watch need no read: the council refuses a tuple that was taken.
+            # Tuples in an open cache need no read, because the council rejects claims of a taken tuple.
             ready = self._taker.find_candidates(cache.tuples, template)[0] if cache.is_open and not number else []
             if not ready:
                 tuples, _ = parse_records(await self._node.get(key))
@@ -185,10 +190,10 @@ class TupleSpace:
                 taken += [claim.fields for claim, is_ours in zip(claims, won, strict=True) if is_ours]
             if taken:
                 return taken
-            # Others held all of them, perhaps briefly, as when three nodes claim at once.
+            # Other nodes held all matching tuples, perhaps only briefly, as when three nodes claim at the same time.
             await self._background.sleep(self._rng.uniform(*PASS_PAUSE_S))
         if is_silent:
-            raise NoAnswer("a tuple matches, but too few members of its council answer to take it; try again")
+            raise NoAnswer("a tuple matches, but too few members of its council answered to take it; try again")
         return taken
 
     # -- read -------------------------------------------------------------------------------------------------------
@@ -203,7 +208,7 @@ class TupleSpace:
         return found.addCallback(lambda tuples: tuples[0] if tuples else None)
 
     def read_all(self, template: Sequence[Field] | Template) -> Deferred[list[Tuple]]:
-        """Read all matching tuples that were not taken, claimed ones included."""
+        """Read all matching tuples that were not taken, including claimed tuples."""
         return self._start(self._read_all(make_template(template)))
 
     async def _read(self, template: Template, wait: WaitingCall) -> Tuple | None:
@@ -269,7 +274,7 @@ class TupleSpace:
         def expired() -> None:
             if not wait.is_over:
                 wait.end()
-                wait.deferred.errback(NoTuple(f"no matching tuple within {timeout} s"))
+                wait.deferred.errback(NoTuple(f"no matching tuple was found within {timeout} s"))
 
         if timeout is not None:
             wait.on_end.add(self._background.later(timeout, expired))

@@ -18,23 +18,25 @@ BASE_ROUND_TRIP_S = 10.0
 MIN_LOSS_SAMPLES = 32
 ROUND_SAMPLES = 8
 FIRST_GAIN, GAIN = 1 / 16, 1 / 128
-"""The weight of the first datagram, as if 15 had arrived before it, and of each one after the first hundred."""
+"""The weights of the first datagram (as if 15 had arrived before it) and of each datagram after the first hundred."""
 MAX_GAP_LOSSES = 4
-"""The most losses that one gap counts for: after a partition or a suspended peer, one session shows a gap of hundreds.
+"""The maximum number of losses that are counted for one gap in the datagram numbers.
+
+After a partition or a suspension of the peer, the numbers in one session may have a gap of hundreds.
 """
 MIN_LOSS = 0.01
-"""Smaller loss rates count as zero: the usual number of tries covers them."""
+"""Loss rates below this value are treated as zero, because the usual number of tries is sufficient for them."""
 TOLERATED_FAILURES = 1e-4
-"""The tolerated rate of exchanges that fail although both sides are alive."""
+"""The tolerated rate of failed exchanges between two nodes that both run."""
 MAX_TRIES_AT_LOSS = 12
 
 
 class RoundTrip:
     """The measured round trips of one peer, in seconds; ``timeout`` is the timeout of the next first try.
 
-    After Jacobson (1988) and RFC 6298, with shorter bounds: smoothed time plus four deviations. An answer after more
-    than one try is not measured (Karn's algorithm); it only keeps the longer timeout until a first try is answered
-    again.
+    After Jacobson (1988) and RFC 6298, with shorter bounds: smoothed time plus four deviations. The time of an answer
+    after more than one try is not measured (Karn's algorithm); it only keeps the timeout longer until a first try is
+    answered again.
     """
 
     __slots__ = ("timeout", "is_measured", "_smoothed", "_deviation", "_min_timeout")
@@ -70,7 +72,7 @@ class RoundTrip:
 
     @property
     def nearly_all(self) -> float:
-        """The time in seconds within which nearly all answers arrive; at first the initial timeout."""
+        """The time in seconds within which nearly all answers arrive; initially the initial timeout."""
         if not self.is_measured:
             return self.timeout
         return max(self._smoothed * 9 / 8, self._smoothed + max(MIN_LATENESS_S, 4 * self._deviation))
@@ -78,21 +80,22 @@ class RoundTrip:
     def lengthen(self, seconds: float) -> None:
         """Lengthen the timeout after an answer to a retransmitted request, ``seconds`` after its first try.
 
-        Before the first measurement ``seconds`` may be the length of the path.
+        Before the first measurement, a large value of ``seconds`` may be due to a long path.
         """
         longer = self.timeout * BACKOFF_FACTOR
         self.timeout = min(MAX_TIMEOUT_S, longer if self.is_measured else max(longer, seconds))
 
 
 class CongestionWindow:
-    """The congestion window: the number of fragments that may be under way to one peer.
+    """The congestion window: the maximum number of unacknowledged fragments to one peer.
 
     It grows in slow start, then slowly, and decreases multiplicatively. Radio links lose datagrams without congestion,
     and halving the window at each loss would leave a window of five at 5 % loss. Therefore a loss counts as congestion
     only if a queue builds up, as in TCP Veno (Fu and Liew, 2003), or if more than one in six of at least
     ``MIN_LOSS_SAMPLES`` fragments is lost. A queue is detected as in HyStart (Ha and Rhee, 2008; RFC 9406): the minimum
-    of ``ROUND_SAMPLES`` round trips exceeds the minimum of the last ``BASE_ROUND_TRIP_S`` seconds by an eighth of it,
-    by 4 ms, and by twice the usual difference between successive round trips, because jitter is not a queue.
+    of ``ROUND_SAMPLES`` round trips exceeds the minimum of the last ``BASE_ROUND_TRIP_S`` seconds by more than an
+    eighth of that minimum, more than 4 ms, and more than twice the usual difference between successive round trips. The
+    last condition prevents jitter from being mistaken for a queue.
     """
 
     __slots__ = (
@@ -122,7 +125,11 @@ class CongestionWindow:
         self._acknowledged = self._lost = 0
 
     def acknowledge(self, count: int, order: int, last_order: int, round_trip: float | None, now: float) -> None:
-        """Process an acknowledgement of ``count`` fragments; the newest was number ``order`` of ``last_order`` sent."""
+        """Process an acknowledgement of ``count`` fragments.
+
+        ``order`` is the position of the newest acknowledged fragment in the order of sending, ``last_order`` that of
+        the last sent fragment. ``round_trip`` is in seconds, None if it was not measured.
+        """
         if round_trip is not None:
             self._round_min = min(self._round_min, round_trip)
             self._samples += 1
@@ -148,7 +155,7 @@ class CongestionWindow:
         self._lost += count
 
     def collapse(self) -> None:
-        """Restart from the smallest window, after more than a round trip without any receipt."""
+        """Restart from the smallest window, after no receipt arrived for more than a round trip."""
         self._threshold = max(MIN_WINDOW, self.size / 2)
         self.size = MIN_WINDOW
 
@@ -172,7 +179,8 @@ class LossRate:
     """Measures the recent loss rate (``rate``) of the datagrams to this node.
 
     Each session numbers the datagrams that it sends, so a gap in the received numbers is a loss, as in the reports of
-    RTP (RFC 3550, section 6.4.1).  Unlike a count of retransmissions, it does not mistake a slow answer for a lost one.
+    RTP (RFC 3550, section 6.4.1). Unlike a count of retransmissions, this method does not mistake a slow answer for a
+    lost datagram.
     """
 
     __slots__ = ("rate", "_gain")
@@ -182,9 +190,10 @@ class LossRate:
         self._gain = FIRST_GAIN
 
     def record_arrival(self, ahead: int) -> None:
-        """Update the rate with a datagram, its counter being ``ahead`` of the newest one before it in its session.
+        """Update the rate with a received datagram.
 
-        A reordered datagram (0 or less) was counted as lost before.
+        ``ahead`` is the difference between its counter and the highest earlier counter in its session. If ``ahead`` is
+        0 or less, the datagram was reordered and has already been counted as lost.
         """
         for _ in range(1, min(ahead, MAX_GAP_LOSSES + 1)):
             self._add_sample(1.0)
@@ -194,12 +203,12 @@ class LossRate:
             self.rate = max(0.0, self.rate - self._gain)
 
     def _add_sample(self, lost: float) -> None:
-        self._gain = max(GAIN, self._gain / (1 + self._gain))  # the mean of all, and later a moving average
+        self._gain = max(GAIN, self._gain / (1 + self._gain))  # a mean at first, later a moving average
         self.rate += (lost - self.rate) * self._gain
 
     @property
     def tries(self) -> int:
-        """The number of tries after which an exchange rarely fails, if both directions lose the same share."""
+        """The number of tries with which an exchange rarely fails, if the loss rate is equal in both directions."""
         if self.rate < MIN_LOSS:
             return 1
         failure_rate = 1 - (1 - self.rate) ** 2

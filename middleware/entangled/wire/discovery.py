@@ -1,11 +1,11 @@
 """Exchange datagrams without a session: discovery (DISCOVERY, DISCOVERY_REPLY) and proof of address (COOKIE).
 
-With DISCOVERY and DISCOVERY_REPLY a node learns the public key of the node at an address.  Both are sealed under the
-team's key alone, so they prove membership and nothing else; the session that follows proves the key.  DISCOVERY_REPLY
-and DISCOVERY have the same length.
+With DISCOVERY and DISCOVERY_REPLY a node learns the public key of the node at an address.  Both datagrams are encrypted
+only under the team's key, so they prove only that the sender has this key; the session that follows proves the node's
+own key.  DISCOVERY_REPLY and DISCOVERY have the same length.
 
-A node under load answers INIT with COOKIE: the initiator must prove that it receives at its source address before the
-responder exchanges keys or keeps state (after WireGuard, Donenfeld 2017, section 5.4.7).
+A node under load answers INIT with COOKIE: the initiator must prove that it receives datagrams at its source address
+before the responder exchanges keys or stores state (after WireGuard, Donenfeld 2017, section 5.4.7).
 """
 
 from __future__ import annotations
@@ -35,10 +35,10 @@ _NONCE_BYTES = 24
 _BODY_BYTES = TOKEN_BYTES + 32
 DISCOVERY_BYTES = 1 + _NONCE_BYTES + _BODY_BYTES + 16
 COOKIE_BYTES = 1 + MAC_BYTES + _NONCE_BYTES + 16 + 16
-# A handshake costs the responder about 0.2 ms: 100 per second take 2 % of a core, and a team of 100 that starts at the
-# same time still needs no second round trip.
+# A handshake costs the responder about 0.2 ms, so 100 handshakes per second take 2 % of a core.  When a team of 100
+# nodes starts at the same time, no handshake needs a second round trip.
 MAX_HANDSHAKES_PER_S = 100.0
-# Handshakes with a valid cookie together take at most a fifth of a core.
+# All handshakes with a valid cookie together take at most a fifth of a core.
 MAX_COOKIE_HANDSHAKES_PER_S = 1000.0
 COOKIE_S = 120.0
 
@@ -49,19 +49,19 @@ def pack_discovery(key: bytes, token: bytes, rng: random.Random) -> bytes:
 
 
 def pack_discovery_reply(key: bytes, token: bytes, public: bytes, rng: random.Random) -> bytes:
-    """Return the DISCOVERY_REPLY that answers the DISCOVERY with ``token``: this node's public key."""
+    """Return a DISCOVERY_REPLY with the public key ``public``, in reply to the DISCOVERY with ``token``."""
     return _seal_discovery(DISCOVERY_REPLY, key, token + public, rng)
 
 
 def open_discovery(key: bytes, datagram: bytes) -> tuple[bytes, bytes]:
-    """Decrypt a DISCOVERY or DISCOVERY_REPLY; return its token and key (zero in DISCOVERY), or raise ``Forged``."""
+    """Decrypt a DISCOVERY or DISCOVERY_REPLY; return its token and public key (zero in DISCOVERY); raise ``Forged``."""
     if len(datagram) != DISCOVERY_BYTES:
         raise Forged("the DISCOVERY or DISCOVERY_REPLY has the wrong length")
     nonce, ciphertext = datagram[1 : 1 + _NONCE_BYTES], datagram[1 + _NONCE_BYTES :]
     try:
         body = bindings.crypto_aead_xchacha20poly1305_ietf_decrypt(ciphertext, datagram[:1], nonce, key)
     except (CryptoError, ValueError) as error:
-        raise Forged("the DISCOVERY or DISCOVERY_REPLY is not sealed under this key") from error
+        raise Forged("the DISCOVERY or DISCOVERY_REPLY is not encrypted under this key") from error
     return body[:TOKEN_BYTES], body[TOKEN_BYTES:]
 
 
@@ -82,14 +82,14 @@ def open_cookie(key: bytes, datagram: bytes) -> bytes:
     try:
         return bindings.crypto_aead_xchacha20poly1305_ietf_decrypt(ciphertext, head, nonce, key)
     except (CryptoError, ValueError) as error:
-        raise Forged("the COOKIE is not sealed under this key") from error
+        raise Forged("the COOKIE is not encrypted under this key") from error
 
 
 class CookieCheck:
-    """Limits the rate of key exchanges and generates cookies, without state per initiator.  ``key`` seals the cookies.
+    """Limits the rate of key exchanges, and generates cookies without state per initiator.
 
-    A cookie is a keyed hash of the initiator's address and of the time in steps of ``COOKIE_S``; the cookies of the
-    current and the previous step are valid.
+    ``key`` encrypts the COOKIE datagrams.  A cookie is a keyed hash of the initiator's address and of the time in steps
+    of ``COOKIE_S`` seconds.  The cookies of the current step and of the previous step are valid.
     """
 
     def __init__(self, key: bytes, rng: random.Random) -> None:
@@ -100,7 +100,7 @@ class CookieCheck:
         self._cookie_limit = TokenBucket(MAX_COOKIE_HANDSHAKES_PER_S)
 
     def is_valid(self, init: bytes, source: Address, now: float) -> bool:
-        """Return whether the last field of an INIT is valid: zero, or made with a cookie of this node."""
+        """Return whether the last field of an INIT is valid: zero, or a hash with a cookie of this node."""
         return init[-MAC_BYTES:] == bytes(MAC_BYTES) or self._has_valid_cookie(init, source, now)
 
     def admits(self, init: bytes, source: Address, now: float) -> bool:
@@ -110,9 +110,9 @@ class CookieCheck:
         return self._limit.take(now)
 
     def pack_cookie(self, init: bytes, source: Address, now: float, key: bytes = b"") -> bytes:
-        """Return the COOKIE datagram for the sender of this INIT, sealed under ``key`` if given.
+        """Return the COOKIE datagram for the sender of this INIT, encrypted under ``key`` if given.
 
-        It is shorter than any INIT.
+        A COOKIE is shorter than any INIT.
         """
         head, nonce = bytes([COOKIE]) + read_mac(init), self._rng.randbytes(_NONCE_BYTES)
         cookie = self._make_cookie(source, int(now / COOKIE_S))
@@ -131,7 +131,7 @@ class CookieCheck:
 class Discoverer(ProbeSender[Contact]):
     """Discovers the node at an address, answers discovery requests, and resends INITs with requested cookies.
 
-    It tries each secret in the ring of ``peers`` in turn, the newest first.
+    Discovery tries each secret in the ring of ``peers`` in turn, the newest first.
     """
 
     failure_text = "no node of this team answers"
@@ -158,7 +158,10 @@ class Discoverer(ProbeSender[Contact]):
         return self._start(token, address, datagrams, timeout)
 
     def make_multicast(self) -> bytes:
-        """Return a DISCOVERY for many receivers, such as a LAN; then probe each sender of a reply directly."""
+        """Return a DISCOVERY for many receivers, for example on a LAN.
+
+        After a reply, discover the address of its sender directly.
+        """
         return pack_discovery(self._peers.ring[0].discovery_key, self._rng.randbytes(TOKEN_BYTES), self._rng)
 
     def is_of_team(self, datagram: bytes) -> bool:
@@ -173,7 +176,7 @@ class Discoverer(ProbeSender[Contact]):
             self._send(pack_discovery_reply(own.discovery_key, token, self._public, self._rng), source)
 
     def on_discovery_reply(self, datagram: bytes, source: Address) -> None:
-        """Process the answer to a DISCOVERY of this node."""
+        """Process the reply to a DISCOVERY of this node."""
         found = self._open_discovery(datagram)
         if found is None:
             return
@@ -187,7 +190,7 @@ class Discoverer(ProbeSender[Contact]):
             self._forget(token)
             contact = Contact(public, source)
             self._peers.record_credentials(contact, own)
-            if not self._peers.overall_round_trip.is_measured:  # an estimate: the reply may answer a later try
+            if not self._peers.overall_round_trip.is_measured:  # the reply may belong to a later try
                 self._peers.overall_round_trip.add_sample(self._clock.seconds() - pending.started_at)
             pending.deferred.callback(contact)
 
@@ -207,7 +210,7 @@ class Discoverer(ProbeSender[Contact]):
             self._peers.resend_with_cookie(opening, cookie, source)
 
     def _open_discovery(self, datagram: bytes) -> tuple[Credentials, bytes, bytes] | None:
-        """Decrypt a datagram of this module; return its credentials, token and key, or count it as forged: None."""
+        """Return the credentials, token and key of a DISCOVERY or DISCOVERY_REPLY, or None; count a forged datagram."""
         for own in self._peers.ring:
             try:
                 return own, *open_discovery(own.discovery_key, datagram)

@@ -1,6 +1,7 @@
-"""Run exposed methods for peers, methods with side effects at most once per request, and send their answers.
+"""Run exposed methods for peers and send the answers; a method with side effects runs at most once per request.
 
-It has no access to keys or sockets: it receives decoded requests, and callables that send a message in a session.
+The dispatcher has no access to keys or sockets: it receives decoded requests, and callables that send a message in a
+session.
 """
 
 from __future__ import annotations
@@ -40,14 +41,14 @@ from middleware.entangled.wire.method import Method, RequestEntry, RequestHistor
 from middleware.entangled.wire.session import MAX_PLAIN_BYTES, Session
 
 MAX_CANCELLED = 1024
-# Requests that one peer may send per second, and in one burst: several times the rate of the busiest node of a team,
-# and about a quarter of a CPU core.
+# The number of requests that one peer may send per second, and in one burst.  The rate is several times that of the
+# busiest node of a team, and takes about a quarter of a CPU core.
 REQUESTS_PER_S, REQUEST_BURST = 2000.0, 8192.0
 MAX_REQUESTERS = 4096
-_BUSY_TEXT = "this node has too many open requests; try again later"
+_BUSY_TEXT = "the peer has too many open requests of this node; try again later"
 _RATE_LIMITED_TEXT = "this node sends more requests per second than the peer accepts; send fewer, and try again later"
-_FULL_TEXT = "too many bytes are already on their way to this node; try again later"
-_GONE_TEXT = "the call ran, but its answer was too large to keep; read the state that it changed"
+_FULL_TEXT = "the peer already sends the maximum number of bytes to this node; try again later"
+_GONE_TEXT = "the call ran, but its answer was too large to store; read the state that the call changed"
 
 
 class Dispatcher:
@@ -98,8 +99,9 @@ class Dispatcher:
     def dispatch(self, request: Request, session: Session, is_bulky: bool = False) -> None:
         """Answer a request of an established session, immediately or when its method is done.
 
-        ``is_bulky``: the request arrived in fragments.  Its answer is then sent in fragments too, however short: they
-        are retransmitted by the responder, and the requester need not send the whole request again for a lost answer.
+        ``is_bulky``: the request arrived in fragments.  Its answer is then also sent in fragments, even if it is short.
+        The responder retransmits lost fragments, so the requester need not repeat the whole request when an answer is
+        lost.
         """
         public = session.contact.public
         if (public, request.id) in self._cancelled:
@@ -133,7 +135,7 @@ class Dispatcher:
             self._reply(session, request.id, answer, is_bulky)
 
     def answer_early(self, request: Request, peer: Contact, room: int) -> bytes:
-        """Return the encoded answer to a request in an INIT, or nothing if it has to wait for the session.
+        """Return the encoded answer to a request in an INIT; empty if the request has to wait for the session.
 
         An INIT may be replayed, and its source address is not verified. Therefore only methods that were exposed with
         ``early`` run, no state is kept, and an answer that is not available immediately or exceeds ``room`` bytes is
@@ -153,7 +155,7 @@ class Dispatcher:
         return answer if len(answer) <= room else b""
 
     def run_notification(self, notification: Notification, peer: Contact) -> None:
-        """Run the method of a notification; nothing is sent back."""
+        """Run the method of a notification; send no answer."""
         method = self.methods.get(notification.method)
         if not self._take_token(peer.public):
             self._counters["busy"] += 1
@@ -171,7 +173,7 @@ class Dispatcher:
             self._log_notification_error(method, result)
 
     def cancel(self, message: Cancel, public: bytes) -> None:
-        """Cancel the work on a request that its peer gave up; if it arrives later it does not run."""
+        """Cancel the work on a request that the peer cancelled; if the request arrives later, it is not executed."""
         self._fragmenter.drop(public, MessageKey(True, message.id))
         self._fragmenter.forget_incoming(public, MessageKey(False, message.id))
         entry = self._history.get(public, message.id)
@@ -227,7 +229,7 @@ class Dispatcher:
     def _finish(self, result: object, method: Method, number: int, public: bytes, entry: RequestEntry | None) -> None:
         answer = self._encode_result(method, number, result)
         if entry is None or self._history.get(public, number) is not entry:
-            return  # the peer was evicted, or the node stopped meanwhile
+            return  # while the method ran, the peer was evicted or the node stopped
         session = entry.session
         kept_answer = _limit_kept_answer(number, answer) if method.runs_once else None
         self._history.finish(public, number, kept_answer, self._clock.seconds())
@@ -235,7 +237,7 @@ class Dispatcher:
             self._reply(session, number, answer, entry.is_fragmented)
 
     def _reply(self, session: Session, number: int, answer: bytes, is_bulky: bool) -> None:
-        """Send an answer, in fragments if it needs them."""
+        """Send an answer, in fragments if it is bulky or larger than a datagram."""
         if len(answer) <= MAX_PLAIN_BYTES and not is_bulky:
             self._send(session, answer)
         elif not self._fragmenter.send(session.contact.public, MessageKey(True, number), answer):
@@ -301,5 +303,5 @@ class Dispatcher:
 
 
 def _limit_kept_answer(number: int, answer: bytes) -> bytes:
-    """Return the answer to keep for repeated requests: the answer itself, or a failure in place of a large one."""
+    """Return what to store for repeated requests: the answer, or a failure if the answer is too large to store."""
     return answer if len(answer) <= MAX_PLAIN_BYTES else encode(Failure(number, GONE, _GONE_TEXT))

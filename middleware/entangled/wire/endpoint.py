@@ -1,7 +1,8 @@
 """Send and answer requests of one node in encrypted datagrams.
 
-The endpoint dispatches received datagrams, keeps the table of sessions, and drops and counts invalid datagrams.
-``asker`` retransmits requests, ``answerer`` answers them; ``docs/reference/wire-protocol.md`` specifies every byte.
+The endpoint dispatches received datagrams, maintains the table of sessions, and drops and counts invalid datagrams.
+``requester`` retransmits this node's requests, and ``dispatcher`` answers the requests of peers.
+``docs/reference/wire-protocol.md`` specifies every byte.
 """
 
 from __future__ import annotations
@@ -77,25 +78,27 @@ _REFUSAL = bytes([REFUSAL])
 MAX_REJECTING_PEERS = 32
 
 MessageReceiver = Callable[[Session, bytes, Address], None]
-"""Takes the content of a DATA datagram: its session, the plaintext, and its source address."""
+"""Called with the session, the plaintext and the source address of a DATA datagram."""
 
 
 class Endpoint:
     """The wire protocol of one node.
 
-    ``team_key`` (32 bytes) is the secret of the team: a node without it can neither decrypt nor cause an answer.
-    ``rng`` generates the ephemeral keys, so outside of simulations it must be ``random.SystemRandom``; in simulations a
-    restarted node must not repeat the numbers of its earlier incarnations.  ``admission`` decides which nodes are
-    admitted, and which methods a peer may call.
+    ``team_key`` (32 bytes) is the secret of the team: a node that lacks it can neither decrypt datagrams nor cause a
+    reply.  ``rng`` generates the ephemeral keys, so outside of simulations it must be ``random.SystemRandom``.  In
+    simulations a restarted node must not repeat the random numbers of its earlier incarnations.  ``admission`` decides
+    which nodes are admitted, and which methods a peer may call.
 
     ``on_contact`` is called when a peer has proved its key and its address, by an answer or by confirming a session
-    that it opened; ``on_seen`` with a peer and this node's address as the peer sees it; ``on_rejected`` when a peer
-    rejects this node, and ``on_rejecting`` when this node rejects an authenticated peer, each with the refusal code;
-    ``on_forgotten`` with the key of a peer that was forgotten after a long silence.
+    that the peer opened.  ``on_seen`` is called with a peer and this node's address as the peer sees it.
+    ``on_rejected`` is called when a peer rejects this node, and ``on_rejecting`` when this node rejects an
+    authenticated peer, each with the refusal code.  ``on_forgotten`` is called with the key of a peer that was
+    forgotten after a long silence.
 
     ``counters`` counts dropped datagrams by reason: oversized, unknown, malformed, forged, replayed, stale (no such
-    session), repeated, misdirected, unasked, late, cancelled, abandoned (an incomplete fragmented message); requests
-    and messages rejected for lack of room (crowded, busy); and rejected nodes and calls (refused).
+    session), repeated, misdirected, unasked, late, cancelled, abandoned (an incomplete fragmented message).  It also
+    counts requests and messages that were rejected because a buffer or table was full (crowded, busy), and rejected
+    nodes and calls (refused).
     """
 
     _log = Logger()
@@ -116,7 +119,7 @@ class Endpoint:
         self.on_rejecting = Listeners[[Contact, str]]()
         self.on_forgotten = Listeners[[bytes]]()
         self.refusals: dict[bytes, tuple[Contact, str]] = {}
-        """Peers that reject this node, by key, with the refusal code; the latest ``MAX_REJECTING_PEERS``."""
+        """The latest ``MAX_REJECTING_PEERS`` peers that reject this node, by key, with the refusal code."""
         self.rejections = Rejections()
         """Rejections of the last hour, in both directions."""
         self.counters: Counter[str] = Counter()
@@ -190,9 +193,9 @@ class Endpoint:
     def replace_secrets(self, newest: bytes, *older: bytes) -> None:
         """Replace the secret of the team (32 bytes); existing sessions continue.
 
-        This node opens handshakes under the ``newest`` secret.  While not all members have it, handshakes under the
-        ``older`` ones are accepted too, and a peer that does not answer under one secret is retried under the next.
-        Raises ``ValueError`` for an invalid secret.
+        This node opens handshakes under the ``newest`` secret.  Handshakes under the ``older`` secrets are also
+        accepted, because some members may not have the newest secret yet.  A peer that does not answer under one secret
+        is retried under the next.  Raises ``ValueError`` for an invalid secret.
         """
         secrets = check_secrets([newest, *older])
         self._peers.rekey([Credentials.derive(self._identity, secret) for secret in secrets])
@@ -201,7 +204,7 @@ class Endpoint:
     def evict(self, public: bytes, code: str = REVOKED) -> None:
         """Close the sessions with a peer: send it ``code``, and fail the requests to it with ``NotAdmitted``.
 
-        The admission check must reject the peer after that.
+        From this call on, the admission check must reject the peer.
         """
         peer = self._peers.get(public)
         if peer is not None and peer.session is not None:
@@ -210,7 +213,7 @@ class Endpoint:
             self._disconnect(public, f"{public.hex()[:16]} is rejected: {explain(code)}", code)
 
     def route(self, kind: int, receiver: Callable[[bytes, Address], None]) -> None:
-        """Pass datagrams with the first byte ``kind`` to ``receiver``; raise ``ValueError`` if the kind is taken."""
+        """Pass datagrams with the first byte ``kind`` to ``receiver``; raise ``ValueError`` if ``kind`` is in use."""
         if kind in self._receivers:
             raise ValueError(f"datagrams of kind {kind:#x} already have a receiver; use another kind")
         self._receivers[kind] = receiver
@@ -230,32 +233,34 @@ class Endpoint:
     ) -> None:
         """Let peers call ``answer(peer, *arguments)`` under ``name``.
 
-        The function returns a value that msgpack can encode (at most ``MAX_MESSAGE`` bytes), a Deferred or a coroutine
-        of one, or raises ``Refused``, which the requester receives with its code and text.  Arguments that do not match
-        the function's parameters and plain annotations are rejected before it runs; other exceptions are logged, and
-        the requester receives ``Refused("internal error")``.  The function runs only in an established session.  With
-        ``changes`` it runs at most once per request, and a repeated request receives the first answer.  Also set
-        ``idempotent`` if a second run does no harm: then no answer is kept.
+        The function returns a value that msgpack can encode (at most ``MAX_MESSAGE_BYTES`` bytes), or a Deferred or
+        coroutine with such a result.  If it raises ``Refused``, the requester receives the code and text of the
+        exception.  Arguments that do not match the function's parameters and plain annotations are rejected before it
+        runs; other exceptions are logged, and the requester receives ``Refused("internal error")``.  The function runs
+        only in an established session.  With ``changes`` the function runs at most once per request, and a repeated
+        request receives the first answer.  Also set ``idempotent`` if a second run does no harm: then the answer is not
+        stored.
 
-        With ``early`` it may also run for a request inside an INIT, which saves a round trip.  An attacker may send a
-        replayed INIT from a forged address, so an early method only reads, sends nothing, and returns its result, not a
-        Deferred; ``ValueError`` if it ``changes`` something.
+        With ``early`` the function may also run for a request inside an INIT, which saves a round trip.  An attacker
+        may send a replayed INIT from a forged address.  Therefore an early method must only read state, send nothing,
+        and return its result immediately instead of a Deferred.  ``early`` together with ``changes`` raises
+        ``ValueError``.
 
         A Deferred or coroutine is cancelled when the requester gives up or its timeout expires.  A function with a
-        keyword-only parameter ``deadline`` receives that time, in seconds of this node's clock (infinite if there is
-        none).
+        keyword-only parameter ``deadline`` receives the time at which the timeout expires, in seconds of this node's
+        clock (infinite if there is no timeout).
         """
         self._dispatcher.methods[name] = Method(name, answer, changes, idempotent, early)
 
     def route_message(self, kind: int, receiver: MessageReceiver) -> None:
         """Pass messages in confirmed sessions with this first byte to ``receiver``.
 
-        They do not change the address of their peer, because they may arrive by a path other than the usual one.
+        Such messages do not change the recorded address of their peer, because they may arrive by an unusual path.
         """
         self._message_receivers[kind] = receiver
 
     def send_sealed(self, session: Session, plain: bytes, to: Address | None = None) -> None:
-        """Seal ``plain`` for the peer of a session and send it to the peer's address, or to its address ``to``."""
+        """Encrypt ``plain`` in a session and send it to the address ``to`` (None: the peer's latest address)."""
         if self.is_running:
             self._network.send(self._seal(session, plain), to or session.contact.address)
 
@@ -275,12 +280,12 @@ class Endpoint:
     ) -> Deferred[Any]:
         """Send a request to a peer, with four tries (more at a high loss rate) within ``timeout`` seconds.
 
-        Request and answer may have ``MAX_MESSAGE`` bytes; if larger than a datagram they are sent in fragments.  Of
-        many requests to one peer the later ones wait in a queue.  The default timeout is 1.5 s, counted from the moment
-        when the request leaves the queue and restarted by each acknowledged fragment.  With a longer ``timeout`` the
-        tries are distributed over it, for slow methods.  Set ``changes`` if the method has side effects: such a request
-        waits for the session, others ride in the handshake.  A request that ``is_light`` opens no new session while
-        there is an old one, even if the peer is silent.
+        Request and answer may have ``MAX_MESSAGE_BYTES`` bytes each; a message larger than a datagram is sent in
+        fragments.  If many requests to one peer are pending, further requests wait in a queue.  The default timeout is
+        1.5 s, counted from the moment when the request leaves the queue and restarted by each acknowledged fragment.
+        If a longer ``timeout`` is given, for a slow method, the tries are distributed over this time.  Set ``changes``
+        if the method has side effects: such a request waits for the session, whereas other requests are sent inside the
+        handshake.  A request that ``is_light`` opens no new session if there is an old one, even if the peer is silent.
 
         Fails with ``NoAnswer``, ``Refused`` (the peer's code and text), ``TooLarge``, ``Crowded``, ``NotAdmitted``,
         ``NotRunning``, or with the ``TypeError`` of arguments that msgpack cannot encode.  Cancelling the Deferred also
@@ -293,14 +298,15 @@ class Endpoint:
     def notify(self, contact: Contact, method: str, *arguments: object) -> None:
         """Send a notification: call a peer's method once, without an answer or retransmission.
 
-        It must fit into one datagram.  Opens a session if there is none.  Raises ``TooLarge`` and ``NotRunning``.
+        The notification must fit into one datagram.  This method opens a session if there is none.  Raises ``TooLarge``
+        and ``NotRunning``.
         """
         if not self.is_running:
             raise NotRunning("the endpoint is not running; start it first")
         self._requester.notify(contact, method, arguments)
 
     def has_session(self, contact: Contact) -> bool:
-        """Return whether there is a session with ``contact``; then a request needs one round trip and no handshake."""
+        """Return whether there is a session with ``contact``; if so, a request needs no handshake."""
         peer = self._peers.get(contact.public)
         return peer is not None and self._peers.has_live_session(peer)
 
@@ -311,7 +317,7 @@ class Endpoint:
 
     @property
     def traffic(self) -> Mapping[str, int]:
-        """The counters of the underlying network (``sent``, ``received``, ...); empty if it has none."""
+        """The counters of the underlying network (``sent``, ``received``, ...); empty if the network does not count."""
         return dict(getattr(self._network, "counters", {}))
 
     def discover(self, address: Address, timeout: float = TIMEOUT_S) -> Deferred[Contact]:
@@ -321,15 +327,15 @@ class Endpoint:
         return self.discoverer.discover(address, timeout)
 
     def process_datagram(self, datagram: bytes, source: Address) -> None:
-        """Process a datagram that did not arrive at the node's own port; answers are sent from that port."""
+        """Process a datagram that did not arrive at the node's usual port; answers are sent from the usual port."""
         if self.is_running:
             self._on_datagram(datagram, source)
 
     def forget_silent(self, seconds: float) -> None:
         """Forget the peers that sent nothing for ``seconds``, unless a request to them is pending.
 
-        The other side does the same, or discovers it with its next unanswered request; either side opens a new session
-        when it needs one.
+        The peer forgets the session after the same time, or detects with its next unanswered request that it is gone.
+        Either side opens a new session when it needs one.
         """
         now = self._clock.seconds()
         self._half_open.sweep(now)
@@ -339,7 +345,7 @@ class Endpoint:
             self.on_forgotten(public)
 
     def reopen(self, contact: Contact) -> None:
-        """Open a session at the contact's address even if there is one elsewhere; the newest session is used."""
+        """Open a session at the contact's address even if there is one at another address; the newest is used."""
         if self.is_running:
             self._peers.open(self._peers.get_or_create(contact), contact.address)
 
@@ -396,7 +402,7 @@ class Endpoint:
                 session.contact.public, session.peer_pass, session.incarnation, self.admission.admit
             )
             session.peer_pass = b""
-            if code:  # two nodes with one identity opened a session at once, or the membership list is full
+            if code:  # two nodes with one identity opened a session at the same time, or the membership list is full
                 self._reject(session, code)
                 return
             self._half_open.confirm(session)
@@ -432,7 +438,7 @@ class Endpoint:
             self._resolve(message, session.contact)
 
     def _on_fragmented_message(self, session: Session, key: MessageKey, data: bytes) -> None:
-        """Process a message that arrived in fragments; reject one with a kind or id other than its fragments say."""
+        """Process a message that arrived in fragments; reject it if its kind or id differs from its fragments."""
         try:
             message = decode(data)
         except Malformed:
@@ -462,7 +468,7 @@ class Endpoint:
     def _on_init(self, datagram: bytes, source: Address) -> None:
         own = None
         if MIN_INIT_BYTES + self.admission.max_pass_bytes <= len(datagram) <= MAX_DATAGRAM_BYTES:
-            for own in self._peers.ring:  # inlined, because a forged INIT must cost no more than this
+            for own in self._peers.ring:  # inlined to make the rejection of a forged INIT as cheap as possible
                 if is_init_of_team(own, datagram):
                     break
             else:
@@ -475,7 +481,7 @@ class Endpoint:
             self.counters["forged"] += 1
             return
         known = self._half_open.find_response(datagram, now)
-        if known is not None:  # the RESP was lost, or the INIT is a replay: neither costs a key exchange
+        if known is not None:  # the RESP was lost, or the INIT is a replay: in both cases no key exchange is needed
             self.counters["repeated"] += 1
             self._network.send(known, source)
             return
@@ -499,10 +505,10 @@ class Endpoint:
         code = self._find_refusal(
             contact.public, acceptance.peer_pass, acceptance.incarnation, self.admission.find_refusal
         )
-        if code:  # no further effects: the INIT may be a replay, with a pass that was replaced since
+        if code:  # no further effects: the INIT may be a replay with an outdated admission credential
             self.counters["refused"] += 1
             self._log_rejection(contact, code)
-            if code not in (DOUBLED, SUPERSEDED):  # a replay must not make operators look for a copied identity
+            if code not in (DOUBLED, SUPERSEDED):  # a replay must not cause a report of a copied identity
                 self._record_rejection("we", contact, code)
             return acceptance.refuse(code, source, hello.incarnation)
         if not self._timestamps.accept(contact.public, acceptance.incarnation, acceptance.timestamp):
@@ -517,7 +523,7 @@ class Endpoint:
         if isinstance(early_message, Request):
             answer = self._dispatcher.answer_early(early_message, contact, acceptance.max_answer_bytes(hello))
         if not self.is_running:
-            return b""  # the method stopped the endpoint
+            return b""  # the method that ran has stopped the endpoint
         index = self._peers.new_index()
         response, keys = acceptance.accept(index, answer, source, hello)
         session = Session(
@@ -587,7 +593,7 @@ class Endpoint:
         return self._incarnations.find_refusal(public, incarnation) or judge(public, peer_pass)
 
     def _reject(self, session: Session, code: str) -> None:
-        """Notify a peer on ``session`` that it is rejected, and close its sessions."""
+        """Notify the peer of ``session`` that it is rejected, and close its sessions."""
         contact = session.contact
         self._send(session, _REFUSAL + code.encode("ascii"))
         self.counters["refused"] += 1
@@ -663,7 +669,7 @@ class Endpoint:
         return session.seal(message)
 
     def _send_to(self, public: bytes, message: bytes) -> None:
-        """Send in the newest session with a peer; without a session the message is lost, as any datagram may be."""
+        """Send a message in the newest session with a peer; drop the message if there is no session."""
         peer = self._peers.get(public)
         if peer is not None and peer.session is not None:
             self._send(peer.session, message)

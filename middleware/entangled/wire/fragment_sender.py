@@ -23,11 +23,11 @@ from middleware.entangled.wire.message import (
 
 IDLE_TIMEOUT_S = 10.0
 MAX_PARALLEL_MESSAGES = (
-    4  # messages to one peer that are sent in turn; the others wait, or each would occupy memory at the receiver
+    4  # messages to one peer that are sent in turn; the others wait, to limit the memory used at the receiver
 )
 RECEIPT_EVERY = 4
 REORDERING_THRESHOLD = (
-    3  # a fragment is lost if one sent this much later has arrived (RFC 9002, 6.1.1), after a round trip
+    3  # a fragment is lost if a fragment sent this many places later is acknowledged (RFC 9002, 6.1.1)
 )
 MIN_TIMEOUT_S = 0.02
 PROBE_FRAGMENTS = 2
@@ -63,8 +63,8 @@ class FragmentedMessage:
         self.acknowledged = 0  # bit n: fragment n is acknowledged
         self.window_end = MAX_FRAGMENTS
         self.progress_at = now
-        self.send_orders: dict[int, int] = {}  # of the fragments under way: the place in the order of sending
-        self.retransmitted = 0  # bit n: fragment n was sent more than once, so its receipt is no measurement (Karn)
+        self.send_orders: dict[int, int] = {}  # the position of each unacknowledged fragment in the order of sending
+        self.retransmitted = 0  # bit n: fragment n was sent more than once, so its round trip is not measured (Karn)
         self._sent = 0
         self._next = 0
         self._lost_fragments: deque[int] = deque()
@@ -76,7 +76,7 @@ class FragmentedMessage:
         return self.acknowledged == (1 << self.count) - 1
 
     def next_fragment(self, limit: int | None = None) -> int | None:
-        """Return the next fragment to send, lost ones first; None if all are under way or the receiver has no room."""
+        """Return the next fragment to send, lost ones first; None if all are sent or the receiver's buffer is full."""
         acknowledged, most = self.acknowledged, self.window_end if limit is None else limit
         while self._lost_fragments and acknowledged >> self._lost_fragments[0] & 1:
             self._lost_fragments.popleft()
@@ -86,7 +86,7 @@ class FragmentedMessage:
         return number if number < min(self.count, most) else None
 
     def mark_sent(self, number: int, order: int) -> None:
-        """Record that a due fragment was sent."""
+        """Record that fragment ``number`` was sent, at the position ``order`` in the order of sending."""
         if self._lost_fragments and self._lost_fragments[0] == number:
             self._lost_fragments.popleft()
         else:
@@ -100,7 +100,10 @@ class FragmentedMessage:
         self._lost_fragments.append(number)
 
     def restart(self) -> None:
-        """Restart, because the receiver may have lost its fragments; if it has not, its first receipt shows them."""
+        """Send the message again from the start, because the receiver may have lost its fragments.
+
+        If the receiver still has them, its first receipt lists them.
+        """
         self.retransmitted |= (1 << self._next) - 1
         self.acknowledged, self._next, self.window_end = 0, 0, MAX_FRAGMENTS
         self._lost_fragments.clear()
@@ -133,10 +136,10 @@ class FragmentedMessage:
 
 
 class Flow:
-    """The fragmented messages to one peer; ``send_sealed`` seals bytes for it.
+    """Sends the fragmented messages to one peer; ``send_sealed`` encrypts bytes for the peer and sends them.
 
-    A fragment that is not acknowledged is retransmitted when later ones have arrived, or when nothing was received for
-    a smoothed round trip plus four deviations (``first_wait`` before the first measurement).
+    An unacknowledged fragment is retransmitted when later fragments have been acknowledged, or when no receipt arrived
+    for a smoothed round trip plus four deviations (``first_wait`` seconds before the first measurement).
     """
 
     def __init__(
@@ -198,7 +201,7 @@ class Flow:
         for number in message.process_receipt(receipt, now):
             order = message.send_orders.pop(number, -1)
             if order < 0:
-                self._window.count_losses(-1)  # it was considered lost, and arrived after all
+                self._window.count_losses(-1)  # the fragment was considered lost, but it arrived
                 continue
             _, _, sent_at = self._in_flight.pop(order)
             count += 1
@@ -242,7 +245,7 @@ class Flow:
                 break
             self._mark_sent(message, number, now)
             picked.append((message, number))
-        # Each message requests its own receipts: for its last fragment in the burst, and for some in between.
+        # Each message requests its own receipts: for its last fragment in this burst, and for every fourth fragment.
         last = {message.key: place for place, (message, _) in enumerate(picked)}
         for place, (message, number) in enumerate(picked):
             self._send_sealed(message.make_fragment(number, message.requests_receipt() or place == last[message.key]))
@@ -273,7 +276,7 @@ class Flow:
         self._sent_at = now
 
     def _due_at(self) -> float:
-        """Return the time of the next action if nothing is received before."""
+        """Return the time of the next action if no receipt arrives until then."""
         if not self._in_flight:
             return self._sent_at + min(MAX_PROBE_TIMEOUT_S, self._probe_timeout())
         order, (_, _, sent_at) = next(iter(self._in_flight.items()))
@@ -294,7 +297,7 @@ class Flow:
         at = max(now, self._due_at())
         if self._timer is not None and self._timer.active():
             if self._timer.getTime() <= at:
-                return  # the timer sees that it is early; resetting it at every receipt would cost more
+                return  # the timer function checks the time again: cheaper than a reset at every receipt
             self._timer.cancel()
         self._timer = self._clock.callLater(at - now, self._on_timer)
 
@@ -311,7 +314,10 @@ class Flow:
         self._send_fragments(now)
 
     def _probe(self, now: float) -> None:
-        """Send probes after a long silence, regardless of window and room; from the third probe on, restart slowly."""
+        """Send fragments as probes after a long silence, even if the congestion window or the receiver is full.
+
+        From the third probe on, restart from the smallest congestion window.
+        """
         self._silent_probes += 1
         if self._silent_probes > 2:
             self._window.collapse()

@@ -1,7 +1,8 @@
 """Transfer messages that are larger than a datagram, in fragments.
 
-Outgoing messages go to the ``Flow`` of their peer; incoming fragments are reassembled here, within limits per peer and
-node: an outgoing message without room is rejected at once, an incoming one without room waits at its sender.
+Outgoing messages go to the ``Flow`` of their peer; incoming fragments are reassembled here. Buffers are limited per
+peer and per node. An outgoing message that exceeds a limit is rejected immediately; an incoming message that exceeds a
+limit waits at its sender.
 """
 
 from __future__ import annotations
@@ -27,24 +28,27 @@ from middleware.entangled.wire.message import (
 )
 from middleware.entangled.wire.session import Session
 
-# Outgoing: eight of the largest messages to one peer, so that a burst of writes is accepted; 16 MiB in all.
+# Outgoing: eight messages of the maximum size to one peer, so that a burst of writes is accepted; 16 MiB to all peers.
 MAX_OUT_PER_PEER_BYTES = 8 * MAX_MESSAGE_BYTES
 MAX_OUT_BYTES = 16 * MAX_MESSAGE_BYTES
-# Incoming: four of the largest messages of one peer; 8 MiB in all, a fifth of the memory of an edge node.
+# Incoming: four messages of the maximum size from one peer; 8 MiB from all peers, a fifth of the memory of an edge
+# node.
 MAX_IN_PER_PEER_BYTES = 4 * MAX_MESSAGE_BYTES
 MAX_IN_BYTES = 8 * MAX_MESSAGE_BYTES
-# Fragments that all senders together may have under way to this node: the usual receive buffer of 208 KiB.
+# The number of fragments that all senders together may have under way to this node: as many as fit into the usual
+# receive buffer of 208 KiB.
 RECEIVE_FRAGMENTS = 128
 MIN_RECEIVE_FRAGMENTS = 4
 MAX_TRANSFER_S = 60.0
-# If the buffer is full, messages that are older than SETTLED_S seconds and grow by fewer than SLOW fragments per second
-# (88 kbit/s) are dropped: otherwise a few peers could fill the buffer with messages that they never finish.
+# If the buffer is full, messages that are older than SLOW_AFTER_S seconds and grow by fewer than MIN_FRAGMENTS_PER_S
+# fragments per second (88 kbit/s) are dropped. Otherwise a few peers could fill the buffer with messages that they
+# never finish.
 SLOW_AFTER_S, MIN_FRAGMENTS_PER_S = 1.0, 8.0
 CLEARING_INTERVAL_S = 0.5
 # A peer that had a message dropped may not use this part of the buffer for TARDY_S seconds, so that others can.
 RESERVED_BYTES = 2 * MAX_MESSAGE_BYTES
 PENALTY_S, MAX_PENALIZED = 60.0, 1024
-# Completed incoming requests that are remembered; their repeated fragments are acknowledged and dropped.
+# The number of completed incoming messages that are remembered; their repeated fragments are acknowledged and dropped.
 MAX_COMPLETED = 1024
 MAX_FLOWS = 64
 PROGRESS_INTERVAL_S = 0.1
@@ -71,12 +75,12 @@ class IncomingMessage:
         return self.received == (1 << len(self.fragments)) - 1
 
     def is_slow(self, now: float) -> bool:
-        """Return whether the message may be dropped to make room for others."""
+        """Return whether the message grows so slowly that it may be dropped to free buffer space."""
         age = now - self.started_at
         return age > SLOW_AFTER_S and self.received.bit_count() < MIN_FRAGMENTS_PER_S * age
 
     def add(self, fragment: Fragment, now: float) -> bool:
-        """Store a fragment; return whether to acknowledge it at once, because it leaves a gap or is a duplicate."""
+        """Store a fragment; return whether to acknowledge it immediately: after a gap, or if it is a duplicate."""
         self.last_received_at = now
         bit = 1 << fragment.number
         if self.received & bit:
@@ -94,10 +98,11 @@ class IncomingMessage:
 class Fragmenter:
     """The message fragmenter of an endpoint.
 
-    ``send_sealed`` seals bytes for a peer; ``deliver`` is called with a session and each message that has arrived
-    completely; ``first_timeout`` returns the time in seconds to wait for a peer's first receipt; ``is_awaited`` returns
-    whether a request to a peer still waits for its answer. ``on_progress`` is called with the id of a request of this
-    node and a peer, whenever the peer acknowledged a fragment of the request or a fragment of the answer arrived.
+    ``send_sealed`` encrypts bytes for a peer and sends them. ``deliver`` is called with a session and each message that
+    has arrived completely. ``first_timeout`` returns the time in seconds to wait for a peer's first receipt.
+    ``is_awaited`` returns whether a request to a peer still waits for its answer. ``on_progress`` is called with the id
+    of a request of this node and the key of a peer, whenever the peer acknowledged a fragment of the request or a
+    fragment of the answer arrived.
     """
 
     def __init__(
@@ -139,7 +144,7 @@ class Fragmenter:
         self._bytes_out.clear()
 
     def reserve(self, public: bytes, size: int) -> bool:
-        """Reserve room for a message of ``size`` bytes to a peer until ``release``; return whether there was room."""
+        """Reserve buffer space for a message of ``size`` bytes to a peer until ``release``; return False if full."""
         if self._bytes_out[public] + size > MAX_OUT_PER_PEER_BYTES or self._bytes_out.total() + size > MAX_OUT_BYTES:
             self._counters["crowded"] += 1
             return False
@@ -147,17 +152,20 @@ class Fragmenter:
         return True
 
     def release(self, public: bytes, size: int) -> None:
-        """Free the room of a message that is no longer buffered."""
+        """Free the buffer space of a message that is no longer buffered."""
         self._bytes_out[public] -= size
         if self._bytes_out[public] <= 0:
             del self._bytes_out[public]
 
     def send(self, public: bytes, key: MessageKey, message: bytes) -> bool:
-        """Send a message to a peer; return False if an answer finds no room. A request has reserved its room before."""
+        """Send a message to a peer; return False if there is no buffer space for an answer.
+
+        The caller has already reserved the buffer space of a request.
+        """
         flow = self._flows.get(public)
         if flow is None:
             flow = self._make_flow(public)
-        self._flows[public] = self._flows.pop(public)  # the flow that was unused for longest stands first
+        self._flows[public] = self._flows.pop(public)  # the least recently used flow is first
         if key in flow.messages:
             return True  # it is already under way
         if key.is_answer and not self.reserve(public, len(message)):
@@ -177,7 +185,7 @@ class Fragmenter:
             flow.drop(key)
 
     def restart(self, public: bytes) -> None:
-        """Restart the messages to a peer in its new session, because a restarted peer lost the earlier fragments."""
+        """Send the messages to a peer again in its new session, because a restarted peer lost the earlier fragments."""
         flow = self._flows.get(public)
         if flow is not None and flow.messages:
             flow.restart()
@@ -208,7 +216,7 @@ class Fragmenter:
         if flow is not None and receipt.key in flow.messages:
             now = self._clock.seconds()
             if now - flow.progress_reported_at >= PROGRESS_INTERVAL_S:
-                # Requests that wait for their turn make progress, too.
+                # Requests that wait for their turn count as progressing also.
                 flow.progress_reported_at = now
                 for key in flow.messages:
                     if not key.is_answer:
@@ -259,7 +267,7 @@ class Fragmenter:
             self._on_progress(key.id, public)
 
     def _has_room(self, public: bytes, size: int, now: float) -> bool:
-        """Return whether another message of a peer can be buffered; slow ones are dropped to make room."""
+        """Return whether one more message from a peer can be buffered; drop slow messages to free space."""
         if self._bytes_in[public] + size > MAX_IN_PER_PEER_BYTES:
             return False
         most = (
@@ -303,7 +311,7 @@ class Fragmenter:
                 cancel(self._sweeper)
 
     def _sweep(self) -> None:
-        """Drop messages that received nothing for ``IDLE_TIMEOUT_S`` or took longer than ``MAX_TRANSFER_S``."""
+        """Drop messages without a new fragment for ``IDLE_TIMEOUT_S``, and messages older than ``MAX_TRANSFER_S``."""
         now = self._clock.seconds()
         for where, assembly in list(self._incoming.items()):
             if now - assembly.last_received_at >= IDLE_TIMEOUT_S or now - assembly.started_at >= MAX_TRANSFER_S:

@@ -1,4 +1,4 @@
-"""Encode and decode the content of sealed datagrams: messages as strict msgpack, fragments, and receipts for fragments.
+"""Encode and decode the content of encrypted datagrams: msgpack messages, fragments, and receipts for fragments.
 
 ``decode``, ``parse_fragment`` and ``parse_receipt`` accept any bytes: they return a value or raise ``Malformed``.
 Absolute times are never transmitted.  A fragment (PART) and a receipt each fill one datagram::
@@ -6,11 +6,11 @@ Absolute times are never transmitted.  A fragment (PART) and a receipt each fill
     PART     0x01  flags 1  id 8  total bytes 4  number 2  the bytes of this fragment
     RECEIPT  0x02  flags 1  id 8  next 2  room 2  cause 2  bitmap
 
-All fragments but the last have ``FRAGMENT_BYTES``, so each fragment has one place and fragments never overlap.
-``next`` is the first missing fragment, bit n of the bitmap (least significant first) is set if fragment ``next + 1 +
-n`` has arrived, and ``room`` is the number of fragments from ``next`` on that the receiver accepts.  ``cause`` is the
-fragment that triggered the receipt: only its round trip is measured, because earlier receipts for the others may have
-been lost.
+All fragments except the last have ``FRAGMENT_BYTES`` bytes, so the number of a fragment determines its offset, and
+fragments never overlap.  ``next`` is the first missing fragment, bit n of the bitmap (least significant first) is set
+if fragment ``next + 1 + n`` has arrived, and ``room`` is the number of fragments, starting with ``next``, that the
+receiver accepts.  ``cause`` is the fragment that triggered the receipt.  Only the round trip of this fragment is
+measured, because earlier receipts for other fragments may have been lost.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ from middleware.entangled.errors import Malformed
 from middleware.entangled.network.network import MAX_DATAGRAM_BYTES
 from middleware.entangled.wire.session import MAX_PLAIN_BYTES
 
-# A record of 1 MiB, and room for its other fields and for the fields of the request that carries it.
+# A record of 1 MiB, with space for its other fields and for the fields of the request that contains it.
 MAX_MESSAGE_BYTES = 2**20 + 4096
 MAX_METHOD = 64
 MAX_CODE = 64
@@ -40,10 +40,10 @@ _UINT32 = b"\xce"
 
 PART, RECEIPT = 0x01, 0x02
 REFUSAL = 0x04
-"""Followed by the refusal code: the sender rejects the peer and forgets the session."""
-IS_ANSWER = 0x01  # flag of both: the message is the answer to the request with this id, otherwise the request
+"""The kind of a message that notifies the peer of its rejection; the refusal code follows."""
+IS_ANSWER = 0x01  # flag of PART and RECEIPT: the message is the answer to the request with this id
 WANTS_RECEIPT = 0x02  # flag of PART: the sender wants a receipt now
-DONE = 0x02  # flag of RECEIPT: stop sending; all fragments are here, or the message is no longer needed
+DONE = 0x02  # flag of RECEIPT: stop sending; all fragments have arrived, or the message is no longer needed
 _FRAGMENT_HEADER_BYTES = 16
 _RECEIPT_HEADER_BYTES = 16
 FRAGMENT_BYTES = MAX_PLAIN_BYTES - _FRAGMENT_HEADER_BYTES
@@ -55,8 +55,8 @@ MAX_BITMAP_BYTES = -(-MAX_FRAGMENTS // 8)
 class Request:
     """Calls ``method``; the requester's ``id`` (64 bits) distinguishes a repeated request from a new one.
 
-    The requester no longer waits for its requests to this peer with ids of more than ``behind`` below this one.
-    ``left_ms`` is the time that the requester will still wait, in milliseconds.
+    The requester no longer waits for its requests to this peer with an id below ``id - behind``.  ``left_ms`` is the
+    time that the requester will still wait, in milliseconds.
     """
 
     id: int
@@ -120,13 +120,13 @@ def encode(message: Message) -> bytes:
 
 
 def set_remaining_time(request: bytes, seconds: float) -> bytes:
-    """Return an encoded request with another remaining time of ``seconds``."""
+    """Return a copy of an encoded request with the remaining time replaced by ``seconds``."""
     left_ms = min(NO_LIMIT_MS, max(0, round(seconds * 1000)))
     return request[:-4] + left_ms.to_bytes(4, "big")
 
 
 def decode(data: bytes) -> Message:
-    """Decode a message; raise ``Malformed`` and nothing else."""
+    """Decode a message; for any invalid bytes raise ``Malformed``."""
     is_large = len(data) > MAX_DATAGRAM_BYTES
     longest = MAX_MESSAGE_BYTES if is_large else MAX_DATAGRAM_BYTES
     budget = _ItemLimit() if is_large else None
@@ -144,9 +144,9 @@ def decode(data: bytes) -> Message:
             max_ext_len=0,
         )
     except Exception as error:  # untrusted input: msgpack raises more types than it documents
-        raise Malformed(f"not msgpack: {type(error).__name__}") from None
-    if type(fields) is not list or not fields or type(fields[0]) is not int:  # True and 1.0 are equal to 1, too
-        raise Malformed("the message does not start with a list and its kind")
+        raise Malformed(f"the message is not valid msgpack: {type(error).__name__}") from None
+    if type(fields) is not list or not fields or type(fields[0]) is not int:  # True and 1.0 also equal 1
+        raise Malformed("the message is not a list that starts with the number of a kind")
     kind, size = fields[0], len(fields)
     if kind == _REQUEST and size == 6:
         _, id_, behind, method, arguments, left = fields
@@ -168,7 +168,7 @@ def decode(data: bytes) -> Message:
             return Notification(method, tuple(arguments))
     elif kind == _CANCEL and size == 2 and _is_id(fields[1]):
         return Cancel(fields[1])
-    raise Malformed("the fields do not match any kind of message")
+    raise Malformed("the fields of the message do not match any kind of message")
 
 
 def is_code(value: object) -> bool:
@@ -191,7 +191,7 @@ class _ItemLimit:
 
 
 def _reject_extension(code: int, data: bytes) -> NoReturn:
-    raise Malformed("extension types are not part of the protocol")
+    raise Malformed("the message contains a msgpack extension type, which the protocol does not use")
 
 
 def _is_id(value: object) -> bool:
@@ -260,9 +260,9 @@ def parse_fragment(plain: bytes) -> Fragment:
     flags, total = plain[1] if len(plain) > _FRAGMENT_HEADER_BYTES else 0xFF, int.from_bytes(plain[10:14], "little")
     number, data = int.from_bytes(plain[14:16], "little"), plain[_FRAGMENT_HEADER_BYTES:]
     if flags & ~(IS_ANSWER | WANTS_RECEIPT) or not 0 < total <= MAX_MESSAGE_BYTES or number >= count_fragments(total):
-        raise Malformed("a fragment with unknown flags, size or number")
+        raise Malformed("the fragment has unknown flags, or an invalid size or number")
     if len(data) != min(FRAGMENT_BYTES, total - number * FRAGMENT_BYTES):
-        raise Malformed("a fragment of the wrong length for its number")
+        raise Malformed("the length of the fragment is wrong for its number")
     return Fragment(_parse_key(plain), bool(flags & WANTS_RECEIPT), total, number, data)
 
 
@@ -271,7 +271,7 @@ def parse_receipt(plain: bytes) -> Receipt:
     if not _RECEIPT_HEADER_BYTES <= len(plain) <= _RECEIPT_HEADER_BYTES + MAX_BITMAP_BYTES or plain[1] & ~(
         IS_ANSWER | DONE
     ):
-        raise Malformed("a receipt of the wrong length, or with unknown flags")
+        raise Malformed("the receipt has the wrong length or unknown flags")
     first = int.from_bytes(plain[10:12], "little")
     room, cause = int.from_bytes(plain[12:14], "little"), int.from_bytes(plain[14:16], "little")
     received = int.from_bytes(plain[_RECEIPT_HEADER_BYTES:], "little") << (first + 1) | (1 << first) - 1
@@ -279,7 +279,10 @@ def parse_receipt(plain: bytes) -> Receipt:
 
 
 def pack_receipt(key: MessageKey, is_done: bool, room: int, cause: int, received: int) -> bytes:
-    """Return the RECEIPT for a message of which the fragments in ``received`` have arrived, ``cause`` the latest."""
+    """Return the RECEIPT for a message.
+
+    Bit n of ``received`` is set if fragment n has arrived; ``cause`` is the latest fragment.
+    """
     first = ((received + 1) & ~received).bit_length() - 1  # the lowest bit that is not set
     bitmap = received >> (first + 1)
     head = bytes([RECEIPT, key.is_answer * IS_ANSWER | is_done * DONE]) + key.id.to_bytes(8, "little")

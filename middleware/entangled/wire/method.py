@@ -1,7 +1,7 @@
 """Check arguments and run exposed methods, remember the calls that ran, and convert errors to failures and back.
 
-``RequestHistory`` prevents a repeated request from running twice.  An error crosses the wire as ``Refused``, with its
-code and its text.
+``RequestHistory`` prevents a repeated request from running twice.  The requester receives an error of a method as
+``Refused``, with the code and the text of the error.
 """
 
 from __future__ import annotations
@@ -47,7 +47,7 @@ class BadArguments(Refused):
 
 
 class _Signature(NamedTuple):
-    """The parameters of a function besides the peer: their number, their types (None: any), and a deadline."""
+    """The parameters of a function after the peer: number, types (None: any), and whether it has ``deadline``."""
 
     min_arguments: int
     max_arguments: float
@@ -63,12 +63,12 @@ _SIGNATURES: WeakKeyDictionary[Callable[..., object], _Signature] = WeakKeyDicti
 class Method:
     """An exposed function.
 
-    ``changes``: it runs once per request.  ``is_idempotent``: a second run does no harm, so the first one need not be
-    remembered.  ``is_early``: it only reads and returns immediately, so it may run before its peer has confirmed the
-    session; every other method runs only in an established session.
+    ``changes``: the function has side effects and runs once per request.  ``is_idempotent``: a second run does no harm,
+    so the first run need not be remembered.  ``is_early``: the function only reads and returns immediately, so it may
+    run before the peer has confirmed the session; every other function runs only in an established session.
 
-    A function with a keyword-only parameter ``deadline`` receives there the time on the node's clock after which its
-    answer is useless.
+    A keyword-only parameter ``deadline`` of the function receives the time on the node's clock after which the answer
+    is useless.
     """
 
     name: str
@@ -84,7 +84,7 @@ class Method:
 
     @property
     def _signature(self) -> _Signature:
-        """The parameters, inspected at the first call: inspecting all methods takes half the time to create a node."""
+        """The parameters, inspected at the first call, because inspecting all methods would double the start time."""
         form = self._cached_signature
         if form is None:
             answer = inspect.unwrap(self.answer)
@@ -112,7 +112,7 @@ class Method:
         )
 
     def _find_types(self, parameters: list[inspect.Parameter]) -> tuple[tuple[type, ...] | None, ...]:
-        """Return the types that the annotations allow; most are plain names, which need not be compiled."""
+        """Return the types that the annotations allow; annotations that are plain names are not evaluated."""
         named = [_types_in_annotation(parameter.annotation) for parameter in parameters]
         if all(named):
             return tuple(named)
@@ -124,7 +124,7 @@ class Method:
 
     @property
     def runs_once(self) -> bool:
-        """Whether it may run only once per request."""
+        """Whether the function may run only once per request."""
         return self.changes and not self.is_idempotent
 
     def run(self, peer: Contact, arguments: tuple[object, ...], deadline: float = math.inf) -> object:
@@ -132,7 +132,7 @@ class Method:
         least, most, all_kinds, wants_deadline = self._signature
         if not least <= len(arguments) <= most:
             count = f"{least}" if least == most else f"{least} to {most}"
-            raise BadArguments(f"{self.name}: takes {count} arguments, got {len(arguments)}")
+            raise BadArguments(f"{self.name}: the method takes {count} arguments, not {len(arguments)}")
         for place, (kinds, argument) in enumerate(zip(all_kinds, arguments, strict=False), start=1):
             if kinds is not None and type(argument) not in kinds:
                 wanted = " or ".join("None" if kind is type(None) else kind.__name__ for kind in kinds)
@@ -186,7 +186,7 @@ def make_error(failure: Failure) -> Refused:
 
 @dataclass(slots=True)
 class RequestEntry:
-    """One request; ``answer`` is None while it runs, the answer is sent in ``session`` (None: discarded)."""
+    """One request; ``answer`` is None while its method runs, and is sent in ``session`` (None: it is discarded)."""
 
     session: Session | None
     is_fragmented: bool = False
@@ -198,7 +198,10 @@ class RequestEntry:
 
 @dataclass(slots=True)
 class _PeerRequests:
-    """The requests of one peer; ``lowest_open`` has, for each of its incarnations, the id below which none is open."""
+    """The requests of one peer.
+
+    ``lowest_open`` maps each incarnation of the peer to the id below which it has no open request.
+    """
 
     running: dict[int, RequestEntry] = field(default_factory=dict)
     finished: dict[int, RequestEntry] = field(default_factory=dict)
@@ -209,9 +212,9 @@ class _PeerRequests:
 class RequestHistory:
     """The running requests, and those that ended in the last ``KEEP_ANSWER_S`` seconds, by public key and request id.
 
-    A requester includes in each request the oldest one that it still waits for: older ones are forgotten at once, and
-    do not run if they arrive late.  A full history rejects new requests: forgetting an old one early could run a method
-    with side effects twice.
+    Each request contains the id of the oldest request that its sender still waits for.  Older requests are forgotten
+    immediately and are not executed if they arrive late.  A full history rejects new requests: if an old request were
+    forgotten early, a method with side effects could run twice.
     """
 
     def __init__(self) -> None:
@@ -232,7 +235,7 @@ class RequestHistory:
         return account is not None and number < account.lowest_open.get(number >> SEQUENCE_BITS, 0)
 
     def forget_before(self, public: bytes, oldest: int, now: float) -> None:
-        """Forget the ended requests of a peer before ``oldest``: it has those answers, or gave them up."""
+        """Forget the ended requests of a peer before ``oldest``, because the peer no longer needs their answers."""
         account = self._get_or_create(public, now)
         if account is None:
             return  # ``begin`` will reject the request
@@ -250,7 +253,7 @@ class RequestHistory:
     def begin(
         self, public: bytes, number: int, session: Session | None, now: float, is_bulky: bool
     ) -> RequestEntry | None:
-        """Add a request that is about to run; return None if there is no room."""
+        """Add a request that is about to run; return None if the history is full."""
         account = self._get_or_create(public, now)
         if (
             account is None
@@ -263,7 +266,7 @@ class RequestHistory:
         return entry
 
     def finish(self, public: bytes, number: int, answer: bytes | None, now: float) -> None:
-        """Store the ``answer`` of a request that ran, or forget the request if it is None and may run again."""
+        """Store the ``answer`` of a request that ran; None: forget the request, which may then run again."""
         account = self._peers.get(public)
         entry = account.running.pop(number, None) if account is not None else None
         if account is None or entry is None:
@@ -295,7 +298,7 @@ class RequestHistory:
         self._count = 0
 
     def _make_room(self) -> bool:
-        """Return whether there is room for one more peer, after deleting a peer without requests if necessary."""
+        """Return whether the table has space for one more peer; if it is full, delete a peer that has no requests."""
         if len(self._peers) < MAX_REQUESTERS:
             return True
         idle = (public for public, account in self._peers.items() if not (account.running or account.finished))
@@ -305,16 +308,17 @@ class RequestHistory:
         return found is not None
 
     def _get_or_create(self, public: bytes, now: float) -> _PeerRequests | None:
-        """Return the account of a peer without its expired requests; None if there is no room for another one.
+        """Return the unexpired requests of a peer; None if the peer is new and the table is full.
 
-        The account that was unused for longest is deleted if it has no requests and is older than ``KEEP_ANSWER_S``.
+        In a full table the least recently used peer is deleted if it has no requests and was unused for
+        ``KEEP_ANSWER_S`` seconds.
         """
         account = self._peers.pop(public, None)
         if account is None:
             if not self._make_room():
                 return None
             account = _PeerRequests()
-        self._peers[public] = account  # the peer that was silent for longest stands first
+        self._peers[public] = account  # the least recently used peer is first
         account.last_received_at = now
         self._expire(account, now)
         oldest_public, oldest = next(iter(self._peers.items()))

@@ -1,6 +1,6 @@
-"""Keep the state of the other nodes: sessions, round trips, handshakes under way, and pending requests.
+"""Store the state of the other nodes: sessions, round trips, handshakes under way, and pending requests.
 
-``Peers`` opens sessions and decides when to renew them; it does not know the messages that are sent in them.
+``Peers`` opens sessions and decides when to renew them; it does not interpret the messages that are sent in them.
 """
 
 from __future__ import annotations
@@ -36,26 +36,29 @@ MAX_TARGETS = 12
 MAX_INITIAL_TIMEOUT_S = 0.5
 """The maximum timeout of the first try to an unknown peer, in seconds."""
 HELP_AFTER_S = 0.2
-"""Seconds without an answer after which other nodes are asked for a path to a distant peer."""
+"""Seconds after which a handshake without an answer makes this node ask other nodes for a path to a distant peer."""
 PUNCH_INTERVAL_S, FAST_PUNCHES = 0.1, 16
-"""The seconds between INITs during hole punching, and the number of them after which the interval grows."""
+"""The seconds between two INITs during hole punching, and the number of INITs after which the interval grows."""
 LIVE_S = 3.0
 SESSION_SILENCE_S = 105.0
-"""Seconds of silence up to which the other side of a session still has it, in a wide network.  It is shorter than the
-time after which a session is forgotten; the margin covers the difference between the last datagrams of both sides."""
+"""In a wide network, seconds of silence up to which the peer is assumed to have the session still.  This is shorter
+than the time after which a session is forgotten; the margin covers the difference between the last datagrams of both
+sides."""
 SESSION_LIFE_S = 120.0
 """The age in seconds at which a session is replaced when something is sent in it."""
 RENEWAL_DELAY_S = 30.0
-"""The seconds by which the peer with the higher key delays, so that the other one replaces the session."""
+"""The seconds by which the peer with the higher key delays the replacement of a session, so that normally only the peer
+with the lower key replaces it."""
 SESSION_END_S = 180.0
 """The age in seconds at which the keys of a session are deleted."""
 SWEEP_S = 1.0
-# Far below the limit of ChaCha20-Poly1305 under one key (2**62 datagrams of this size).
+# The maximum number of datagrams in one session: far below the limit of ChaCha20-Poly1305 under one key, which is 2**62
+# datagrams of this size.
 SESSION_DATAGRAMS = 2**32
 
 
 NO_NUMBERS: Mapping[int, None] = MappingProxyType({})
-"""An empty table, shared by all peers without pending requests, which are the majority."""
+"""An empty table that is shared by all peers without pending requests; most peers have none."""
 
 
 def _add_number(numbers: Mapping[int, None], number: int) -> Mapping[int, None]:
@@ -75,11 +78,11 @@ def _remove_number(numbers: Mapping[int, None], number: int) -> Mapping[int, Non
 class OutgoingHandshake:
     """A handshake of this node that waits for its RESP.
 
-    It was begun at ``address``.  ``cookies`` maps every address to which the INIT is sent to the cookie that was
-    requested there.  The session is needed ``timeout_s`` that many seconds.  Until ``held_until`` other nodes help with
-    hole punching, and the handshake continues regardless of its tries.  ``has_request``: a request waits for it;
-    otherwise it was begun to admit the peer or to find a better path.  While it ``is_waiting`` it sends nothing and
-    waits for a late RESP.
+    The first INIT was sent to ``address``.  ``cookies`` maps every address to which the INIT is sent to the cookie that
+    was requested there.  The session is needed within ``timeout_s`` seconds.  Until the time ``held_until`` other nodes
+    help with hole punching, and the handshake continues regardless of the number of its tries.  ``has_request``: a
+    request waits for the handshake; otherwise this node started it to admit the peer or to find a better path.  A
+    handshake that ``is_waiting`` sends nothing more and waits for a late RESP.
     """
 
     initiator: InitiatorHandshake
@@ -101,7 +104,7 @@ class OutgoingHandshake:
 class Peer:
     """One peer, identified by its public key; ``contact`` has the address of the latest request to it.
 
-    ``own`` are the credentials under the team secret that it uses, if that is not the newest one.
+    ``own`` are this node's credentials under the team secret that the peer uses, if that is not the newest secret.
     """
 
     contact: Contact
@@ -111,7 +114,7 @@ class Peer:
     notifications: tuple[bytes, ...] = ()
     requests: Mapping[int, None] = field(
         default_factory=lambda: NO_NUMBERS
-    )  # the ids of pending requests to it, in order
+    )  # the ids of pending requests to this peer, in order
     queue: Mapping[int, None] = field(
         default_factory=lambda: NO_NUMBERS
     )  # the pending requests that have not been sent yet
@@ -120,7 +123,7 @@ class Peer:
 
     @property
     def public(self) -> bytes:
-        """The public key that identifies it."""
+        """The public key that identifies the peer."""
         return self.contact.public
 
     @property
@@ -134,11 +137,11 @@ class Peer:
         return next((session for session in reversed(self.sessions) if not is_relayed(session.contact.address)), None)
 
     def oldest_request(self, number: int) -> int:
-        """Return the id of its oldest pending request, or ``number`` if there is none."""
+        """Return the id of the oldest pending request to this peer, or ``number`` if there is none."""
         return next(iter(self.requests), number)
 
     def add_request(self, number: int) -> None:
-        """Record a request to it."""
+        """Record a request to this peer."""
         self.requests = _add_number(self.requests, number)
 
     def remove_request(self, number: int) -> None:
@@ -160,17 +163,17 @@ class Peer:
 
 
 class Peers:
-    """All peers of an endpoint, ``sessions`` by their index, and the handshakes of this node.
+    """All peers of an endpoint, their ``sessions`` by index, and the outgoing handshakes of this node.
 
-    ``ring`` are the credentials under the team's secrets, newest first; ``admission`` supplies the pass that is shown
-    to others.  ``on_handshake_failed`` is called with a handshake that got no answer to any of its tries.  ``is_far``
-    returns whether other nodes may know a path to an address; ``on_slow_handshake`` is called with a handshake to such
-    an address that gets no early answer, ``on_established`` with each new session, and ``on_moved`` with a session that
-    received from a new address.
+    ``ring`` are the credentials under the team's secrets, newest first; ``admission`` supplies the admission credential
+    that this node sends.  ``on_handshake_failed`` is called with a handshake that got no answer to any of its tries.
+    ``is_far`` returns whether other nodes may know a path to an address; ``on_slow_handshake`` is called with a
+    handshake to such an address that gets no early answer.  ``on_established`` is called with each new session, and
+    ``on_moved`` with a session in which a datagram arrived from a new address.
 
     ``overall_round_trip`` is the round trip to all peers together.  In a network that ``is_large`` it is also the
-    estimate for unknown peers, because there are so many that needless retransmissions matter.  ``loss`` is the loss
-    rate of incoming datagrams.
+    estimate for unknown peers, because needless retransmissions to many unknown peers would be expensive.  ``loss`` is
+    the loss rate of incoming datagrams.
     """
 
     def __init__(
@@ -228,7 +231,7 @@ class Peers:
         """Return the peer of that contact, creating it if needed; raise ``ValueError`` if its public key is invalid."""
         peer = self._peers.get(contact.public)
         if peer is not None:
-            # the peer that was unused for longest stands first
+            # the least recently used peer is first
             self._peers[contact.public] = self._peers.pop(contact.public)
             peer.contact = contact
             return peer
@@ -261,19 +264,19 @@ class Peers:
     def retry_interval(self, round_trip: RoundTrip, tries: int, within: float) -> float:
         """Return the seconds between the try number ``tries`` and the next one.
 
-        ``within`` is the time in seconds in which the request should succeed.  Each interval is longer than the one
-        before, up to the usual number of tries.  At a high loss rate the tries are as close together as necessary to
-        fit the required number, but none is sent before most answers would have arrived.  The estimate for an unknown
-        peer, which may be near or far, is the mean over all peers.
+        ``within`` is the time in seconds in which the request should succeed.  Up to the usual number of tries, each
+        interval is longer than the previous interval.  At a high loss rate the intervals are shortened to fit the
+        required number of tries, but not below the time within which most answers arrive.  For a peer without
+        measurements, the mean over all peers is used as the estimate.
         """
         wait = round_trip.timeout * BACKOFF_FACTOR ** (min(tries, MAX_TRIES) - 1)
         likely = round_trip.most if round_trip.is_measured else self.overall_round_trip.mean
         return wait if likely is None else min(wait, max(likely, within / self.loss.tries))
 
     def find_usable_session(self, peer: Peer) -> Session | None:
-        """Return the session to send in, after dropping the peer's sessions at their datagram limit.
+        """Return the session to send in, or None; drop the peer's sessions that reached their datagram limit.
 
-        The sessions with an idle peer that may have forgotten them are dropped too.
+        The sessions with an idle peer that may have forgotten them are also dropped.
         """
         session = peer.session
         if session is None:
@@ -285,9 +288,9 @@ class Peers:
         return session
 
     def renew_if_old(self, session: Session) -> None:
-        """Open a successor of a session before something is sent in it, if it is old or near its datagram limit.
+        """Open a successor of a session that is old or near its datagram limit; call this before sending in it.
 
-        Of two peers the one with the lower key does so first, so that there are not two successors.
+        Of the two peers, the peer with the lower key opens the successor first, so that there are not two successors.
         """
         public = session.contact.public
         life = SESSION_LIFE_S if self.ring[0].public < public else SESSION_LIFE_S + RENEWAL_DELAY_S
@@ -298,16 +301,16 @@ class Peers:
             self.open(peer, session.contact.address)
 
     def has_live_session(self, peer: Peer) -> bool:
-        """Return whether there is a session that the other side, if it is alive, still has.
+        """Return whether there is a session that a running peer has not forgotten yet.
 
         In a wide network each node forgets the sessions with a silent peer without notification, at a time that the
-        peer does not know; datagrams that the peer sends in them afterwards are lost.
+        peer does not know.  Datagrams that the peer sends later in such a session are lost.
         """
         since = self._clock.seconds() - SESSION_SILENCE_S if self.is_large else float("-inf")
         return any(session.last_received_at >= since for session in peer.sessions)
 
     def add_session(self, session: Session) -> Peer:
-        """Use a session for sending from now on; return its peer."""
+        """Use a session for sending to its peer from now on; return the peer."""
         peer = self.get_or_create(session.contact)
         is_carried = is_relayed(session.contact.address)
         newest = peer.session
@@ -320,7 +323,7 @@ class Peers:
             self._delete_sessions(peer.sessions[:1])
             peer.sessions = peer.sessions[1:]
         if peer.handshake is not None and peer.handshake.punches and not is_carried:
-            self.close(peer.handshake)  # the peer's own handshake of the hole punching succeeded first
+            self.close(peer.handshake)  # during hole punching, the peer's handshake succeeded before this node's own
         if self._sweeper is None:
             self._sweep()
         self.on_established(session)
@@ -329,7 +332,7 @@ class Peers:
     def _sweep(self) -> None:
         """Delete the sessions that reached their maximum age, and schedule the next sweep."""
         self._sweeper, now = None, self._clock.seconds()
-        while self.sessions:  # in the order in which they were opened
+        while self.sessions:  # the sessions are in the order in which they were opened
             oldest = next(iter(self.sessions.values()))
             left = oldest.opened_at + SESSION_END_S - now
             if left > 0:
@@ -338,16 +341,17 @@ class Peers:
             self.drop(oldest)
 
     def measure_confirmation(self, session: Session) -> None:
-        """Measure the round trip of a peer that confirmed its session: one round trip after the RESP.
+        """Measure the round trip of a peer from the RESP to the confirmation of the session.
 
-        Otherwise the first request to it would be retransmitted too soon, and a long path be mistaken for a restart.
+        Without this measurement the first request to the peer would be retransmitted too early, and a long path would
+        be mistaken for a restart of the peer.
         """
         peer = self.get_or_create(session.contact)
         if not peer.round_trip.is_measured:
             self.record_answer(peer, 1, self._clock.seconds() - session.opened_at)
 
     def record_answer(self, peer: Peer, tries: int, seconds: float) -> None:
-        """Update the estimates with an answer to the last of ``tries`` tries, ``seconds`` after the first."""
+        """Update the estimates with an answer that arrived ``seconds`` after the first of ``tries`` tries."""
         for round_trip in (peer.round_trip, self.overall_round_trip):
             if tries == 1:
                 round_trip.add_sample(seconds)
@@ -357,12 +361,12 @@ class Peers:
     def tries_before_check(self, peer: Peer) -> int:
         """Return the number of unanswered tries after which a peer may have lost the session.
 
-        With an unknown round trip or a high loss rate a single unanswered try is no evidence.
+        If the round trip is unknown or the loss rate is high, a single unanswered try is not sufficient evidence.
         """
         return 1 if peer.round_trip.is_measured and self.loss.tries == 1 else 2
 
     def record_move(self, session: Session) -> None:
-        """Record that a peer's newest datagram came from another address."""
+        """Record that a peer's newest datagram came from a different address than the previous one."""
         peer = self._peers.get(session.contact.public)
         if peer is not None:
             for other in peer.sessions:
@@ -378,7 +382,7 @@ class Peers:
     def record_credentials(self, contact: Contact, own: Credentials) -> None:
         """Record under which of several secrets ``contact`` answered."""
         if len(self.ring) > 1:
-            with suppress(ValueError):  # the key that it sent is invalid
+            with suppress(ValueError):  # the key that the contact sent is invalid
                 self.get_or_create(contact).credentials = own
 
     def evict(self, peer: Peer) -> None:
@@ -445,7 +449,7 @@ class Peers:
         is_wanted: bool = True,
         within: float = HANDSHAKE_S,
     ) -> bool:
-        """Open a session, unless a handshake is under way; return False if there are too many handshakes.
+        """Start a handshake unless one with this peer is under way; return False if there are too many handshakes.
 
         ``early_message`` is a message for the INIT; it is omitted if it does not fit.  ``within`` is the time in
         seconds in which the session is needed.
@@ -479,12 +483,12 @@ class Peers:
         return True
 
     def extend(self, opening: OutgoingHandshake, until: float) -> None:
-        """Continue a handshake until a time, because other nodes help; a time in the past restores the usual limit."""
+        """Continue a handshake until ``until``, because other nodes help; a past time restores the usual limit."""
         if opening.peer.handshake is opening:
             opening.held_until = until
 
     def punch(self, opening: OutgoingHandshake, addresses: Iterable[Address]) -> None:
-        """Send the INIT to further addresses too, immediately and at short intervals (hole punching)."""
+        """Send the INIT also to further addresses, immediately and then at short intervals (hole punching)."""
         if opening.peer.handshake is not opening:
             return
         for address in addresses:
@@ -511,14 +515,14 @@ class Peers:
     def finish(self, opening: OutgoingHandshake) -> None:
         """Close an outgoing handshake that got its RESP, and measure its round trip."""
         self.close(opening)
-        if not opening.punches:  # otherwise the time includes hole punching
+        if not opening.punches:  # otherwise the measured time would include hole punching
             tries = opening.tries + any(opening.cookies.values())  # a responder that requested a cookie got two INITs
             self.record_answer(opening.peer, tries, self._clock.seconds() - opening.started_at)
 
     def _send_init(self, opening: OutgoingHandshake, is_asked: bool = False) -> None:
-        """Send an INIT and schedule the next one, until the tries are used up or while a request waits.
+        """Send an INIT and schedule the next one, unless enough INITs were sent.
 
-        ``is_asked``: a new request waits for the session.
+        ``is_asked``: this INIT is sent because a new request waits for the session.
         """
         left = opening.started_at + HANDSHAKE_S - self._clock.seconds()
         opening.is_waiting = not is_asked and opening.tries > 0 and self._has_sent_enough(opening)
@@ -547,9 +551,9 @@ class Peers:
     def _has_sent_enough(self, opening: OutgoingHandshake) -> bool:
         """Return whether enough INITs, the most expensive datagrams, were sent.
 
-        A handshake for requests is repeated until none waits.  A handshake next to an existing session only checks
-        whether the peer lost the session, or replaces it: the requests are sent in the session as well, and the next
-        one would retry the handshake.
+        A handshake for requests is repeated until no request waits.  If a session exists already, the handshake only
+        replaces it or checks whether the peer lost it.  In this case the requests are also sent in the session, and the
+        next request would retry the handshake.
         """
         peer = opening.peer
         if not opening.has_request or opening.punches or opening.held_until:
@@ -562,7 +566,7 @@ class Peers:
         round_trip = opening.peer.round_trip
         wait = self.retry_interval(round_trip, opening.tries, opening.timeout_s)
         if opening.tries == self.tries and not round_trip.is_measured:
-            # Nothing is known of this peer: it may be distant instead of gone.
+            # This peer has not been measured: it may be distant, not unreachable.
             wait = max(wait, opening.started_at + HANDSHAKE_S - self._clock.seconds())
         return wait
 

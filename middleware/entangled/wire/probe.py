@@ -1,8 +1,8 @@
-"""Probe an address for a node of any team, with PROBE and PROBE_REPLY; neither is encrypted or contains a secret.
+"""Probe an address for a node of any team, with the datagrams PROBE and PROBE_REPLY.
 
-A node that finds no team, or not its own, learns from it whether an address is reachable, which team is there, the
-protocol version, the clock difference, and its own external address.  PROBE and PROBE_REPLY have the same length, and
-replies are rate-limited.
+Neither datagram is encrypted or contains a secret.  With a probe, a node that cannot find its team learns whether an
+address is reachable, which team uses it, the protocol version, the clock difference, and its own external address.
+PROBE and PROBE_REPLY have the same length, and replies are rate-limited.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ VERSION = 1
 TOKEN_BYTES = 16
 FINGERPRINT_BYTES = 8
 REPLIES_PER_S = 20.0
-"""PROBE_REPLY datagrams per second: enough for the diagnostics of a whole team, and 8 kbit/s at most."""
+"""The maximum number of PROBE_REPLY datagrams per second (8 kbit/s): enough for the diagnostics of a whole team."""
 _HEADER_BYTES = 1 + TOKEN_BYTES
 PROBE_BYTES = _HEADER_BYTES + 1 + FINGERPRINT_BYTES + 8 + ADDRESS_BYTES
 
@@ -35,8 +35,8 @@ PROBE_BYTES = _HEADER_BYTES + 1 + FINGERPRINT_BYTES + 8 + ADDRESS_BYTES
 class ProbeReply(NamedTuple):
     """The content of a PROBE_REPLY.
 
-    ``fingerprint`` identifies the team (zero: an open team), ``wall`` is the clock of its node in Unix seconds (0:
-    unknown), ``observed_address`` is the source address of the PROBE.
+    ``fingerprint`` identifies the team (zero: an open team), ``wall`` is the clock of the replying node in Unix seconds
+    (0: unknown), ``observed_address`` is the source address of the PROBE.
     """
 
     token: bytes
@@ -52,7 +52,7 @@ def pack_probe(token: bytes) -> bytes:
 
 
 def pack_reply(probe: bytes, fingerprint: bytes, wall: float, source: Address) -> bytes:
-    """Return the PROBE_REPLY for the PROBE ``probe`` from ``source``; raise ``Malformed`` if it is no PROBE."""
+    """Return the PROBE_REPLY for the PROBE ``probe`` from ``source``; raise ``Malformed`` if it is not a PROBE."""
     if len(probe) != PROBE_BYTES or probe[0] != PROBE:
         raise Malformed("the PROBE has the wrong length")
     moment = max(0, int(1000 * wall)).to_bytes(8, "little")
@@ -84,7 +84,7 @@ class ProbeResponder:
         self._bucket = TokenBucket(REPLIES_PER_S)
 
     def on_probe(self, datagram: bytes, source: Address) -> str:
-        """Answer a PROBE; return the reason in one word if it was dropped."""
+        """Reply to a PROBE; return a one-word reason if the PROBE was dropped, else an empty string."""
         try:
             answer = pack_reply(datagram, self._fingerprint(), self.unix_time(), source)
         except Malformed:
@@ -97,7 +97,7 @@ class ProbeResponder:
 
 @dataclass(slots=True, eq=False)
 class PendingProbe(Generic[T]):
-    """A request to an address without a session; ``datagrams`` are sent in turn."""
+    """A request outside of a session, to an address; the tries send each of ``datagrams`` in turn."""
 
     address: Address
     datagrams: Sequence[bytes]
@@ -166,7 +166,7 @@ class Prober(ProbeSender[ProbeReply]):
         return self._start(token, address, [pack_probe(token)], timeout)
 
     def on_reply(self, datagram: bytes, source: Address) -> str:
-        """Process a PROBE_REPLY; return the reason in one word if it was dropped."""
+        """Process a PROBE_REPLY; return a one-word reason if it was dropped, else an empty string."""
         try:
             answer = parse_reply(datagram)
         except Malformed:

@@ -1,4 +1,4 @@
-"""Remember recent rejections for diagnostics, with their side and reason; bounded."""
+"""Remember a bounded number of recent rejections for diagnostics, with their direction and reason."""
 
 from __future__ import annotations
 
@@ -19,9 +19,10 @@ SIDES: tuple[Side, ...] = ("they", "we", "call", "code")
 class Rejection:
     """One rejection and the number of its occurrences; times are seconds of the node's clock.
 
-    ``who`` is the public key of the other node, empty if it showed none.  ``side`` is the direction: ``they`` reject
-    this node, ``we`` reject them, this node refuses their ``call``, or the join ``code`` of a newcomer is invalid.
-    ``reason`` is for operators: the cause, and after a semicolon the remedy.
+    ``who`` is the public key of the other node, empty if it sent none.  ``side`` is the direction: ``they`` (the other
+    node rejects this node), ``we`` (this node rejects the other node), ``call`` (this node rejects a call of the other
+    node), or ``code`` (the join code of a newcomer is invalid).  ``reason`` is for operators: the cause, and after a
+    semicolon the remedy.
     """
 
     who: bytes

@@ -1,6 +1,7 @@
-"""Keep the requests of this node until they are answered, and send notifications.
+"""Send the requests of this node, wait for their answers, and send notifications.
 
-It decides when to retransmit a request and when to give it up.  The endpoint calls it with each received answer.
+The requester decides when to retransmit a request and when to fail it.  The endpoint passes each received answer to the
+requester.
 """
 
 from __future__ import annotations
@@ -39,11 +40,11 @@ TIMEOUT_S = 1.5
 MAX_NOTIFICATIONS = 32
 SILENCE_S = 5.0
 MAX_IN_FLIGHT = 32
-"""Requests that may be under way to one peer; further ones wait in a queue. They take a quarter of the usual receive
-buffer of 208 KiB, because other nodes send requests to the same peer."""
+"""The number of requests that may be under way to one peer; further requests wait in a queue.  These requests take a
+quarter of the usual receive buffer of 208 KiB, because other nodes also send requests to the same peer."""
 MAX_QUEUED = 8192
 MAX_QUEUED_S = 10.0
-_QUEUE_TIMEOUT_TEXT = "timed out in the queue; send fewer requests at the same time"
+_QUEUE_TIMEOUT_TEXT = "the request timed out in the queue; send fewer requests at the same time"
 _HANDSHAKES_TEXT = "too many handshakes are under way; try again later"
 _FULL_TEXT = "too many requests or bytes are under way; try again later"
 
@@ -52,10 +53,10 @@ _FULL_TEXT = "too many requests or bytes are under way; try again later"
 class PendingRequest:
     """A request that waits for its answer.
 
-    ``has_long_timeout``: the caller gave a longer timeout than the default; ``is_fragmented``: the request is sent in
-    fragments; ``avoids_handshake``: the request does not justify a handshake. ``extension_s`` is the time in seconds
-    that the answer has after the request left the queue and after each acknowledged fragment; 0 if the caller gave a
-    timeout.
+    ``has_long_timeout``: the caller gave a longer timeout than the default.  ``is_fragmented``: the request is sent in
+    fragments.  ``avoids_handshake``: the request does not justify a handshake.  ``extension_s`` is the time in seconds
+    within which the answer must arrive after the request left the queue and after each acknowledged fragment; 0 if the
+    caller gave a timeout.
     """
 
     number: int
@@ -101,7 +102,7 @@ class Requester:
         self._fragmenter = fragmenter
         self._requests: dict[int, PendingRequest] = {}
         self._queued = 0
-        # A random start within 62 bits keeps the request ids of a restarted node apart from its earlier ones.
+        # The random start within 62 bits separates the request ids of a restarted node from its earlier request ids.
         self._next_number = rng.getrandbits(62)
         peers.on_handshake_failed.add(self._fail_unanswered)
 
@@ -153,7 +154,7 @@ class Requester:
         )
         is_open = (
             self._peers.find_usable_session(peer) is not None
-        )  # before the request itself marks the session as in use
+        )  # evaluated before the request itself marks the session as in use
         self._requests[number] = request
         peer.add_request(number)
         if is_open and (peer.in_flight < MAX_IN_FLIGHT or not request.is_counted):
@@ -212,13 +213,13 @@ class Requester:
             request.deadline = max(request.deadline, request.progress_at + request.extension_s)
 
     def resolve(self, message: Answer | Failure, public: bytes) -> None:
-        """Pass an answer to its caller, or count an answer that no request waits for."""
+        """Pass an answer to the caller of its request; count the answer if no request waits for it."""
         request = self._requests.get(message.id)
         if request is None or request.peer.public != public:
             self._counters["unasked"] += 1
             return
         is_timed = request.tries > 0 and request.progress_at < 0 and not request.is_fragmented
-        if is_timed:  # otherwise the time includes the handshake or the transfer
+        if is_timed:  # otherwise the measured time would include the handshake or the transfer
             self._peers.record_answer(request.peer, request.tries, self._clock.seconds() - request.sent_at)
         self._forget(request)
         if isinstance(message, Answer):
@@ -227,13 +228,13 @@ class Requester:
             request.deferred.errback(make_error(message))
 
     def send_waiting(self, peer: Peer, session: Session, is_owed: bool) -> None:
-        """Send the messages that waited for a session; ``is_owed``: the peer waits for a datagram in it."""
+        """Send the messages that waited for a session; ``is_owed``: the peer waits for a datagram in this session."""
         sent = 0
         for message in peer.notifications:
             self._send(session, message)
             sent += 1
         peer.notifications = ()
-        if is_owed:  # the peer may have lost the session in which these requests were sent
+        if is_owed:  # the peer may have lost the session in which the other requests were sent
             for request in self._requests_to(peer):
                 if request.tries:
                     self._send_request(request)
@@ -258,7 +259,7 @@ class Requester:
         within = request.deadline - request.created_at
         wait = self._peers.retry_interval(request.peer.round_trip, request.tries, within)
         if request.has_long_timeout and request.tries > 1:
-            # A slow method: the later retransmissions are for an answer that was lost.
+            # The method is slow: later retransmissions are needed only if the answer was lost.
             wait = max(wait, (request.deadline - now) / max(1, self._peers.tries + 1 - request.tries))
         self._set_timer(request, wait)
 
@@ -267,8 +268,8 @@ class Requester:
         now, peer = self._clock.seconds(), request.peer
         left = request.deadline - now
         if left <= 0 and request.number in peer.queue and peer.session is not None:
-            # The request is queued behind others that the peer is answering; its delay does not mean that the peer
-            # failed.
+            # The request waits in the queue while the peer answers other requests; its delay does not mean that the
+            # peer failed.
             left = min(peer.session.last_received_at, request.created_at + MAX_QUEUED_S) + request.extension_s - now
             if left <= 0:
                 self._fail(request, _QUEUE_TIMEOUT_TEXT)
@@ -299,7 +300,7 @@ class Requester:
                 self._fail(request, f"no answer to {request.tries} tries")
         else:
             if is_silent and not request.avoids_handshake and request.tries >= self._peers.tries_before_check(peer):
-                self._open_session(request)  # the peer may have restarted without the session
+                self._open_session(request)  # the peer may have restarted and lost the session
             self._send_request(request)
 
     def _send_queued(self, peer: Peer) -> int:
@@ -308,7 +309,7 @@ class Requester:
         while peer.queue and peer.in_flight < MAX_IN_FLIGHT and self._peers.find_usable_session(peer) is not None:
             request = self._requests[next(iter(peer.queue))]
             self._leave_queue(request)
-            # Without a timeout from the caller, the time for the answer starts now.
+            # If the caller gave no timeout, the time for the answer starts now.
             request.deadline = max(request.deadline, self._clock.seconds() + request.extension_s)
             self._send_request(request)
             sent += 1
@@ -323,7 +324,7 @@ class Requester:
         return [self._requests[number] for number in peer.requests]
 
     def _open_session(self, request: PendingRequest) -> bool:
-        """Open a session for a request, which the INIT carries if allowed; return False for too many handshakes."""
+        """Open a session for a request, inside the INIT if allowed; return False if there are too many handshakes."""
         left = request.deadline - self._clock.seconds()
         early_message = b"" if request.changes else set_remaining_time(request.message, left)
         return self._peers.open(request.peer, request.address, early_message, within=min(left, HANDSHAKE_S))
@@ -335,9 +336,9 @@ class Requester:
         peer.notifications = ()
         if peer.sessions:
             for request in self._requests_to(peer):
-                if request.tries >= self._peers.tries:  # it waited for this handshake only
+                if request.tries >= self._peers.tries:  # the request waited only for this handshake
                     self._on_timer(request)
-            return  # the others have their own timers
+            return  # the other requests have their own timers
         for request in self._requests_to(peer):
             was_tried = request.created_at <= opening.started_at and request.address == opening.address
             if request.has_long_timeout or not was_tried:

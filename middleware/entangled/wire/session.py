@@ -1,12 +1,12 @@
 """Build and read the datagrams that open a session (INIT, RESP) and the DATA datagrams that it carries.
 
-INIT and RESP each carry a message, the sender's pass, which the admission check of the other side judges, and the
-sender's incarnation.  INIT is padded so that RESP is never larger; RESP contains the source address of the INIT, or a
-refusal.  A keyed hash near the end of INIT lets a node drop forged datagrams in a microsecond instead of four key
-exchanges; a second hash, made with a cookie from the responder, is required under load (``greeting``).
+INIT and RESP each contain a message, the sender's incarnation, and the sender's admission credential, which the other
+side checks.  INIT is padded so that RESP is never larger; RESP contains the source address of the INIT, or a refusal.
+With a keyed hash near the end of INIT, a node can drop forged datagrams in a microsecond, without four key exchanges.
+Under load a second hash is required, made with a cookie from the responder (``discovery``).
 
-A DATA datagram is: type (1), the receiver's index of the session (4), counter (8), then the sealed message with its tag
-(16): 29 bytes more than the message.  The 13 header bytes are authenticated too.
+A DATA datagram consists of the type (1 byte), the receiver's index of the session (4), the counter (8), and the
+encrypted message with its tag (16): 29 bytes more than the message.  The 13 header bytes are also authenticated.
 """
 
 from __future__ import annotations
@@ -45,8 +45,8 @@ MAC_BYTES = 16
 MIN_ANSWER_BYTES = 512
 _INCARNATION_BYTES = 8 + NONCE_BYTES
 TIMESTAMP_BYTES = 8
-_INIT_PASS_AT = INDEX_BYTES + KEY_BYTES + _INCARNATION_BYTES  # before the pass of an INIT
-_RESP_PASS_AT = INDEX_BYTES + _INCARNATION_BYTES + ADDRESS_BYTES  # before the pass of a RESP
+_INIT_PASS_AT = INDEX_BYTES + KEY_BYTES + _INCARNATION_BYTES  # the offset of the admission credential in an INIT
+_RESP_PASS_AT = INDEX_BYTES + _INCARNATION_BYTES + ADDRESS_BYTES  # the offset of the admission credential in a RESP
 _PAYLOAD_BYTES = _INIT_PASS_AT + 2 + 2 + TIMESTAMP_BYTES
 _INIT_FIXED_BYTES = 1 + FIRST_OVERHEAD_BYTES + _PAYLOAD_BYTES + 2 * MAC_BYTES
 _RESP_FIXED_BYTES = 1 + INDEX_BYTES + SECOND_OVERHEAD_BYTES + _RESP_PASS_AT + 2
@@ -95,9 +95,9 @@ class Credentials:
 
 
 class HandshakeFields(NamedTuple):
-    """A node's fields of a handshake: its incarnation and its pass.
+    """The fields of one node in a handshake: its incarnation and its admission credential.
 
-    ``max_pass_bytes`` is the maximum length of the other side's pass.
+    ``max_pass_bytes`` is the maximum length of the other side's credential in bytes.
     """
 
     incarnation: Incarnation = UNNUMBERED
@@ -106,12 +106,15 @@ class HandshakeFields(NamedTuple):
 
     @property
     def max_early_bytes(self) -> int:
-        """The maximum length of a message in an INIT with this pass, in bytes."""
+        """The maximum length of a message in an INIT with this admission credential, in bytes."""
         return MAX_EARLY_BYTES - len(self.own_pass)
 
     @property
     def min_init_bytes(self) -> int:
-        """The length of the shortest INIT that may be answered with a pass and ``MIN_ANSWER_BYTES`` of message."""
+        """The minimum length of an INIT, in bytes.
+
+        A RESP of this length has space for a credential and a message of ``MIN_ANSWER_BYTES`` bytes.
+        """
         return MIN_INIT_BYTES + self.max_pass_bytes
 
 
@@ -119,10 +122,10 @@ OPEN_TEAM_FIELDS = HandshakeFields()
 
 
 class Response(NamedTuple):
-    """The content of a RESP: ``remote_index``, the responder's index, its incarnation, pass and message.
+    """The content of a RESP: the responder's session index (``remote_index``), incarnation, credential and message.
 
-    ``seen`` is the source address of the INIT as the responder saw it (None: unknown).  With a ``refusal`` code the
-    responder rejects this node, and the other fields are void.
+    ``seen`` is the source address of the INIT as the responder saw it (None: unknown).  If ``refusal`` contains a code,
+    the responder rejects this node, and the other fields have no meaning.
     """
 
     remote_index: int
@@ -137,7 +140,7 @@ class Response(NamedTuple):
 class InitiatorHandshake:
     """The initiator's half of a handshake; ``mac`` is the first of the two hashes in its INIT.
 
-    ``timestamp`` is the timestamp of the INIT: higher than in every earlier INIT of this incarnation.
+    ``timestamp`` is the timestamp of the INIT; it must be higher than in every earlier INIT of this incarnation.
     """
 
     def __init__(
@@ -168,15 +171,15 @@ class InitiatorHandshake:
         self._init_without_cookie = bare + self.mac
 
     def make_init(self, cookie: bytes = b"") -> bytes:
-        """Return the INIT, which may be resent unchanged, or with a ``cookie`` that the responder requested."""
+        """Return the INIT, with ``cookie`` if the responder requested one; the same INIT may be sent several times."""
         return self._init_without_cookie + (
             _keyed_hash(cookie, self._init_without_cookie) if cookie else bytes(MAC_BYTES)
         )
 
     def read_response(self, datagram: bytes) -> Response:
-        """Read a RESP and return it with the keys of the session; raise ``Forged``.
+        """Decode a RESP and return it with the keys of the session; raise ``Forged``.
 
-        Each reading works on a copy of the handshake state, because a forged RESP would corrupt the state.
+        Each call uses a copy of the handshake state, because a forged RESP would corrupt the state.
         """
         payload, keys = self._noise.copy().read(datagram[1 + INDEX_BYTES :])
         index = int.from_bytes(payload[:INDEX_BYTES], "little")
@@ -194,8 +197,8 @@ class InitiatorHandshake:
 class ResponderHandshake:
     """The responder's half of a handshake: reads an INIT, then builds its RESP.
 
-    ``public`` is the initiator's verified Ed25519 key; ``life`` and ``shown`` are its incarnation and pass, ``rider``
-    its message, ``stamp`` its timestamp.  Raises ``Forged`` for an invalid INIT.
+    ``public`` is the initiator's verified Ed25519 key.  The other attributes are the initiator's incarnation, admission
+    credential, message and timestamp.  Raises ``Forged`` for an invalid INIT.
     """
 
     def __init__(self, credentials: Credentials, datagram: bytes, ephemeral_secret: bytes) -> None:
@@ -216,7 +219,7 @@ class ResponderHandshake:
         self._room_bytes = len(datagram) - _RESP_FIXED_BYTES
 
     def max_answer_bytes(self, hello: HandshakeFields) -> int:
-        """Return the maximum length of a message in the RESP next to the pass, in bytes."""
+        """Return the maximum length of a message in the RESP in bytes, besides the admission credential."""
         return self._room_bytes - len(hello.own_pass)
 
     def accept(
@@ -236,12 +239,12 @@ class ResponderHandshake:
 
 
 def is_init_of_team(own: Credentials, datagram: bytes) -> bool:
-    """Return whether the sender of an INIT of valid size holds the team secret of ``own``."""
+    """Return whether the sender of an INIT of valid size has the team secret of ``own``."""
     return hmac.compare_digest(_keyed_hash(own.mac_key, datagram[: -2 * MAC_BYTES]), read_mac(datagram))
 
 
 def read_mac(init: bytes) -> bytes:
-    """Return the hash in an INIT that was made with the team's key."""
+    """Return the hash in an INIT that is keyed with the team's key."""
     return init[-2 * MAC_BYTES : -MAC_BYTES]
 
 
@@ -286,10 +289,10 @@ class Session:
     """The keys and the state of one session with one peer.
 
     ``local_index`` identifies the session at this node, ``remote_index`` at the peer.  ``contact`` is the peer with the
-    source address of its newest datagram.  ``is_confirmed``: the peer has proved at that address that it holds the
-    keys; before that nothing may be sent.  Times are seconds of the endpoint's clock.  ``incarnation`` is the
-    incarnation of the peer; ``is_superseded``: a later incarnation has replaced it.  ``shown`` is the pass in its INIT,
-    until the session is confirmed.
+    source address of its newest datagram.  ``is_confirmed``: the peer has proved at that address that it has the keys;
+    until then nothing may be sent.  Times are seconds of the endpoint's clock.  ``incarnation`` is the incarnation of
+    the peer; ``is_superseded``: a later incarnation has replaced it.  ``peer_pass`` is the admission credential in the
+    peer's INIT, stored until the session is confirmed.
     """
 
     __slots__ = (
@@ -335,7 +338,7 @@ class Session:
         self._seen = 0  # bit n: the counter n below the highest was received
 
     def seal(self, message: bytes) -> bytes:
-        """Return the next DATA datagram, with ``message`` of at most ``MAX_PLAIN_BYTES`` bytes."""
+        """Return the next DATA datagram, which contains ``message`` (at most ``MAX_PLAIN_BYTES`` bytes) encrypted."""
         counter = self._sent
         self._sent = counter + 1
         header = _pack(DATA, self.remote_index, counter)
@@ -343,7 +346,7 @@ class Session:
 
     @property
     def sent(self) -> int:
-        """The number of datagrams that were sealed."""
+        """The number of DATA datagrams that were encrypted."""
         return self._sent
 
     def is_replay(self, datagram: bytes) -> bool:
@@ -352,9 +355,9 @@ class Session:
         return behind >= 0 and (behind >= WINDOW or bool(self._seen >> behind & 1))
 
     def open(self, datagram: bytes) -> tuple[bytes, int]:
-        """Decrypt a DATA datagram; return its message, and the distance of its counter from the newest one before it.
+        """Decrypt a DATA datagram; return its message, and how far its counter is ahead of the highest earlier counter.
 
-        Raises ``Forged`` if the datagram is not authentic or a replay; the session is then unchanged.
+        Raises ``Forged`` if the datagram is not authentic or is a replay; the session is then unchanged.
         """
         if len(datagram) < OVERHEAD_BYTES or self.is_replay(datagram):
             raise Forged("the datagram is a replay, or too short")
@@ -363,7 +366,7 @@ class Session:
         message = open_sealed(self._receiving, counter, datagram[_HEADER_BYTES:], header)
         ahead = counter - self._highest
         if ahead > 0:
-            # A counter may advance by up to 2**64: shifting by more than the window would only waste memory.
+            # A counter may advance by up to 2**64; a shift by more than the window would only waste memory.
             self._seen = ((self._seen << ahead) & _WINDOW_MASK if ahead < WINDOW else 0) | 1
             self._highest = counter
         else:
@@ -379,7 +382,7 @@ def read_index(datagram: bytes) -> int:
 class HalfOpenSessions:
     """Sessions that their initiators have not confirmed, and the RESPs of the last ``RESPONSES_S`` seconds.
 
-    ``sessions`` is the endpoint's table, which also contains the unconfirmed sessions.
+    ``sessions`` is the endpoint's table of all sessions, including the unconfirmed ones.
     """
 
     def __init__(self, sessions: dict[int, Session]) -> None:
@@ -419,7 +422,7 @@ class HalfOpenSessions:
             del responses[ephemeral]
 
     def confirm(self, session: Session) -> None:
-        """Record that the initiator proved at its address that it holds the keys."""
+        """Record that the initiator proved at its address that it has the keys."""
         session.is_confirmed = True
         self._unconfirmed.pop(session.local_index, None)
 

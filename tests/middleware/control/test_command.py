@@ -148,7 +148,7 @@ class CommandTests(SynchronousTestCase):
         """A socket without a server, and a server with another protocol, give an error with the cause."""
         path = prepare_path("gone")
         said = str(self.assertRaises(NoControl, list, send_request(path, {})))
-        self.assertIn("does not answer (No such file or directory); start it, or remove that file", said)
+        self.assertIn("does not answer (No such file or directory); start the node, or remove this file", said)
         server = socket.socket(socket.AF_UNIX)
         self.addCleanup(server.close)
         server.bind(str(path))

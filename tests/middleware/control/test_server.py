@@ -144,15 +144,15 @@ class ControlTests(SynchronousTestCase):
         self.assertIn("no known node", self.refusal("rpc", node="zz", method="add", arguments=[]))
         for port in ("0", "65536", "9" * 5000):
             told = self.refusal("rpc", node=f"10.0.0.1:{port}", method="add", arguments=[])
-            self.assertTrue(told.endswith(": the port must be 1 to 65535"), told)
+            self.assertTrue(told.endswith(": the port must be from 1 to 65535"), told)
 
     def test_wrong_requests(self) -> None:
         """An invalid request is rejected, and the error contains the name of the invalid argument."""
         for verb, given, said in (
             ("dht fly", {}, "dht get"),
             (None, {}, "no verb"),
-            ("dht get", {}, "key: is missing"),
-            ("dht get", {"key": 7}, "key: must be a text"),
+            ("dht get", {}, "key is missing"),
+            ("dht get", {"key": 7}, "key must be a string"),
             ("dht get", {"key": "id:12"}, "40"),
             ("dht get", {"key": "id:xy"}, "40"),
             ("dht get", {"key": "a", "concern": "some"}, "concern"),
