@@ -27,7 +27,7 @@ MAX_PARALLEL_MESSAGES = (
 )
 RECEIPT_EVERY = 4
 REORDERING_THRESHOLD = (
-    3  # a fragment is lost if a fragment sent this many places later is acknowledged (RFC 9002, 6.1.1)
+    3  # after a round trip, a fragment is lost if one sent this many places later has arrived (RFC 9002, 6.1.1)
 )
 MIN_TIMEOUT_S = 0.02
 PROBE_FRAGMENTS = 2
