@@ -57,7 +57,7 @@ class Create2PtyTests(TestCase):
         await driver.enable()
         self.port.close()
         await until(lambda: driver.state == "stale")
-        await until(lambda: "no such device" in driver.problem)
+        await until(lambda: "does not exist" in driver.problem)
         self.port = PtyPort(reactor, self.robot.accept, self.path)
 
         def obeys() -> bool:
@@ -81,11 +81,11 @@ class Create2PtyTests(TestCase):
         self.assertEqual(second.problem, "")
 
     async def test_names_what_is_no_port(self) -> None:
-        """A file that is no serial device, and one without permission, are reported."""
+        """A file that is not a serial device, and one without permission, are reported."""
         plain = self.mktemp()
         with open(plain, "wb"):
             pass
-        await self.named(plain, "no serial device")
+        await self.named(plain, "not a serial device")
         if os.geteuid() != 0:  # root may open every file
             os.chmod(os.path.realpath(self.path), 0)
             await self.named(self.path, "no permission")
