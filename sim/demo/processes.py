@@ -132,5 +132,5 @@ class ProcessGroup:
 
 
 def make_child_command(arguments: Sequence[str]) -> list[str]:
-    """Return the command of a Python process with ``arguments`` that ends when this process ends (``parent_monitor``)."""
+    """Return the command of a Python process with ``arguments`` that ends with this process (``parent_monitor``)."""
     return [sys.executable, "-m", "sim.demo.parent_monitor", *arguments]

@@ -67,7 +67,7 @@ class LinkDirection:
         return {"passed": self.passed, "lost": self.lost, "bytes": self.passed_bytes}
 
     def draw_delivery_times(self, size: int, now: float) -> list[float]:
-        """Return the delivery times of a frame of ``size`` bytes: none if the frame is lost, two if it is duplicated."""
+        """Return the delivery times of a frame of ``size`` bytes: none for a lost frame, two for a duplicated one."""
         impairments = self._impairments
         if impairments.is_perfect:
             self.passed += 1
@@ -100,7 +100,7 @@ class LinkDirection:
         return frame[:place] + bytes([frame[place] ^ 1 << self._rng.randrange(8)]) + frame[place + 1 :]
 
     def _is_lost(self) -> bool:
-        """Draw whether a frame is lost (Gilbert-Elliott): all frames are lost in the bad state, none in the good state."""
+        """Draw whether a frame is lost (Gilbert-Elliott: all frames are lost in the bad state, none otherwise)."""
         loss, burst = self._impairments.loss / 100, self._impairments.burst
         if burst <= 1.0 or not 0.0 < loss < 1.0:
             return self._draw(100 * loss)

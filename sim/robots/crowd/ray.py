@@ -59,7 +59,7 @@ class Rays:
         return ranges
 
     def _shorten(self, ranges: Floats, observers: Indices, bearing: Floats, distance: Floats, radius: float) -> None:
-        """Shorten the rays of ``observers``, each of which meets a disc at ``bearing`` (0 is ahead) and ``distance``."""
+        """Shorten the rays of ``observers``, each of which meets a disc at ``bearing`` (0: ahead) and ``distance``."""
         half = np.arcsin(np.minimum(radius / distance, 1.0)) / self._between
         middle = bearing / self._between
         first = np.ceil(middle - half)

@@ -75,7 +75,7 @@ class CrowdSimulator(PacedSimulator):
         self.crowd.commands[self._numbers[name]] = 0.0
 
     def _simulate(self, late: float) -> int:
-        """Simulate one tick, even if several are due: the next one follows immediately, with newly received commands."""
+        """Simulate one tick, even if several are due: the next one follows immediately, with newer commands."""
         started_at = self._stopwatch()
         self._stop_expired(self.crowd.t)
         self.crowd.commands[len(self.names) :] = self._controller(self._other_readings)
