@@ -299,7 +299,7 @@ class LivingMembers(Event):
 
 @dataclass(frozen=True, slots=True)
 class AnswerRepeated(Event):
-    """A member that had accepted ``taker`` for a tuple answered a further request with ``value`` (None: invalid)."""
+    """A member that had accepted ``taker`` for a tuple answered a further request with ``answer`` (None: invalid)."""
 
     fields: Hashable
     taker: bytes
