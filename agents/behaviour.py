@@ -1,6 +1,6 @@
 """The interface of behaviours: pure code that performs one kind of task with one robot, loaded by name.
 
-A behaviour receives observations and returns actions (``drivers.reading``).  It knows neither peers nor leases: the
+A behaviour receives observations and returns actions (``drivers.reading``).  It has no access to peers or leases: the
 agent decides whether the behaviour may act.
 """
 
@@ -35,13 +35,14 @@ class Behaviour(Protocol):
 
     - ``is_safe``: whether the task may be reassigned now; default True
     - ``progress``: the share of the task that is done, 0 to 1
-    - ``valid_for``: seconds for which the cost is valid; default: while the node is present
+    - ``valid_for``: seconds for which the cost is valid; default: as long as the node is present
     - ``angle`` and ``take_post``: see ``agents.formation``
     - ``embody``: a method that gets the robot's motion capabilities before the first ``look``, see ``agents.motion``
     - ``close``: a method that is called after the agent has left the task
 
-    Some strategies also read ``value`` (a tuple: a number, or a place in metres), ``choice`` (the option that it votes
-    for), ``weight`` (of both) and ``electorate`` (the total weight of all that may vote).
+    Some strategies also read ``value`` (a tuple: one number, or a position in metres), ``choice`` (the option for
+    which the agent votes), ``weight`` (the weight of the value or the vote) and ``electorate`` (the total weight of
+    all agents that may vote).
     """
 
     def look(self, seen: Observation, now: float) -> None:
@@ -49,10 +50,10 @@ class Behaviour(Protocol):
 
     @property
     def cost(self) -> float | None:
-        """The cost of the task for this robot, at least 0 (metres, for a distance); None while it is unknown."""
+        """The cost of the task for this robot, at least 0; a distance is in metres.  None while the cost is unknown."""
 
     def search(self, now: float) -> Action:
-        """Return the next action while the cost is unknown; the agent holds no lease."""
+        """Return the next action while the cost is unknown and the agent holds no lease."""
 
     def hold(self, now: float) -> Action:
         """Return the next action while the cost is known and the agent holds no lease."""
@@ -66,12 +67,12 @@ def create_behaviour(
 ) -> Behaviour:
     """Create the behaviour for ``task.kind``: a built-in one, or an entry point of ``swarm_node.behaviours``.
 
-    ``deployed:x`` is the module ``x`` in ``deployed``, which an operator deployed to the team.  If ``motion`` is given,
-    it is passed to the behaviour's ``embody``.
+    The kind ``deployed:x`` selects the module ``x`` of ``deployed``, the modules that an operator deployed to the
+    team. If ``motion`` is given, it is passed to the behaviour's ``embody``.
 
-    A task comes from the network, so its kind selects among installed behaviours and is never an import path.  Raises
-    ``UnknownTask`` if the kind is unknown or the parameters are invalid, and ``MissingExtra`` if the behaviour's
-    libraries are not installed.
+    A task comes from the network, so its kind only selects an installed or deployed behaviour and is never an import
+    path.  Raises ``UnknownTask`` if the kind is unknown or the parameters are invalid, and ``MissingExtra`` if the
+    behaviour's libraries are not installed.
     """
     behaviour = _create_deployed(task, rng, deployed or {}) if is_deployed(task.kind) else _create_installed(task, rng)
     embody = getattr(behaviour, "embody", None)

@@ -1,4 +1,4 @@
-"""Observations, motion capabilities and contexts as plain values, and the process side of deployed behaviours; pure."""
+"""Convert observations, motion capabilities and contexts to plain values, and serve deployed behaviours; pure."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ LOOK, SEARCH, HOLD, EXECUTE, EMBODY = "look", "search", "hold", "execute", "embo
 
 
 class BehaviourKind:
-    """Serves behaviours in their own process; each reply has the result, the cost and the optional attributes."""
+    """Serves behaviours in a separate process; each reply contains the result, the cost and the optional attributes."""
 
     def make(self, make: Factory, arguments: list[Any]) -> object:
         """Create a behaviour from a task's parameters, with its own random generator."""
@@ -40,7 +40,7 @@ class BehaviourKind:
         return {"told": read_attributes(thing.behaviour)}
 
     def call(self, thing: object, method: str, arguments: list[Any]) -> object:
-        """Call one method; returns its result, and the cost and attributes after it."""
+        """Call one method; return its result, and the cost and attributes after the call."""
         assert isinstance(thing, _HostedBehaviour)
         behaviour = thing.behaviour
         result = None
@@ -83,7 +83,7 @@ def read_attributes(thing: object) -> list[Any]:
 
 
 def encode_motion(motion: MotionCapabilities) -> dict[str, Any]:
-    """Convert motion capabilities to plain values; ``run`` is left out because the process decodes pictures itself."""
+    """Convert motion capabilities to plain values, except ``run``: the process decodes pictures itself."""
     fields = {name: value for name, value in vars(motion).items() if name != "run"}
     return {name: dict(value) if isinstance(value, Mapping) else value for name, value in fields.items()}
 

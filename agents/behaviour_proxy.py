@@ -1,8 +1,8 @@
-"""A behaviour in another process, which may raise, hang or exit without harm to the agent.
+"""A behaviour in a separate process: if the behaviour raises, hangs or exits, the agent continues to work.
 
-Calls do not block: each call sends a request and returns the last result if it is fresh and from the same method and
-lease.  Otherwise the robot stands still.  After a failure the behaviour is not called again: the robot stands still and
-reports no cost, so that another agent acts.
+Calls do not block: each call sends a request and returns the last result, provided that it is recent and from the same
+method and lease. Otherwise the robot stands still. After a failure the behaviour is not called again: the robot stands
+still and the agent reports no cost, so another agent acts.
 """
 
 from __future__ import annotations
@@ -56,7 +56,7 @@ class BehaviourConnection(Protocol):
 
 
 class BehaviourProxy:
-    """The behaviour behind ``inner`` until it fails, then ``stand``."""
+    """Performs the behaviour of the process at ``inner`` until that behaviour fails, then ``stand``."""
 
     _log = Logger()
 
@@ -74,12 +74,12 @@ class BehaviourProxy:
 
     @property
     def has_failed(self) -> bool:
-        """Whether the behaviour has failed and is not called any longer."""
+        """Whether the behaviour has failed; it is then not called any more."""
         self._receive()
         return self._has_failed
 
     def embody(self, motion: MotionCapabilities) -> None:
-        """Pass on the robot's motion capabilities; their changes are sent before each observation."""
+        """Pass on the robot's motion capabilities; later changes to them are sent before each observation."""
         self._motion = motion
         self._send_motion()
 
@@ -92,7 +92,7 @@ class BehaviourProxy:
 
     @property
     def cost(self) -> float | None:
-        """The cost of the task for this robot; None if it is unknown or the behaviour has failed."""
+        """The cost of the task for this robot; None if the cost is unknown or the behaviour has failed."""
         self._receive()
         cost = self._cost
         is_valid = isinstance(cost, int | float) and not isinstance(cost, bool) and 0 <= cost < float("inf")
@@ -205,6 +205,6 @@ def _check_action(result: object) -> Action | None:
     for key, value in result.items():
         if not isinstance(key, str) or len(key) > MAX_KEY_CHARS or type(value) is not float or not math.isfinite(value):
             raise ValueError(
-                f"each key of an action must be a text of at most {MAX_KEY_CHARS} characters, each value a finite float"
+                f"each key of an action must have at most {MAX_KEY_CHARS} characters, each value must be a finite float"
             )
     return result

@@ -29,7 +29,7 @@ TASKS = {
         waiting_period=1.0,
         stop_time=STOP_TIME_S,
     ),
-    # Any device with a camera can do it: a dog turns itself, a phone is turned by its user.
+    # Any device with a camera can do this task: a dog turns itself, a phone is turned by its user.
     "watch-target": Task(
         task_id="",
         kind="watch-target",
@@ -50,7 +50,7 @@ TASKS = {
 
 
 def create_task(name: str, task_id: str, created: float) -> Task:
-    """Return the predefined task ``name`` as a new task; raises ``UnknownTask``, whose text lists the known names."""
+    """Return the predefined task ``name`` as a new task; raise ``UnknownTask``, which lists the known names."""
     template = TASKS.get(name)
     if template is None:
         raise UnknownTask(f"no predefined task {name!r}; known tasks: {', '.join(sorted(TASKS))}")

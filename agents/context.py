@@ -12,10 +12,11 @@ class Context:
     - ``token``: the lease's fencing token
     - ``deadline``: the end of the lease, on the clock of ``now``
     - ``began``: the time of the first call with this token
-    - ``is_resumed``: the token is the same as in the previous call, so no other agent has acted in between.
-      With a new token another agent may have acted, and earlier results may be void.
-    - ``value``, ``choice``: the agreed number or place, or the option that won the vote, if the strategy finds one.
-      They persist under one token while a decision is open again, for example after a new agent has joined.
+    - ``is_resumed``: the token is the same as in the previous call, so no other agent has acted since that call. With
+      a new token another agent may have acted, and earlier results may be invalid.
+    - ``value``, ``choice``: the agreed number or position, and the option that won the vote, if the strategy
+      determines them. While a decision is repeated under the same token, for example after an agent has joined, both
+      keep their last values.
     """
 
     now: float

@@ -24,8 +24,9 @@ Basis = tuple[object, ...]
 class RoundCounter:
     """The round counter of one task at one participant.
 
-    All participants raise their counter to the highest number received, as Lamport clocks do, so a round never returns.
-    The first participant that has to decide again starts a new round; participants with the same decision join it.
+    All participants raise their counter to the highest number received, as Lamport clocks do, so no round number is
+    used twice. The first participant that has to decide again starts a new round; participants with the same decision
+    join that round.
     """
 
     def __init__(self) -> None:
@@ -56,9 +57,9 @@ def is_older(report: Member, known: Member | None) -> bool:
 
 
 class PeerReports:
-    """The reports of the participants other than ``uuid``, which may arrive late, twice and in any order.
+    """The reports of all participants except ``uuid``; reports may arrive late, twice and in any order.
 
-    Of each participant the newest report counts, until it expires; departed participants are forgotten.
+    Only the newest report of each participant is used, until it expires; departed participants are removed.
     """
 
     def __init__(self, uuid: str) -> None:
@@ -68,7 +69,8 @@ class PeerReports:
         self._departed: dict[str, tuple[Member, float]] = {}
         self._ignored: dict[str, Member] = {}
         self.own_report: Member | None = None
-        """This participant's own newest report, if it came back: after a restart it is from the previous run."""
+        """This participant's own newest report as received from the group; after a restart it is from the previous
+        run."""
 
     def __len__(self) -> int:
         """Return the number of other participants."""
@@ -96,12 +98,12 @@ class PeerReports:
         self._ignored = {uuid: was for uuid, was in self._ignored.items() if known.get(uuid) == was}
 
     def ignore_report(self, uuid: str) -> None:
-        """Ignore the last report of ``uuid`` until a new one arrives: it gave up the task."""
+        """Ignore the last report of ``uuid``, which has given up the task, until its next report arrives."""
         if uuid in self._reports:
             self._ignored[uuid] = self._reports[uuid]
 
     def members(self, now: float) -> list[Member]:
-        """Return the others, sorted by uuid; invalid and stale costs are removed."""
+        """Return the other participants, sorted by uuid, with invalid and expired costs removed."""
         return [self._valid_report(self._reports[uuid], now) for uuid in sorted(self._reports)]
 
     @property
@@ -138,7 +140,7 @@ class DecisionRecorder:
         members = [me, *others]
         tokens = [m.token for m in members if m.status == EXECUTING]
         self._token = max(self._token, *(m.token for m in members))
-        # The epoch is the token under which the task is done, or will be done next.
+        # The epoch is the token under which the task is executed now or will be executed next.
         epoch = max(tokens, default=self._token + 1)
         state_key = (epoch, decision.assigned, token, len(members), decision.digest)
         is_new, is_due = state_key[:-1] != self._recorded[:-1], now - self._recorded_at >= MIN_RECORD_INTERVAL_S
@@ -159,8 +161,8 @@ class DecisionRecorder:
 class Decider:
     """One agent's view of ``task``.
 
-    ``uuid`` is the agent's own, ``task_group`` the task's group or None.  ``reporters`` are the reporters of a large
-    team; an agent that is not one of them decides from their reports without its own.
+    ``uuid`` is the uuid of this agent, ``task_group`` the task's group or None. ``reporters`` are the reporters of a
+    large team; an agent that is not a reporter decides from the reports of the reporters only.
     """
 
     def __init__(self, task: Task, uuid: str, strategy: ConsensusAlgorithm, reporters: Reporters) -> None:
@@ -185,7 +187,7 @@ class Decider:
         return self._round_counter.number
 
     def others(self, now: float) -> list[Member]:
-        """Return the others with their valid reports."""
+        """Return the other participants with their valid reports."""
         return self._peers.members(now)
 
     def is_report_visible(self, now: float) -> bool:
@@ -193,9 +195,9 @@ class Decider:
         return self._panel.is_known(now)
 
     def update_reports(self, members: Sequence[Member], me: Member, now: float) -> Member:
-        """Process the present members and their reports; return ``me`` with its counters advanced if necessary."""
+        """Process the present members and their reports; return ``me`` with advanced counters if necessary."""
         self._peers.update(members, now)
-        # A new participant starts a round, so that its reports from an earlier run no longer count.
+        # A new participant starts a round, so that its reports from an earlier run are ignored.
         self._round_counter.advance(self._peers.epoch + (self._is_new and bool(self._peers)))
         self._is_new = self._is_new and not self._peers
         echo = self._peers.own_report
@@ -208,8 +210,8 @@ class Decider:
     def decide(self, task: Task, me: Member, now: float, is_successor: bool = False) -> Decision:
         """Decide from all reports, including ``me``.
 
-        ``is_successor`` is True for a standby that was granted the lease: the assigned agent has given up and its
-        notice is still on its way, so its reports are ignored until a new one arrives.
+        ``is_successor`` is True for a standby that was granted the lease. The assigned agent has then given up the
+        task, but its notice has not arrived yet; its reports are ignored until the next one arrives.
         """
         decision = self._decide(task, me, now)
         for _ in range(len(self) if is_successor else 0):
@@ -248,7 +250,7 @@ class Decider:
         return decision
 
     def is_first(self, now: float) -> bool:
-        """Return whether this agent acts for all: no agent executes the task, and its uuid is the lowest."""
+        """Return whether this agent does the group's duties: no agent executes the task, and its uuid is the lowest."""
         others = self.others(now)
         return (
             self.is_report_visible(now)

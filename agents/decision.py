@@ -1,7 +1,7 @@
 """The decision rule between reports and actions (Algorithm 4.5, revised); pure.
 
-The input is the reports of all present members; the output is the assigned agent, or the reason why there is none yet.
-An agent decides again after each change: a member joins or leaves, or a report arrives.
+The input is the reports of all present members; the output is the assigned agent, or the reason why no agent is
+assigned yet. An agent decides again after each change: a member joins or leaves, or a report arrives.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from middleware.directory.presence import EXECUTING
 from middleware.tasks.task import Member
 
 MAX_REASON_CHARS = 100
-"""Maximum characters of a strategy's reason for assigning no agent: each report carries it."""
+"""Maximum characters of a strategy's reason for assigning no agent; every report contains this reason."""
 
 
 @dataclass(frozen=True)
@@ -49,16 +49,16 @@ def decide(
     since_first: float | None,
     has_word: bool | None = None,
 ) -> Decision:
-    """Decide from the reports of ``members`` with ``strategy`` (a third-party one must be guarded).
+    """Decide from the reports of ``members`` with ``strategy``; a third-party strategy must be guarded.
 
     A strategy that reads more than these reports lists it in its ``basis``.
 
-    ``since_first`` is the number of seconds since the first report, None without reports.  Within the waiting period no
-    agent is assigned, unless all available members have reported or an agent already acts.  The acting agent keeps the
-    task until another is better by ``hysteresis``.
+    ``since_first`` is the number of seconds since the first report, None without reports.  Within the waiting period
+    no agent is assigned, unless all available members have reported or an agent already acts. The acting agent keeps
+    the task until the cost of another agent is lower by ``hysteresis``.
 
-    If ``members`` are only the reporters of a large team, ``has_word`` says whether the quorum members have announced
-    the best agent of all; until then, for a limited time, no agent is assigned.
+    If ``members`` are only the reporters of a large team, ``has_word`` is whether the quorum members have announced
+    the best agent of the whole team. Until they have, for a limited time, no agent is assigned.
     """
     present = {m.uuid: m for m in members}
     view = make_view(strategy)
@@ -96,7 +96,7 @@ def decide(
 def _choose(
     reports: Sequence[Report], holder: Report | None, strategy: ConsensusAlgorithm, hysteresis: float
 ) -> tuple[Consensus, str | None]:
-    """Return the decision of the strategy, and the agent that should act: the holder unless another improves on it."""
+    """Return the strategy's decision, and the agent that should act: the holder, unless another agent is better."""
     consensus = strategy.find(list(reports))
     best = next((r for r in reports if r.agent == consensus.assigned_agent), None)
     if holder is not None and (best is None or not strategy.improves(holder, best, hysteresis)):
@@ -105,8 +105,8 @@ def _choose(
 
 
 def _acting_sort_key(member: Member) -> tuple[int, float, str]:
-    """Of several agents that report to act, the one with the newest fencing token does.
+    """Return the sort key by which the actual holder is first among several agents that report that they act.
 
-    The others do not know it yet.
+    The agent with the newest fencing token is the holder; the other agents have not received its report yet.
     """
     return -member.token, member.cost or 0.0, member.uuid

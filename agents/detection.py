@@ -1,6 +1,6 @@
 """Search the newest camera picture for the target, outside the reactor's thread.
 
-Decoding a picture takes milliseconds to a second.  ``run_in_thread`` decodes in the reactor's thread pool; with virtual
+Decoding a picture takes milliseconds to a second.  ``run_in_thread`` decodes in the reactor's thread pool; in virtual
 time ``run_now`` keeps runs reproducible.
 """
 
@@ -15,7 +15,7 @@ from twisted.internet.threads import deferToThreadPool
 from twisted.logger import Logger
 
 Executor = Callable[[Callable[[], Any]], Deferred[Any]]
-"""Calls a function, now or in a thread, and fires with its result in the reactor's thread."""
+"""Calls a function, immediately or in a thread; its Deferred fires with the result in the reactor's thread."""
 
 
 def run_now(function: Callable[[], Any]) -> Deferred[Any]:
@@ -32,7 +32,7 @@ def run_in_thread(clock: object) -> Executor:
 
 
 class Detector:
-    """Run one detection at a time; of the waiting pictures only the newest is kept."""
+    """Runs one detection at a time; only the newest waiting picture is kept."""
 
     _log = Logger()
 
@@ -44,7 +44,7 @@ class Detector:
         self._waiting: tuple[Callable[[], Any], Callable[[Any], None]] | None = None
 
     def detect(self, find: Callable[[], Any], found: Callable[[Any], None]) -> None:
-        """Call ``find``, then ``found`` with its result; skipped if a newer picture arrives before its turn."""
+        """Call ``find``, then ``found`` with its result, unless a newer picture arrives before ``find`` starts."""
         if self._is_running:
             self.dropped += self._waiting is not None
             self._waiting = (find, found)

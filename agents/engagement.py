@@ -1,9 +1,9 @@
 """One agent's part in one task, from assignment to end (Algorithm 4.5, revised).
 
-Selection and commitment are separate: ``decide`` selects the agent that should act, and the lease gives it the right to
-act.  An agent executes only under a valid lease.  When the decision or the lease changes, the agent first stops the
-robot, then releases the lease.  Each turn determines one event; the table in ``agents.state`` gives its effects, which
-are performed here.
+Selection and commitment are separate: ``decide`` selects the agent that should act, and the lease gives this agent the
+right to act. An agent executes a task only under a valid lease. When the decision or the lease changes, the agent
+first stops the robot, then releases the lease. Each step determines one event; the table in ``agents.state`` lists the
+effects of the event, and this module performs them.
 """
 
 from __future__ import annotations
@@ -59,7 +59,7 @@ class EngagementOutputs(Protocol):
         """Record the outcome."""
 
     def log_event(self, text: str) -> None:
-        """Write a line to the device's log on the page."""
+        """Write a line to the device's log, which the page displays."""
 
     def stop_robot(self) -> float:
         """Stop the robot; return the seconds for which it may still move if it does not respond."""
@@ -74,9 +74,9 @@ class EngagementOutputs(Protocol):
 class Engagement:
     """One agent's part in one task.
 
-    ``age`` is the age of the task in seconds at ``now``, when the agent joined it; ``token`` is the highest fencing
-    token that the robot has obeyed.  Until the robot is assigned to this task, or to another one of its group, the
-    agent only listens.
+    ``age`` is the age of the task in seconds at ``now``, the time at which the agent joins the task; ``token`` is the
+    highest fencing token that the robot has obeyed. Until the robot is assigned to this task, or to another task of
+    its group, the agent only receives reports.
     """
 
     def __init__(
@@ -107,7 +107,7 @@ class Engagement:
 
     @property
     def lease_client(self) -> LeaseClient | None:
-        """The client of the task's lease; None while another task has the robot."""
+        """The client of the task's lease; None while the robot is assigned to another task."""
         return self.task_lease.lease_client
 
     @property
@@ -133,7 +133,7 @@ class Engagement:
         return self._decider.task_group
 
     def is_council_maintainer(self, now: float) -> bool:
-        """Return whether this agent maintains the quorum: it acts, or it is the first while no agent acts."""
+        """Return whether this agent maintains the quorum: it acts, or no agent acts and it is the first by uuid."""
         return self.state_machine.state not in SETTLED_STATES and self._may_end_task(now)
 
     # -- inputs -----------------------------------------------------------------------------------------------------
@@ -144,7 +144,7 @@ class Engagement:
         task_group.join(self.task, lambda now: [self.me, *self._decider.others(now)], now)
 
     def process_reports(self, members: list[Member], outcome: Result | None, now: float) -> None:
-        """Process the present members, their reports, and the outcome if there is one; the outcome is final."""
+        """Process the present members, their reports, and the outcome of the task, if known; an outcome is final."""
         if outcome is not None and (self.result is None or outcome.rank > self.result.rank):
             self.result = outcome
             self.apply_event(Event.OUTCOME, now)
@@ -160,7 +160,7 @@ class Engagement:
         left = self._formation.update_members(self._decider.others(now))
         if left and self._decider.is_report_visible(now):
             self._outputs.log_event(
-                f"a member left, {len(self._decider) + 1} remain: changes its place in the formation"
+                f"a member left, {len(self._decider) + 1} remain: changes its post in the formation"
             )
 
     def process_order(self, order: Order | None) -> None:
@@ -170,7 +170,7 @@ class Engagement:
             self._outputs.log_event(f"{'paused' if self.is_paused else 'resumed'} by {order.by}")
 
     def update_task(self, task: Task) -> None:
-        """Process a changed record of the task; the newest quorum is kept."""
+        """Process a changed record of the task, except for its quorum if that is older than the known one."""
         self.task = task.with_newer_council(self.task)
         if self.lease_client is not None:
             self.lease_client.proposer.learn_charter(self.task.charter)
@@ -188,7 +188,7 @@ class Engagement:
         self._execution.look(seen, now)
         if not self._is_free or self.is_over or self._execution.has_stalled(now):
             return
-        # In a group the robot is free between tasks, so a task that is nearly done must report its reduced cost.
+        # In a group the robot may change tasks at any time, so a nearly finished task must report its reduced cost.
         is_acting = self.state_machine.state is State.EXECUTING and self.task_group is None
         news = self._report_builder.find_changes(self.me, is_acting, seen, now)
         if news is not None:
@@ -200,11 +200,11 @@ class Engagement:
     # -- the robot --------------------------------------------------------------------------------------------------
 
     def take_robot(self, lease_client: LeaseClient, token: int) -> None:
-        """Assign the robot to this task; it has obeyed ``token``, ``lease_client`` is the client of its lease."""
+        """Assign the robot, which has obeyed ``token``, to this task, whose lease ``lease_client`` requests."""
         self.task_lease.lease_client, self.task_lease.token = lease_client, token
 
     def set_robot_lent(self, is_lent: bool, now: float) -> None:
-        """Record whether another task of the group has the robot; if this task had it, it stops acting."""
+        """Record whether another task of the group uses the robot; if it does, this task stops acting."""
         if is_lent and self.lease_client is not None:
             if self.state_machine.state in SETTLED_STATES:
                 return  # the lease is kept until the outcome is known
@@ -219,7 +219,7 @@ class Engagement:
             self.task_lease.lease_client = None
 
     def on_robot_lost(self) -> None:
-        """Withdraw the report, because the robot does not respond; the next observation reports again."""
+        """Withdraw the report, because the robot does not respond; the next observation leads to a new report."""
         if self.me.available and not self.is_over:
             self._outputs.log_event("has lost its robot")
             self._publish(cost=None, available=False)
@@ -235,7 +235,7 @@ class Engagement:
     # -- one turn ---------------------------------------------------------------------------------------------------
 
     def step(self, now: float) -> RobotCommand | None:
-        """Decide again and return the next action; None if there is nothing to do for this task."""
+        """Decide again and return the next action; None if the robot has nothing to do for this task."""
         if self.state_machine.state in SETTLED_STATES:
             return None
         lease = self.task_lease.lease
@@ -277,11 +277,11 @@ class Engagement:
 
     @property
     def _is_free(self) -> bool:
-        """Whether the robot is free for the task, or for another of its group."""
+        """Whether the robot is free for this task or for another task of its group."""
         return not self.is_paused and (self.lease_client is not None or self.task_lease.is_lent)
 
     def _may_end_task(self, now: float) -> bool:
-        """Return whether this agent may end the task as failed: it acts, or is the first of the present agents."""
+        """Return whether this agent may end the task as failed: it acts, or it is the first agent by uuid."""
         return self.state_machine.state is State.EXECUTING or self._decider.is_first(now)
 
     def _is_past_deadline(self, now: float) -> bool:
@@ -303,7 +303,7 @@ class Engagement:
         self, effect: Effect, now: float, decision: Decision, lease: Lease | None
     ) -> RobotCommand | None:
         task_lease, outputs = self.task_lease, self._outputs
-        match effect:  # the effects of every turn come first
+        match effect:  # the effects of every step come first
             case Effect.WANT:
                 task_lease.request()
             case Effect.EXECUTE:
@@ -360,20 +360,20 @@ class Engagement:
         return RobotCommand(STAND if step.action is None else step.action, Permit(lease.token, lease.deadline))
 
     def _hold(self, decision: Decision, now: float) -> RobotCommand | None:
-        if self.lease_client is None:  # another task of its group has the robot
+        if self.lease_client is None:  # another task of its group uses the robot
             self._publish_decision(decision, 0, now)
             return None
         post = None
-        if self._decider.is_report_visible(now):  # only members with a visible report take a place in the formation
+        if self._decider.is_report_visible(now):  # only members with a visible report have a post in the formation
             post = self._formation.assign_post(self.me, self._decider.others(now), decision.assigned)
         self._publish_decision(decision, 0, now, post=post)
         action = self._execution.step_without_lease(self.me.cost is None, now)
         return RobotCommand(action, Permit(self.task_lease.token, now + SEARCH_TTL_S))
 
     def _standby_rank(self, decision: Decision, now: float) -> int:
-        """Return the standby rank, from 1, of an agent that is to take over at once; 0 otherwise.
+        """Return the standby rank, from 1, of an agent that must be ready to take over immediately; 0 for others.
 
-        The assigned agent counts until it acts.
+        The assigned agent is included as long as it does not act.
         """
         if not 0 < self.state_machine.rank <= STANDBYS:
             return 0
@@ -404,7 +404,7 @@ class Engagement:
 
     def _publish(self, again: bool = False, **changes: object) -> None:
         changes |= {"status": self.state_machine.state.status, "state": str(self.state_machine)}
-        # a new round alone is sent with the next report
+        # a change of the round only is sent with the next report
         if again or any(getattr(self.me, name) != value for name, value in changes.items()):
             epoch = self._decider.epoch
             serial = self.me.serial + 1 if epoch == self.me.epoch else 0

@@ -1,7 +1,8 @@
 """One agent's execution of one task, which continues after interruptions; pure.
 
-A behaviour is called with the fencing token under which it acts.  The same token means "continue"; with a new token
-other agents may have acted in between, and the behaviour decides the consequences.  Lack of progress is detected here.
+A behaviour is called with the fencing token under which it acts.  The same token means "continue". With a new token
+other agents may have acted since the last call, and the behaviour decides whether to start again. This module also
+detects a lack of progress.
 """
 
 from __future__ import annotations
@@ -15,16 +16,16 @@ from drivers.reading import Action, Observation
 from middleware.consensus.strategy import Consensus
 
 MIN_PROGRESS = 0.01
-"""Minimum growth of the progress, 0 to 1, that counts."""
+"""Minimum increase of the progress (0 to 1) that is not regarded as a stall."""
 MAX_PAUSE_S = 1.0
-"""Seconds after which a pause between two calls does not count as time without progress."""
+"""A pause of more than this many seconds between two calls is not counted as time without progress."""
 PROGRESS_STEP = 0.25
 """Progress is reported in steps of this size."""
 
 
 @dataclass(frozen=True)
 class Step:
-    """The next action (None: the task is done), and the progress from 0 to 1 if the behaviour reports it."""
+    """The next action (None: the task is done), and the progress from 0 to 1 if the behaviour reports progress."""
 
     action: Action | None
     progress: float | None
@@ -49,7 +50,7 @@ class Execution:
         self._behaviour.look(seen, now)
 
     def step_without_lease(self, is_searching: bool, now: float) -> Action:
-        """Return the action without a lease: search for the data that the cost depends on, or hold."""
+        """Return the next action without a lease: search for the data on which the cost depends, or hold."""
         return self._behaviour.search(now) if is_searching else self._behaviour.hold(now)
 
     def step(self, now: float, token: int, deadline: float, consensus: Consensus | None = None) -> Step:
@@ -75,9 +76,9 @@ class Execution:
         return Step(action, math.floor(max(progress, self._best_progress) / PROGRESS_STEP + 1e-9) * PROGRESS_STEP)
 
     def has_stalled(self, now: float) -> bool:
-        """Return whether progress stalled within the last ``stall_limit`` seconds.
+        """Return whether there was no progress for ``stall_limit`` seconds, or the execution stalled within that time.
 
-        In that time another agent may try.
+        During this time another agent may execute the task.
         """
         return now - self._stalled_at < self._stall_limit
 

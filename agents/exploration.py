@@ -1,6 +1,6 @@
-"""Explore an unknown place: look around, walk in an open direction, and go around obstacles; pure.
+"""Explore an unknown area: look around, walk in an open direction, and go around obstacles; pure.
 
-It uses ranges and the robot's odometry only, and knows nothing of the target.
+The exploration uses only ranges and the robot's odometry, not the target.
 """
 
 from __future__ import annotations
@@ -17,13 +17,13 @@ LEG_M = 0.6
 CLEARANCE_M = 0.38
 """Metres ahead at which a leg ends because of an obstacle."""
 OPEN_RANGE_M = 1.5
-"""Range in metres of the far ranger: a direction without an obstacle within it counts as open."""
+"""Range in metres of the far ranger: a direction is open if it has no obstacle within this range."""
 AIM_TOLERANCE_RAD = math.radians(8.0)
 BUMP_RADIUS_M = 0.5
 """Metres within which a bump excludes its heading."""
 MAX_BUMPS = 3
 BACK_OFF_M = 0.10
-"""Metres that a detour backs off; no sensor looks behind."""
+"""Metres that the robot backs off at the start of a detour: a short distance, because no sensor looks behind."""
 BACK_OFF_SPEED_MPS = 0.08
 DETOUR_LEG_M = 0.35
 DETOUR_TURN_RAD = math.radians(70.0)
@@ -46,7 +46,7 @@ class Exploration:
         self._leg_from: tuple[float, float] | None = None
         self._bumps: list[Pose] = []
         self.sector: tuple[float, float] | None = None
-        """The middle and the width of the headings that this robot searches; None: all."""
+        """The middle and the width of the sector of headings that this robot searches; None: all headings."""
 
     def update(self, pose: Pose, turned: float, ahead: float) -> None:
         """Process the pose, the turn since the last call, and the range ahead (NaN: nothing in range)."""
@@ -55,7 +55,7 @@ class Exploration:
             self._openness.append((OPEN_RANGE_M if math.isnan(ahead) else ahead, pose[2]))
 
     def on_bump(self, pose: Pose) -> None:
-        """Process a bump at ``pose``: end the leg, and avoid its heading while it is near."""
+        """Process a bump at ``pose``: end the leg, and avoid its heading as long as the robot is near that pose."""
         self._bumps = [*self._bumps, pose][-MAX_BUMPS:]
         self._start_looking()
 
@@ -76,7 +76,7 @@ class Exploration:
         return walk_to(self.motion, off)
 
     def _choose_heading(self, pose: Pose) -> float:
-        """Return a heading with a large range, in the own sector if possible; chosen at random among the best."""
+        """Return a random one of the headings with a large range, in the robot's own sector if possible."""
         seen = self._openness
         if self.sector is not None:
             middle, width = self.sector
@@ -111,7 +111,7 @@ class Detour:
         self._since = 0.0
 
     def is_active(self, now: float) -> bool:
-        """Return whether the robot is on the detour and does not look at the target."""
+        """Return whether the robot is on the detour, and therefore does not look at the target."""
         return bool(self._legs) and now - self._since <= DETOUR_LEG_TIMEOUT_S
 
     def start(self, pose: Pose, side: float, now: float, has_touched: bool) -> None:
@@ -155,7 +155,7 @@ def clip(value: float, limit: float) -> float:
 
 
 def turn_to(motion: MotionCapabilities, off: float) -> Action | None:
-    """Turn on the spot to a heading ``off`` radians to the left; None if the robot faces it already."""
+    """Turn on the spot to a heading ``off`` radians to the left; None if the robot already has this heading."""
     return (
         None
         if abs(off) <= max(AIM_TOLERANCE_RAD, motion.facing_tolerance)
@@ -169,5 +169,5 @@ def walk_to(motion: MotionCapabilities, off: float) -> Action:
 
 
 def is_blocked(ahead: float) -> bool:
-    """Return whether an obstacle is near, by the range ahead (NaN: nothing in range)."""
+    """Return whether an obstacle is near according to ``ahead``, the range ahead (NaN: nothing in range)."""
     return not math.isnan(ahead) and ahead < CLEARANCE_M

@@ -1,9 +1,9 @@
-"""Place the robots that do not act so that together they see most (thesis, section 4.2.5); pure.
+"""Assign posts to the robots that do not act, for the best joint view (thesis, section 4.2.5); pure.
 
-The robots share the target and compass north: from its compass and the bearing of the target each robot knows its
-direction as seen from the target.  Around the target the posts are evenly spaced, in the robots' current order, so that
-no paths cross; the assigned robot keeps its place.  Until the target is seen, each robot searches its own sector.  The
-formation changes only after a member has left, to close its gap.
+All robots have the target and compass north in common: from its compass and the bearing of the target each robot
+computes its own direction as seen from the target. The posts are evenly spaced around the target, in the robots'
+current order, so that no paths cross; the assigned robot does not move. Until the target is seen, each robot searches
+its own sector. The formation changes only after a member has left, to close the gap.
 """
 
 from __future__ import annotations
@@ -24,9 +24,9 @@ POST_TOLERANCE_RAD = math.radians(20.0)
 
 @dataclass(frozen=True)
 class Post:
-    """The place of a robot as seen from the target (``angle``; None: anywhere) and the sector that it searches.
+    """The direction of a robot's post as seen from the target (``angle``; None: anywhere), and the sector to search.
 
-    ``sector`` is its middle and width; all angles in radians by the compass.
+    ``sector`` is the middle and the width of the sector; all angles are in radians by the compass.
     """
 
     angle: float | None
@@ -34,15 +34,16 @@ class Post:
 
 
 def assign_posts(angles: Sequence[tuple[str, float]], assigned: str | None) -> dict[str, float]:
-    """Return the post of each robot in ``angles`` (its uuid and its direction as seen from the target).
+    """Return the post of each robot in ``angles`` (robot uuid to its direction as seen from the target).
 
-    The ``assigned`` robot keeps its place; without one the posts are rotated so that the paths are short overall.
+    The ``assigned`` robot keeps its direction; if no robot is assigned, the posts are rotated so that the paths are
+    short overall.
     """
     order = sorted(angles, key=lambda one: (one[1] % math.tau, one[0]))
     step = math.tau / max(1, len(order))
     fixed = next((n for n, (uuid, _) in enumerate(order) if uuid == assigned), None)
     if fixed is None:
-        # Each robot's preferred rotation of the posts; the circular mean moves all robots least.
+        # Each robot's preferred rotation of the posts; with the circular mean the robots move least in total.
         preferred_turns = [angle - n * step for n, (_, angle) in enumerate(order)]
         turn = math.atan2(sum(map(math.sin, preferred_turns)), sum(map(math.cos, preferred_turns)))
     else:
@@ -57,7 +58,7 @@ def assign_sector(uuid: str, present: Collection[str]) -> tuple[float, float]:
 
 
 class Formation:
-    """The formation at one task, from the view of the robot ``uuid`` with ``behaviour``."""
+    """The formation at one task as computed by the robot ``uuid`` with ``behaviour``."""
 
     def __init__(self, uuid: str, behaviour: Behaviour) -> None:
         self.has_gap = False
@@ -75,7 +76,7 @@ class Formation:
         return left if self._take_post is not None else []
 
     def assign_post(self, me: Member, others: Sequence[Member], assigned: str | None) -> float | None:
-        """Send the robot to its post and return the angle; None without a post, as for the ``assigned`` robot."""
+        """Send the robot to its post and return the angle; None if it has no post, like the ``assigned`` robot."""
         if self._take_post is None or not self.has_gap:
             return None
         available_members = [member for member in (me, *others) if member.available]
@@ -87,23 +88,23 @@ class Formation:
             and self._post is not None
             and abs(math.remainder(angle - self._post, math.tau)) <= POST_TOLERANCE_RAD
         ):
-            angle = self._post  # others report their angles rarely: small changes do not move the post
+            angle = self._post  # other robots report their angles rarely: small changes do not move the post
         self._post = None if angle is None else round(angle, 2)
         self._take_post(Post(self._post, assign_sector(self._uuid, {member.uuid for member in (me, *others)})))
         return self._post
 
 
 MAX_CHORD_M = 0.45
-"""Metres of a chord at most: an ERS-7 walks it in three seconds, without seeing the target."""
+"""Maximum metres of a chord: an ERS-7 walks this distance in three seconds, without seeing the target."""
 MIN_CIRCLING_RADIUS_M = 0.45
-"""Metres from the target; a nearer robot keeps its place, so that it does not obstruct the acting robot."""
+"""Metres from the target within which a robot does not move, so that it does not obstruct the acting robot."""
 
 
 class PostPath:
     """The path of one robot to its post around the target at constant distance, in short chords.
 
-    A robot sees and ranges only ahead, so it turns along the circle, walks a chord while the path is free, and turns
-    back to the target before the next one.  A robot without a ranger keeps its place.
+    Camera and ranger of a robot look only ahead, so the robot turns along the circle, walks a chord while the path is
+    free, and turns back to the target before the next chord. A robot without a ranger does not move.
     """
 
     def __init__(self, motion: MotionCapabilities | None = None) -> None:
@@ -141,7 +142,7 @@ class PostPath:
                 return turn
             self._leg_from = pose[:2]
         if is_blocked(ahead):
-            self._is_blocked = True  # a wall or another robot: as near to the post as possible
+            self._is_blocked = True  # a wall or another robot: the robot is as near to the post as possible
             return self.end_leg()
         if math.dist(self._leg_from, pose[:2]) >= self._leg_m:
             return self.end_leg()
@@ -161,7 +162,8 @@ class PostPath:
         if abs(arc) <= POST_TOLERANCE_RAD or radius < MIN_CIRCLING_RADIUS_M:
             return False
         outward = math.atan2(pose[1] - target[1], pose[0] - target[0])
-        # A chord leans inwards by half its angle, so that the distance is kept.
+        # The heading of a chord points inwards by half of the arc, so that the distance to the target is the same at
+        # its end.
         half = min(abs(arc) / 2, math.asin(MAX_CHORD_M / 2 / radius))
         self._leg_m = 2 * radius * math.sin(half)
         self._heading = outward + math.copysign(math.pi / 2 + half, arc)

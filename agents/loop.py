@@ -33,8 +33,8 @@ OUTCOME_RETRY_S = 0.5
 class Agent(Service):
     """One device's agent; each tick has four steps: observe, decide, act, publish.
 
-    The agent takes part in every open task that its robot can do.  One task has the robot; in the others the agent
-    reports that it is not available.
+    The agent takes part in every open task that its robot can do. The robot is assigned to one of these tasks; in all
+    other tasks the agent reports that it is not available.
     """
 
     def __init__(self, node: SwarmNode, driver: Driver, clock: IReactorTime, rng: random.Random) -> None:
@@ -54,7 +54,7 @@ class Agent(Service):
 
     @property
     def engagement(self) -> Engagement | None:
-        """The engagement that has the robot, or None."""
+        """The engagement to which the robot is assigned, or None."""
         return None if self._robot_user is None else self._robot_user.engagement
 
     def startService(self) -> None:
@@ -77,11 +77,11 @@ class Agent(Service):
 
     def _on_observation(self, seen: Observation) -> None:
         if seen.frame is not None:
-            # age: on the robot's clock until the frame was received, on this clock since then
+            # The age is measured on the robot's clock until the frame was received, and on this clock since then.
             age = max(0.0, seen.t_robot - seen.frame.t_robot) + self._clock.seconds() - seen.t_host
             self._node.streams.publish(CAMERA, seen.frame.seq, seen.frame.data, age)
         if self._robot.is_battery_empty or self._robot.is_estop_engaged or not self._node.stop_state.is_known:
-            return  # the robot could not act at once on this report, and others would rely on it
+            return  # the robot could not act immediately, and the other agents would rely on the report
         for engagement in self._engagements_with_robot():
             if not engagement.is_over:
                 engagement.look(seen, self._clock.seconds())
@@ -158,9 +158,9 @@ class Agent(Service):
             each.engagement.set_robot_lent(each in parts and each is not part, self._clock.seconds())
 
     def _group_by_urgency(self, active: list[Participation]) -> dict[Participation, list[Participation]]:
-        """Return the most urgent part of each group with all parts of the group.
+        """Return the most urgent part of each group, with all parts of the group.
 
-        A task without a group stands alone.
+        A task without a group forms a group of its own.
         """
         for task_id, part in self._participations.items():
             task_group = part.engagement.task_group
@@ -175,7 +175,7 @@ class Agent(Service):
         return {parts[0]: parts for parts in groups.values()}
 
     def _engagements_with_robot(self) -> list[Engagement]:
-        """Return the engagements that the robot is free for: the one that has it, and the others of its group."""
+        """Return the engagements for which the robot is available: the current one, and all others of its group."""
         return [
             p.engagement
             for p in list(self._participations.values())
@@ -257,7 +257,7 @@ class Agent(Service):
         if not has_robot:
             for each in self._engagements_with_robot():
                 each.on_robot_lost()
-        # The robot may have obeyed another agent before: it rejects older tokens.
+        # The robot may have obeyed another agent earlier: it then rejects older tokens.
         engagement.task_lease.raise_token(self._robot.driver.token)
         command = engagement.step(self._clock.seconds())
         self._token = max(self._token, engagement.task_lease.token)
@@ -265,7 +265,7 @@ class Agent(Service):
             engagement.apply_event(Event.OUTRANKED, self._clock.seconds())
 
     def _apply_stop(self) -> str:
-        """Stand still while the team is stopped, and return the robot's state for the stop's reply.
+        """Keep the robot at rest while the team is stopped, and return the robot's state, which the node reports.
 
         The agent keeps its lease, so that no other agent takes over.
         """
@@ -282,7 +282,7 @@ class Agent(Service):
         if not stop_state.is_motion_forbidden:
             return CONTINUES
         if not stop_state.is_known:
-            stop_state.request_stops()  # no node has answered yet
+            stop_state.request_stops()  # no node has reported its stops yet
         self._robot.driver.stop()
         return (
             STANDS_STILL if self._robot.driver.state == "ready" else "does not reach its robot, which stops by itself"
@@ -303,7 +303,7 @@ class Agent(Service):
 
     def _publish_status(self, part: Participation, member: Member) -> None:
         if part is self._robot_user and not part.engagement.is_over:
-            # The end of the task sets the device's status instead.
+            # When the task ends, the device's status is set elsewhere.
             self._node.presence.change(status=member.status)
 
     def _log_event(self, text: str) -> None:
@@ -311,9 +311,10 @@ class Agent(Service):
 
 
 def select_participation(parts: list[Participation], holder: Participation | None) -> Participation:
-    """Return the part of a group that should have the robot: the assigned one, else one with an unknown cost.
+    """Return the part of a group that should get the robot: the part assigned to it, else a part with unknown cost.
 
-    ``parts`` are sorted by urgency, at least one; ``holder`` has the robot now, for one of them or for another task.
+    ``parts`` has at least one entry and is sorted by urgency; ``holder`` has the robot now, and may be outside of
+    ``parts``.
     """
     own = holder if holder in parts else None
     if own is not None and (own.engagement.is_acting or not own.engagement.can_yield_robot):

@@ -1,7 +1,7 @@
-"""One agent's engagement in one task, connected to the task's group: its reports are sent through it.
+"""One agent's engagement in one task, connected to the task's group, through which the reports are sent.
 
-The council maintainer replaces lost members of the task's quorum.  This is the duty of the acting agent or, while no
-agent acts, of the first present agent (consensus rules 1 and 2).
+The council maintainer replaces lost members of the task's quorum. This is the duty of the acting agent or, while no
+agent acts, of the present agent with the lowest uuid (consensus rules 1 and 2).
 """
 
 from __future__ import annotations
@@ -29,12 +29,12 @@ from middleware.tasks.order import find_newest_order
 from middleware.tasks.task import Member, Result, Task, group_key, with_newest_council
 
 OUTCOME_RETRY_S = 0.5
-"""Seconds until an outcome is sent again after no majority could be reached."""
+"""Seconds until an outcome is sent again if no majority could be reached."""
 
 COUNCIL_CHECK_S = 5.0
-"""Seconds between two checks; a quorum without lease requests is probed at this interval."""
+"""Seconds between two checks; a quorum that receives no lease requests is probed at this interval."""
 SUCCESSOR_RETRY_S = 10.0
-"""Seconds until a successor is looked for again after none was found."""
+"""Seconds until the next search for a replacement member if no node was found."""
 
 
 class CouncilMaintainer:
@@ -62,7 +62,7 @@ class CouncilMaintainer:
             following.addCallback(self._hand_over_council, council).addErrback(_ignore_unreachable)
 
     def _probe_council(self) -> LeaseProposer:
-        """Probe the quorum, which gets no lease requests at present."""
+        """Probe the members of the quorum, which receive no lease requests at present."""
         task = self._engagement.task
         if self._council is None:
             self._council = self._node.council_manager.make_proposer(task)
@@ -79,7 +79,7 @@ class CouncilMaintainer:
 
 
 def _ignore_unreachable(failure: Any) -> None:
-    """Ignore that too few members answer or that the lease is claimed: the council maintainer tries again."""
+    """Ignore that too few members answered or that the lease is claimed: the council maintainer tries again."""
     failure.trap(EntangledError)
 
 
@@ -119,7 +119,7 @@ class Participation:
     def leave(self, is_running: bool) -> Deferred[object]:
         """Release the lease and leave the group; a node that continues to run also withdraws its report.
 
-        Fires when the quorum members know.
+        Fires when the quorum members have been notified.
         """
         self.has_left = True
         released = self.engagement.leave(self._clock.seconds())
@@ -149,7 +149,7 @@ class Participation:
             self._node.publish_decision_record(record)
 
     def record_outcome(self, result: Result) -> None:
-        """Record the outcome, while this agent may record it."""
+        """Record the outcome of the task, as long as this agent is permitted to record it."""
         lease_client = self.engagement.lease_client
         if self.has_left or lease_client is None:
             return
@@ -159,7 +159,7 @@ class Participation:
         proved.addErrback(self._retry_record_outcome, result)
 
     def _retry_record_outcome(self, failure: Any, result: Result) -> None:
-        """Try again while this agent may record the outcome: no majority could be reached."""
+        """Try again as long as this agent is permitted to record the outcome; no majority could be reached."""
         failure.trap(EntangledError)
         if failure.check(Superseded) is not None:
             self.engagement.apply_event(Event.REOPENED, self._clock.seconds())
@@ -167,5 +167,5 @@ class Participation:
             self._clock.callLater(OUTCOME_RETRY_S, self.record_outcome, result)
 
     def log_event(self, text: str) -> None:
-        """Write a line to the device's log on the page."""
+        """Write a line to the device's log, which the page displays."""
         self._node.presence.add_message(self._node.wall(), text)

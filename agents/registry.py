@@ -19,9 +19,9 @@ AgentFactory = Callable[[SwarmNode, Driver, IReactorTime, random.Random], Servic
 
 
 def load_agent(name: str) -> AgentFactory:
-    """Return the factory of the agent called ``name``: a built-in one, or ``module:Class`` on this machine.
+    """Return the factory of the agent ``name``: a built-in agent, or ``module:Class`` on this machine.
 
-    Raises ``UnknownAgent``, whose text lists the known names.
+    Raises ``UnknownAgent``, which lists the known names.
     """
     target = BUILT_IN.get(name, name if ":" in name else None)
     if target is None:

@@ -1,4 +1,4 @@
-"""The values that one agent reports of its device, and when they have changed enough to be sent; pure."""
+"""Determine the values that one agent reports about its device, and whether they changed enough to be sent; pure."""
 
 from __future__ import annotations
 
@@ -11,17 +11,17 @@ from drivers.reading import Observation
 from middleware.tasks.task import Member, is_bid, is_choice, is_value, is_weight
 
 INCREASE_FACTOR, DECREASE_FACTOR, COST_STEP_M = 1.15, 0.85, 0.05
-"""Change of a cost after which it is sent again: 15 % and 5 cm; a decrease is not sent while the robot acts."""
+"""Change after which a cost is sent again: 15 % and 5 cm; a decrease is not sent while the robot acts."""
 ANGLE_STEP_RAD = math.radians(15.0)
-"""Change of the direction as seen from the target after which it is sent again."""
+"""Change after which the robot's direction, as seen from the target, is sent again."""
 BATTERY_STEP = 0.05
-"""Change of the battery charge, as a share, after which it is sent again."""
+"""Change after which the battery charge (0 to 1) is sent again."""
 MIN_REPORT_INTERVAL_S = 1.0
-"""Minimum seconds between two reports of a moving number; votes and first numbers are sent immediately."""
+"""Minimum seconds between two reports of a changing ``value``; votes and the first ``value`` are sent immediately."""
 
 
 class ReportBuilder:
-    """Determines the changes of a ``behaviour`` that the other agents do not know yet.
+    """Determines the changes of a ``behaviour`` that have not been sent to the other agents yet.
 
     ``reads`` are the fields that the task's strategy reads besides the cost; ``load`` is the number of the agent's
     tasks.
@@ -35,10 +35,10 @@ class ReportBuilder:
         self._numbers_sent_at = -math.inf
 
     def find_changes(self, known: Member, is_acting: bool, seen: Observation, now: float) -> dict[str, Any] | None:
-        """Return the fields that differ enough from the last report ``known``; None if there are none."""
+        """Return the fields that differ enough from the last report ``known``; None if there are no such fields."""
         cost = self._behaviour.cost
         if not is_bid(cost):
-            cost = None  # an invalid cost is no bid
+            cost = None  # an invalid cost is not a bid
         news: dict[str, Any] = {}
         if _has_changed(cost, known.cost, is_acting):
             news["cost"] = cost

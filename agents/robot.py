@@ -1,4 +1,4 @@
-"""An agent's robot behind its driver: connect it, monitor whether it responds, and move it under a permit."""
+"""An agent's robot: connect it through its driver, check that it responds, and move it under a permit."""
 
 from __future__ import annotations
 
@@ -22,11 +22,11 @@ ENABLE_RETRY_S = 0.5
 RESPONSE_TIMEOUT_S = 0.5
 """Seconds without a response after which the agent withdraws its report."""
 EMPTY_BATTERY_LEVEL = 0.05
-"""Battery charge (0 to 1) below which a robot takes no tasks, so that it can still return."""
+"""Battery charge (0 to 1) below which a robot executes no tasks, so that it can still return."""
 
 
 class AgentRobot:
-    """One robot; ``seen`` is called with each observation, ``missing`` with the reason if there is no robot."""
+    """One robot; ``seen`` is called with each observation, ``missing`` with the reason why no robot is connected."""
 
     _log = Logger()
 
@@ -86,7 +86,7 @@ class AgentRobot:
         return self.is_enabled and has_motors and now - self._responded_at <= RESPONSE_TIMEOUT_S
 
     def perform(self, command: RobotCommand) -> bool:
-        """Perform ``command``; False if the robot has obeyed a newer fencing token, so that another agent may act."""
+        """Perform ``command``; return False if the robot has obeyed a newer fencing token: another agent may act."""
         if self.driver.state != "ready":
             return True
         try:
@@ -104,8 +104,8 @@ class AgentRobot:
     def halt(self) -> float:
         """Stop the robot, and return the number of seconds for which it may still move.
 
-        This is 0 for a reachable robot, and otherwise the rest of its last permit.  A robot without permits moves until
-        its own timer expires (docs/explanation/stopping-a-robot.md).
+        This is 0 for a reachable robot, and otherwise the remaining time of its last permit. A robot that has no
+        permits itself moves until its own timer expires (docs/explanation/stopping-a-robot.md).
         """
         self.driver.stop()
         if not self.driver.description.limits or self.driver.state in ("ready", "stopped"):
@@ -113,7 +113,7 @@ class AgentRobot:
         return max(0.0, self._permit_ends_at - self._clock.seconds())
 
     async def _connect(self) -> None:
-        """Connect and enable the motors; retry after a lost link."""
+        """Connect and enable the motors; retry if the link is lost."""
         await self.driver.connect()
         while self._is_running and not self.is_enabled:
             try:

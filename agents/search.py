@@ -1,8 +1,8 @@
 """Search for the red target, face it, report its distance, and walk up to it (thesis, section 5).
 
-The distance comes from a ranger that looks ahead once the robot faces the target, cross-checked against the target's
-size in the picture, because a ranger may measure another dog or a wall.  Without a ranger the distance comes from the
-picture, and a bump into the target also counts as arrival.
+Once the robot faces the target, a ranger that looks ahead measures the distance. Because the ranger may measure
+another dog or a wall, the result is checked against the target's size in the picture. Without a ranger the distance
+comes from the picture, and a bump into the target also counts as arrival.
 """
 
 from __future__ import annotations
@@ -30,24 +30,24 @@ from agents.vision import Detection, TargetSize, find_target
 from drivers.reading import Action, Observation
 
 ARRIVAL_BEARING_RAD = math.radians(12.0)
-"""A robot in front of the target faces it within this angle."""
+"""Maximum bearing of the target on arrival: the robot then faces the target."""
 MAX_WALK_BEARING_RAD = math.radians(25)
 OBSTACLE_RANGE_M = 0.30
 SIDESTEP_SPEED_MPS, CREEP_SPEED_MPS = 0.10, 0.04
 SIDESTEP_RADII = 2.0
-"""A robot continues sideways by this many radii after its camera has passed an obstacle, since its body is wider."""
+"""Radii that a robot continues sideways after its camera has passed an obstacle, because its body is wider."""
 TOUCH_DISTANCE_M = 0.30
-"""A bump while facing a target within this many metres is a bump into the target."""
+"""A bump counts as a bump into the target if the robot faces the target within this many metres."""
 TIGHT_TURN_RADII = 3.0
-"""A robot that cannot turn on the spot backs off first if the target is to its side within this many circle radii."""
+"""A robot that cannot turn on the spot first backs off if the target is beside it, within this many circle radii."""
 TARGET_MEMORY_S = 4.0
 """Seconds for which a target out of sight is assumed to stay: another dog may be passing."""
 HIDDEN_TARGET_MEMORY_S = 30.0
-"""The same in seconds if an obstacle is seen in between: a robot that failed on the way stays there."""
+"""Seconds for which the target is assumed to stay if an obstacle hides it: a robot that failed there does not leave."""
 MAX_RANGE_DISAGREEMENT = 0.25
 MIN_DETECTIONS = 3
 STUCK_DISTANCE_M, STUCK_TIME_S = 0.02, 1.5
-"""A walking robot that moves less than this (metres) in this time (seconds) is stuck."""
+"""A walking robot is stuck if it moves less than this distance (metres) in this time (seconds)."""
 MAX_TARGET_SIZE_M = 5.0
 
 
@@ -89,7 +89,7 @@ class SearchAndApproach:
         """Process odometry and ranges, and search a new picture for the target."""
         values = seen.values
         x, y, yaw = (float(values.get(f"odom.{axis}", 0.0)) for axis in ("x", "y", "yaw"))
-        # Odometry starts at an arbitrary pose, so the first one is not a turn.
+        # Odometry starts at an arbitrary pose, so the first pose does not indicate a turn.
         before = self._pose if self._has_pose else (x, y, yaw)
         self._pose, self._has_pose = (x, y, yaw), True
         for name in FRONT_RANGERS:
@@ -103,7 +103,7 @@ class SearchAndApproach:
             find = partial(find_target, seen.frame.data, self._size, self._motion.lens)
             self._detector.detect(find, partial(self._add_detection, now, self._pose))
         if self._post_path.is_walking or self._detour.is_active(now):
-            self._looked_at = now  # the robot looks elsewhere, and the target stays in place
+            self._looked_at = now  # the robot looks elsewhere; the target is assumed not to move
         elif (
             self.cost is not None
             and self._is_hidden
@@ -121,7 +121,8 @@ class SearchAndApproach:
         # Stored in odometry coordinates: the robot moves between pictures, the target does not.
         x, y, yaw = pose
         if sighting.is_filling and self._target is not None and not self._motion.ranges:
-            # Nearer than the picture can measure: use the last position and the distance walked since.
+            # The target is too near to be measured in the picture: use its last position and the distance walked since
+            # then.
             sighting = replace(sighting, distance=min(sighting.distance, self._distance))
         reach, towards = sighting.distance + self._motion.ahead, yaw + sighting.bearing
         self._target = (x + reach * math.cos(towards), y + reach * math.sin(towards))
@@ -129,7 +130,7 @@ class SearchAndApproach:
             self._distances = [*self._distances, self._measure_distance(sighting)][-9:]
 
     def _measure_distance(self, sighting: Detection) -> float:
-        """Return the metres from the head: the ranger's if it agrees with the picture, else the picture's."""
+        """Return the metres from the head: by the ranger if it agrees with the picture, else by the picture."""
         for name in FRONT_RANGERS:
             ranged = self._ranges[name] + self._radius
             if abs(ranged - sighting.distance) < MAX_RANGE_DISAGREEMENT * sighting.distance:
@@ -163,7 +164,7 @@ class SearchAndApproach:
 
     @property
     def cost(self) -> float | None:
-        """Metres to the target: the median of the newest measurements; None until there are enough."""
+        """Metres to the target: the median of the newest measurements; None until there are enough measurements."""
         if self._target is None or len(self._distances) < MIN_DETECTIONS:
             return None
         ordered = sorted(self._distances)
@@ -171,7 +172,7 @@ class SearchAndApproach:
 
     @property
     def angle(self) -> float | None:
-        """The robot's direction as seen from the target, by the compass; None without target or compass."""
+        """The robot's direction as seen from the target, by the compass; None if target or compass is missing."""
         if self._target is None or self._north is None:
             return None
         x, y, _ = self._pose
@@ -180,11 +181,11 @@ class SearchAndApproach:
 
     @property
     def progress(self) -> float | None:
-        """The share of the distance walked since the robot last held; None if it did not hold or sees no target."""
+        """The share of the distance walked since the last ``hold``; None before a ``hold``, or if no target is seen."""
         return None if self._target is None or not self._initial_gap else max(0.0, 1.0 - self._gap / self._initial_gap)
 
     def is_in_view(self, now: float) -> bool:
-        """Return whether the newest sighting is recent enough to count as seeing the target."""
+        """Return whether the target was seen recently enough to be in view."""
         return now - self._seen_at <= self._motion.fresh
 
     # -- acting -----------------------------------------------------------------------------------------------------
@@ -236,10 +237,10 @@ class SearchAndApproach:
             return detour
         if abs(bearing) > MAX_WALK_BEARING_RAD:
             if math.dist(self._pose[:2], self._target) < TIGHT_TURN_RADII * motion.circle:
-                return motion.go(-CREEP_SPEED_MPS)  # nearer than the robot's turning circle
+                return motion.go(-CREEP_SPEED_MPS)  # the target is nearer than the robot's turning circle
             return motion.spin(turn)
         if self._ahead < OBSTACLE_RANGE_M and self._is_hidden:
-            # An obstacle is in between: step aside while facing the target, or take a detour.
+            # An obstacle hides the target: step aside while facing the target, or make a detour.
             if not motion.strafes:
                 self._detour.start(self._pose, self._side, now, has_touched=False)
                 return self._step_detour(now) or STAND
@@ -255,12 +256,12 @@ class SearchAndApproach:
         for name in NEAR_RANGERS:
             near = self._ranges.get(name, math.nan)
             if abs(self._bearing) < ARRIVAL_BEARING_RAD and abs(near - believed) < 0.12:
-                # The ranger may sit behind the camera: then the picture is more accurate.
+                # The ranger may be mounted behind the camera: then the picture is more accurate.
                 return near if name == "near" else min(near, believed)
         return believed
 
     def _detect_stuck(self, now: float) -> None:
-        """Count as a bump if a robot without a ranger walks but does not move."""
+        """Treat it as a bump if a robot without a ranger walks but does not move."""
         is_walking = self._motion.is_walking and not self._motion.ranges and now - self._called_at < STUCK_TIME_S / 2
         self._called_at = now
         if not is_walking or math.dist(self._last_moved[0][:2], self._pose[:2]) > STUCK_DISTANCE_M:
@@ -268,7 +269,7 @@ class SearchAndApproach:
         self._is_bumped = self._is_bumped or now - self._last_moved[1] > STUCK_TIME_S
 
     def _step_detour(self, now: float) -> Action | None:
-        """Return the next action of a detour around a touched obstacle; None if there is none."""
+        """Return the next action of a detour around a touched obstacle; None if the robot is not on a detour."""
         if self._is_bumped and not self._was_bumped:
             self._detour.start(self._pose, self._side, now, has_touched=True)
             if self._target is None:

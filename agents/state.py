@@ -1,8 +1,8 @@
 """The states of one agent in one task, and the table (state, event) -> (state, effects); pure.
 
-The table has a row for every pair: an event without meaning in a state leaves it unchanged.  The table ensures three
-rules.  Only GRANTED leads to EXECUTING.  Leaving EXECUTING has STOP as its first effect, before the lease is released.
-DONE is final.
+The table has a row for every pair: an event that has no meaning in a state leaves the state unchanged. The table
+ensures three rules. Only the event GRANTED leads to EXECUTING. STOP is the first effect of each event that leaves
+EXECUTING, so the robot stops before the lease is released. DONE is final.
 """
 
 from __future__ import annotations
@@ -70,14 +70,14 @@ class Effect(Enum):
     WITHDRAW = "withdraw the report"
     START = "log on the page that the agent acts"
     EXECUTE = "perform the next action of the task, under the lease"
-    HOLD = "report the decision, and search or hold meanwhile"
+    HOLD = "report the decision, and search or hold until the lease is granted"
     COMPLETE = "record that the task is completed"
     FAIL = "record that the task has failed"
     END = "report the end"
 
 
 class Row(NamedTuple):
-    """In each of ``states`` the event leads to ``target`` (None: the same state) with these effects."""
+    """A row of the table: ``event`` leads from ``states`` to ``target`` (None: no change) with ``effects``."""
 
     event: Event
     states: tuple[State, ...]
@@ -101,7 +101,7 @@ ROWS = (
     Row(_V.NO_BODY, _SETTLED_STATES),
     Row(_V.FREE, (_S.IDLE,), _S.OBSERVING, (_E.OFFER,)),
     Row(_V.FREE, (*_PRESENT_STATES, *_ACTING_STATES, *_SETTLED_STATES)),
-    # An agent ends only a task whose lease it holds.
+    # An agent may end a task only while it holds the task's lease.
     Row(_V.LATE, _INACTIVE_STATES, None, (_E.WANT,)),
     Row(_V.LATE, _ACTING_STATES, _S.FENCED, (_E.STOP, _E.WANT)),
     Row(_V.LATE, _SETTLED_STATES),
@@ -129,12 +129,13 @@ ROWS = (
     Row(_V.GRANTED, _PRESENT_STATES, _S.EXECUTING, (_E.WANT, _E.START, _E.EXECUTE)),
     Row(_V.GRANTED, _ACTING_STATES, None, (_E.WANT, _E.EXECUTE)),
     Row(_V.GRANTED, (_S.IDLE, *_SETTLED_STATES)),
-    # The agent remains the acting one, so that no other is assigned; it stands still until it has a lease again.
+    # The agent remains the acting agent, so that no other agent is assigned; its robot stands still until it has a
+    # lease again.
     Row(_V.MOVE, _ACTING_STATES, None, (_E.STOP, _E.CHANGE_COUNCIL)),
     Row(_V.MOVE, _NOT_ACTING_STATES),
     Row(_V.FINISHED, _ACTING_STATES, _S.RELEASING, (_E.STOP, _E.COMPLETE)),
     Row(_V.FINISHED, _NOT_ACTING_STATES),
-    # A standby ignores it: the robot remembers a token from an earlier run of the agent.
+    # A standby ignores this event: the robot may have a token from an earlier run of the agent.
     Row(_V.OUTRANKED, _ACTING_STATES, _S.FENCED, (_E.STOP, _E.RELEASE)),
     Row(_V.OUTRANKED, _NOT_ACTING_STATES),
     Row(_V.LENT, _INACTIVE_STATES, None, (_E.RELEASE,)),
@@ -151,7 +152,7 @@ ROWS = (
 
 
 def build_table(rows: Iterable[Row]) -> dict[tuple[State, Event], tuple[State, tuple[Effect, ...]]]:
-    """Return the table of ``rows``, with one entry for each pair that they name."""
+    """Return the table of ``rows``, with one entry for each pair of state and event in them."""
     return {(state, row.event): (row.target or state, row.effects) for row in rows for state in row.states}
 
 

@@ -1,9 +1,9 @@
-"""Assign the open tasks of a group together among the able agents; pure.
+"""Assign the open tasks of a group jointly to the agents that can do them; pure.
 
-Each agent computes the assignment from the reports on all tasks of the group, and uses the part about each task.  The
-digest of a decision therefore covers the reports on all these tasks.  An agent that acts counts for its task alone, at
-a cost reduced by the task's hysteresis, so that a task is reassigned under the same condition as a task without a
-group.
+Each agent computes the assignment of the whole group from the reports on all its tasks, and then uses the part of each
+task. The digest of a decision therefore covers the reports on all these tasks. An acting agent is considered only for
+its own task, at a cost reduced by the task's hysteresis, so a task of a group is reassigned under the same condition
+as a task without a group.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from middleware.directory.presence import EXECUTING
 from middleware.tasks.task import Member, Task
 
 GROUP_SETTLE_S = 1.0
-"""Seconds without a new task before a group is divided, because tasks are submitted one after another."""
+"""Seconds without a new task before a group's tasks are assigned, because tasks are submitted one after another."""
 
 GroupKey = tuple[str, str, str]
 GetMembers = Callable[[float], Sequence[Member]]
@@ -28,10 +28,10 @@ GetMembers = Callable[[float], Sequence[Member]]
 
 
 def get_group_key(task: Task) -> GroupKey | None:
-    """Return the key of the tasks that are assigned together with ``task``; None for a task without a group.
+    """Return the key of the tasks that are assigned jointly with ``task``; None for a task without a group.
 
-    The key has the group, the strategy and the requirements, so every agent that takes part in one of these tasks takes
-    part in all, and knows the reports on all.
+    The key contains the group, the strategy and the requirements, so every agent that takes part in one of these tasks
+    takes part in all of them and receives the reports on all of them.
     """
     if not task.group:
         return None
@@ -60,7 +60,7 @@ class TaskGroup:
         self._tasks.pop(task_id, None)
 
     def make_strategy(self, task: Task, now: float, since: float | None) -> GroupStrategy:
-        """Return a strategy for ``task`` that decides it together with the group.
+        """Return a strategy for ``task`` that assigns it jointly with the other tasks of the group.
 
         ``since`` is the number of seconds since the task's first report, None without reports.
         """
@@ -108,8 +108,8 @@ class TaskGroup:
 class GroupStrategy:
     """The strategy of a group, restricted to one of its tasks: the interface that ``decide`` uses.
 
-    ``basis`` has its inputs besides the reports on this task; ``why`` is the reason why no agent is assigned yet, or
-    "".
+    ``basis`` contains the inputs besides the reports on this task; ``why`` is the reason why no agent is assigned yet,
+    or "".
     """
 
     def __init__(
@@ -126,7 +126,7 @@ class GroupStrategy:
         self._why = why
 
     def find(self, contacts: Sequence[Report]) -> Consensus:
-        """Decide the task together with its group."""
+        """Decide the task jointly with its group."""
         if self._why:
             acting = sorted((r.cost, r.agent) for r in contacts if self._acting.get(r.agent) == self._task_id)
             holder = acting[0][1] if acting else None

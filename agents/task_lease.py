@@ -11,19 +11,19 @@ from middleware.entangled.contact import Contact
 from middleware.entangled.errors import EntangledError
 
 STANDBYS = 2
-"""Number of standbys: agents that poll the quorum members to take over at once."""
+"""Number of standbys: agents that poll the quorum members so that they can take over immediately."""
 REPORT_AGAIN_S = 1.0
 """Seconds after which an assigned agent without a lease reports again, since the holder may have missed its report."""
 
 
 class TaskLease:
-    """One agent's claim; without a ``lease_client`` the agent has no robot for the task and claims nothing.
+    """One agent's claim on the lease; without a robot for the task, ``lease_client`` is None and it claims nothing.
 
     - ``is_lent``: another task of the group uses the robot; the agent still reports and decides
     - ``token``: the highest fencing token that the robot has obeyed
     - ``standbys``: the uuids of the standbys, the best first
-    - ``next_members``: the members of the next quorum
-    - ``when_released``: fires when the quorum members know that the lease was handed over
+    - ``next_members``: the members of the next quorum of the task
+    - ``when_released``: fires when the quorum members have been notified of the release
     """
 
     def __init__(self, token: int) -> None:
@@ -43,17 +43,17 @@ class TaskLease:
         return None if self.lease_client is None else self.lease_client.lease
 
     def raise_token(self, token: int) -> None:
-        """Record that the robot has obeyed ``token``; it rejects lower ones from now on."""
+        """Record that the robot has obeyed ``token``; the robot rejects lower tokens from now on."""
         self.token = max(self.token, token)
         if self.lease_client is not None:
             self.lease_client.on_higher_token(self.token)
 
     def is_changing_council(self, now: float) -> bool:
-        """Return whether the lease is moving to another quorum, and may still return."""
+        """Return whether the quorum is being changed and the lease may still be granted again."""
         return self.lease is None and now < self._council_change_ends_at
 
     def request(self) -> None:
-        """Claim the lease, or keep it."""
+        """Claim the lease, or continue to renew it."""
         if self.lease_client is not None:
             self.lease_client.claim()
 
@@ -64,7 +64,7 @@ class TaskLease:
             self._report_again_at = now + REPORT_AGAIN_S
 
     def retry_request(self, now: float) -> bool:
-        """Claim the lease; returns whether the report is due to be sent again."""
+        """Claim the lease; return whether the report has to be sent again."""
         if self.lease_client is None or now < self._report_again_at:
             self.request()
             return False
@@ -83,7 +83,7 @@ class TaskLease:
         self._stands_still_at = now + moves_for
 
     def release(self, now: float, standbys: Sequence[Contact] = ()) -> Deferred[object]:
-        """Release the lease, or stop claiming it; other agents wait while the robot may still move."""
+        """Release the lease, or stop claiming it; other agents wait as long as this robot may still move."""
         if self.lease_client is None:
             return succeed(None)
         return self.lease_client.release(standbys, max(0.0, self._stands_still_at - now))

@@ -1,7 +1,7 @@
 """The tasks that one agent knows: the open ones in order of urgency, and the finished ones; pure.
 
-A task that is over never starts again, even if a late record of it arrives: its tombstone is kept longer than any lease
-and any tolerated absence of a node, and at least while the task is listed.
+A task that is over never starts again, even if a late record of the task arrives: its tombstone is kept longer than
+any lease and any tolerated absence of a node, and at least as long as the task is listed.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ from middleware.tasks.task import MAX_LEASE_TTL_S, Task
 TOMBSTONE_TTL_S = TOLERATED_ABSENCE_S + MAX_LEASE_TTL_S
 """Minimum seconds for which the end of a task is remembered."""
 MAX_FOLLOWED = 16
-"""Maximum number of open tasks that are followed at once; the others wait."""
+"""Maximum number of open tasks in which the agent takes part at the same time; further tasks wait."""
 
 
 def urgency_key(task: Task) -> tuple[int, float, str]:
@@ -30,7 +30,7 @@ class TaskQueue:
         self._tombstones: dict[str, float] = {}
 
     def is_new(self, task_id: str) -> bool:
-        """Return whether the task is neither open nor known to be over."""
+        """Return whether the task is unknown: neither open nor over."""
         return task_id not in self._open and task_id not in self._tombstones
 
     def add(self, task: Task) -> bool:
@@ -41,7 +41,7 @@ class TaskQueue:
         return True
 
     def mark_over(self, task_id: str, now: float) -> None:
-        """Record that the task is over, or not for this agent."""
+        """Record that the task is over, or that this agent cannot do it."""
         self._open.pop(task_id, None)
         self._tombstones[task_id] = now
 
@@ -52,7 +52,7 @@ class TaskQueue:
                 del self._tombstones[task_id]
 
     def list_followed(self) -> list[Task]:
-        """Return the open tasks that are followed now, the most urgent first."""
+        """Return the open tasks in which the agent takes part now, the most urgent first."""
         return sorted(self._open.values(), key=urgency_key)[:MAX_FOLLOWED]
 
     @property

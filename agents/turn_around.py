@@ -18,8 +18,8 @@ MAX_TURNS = 100.0
 class TurnAround:
     """Turn on the spot; no target is needed.
 
-    The cost is the used share of the battery charge, 0 to 1.  The parameter ``turns`` is the number of turns (default
-    1).
+    The cost is the part of the battery charge that has been used, 0 to 1.  The parameter ``turns`` is the number of
+    turns (default 1).
     """
 
     def __init__(self, parameters: Mapping[str, float | str], rng: random.Random) -> None:
@@ -46,11 +46,11 @@ class TurnAround:
 
     @property
     def cost(self) -> float | None:
-        """The used share of the battery charge."""
+        """The part of the battery charge that has been used, 0 to 1."""
         return None if self._charge is None or math.isnan(self._charge) else round(1.0 - self._charge, 4)
 
     def search(self, now: float) -> Action:
-        """Return to stand: there is nothing to search for."""
+        """Stand still: there is nothing to search for."""
         return STAND
 
     def hold(self, now: float) -> Action:
@@ -64,9 +64,9 @@ class TurnAround:
         return 1.0 if not self._turns else self._turned_rad / (self._turns * math.tau)
 
     def execute(self, context: Context) -> Action | None:
-        """Turn left until the turns are complete; turns under an earlier lease count."""
+        """Turn left until the turns are complete; turns under an earlier lease of this robot count as well."""
         if not context.is_resumed:
-            self._yaw = None  # turns made in between were not for this task
+            self._yaw = None  # turns between two leases are not part of this task
         self._is_acting = True
         is_done = self._turned_rad >= self._turns * math.tau
         return None if is_done else self._motion.spin(clip(TURN_RATE_RADPS, self._motion.turn))

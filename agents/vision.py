@@ -1,7 +1,7 @@
 """Find the red target in a camera picture.
 
-The only module of this package that needs OpenCV (extra ``[vision]``); it is imported on demand.  In YCrCb, the colour
-space of the ERS-7's camera, red is one corner and needs one range, without the wrap-around of hue.
+This is the only module of the package that needs OpenCV (extra ``[vision]``); it is imported on demand. In YCrCb, the
+colour space of the ERS-7's camera, red occupies one corner, so one range selects it; hue would need two ranges.
 """
 
 from __future__ import annotations
@@ -40,7 +40,8 @@ class Detection:
     """The target in one picture: ``bearing`` in radians (left positive), ``distance`` in metres from camera to axis.
 
     ``is_whole`` is False if the blob is cut off by the picture's edge or partly hidden, so that its size is less
-    reliable.  If ``is_filling``, it spans the whole width, and the distance is only an upper bound.
+    reliable.  If ``is_filling``, the target spans the whole width of the picture, and the distance is only an upper
+    bound.
     """
 
     bearing: float
@@ -52,7 +53,7 @@ class Detection:
 def find_target(
     jpeg: bytes, size: TargetSize, lens: tuple[float, float | None] = ERS7_FIELD_OF_VIEW_RAD
 ) -> Detection | None:
-    """Return the largest red blob of a JPEG picture; None if there is none or the picture is incomplete or too large.
+    """Return the largest red blob of a JPEG picture; None if there is no blob, or the picture is invalid or too large.
 
     ``lens`` is the horizontal and vertical field of view in radians (vertical None: square pixels).
     """

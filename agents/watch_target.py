@@ -60,7 +60,7 @@ class WatchTarget:
         self._motion = motion
 
     def look(self, seen: Observation, now: float) -> None:
-        """Process an observation; the first one shows the kind of device."""
+        """Process an observation; the first observation determines the kind of device."""
         if self._finder is None:
             self._has_motors = "odom.yaw" in seen.values
             self._finder = self._create_finder(seen)
@@ -86,7 +86,7 @@ class WatchTarget:
         return self.search(now)
 
     def execute(self, context: Context) -> Action | None:
-        """Keep facing the target; None once it was in view for long enough."""
+        """Keep facing the target; None when the target has been in view for long enough."""
         now, before = context.now, self._looked_at if context.is_resumed else None
         is_in_view = self._finder is not None and self._finder.is_in_view(now)
         if is_in_view and before is not None:
@@ -98,7 +98,7 @@ class WatchTarget:
         if BEARING in seen.values:
             return ReportedTarget()
         try:
-            from agents.search import SearchAndApproach  # only this finder needs its libraries
+            from agents.search import SearchAndApproach  # only this class needs the libraries of ``search``
         except ImportError as error:
             _log.warn(
                 "pictures cannot be searched ({error}); install the extra: pip install 'swarm-node[vision]'",
@@ -113,7 +113,7 @@ class WatchTarget:
 
 
 class ReportedTarget:
-    """The target as reported by the device itself."""
+    """Reads the target's position from the observations of a device that detects the target itself."""
 
     def __init__(self) -> None:
         self._distances: list[float] = []
@@ -127,7 +127,7 @@ class ReportedTarget:
         return sorted(self._distances)[len(self._distances) // 2]
 
     def look(self, seen: Observation, now: float) -> None:
-        """Process the target's position; NaN or a missing value means that it is not in view."""
+        """Process the target's position; NaN or a missing value means that the target is not in view."""
         self._now = now
         bearing, distance = seen.values.get(BEARING), seen.values.get(DISTANCE)
         if _is_number(bearing) and _is_number(distance):

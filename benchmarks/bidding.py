@@ -1,8 +1,8 @@
 """Measure bidding for up to 10,000 agents: messages, time and agreement.
 
-The bidding code is the real one. The links are simulated by a heap of events, with a one-way delay of 20 ms + Exp(10
-ms) and independent loss; messages are retransmitted as the endpoint does it. The next hops come from real routing
-tables. Signatures are omitted, because they affect only processor time.
+The bidding code and the routing tables are production code. The links are simulated by a heap of events, with a
+one-way delay of 20 ms + Exp(10 ms) and independent loss; messages are retransmitted at the same times as by the
+endpoint. Signatures are omitted, because they affect only processor time.
 """
 
 from __future__ import annotations
@@ -38,8 +38,8 @@ BITS = 160
 K = 8
 RETRANSMISSION_DELAYS_S = (0.0, 0.1, 0.25)
 ANSWER_LIMIT_S = 0.4
-"""Times of the retransmissions of a message, and of its failure, in seconds: as at the endpoint with its default
-time."""
+"""Seconds until the retransmissions of a message, and until its failure, as at the endpoint with the default
+timeout."""
 SMALL_COUNCIL, LARGE_COUNCIL, LARGE_FROM = 3, 5, 50
 MIN_RIGHT_SHARE = 0.99
 MESSAGES = {3: 10.0, 30: 10.0, 100: 6.0, 1_000: 6.0, 10_000: 6.0}
@@ -76,7 +76,7 @@ class Ring:
 
 @dataclass
 class LinkFaults:
-    """Faults of the links: the shares ``loss``, ``dead`` (failed agents) and ``duplicate`` (duplicates)."""
+    """Faults: the shares of lost datagrams, of failed agents (``dead``) and of duplicated datagrams."""
 
     loss: float = 0.0
     dead: float = 0.0
@@ -86,7 +86,7 @@ class LinkFaults:
 
 @dataclass
 class Outcome:
-    """The result of an auction; ``took``: seconds after the waiting period, for each agent with the right winner."""
+    """The result of an auction; ``took``: seconds from the waiting period to the right decision, for each agent."""
 
     messages: float
     busiest: int
@@ -234,9 +234,7 @@ class AuctionSimulation:
         self.send_pending(to)
 
     def _deliver(self, place: int, to: int, message: OutgoingMessage, state: dict[str, object]) -> None:
-        if (
-            "reply" not in state or self.faults.duplicate
-        ):  # with duplicates the method runs twice, too (it is idempotent)
+        if "reply" not in state or self.faults.duplicate:  # a duplicate also runs the method, which is idempotent
             state["reply"] = self._handle(place, to, message)
         self._send(to, place, self._handle_reply, place, message, state)
         self.send_pending(to)
@@ -275,7 +273,8 @@ class AuctionSimulation:
         def contacts() -> list[Contact]:
             if not known:
                 table = self.ring.make_table(place)
-                # Ten thousand full tables do not fit into memory; only flooding uses more than the path to the key.
+                # Ten thousand full tables do not fit into memory; only flooding needs more contacts than the path to
+                # the key.
                 everybody = table.list_contacts()
                 known.extend(select_closest(everybody, self.auction.key, K) if self.auction.exclusive else everybody)
             return known

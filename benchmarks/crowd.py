@@ -1,7 +1,7 @@
 """Measure a large simulated world: rays, motion and controllers of 3 to 10,000 robots, attached agents, and a task.
 
-Started by ``make bench-crowd``. Times are milliseconds of processor time, so other work on the machine has little
-effect. Each size runs in a separate process, so that its memory can be measured.
+Started by ``make bench-crowd``. Times are in milliseconds of processor time, so other processes on the machine have
+little effect. Each size runs in a separate process, so that its memory can be measured.
 """
 
 from __future__ import annotations

@@ -31,7 +31,7 @@ from middleware.admission.membership_file import MembershipFile, create_membersh
 START_LIMIT_S = 60.0
 TASK_LIMIT_S = 120.0
 TARGETS = {"pss": 300.0, "cores": 1.0, "page": 60_000, "plain": 40.0}
-"""MiB of all processes, cores of all processes, bytes of the page, MiB of a robot's node without vision."""
+"""Limits: MiB of all processes, cores of all processes, bytes of the page, MiB of a robot's node without vision."""
 
 
 class PageClient:

@@ -1,8 +1,8 @@
 """Measure the directory of up to 10,000 devices: the records of each node, and the cost of a listing.
 
-The model has only ids: each device knows its nearest nodes, and is listed at the positions that
-``middleware.directory.prefix`` computes; the k nodes closest to a position store it, and
-``middleware.directory.listing`` reads the lists. The team has complete nodes in virtual time, connected by one
+The model consists of ids only. Each device knows its nearest nodes, and is listed at the positions that
+``middleware.directory.prefix`` computes; the k nodes closest to a position store that list, and
+``middleware.directory.listing`` reads the lists. The team consists of complete nodes in virtual time, connected by one
 switchboard.
 """
 
@@ -33,7 +33,7 @@ SMALL_TEAM = 40
 PAUSE_S = 0.05
 """Seconds between two joins."""
 ALIVE_BYTES = 57
-"""The encrypted datagram of a keep-alive; measured."""
+"""Size of the encrypted datagram of a keep-alive in bytes, as measured."""
 
 
 class Model:
@@ -70,7 +70,7 @@ class Model:
         return []
 
     def make_listing(self, reader: int) -> Listing:
-        """Return the listing that the device with that index obtains."""
+        """Return the listing that the device with the index ``reader`` obtains."""
         listing = Listing(floor=max(0, self.depths[reader] - 1))
         while (place := listing.take_next()) is not None:
             listing.add_records(place, self.places.get(place.key, []))
@@ -214,7 +214,7 @@ def main(arguments: Sequence[str]) -> int:
     if args.team:
         for row in run_team(args.team, args.seed):  # each row takes minutes of processor time for large teams
             print(", ".join(f"{name} {cell}" for name, cell in zip(TEAM_HEADER, row, strict=True)), flush=True)
-    # Only rows with unmodified estimates count: with deliberate errors a listing may miss one device in some thousands.
+    # Check only rows with correct depths: with wrong depths, a listing may miss one device in some thousands.
     right = [row for row in rows if row[1] == "0%"]
     is_good = all(row[UNSEEN] == "0" for row in right)
     return 0 if is_good and all(int(row[MOST]) <= max(100, MAX_SHARE * int(row[0])) for row in right) else 1

@@ -86,7 +86,8 @@ def make_generators(order: dict[str, Any]) -> dict[str, Callable[[], bytes]]:
 
     single: dict[str, Callable[[], bytes]] = {
         "random": lambda: some(rng.randrange(1, 1400)),
-        # Length and padding of a real one, without the mac that needs the team's secret, and without a payment.
+        # Length and padding of a real INIT, with zeros instead of the mac, which needs the team's secret, and no
+        # payment.
         "init": lambda: bytes([session.INIT]) + some(1283) + bytes(16),
         "data": data,
         "replay": lambda: rng.choice(recorded),
@@ -168,7 +169,7 @@ def _measure_kinds(children: list[ChildProcess], port: int, seconds: float, rate
     peak = quiet[0]["rss"]
     for kind in KINDS:
         fired = sender.read()
-        time.sleep(0.05)  # datagrams in the socket buffer
+        time.sleep(0.05)  # wait for datagrams in the socket buffer
         now, other = target.request_report(), friend.request_report()
         calls = _sum_calls((calls, now["calls"], other["calls"]))
         gaps += now["gaps"] + other["gaps"]

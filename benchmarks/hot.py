@@ -44,7 +44,7 @@ class OperationBenchmark:
             self.team.clock.advance(STEP_S)
 
     def measure_each(self, work: Callable[[int], Deferred[Any]], times: int, wide: int = 1) -> str:
-        """Return the cost of one of ``times`` operations, ``wide`` of them in parallel; the best quarter counts."""
+        """Return the cost of one of ``times`` operations, ``wide`` of them in parallel, in the best quarter."""
         self.failed = 0
         gc.collect()
         sent, moment = self.team.total_traffic.sent, self.team.clock.seconds()
@@ -63,7 +63,7 @@ class OperationBenchmark:
         self.failed += 1
 
     def measure_join(self, place: int) -> str:
-        """Return the cost of a new node: its join, its first read of an existing key, and the five seconds after."""
+        """Return the cost of a new node: its join, its first read of an existing key, and the next five seconds."""
         clock = self.team.clock
         newcomer = self.team.make_node(place)
         lines = []

@@ -70,7 +70,7 @@ def _emulate(ports: list[dict[str, int]]) -> int:
 
         def stamped(vx: float, vy: float, wz: float, number: int = number, drive: Any = drive) -> None:
             legs.append((number, vx, time.monotonic()))
-            # The legs receive the command, but the robot does not move: its position is not used.
+            # The robot does not move on the map, because its position is not needed; only the command is recorded.
             drive(0.0, 0.0, 0.0)
 
         body.drive = stamped
@@ -148,7 +148,7 @@ class DriverProcess:
 
 
 def _drive(options: dict[str, Any], seconds: float) -> int:
-    # Twisted would load pyOpenSSL if it is installed (13 MiB), but this process uses no TLS.
+    # Prevent Twisted from loading pyOpenSSL (13 MiB); this process uses no TLS.
     sys.modules.setdefault("OpenSSL", None)  # type: ignore[arg-type]
     from twisted.internet import reactor
 

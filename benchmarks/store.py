@@ -30,13 +30,13 @@ SLOTS = 3000
 TTL_S = 1e6
 RESTART_LIMIT_S = 2.0
 STALL_LIMIT_S = 0.05
-"""Maximum additional delay of the reactor at the 99th percentile, compared with an idle one, while the store writes."""
+"""Maximum delay of the reactor (99th percentile) while the store writes, in addition to the delay when idle."""
 
 
 def make_record(number: int) -> Record:
     """Return the record with the index ``number``; all of it follows from the number.
 
-    Large values are in the same slots in each pass, so the owner never reaches its limit, however fast the writer is.
+    Large values reuse the same slots, so the owner never reaches its storage limit, however fast the writer is.
     """
     rng = random.Random(number)
     size = 60_000 if number % SLOTS % 97 == 0 else rng.randrange(300)

@@ -1,7 +1,7 @@
 """Base classes of drivers: the behaviour that is the same for every kind of robot.
 
-A kind of robot inherits from ``BaseDriver``, implements five methods that command its robot (``_open _close _power
-_drive _halt``) and calls four methods to report on it (``_up _observed _down _refused``).
+The driver of a kind of robot inherits from ``BaseDriver``. It implements five methods that command its robot (``_open
+_close _power _drive _halt``) and calls four methods to report on the robot (``_up _observed _down _refused``).
 """
 
 from __future__ import annotations
@@ -28,21 +28,21 @@ ENGAGED = "estop.engaged"
 
 
 def correct_last_data_time(moment: float, due: float, now: float) -> float:
-    """Return the time of a robot's last data, corrected for a check that runs late.
+    """Return the ``moment`` of a robot's last data, corrected for a check that runs late.
 
-    The check was due at ``due`` and runs at ``now``.  The delay does not count as silence of the robot: the process was
-    frozen then, and received data may still wait to be read.
+    The check was due at ``due`` and runs at ``now``. The difference does not count as silence of the robot: this
+    process was frozen during that time, and received data may still be unread.
     """
     return min(now, moment + max(0.0, now - due))
 
 
 class BaseDriver:
-    """One robot called ``name``; everything happens on the reactor's thread.
+    """One robot called ``name``; all methods run on the reactor's thread.
 
-    ``state`` is ``ready`` while observations arrive, ``stale`` when none has arrived for ``STALE_S`` or the link is
-    being reopened, and ``stopped`` after ``disable``.  After a reconnect the motors have the state that was requested
-    last, and the motion is zero.  The motion ends at the permit's deadline; a token lower than the highest seen is
-    refused.  For a robot that has no deadlines itself, ``dead_man`` halts it when this process freezes.
+    ``state`` is ``ready`` while observations arrive, ``stale`` when no observation has arrived for ``STALE_S`` or the
+    link is being reopened, and ``stopped`` after ``disable``. After a reconnect the motors are in the state that was
+    requested last, and the motion is zero. The motion ends at the permit's deadline; a token lower than the highest
+    seen is refused. A robot that does not check deadlines itself is halted by ``dead_man`` if this process freezes.
     """
 
     log = Logger()
@@ -92,15 +92,15 @@ class BaseDriver:
 
     @property
     def token(self) -> int:
-        """The highest token that the robot has obeyed, of any commander, according to its reports."""
+        """The highest token that the robot reports to have obeyed, from any sender of commands."""
         return self._gate.token or 0
 
     def connect(self) -> Deferred[Description]:
-        """Open the link; fires when the first observation has arrived.  Lost links are opened again with back-off."""
+        """Open the link; fires when the first observation has arrived. A lost link is reopened, with back-off."""
         if self._is_closed:
-            return fail(UsageError("this driver was disconnected; make a new one"))
+            return fail(UsageError("this driver was disconnected and cannot be used again; create a new driver"))
         if self._is_open:
-            return fail(UsageError("this driver is already connected or connecting; use it as it is"))
+            return fail(UsageError("this driver is already connected or connecting; do not call connect() again"))
         self._is_open = True
         connecting = self._connecting = Deferred(self._on_cancelled_connecting)
         self._open()
@@ -175,10 +175,11 @@ class BaseDriver:
         return fail(Unsupported(f"{self._name} has no skill {name!r}; its skills are {known}"))
 
     def diagnostics(self) -> dict[str, float]:
-        """Return counters: frames, bad frames, pictures, bytes, links, reconnects, refused; ``age`` of the newest in s.
+        """Return counters: frames, bad frames, pictures, bytes, links, reconnects, refused; and ``age``.
 
-        Includes the commands ``accepted`` here and the refused ones as ``lower token`` or ``late``; with a dead man's
-        switch also ``halts``, the number of times that the switch halted the robot.
+        ``age`` is the age of the newest observation in seconds. ``accepted`` counts the commands that this driver
+        accepted, ``lower token`` and ``late`` those that it refused. With a dead man's switch, ``halts`` is the number
+        of times that the switch halted the robot.
         """
         counts: dict[str, float] = {**self._counts, "accepted": self._gate.accepted, **self._gate.refused}
         if self._dead_man is not None:
@@ -190,7 +191,7 @@ class BaseDriver:
     # -- implemented by each kind of robot --------------------------------------------------------------------------
 
     def _open(self) -> None:
-        """Start to open the link, and reopen it after each loss; call ``_up`` each time that it opens."""
+        """Start to open the link, and reopen it after each loss; call ``_up`` each time the link opens."""
         raise NotImplementedError
 
     def _close(self) -> Deferred[None]:
@@ -198,7 +199,7 @@ class BaseDriver:
         raise NotImplementedError
 
     def _power(self, on: bool) -> None:
-        """Switch the motors; complete when an observation confirms it, or at once if the robot has no such state."""
+        """Switch the motors; done when an observation confirms it, or immediately if the robot does not report it."""
 
     def _drive(self, motion: Action, permit: Permit) -> Action:
         """Set the motion; return the motion that the robot performs, which can be a part of ``motion``."""
@@ -247,7 +248,7 @@ class BaseDriver:
         self._subscribers.notify(observation)
 
     def _refused(self, error: Exception) -> None:
-        """Close the driver because this robot does not exist; reconnecting cannot help."""
+        """Close the driver because this robot does not exist, so reconnecting would be useless."""
         self._mark_closed()
         self._close()
         if self._connecting is None:
@@ -256,10 +257,10 @@ class BaseDriver:
 
     @property
     def _is_motion_permitted(self) -> bool:
-        """Whether a motion is in force and its deadline lies ahead.
+        """Whether a motion is in force and its deadline has not passed.
 
-        Code that repeats a motion has to check this: after a freeze of the node all timers are late, and the timer that
-        repeats a motion may fire before the timer that ends it.
+        Code that repeats a motion has to check this: after the node was frozen all timers are late, and the timer that
+        repeats a motion may fire before the timer that ends the motion.
         """
         return self._gate.deadline is not None and not self._gate.is_motion_over(self._clock.seconds())
 
@@ -272,7 +273,7 @@ class BaseDriver:
     def _switch(self, on: bool) -> Deferred[bool]:
         if not self._is_up or self._newest is None:
             return fail(LinkLost(f"{self._name} is {self.state}; connect first, or wait for the link"))
-        self._fail_switching(UsageError("a later enable() or disable() replaced this one"))
+        self._fail_switching(UsageError("this call was replaced by a later enable() or disable()"))
         self._wants_motors = on
         self._power(on)
         if ENGAGED not in self._newest.values:
@@ -332,7 +333,7 @@ class SensingDriver(BaseDriver):
 
     def _switch(self, on: bool) -> Deferred[bool]:
         if self.state == "stale":
-            return fail(LinkLost(f"{self._name} is stale; wait for its next reading"))
+            return fail(LinkLost(f"{self._name} sends no readings at present; wait for the next one"))
         return super()._switch(on)
 
 
@@ -371,11 +372,11 @@ class LinkedDriver(BaseDriver):
 
     @property
     def problem(self) -> str:
-        """The reason why no data arrives from the robot, and the remedy; empty while data arrives."""
+        """The reason why no data arrives from the robot, and the remedy; empty if data arrives."""
         return str(getattr(self._reconnector, "problem", "")) or self._problem
 
     def data_received(self, data: bytes) -> None:
-        """Take bytes from the robot; called by the link."""
+        """Process bytes from the robot; called by the link."""
         self._counts["bytes"] += len(data)
         reader = self._reader
         bad = reader.bad_frames
@@ -401,7 +402,7 @@ class LinkedDriver(BaseDriver):
             self._link.send(data)
 
     def _set_problem(self, problem: str) -> None:
-        """Store and log the reason why no data arrives from the robot; the same reason is not logged twice in a row."""
+        """Store and log the reason why no data arrives from the robot; a repeated reason is not logged again."""
         if problem != self._problem:
             self.log.warn("{robot}: {problem}", robot=self._name, problem=problem)
         self._problem = problem

@@ -1,4 +1,4 @@
-"""Combine a robot and parts mounted on it that only sense (a camera board, a compass) into one device.
+"""Combine a robot and the sensing parts mounted on it (a camera board, a compass) into one device.
 
 Motion commands go to the robot, and its link is the device's link; parts connect and disconnect independently.
 """
@@ -22,7 +22,7 @@ CAMERA = "camera"
 
 
 def combine_descriptions(main: Description, parts: Sequence[Description]) -> Description:
-    """Combine the descriptions of ``main`` and ``parts``; the robot's value wins, then the earlier part's.
+    """Combine the descriptions of ``main`` and ``parts``; if several have the same field, the first of them is used.
 
     Raises ``UsageError`` for a part that can move.
     """
@@ -30,7 +30,7 @@ def combine_descriptions(main: Description, parts: Sequence[Description]) -> Des
     for number, part in enumerate(parts, 1):
         if part.limits:
             raise UsageError(
-                f"part {number}: a robot of kind {part.kind!r} moves, but parts only sense; "
+                f"part {number}: a robot of kind {part.kind!r} moves, but a part must only sense; "
                 "make it the robot, or a separate device"
             )
         for name, properties in part.capabilities.items():
@@ -42,7 +42,7 @@ def combine_descriptions(main: Description, parts: Sequence[Description]) -> Des
 
 
 def combine_drivers(main: Driver, parts: Sequence[Driver], name: str) -> CompositeDriver:
-    """Return the driver of the device ``name``; it is ``Filming`` if the driver that has the camera is."""
+    """Return the driver of the device ``name``; it implements ``Filming`` if the driver with the camera does."""
     is_filming = isinstance(_find_camera_driver((main, *parts)), Filming)
     return (FilmingCompositeDriver if is_filming else CompositeDriver)(main, parts, name)
 
@@ -50,9 +50,10 @@ def combine_drivers(main: Driver, parts: Sequence[Driver], name: str) -> Composi
 class CompositeDriver:
     """``main`` with the sensors of ``parts``.
 
-    Each observation of the robot also carries the newest values of those parts that are ``ready``.  If the robot has no
-    camera, it carries the picture of the first part that has one.  A part alone creates no observation.  Once the robot
-    has reported a key, no part overrides it.  ``samples`` come from the robot only.
+    Each observation of the robot also contains the newest values of the parts that are ``ready``. If the robot has no
+    camera, the observation contains the picture of the first part that has a camera. Data from a part does not create
+    an observation by itself. Once the robot has reported a key, no part overrides that key. ``samples`` come from the
+    robot only.
     """
 
     log = Logger()
@@ -80,7 +81,7 @@ class CompositeDriver:
 
     @property
     def state(self) -> str:
-        """The state of the robot's link; the parts have no influence."""
+        """The state of the robot's link; the links of the parts do not affect it."""
         return self._main.state
 
     @property
@@ -118,7 +119,7 @@ class CompositeDriver:
         return self._main.disable()
 
     def act(self, action: Action, permit: Permit) -> Action:
-        """Have the robot perform ``action`` until ``permit.deadline``; raises as its driver does."""
+        """Perform ``action`` on the robot until ``permit.deadline``; raises the errors of the robot's driver."""
         return self._main.act(action, permit)
 
     def stop(self) -> Action:
@@ -148,7 +149,7 @@ class CompositeDriver:
     def diagnostics(self) -> dict[str, float]:
         """Return the robot's counters, and each part's prefixed with its kind and a dot, as in ``camera.age``.
 
-        The second part of a kind has its number after the kind: ``camera2.age``.
+        For the second part of a kind, its number follows the kind: ``camera2.age``.
         """
         counts = dict(self._main.diagnostics())
         for kind, part in self._parts.items():
@@ -177,12 +178,12 @@ class CompositeDriver:
         return replace(source, values={**values, **source.values}, frame=frame)
 
     def _convert_frame_time(self, frame: Frame, sensed: Observation, source: Observation) -> Frame:
-        """Return ``frame`` with its time converted to the robot's clock; the clock of a part has another origin."""
+        """Return ``frame`` with its time converted from the part's clock to the robot's clock (different origins)."""
         age = max(0.0, sensed.t_robot - frame.t_robot) + max(0.0, source.t_host - sensed.t_host)
         return replace(frame, t_robot=source.t_robot - age)
 
     def _on_part_failed(self, failure: Failure, kind: str) -> None:
-        # Disconnecting a part that never connected makes its connect fail; that is expected.
+        # If a part never connected, disconnecting makes its connect() fail; that is expected.
         if not self._is_disconnecting_parts:
             self.log.error(
                 "{robot}: cannot connect to its part {part}: {error}",

@@ -5,10 +5,10 @@
     class RoverTests(Conformance, SynchronousTestCase):
         rig = partial(MemoryRig, Rover, Emulator, {"host": "rover"})
 
-Without a test case, ``find_violations(partial(MemoryRig, ...))`` returns a line for each rule that is broken.  For
-another kind of test rig set ``rig`` to a function that creates it, or implement ``Rig`` in the test case.
+Outside of a test case, ``find_violations(partial(MemoryRig, ...))`` returns a line for each broken rule. For a
+different kind of test rig set ``rig`` to a function that creates the rig, or implement ``Rig`` in the test case.
 
-Devices that only sense (a description without limits) are exempt from the rules of motion.
+Devices that only sense (their description has no limits) are exempt from the rules of motion.
 """
 
 from __future__ import annotations
@@ -31,9 +31,9 @@ STATES = ("idle", "connecting", "ready", "stale", "stopped", "closed")
 COUNTER_NAMES = ("frames", "bad_frames", "bytes", "reconnects", "age", "accepted", "lower token", "late")
 """Keys that ``diagnostics`` must contain."""
 REST_SPEED_MPS = 0.01
-"""Speed in m/s or rad/s below which a robot counts as standing still."""
+"""A robot stands still if its speed is below this, in m/s or rad/s."""
 HALT_S = 0.2
-"""Seconds within which a robot must stand still after a stop or its deadline."""
+"""Seconds within which a robot must stand still after a stop or the deadline of its command."""
 INVALID_NUMBERS = (math.nan, math.inf, -math.inf, True, None, "0.1")
 
 
@@ -58,7 +58,7 @@ class Rig(Protocol):
         """Return the real speed of the robot in m/s; called only for robots that move."""
 
     def cut_link(self) -> None:
-        """Break the link; it can be reopened.  Raises ``NotImplementedError`` if there is no link."""
+        """Break the link, which the driver may reopen. Raises ``NotImplementedError`` if the rig has no link."""
 
 
 class EmulatedRobot(Protocol):
@@ -74,7 +74,7 @@ class EmulatedRobot(Protocol):
 class MemoryRig:
     """A driver and an emulated robot connected in memory, each with a clock in virtual time.
 
-    ``make`` creates the driver, with the arguments (options, name, clock, connector).
+    ``make`` creates the driver; its arguments are (options, name, clock, connector).
     """
 
     settle_s = 0.3
@@ -132,7 +132,7 @@ def check_describes(rig: Rig) -> None:
     driver = rig.make_driver()
     robot = driver.description
     _require(driver.state == "idle", f"before connect its state is {driver.state!r}, not 'idle'")
-    _require(driver.observe() is None, "it observes something before it is connected")
+    _require(driver.observe() is None, "it has an observation before it is connected")
     _require(isinstance(robot, Description) and bool(robot.kind and robot.model), "its kind or model is empty")
     _require(math.isfinite(robot.radius) and robot.radius > 0.0, f"its radius is {robot.radius!r}")
     for key, (low, high) in robot.limits.items():
@@ -151,7 +151,7 @@ def check_describes(rig: Rig) -> None:
 
 
 def check_connects(rig: Rig) -> None:
-    """The Deferred of ``connect`` fires when the first observation has arrived, and not before."""
+    """The Deferred of ``connect`` fires when the first observation has arrived, not earlier."""
     driver = rig.make_driver()
     has_seen: list[bool] = []
 
@@ -164,7 +164,7 @@ def check_connects(rig: Rig) -> None:
     _require(driver.state == "connecting", f"while it connects its state is {driver.state!r}")
     rig.pass_time(rig.settle_s)
     _require(connected.value("connect") == driver.description, "connect does not fire with the description")
-    _require(has_seen == [True], "connect fires before there is something to observe")
+    _require(has_seen == [True], "connect fires before the first observation")
     _require(driver.state == "ready", f"connected its state is {driver.state!r}, not 'ready'")
     _require(_Result(driver.connect()).is_error(DriverError), "a connected driver can be connected again")
 
@@ -193,7 +193,7 @@ def check_motors(rig: Rig) -> None:
 
 
 def check_clips(rig: Rig) -> None:
-    """``act`` returns the action that is really performed, within the limits of the description."""
+    """``act`` returns the action that the robot actually performs, within the limits of the description."""
     driver = _make_ready_driver(rig)
     for key, (low, high) in driver.description.limits.items():
         for wanted in (low - 99.0, high + 99.0):
@@ -213,7 +213,7 @@ def check_clips(rig: Rig) -> None:
 
 
 def check_keeps(rig: Rig) -> None:
-    """A key that an action omits keeps its value while the last command holds, and is zero after a stop."""
+    """A key that an action omits keeps its value as long as the last command is in force; it is zero after a stop."""
     driver = _make_ready_driver(rig)
     axis = _select_axis(driver)
     if not axis:
@@ -239,7 +239,7 @@ def check_refuses(rig: Rig) -> None:
 
 
 def check_deadline(rig: Rig) -> None:
-    """The robot moves until its permit expires and then stops by itself; a new permit extends the motion."""
+    """The robot moves until its permit expires, and then stops; a new permit extends the motion."""
     driver = _make_ready_driver(rig)
     if not _select_axis(driver):
         return
@@ -254,7 +254,7 @@ def check_deadline(rig: Rig) -> None:
 
 
 def check_token(rig: Rig) -> None:
-    """A lower token than one seen, or a deadline that has passed, raises ``StaleCommand`` and is counted."""
+    """A token lower than the highest seen, or an expired deadline, raises ``StaleCommand`` and is counted."""
     driver = _make_ready_driver(rig)
     action = _make_half_speed_action(driver)
     driver.act(action, _grant(rig, token=5))
@@ -299,7 +299,7 @@ def check_stops(rig: Rig) -> None:
 
 
 def check_ends(rig: Rig) -> None:
-    """``disconnect`` stops the motion first, is final, and may be called twice and in any state."""
+    """``disconnect`` first stops the motion, is final, and may be called in any state and more than once."""
     idle = rig.make_driver()
     left = _Result(idle.disconnect())
     rig.pass_time(rig.settle_s)
@@ -324,7 +324,7 @@ def check_ends(rig: Rig) -> None:
 
 
 def check_leaves(rig: Rig) -> None:
-    """After ``disconnect``, or a cancelled ``connect``, it is closed and has no pending calls on its clock."""
+    """After ``disconnect`` or a cancelled ``connect`` the driver is closed and has no pending calls on its clock."""
     driver = _make_ready_driver(rig)
     driver.act(_make_half_speed_action(driver), _grant(rig, 30.0))
     _Result(driver.disconnect())
@@ -348,7 +348,7 @@ def check_leaves(rig: Rig) -> None:
 
 
 def check_link(rig: Rig) -> None:
-    """A lost link makes it stale and ends the motion; it reconnects by itself, at rest."""
+    """After the loss of its link the driver is stale and the motion ends; it reconnects by itself, with no motion."""
     driver = _make_ready_driver(rig)
     driver.act(_make_half_speed_action(driver), _grant(rig, 30.0))
     rig.pass_time(0.3)
@@ -365,7 +365,7 @@ def check_link(rig: Rig) -> None:
 
 
 def check_times(rig: Rig) -> None:
-    """Observations arrive in order of time, none from the future, and ``observe`` returns the newest."""
+    """Observations arrive in order of time and never from the future, and ``observe`` returns the newest one."""
     driver = _make_ready_driver(rig)
     seen: list[Observation] = []
     driver.subscribe(seen.append)
@@ -383,7 +383,7 @@ def check_times(rig: Rig) -> None:
 
 
 def check_subscribers(rig: Rig) -> None:
-    """Each subscriber is called until it unsubscribes, even if another one raises."""
+    """Each subscriber is called until it unsubscribes, even if another subscriber raises."""
     driver = _make_ready_driver(rig)
     seen: list[Observation] = []
 
@@ -393,7 +393,7 @@ def check_subscribers(rig: Rig) -> None:
     end_faulty = driver.subscribe(faulty)
     end = driver.subscribe(seen.append)
     rig.pass_time(rig.settle_s)
-    _require(bool(seen), "a subscriber is not called if another one raises")
+    _require(bool(seen), "a subscriber is not called if another subscriber raises")
     end_faulty()
     end()
     end()
@@ -403,7 +403,7 @@ def check_subscribers(rig: Rig) -> None:
 
 
 def check_counts(rig: Rig) -> None:
-    """``diagnostics`` returns numbers under the agreed names in any state; ``age`` is the newest observation's."""
+    """``diagnostics`` returns numbers under the required names in any state; ``age`` is correct."""
     driver = rig.make_driver()
     _require(driver.diagnostics().get("age") == math.inf, "before the first observation its age is not infinite")
     _connect(rig, driver)
@@ -432,7 +432,7 @@ def check_invoke(rig: Rig) -> None:
 CHECKS: dict[str, Callable[[Rig], None]] = {
     name.removeprefix("check_"): check for name, check in list(globals().items()) if name.startswith("check_")
 }
-"""The rules: each ``check_NAME`` of this module, in order."""
+"""The rules by name: every function ``check_NAME`` of this module, in order."""
 
 
 class Conformance:
@@ -452,7 +452,7 @@ class Conformance:
 def _make_test(check: Callable[[Rig], None]) -> Callable[[Conformance], None]:
     def test(case: Conformance) -> None:
         check(case._make_rig())
-        # Trial fails a test on logged errors; the driver logs the one of the faulty subscriber.
+        # Trial fails a test on logged errors, and the driver logs the error of the faulty subscriber.
         getattr(case, "flushLoggedErrors", lambda _: None)(SubscriberError)
 
     test.__doc__ = check.__doc__
@@ -464,7 +464,7 @@ for _name, _check in CHECKS.items():
 
 
 def find_violations(rig: Callable[[], Rig]) -> dict[str, str]:
-    """Return each broken rule with its message; an exception breaks the rule.  Each rule gets a new ``rig``."""
+    """Return each broken rule with its message; an exception also breaks a rule. Each rule gets a new ``rig``."""
     found = {}
     for name, check in CHECKS.items():
         try:
@@ -475,7 +475,7 @@ def find_violations(rig: Callable[[], Rig]) -> dict[str, str]:
 
 
 class _Result:
-    """The result of a Deferred so far; its error is handled here, so it is not logged as unhandled."""
+    """The result of a Deferred, if it has fired; an error is handled here, so Twisted does not log it as unhandled."""
 
     def __init__(self, deferred: Deferred[Any]) -> None:
         self._results: list[Any] = []

@@ -38,7 +38,7 @@ class Filming(Protocol):
 
 
 class Driver(Protocol):
-    """One robot with an asynchronous interface; everything happens on the reactor's thread.
+    """One robot with an asynchronous interface; all methods are called on the reactor's thread.
 
     A driver with an adjustable camera frame rate implements ``Filming`` as well.
     ``state`` is one of ``idle connecting ready stale stopped closed``.
@@ -57,7 +57,7 @@ class Driver(Protocol):
         """The highest token that the robot reports to have obeyed; a new lease needs a higher one."""
 
     def connect(self) -> Deferred[Description]:
-        """Open the link; fires when the first observation has arrived.  Lost links are opened again with back-off."""
+        """Open the link; fires when the first observation has arrived. A lost link is reopened, with back-off."""
 
     def disconnect(self) -> Deferred[None]:
         """Stop the motion, then close.  May be called twice."""
@@ -86,11 +86,11 @@ class Driver(Protocol):
     def invoke(self, name: str, **arguments: float | str) -> Deferred[Mapping[str, Value]]:
         """Run one of ``description.skills``; fires with its results when it has finished.
 
-        Fails with ``Unsupported`` for another name or a wrong argument, with ``LinkLost`` or ``NoReply``.
+        Fails with ``Unsupported`` for an unknown name or a wrong argument, or with ``LinkLost`` or ``NoReply``.
         """
 
     def diagnostics(self) -> dict[str, float]:
-        """Return counters: frames, bad frames, bytes, reconnects; ``age`` of the newest observation in seconds.
+        """Return counters: frames, bad frames, bytes, reconnects; and ``age``, of the newest observation, in seconds.
 
-        Includes the commands ``accepted`` here, and those refused as ``lower token`` or ``late``.
+        ``accepted`` counts the accepted commands, ``lower token`` and ``late`` the refused commands by reason.
         """

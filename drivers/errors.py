@@ -24,7 +24,7 @@ class RobotError(DriverError):
 
 
 class BadFrame(RobotError):
-    """Bytes from the robot are not a frame; they are dropped and counted."""
+    """Bytes from the robot are not a valid frame; the driver drops and counts them."""
 
 
 class LinkError(DriverError):
@@ -52,4 +52,4 @@ class Unsupported(UsageError):
 
 
 class StaleCommand(UsageError):
-    """A command has a token lower than one already seen, or its deadline has passed; it was not sent."""
+    """A command was not sent: its token is lower than the highest seen, or its deadline has passed."""

@@ -1,7 +1,7 @@
 """Check fencing tokens and deadlines of the commands to one robot.
 
-The code is pure: the time is an argument.  A driver checks a command before it sends it, and a robot or its emulator
-checks it on arrival, so that the robot stops by itself if its node freezes.
+The code is pure: the time is an argument. A driver checks each command before sending it. A robot with a gate, or its
+emulator, checks the command again on arrival, so the robot stops by itself if its node freezes.
 """
 
 from __future__ import annotations
@@ -12,15 +12,15 @@ from drivers.driver import Permit
 from drivers.errors import StaleCommand
 
 LOWER, LATE = "lower token", "late"
-"""Reasons to refuse a command: its token is lower than one already seen, or its deadline has passed."""
+"""Reasons to refuse a command: its token is lower than the highest seen, or its deadline has passed."""
 
 
 class Gate:
     """The highest token seen, and the deadline of the last accepted command.
 
-    A gate serves one robot while that robot runs, across all links: a new connection does not make an old token
-    valid again.  Tokens of different tasks are compared with each other.  ``accepted`` counts accepted commands,
-    ``refused`` the refused ones by reason.
+    A robot has one gate for all links as long as it runs: a new connection does not make an old token valid again.
+    Tokens of different tasks are compared with each other. ``accepted`` counts the accepted commands, ``refused`` the
+    refused commands by reason.
     """
 
     def __init__(self) -> None:
@@ -40,12 +40,12 @@ class Gate:
         return self._deadline
 
     def learn(self, token: int) -> None:
-        """Adopt a token that the robot's own gate reports; lower tokens are refused from now on."""
+        """Adopt a token that the robot's own gate reports, and refuse lower tokens from now on."""
         if token > (self._token or 0):
             self._token = token
 
     def admit(self, permit: Permit, now: float) -> None:
-        """Accept a command; raise ``StaleCommand`` if its token is lower than one seen or its deadline has passed."""
+        """Accept a command; raise ``StaleCommand`` if its token is lower than the highest seen or it is too late."""
         if not math.isfinite(permit.deadline) or permit.deadline <= now:
             self.refused[LATE] += 1
             late = now - permit.deadline
@@ -53,7 +53,7 @@ class Gate:
         if self._token is not None and permit.token < self._token:
             self.refused[LOWER] += 1
             raise StaleCommand(
-                f"token {permit.token} is lower than token {self._token}, which was obeyed before; take a new lease"
+                f"token {permit.token} is lower than token {self._token}, which was obeyed earlier; take a new lease"
             )
         self.accepted += 1
         self._token = permit.token
@@ -64,5 +64,5 @@ class Gate:
         return self._deadline is not None and now >= self._deadline
 
     def end_motion(self) -> None:
-        """Clear the motion in force after a stop; the token stays, so that fencing holds."""
+        """Clear the motion in force after a stop; the highest token is kept, so that older tokens are still refused."""
         self._deadline = None

@@ -23,16 +23,16 @@ MAX_RETRY_S = 2
 RETRY_FACTOR = 1.6
 CONNECT_TIMEOUT_S = 2.0
 MIN_LOGGED_FAILURES = 5
-"""Number of consecutive failed calls before the log reports it."""
-CLOSED_AT_ONCE = "it closes each new connection at once; does it already serve another client, and is the port right?"
+"""Number of consecutive failed attempts to connect after which the failure is logged."""
+CLOSED_AT_ONCE = "the server closes each new connection; does it already serve another client, and is the port correct?"
 PROBLEMS: Sequence[tuple[type[Exception], str]] = (
-    (error.ConnectionRefusedError, "nothing listens at this port; is the port right, and is its server running?"),
-    (error.TCPTimedOutError, "it does not answer; is it switched on, and in this network?"),
-    (error.TimeoutError, "it does not answer; is it switched on, and in this network?"),
-    (error.NoRouteError, "no route to it; is this machine in its network?"),
+    (error.ConnectionRefusedError, "nothing listens at this port; is the port correct, and is its server running?"),
+    (error.TCPTimedOutError, "the device does not answer; is it switched on, and in this network?"),
+    (error.TimeoutError, "the device does not answer; is it switched on, and in this network?"),
+    (error.NoRouteError, "no route leads to the device; is this machine in its network?"),
     (error.DNSLookupError, "this host name has no address; correct the name, or write a numeric address"),
 )
-"""Reasons why a connection fails, with the remedy."""
+"""The message for each error of a connection: the reason and the remedy."""
 
 
 class Link(Protocol):
@@ -40,7 +40,7 @@ class Link(Protocol):
 
     @property
     def is_busy(self) -> bool:
-        """Whether earlier data is still unsent; the sender should drop data that it can omit."""
+        """Whether earlier data is still unsent; the sender should then drop data that it can omit."""
 
     def send(self, data: bytes) -> None:
         """Send bytes; does nothing on a closed link."""
@@ -53,14 +53,14 @@ class Receiver(Protocol):
     """Receives the data and the close of a link."""
 
     def data_received(self, data: bytes) -> None:
-        """Take bytes from the stream, in pieces of any size."""
+        """Process bytes of the stream, in chunks of any size."""
 
     def link_down(self) -> None:
         """Handle the close of the link, by either side."""
 
 
 class LinkClient(Receiver, Protocol):
-    """A receiver on the side that connects; it is given each new link."""
+    """A receiver on the connecting side, which gets each new link."""
 
     def link_up(self, link: Link) -> None:
         """Use the link that has just opened."""
@@ -155,14 +155,14 @@ class TcpLink(StreamLink):
         self._is_busy = False
 
     def stopProducing(self) -> None:
-        """Mark the link busy: the transport sends no more."""
+        """Mark the link busy: the transport stops sending."""
         self._is_busy = True
 
 
 def reactor_or_running(reactor: Any) -> Any:
     """Return ``reactor``, or the running one if it is None."""
     if reactor is None:
-        # The import installs the reactor, so it must not happen when this module is imported.
+        # Importing ``reactor`` installs it, so this must not happen when this module is imported.
         from twisted.internet import reactor as running
 
         return running
@@ -184,8 +184,9 @@ class TcpLinkFactory(protocol.Factory):
 class TcpConnector:
     """Opens links over TCP on ``reactor`` (None: the running one).
 
-    ``waits`` are the seconds before each retry, the last one repeats; without ``waits`` they grow exponentially.  With
-    ``says`` the reason why a link cannot be opened is logged, once until it opens.
+    ``waits`` are the delays in seconds before each retry, of which the last one is repeated; without ``waits`` the
+    delays grow exponentially. With ``says`` the reason why a link cannot be opened is logged, once until the link
+    opens.
     """
 
     def __init__(self, reactor: Any = None, waits: Sequence[float] = (), says: bool = False) -> None:
@@ -211,9 +212,9 @@ class TcpConnector:
 class _TcpReconnector(protocol.ReconnectingClientFactory):
     """Reconnect with Twisted's older factory; ``ClientService`` has no advantage here and takes 0.6 MiB more per node.
 
-    ``problem`` says in one line why there is no link; it is empty while the link is open and before the first attempt
-    ends.  The delay is reset only by a link that received data or lasted ``MAX_RETRY_S``: a server that accepts and
-    closes at once is retried no more often than one that refuses.
+    ``problem`` is the reason in one line why no link is open; it is empty while a link is open and before the first
+    attempt ends. The delay is reset only by a link that received data or lasted ``MAX_RETRY_S``, so a server that
+    accepts and immediately closes connections is not retried more often than a server that refuses connections.
     """
 
     noisy = False
@@ -302,7 +303,7 @@ class MemoryLink:
             self._clock.callLater(self._delay, self.other._deliver, data)
 
     def close(self) -> None:
-        """Close both ends; the other end is notified after the delay; data sent before still arrives."""
+        """Close both ends; the other end is notified after the delay, and still receives data that was sent earlier."""
         other, self.other = self.other, None
         if other is not None:
             self._clock.callLater(self._delay, other._drop)
@@ -322,7 +323,7 @@ class MemoryLink:
 class MemoryConnector:
     """Opens links to ``accept`` through ``clock``; host and port are ignored.
 
-    ``is_open`` False refuses new links, ``cut`` breaks the open ones, and ``block_data`` leaves them open without data.
+    With ``is_open`` False new links are refused; ``cut`` breaks open links; ``block_data`` drops their data.
     """
 
     def __init__(self, clock: IReactorTime, accept: Accept, delay: float = 0.0005) -> None:
@@ -351,7 +352,7 @@ class MemoryConnector:
                     end.is_blocked = True
 
     def open_pair(self, client: Receiver) -> MemoryLink | None:
-        """Open a new pair and return the client's end; None if refused."""
+        """Open a new pair of links and return the client's end; None if the connector refuses links."""
         if not self.is_open:
             return None
         near, far = MemoryLink(self._clock, self._delay), MemoryLink(self._clock, self._delay)
@@ -363,7 +364,7 @@ class MemoryConnector:
 
 
 class _MemoryReconnector:
-    """The counterpart of ``_TcpReconnector`` in memory; it sits between link and client to notice a closed link."""
+    """The counterpart of ``_TcpReconnector`` in memory; it receives from the link to notice when the link closes."""
 
     def __init__(self, connector: MemoryConnector, clock: IReactorTime, client: LinkClient) -> None:
         self._connector = connector

@@ -1,4 +1,4 @@
-"""Manifests and option types: the facts that tools need about a kind of robot without importing its driver."""
+"""Manifests and option types: what tools need to know about a kind of robot before its driver is imported."""
 
 from __future__ import annotations
 
@@ -23,9 +23,9 @@ Device = Annotated[str, Meta(min_length=1, description="a serial device", exampl
 class Manifest:
     """One kind of robot; the constant ``MANIFEST`` of its module ``driver``.
 
-    ``library`` is the additional module that the kind needs, ``extra`` the extra of this distribution that installs it,
-    ``when`` the case in which it is needed (empty for always).  ``example`` contains options of such a robot, empty if
-    none are required.  ``is_on_cable`` says that ``port`` may be a serial device.
+    ``library`` is the additional module that the kind needs, ``extra`` the extra of this distribution that installs
+    the module, ``when`` the case in which the module is needed (empty: always). ``example`` contains options of such a
+    robot, and is empty if no options are required. ``is_on_cable``: the option ``port`` may be a serial device.
     """
 
     library: str = ""
@@ -36,7 +36,7 @@ class Manifest:
 
 
 def convert_options(kind: str, table: object, cls: type[T]) -> T:
-    """Convert ``table`` to the options class ``cls``; raise ``UsageError`` that names the key and the remedy."""
+    """Convert ``table`` to the options class ``cls``; raise ``UsageError`` with the key, the problem and the remedy."""
     try:
         return convert_table(table, cls)
     except InvalidValue as error:
@@ -44,5 +44,5 @@ def convert_options(kind: str, table: object, cls: type[T]) -> T:
 
 
 def make_option_error(kind: str, key: str, problem: str, remedy: str) -> UsageError:
-    """Return the error about one option."""
+    """Return the error for a problem of one option."""
     return UsageError(f'driver "{kind}": option {key} {problem}; {remedy}')

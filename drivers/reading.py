@@ -18,7 +18,8 @@ Action = Mapping[str, float]
 class Frame:
     """One camera picture.
 
-    ``data`` is a whole JPEG; ``seq`` counts frames (gaps are dropped frames); ``t_robot`` is in robot seconds.
+    ``data`` is a complete JPEG; ``seq`` counts frames, including dropped ones; ``t_robot`` is in seconds of the
+    robot's clock.
     """
 
     seq: int
@@ -33,9 +34,9 @@ class Frame:
 class Observation:
     """The newest known state of a robot.
 
-    ``values`` maps flat keys to SI values (NaN: nothing in range); ``samples`` maps a key to the samples since the
-    previous frame, oldest first (the ERS-7 delivers 4 each 32 ms).  ``t_host`` is the time of arrival on the driver's
-    clock, ``t_robot`` the time on the robot's clock, both in seconds.
+    ``values`` maps flat keys to SI values (NaN: nothing in range). ``samples`` maps a key to the samples since the
+    previous frame, oldest first; the ERS-7 delivers 4 samples every 32 ms.  ``t_host`` is the time of arrival on the
+    driver's clock, ``t_robot`` the time on the robot's clock, both in seconds.
     """
 
     t_host: float
@@ -50,9 +51,9 @@ class Description:
     """The properties and abilities of a robot, known without a connection.
 
     ``capabilities`` maps a capability name (``base2d``, ``ranger``, ``camera``, ``imu``, ``odometry``, ``power``) to
-    its properties (numbers or text; ``ranger`` has ``max`` in metres, ``camera`` has ``width``, ``height``, ``fps``);
-    ``limits`` maps each action key to its lowest and highest value; ``radius`` is in metres, ``rates`` in Hz;
-    ``skills`` are the names that ``invoke`` accepts.
+    its properties, which are numbers or text: ``ranger`` has ``max`` in metres, ``camera`` has ``width``, ``height``
+    and ``fps``. ``limits`` maps each action key to its lowest and highest value. ``radius`` is in metres, ``rates``
+    are in Hz. ``skills`` are the names that ``invoke`` accepts.
     """
 
     kind: str

@@ -1,8 +1,9 @@
 """Find the driver of a kind of robot; a driver is imported only when its kind is used.
 
 A kind is built in, an entry point of ``swarm_node.drivers``, or a class given as ``module:name``.  A driver that is
-not built in is a class or another callable with the arguments (options, name, clock, connector).  It is third-party
-code and may fail in any way: such an error is reported in one line that names the driver, and affects no other.
+not built in is a class or another callable with the arguments (options, name, clock, connector).  Such a driver is
+third-party code and may fail in any way: its error is reported in one line that contains the name of the driver, and
+does not affect other drivers.
 """
 
 from __future__ import annotations
@@ -43,11 +44,11 @@ REQUIRED_MEMBERS = (
 Factory = Callable[[Mapping[str, object], str, IReactorTime, "Connector | None"], Driver]
 Describe = Callable[[Mapping[str, object], str], Description]
 Parts = Sequence[tuple[str, Mapping[str, object]]]
-"""Kind and options of each sensing part that is mounted on a robot."""
+"""The kind and the options of each sensing part of a robot."""
 
 
 def list_built_in_kinds() -> list[str]:
-    """Return the built-in kinds: the packages of ``drivers`` that have a ``driver`` module; none is imported.
+    """Return the built-in kinds: the packages of ``drivers`` with a module ``driver``; the modules are not imported.
 
     Such a module has ``MANIFEST``, ``make_driver(options, name, clock, connector)`` and ``describe(options, name)``.
     """
@@ -56,18 +57,18 @@ def list_built_in_kinds() -> list[str]:
 
 
 def load_manifest(kind: str) -> Manifest:
-    """Return the manifest of a built-in kind; an empty one for any other."""
+    """Return the manifest of a built-in kind; an empty manifest for any other kind."""
     return cast(Manifest, _load_attribute(kind, "MANIFEST")) if kind in list_built_in_kinds() else Manifest()
 
 
 def list_kinds() -> list[str]:
-    """Return the kinds of robot that have drivers, including other distributions; none is imported."""
+    """Return the kinds of robot that have drivers, in all installed distributions, without importing the drivers."""
     return sorted({*list_built_in_kinds(), *list_entry_points()})
 
 
 def list_entry_points() -> dict[str, str]:
-    """Return each kind that another distribution provides, and its ``module:name``; none is imported."""
-    from importlib.metadata import entry_points  # expensive to import, and most nodes do not need it
+    """Return each kind that another distribution provides, and its ``module:name``, without importing the module."""
+    from importlib.metadata import entry_points  # expensive to import, and not needed by most nodes
 
     return {point.name: point.value for point in entry_points(group=ENTRY_POINT_GROUP)}
 
@@ -85,7 +86,7 @@ def load_factory(kind: str, place: str) -> Factory:
 
 
 def get_description(make: Factory, options: Mapping[str, object], name: str) -> Description:
-    """Return the description of such a robot; this creates a temporary driver, which opens nothing."""
+    """Return the description of such a robot, by creating a temporary driver, which opens no links."""
     return make(options, name, Clock(), None).description
 
 
@@ -99,8 +100,8 @@ def create_driver(
 ) -> Driver:
     """Return an unconnected driver of ``kind``, combined with the sensors of ``parts``.
 
-    ``name`` is the name of the device and selects the robot if the options do not; ``connector`` opens the links; None
-    means TCP on the running reactor.  Raises ``UsageError`` with one line for an unknown kind or a wrong option.
+    ``name`` is the name of the device, and selects the robot if the options do not. ``connector`` opens the links
+    (None: TCP on the running reactor). Raises ``UsageError`` with one line for an unknown kind or a wrong option.
     """
     main = cast(Factory, _load_attribute(kind, "make_driver"))(options, name, clock, connector)
     if not parts:
@@ -116,7 +117,7 @@ def create_driver(
 
 
 def describe(kind: str, options: Mapping[str, object], name: str = "robot", parts: Parts = ()) -> Description:
-    """Return the description of a robot of ``kind`` with ``parts``, without a driver; raises as ``create_driver``."""
+    """Return the description of a robot of ``kind`` with ``parts``, without a driver; raises like ``create_driver``."""
     main = cast(Describe, _load_attribute(kind, "describe"))(options, name)
     if not parts:
         return main
@@ -156,7 +157,7 @@ def _make_checked(
         driver = make(options, name, clock, connector)
         missing = [each for each in REQUIRED_MEMBERS if not hasattr(driver, each)]
         if missing or not isinstance(driver.description, Description):
-            raise TypeError(f"it is not a Driver: it lacks {', '.join(missing) or 'a Description'}")
+            raise TypeError(f"the result is not a Driver: it lacks {', '.join(missing) or 'a Description'}")
     except DriverError:
         raise
     except Exception as error:  # third-party code

@@ -1,7 +1,8 @@
 """Links over serial devices, for robots on a cable.
 
-``SerialConnector`` has the interface of ``drivers.link.Connector``, so ``MemoryConnector`` can replace it: the host
-is the device, the port the baud rate.  pyserial (the extra ``serial``) is imported by the first ``connect``.
+``SerialConnector`` has the interface of ``drivers.link.Connector``, so ``MemoryConnector`` can replace it; the
+argument ``host`` is the device, and ``port`` is the baud rate.  pyserial (the extra ``serial``) is imported by the
+first ``connect``.
 """
 
 from __future__ import annotations
@@ -29,20 +30,20 @@ from drivers.link import (
 from drivers.timer import Timer
 
 FLUSH_TIMEOUT_S = 1.0
-"""Seconds that data sent before ``disconnect`` may take to be written."""
+"""Maximum seconds for writing data that was sent before ``disconnect``."""
 MAX_BACKLOG_BYTES = 4096
 """Number of unsent bytes above which a link is busy."""
 PROBLEMS = {
-    errno.ENOENT: "there is no such device; plug the robot in, or correct the option port",
+    errno.ENOENT: "the device does not exist; plug the robot in, or correct the option port",
     errno.EACCES: "no permission; add this user to the device's group (often dialout), and log in again",
     errno.EPERM: "no permission; add this user to the device's group (often dialout), and log in again",
-    errno.EBUSY: "the port is busy: another program has it open; end that",
-    errno.EAGAIN: "the port is busy: another program has it open; end that",
+    errno.EBUSY: "the port is busy: another program has it open; end that program",
+    errno.EAGAIN: "the port is busy: another program has it open; end that program",
     errno.EIO: "the device does not answer; plug it in again",
-    errno.ENXIO: "the device is gone; plug it in again",
-    errno.ENODEV: "the device is gone; plug it in again",
-    errno.EISDIR: "this is no serial device; correct the option port",
-    errno.ENOTTY: "this is no serial device; correct the option port",
+    errno.ENXIO: "the device was removed; plug it in again",
+    errno.ENODEV: "the device was removed; plug it in again",
+    errno.EISDIR: "this is not a serial device; correct the option port",
+    errno.ENOTTY: "this is not a serial device; correct the option port",
 }
 
 Opener = Callable[[protocol.Protocol, str, int, Any], Any]
@@ -77,7 +78,7 @@ class SerialConnector:
 
 
 class SerialReconnector:
-    """Keeps a device open; ``problem`` says in one line why it is not, and is logged once."""
+    """Keeps a device open; ``problem`` is the reason in one line why the device is not open, and is logged once."""
 
     log = Logger()
 
@@ -95,7 +96,7 @@ class SerialReconnector:
         self._pending.set(0.0, self._try_open)
 
     def disconnect(self) -> Deferred[None]:
-        """Write pending data, close the device, stop retrying; fires when the device is closed."""
+        """Write pending data, close the device, and stop retrying; fires when the device is closed."""
         if self._link is None:
             self._pending.cancel()
             return succeed(None)

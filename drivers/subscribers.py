@@ -1,4 +1,4 @@
-"""Call subscribers in order of subscription; an error in one does not affect the others."""
+"""Call subscribers in order of subscription; an error in one subscriber does not affect the others."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ class Subscribers(Generic[T]):
         return end
 
     def notify(self, newest: T) -> None:
-        """Call the current subscribers; changes made during the calls take effect with the next item."""
+        """Call the current subscribers; a subscription that changes during the calls affects only the next item."""
         for callback in list(self._callbacks):
             try:
                 callback(newest)

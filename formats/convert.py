@@ -1,8 +1,8 @@
 """Convert values of TOML or a command line to the types of dataclass fields.
 
-``msgspec`` checks types and constraints (``Annotated[int, Meta(ge=0, le=65535)]``); this module converts its errors to
-``InvalidValue``, with the key, the problem and the remedy.  It uses dataclasses instead of ``msgspec.Struct`` because a
-dataclass can omit a secret from its ``repr``.
+``msgspec`` checks types and constraints (``Annotated[int, Meta(ge=0, le=65535)]``); this module converts the errors of
+``msgspec`` to ``InvalidValue``, with the key, the problem and the remedy. Dataclasses are used instead of
+``msgspec.Struct`` because a dataclass can omit a secret from its ``repr``.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ class InvalidValue(Exception):
 class ConversionStep:
     """A step after the conversion: return the value to use, or raise ``ValueError``.
 
-    ``raw`` is the type of the value before this step, if it differs from the field's.
+    ``raw`` is the type of the value before this step, if it differs from the type of the field.
     """
 
     apply: Callable[[Any], Any]
@@ -51,7 +51,7 @@ class Unit:
 
 @dataclass(frozen=True)
 class Secret:
-    """Marks a value that errors must not show."""
+    """Marks a secret value, which errors must not contain."""
 
 
 def check_printable(value: Any) -> Any:
@@ -105,7 +105,7 @@ def convert_field(value: object, cls: type[Any], key: str, is_text: bool = False
 
 
 def convert_value(value: object, hint: Any, key: str = "", default: object = None, is_text: bool = False) -> Any:
-    """Convert ``value`` to the type ``hint``; raise ``InvalidValue`` with ``key``, and ``default`` as the example.
+    """Convert ``value`` to the type ``hint``; raise ``InvalidValue`` with ``key``, and with ``default`` as the example.
 
     ``is_text``: the value is a command-line argument, in which commas separate the entries of a list.
     """

@@ -1,4 +1,4 @@
-"""Read and write the head of an HTTP/1.1 request or response (RFC 9112) before the connection changes its protocol."""
+"""Read and write the head of an HTTP/1.1 request or response (RFC 9112), for example before a protocol upgrade."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ def encode_head(*lines: str) -> bytes:
 
 
 def pop_head(buffer: bytearray) -> Head | None:
-    """Remove the head from ``buffer`` and return it; None while it is incomplete."""
+    """Remove the head from ``buffer`` and return the head; None if it is incomplete."""
     end = buffer.find(_HEAD_END, 0, MAX_HEAD_BYTES)
     if end < 0:
         return None

@@ -1,4 +1,4 @@
-"""Read the headers of a JPEG (ITU-T T.81) before it is decoded.
+"""Read the headers of a JPEG (ITU-T T.81) before the image is decoded.
 
 A few hundred bytes may declare an image of four thousand megapixels, or thousands of scans over the whole image.
 ``read_size`` rejects images that would take much memory or time to decode, so call it before every decoder.
@@ -9,9 +9,10 @@ from __future__ import annotations
 MAX_SIDE_PX = 4096
 """The maximum width and height in pixels."""
 MAX_DECODED_PX = 2**25
-"""The maximum number of pixels in all scans together: 16 megapixels in two, 1920 x 1080 in sixteen."""
+"""The maximum number of pixels in all scans together: two scans of 16 megapixels, or sixteen of 1920 x 1080."""
 _START_OF_FRAME = frozenset((0xC0, 0xC1, 0xC2))
-"""Baseline, extended and progressive with Huffman coding.  Cameras send no others, and their decoders are slower."""
+"""Baseline, extended and progressive with Huffman coding. Cameras do not send other types, which are slower to
+decode."""
 _OTHER_FRAMES = frozenset(range(0xC3, 0xD0)) - {0xC4, 0xC8, 0xCC}
 _START_OF_SCAN = b"\xff\xda"
 _MARKERS_WITHOUT_LENGTH = frozenset((0x01, *range(0xD0, 0xD8)))
@@ -40,6 +41,6 @@ def read_size(data: bytes) -> tuple[int, int] | None:
 def _is_within_limits(width: int, height: int, data: bytes, start: int) -> bool:
     if not (0 < width <= MAX_SIDE_PX and 0 < height <= MAX_SIDE_PX):
         return False
-    # Coded data does not contain these bytes. Bytes of other segments may, so the count is never too low.
+    # Coded data does not contain the marker. Other segments may contain its bytes, so the count can only be too high.
     scans = data.count(_START_OF_SCAN, start)
     return width * height * max(1, scans) <= MAX_DECODED_PX

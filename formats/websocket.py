@@ -1,7 +1,8 @@
 """Implement one end of a WebSocket (RFC 6455) without I/O, based on ``wsproto``.
 
-It adds the parts that ``wsproto`` leaves to its caller: limits of the handshake, of a message and of the frames in one
-read, and an HTTP response to other requests.  Extensions are disabled, so messages are not compressed.
+This module adds what ``wsproto`` leaves to its caller: limits for the handshake, for a message and for the frames in
+one read, and an HTTP response to requests that are not a handshake. Extensions are disabled, so messages are not
+compressed.
 """
 
 from __future__ import annotations
@@ -28,25 +29,25 @@ from wsproto.utilities import LocalProtocolError, RemoteProtocolError
 from formats.head import MAX_HEAD_BYTES
 
 CLOSE_NORMAL, CLOSE_PROTOCOL_ERROR = 1000, 1002
-"""Close codes."""
+"""Close codes: normal closure and protocol error."""
 MAX_FRAMES = 2048
-"""The maximum number of frames in one read of at most 64 KiB; more are nearly empty frames, which cost more to receive
-than to send."""
+"""The maximum number of frames in one read of at most 64 KiB; with more, the frames are nearly empty, and cost more to
+receive than to send."""
 
 
 class WebSocketEnd(ABC):
-    """One end of a connection: the client if ``request`` is given.
+    """One end of a connection: the client if ``request`` is given, else the server.
 
-    After a ``fault`` nothing more is received: close the stream.  A subclass checks the handshake of the other end.
-    ``longest`` is the maximum length of a message in bytes.
+    After a ``fault`` received data is ignored, and the caller has to close the stream. A subclass checks the handshake
+    of the other end. ``longest`` is the maximum length of a message in bytes.
     """
 
     def __init__(self, longest: int, request: Request | None = None, takes_text: bool = True) -> None:
         self.is_open = False
         self.fault = ""
         self.frames = 0
-        """The number of complete frames received.  If bytes arrive and it does not grow, the length of a frame may be
-        corrupt."""
+        """The number of complete frames received. If bytes arrive but this number does not grow, the length of a frame
+        may be corrupt."""
         self._request = request
         self._max_message_bytes = longest
         self._takes_text = takes_text
@@ -62,7 +63,7 @@ class WebSocketEnd(ABC):
         return b"" if self._request is None else self._send(self._request)
 
     def receive_data(self, data: bytes) -> tuple[list[bytes], bytes]:
-        """Process received bytes; return the messages that they complete, and the bytes to send back at once."""
+        """Process received bytes; return the messages that they complete, and the bytes to send back immediately."""
         if self.fault or not data:
             return [], b""
         self._frames_left = MAX_FRAMES
@@ -76,7 +77,7 @@ class WebSocketEnd(ABC):
         except (RemoteProtocolError, LocalProtocolError, ValueError) as error:
             self._reject_handshake(error)
         if not (self.is_open or self.fault) and self._handshake_bytes >= MAX_HEAD_BYTES:
-            self.fault = f"the handshake has no end within {MAX_HEAD_BYTES} bytes; the other end is not a WebSocket"
+            self.fault = f"the handshake is longer than {MAX_HEAD_BYTES} bytes; the other end is not a WebSocket"
         messages, self._messages = self._messages, []
         reply, self._reply = b"".join(self._reply), []
         return messages, reply
@@ -94,7 +95,7 @@ class WebSocketEnd(ABC):
         return self._send(Ping())
 
     def encode_close(self, code: int = CLOSE_NORMAL) -> bytes:
-        """Return the frame that closes the connection, or nothing if it was sent before."""
+        """Return the frame that closes the connection, or nothing if the frame was already sent."""
         return self._send(CloseConnection(code))
 
     # -- for subclasses ---------------------------------------------------------------------------------------------
@@ -105,7 +106,7 @@ class WebSocketEnd(ABC):
 
     @abstractmethod
     def _find_error(self, answer: AcceptConnection | RejectConnection | Exception) -> str:
-        """Return the fault in a server's response, or an empty text if frames may follow."""
+        """Return the fault in a server's response; empty if the response is correct and frames may follow."""
 
     # -- private ----------------------------------------------------------------------------------------------------
 
@@ -113,13 +114,13 @@ class WebSocketEnd(ABC):
         try:
             return self._socket.send(event)
         except LocalProtocolError:
-            return b""  # it is not open yet, or is closing
+            return b""  # the connection is not open yet, or is closing
 
     def _process_event(self, event: Event) -> bool:
         """Process an event; return False if it ends the connection."""
         self._frames_left -= 1
         if self._frames_left < 0:
-            self._fail(f"more than {MAX_FRAMES} frames at once")
+            self._fail(f"the other end sent more than {MAX_FRAMES} frames in one read")
         elif isinstance(event, Message):
             self._add_frame(event)
         elif isinstance(event, Ping | Pong):
@@ -147,9 +148,9 @@ class WebSocketEnd(ABC):
         self.frames += event.frame_finished
         self._partial_message += event.data.encode() if isinstance(event.data, str) else event.data
         if isinstance(event, TextMessage) and not self._takes_text:
-            self._fail("a text message, but only binary ones are allowed")
+            self._fail("the other end sent a text message, but only binary messages are allowed")
         elif len(self._partial_message) > self._max_message_bytes:
-            self._fail(f"a message of more than {self._max_message_bytes} bytes")
+            self._fail(f"the other end sent a message of more than {self._max_message_bytes} bytes")
         elif event.message_finished:
             self._messages.append(bytes(self._partial_message))
             self._partial_message = bytearray()

@@ -29,7 +29,7 @@ SIZES = (3, 10, 30, 100, 300, 1000)
 QUICK_SIZES = (3, 10, 30, 100)
 SEEDS, QUICK_SEEDS = 10, 2
 MAX_AGENTS = 3000
-"""Maximum number of agents in all missions of one size together: the cost of a mission grows with their square."""
+"""Maximum total number of agents in the missions of one size: the cost of a mission grows with their square."""
 FAILED_PERCENT = 10
 ROUTE_SIZES = ((3, 3), (3, 6), (10, 10), (10, 20), (50, 50), (50, 100))
 ROUTE_SEARCH_S, QUICK_ROUTE_SEARCH_S = 0.08, 0.01
@@ -52,7 +52,7 @@ def main() -> int:
     args = parser.parse_args()
     sizes = [int(n) for n in args.sizes.split(",")] if args.sizes else list(QUICK_SIZES if args.quick else SIZES)
     seeds = args.seeds or (QUICK_SEEDS if args.quick else SEEDS)
-    gc.disable()  # otherwise the garbage collector scans a thousand agents in one process, without finding garbage
+    gc.disable()  # the garbage collector would scan a thousand agents repeatedly and find no garbage
     started_at = time.monotonic()
     print(f"{'agents':>6s} {'missions':>8s} {'strategy':24s} {'cost':>6s} {'failed':>7s} {'moved':>6s} {'messages':>8s}"
           f" {'kB':>6s} {'rounds':>6s} {'agree s':>7s} {'CPU ms':>8s}")  # fmt: skip
@@ -93,7 +93,7 @@ def run_mission(size: int, seed: int) -> dict[str, dict[str, Any]]:
     for name in DECIDERS:
         now, then = make_outcome(name, calm, cbba_run), make_outcome(name, after)
         kept = [task for task, agent in now.owners.items() if agent in alive]
-        is_greedy = name == "cbba" and size <= MAX_FULL_BIDDERS  # otherwise CBBA did not use every bid
+        is_greedy = name == "cbba" and size <= MAX_FULL_BIDDERS  # in larger missions CBBA does not use every bid
         found[name] = {
             "ratio": compute_cost(calm, now.owners) / least,
             "ratio_failed": compute_cost(after, then.owners) / least_after,
@@ -118,7 +118,7 @@ def summarize(size: int, name: str, found: list[dict[str, Any]]) -> dict[str, An
     row |= {key: fmean(one[key] for one in found) for key in means}
     row |= {key: sum(one[key] for one in found) for key in ("two_owners", "unlike_greedy")}
     row["cpu_ms"] = median(one["cpu_ms"] for one in found)
-    # The agents of CBBA compute in parallel, also while messages are in transit.
+    # The agents of CBBA compute in parallel, even while messages are in transit.
     row["agree_s"] = row["rounds"] * ROUND_S + (0.0 if name in EXCHANGING else row["cpu_ms"] / 1000.0)
     return row
 
@@ -130,7 +130,7 @@ def compute_cost(mission: Mission, owners: Owners) -> float:
 
 
 def compare_routes(seeds: int, seconds: float) -> dict[str, Any]:
-    """Compare the routes of the sequential auction with the shortest known after ``seconds`` per task."""
+    """Compare the routes of the sequential auction with the shortest routes found in ``seconds`` per task."""
     ratios, worst, by = {}, {}, ""
     for agents, tasks in ROUTE_SIZES:
         found = []

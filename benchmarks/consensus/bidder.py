@@ -1,9 +1,9 @@
 """One agent's side of CBBA over a network that delays, repeats and reorders messages, but delivers them eventually.
 
-Each agent states its own bids, with version numbers; a newer statement of an agent about a task replaces its older
-ones, and the highest valid bid for a task wins. Statements are values: the caller sends the result of ``drain`` to the
-neighbours and passes received statements to ``receive``. Only changes are sent. Silence proves nothing: the lease
-decides which agent may act.
+Each agent publishes its own bids as statements with version numbers. A newer statement of an agent about a task
+replaces the older one, and the highest valid bid for a task wins. The caller sends the result of ``drain`` to the
+neighbours and passes received statements to ``receive``. Only changes are sent. A lack of messages does not prove
+agreement: the lease decides which agent may act.
 """
 
 from __future__ import annotations
@@ -14,11 +14,11 @@ from typing import NamedTuple
 from middleware.consensus.strategy import MAX_NUMBER
 
 Score = Callable[[tuple[str, ...], str], float]
-"""The value of a task for an agent with a given bundle; with 0 or less it does not bid."""
+"""The value of a task for an agent with a given bundle; the agent does not bid if the value is 0 or less."""
 
 
 class Statement(NamedTuple):
-    """An agent's bid for a task, or 0 after withdrawal; ``version`` numbers all its statements."""
+    """An agent's bid for a task, or 0 after a withdrawal; ``version`` numbers the statements of the agent."""
 
     task: str
     agent: str
@@ -27,7 +27,7 @@ class Statement(NamedTuple):
 
 
 class Bidder:
-    """One agent's bids and its view of all other bids; ``score`` is its value of tasks."""
+    """One agent's bids and its view of all other bids; ``score`` returns the value of a task for this agent."""
 
     def __init__(
         self, agent: str, tasks: Iterable[str], score: Score, capacity: int = 1, neighbours: Iterable[str] = ()
@@ -78,7 +78,7 @@ class Bidder:
                 continue
             bids[agent] = statement
             if known is not None and known.bid > 0.0:
-                self._outgoing[task, agent] = statement  # it replaces the forwarded statement
+                self._outgoing[task, agent] = statement  # the newer statement replaces one that was to be forwarded
             is_moved |= self._update_rival(statement)
         if is_moved:
             self._rebuild_bundle()
@@ -87,7 +87,7 @@ class Bidder:
     def drain(self) -> dict[str, tuple[Statement, ...]]:
         """Return the statements that each neighbour does not have yet, and mark them as sent.
 
-        A call every few message times instead of every time gives fewer and larger messages with the same content.
+        A call only every few rounds gives fewer and larger messages with the same content.
         """
         for task in sorted(self._touched):
             best = self.find_winner(task)
@@ -110,7 +110,7 @@ class Bidder:
         return not self._outgoing and not self._touched
 
     def _adopt_previous_run(self, statement: Statement) -> bool:
-        """Number new statements above the statements of a previous run of this agent, which others remember."""
+        """Continue the version numbers of a previous run of this agent, whose statements other agents remember."""
         own = self._known[statement.task].get(self.agent)
         if statement.version <= (own.version if own is not None else 0):
             return False
@@ -120,7 +120,7 @@ class Bidder:
         return True
 
     def _update_rival(self, statement: Statement) -> bool:
-        """Recompute the best bid of the others for that task; return whether the own bundle can change."""
+        """Recompute the best bid of the other agents for a task; return whether this agent's bundle can change."""
         task, before = statement.task, self._rival[statement.task]
         self._touched.add(task)
         if statement.bid > 0.0 and (before is None or _beats(statement.bid, statement.agent, before)):
@@ -140,7 +140,7 @@ class Bidder:
         """Rebuild the bundle, best task first, from tasks on which no other agent bids more.
 
         A bid is never higher than the previous one in the bundle (bid warping: Johnson, Choi, How 2012), so the agents
-        converge also if a task is worth more together with another one.
+        converge even if a task is worth more in combination with another task.
         """
         bids: dict[str, float] = {}
         ceiling = float("inf")
@@ -171,8 +171,8 @@ class Bidder:
 def is_final(rounds: int, quiet: int, tasks: int, members: int) -> bool:
     """Return whether the result is final after ``rounds`` synchronous rounds, the last ``quiet`` without changes.
 
-    Silence is no proof, because distant agents may still change their bids. The bound is the number of tasks times the
-    diameter of the graph (Choi and others, theorem 1), without message loss.
+    Rounds without changes are not a proof, because distant agents may still change their bids. The bound is the number
+    of tasks times the diameter of the graph (Choi and others, theorem 1), without message loss.
     """
     return rounds > tasks * max(1, members - 1)
 

@@ -14,10 +14,10 @@ from benchmarks.consensus.mission import SIDE_M, Mission
 from middleware.consensus.strategies.cbba import improve_assignment
 
 PAUSE_ROUNDS = 5
-"""Rounds between two messages of an agent, which combine all its news."""
+"""Rounds between two messages of an agent; a message contains all changes since the previous one."""
 MAX_SCORE = 3.0 * SIDE_M
 ROUND_S = 0.030
-"""A round is one network delay: 20 ms and 10 ms more on average."""
+"""Seconds of a round, one mean network delay: 20 ms plus 10 ms on average."""
 
 
 @dataclass(frozen=True)
@@ -50,16 +50,16 @@ def exchange_tasks(
     costs: Mapping[str, Mapping[str, int]],
     capacities: Mapping[str, int],
 ) -> dict[str, str]:
-    """Return the owners of the tasks of two agents after an exchange in which each knows the other's costs."""
+    """Return the owners of the tasks of two agents after an exchange in which both know the costs of both."""
     both = {task: agent for task, agent in owners.items() if agent in (one, other)}
     rows = {agent: {task: costs[agent][task] for task in both if task in costs[agent]} for agent in (one, other)}
     return improve_assignment(both, rows, capacities)
 
 
 def run_meetings(mission: Mission, owners: dict[str, str]) -> tuple[dict[str, str], float]:
-    """Return the owners after pairwise exchanges until none improves the cost, and the messages of each agent.
+    """Exchange pairwise until no exchange improves the cost; return the owners, and the messages of each agent.
 
-    An exchange is one message in each direction; a pair without success repeats it only after a change.
+    An exchange is one message in each direction; a pair whose exchange had no effect repeats it only after a change.
     """
     room = dict.fromkeys(mission.alive, mission.capacity)
     near = {agent: [task for _, task in ways] for agent, ways in mission.nearest_tasks.items()}
@@ -109,9 +109,9 @@ def make_score(costs: dict[str, int]) -> Score:
 
 
 def run_cbba(mission: Mission, pause: int = PAUSE_ROUNDS, loss: float = 0.0, quiet: int | None = None) -> CbbaRun:
-    """Run the bidders of a mission until no messages are left, or none were sent for ``quiet`` rounds.
+    """Run the bidders of a mission until no messages are left, or no message was sent for ``quiet`` rounds.
 
-    A lost message is sent again in the next round, because it is not acknowledged.
+    A lost message is not acknowledged and is therefore sent again in the next round.
     """
     graph = make_graph(mission.alive, mission.seed)
     rng = random.Random(f"loss/{mission.seed}")

@@ -17,7 +17,7 @@ Decider = Callable[[Mission, list[Report]], Owners]
 
 
 def decide_in_order(mission: Mission, reports: list[Report]) -> Owners:
-    """The rule of the thesis: one task after the other; an agent with a full bundle does not bid."""
+    """Decide by the rule of the thesis: one task after the other; an agent with a full bundle does not bid."""
     left = find_capacities(reports)
     owners: Owners = {}
     bids: dict[str, list[Report]] = {}
@@ -33,7 +33,7 @@ def decide_in_order(mission: Mission, reports: list[Report]) -> Owners:
 
 
 def decide_greedily(mission: Mission, reports: list[Report]) -> Owners:
-    """CBBA without exchange, which ends at the greedy assignment."""
+    """Decide like CBBA without exchanges, which results in the greedy assignment."""
     costs: dict[str, dict[str, float]] = {}
     for report in reports:
         costs.setdefault(report.agent, {})[report.task] = to_millionths(report.cost)
@@ -51,7 +51,7 @@ def make_decider(strategy: MultiTaskStrategy) -> Decider:
 
 
 def make_exact_optimum() -> GroupOptimal:
-    """The optimum over all bids, instead of 20 of each agent."""
+    """Return the optimum over all bids, instead of 20 bids of each agent."""
     strategy = GroupOptimal()
     strategy.bids = 10**6
     return strategy
@@ -70,4 +70,4 @@ DECIDERS: dict[str, Decider] = {
     "group_optimal": make_decider(make_exact_optimum()),
 }
 BIDS_BY_NAME = {LIMITED_OPTIMUM: FIRST_PASS_BIDS}
-"""Bids of each agent, if the number does not depend on the team."""
+"""Number of bids of each agent, for strategies for which this number is fixed."""

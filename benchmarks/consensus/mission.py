@@ -27,7 +27,7 @@ class Mission:
 
     @cached_property
     def capacity(self) -> int:
-        """Tasks per agent: as few as suffice for the remaining agents, and ``spare`` more."""
+        """Maximum tasks per agent: the minimum with which the remaining agents can do all tasks, plus ``spare``."""
         return math.ceil(self.tasks / max(1, len(self.alive))) + self.spare
 
     @cached_property

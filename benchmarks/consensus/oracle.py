@@ -1,4 +1,4 @@
-"""Lower bounds for the cost of a mission, by SciPy and OR-Tools if they are installed, otherwise by own algorithms."""
+"""Reference costs of a mission, by SciPy and OR-Tools if installed, otherwise by algorithms in this module."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from middleware.consensus.strategies import hungarian
 from middleware.consensus.strategies.sequential import compute_length, find_insertion
 
 STEPS_PER_S = 60_000
-"""Steps of the own search for short routes per second that OR-Tools would get."""
+"""Steps of this module's search for short routes, per second of search time of OR-Tools."""
 
 
 def solve_assignment(mission: Mission) -> tuple[float, str]:
@@ -61,7 +61,7 @@ def _anneal(mission: Mission, ways: dict[str, list[str]], steps: int) -> float:
         temperature = heat * (1.0 - step / steps) ** 2 + 1e-9
         task = rng.choice(tasks)
         here = owner[task]
-        # Choose the same agent, an agent of a random task, or a random agent.
+        # Choose the same agent, the agent of a random task, or a random agent.
         there = here if rng.random() < 0.3 else owner[rng.choice(tasks)] if rng.random() < 0.7 else rng.choice(agents)
         rest = [t for t in now[here] if t != task]
         target = rest if there == here else now[there]
@@ -85,11 +85,11 @@ def _solve_with_ortools(mission: Mission, seconds: float) -> float:
 
     agents, tasks = mission.alive, list(mission.task_positions)
     points = [mission.agent_positions[a] for a in agents] + [mission.task_positions[t] for t in tasks]
-    end = len(points)  # a place without cost: routes are open at their end
+    end = len(points)  # a point that is reached at no cost: routes are open at their end
     far = [[round(1000.0 * math.dist(p, q)) for q in points] + [0] for p in points] + [[0] * (end + 1)]
     index = pywrapcp.RoutingIndexManager(end + 1, len(agents), list(range(len(agents))), [end] * len(agents))
     model = pywrapcp.RoutingModel(index)
-    # With callbacks into Python instead of tables the routes are 1 % longer in the same time.
+    # Tables are faster: with callbacks into Python the routes are 1 % longer after the same time.
     model.SetArcCostEvaluatorOfAllVehicles(model.RegisterTransitMatrix(far))
     load = model.RegisterUnaryTransitVector([int(len(agents) <= place < end) for place in range(end + 1)])
     model.AddDimensionWithVehicleCapacity(load, 0, [mission.capacity] * len(agents), True, "load")

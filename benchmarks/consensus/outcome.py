@@ -11,25 +11,25 @@ from benchmarks.consensus.mission import Mission
 
 MAX_FULL_BIDDERS = 100
 FEW_BIDS = 40
-"""Bids of each agent in missions of more than ``MAX_FULL_BIDDERS`` agents, because all bids would be a million."""
+"""Bids of each agent in missions of more than ``MAX_FULL_BIDDERS`` agents, in which all bids would be a million."""
 BID_KB = 0.012
-"""An encoded bid: its task, its cost, and its share of the message overhead."""
+"""Size of an encoded bid in kB: its task, its cost, and its share of the message overhead."""
 MEETING_KB = 0.03
 
 
 @dataclass(frozen=True)
 class Outcome:
-    """The owner of each task; messages and kB are per agent, ``cpu_ms`` is of all computing agents."""
+    """The owner of each task; messages and kB are averages per agent, ``cpu_ms`` is the sum over all agents."""
 
     owners: Owners
     messages: float
-    kB: float  # noqa: N815 the unit is written so
+    kB: float  # noqa: N815 the unit's spelling
     rounds: float
     cpu_ms: float
 
 
 def make_outcome(name: str, mission: Mission, cbba_run: CbbaRun | None = None) -> Outcome:
-    """Return the result of a strategy; strategies without collection use ``cbba_run``, if given."""
+    """Return the result of a strategy; strategies that do not collect bids at one node use ``cbba_run``, if given."""
     found = (
         make_collected_outcome(name, mission)
         if cbba_run is None or name not in EXCHANGING
@@ -54,9 +54,9 @@ def make_cbba_outcome(cbba_run: CbbaRun) -> Outcome:
 
 
 def make_collected_outcome(name: str, mission: Mission) -> Outcome:
-    """Return the result with bids collected at one node: each agent sends one message per round, and gets one.
+    """Return the result with bids collected at one node: each agent sends and receives one message per round.
 
-    Agents bid for tasks without a bid in another round, and everything is decided again.
+    If tasks have no bids, the agents bid for these tasks in a further round, and all tasks are decided again.
     """
     most = BIDS_BY_NAME.get(name, mission.tasks if mission.agents <= MAX_FULL_BIDDERS else FEW_BIDS)
     took, times, holes = 0.0, 0, set[str]()

@@ -1,4 +1,4 @@
-"""Base class of the contestants with an asyncio loop, or with threads that call back into it."""
+"""Base class of the libraries' nodes that use an asyncio loop, or threads that call back into the loop."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from benchmarks.dht.library import Cancel, OnDone, OnValue
 
 
 class AsyncioPeer:
-    """The loop of a contestant; a library's own threads use ``call_soon``."""
+    """A node that runs in an asyncio loop; a library's own threads use ``call_soon``."""
 
     def __init__(self, folder: str) -> None:
         self._tasks: set[asyncio.Task[Any]] = set()
@@ -45,11 +45,11 @@ class AsyncioPeer:
         task.add_done_callback(ended)
 
     def list_held(self, keys: list[str]) -> list[bool | None]:
-        """Return None for unknown, unless the library can tell."""
+        """Return None (unknown); libraries that can list their stored keys override this."""
         return [None] * len(keys)
 
     def watch(self, key: str, heard: OnValue, done: Callable[[], None]) -> None:
-        """Raise ``NotImplementedError``, unless the library has watches."""
+        """Raise ``NotImplementedError``; libraries that have watches override this."""
         raise NotImplementedError("this library has no watches")
 
     def run_space_operation(self, verb: str, fields: list[object], limit_s: float, done: OnDone) -> None:

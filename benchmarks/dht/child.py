@@ -42,7 +42,7 @@ class OrderExecutor:
     def _read(self) -> None:
         for line in sys.stdin:
             self._node.call_soon(self._execute, json.loads(line))
-        # The parent has exited, perhaps without a message.
+        # The parent process has exited, perhaps without notice.
         os._exit(0)
 
     def _execute(self, order: Order) -> None:
@@ -59,7 +59,7 @@ class OrderExecutor:
     # -- orders -----------------------------------------------------------------------------------------------------
 
     def _do_start(self, order: Order) -> None:
-        """Join; with an existing key ``wanted``, measure the time until it has been read."""
+        """Join; if the order contains an existing key ``wanted``, measure the time until its value has been read."""
         started_at = time.monotonic()
         wanted = order.get("wanted")
 
@@ -93,7 +93,7 @@ class OrderExecutor:
         self._start_timing(order["kind"], key, data, order["limit_s"], done)
 
     def _do_load(self, order: Order) -> None:
-        """Keep operations in flight: each item ``once``, or all of them repeatedly for ``seconds``."""
+        """Run operations concurrently: each item ``once``, or all items repeatedly for ``seconds``."""
         Load(self._start_timing, self._node.call_later, order, lambda **fields: self._answer(order, **fields)).fill()
 
     def _do_space(self, order: Order) -> None:

@@ -12,7 +12,7 @@ from benchmarks.dht.library import HOST, OnDone, OnValue
 
 
 class KademliaPeer(AsyncioPeer):
-    """A contestant."""
+    """A node of the library ``kademlia``."""
 
     def start(self, port: int, known: int, done: Callable[[], None]) -> None:
         """Listen, and bootstrap."""
@@ -30,7 +30,7 @@ class KademliaPeer(AsyncioPeer):
         self.run_in_thread(self._server.set(key, value), lambda ok: done(bool(ok)))
 
     def get(self, key: str, value: bytes, done: OnValue) -> None:
-        """Read; from the own store if it has the key."""
+        """Read, from this node's store if it contains the key."""
         self.run_in_thread(self._server.get(key), done)
 
     def list_held(self, keys: list[str]) -> list[bool | None]:

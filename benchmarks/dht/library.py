@@ -1,4 +1,4 @@
-"""The contestants: their guarantees, and the interface of a node."""
+"""The compared libraries, their guarantees, and the interface of a node."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ class LibraryNode(Protocol):
         """Store; call back with whether the library reports the value as stored."""
 
     def get(self, key: str, value: bytes, done: OnValue) -> None:
-        """Read; only libraries whose key is the hash of the value use ``value``."""
+        """Read; ``value`` is used only by libraries whose key is the hash of the value."""
 
     def list_held(self, keys: list[str]) -> list[bool | None]:
         """Return whether this node stores each of ``keys``, None if the library cannot tell. Called while idle."""
@@ -58,8 +58,8 @@ class Library:
     """One column of the comparison.
 
     ``package`` is the module that must be importable; ``guarantee`` is the guarantee of a finished put; ``largest`` is
-    the documented maximum length of a value in bytes; ``survives`` names the failures that a store on disk survives, if
-    it does not survive a loss of power; ``features`` names its features in addition to put and get.
+    the documented maximum length of a value in bytes; ``survives`` lists the failures that a store on disk survives,
+    if it does not survive a loss of power; ``features`` lists the features besides put and get.
     """
 
     name: str

@@ -1,7 +1,7 @@
 """A node of libtorrent's DHT with immutable items (BEP 44: the key is the hash of the value).
 
-All nodes share one address here, which the library forbids by default: these two restrictions and the flood blocker are
-always off, otherwise there would be no network.
+All nodes share one address here, which the library forbids by default. Its two restrictions of nodes per address and
+its flood blocker are therefore always off; otherwise the nodes could not form a network.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from benchmarks.dht.library import HOST, OnDone, OnValue
 
 
 class LibtorrentPeer(AsyncioPeer):
-    """A contestant; "free" removes the default limit of 8,000 bytes a second for the DHT."""
+    """A node of libtorrent; "free" removes the default limit of 8,000 bytes per second for the DHT."""
 
     def __init__(self, folder: str, limits: str = "") -> None:
         super().__init__(folder)
@@ -63,7 +63,7 @@ class LibtorrentPeer(AsyncioPeer):
         self._session.dht_get_immutable_item(libtorrent.sha1_hash(target))
 
     def list_held(self, keys: list[str]) -> list[bool | None]:
-        """Return False for all keys: reads never come from the own store."""
+        """Return False for all keys: reads are never answered from this node's store."""
         return [False] * len(keys)
 
     def _report_joined(self) -> None:

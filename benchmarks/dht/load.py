@@ -7,14 +7,14 @@ from collections.abc import Callable
 from typing import Any
 
 MAX_BATCH = 64
-"""Operations started in one turn; answers from the own store are immediate, and the loop must run in between."""
+"""Operations started at a time: reads from the node's own store end immediately, so the loop must run in between."""
 
 
 class Load:
     """Keep ``order["in_flight"]`` operations open for ``order["seconds"]``, each item ``once`` or repeatedly.
 
-    An operation is good only if it ended successfully and in time; an operation that was not started, or was open at
-    the end, is not ("done" names the good ones if each item is used once).
+    An operation is good only if it ended successfully and in time, not if it was still open at the end or not started.
+    If each item is used once, "done" lists the good operations.
     """
 
     def __init__(

@@ -1,7 +1,7 @@
 """Read directly after the failure of a quarter of the nodes, and again after the failure of a half.
 
-A killed node leaves a closed port, which loopback reports at once, unlike a real outage; a silent (stopped) node does
-not answer, like a robot out of range or without power.
+A killed node leaves a closed port, which is reported immediately on loopback, unlike in a real outage. A silent
+(stopped) node does not answer, like a robot out of range or without power.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ IN_FLIGHT = 10
 LOSS_LIMIT_S = 30.0
 WRITERS = 4
 MIN_NODES = 8
-"""In a smaller network half of the nodes is too few for a meaningful result."""
+"""Minimum number of nodes; half of a smaller network is too few for a meaningful result."""
 
 
 async def measure_losses(workload: Workload, is_silent: bool) -> None:
@@ -28,7 +28,7 @@ async def measure_losses(workload: Workload, is_silent: bool) -> None:
             workload.run_load(nodes[n], "put", items[n::WRITERS], 2, SINGLES_LIMIT_S, once=True) for n in range(WRITERS)
         ]
         done = {key for outcome in await asyncio.gather(*parts) for key in outcome["done"]}
-        # Only values that the library reported as stored can count as missing.
+        # Only values that the library reported as stored are counted as missing.
         stored = [item for item in items if item[0] in done]
         workload.result["stored"] = len(stored)
         await asyncio.sleep(plan.scale_pause(1.0))

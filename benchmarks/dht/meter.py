@@ -18,7 +18,7 @@ def percentile(values: list[float], percent: float) -> float | None:
 
 
 def read_cpu_s(pids: Iterable[int]) -> float:
-    """Return the processor seconds of the threads of these processes; ended threads do not count."""
+    """Return the processor seconds of the threads of these processes, except for threads that have ended."""
     total = 0
     for pid in pids:
         for file in Path(f"/proc/{pid}/task").glob("*/schedstat"):
@@ -52,7 +52,7 @@ class Cost:
     foreign_share: float = 0.0
 
     def per_operation(self, operations: int, idle: Cost) -> dict[str, float]:
-        """Return the cost of one operation, without the consumption of an idle network in that time."""
+        """Return the cost of one operation, after subtracting the cost of an idle network in the same time."""
         noise = {"dropped": self.dropped, "foreign": self.foreign_share}
         if not operations:
             return noise

@@ -11,11 +11,11 @@ from benchmarks.dht.aio import AsyncioPeer
 from benchmarks.dht.library import HOST, OnDone, OnValue
 
 JOIN_DELAY_S = 0.5
-"""The binding does not report when the replicas have registered a listen."""
+"""Seconds to wait until the replicas have registered a listen, which the binding does not report."""
 
 
 class OpenDhtPeer(AsyncioPeer):
-    """A contestant; "free" removes the limits on requests per second, which all nodes of one address share."""
+    """A node of OpenDHT; "free" removes the limits on requests per second, which all nodes of one address share."""
 
     def __init__(self, folder: str, limits: str = "") -> None:
         super().__init__(folder)
@@ -64,6 +64,6 @@ class OpenDhtPeer(AsyncioPeer):
         self.call_later(JOIN_DELAY_S, done)
 
     def list_held(self, keys: list[str]) -> list[bool | None]:
-        """Read the log of the store; the binding holds Python's lock meanwhile, so never under load."""
+        """Read the log of the store, but never under load: the binding holds Python's global lock during the call."""
         log = self._node.getStorageLog()
         return [str(opendht.InfoHash.get(key)) in log for key in keys]

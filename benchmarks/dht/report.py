@@ -15,7 +15,7 @@ WORDS = {True: "yes", False: "NO", None: "?"}
 
 
 def format_table(results: Results) -> str:
-    """Return the printed report; "x0.50" next to a figure: this library's value is half of it."""
+    """Return the report; "x0.50" next to a figure means that this library's value is half of the figure."""
     blocks = [_format_size(size, row) for size, row in results.items()]
     blocks += [
         _format_targets(size, row) for size, row in list(results.items())[-1:] if OURS in row or OURS_IN_MEMORY in row

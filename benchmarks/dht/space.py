@@ -16,7 +16,7 @@ RACES = 10
 TAKERS = 4
 OPERATION_LIMIT_S = 5.0
 WAIT_BEFORE_PUT_S = 0.3
-"""Seconds for which a node waits for a tuple before the put."""
+"""Seconds before the put at which a node starts to wait for the tuple."""
 
 Fields = list[object]
 
@@ -47,7 +47,7 @@ async def _run_operation(node: Node, verb: str, fields: Fields) -> Result:
 
 
 async def _measure_singles(workload: Workload, verb: str, works: list[Fields]) -> Result:
-    """One after the other, each at a random node."""
+    """Measure operations one after the other, each at a random node."""
     meter = Meter(workload.team.pids)
     done = [await _run_operation(workload.rng.choice(workload.nodes), verb, fields) for fields in works]
     good = [each["ms"] for each in done if each["good"]]

@@ -26,7 +26,7 @@ from middleware.entangled.space.tuplespace import TupleSpace
 TEAM_KEY = b"the key of a team that only runs"
 NAME = "bench"
 JOIN_DELAY_S = 0.2
-"""A watch does not report when its replicas have registered it."""
+"""Seconds to wait until the replicas have registered a watch, which a watch does not report."""
 reactor: Any = _reactor
 
 
@@ -42,7 +42,7 @@ class LossyUdp(UdpNetwork):
 
 
 class SwarmPeer:
-    """A contestant; ``store`` is "memory", "sqlite", or "crash": SQLite that does not wait for the disk."""
+    """A node of this library; ``store`` is "memory", "sqlite", or "crash" (SQLite that does not wait for the disk)."""
 
     def __init__(self, folder: str, store: str = "memory") -> None:
         use_monotonic_time()

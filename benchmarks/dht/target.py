@@ -1,7 +1,7 @@
 """Targets for this library, as absolute figures or relative to other libraries in the same run.
 
-If a library is not in the run (Entangled of 2011, libp2p), its figure from the first comparison is used; the verdict
-``None`` means that a required figure was not measured.
+For libraries that are never in the run (Entangled of 2011, libp2p), the figures of an earlier comparison are used. A
+result ``None`` means that a required figure was not measured.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ RowReader = Callable[[Row], float | None]
 
 
 class Limit(NamedTuple):
-    """A figure that must not be above (``most``) or below ``bound``."""
+    """A figure that must be at most (``is_maximum``) or at least ``bound``."""
 
     what: str
     value: float | None
@@ -36,7 +36,7 @@ class Limit(NamedTuple):
 
     @property
     def is_met(self) -> bool | None:
-        """Return whether it meets the limit; None if it is unknown."""
+        """Return whether the figure meets the limit; None if the figure is unknown."""
         if self.value is None or self.bound is None:
             return None
         return self.value <= self.bound if self.is_maximum else self.value >= self.bound
@@ -61,7 +61,7 @@ class TargetResult(NamedTuple):
 
 
 class LimitDefinition(NamedTuple):
-    """A figure of a row with the bound that it must not be above (``most``) or below."""
+    """A figure of a row with its maximum (``is_maximum``) or minimum."""
 
     what: str
     reader: RowReader
@@ -75,7 +75,7 @@ class LimitDefinition(NamedTuple):
 
 
 class Target(NamedTuple):
-    """A title, and all limits that belong to it."""
+    """A target: a title and all limits that must be met."""
 
     title: str
     limit_definitions: tuple[LimitDefinition, ...]

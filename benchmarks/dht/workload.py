@@ -1,4 +1,4 @@
-"""The workload of every library while all its nodes are healthy, in phases with time limits.
+"""Run the workload of each library while all nodes are healthy, in phases with time limits.
 
 Each phase adds its figures to the result; the reason for an early end of a phase is stored under "trouble", and the
 next phase starts.
@@ -27,7 +27,7 @@ READ_LIMIT_S = 3.0
 PHASE_LIMIT_S = 60.0
 VALUE_BYTES = 100
 MIN_REMOTE_SHARE = 0.1
-"""Minimum share of keys that a node does not store, to use only such keys as its load."""
+"""Minimum share of keys that a node does not store; with fewer, its load also includes keys that it stores."""
 
 Result = dict[str, Any]
 
@@ -80,7 +80,7 @@ class Workload:
     # -- parts of phases ----------------------------------------------------------------------------------------------
 
     async def start_nodes(self, nodes: list[Node]) -> None:
-        """Start these nodes one after the other with the first one as contact, and wait until all work.
+        """Start these nodes one after the other with the first one as contact, and wait until all nodes work.
 
         Some libraries report a join or a stored value before other nodes can find it.
         """
@@ -205,7 +205,7 @@ class Workload:
         """Measure the operations that one node completes with that many in flight."""
         loaded = self.nodes[len(self.nodes) // 2]
         mine = held[len(self.nodes) // 2]
-        # In a small network a node stores all or nearly all keys: then its reads are local ones.
+        # In a small network a node stores nearly all keys: then its reads are local.
         far = [item for n, item in enumerate(items) if mine[n] is not True]
         if len(far) < len(items) * MIN_REMOTE_SHARE:
             far = items

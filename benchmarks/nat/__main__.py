@@ -30,7 +30,7 @@ PICTURE = "images/nat.svg"
 
 
 async def run(count: int, lossy: int, seed: int) -> list[Outcome]:
-    """Run the whole matrix; clean up on SIGTERM, too."""
+    """Run the whole matrix; also clean up on SIGTERM."""
     from benchmarks.nat.hosts import Hosts
     from benchmarks.nat.matrix import Matrix, list_sites
 
@@ -67,7 +67,7 @@ def main(arguments: Sequence[str] = tuple(sys.argv[1:])) -> int:
     try:
         outcomes = asyncio.run(run(args.count, args.lossy, args.seed))
     except asyncio.CancelledError:
-        sys.stderr.write("live-nat: ended before its time; all it had made is gone\n")
+        sys.stderr.write("live-nat: ended early; its processes and namespaces have been removed\n")
         return 130
     kept = check_requirements(outcomes)
     file = args.out / "live-nat"

@@ -61,7 +61,7 @@ class Member:
         self._network = network
         endpoint = self.node.endpoint
         self._ask = endpoint.ask
-        # The time at which a node learns of a peer is visible only in its own requests, so they are intercepted.
+        # The time at which a node learns of a peer shows only in the node's own requests, so these are intercepted.
         endpoint.ask = self._ask_and_record  # type: ignore[method-assign]
         endpoint.on_contact.add(self._on_contact)
         self.node.rpc(CALL_METHOD)(lambda peer: True)
@@ -185,7 +185,7 @@ class OrderExecutor:
     # -- orders -----------------------------------------------------------------------------------------------------
 
     def _do_start(self, order: Order) -> None:
-        """Start a node; answer when it has joined (the first of a team at once), or at the time limit."""
+        """Start a node; answer when it has joined (immediately for the first node of a team), or at the time limit."""
         settings = Settings.from_mapping({"node": order["node"]}, "trial")
         member = self._members[order["trial"]] = Member(settings, bytes.fromhex(order["seed"]))
         member.wanted_peers = {bytes.fromhex(public): order["limit_s"] for public in order["sought"]}
@@ -200,7 +200,7 @@ class OrderExecutor:
         member.node.join(settings.node.known_nodes).addCallbacks(joined, lambda _: None)
 
     def _do_meet(self, order: Order) -> None:
-        """Wait until a peer has answered; return the time since the node learnt of it."""
+        """Wait until a peer has answered; return the seconds since the node learnt of the peer."""
         member = self._members[order["trial"]]
         public = bytes.fromhex(order["peer"])
         observation = member.get_observation(public)

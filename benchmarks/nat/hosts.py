@@ -14,7 +14,7 @@ from sim.namespaces.namespace import make_environment
 
 SPAWN_LIMIT_S = 60.0
 MARGIN_S = 10.0
-"""Seconds after an order's time limit until it counts as lost."""
+"""Seconds after the time limit of an order until its answer is regarded as lost."""
 MAX_LINE_BYTES = 1 << 20
 
 

@@ -21,7 +21,7 @@ JOIN_S, LOSSY_JOIN_S = 6.0, 20.0
 MEET_S, LOSSY_MEET_S = 6.0, 10.0
 BACK_S = 12.0
 LATE_MS = 500.0
-"""Delay of the bootstrap node's messages to the late side of a staggered pair."""
+"""Delay in ms of the bootstrap node's messages to the late node of a pair."""
 LOST_PERCENT = 30.0
 SHORT_S = 20
 HOMES = (NatKind.FULL, NatKind.PORT, NatKind.SYM)
@@ -64,7 +64,7 @@ def list_plain_pairs(part: str) -> list[Pair]:
 
 
 def list_special_pairs() -> list[Pair]:
-    """Return pairs behind one router, and pairs with routers without a firewall, also with one late side."""
+    """Return pairs behind one router, and pairs with routers without a firewall, some of them with one late node."""
     homes = [Pair(HOME, k.value, k.value, f"{k.value}a1", f"{k.value}a2") for k in HOMES]
     leaky = [
         Pair(LEAKY, "leaky", "leaky", "leakya1", "leakyb1"),
@@ -158,10 +158,10 @@ class Trial:
         return str((await self._hosts[host].run_order("path", trial=self._name, peer=peer))["path"])
 
     async def _find_worse_path(self, between: Sequence[str]) -> str:
-        """Return the worse path of the two directions; a relayed path counts as a tunnel if its first hop is one."""
+        """Return the worse path of the two directions; a relayed path that begins with a tunnel counts as a tunnel."""
         to_bootstrap = [await self._read_path(host, self._publics[PUBLIC_HOST]) for host in self.join_order]
         if "" in between:
-            return ""  # one of them never received an answer
+            return ""  # one node never received an answer
         if any(path != "direct" for path in between):
             return "tunnel" if "tunnel" in (*between, *to_bootstrap) else "relayed"
         return "direct"

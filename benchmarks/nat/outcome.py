@@ -67,7 +67,7 @@ class Requirement:
 def is_punchable(a: NatKind, b: NatKind) -> bool:
     """Return whether datagrams sent at the same time from both sides can open a path (hole punching).
 
-    They cannot if a filter by port meets a NAT that uses another port for each peer.
+    This fails if one router filters by port and the other uses a different port for each peer.
     """
     closed = {NatKind.PORT, NatKind.SYM}
     return NatKind.NOUDP not in (a, b) and not (NatKind.SYM in (a, b) and {a, b} <= closed)
@@ -87,7 +87,7 @@ def format_cell(outcomes: Sequence[Outcome]) -> str:
 
 
 def check_requirements(outcomes: Iterable[Outcome]) -> list[Requirement]:
-    """Return the requirements of a run in the order of the parts, without the parts that were not run."""
+    """Return the requirements of a run in the order of the parts, except for parts that were not run."""
     every = list(outcomes)
     plain = [one for one in every if one.part == PLAIN]
     open_ones = [one for one in plain if is_punchable(NatKind(one.a), NatKind(one.b))]

@@ -67,7 +67,7 @@ def format_table(outcomes: Sequence[Outcome]) -> str:
 
 
 def update_document(document: str, outcomes: Sequence[Outcome]) -> str:
-    """Return ``document`` with the results between its two marks; raises ``ValueError`` without the marks."""
+    """Return ``document`` with the results between its two marks; raise ``ValueError`` if the marks are missing."""
     before, begin, rest = document.partition(BEGIN)
     _, end, after = rest.partition(END)
     if not begin or not end:

@@ -10,12 +10,12 @@ from enum import Enum
 from middleware.tasks.task import COMPLETED, Result
 
 WEB, WITNESSES = "page", ("witness1", "witness2")
-"""The nodes besides the bootstrap node and the robots. With seven members three may fail at once, and four still
-agree."""
+"""The nodes besides the bootstrap node and the robots. With seven members, three may fail at the same time, and the
+other four are still a majority."""
 PHASE_S = (0.2, 2.0)
-"""Seconds from the first motion to the failure: anywhere in a renewal period, and before the task is done."""
+"""Seconds from the first motion to the failure: at a random time of a renewal period, before the task is done."""
 FROZEN_S = (3.0, 5.0)
-"""Seconds for which a node is frozen: two leases and more."""
+"""Seconds for which a node is frozen: at least the duration of two leases."""
 
 
 class Cause(Enum):
@@ -31,7 +31,7 @@ class Cause(Enum):
 
 
 VIRTUAL_ONLY = frozenset({Cause.LOST_LINK})
-"""Causes in virtual time only; with processes the demonstration has it (``--lose link``)."""
+"""Causes that are tested in virtual time only; with processes the demonstration tests this (``--lose link``)."""
 DESCRIPTIONS = {
     Cause.CRASH: "its node dies (SIGKILL)",
     Cause.FREEZE: "its node stands still (SIGSTOP) for two leases and more, and goes on",

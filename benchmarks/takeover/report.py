@@ -15,7 +15,7 @@ WIDE, HIGH, LEFT = 12, 60, 150
 
 
 def format_table(trials: Sequence[Trial]) -> str:
-    """Return one line per cause: held trials, seconds to take over, and samples with two moving robots or a zombie."""
+    """Return a line for each cause: passed trials, takeover times, and samples with two moving robots or a zombie."""
     lines = [
         f"{'':16}{'trials':>7}{'held':>6}{'p50 s':>8}{'p95 s':>8}{'p99 s':>8}{'max s':>8}"
         f"{'two':>5}{'zombie':>8}  target"

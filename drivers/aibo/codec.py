@@ -1,8 +1,8 @@
 """Codec of the AIBO's ports for walk, head, joints, emergency stop, world state and gains; pure.
 
 All numbers are little-endian, 32 bits wide.  The world state has two dialects, distinguished by their first bytes:
-``T4`` (Tekkotsu 4.0 and 5.x: model, counts of everything) and ``T2`` (2.x: no model, no frame number).  Counts are
-read from the stream, so models other than the ERS-7 can be read as well.
+``T4`` (Tekkotsu 4.0 and 5.x: model, counts of everything) and ``T2`` (2.x: no model, no frame number). The numbers of
+sensors are read from the stream, so the reader also accepts models other than the ERS-7.
 """
 
 from __future__ import annotations
@@ -43,7 +43,7 @@ def encode_command(letter: str, value: float) -> bytes:
 
 
 class IncompletePacket(Exception):
-    """A packet is incomplete: it has at least ``need`` bytes."""
+    """A packet is incomplete: the whole packet has at least ``need`` bytes."""
 
     def __init__(self, need: int) -> None:
         super().__init__(need)
@@ -113,7 +113,7 @@ class Cursor:
 
 
 class CommandReader:
-    """The dog's side of walk and head: splits a stream into commands."""
+    """Splits the stream to the walk or head port into commands, as the dog does."""
 
     def __init__(self) -> None:
         self._rest = bytearray()
@@ -148,7 +148,7 @@ class LineReader:
 
 
 def encode_state(state: WorldState) -> bytes:
-    """Encode ``state`` in its dialect; T2 contains joints only, which are the first of the outputs."""
+    """Encode ``state`` in its dialect; of the outputs, T2 contains only the joints, which come first."""
     if state.dialect == T2:
         rows = (state.outputs[: len(state.duties)], state.sensors, state.buttons)
         return struct.pack("<I", state.t) + b"".join(_encode_row(row) for row in rows) + _encode_floats(state.duties)
@@ -204,7 +204,7 @@ def _read_state(cursor: Cursor, has_model: bool) -> WorldState:
     (t,) = cursor.read_words(1)
     joints = cursor.read_count()
     if joints != PID_JOINTS:
-        raise BadFrame(f"neither dialect: no model, and {joints} joints")
+        raise BadFrame(f"the data is in neither dialect: no model, and {joints} joints")
     return WorldState(
         T2, "", t, 0, cursor.read_floats(joints), cursor.read_row(), cursor.read_row(), cursor.read_floats(joints)
     )

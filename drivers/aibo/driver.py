@@ -31,7 +31,7 @@ WALK_REPEAT_S = 0.5
 """Interval in seconds at which a walk command is repeated; the dog stops 3 s after the last one."""
 CHECK_INTERVAL_S = 0.125
 SERVER_RESTART_S = 1.0
-"""Seconds without an answer after which a port's server is started again through main control."""
+"""Seconds without an answer from a port after which its server is started again through main control."""
 MAIN_CONTROL_TIMEOUT_S = 3.0
 """Seconds to wait for main control before connecting to the other ports anyway."""
 NO_ANSWER_S = 5.0
@@ -43,8 +43,9 @@ SOUND_NAME = re.compile(r"[A-Za-z0-9_-]{1,32}(\.[A-Za-z0-9]{1,4})?")
 class AiboDriver(BaseDriver):
     """One dog, with a link to each of its ports by ``connector``; ``datagrams`` deliver pictures over UDP.
 
-    The motors are off after ``connect``.  The dog's own emergency stop (its back button, twice) keeps them off until
-    ``enable``.  A lost link, or ``STALE_S`` without a world state, ends the walk and reopens that link.
+    The motors are off after ``connect``. The dog's own emergency stop (its back button, pressed twice) keeps the
+    motors off until ``enable``. If a link is lost, or no world state arrives for ``STALE_S``, the walk ends and that
+    link is reopened.
     """
 
     STALE_S = 0.5
@@ -116,7 +117,7 @@ class AiboDriver(BaseDriver):
         return super().invoke(name, **arguments)
 
     def diagnostics(self) -> dict[str, float]:
-        """As for every driver; ``unanswered`` is the number of ports that do not answer."""
+        """The counters of every driver, and ``unanswered``, the number of ports that do not answer."""
         counts = super().diagnostics()
         counts["bad_frames"] += self._camera.bad_frames + self._menu.bad_lines + self._lines.bad_lines
         counts["bytes"] += self._camera.bytes
@@ -148,7 +149,7 @@ class AiboDriver(BaseDriver):
         forward, backward, aside, turn = self._options.speed
         vx, vy, wz = motion["base.vx"], motion["base.vy"], motion["base.wz"]
         r = wz / turn
-        # All three at full scale break the gait, so turning limits walking.
+        # Walking ahead, sideways and turning, all at full speed, would break the gait, so turning limits walking.
         left = 1.0 - abs(r)
         f = min(max(vx / (forward if vx > 0 else backward), -left), left)
         s = min(max(vy / aside, -left), left)
@@ -252,7 +253,7 @@ class AiboDriver(BaseDriver):
                     port.open()
 
     def _open_ports(self) -> None:
-        """Connect to all servers, which run by now or never will; retry the waiting ones at once."""
+        """Connect to all servers, which have been started by now; retry waiting connections immediately."""
         self._main_opened_at = None
         for service, port in self._ports.items():
             if service != "main":
@@ -276,7 +277,7 @@ class AiboDriver(BaseDriver):
             elif line == "off":
                 self._is_engaged = self._wants_motors is not True
                 if self._is_engaged:
-                    # The dog's button released the stop; only enable() may do that.
+                    # The dog's button released the stop; only enable() may switch the motors on, so stop again.
                     self._ports["estop"].send(b"stop\n")
             else:
                 self._counts["bad_frames"] += 1
@@ -334,7 +335,7 @@ class AiboDriver(BaseDriver):
         self._halt()
         if not self._wants_motors:
             self._power(False)
-        # Silence and invalid data are logged again only after valid data in between.
+        # After valid data, the next silence or invalid data is logged again.
         self._logged_keys &= {"silence", "sense", "state"}
         self._up()
 
@@ -374,7 +375,7 @@ class AiboDriver(BaseDriver):
                 self._log_once(service, f"its {service} server at {where} does not answer; {why}")
 
     def _restart_server(self, service: str, since: float) -> None:
-        """Start a server that is silent through main control: a server of Tekkotsu 5 ends with its client."""
+        """Start a silent server through main control: a server of Tekkotsu 5 ends when its client disconnects."""
         now = self._clock.seconds()
         if now - max(since, self._restarted_at.get(service, 0.0)) > SERVER_RESTART_S:
             self._restarted_at[service] = now
@@ -391,7 +392,7 @@ def _encode_walk(f: float, s: float, r: float) -> bytes:
 
 
 _HEAD_AXES = {"pan": ("p", sensors.PAN), "tilt": ("t", sensors.TILT), "nod": ("r", sensors.NOD)}
-"""The letter and the range of each axis."""
+"""The letter of each head axis in commands, and its range."""
 
 
 def make_driver(

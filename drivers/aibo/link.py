@@ -15,15 +15,15 @@ from drivers.link import Connector, Link, Reconnector
 from drivers.timer import Timer
 
 RETRY_DELAYS_S = (0.5, 1.0, 2.0, 5.0)
-"""Delays before reconnecting, as in the dog's own clients: a port that was just closed does not accept at once."""
+"""Delays before reconnecting, as in the dog's own clients: a port that was just closed accepts only after a while."""
 FLUSH_S = 1.0
 REQUEST_INTERVAL_S = 0.5
-"""Interval at which datagrams are requested until the first arrives, and again after they stop."""
+"""Interval in seconds at which datagrams are requested until they arrive, and again when they stop arriving."""
 SILENCE_S = 2.0
 
 
 class Port:
-    """One TCP port that is kept connected; it does not interpret the data."""
+    """A connection to one TCP port, reopened whenever it is lost; the data is not interpreted."""
 
     def __init__(
         self,
@@ -51,7 +51,7 @@ class Port:
 
     @property
     def link(self) -> Link | None:
-        """The current link, None without one."""
+        """The current link, or None."""
         return self._link
 
     @property
@@ -70,7 +70,7 @@ class Port:
         self._reconnector = self._connector.connect(*self._address, self)
 
     def send(self, data: bytes) -> None:
-        """Send bytes; does nothing without a link."""
+        """Send bytes; does nothing if there is no link."""
         if self._link is not None:
             self._link.send(data)
 
@@ -80,7 +80,7 @@ class Port:
             self._link.close()
 
     def close(self) -> Deferred[None]:
-        """Close for good after pending data is written, but wait at most ``FLUSH_S`` for a dead link."""
+        """Close permanently after pending data is written; wait at most ``FLUSH_S`` for that."""
         reconnector, self._reconnector = self._reconnector, None
         if reconnector is None:
             return succeed(None)
@@ -104,7 +104,7 @@ class Port:
         self._on_down()
 
     def data_received(self, data: bytes) -> None:
-        """Take bytes; called by the link."""
+        """Process received bytes; called by the link."""
         if self._reconnector is not None:
             self._on_bytes(data)
 
@@ -145,7 +145,7 @@ class _UdpLink(DatagramProtocol):
         self._on_datagram(datagram)
 
     def connectionRefused(self) -> None:
-        """Ignore the error: the server does not listen yet, and the request is sent again."""
+        """Ignore the error: the server does not listen yet, and the request will be repeated."""
 
     def send(self, data: bytes) -> None:
         transport: Any = self.transport
@@ -182,7 +182,7 @@ class Camera:
 
     @property
     def is_silent(self) -> bool:
-        """Whether datagrams were requested and none has arrived for ``SILENCE_S``."""
+        """Whether datagrams were requested, but no datagram has arrived for ``SILENCE_S``."""
         return self._link is not None and self._clock.seconds() - self._last_data_at >= SILENCE_S
 
     def open(self) -> None:

@@ -1,10 +1,10 @@
 """The text protocol of main control (port 10020), in both directions; pure.
 
-Commands are lines.  A reply is a keyword on a line, followed by a number of lines that the keyword defines.  The
-menu (``refresh``) has five fields per item, or four in Tekkotsu 2.x, which its first item shows.
+Commands are lines.  A reply is a keyword on a line, followed by a number of lines that the keyword defines.  The menu
+(``refresh``) has five fields per item, or four in Tekkotsu 2.x; the reader infers the number from the first item.
 
-Each generation of Tekkotsu has other names for its servers: all names are sent, and the dog ignores unknown ones.
-The name of a running server becomes ``#name``, so starting it again does nothing.
+The names of the servers differ between generations of Tekkotsu: the driver sends all names, and the dog ignores
+unknown names. The name of a running server becomes ``#name``, so starting it again does nothing.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from drivers.errors import BadFrame
 
 MAX_COUNT = 256
 MAX_MESSAGE_LINES = 4096
-"""Most lines of one message, more than any real menu has."""
+"""Maximum number of lines of one message, more than any real menu has."""
 HELLO = "!hello"
 EMPTY_SLOT = "----------"
 SERVERS: dict[str, tuple[str, ...]] = {
@@ -50,7 +50,7 @@ class Refresh:
 
 @dataclass(frozen=True)
 class Status:
-    """Text for people."""
+    """A status text to be read by a person."""
 
     text: str
 
@@ -98,7 +98,7 @@ _Lines = Generator[None, str, Message]
 
 
 def select(name: str) -> str:
-    """Return the command that activates the item ``name``; it is idempotent, as a running item is called ``#name``."""
+    """Return the command that activates the item ``name``; it is idempotent: a running item is called ``#name``."""
     return f'!select "{name}"'
 
 
@@ -118,9 +118,9 @@ def make_greeting() -> list[str]:
 
 
 def make_start_commands(services: Iterable[str], transport: str, fps: float, width: int = 104) -> list[str]:
-    """Return commands that set up and start ``services``; the answer to the last one confirms all of them.
+    """Return commands that set up and start ``services``; the answer to the last command confirms all commands.
 
-    Each server is started under all its names; ``width`` is the width of the pictures in pixels.
+    The commands try all names of each server; ``width`` is the width of the pictures in pixels.
     """
     lines = [
         format_setting("main.worldState_interval", 0),
@@ -133,7 +133,7 @@ def make_start_commands(services: Iterable[str], transport: str, fps: float, wid
 
 
 def make_size_commands(width: int) -> list[str]:
-    """Return commands for the width of the pictures in pixels; each camera layer is half as wide as the one above."""
+    """Return commands that set the picture width in pixels; each camera layer halves the width of the layer above."""
     skip = {208: 1, 104: 2}[width]
     names = (f"vision.rawcam{mark}{channel}_skip" for mark in "._" for channel in ("y", "uv"))
     return [format_setting(name, skip + name.endswith("uv_skip")) for name in names]
@@ -225,7 +225,7 @@ class MenuReader:
 
 
 def _parse_message(word: str) -> _Lines:
-    """Take the lines after ``word`` one by one, and return the message."""
+    """Receive the lines after ``word`` one by one, and return the message."""
     match word:
         case "push" | "pop" | "goodbye":
             return OneWordMessage(word)
@@ -270,5 +270,5 @@ def _parse_text(more: int) -> Generator[None, str, str]:
 
 def _parse_count(line: str, limit: int = MAX_COUNT) -> int:
     if not (line.isascii() and line.isdecimal()) or len(line) > 10 or int(line) > limit:
-        raise BadFrame(f"not a count up to {limit}: {line!r}")
+        raise BadFrame(f"{line!r} is not a number from 0 to {limit}")
     return int(line)

@@ -1,4 +1,4 @@
-"""Options of the kind "aibo"; each error names the remedy."""
+"""Options of the kind "aibo"; each error says how to correct it."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ SOUNDS = {"howl": "5", "yap": "6", "whimper": "7", "growl": "8", "bark": "9"}
 Transport = Literal["tcp", "udp"]
 Speed = Annotated[float, Meta(gt=0, le=10)]
 HEIGHTS = {104: 80, 208: 160}
-"""Width of a camera picture to its height, in pixels."""
+"""The height of a camera picture by its width, in pixels."""
 
 
 def _complete_ports(given: Mapping[str, int]) -> dict[str, int]:
@@ -35,7 +35,7 @@ def _complete_ports(given: Mapping[str, int]) -> dict[str, int]:
 
 @dataclass(frozen=True)
 class Options:
-    """The dog's address, the transport of its camera, the speed of its walk, and its ports."""
+    """The dog's address, the transport of its camera pictures, the speeds of its walk, and its ports."""
 
     host: Host
     camera: bool = True
@@ -59,10 +59,10 @@ class Options:
 
 
 def parse_options(table: Mapping[str, object]) -> Options:
-    """Convert and check ``table``; raise ``UsageError`` that names the key and the remedy."""
+    """Convert and check ``table``; raise ``UsageError`` with the key, the problem and the remedy."""
     options = convert_options("aibo", table, Options)
     if options.camera_transport == "udp" and not _is_address(options.host):
-        problem = f'is {options.host!r}, which camera_transport = "udp" does not allow'
+        problem = f'must be a numeric address with camera_transport = "udp", is {options.host!r}'
         raise make_option_error("aibo", "host", problem, 'write a numeric address, such as "192.168.0.51"')
     return options
 

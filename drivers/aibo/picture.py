@@ -1,8 +1,9 @@
 """Packets of the raw camera (port 10011), in both directions; pure.
 
-A packet is a header and one or three blocks of channels; a JPEG is passed on unchanged, raw channels become
-``yuv444`` (three planes of the same size) or ``mono8``.  Over UDP each datagram is one packet.  Over TCP packets have
-no delimiter, but every header begins with the same 18 bytes, by which the reader resynchronizes after invalid data.
+A packet is a header and one or three blocks, each with one channel or a JPEG. A JPEG is passed on unchanged; raw
+channels are converted to ``yuv444`` (three planes of the same size) or ``mono8``.  Over UDP each datagram is one
+packet.  Over TCP packets have no delimiter, but every header begins with the same 18 bytes, by which the reader
+resynchronizes after invalid data.
 """
 
 from __future__ import annotations
@@ -42,7 +43,7 @@ class Closing:
 
 @dataclass(frozen=True)
 class Posture:
-    """Text about the joints that another client of the camera requested."""
+    """Text about the joints, which a different client of the camera requested."""
 
     text: str
 
@@ -71,7 +72,7 @@ def encode_header(encoding: int, compression: int, width: int, height: int, t: i
 
 
 def encode_block(one: Block, size: int | None = None) -> bytes:
-    """Encode one block; ``size`` replaces the length of its JPEG, to create invalid packets."""
+    """Encode one block; ``size`` replaces the length of its JPEG, so that tests can create invalid packets."""
     head = (
         encode_string("FbkImage")
         + struct.pack("<4I", one.width, one.height, one.layer, one.channel)
@@ -129,12 +130,12 @@ class PictureReader:
 
 
 def _check_start(data: bytearray) -> None:
-    """Reject invalid data early: its first bytes, read as a length, could make the reader wait for long."""
+    """Reject invalid data early: if read as a length, its first bytes could make the reader wait for a long time."""
     for start in (HEADER_START, CLOSING):
         if start.startswith(data[: len(start)]):
             return
     if not POSTURE.startswith(data[4 : 4 + len(POSTURE)]):
-        raise BadFrame("not the start of a camera packet")
+        raise BadFrame("the data is not the start of a camera packet")
 
 
 def _read_message(cursor: Cursor) -> Message:
@@ -156,7 +157,7 @@ def _read_message(cursor: Cursor) -> Message:
 
 def _read_block(cursor: Cursor) -> Block:
     if cursor.read_string(32) != "FbkImage":
-        raise BadFrame("not the start of a block of channels")
+        raise BadFrame("the data is not the start of a block of channels")
     width, height, layer, channel = cursor.read_words(4)
     form = cursor.read_string(32)
     if form in ("JPEGColor", "JPEGGrayscale"):
@@ -178,11 +179,11 @@ def _read_block(cursor: Cursor) -> Block:
 
 
 def _join_blocks(blocks: Sequence[Block], width: int, height: int) -> tuple[str, bytes]:
-    """Return encoding and bytes; of three JPEGs, one per channel, only the brightness, which is a picture by itself."""
+    """Return encoding and bytes; of three JPEGs, one per channel, return the brightness, a valid picture by itself."""
     if blocks[0].form.startswith("JPEG"):
         return "jpeg", blocks[0].data
     if any(one.form.startswith("JPEG") for one in blocks):
-        raise BadFrame("raw channels and JPEGs in one picture")
+        raise BadFrame("the picture contains both raw channels and JPEGs")
     planes = [_scale_up(one, width, height) for one in blocks]
     return ("yuv444" if len(planes) == 3 else "mono8"), b"".join(planes)
 

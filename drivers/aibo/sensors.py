@@ -23,7 +23,7 @@ BUTTONS = ("LFrPaw", "RFrPaw", "LBkPaw", "RBkPaw", "chin", "head", "frontback", 
 PAN, TILT, NOD = (-1.536, 1.536), (-1.309, 0.0), (-0.262, 0.785)
 OUTPUT_COUNT = 47
 MAX_RANGE_MM = 10_000.0
-"""Largest plausible reading of an infrared ranger, in mm."""
+"""Maximum plausible reading of an infrared ranger, in mm."""
 
 _SENSOR_BOUNDS = (
     *((-1.0, MAX_RANGE_MM),) * 3,
@@ -33,7 +33,7 @@ _SENSOR_BOUNDS = (
 _CAPACITY_MAH = 2200.0
 WRAP_MS = 2**32
 MAX_GAP_MS = 1000
-"""Longest gap in ms that odometry bridges; after a longer one the movement is unknown."""
+"""Longest gap in ms over which odometry integrates; after a longer gap the movement is unknown."""
 
 
 def is_known(state: WorldState) -> bool:
@@ -75,7 +75,7 @@ def convert_state(state: WorldState) -> dict[str, Value]:
 
 
 def make_state(values: Mapping[str, Value], joints: Sequence[float], dialect: str, t: int, frame: int) -> WorldState:
-    """Return the world state of an ERS-7 with ``values`` and ``joints``; missing values are as at rest."""
+    """Return the world state of an ERS-7 with ``values`` and ``joints``; missing values are those of a dog at rest."""
 
     def number(key: str, default: float) -> float:
         return float(values.get(key, default))
@@ -95,12 +95,12 @@ def make_state(values: Mapping[str, Value], joints: Sequence[float], dialect: st
 
 def _check_bounds(row: Sequence[float], bounds: Sequence[tuple[float, float]]) -> None:
     for value, (low, high) in zip(row, bounds, strict=True):
-        if not low <= value <= high:  # NaN is in no bounds
-            raise BadFrame(f"{value} is not from {low} to {high}")
+        if not low <= value <= high:  # NaN is never within bounds
+            raise BadFrame(f"{value} is not between {low} and {high}")
 
 
 class Odometry:
-    """Extends the robot's time past its wrap, and integrates the commanded velocity over it."""
+    """Converts the robot's wrapping time stamps to a steady time, and integrates the commanded velocity over it."""
 
     def __init__(self) -> None:
         self.t = 0.0
@@ -112,7 +112,7 @@ class Odometry:
         self._newest = None
 
     def convert_time(self, t_ms: int) -> float:
-        """Convert a time stamp near the newest one to seconds of ``t``."""
+        """Convert a time stamp close to the newest one to seconds of the steady time."""
         if self._newest is None:
             return self.t
         return self.t + ((t_ms - self._newest + WRAP_MS // 2) % WRAP_MS - WRAP_MS // 2) / 1000.0

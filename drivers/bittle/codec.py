@@ -1,7 +1,8 @@
 """Codec of OpenCat, the protocol of Petoi's robots: commands to the robot and lines from it; pure.
 
-A command begins with its token.  A lower-case token has text arguments and ends with a line feed, an upper-case token
-has binary arguments and ends with ``~``.  The robot answers with lines, the last of which is the token alone.
+A command begins with its token.  A command with a lower-case token has text arguments and ends with a line feed; a
+command with an upper-case token has binary arguments and ends with ``~``. The robot answers with lines; the last line
+contains only the token.
 """
 
 from __future__ import annotations
@@ -31,10 +32,10 @@ NAME = re.compile(r"[A-Za-z][A-Za-z0-9]{0,15}")
 def encode_skill(name: str) -> bytes:
     """Return the command for a skill.
 
-    A gait runs until the next skill, a posture is held, a behaviour ends by itself.
+    A gait and a posture last until the next skill; a behaviour ends by itself.
     """
     if not NAME.fullmatch(name):
-        raise ValueError(f"not a valid skill name: {name!r}")
+        raise ValueError(f"{name!r} is not a valid skill name")
     return b"k" + name.encode() + END_TEXT
 
 
@@ -92,7 +93,7 @@ class LineReader:
 
 
 def is_end(line: str, token: str) -> bool:
-    """Return whether ``line`` ends the answer to the command with ``token``; toggles answer in either case."""
+    """Return whether ``line`` ends the answer to ``token``; a toggle may answer in upper or lower case."""
     return line.lower() == token.lower()
 
 
@@ -120,17 +121,17 @@ def parse_joints(lines: Sequence[str]) -> dict[int, float]:
     numbers = _find_numbers(lines)
     half = len(numbers) // 2
     if half == 0 or len(numbers) % 2 or numbers[:half] != [float(one) for one in range(half)] or half > MAX_JOINTS:
-        raise BadFrame(f"not a list of joint angles: {' / '.join(lines)}")
+        raise BadFrame(f"the answer is not a list of joint angles: {' / '.join(lines)}")
     if any(abs(angle) > MAX_JOINT_ANGLE_DEG for angle in numbers[half:]):
-        raise BadFrame(f"joint angle beyond {MAX_JOINT_ANGLE_DEG:g} degrees: {' / '.join(lines)}")
+        raise BadFrame(f"a joint angle is beyond {MAX_JOINT_ANGLE_DEG:g} degrees: {' / '.join(lines)}")
     return {joint: math.radians(angle) for joint, angle in enumerate(numbers[half:])}
 
 
 def parse_attitude(lines: Sequence[str]) -> dict[str, float]:
-    """Return ``roll``, ``pitch``, ``yaw`` in radians of a BiBoard's first sensor; raise ``BadFrame`` if invalid."""
+    """Return ``roll``, ``pitch``, ``yaw`` in radians from a BiBoard's first sensor; raise ``BadFrame`` if invalid."""
     for line in lines:
         if line.startswith(("ICM:", "MCU:")):
-            # Columns have no space between them if a number fills its column.
+            # If a number fills its column, no space separates it from the next column.
             numbers = _find_numbers([line[4:].split("MCU:")[0]])
             if len(numbers) == 6:
                 return _to_radians(roll=numbers[5], pitch=numbers[4], yaw=numbers[3])
@@ -173,7 +174,7 @@ def _find_numbers(lines: Sequence[str]) -> list[float]:
 
 def _to_radians(**degrees: float) -> dict[str, float]:
     if any(abs(angle) > 360.0 for angle in degrees.values()):
-        raise BadFrame(f"angle beyond 360 degrees: {degrees}")
+        raise BadFrame(f"an angle is beyond 360 degrees: {degrees}")
     return {name: math.remainder(math.radians(angle), math.tau) for name, angle in degrees.items()}
 
 
@@ -181,12 +182,12 @@ def _to_radians(**degrees: float) -> dict[str, float]:
 
 
 def encode_request(host: str, path: str) -> bytes:
-    """Return an HTTP request for ``path``, after which the robot closes the connection."""
+    """Return an HTTP request for ``path`` that asks the robot to close the connection after its response."""
     return encode_head(f"GET {path} HTTP/1.1", f"Host: {host}", "Connection: close")
 
 
 def format_command_path(board: str, command: bytes) -> str:
-    """Return the path at which a robot with this board takes a command; the robot adds the line feed itself."""
+    """Return the path to which ``command`` is sent on a robot with this board; the robot adds the line feed itself."""
     quoted = quote_from_bytes(command.removesuffix(END_TEXT), safe="")
     return f"/action?name={quoted}" if board == "nyboard" else f"/cmd?cmd={quoted}"
 
@@ -197,15 +198,15 @@ def format_status_path(task: str) -> str:
 
 
 def parse_task_id(body: bytes) -> str:
-    """Return the id of the task that a BiBoard created for a command; raise ``BadFrame`` if there is none."""
+    """Return the id of the task that a BiBoard created for a command; raise ``BadFrame`` if ``body`` has no id."""
     found = re.fullmatch(rb"\s*TASK_ID:\s*([0-9A-Za-z_-]{1,40})\s*", body)
     if not found:
-        raise BadFrame(f"not a task id: {body[:60]!r}")
+        raise BadFrame(f"the response is not a task id: {body[:60]!r}")
     return found[1].decode()
 
 
 def parse_task_result(body: bytes) -> bytes | None:
-    """Return the result of a task, None while it runs; raise ``BadFrame`` if it failed or the answer is invalid."""
+    """Return the result of a task, None while the task runs; raise ``BadFrame`` if it failed or ``body`` is invalid."""
     state, _, rest = body.partition(b"\n")
     state = state.strip()
     if state in (b"pending", b"running"):
@@ -216,7 +217,7 @@ def parse_task_result(body: bytes) -> bytes | None:
 
 
 class ResponseReader:
-    """Reads one HTTP response, which ends after its ``Content-Length`` or with the connection."""
+    """Reads one HTTP response, which ends after ``Content-Length`` bytes or with the connection."""
 
     MAX_BYTES = 8192
 

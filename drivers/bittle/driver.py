@@ -1,8 +1,7 @@
-"""Driver of Petoi's robot dog Bittle, on a cable or over Wi-Fi.
+"""Driver of Petoi's robot dog Bittle, over a cable or Wi-Fi.
 
-A gait continues until the next skill, because the robot has no time-out.  The driver therefore ends each motion at
-its deadline, and a dead man's switch does so if this process freezes.  A dog that loses its link while it walks
-keeps walking.
+A gait continues until the next skill, because the robot has no time-out. The driver therefore ends each motion at its
+deadline; if this process freezes, a dead man's switch ends the motion. A walking dog whose link is lost keeps walking.
 """
 
 from __future__ import annotations
@@ -32,7 +31,7 @@ from drivers.serial import SerialConnector
 MANIFEST = Manifest("serial", "serial", "on a cable", {"port": "/dev/ttyUSB0"}, is_on_cable=True)
 
 VERSION_TIMEOUT_S = 1.0
-"""Seconds to wait for the robot's version before asking again: it may be booting."""
+"""Seconds to wait for the robot's version before asking again: the robot may be booting."""
 POLL_S, HTTP_POLL_S = 0.05, 0.2
 POLL_TIMEOUT_S = 1.0
 GAIT_RETRY_S = 1.0
@@ -40,20 +39,20 @@ GAIT_RETRY_S = 1.0
 REST_RETRY_S = 2.0
 """Seconds after which an unanswered command to lie down is repeated."""
 SKILL_TIMEOUT_S = 15.0
-"""Longest duration of a behaviour; the longest known ones take about eight seconds."""
+"""Maximum duration of a behaviour in seconds; the longest known behaviours take about eight seconds."""
 MAX_MISSED_POLLS = 3
-"""Missing answers after which old values are dropped; if all polls fail, the driver greets the robot again."""
+"""Missing answers after which an old value is dropped; if all polls fail, the driver asks for the version again."""
 BATTERY_POLL_PERIOD = 20
-"""One poll in this many asks for the battery."""
+"""Every how many polls the battery voltage is requested."""
 EMPTY_V, FULL_V = 6.8, 8.4
-"""Voltages of two lithium cells."""
+"""Voltages of the two lithium cells in series, empty and full."""
 
 
 class BittleDriver(LinkedDriver):
     """One dog.
 
-    ``enable`` makes it stand, ``disable`` makes it lie down with its servos off, its state after ``connect``.  ``act``
-    returns the velocity of the nearest gait, which odometry integrates.
+    ``enable`` makes the dog stand up. ``disable`` makes it lie down with its servos off, which is also its state after
+    ``connect``. ``act`` returns the velocity of the nearest gait; odometry integrates this velocity.
     """
 
     SWITCH_S = 4.0
@@ -87,7 +86,7 @@ class BittleDriver(LinkedDriver):
         self._values: dict[str, dict[str, Value]] = {}
 
     def invoke(self, name: str, **arguments: float | str) -> Deferred[Mapping[str, Value]]:
-        """Run a posture or behaviour until it is done; ``joint`` turns joints, given by name, to angles in radians."""
+        """Run a posture or behaviour to its end; ``joint`` turns joints, given by name, to angles in radians."""
         if name not in self._description.skills:
             return super().invoke(name, **arguments)
         if not self._is_up or self.state in ("stale", "closed"):
@@ -102,16 +101,16 @@ class BittleDriver(LinkedDriver):
                 raise Unsupported(f"{name} takes no arguments")
         except Unsupported as error:
             return fail(error)
-        # The skill replaces any gait.
+        # The skill replaces a running gait.
         self._clear_motion()
         self._update_odometry()
         self._velocity, self._requested_gait, self._running_skill = REST, "", name
-        # The robot answers no poll while the skill runs.
+        # The robot does not answer polls while the skill runs.
         self.STALE_S += SKILL_TIMEOUT_S
         return self._requests.request(command, SKILL_TIMEOUT_S).addBoth(self._on_skill_done, name)
 
     def act(self, action: Action, permit: Permit) -> Action:
-        """As for every driver; raises ``NotEnabled`` while a skill runs, because the robot would act only after it."""
+        """Perform ``action``; raises ``NotEnabled`` also while a skill runs, because that would delay the action."""
         if self._running_skill:
             raise NotEnabled(f"{self._name} is busy with {self._running_skill}; wait until it is done")
         return super().act(action, permit)
@@ -141,7 +140,7 @@ class BittleDriver(LinkedDriver):
         return {key: getattr(velocity, key.removeprefix("base.")) for key in motion}
 
     def _halt(self) -> None:
-        # With its servos off the dog would stand up.
+        # A dog whose servos are off would stand up.
         if self._wants_motors is True:
             self._request_gait(STAND, REST)
 
@@ -252,12 +251,12 @@ class BittleDriver(LinkedDriver):
         board = codec.parse_board(lines)
         self._board = self._options.board if self._options.board != "auto" else board or "biboard"
         if board and board != self._board:
-            self._set_problem(f"this robot has a {board}, the option board says {self._board}; correct the option")
+            self._set_problem(f"this robot has a {board}, but the option board is {self._board}; correct the option")
         else:
             self._problem = ""
         self._values = {"mode": {"mode": self._board}}
         self._missed_polls = {}
-        # Its state is unknown, so it lies down, with its servos off, before any other command.
+        # The dog's state is unknown, so the first command makes it lie down and switches its servos off.
         self._lie_down()
         self._up()
         self._schedule_poll()
@@ -266,9 +265,9 @@ class BittleDriver(LinkedDriver):
         if self._link is None or self._is_closed:
             return
         self._set_problem(
-            f"it does not report its version; is it switched on, and {self._options.baud} baud right?"
+            f"the robot does not report its version; is it switched on, and is {self._options.baud} baud correct?"
             if self._options.port
-            else "it does not report its version; is it switched on, and its web server part of the firmware?"
+            else "the robot does not report its version; is it switched on, and does its firmware have a web server?"
         )
         self._version_timeout_s = min(self._version_timeout_s * 1.5, 5.0)
         if not failure.check(LinkLost):
@@ -317,13 +316,13 @@ class BittleDriver(LinkedDriver):
         if not self._is_up or self._is_closed:
             return
         self._missed_polls[key] = self._missed_polls.get(key, 0) + 1
-        # It may have restarted and lie down: the next action sends its gait again.
+        # The dog may have restarted and be lying down: the next action sends its gait again.
         self._is_gait_certain = False
         if self._missed_polls[key] >= MAX_MISSED_POLLS:
             self._values.pop(key, None)
         polls = self._list_polls()
         if all(self._missed_polls.get(one, 0) >= MAX_MISSED_POLLS for one in polls):
-            self._set_problem("it answers nothing; is it switched on, and in range?")
+            self._set_problem("the robot does not answer; is it switched on, and in range?")
             self._on_lost(LinkLost(f"{self._name} does not answer"))
             self._request_version()
         else:
@@ -339,7 +338,7 @@ class BittleDriver(LinkedDriver):
         observed["skill.running"] = self._running_skill or (self._requested_gait if self._velocity != REST else "")
         for group in self._values.values():
             observed |= group
-        # The robot sends no time.
+        # The robot sends no time stamps, so the time of arrival is used.
         self._observed(observed, self._clock.seconds())
 
     def _update_odometry(self) -> None:

@@ -1,4 +1,4 @@
-"""The few velocities that a Bittle has, and the choice of the one nearest to a requested velocity."""
+"""The few velocities of a Bittle, and the selection of the gait nearest to a requested velocity."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from typing import NamedTuple
 
 STAND = "up"
 MIN_SPEED_MPS, MIN_TURN_RADPS = 0.02, 0.1
-"""Requested speeds below these, in m/s and rad/s, mean standing."""
+"""Minimum requested speeds in m/s and rad/s; if both are lower, the robot stands."""
 
 
 class Velocity(NamedTuple):
@@ -28,14 +28,14 @@ GAITS: Mapping[str, Velocity] = {
     "vtL": Velocity(0.0, 0.5),
     "vtR": Velocity(0.0, -0.5),
 }
-"""Approximate velocity of each skill on a smooth floor; measured values of a robot go into its options."""
+"""Approximate velocity of each skill on a smooth floor; the options may contain measured values instead."""
 
 
 def select_gait(vx: float, wz: float, gaits: Mapping[str, Velocity]) -> tuple[str, Velocity]:
     """Return the skill nearest to the requested velocity, and its real velocity.
 
-    A slow request still selects a moving gait.  A gait that moves in an unrequested direction is never selected;
-    if no other fits, the robot stands.
+    Even a slow requested velocity selects a moving gait. A gait that moves in an unrequested direction is never
+    selected; if no gait is suitable, the robot stands.
     """
     vx = 0.0 if abs(vx) < MIN_SPEED_MPS else vx
     wz = 0.0 if abs(wz) < MIN_TURN_RADPS else wz

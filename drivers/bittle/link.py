@@ -17,7 +17,7 @@ from drivers.timer import Timer
 REQUEST_TIMEOUT_S = 3.0
 """Seconds after which an unanswered request has failed."""
 STATUS_POLL_S = 0.05
-"""Interval at which a BiBoard's task is polled, for at most ``TASK_TIMEOUT_S``."""
+"""Interval in seconds at which a BiBoard's task is polled, for at most ``TASK_TIMEOUT_S``."""
 TASK_TIMEOUT_S = 16.0
 MAX_FAILURES = 3
 """Consecutive failures after which the link counts as lost."""
@@ -39,7 +39,7 @@ class HttpConnector:
 
 
 class HttpLink:
-    """A persistent connection and its one link; ``problem`` says why the robot cannot be reached.
+    """A link over many HTTP connections; ``problem`` is the reason why the robot cannot be reached.
 
     ``should_send`` is called when a queued command can be sent; if it returns False, the command is dropped.
     """
@@ -70,7 +70,7 @@ class HttpLink:
     # -- Line -------------------------------------------------------------------------------------------------------
 
     def disconnect(self) -> Deferred[None]:
-        """Send only the last queued command, which makes the robot lie down; fires when its request has ended."""
+        """Send only the last queued command, which makes the robot lie down; fires when that request has ended."""
         self._is_wanted = False
         if self._is_up:
             self._is_up = False
@@ -148,7 +148,7 @@ class HttpLink:
     def _on_text(self, body: bytes, command: bytes, end: float) -> None:
         if not self._is_wanted:
             return
-        # Output that follows the dongle's response stays in the dongle until the next request, even an empty one.
+        # Output after the dongle's response stays in the dongle until the next request, which may be empty.
         is_done = _has_end(body, command)
         if not is_done and self.clock.seconds() < end and not self._queue:
             self._timer.set(STATUS_POLL_S, self._request_more, command, end)
@@ -178,7 +178,7 @@ class HttpLink:
             self._timer.set(STATUS_POLL_S, self._request_status, task, command, end)
             return
         lines = (result or b"") + b"\n"
-        # On a cable the token ends the answer; here the status of the task does.
+        # On a cable the token ends the answer; over HTTP the status of the task shows the end.
         if result is not None and not _has_end(lines, command):
             lines += command[:1] + b"\n"
         self._deliver(lines)
@@ -200,7 +200,7 @@ class HttpLink:
             self._send_next()
 
     def on_command_dropped(self) -> None:
-        """Handle a request with a command that ``should_send`` dropped."""
+        """Handle a request whose command was dropped because of ``should_send``."""
         self._end_request()
         self._send_next()
 
@@ -217,7 +217,7 @@ class HttpLink:
         return self._connector.connect(self._host, self._port, request)
 
     def store_peer(self, link: Link) -> None:
-        """Store the peer's address of a request's connection."""
+        """Store the address of the other end of a request's connection."""
         self._peer = getattr(link, "peer", None) or self._peer
 
     def encode_command_request(self, command: bytes) -> bytes:
@@ -245,7 +245,7 @@ def _has_end(lines: bytes, command: bytes) -> bool:
 
 
 class _Request:
-    """One request over its own connection; ``command`` is the command that it carries, if any."""
+    """One request over its own connection; ``command`` is the command in the request, if any."""
 
     def __init__(self, http_link: HttpLink, path: str, take: Callable[[bytes], None], command: bytes = b"") -> None:
         self._http_link = http_link
@@ -261,7 +261,7 @@ class _Request:
     def link_up(self, link: Link) -> None:
         if self._is_sent:
             # The first connection was lost, and the robot may already have performed the command.
-            self._fail("the robot closes without an answer; is its web server part of the firmware?")
+            self._fail("the robot closed the connection without an answer; does its firmware have a web server?")
             return
         if self._command and not self._http_link.should_send(self._command):
             self.drop()
@@ -298,7 +298,7 @@ class _Request:
         self._reconnector.disconnect()
 
     def _on_timeout(self) -> None:
-        self._fail("the robot does not answer; is it switched on, in this network, and the option host right?")
+        self._fail("the robot does not answer; is it switched on and in this network, and is the option host correct?")
 
     def _finish(self, body: bytes) -> None:
         self.drop()

@@ -1,4 +1,4 @@
-"""Options of the kind "bittle"; each error names the remedy."""
+"""Options of the kind "bittle"; each error says how to correct it."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ JOINT_LIMITS = {
     **dict.fromkeys(("rb_shoulder", "lb_shoulder"), (-80, 200)),
     **dict.fromkeys(("lf_knee", "rf_knee", "rb_knee", "lb_knee"), (-80, 200)),
 }
-"""Degrees."""
+"""The lowest and highest angle of each joint in degrees."""
 
 
 def _parse_gaits(table: Mapping[str, tuple[float, float]]) -> tuple[tuple[str, Velocity], ...]:
@@ -75,7 +75,7 @@ class Options:
 
 
 def parse_options(table: Mapping[str, object]) -> Options:
-    """Convert and check ``table``; raise ``UsageError`` that names the key and the remedy."""
+    """Convert and check ``table``; raise ``UsageError`` with the key, the problem and the remedy."""
     options = convert_options("bittle", table, Options)
     if bool(options.port) == bool(options.host):
         raise UsageError('driver "bittle": write one of the options port = "/dev/ttyUSB0" and host = "192.168.1.40"')

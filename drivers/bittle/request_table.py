@@ -1,7 +1,7 @@
 """Match commands to the lines of the robot's answers.
 
-The robot executes commands in order, so a command can be sent before the previous one is answered: a stop never
-waits.
+The robot executes commands in order, so a command can be sent before the previous command is answered. In particular,
+a stop is always sent immediately.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from drivers.errors import NoReply, RobotError, Unsupported
 OVERFLOW = "OVF"
 """The robot's reply to a command that is too long."""
 MAX_ANSWER_LINES = 40
-"""Most lines stored of one answer; further ones are dropped."""
+"""Maximum number of stored lines of one answer; further lines are dropped."""
 
 
 @dataclass(eq=False)
@@ -65,11 +65,11 @@ class RequestTable:
                     self._fail(pending, Unsupported(f"the robot knows no skill {name!r}"))
                     return
         for place, pending in enumerate(self._pending):
-            # The answer to a skill starts with its name, which distinguishes commands with the same token.
+            # The answer to a skill starts with the skill's name, which distinguishes commands with the same token.
             if place and pending.token == "k" and pending.command[1:].strip() == line.encode():
                 self._skip_to(place)
                 break
-        # Before the end of a rest, the robot reports that its gyroscope is off, with the gyroscope's token.
+        # Before it answers the rest command, the robot reports the gyroscope as off, with the gyroscope's token.
         is_gyroscope_report = self._pending[0].token == "d" and is_end(line, "g")
         if not is_gyroscope_report:
             for place, pending in enumerate(self._pending):
@@ -98,7 +98,7 @@ class RequestTable:
             pending.done.errback(error)
 
     def _remove(self, pending: _PendingCommand) -> bool:
-        """Remove a pending command; return False if it was already removed by the errback of another one."""
+        """Remove a pending command; return False if the errback of another command has already removed it."""
         if pending not in self._pending:
             return False
         self._pending.remove(pending)

@@ -1,8 +1,8 @@
 """Codec of cameras that serve MJPEG over HTTP: ``multipart/x-mixed-replace``, one part per picture.
 
-No standard exists apart from RFC 2046; this accepts the variants in use: a boundary with or without its dashes, parts
-with a ``Content-Length`` or ended by the next boundary only, lines ended by CR LF or LF, and chunked encoding (as an
-ESP32-CAM sends).
+The only standard is RFC 2046. The reader accepts the variants in use: the boundary may lack its dashes, a part may
+have no ``Content-Length`` and end at the next boundary, lines may end with CR LF or LF, and the encoding may be
+chunked (as from an ESP32-CAM).
 """
 
 from __future__ import annotations
@@ -13,9 +13,9 @@ from collections.abc import Callable, Mapping
 from drivers.errors import BadFrame
 
 MAX_PICTURE_BYTES = 1024 * 1024
-"""Largest picture in bytes."""
+"""Maximum size of a picture in bytes."""
 MAX_HEADER_BYTES = 8192
-"""Largest header in bytes, of the stream or of one picture."""
+"""Maximum size of a header in bytes, of the stream or of one picture."""
 TOO_LARGE_ERROR = f"a picture has more than {MAX_PICTURE_BYTES} bytes; set a smaller size in the camera"
 CONTENT_TYPE = "multipart/x-mixed-replace"
 BOUNDARY = "frame"
@@ -40,7 +40,7 @@ class StreamReader:
     """Extracts the pictures from the answer to one request; their content is not checked.
 
     ``read`` raises ``BadFrame`` with reason and remedy if the answer is not a stream of pictures or becomes invalid;
-    after that the reader cannot be used.  ``is_over`` is true after the regular end of the stream.
+    the reader cannot be used afterwards. ``is_over`` is true after the regular end of the stream.
     """
 
     def __init__(self) -> None:
@@ -113,7 +113,7 @@ class StreamReader:
         self._field_bytes += end + 1
         name, _, value = line.partition(b":")
         if name.strip().lower() == b"content-length" and value.strip().isdigit():
-            # Twelve digits are enough to exceed the limit.
+            # Use at most twelve digits, which are enough to exceed the limit.
             self._length = int(value.strip()[:12])
             if self._length > MAX_PICTURE_BYTES:
                 raise BadFrame(TOO_LARGE_ERROR)
@@ -133,7 +133,7 @@ class StreamReader:
     def _read_until_boundary(self) -> bool:
         at = self._rest.find(self._delimiter, self._search_start)
         if at < 0:
-            # The last bytes may be a line end and the start of the boundary; they do not count.
+            # The last bytes may be a line end and the start of the boundary, which are not part of the picture.
             if len(self._rest) - len(self._delimiter) - 4 > MAX_PICTURE_BYTES:
                 raise BadFrame(TOO_LARGE_ERROR)
             self._search_start = max(0, len(self._rest) - len(self._delimiter) + 1)
@@ -169,7 +169,7 @@ class _Chunks:
             line, end, after = data.removeprefix(b"\r").removeprefix(b"\n").partition(b"\n")
             if not end:
                 if len(data) > 100:
-                    raise BadFrame("its chunks have no size; is it a camera?")
+                    raise BadFrame("the camera sent a chunk that has no size; is it a camera?")
                 self._rest = data
                 break
             size = line.partition(b";")[0].strip()
@@ -208,7 +208,7 @@ def parse_method(data: bytes) -> str | None:
 
 
 def _find_blank_line(data: bytes | bytearray) -> int:
-    """Return the offset after the first blank line; -1 without one."""
+    """Return the offset after the first blank line; -1 if there is no blank line."""
     ends = [at + len(end) for end in (b"\r\n\r\n", b"\n\n") if (at := data.find(end)) >= 0]
     return min(ends, default=-1)
 

@@ -45,7 +45,7 @@ class CameraDriver(SensingDriver):
         return self._fps
 
     def set_camera_fps(self, fps: float) -> None:
-        """Set the frame rate in pictures per second; at 0 no pictures are taken, and the device stays ready."""
+        """Set the frame rate in pictures per second; at 0 no pictures are taken, but the device stays ready."""
         previous, self._fps = self._fps, fps
         self._stream.set_fps(fps)
         self.STALE_S = max(0.5, 3.0 / fps) if fps > 0 else 0.5
@@ -56,11 +56,11 @@ class CameraDriver(SensingDriver):
 
     @property
     def problem(self) -> str:
-        """The reason why there are no pictures, and the remedy; empty while there are."""
+        """The reason why no pictures arrive, and the remedy; empty if pictures arrive."""
         return self._problem
 
     def diagnostics(self) -> dict[str, float]:
-        """As for every driver; ``dropped`` is the number of pictures replaced by newer ones."""
+        """The counters of every driver, and ``dropped``, the number of pictures replaced by newer pictures."""
         return {**super().diagnostics(), "dropped": float(getattr(self._stream, "dropped", 0))}
 
     # -- called by the stream ---------------------------------------------------------------------------------------
@@ -103,13 +103,13 @@ class CameraDriver(SensingDriver):
         return self._stream.stop()
 
     def _report_idle(self) -> None:
-        """Observe without a new picture, so that the link does not become stale while no pictures are requested."""
+        """Publish an observation that has no new picture, so that the link does not become stale at frame rate 0."""
         self._idle_timer.set(self.STALE_S / 2, self._report_idle)
         self._observed({}, self._clock.seconds() - self._started_at, frame=self._frame)
 
 
 def make_driver(options: Mapping[str, object], name: str, clock: IReactorTime, connector: Any) -> CameraDriver:
-    """Return a driver of a camera or a substitute; only a camera on the network uses ``connector``."""
+    """Return a driver of a camera or a substitute source; only a camera on the network uses ``connector``."""
     wanted = parse_options(options)
     return CameraDriver(wanted, make_picture_stream(wanted, clock, connector), clock, name)
 

@@ -22,8 +22,8 @@ PICTURE_TIMEOUT_S = 5.0
 class MjpegStream:
     """The pictures at ``address``; ``size`` is their width and height according to the options.
 
-    A camera sends at its own rate; pictures above the requested rate are dropped.  At rate 0 the connection is closed
-    after the first picture, which shows that the camera is present.
+    A camera sends at its own rate; pictures that exceed the requested rate are dropped. At rate 0 the connection is
+    closed after the first picture, which proves that the camera is present.
     """
 
     log = Logger()
@@ -32,7 +32,7 @@ class MjpegStream:
         self, address: StreamAddress, size: tuple[int, int], connector: Connector, clock: IReactorTime
     ) -> None:
         self.dropped = 0
-        """Pictures above the requested rate."""
+        """Number of pictures that exceeded the requested rate."""
         self._address = address
         self._size = size
         self._connector = connector
@@ -99,7 +99,7 @@ class MjpegStream:
         receiver, size = self._receiver, read_size(jpeg)
         assert receiver is not None
         if size is None:
-            receiver.on_invalid_picture(f"a picture of {len(jpeg)} bytes is no whole JPEG")
+            receiver.on_invalid_picture(f"a picture of {len(jpeg)} bytes is not a complete JPEG")
             return
         self._backoff.reset()
         self._timer.set(PICTURE_TIMEOUT_S, self._on_silence)
@@ -108,7 +108,7 @@ class MjpegStream:
         if now < self._due_at:
             self.dropped += 1
             return
-        # Add to the due time, so that a late picture does not change the rate.
+        # The next due time counts from the last one, so that a late picture does not change the rate.
         self._due_at = max(self._due_at + interval, now)
         self._has_shown = True
         if size != self._size:
@@ -139,7 +139,7 @@ class MjpegStream:
 
 
 class _Attempt:
-    """One connection attempt; data of an earlier one, which is still being closed, is ignored."""
+    """One connection attempt; data of an earlier attempt, whose connection is still being closed, is ignored."""
 
     def __init__(self, stream: MjpegStream, request: bytes) -> None:
         self.reader = codec.StreamReader()

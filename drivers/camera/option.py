@@ -16,7 +16,7 @@ from drivers.reading import Description
 from formats.convert import PRINTABLE, Unit
 
 MIN_SIDE_PX, MAX_SIDE_PX = 16, 1920
-"""Smallest and largest side of a picture, in pixels."""
+"""Minimum and maximum width and height of a picture, in pixels."""
 Side = Annotated[int, Meta(ge=MIN_SIDE_PX, le=MAX_SIDE_PX), Unit("pixels")]
 DEVICE_PREFIX = "/dev/video"
 
@@ -40,10 +40,10 @@ class StreamAddress:
 class Options:
     """The source of the pictures and their properties.
 
-    ``source`` is the number of a camera or its device file, a video file, or a folder of JPEGs; ``url`` is instead the
-    address of an MJPEG stream.  Pictures of a camera are requested in ``width`` and ``height``, and reduced to that
-    size; other pictures are used unchanged.  ``lens`` is the horizontal field of view in degrees,
-    ``quality`` the quality of the JPEGs, ``ahead`` the distance of the camera from the centre of its robot, in metres.
+    ``source`` is the number of a camera or its device file, a video file, or a folder of JPEGs; alternatively, ``url``
+    is the address of an MJPEG stream.  Pictures of a camera are requested in ``width`` and ``height``, and reduced to
+    that size; other pictures are used unchanged.  ``lens`` is the horizontal field of view in degrees, ``quality`` the
+    quality of the JPEGs, ``ahead`` the distance of the camera from the centre of its robot, in metres.
     """
 
     source: Annotated[
@@ -67,7 +67,7 @@ class Options:
 
 
 def parse_options(table: Mapping[str, object]) -> Options:
-    """Convert and check ``table``; raise ``UsageError`` that names the key and the remedy."""
+    """Convert and check ``table``; raise ``UsageError`` with the key, the problem and the remedy."""
     if "url" in table and "source" in table:
         raise UsageError('driver "camera": options source and url exclude each other; leave one out')
     if "url" in table:
@@ -96,7 +96,7 @@ def parse_url(url: object) -> StreamAddress:
 
 
 def make_description(options: Options) -> Description:
-    """Return the description of the camera; it has no motor, so it has no actions."""
+    """Return the description of the camera, which has no motors and therefore no actions."""
     camera = {"width": options.width, "height": options.height, "fps": options.fps, "fov_h_deg": options.lens}
     camera["ahead"] = options.ahead
     model = "a camera" if options.is_device else "pictures in place of a camera"

@@ -1,6 +1,6 @@
-"""Read a blocking camera in its own thread, or files on a clock in virtual time.
+"""Read a blocking camera in its own thread, or read files at times of a clock.
 
-Both deliver at most one picture at a time: a picture that is not yet consumed is replaced by a newer one.
+Both streams deliver at most one picture at a time: a picture that has not been consumed is replaced by the next one.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ class PictureReceiver(Protocol):
     """Receives pictures and errors, always on the reactor's thread."""
 
     def on_picture(self, picture: JpegPicture) -> None:
-        """Take a picture."""
+        """Process a picture."""
 
     def on_invalid_picture(self, reason: str) -> None:
         """Handle an invalid picture."""
@@ -70,7 +70,7 @@ class Backoff:
 class SourceReader:
     """Opens the source if necessary, takes pictures, and reports results.
 
-    ``tell`` gets the name of a method of ``PictureReceiver`` and its argument; it must not block.
+    ``tell`` is called with the name of a method of ``PictureReceiver`` and its argument, and must not block.
     """
 
     def __init__(self, source: PictureSource, tell: Callable[[str, Any], None]) -> None:
@@ -108,7 +108,7 @@ class SourceReader:
 
 
 class TimedStream:
-    """Pictures from files, timed by ``clock``: the same run shows the same pictures."""
+    """Pictures from files, timed by ``clock``: repeated runs deliver the same pictures."""
 
     def __init__(self, source: PictureSource, clock: IReactorTime) -> None:
         self._reader = SourceReader(source, self._report)
@@ -159,7 +159,7 @@ class ThreadedStream:
         self._queue: list[tuple[str, Any]] = []
         self._thread: threading.Thread | None = None
         self.dropped = 0
-        """Pictures that were replaced by a newer one."""
+        """Number of pictures that were replaced by a newer picture."""
 
     def start(self, receiver: PictureReceiver, fps: float) -> None:
         """Start the thread."""

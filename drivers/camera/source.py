@@ -17,7 +17,7 @@ from formats.jpeg import read_size
 
 MAX_FILES = 10_000
 MAX_PICTURE_BYTES = 4 * 1024 * 1024
-"""Largest picture in bytes."""
+"""Maximum size of a picture in bytes."""
 
 
 @dataclass(frozen=True)
@@ -36,7 +36,7 @@ class PictureSource(Protocol):
         """Open the source; raise ``LinkLost`` with the reason and the remedy."""
 
     def read_picture(self) -> JpegPicture:
-        """Return the next picture; raise ``BadFrame`` for an invalid one, ``LinkLost`` after the last one."""
+        """Return the next picture; raise ``BadFrame`` for an invalid picture, ``LinkLost`` if no more pictures come."""
 
     def close(self) -> None:
         """Release the source; may be called in any state."""
@@ -79,7 +79,7 @@ class FolderSource:
         return JpegPicture(data, *size)
 
     def close(self) -> None:
-        """Discard the list of files; after ``open`` the sequence continues."""
+        """Discard the list of files; the next ``open`` continues with the next file."""
         self._files = []
 
 
@@ -102,17 +102,17 @@ class CaptureSource:
                 raise LinkLost('OpenCV is not installed: install swarm-node with the extra "vision"') from error
         name = f"{source}" if isinstance(source, str) else f"/dev/video{source}"
         if not options.is_device and not os.path.isfile(name):
-            raise LinkLost(f"{name}: there is no such video file, or folder of JPEGs")
+            raise LinkLost(f"{name}: no such video file or folder of JPEGs exists; correct the option source")
         if name.startswith("/dev/"):
             if not os.path.exists(name):
-                raise LinkLost(f"{name}: there is no such camera; is it plugged in?")
+                raise LinkLost(f"{name}: no such camera exists; is it plugged in?")
             if not os.access(name, os.R_OK | os.W_OK):
                 raise LinkLost(f"{name}: no permission; add this user to the group video")
             source = int(name.removeprefix("/dev/video")) if name.removeprefix("/dev/video").isdecimal() else name
         capture = self._cv2.VideoCapture(source)
         if not capture.isOpened():
             capture.release()
-            raise LinkLost(f"{name}: it cannot be opened; something else may be using it, or it holds no pictures")
+            raise LinkLost(f"{name} cannot be opened; another program may be using it, or it contains no pictures")
         if options.is_device:
             capture.set(self._cv2.CAP_PROP_FRAME_WIDTH, options.width)
             capture.set(self._cv2.CAP_PROP_FRAME_HEIGHT, options.height)
@@ -120,7 +120,7 @@ class CaptureSource:
         self._capture = capture
 
     def read_picture(self) -> JpegPicture:
-        """Wait for the camera's next picture, or read the video's next one; a video restarts at its end."""
+        """Return the camera's next picture, or the next picture of the video, which restarts at its end."""
         if self._capture is None:
             raise LinkLost("it is not open")
         is_read, picture = self._capture.read()

@@ -1,4 +1,4 @@
-"""Parse and write the NMEA 0183 sentences ``HDG``, ``HDM`` and ``HDT`` of any talker, from a stream cut at any byte.
+"""Parse and write the NMEA 0183 sentences ``HDG``, ``HDM`` and ``HDT`` of any talker, in chunks of any size.
 
 ::
 
@@ -6,7 +6,8 @@
     $HCHDM,98.3,M*hh                degrees from magnetic north
     $HCHDT,95.5,T*1B                degrees from true north
 
-Degrees count clockwise from north.  East is added: reading + deviation is magnetic, magnetic + variation is true.
+Headings are in degrees clockwise from north. Deviation and variation are positive to the east: reading + deviation is
+the magnetic heading, magnetic heading + variation is the true heading.
 """
 
 from __future__ import annotations
@@ -17,7 +18,7 @@ from dataclasses import dataclass
 from drivers.errors import BadFrame
 
 MAX_LINE_BYTES = 120
-"""Longest sentence in bytes; the standard allows 82."""
+"""Maximum length of a sentence in bytes; the standard allows 82."""
 RANKS = {"HDM": 1, "HDG": 2, "HDT": 3}
 """The sentences that contain a heading; if a compass sends several, the highest rank is used."""
 
@@ -36,7 +37,7 @@ class Heading:
 class SentenceReader:
     """Extracts headings from a stream; ``sentences`` counts valid sentences, ``bad_frames`` invalid lines.
 
-    After the first sentence with a checksum, sentences without one are invalid.
+    After the first sentence with a checksum, sentences that lack a checksum are invalid.
     """
 
     def __init__(self) -> None:
@@ -55,7 +56,7 @@ class SentenceReader:
             try:
                 heading = self._parse_line(line)
             except BadFrame:
-                # The first line of a stream is usually the end of a sentence.
+                # The first line of a stream is usually the end of a cut sentence, so it is not counted as invalid.
                 self.bad_frames += not is_first
                 continue
             self.sentences += 1
@@ -76,7 +77,7 @@ class SentenceReader:
 
 
 def parse_heading(line: bytes) -> Heading | None:
-    """Parse one sentence; return None for another kind; raise ``BadFrame`` if it is invalid or has no heading."""
+    """Parse one sentence; None if its kind has no heading; raise ``BadFrame`` if it is invalid or empty."""
     body, star, checksum = line.strip().partition(b"*")
     if len(line) > MAX_LINE_BYTES or not body.startswith((b"$", b"!")) or not body.isascii():
         raise BadFrame("not an NMEA 0183 sentence")

@@ -21,7 +21,7 @@ MANIFEST = Manifest("serial", "serial", "on a cable", {"device": "/dev/ttyUSB1"}
 
 HEADING = "compass.heading"
 SILENCE_S, MAX_SILENCE_S = 3.0, 24.0
-"""Seconds without a heading after which the link is reopened, at first and at most; the time doubles each time."""
+"""Seconds without a heading after which the link is reopened: initial and maximum value, doubled each time."""
 RANK_HOLD_S = 3.0
 """Seconds for which sentences of a lower rank are ignored after one of the best rank."""
 
@@ -71,7 +71,7 @@ class CompassDriver(SensingDriver, LinkedDriver):
         self._counts["frames"] += 1
         if not self._is_up:
             self._up()
-        # The compass sends no time.
+        # The compass sends no time stamps, so the time of arrival is used.
         self._observed({HEADING: self._convert_heading(heading)}, now)
 
     def _convert_heading(self, heading: Heading) -> float:
@@ -99,13 +99,13 @@ class CompassDriver(SensingDriver, LinkedDriver):
             return (
                 f"{endpoint} is not open"
                 if is_cable
-                else f"nothing answers at {endpoint}:{scale}; is it on, and in this network?"
+                else f"nothing answers at {endpoint}:{scale}; is the compass switched on, and in this network?"
             )
         if self._counts["bytes"] == self._bytes_at_start:
-            return "it sends nothing; is it on, and is its output NMEA 0183?"
+            return "the compass sends nothing; is it switched on, and is its output NMEA 0183?"
         if self._reader.sentences:
-            return "it sends no heading (HDG, HDM or HDT); is it a compass, and has it settled?"
-        return "it sends, but no sentences; " + (
+            return "the device sends no heading (HDG, HDM or HDT); is it a compass, and has it settled?"
+        return "the device sends data, but no sentences; " + (
             f"is {scale} baud right?" if self._options.device else "is it NMEA 0183?"
         )
 
@@ -113,7 +113,7 @@ class CompassDriver(SensingDriver, LinkedDriver):
 def make_driver(
     options: Mapping[str, object], name: str, clock: IReactorTime, connector: Connector | None
 ) -> CompassDriver:
-    """Return a driver of the compass that ``options`` name."""
+    """Return a driver of the compass at the address in ``options``."""
     wanted = parse_options(options)
     if connector is None and wanted.device:
         from drivers.serial import SerialConnector  # not needed for a compass on the network

@@ -22,9 +22,10 @@ Baud = Literal[4800, 9600, 19200, 38400, 57600, 115200]
 class Options:
     """A compass at ``host`` and ``port``, or at the serial ``device`` with ``baud``.
 
-    ``mounted_deg`` is the angle of its mark to the left of the robot's front; ``variation_deg`` the angle of magnetic
-    north east of true north, for a compass that does not send it; ``x_axis_deg`` the direction of the map's x axis in
-    degrees clockwise from north.  ``rate`` is the number of headings per second that it sends.
+    ``mounted_deg`` is the angle by which the mark on the compass points to the left of the robot's front.
+    ``variation_deg`` is the angle by which magnetic north is east of true north, for a compass that does not send the
+    variation. ``x_axis_deg`` is the direction of the map's x axis in degrees clockwise from north.  ``rate`` is the
+    number of headings per second that it sends.
     """
 
     host: Annotated[str, Meta(min_length=1, examples=["192.168.1.31"]), PRINTABLE] = ""
@@ -43,7 +44,7 @@ class Options:
 
 
 def parse_options(table: Mapping[str, object]) -> Options:
-    """Convert and check ``table``; raise ``UsageError`` that names the key and the remedy."""
+    """Convert and check ``table``; raise ``UsageError`` with the key, the problem and the remedy."""
     options = convert_options("compass", table, Options)
     if bool(options.host) == bool(options.device):
         raise UsageError('driver "compass": write either option host (over the network) or device (on a serial cable)')
@@ -51,5 +52,5 @@ def parse_options(table: Mapping[str, object]) -> Options:
 
 
 def make_description(options: Options) -> Description:
-    """Return the description of the compass; it has no motor, so it has no actions."""
+    """Return the description of the compass, which has no motors and therefore no actions."""
     return Description("compass", "a compass (NMEA 0183)", {"compass": {}}, {}, 0.05, {"compass": options.rate})

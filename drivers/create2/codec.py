@@ -28,11 +28,11 @@ MODES = ("off", "passive", "safe", "full")
 FRAME_S = 0.015
 """Interval in seconds at which the robot refreshes and streams its packets."""
 MAX_WHEEL_SPEED_MMPS = 500
-"""Top speed of a wheel in mm/s."""
+"""Maximum speed of a wheel in mm/s."""
 STRAIGHT_RADIUS = -0x8000
 FRAME_HEADER = 19
 MAX_FRAME_BYTES = 172
-"""Largest frame in bytes that a line of 115200 baud carries in ``FRAME_S``."""
+"""Maximum frame in bytes that a line of 115200 baud transmits within ``FRAME_S``."""
 
 
 @dataclass(frozen=True)
@@ -129,7 +129,7 @@ GROUPS: dict[int, range] = {
     106: range(46, 52),
     107: range(54, 59),
 }
-"""Packet ids that stand for a sequence of packets."""
+"""Group ids, each of which stands for a sequence of packets."""
 
 _DATA_LENGTHS = {
     **dict.fromkeys((RESET, START, 130, SAFE, FULL, 133, 134, CLEAN, 136, DOCK, STOP), 0),
@@ -143,7 +143,10 @@ _DATA_LENGTHS = {
 
 
 def encode_drive(velocity: int, radius: int) -> bytes:
-    """Drive at ``velocity`` mm/s on an arc of ``radius`` mm, left positive; or ``STRAIGHT_RADIUS``; 1 and -1 spin."""
+    """Drive at ``velocity`` mm/s on an arc of ``radius`` mm, left positive, or straight (``STRAIGHT_RADIUS``).
+
+    The radius 1 turns on the spot to the left, -1 to the right.
+    """
     return struct.pack(">Bhh", DRIVE, velocity, radius)
 
 
@@ -198,8 +201,7 @@ def encode_stream_frame(ids: Sequence[int], values: Mapping[str, int]) -> bytes:
 class StreamReader:
     """Splits the robot's bytes into frames of the packets ``ids``.
 
-    Other data is dropped and counted: boot messages, incomplete frames, wrong checksums, and frames with values out of
-    range.
+    All other data is dropped and counted: boot messages, incomplete frames, wrong checksums, and values out of range.
     """
 
     def __init__(self, ids: Sequence[int]) -> None:
@@ -223,7 +225,7 @@ class StreamReader:
             self._skip_to_head()
             if len(rest) < self._frame_size:
                 return
-            # The header bytes can occur within data: checksum and ids decide.
+            # The header bytes can also occur within data: only a frame with the right checksum and ids is accepted.
             values = None if sum(rest[: self._frame_size]) & 0xFF else self._read_values()
             if values is None:
                 self._count_loss()
@@ -245,7 +247,7 @@ class StreamReader:
             del rest[: at if at > 0 else len(rest)]
 
     def _count_loss(self) -> None:
-        # Consecutive bad bytes count once.
+        # Consecutive bad bytes are counted once.
         self.bad_frames += not self._is_resyncing
         self._is_resyncing = True
 
@@ -272,14 +274,14 @@ class Command:
 
 
 class CommandReader:
-    """Splits a stream into commands as the robot does: it waits for missing data without a time-out."""
+    """Splits a stream into commands as the robot does: it waits for missing data for an unlimited time."""
 
     def __init__(self) -> None:
         self.unknown = 0
         self._rest = bytearray()
 
     def read(self, data: bytes) -> Iterator[Command]:
-        """Yield the commands that ``data`` completes; bytes that start no command are counted as ``unknown``."""
+        """Yield the commands that ``data`` completes; bytes that do not start a command are counted as ``unknown``."""
         rest = self._rest
         rest += data
         while rest:
@@ -297,7 +299,7 @@ class CommandReader:
     def _find_command_size(self) -> int | None:
         """Return the size of the first command in bytes.
 
-        None means that it is not a command; more bytes than available means that the size is not known yet.
+        None: the data does not start with a command. A size larger than the data: the command is incomplete.
         """
         rest = self._rest
         opcode = rest[0]

@@ -1,8 +1,8 @@
 """Driver of a Create 2 or Roomba on a serial cable.
 
-The robot has no time-out: it drives until the next command, or until its own cliff and wheel-drop sensors stop it.
-The driver therefore ends each motion at its deadline, and a dead man's switch does so if this process freezes.  If
-the cable is unplugged during a motion, the robot cannot be stopped.
+The robot has no time-out: it drives until the next command, or until its own cliff and wheel-drop sensors stop it. The
+driver therefore ends each motion at its deadline; if this process freezes, a dead man's switch ends the motion. If the
+cable is unplugged during a motion, the robot cannot be stopped.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ MANIFEST = Manifest("serial", "serial", example={"port": "/dev/ttyUSB0"}, is_on_
 START_DELAY_S = 0.05
 """Seconds to wait after ``START`` before the next command."""
 SILENCE_S = 0.5
-"""Seconds without a frame after which the robot is started again: it was switched off, or rebooted."""
+"""Seconds without a frame after which ``START`` is sent again: the robot was switched off, or rebooted."""
 MAX_SILENCE_S = 4.0
 DOCK_TIMEOUT_S = 120.0
 """Seconds within which the robot must find its home base."""
@@ -42,9 +42,9 @@ DOCK_TIMEOUT_S = 120.0
 class Create2Driver(LinkedDriver):
     """One robot on a serial device.
 
-    ``enable`` selects safe (or full) mode, ``disable`` passive mode.  If the robot leaves safe mode by itself (a cliff,
-    a lifted wheel, a charger), that is a safety event: ``safety.event`` names it, the motion is zero, and the motors
-    stay off until ``enable`` is called again.
+    ``enable`` selects safe (or full) mode, ``disable`` passive mode.  If the robot leaves safe mode by itself (at a
+    cliff, a lifted wheel or a charger), that is a safety event: ``safety.event`` contains the reason, the motion is
+    zero, and the motors stay off until ``enable`` is called again.
     """
 
     def __init__(
@@ -69,7 +69,7 @@ class Create2Driver(LinkedDriver):
         self._counts |= {"safety_events": 0, "jumps": 0}
 
     def invoke(self, name: str, **arguments: float | str) -> Deferred[Mapping[str, Value]]:
-        """Run ``dock``: seek the home base until it charges; or ``beep``: ``hz`` from 49 to 12544 for ``s`` seconds."""
+        """Run ``dock``: drive to the home base; or ``beep``: play ``hz``, from 49 to 12544, for ``s`` seconds."""
         if name not in SKILLS:
             return super().invoke(name, **arguments)
         if not self._is_up or self.state in ("stale", "closed"):
@@ -83,7 +83,7 @@ class Create2Driver(LinkedDriver):
 
     def _close(self) -> Deferred[None]:
         self._end_docking(LinkLost(f"{self._name}: disconnected"))
-        # Without STOP the robot stays awake and drains its battery.
+        # If it gets no STOP, the robot stays awake and drains its battery.
         self._send(codec.encode_drive_direct(0, 0) + codec.encode_pause(False) + bytes((codec.START, codec.STOP)))
         return super()._close()
 
@@ -114,7 +114,7 @@ class Create2Driver(LinkedDriver):
         if arguments:
             raise Unsupported("dock takes no arguments")
         if self._docking is not None:
-            raise UsageError("it is already seeking its dock")
+            raise UsageError("{self._name} is already seeking its dock")
         if self._wants_motors is not True or self._mode not in DRIVING_MODES:
             raise NotEnabled(f"{self._name}'s motors are off; call enable() first")
         self.stop()
@@ -136,7 +136,7 @@ class Create2Driver(LinkedDriver):
             docking.callback({"dock.on": True})
 
     def _end_docking(self, error: Exception | None) -> bool:
-        """End the search for the dock, at rest and in passive mode; return whether a search was in progress."""
+        """End the search for the dock: the robot stands still, in passive mode; return whether it was searching."""
         docking, self._docking = self._docking, None
         if docking is None:
             return False
@@ -169,7 +169,7 @@ class Create2Driver(LinkedDriver):
         self._start()
 
     def link_down(self) -> None:
-        """Reset the motion here; the robot keeps driving until it is reachable again; called by the link."""
+        """Reset the motion; the robot itself keeps driving until it is reachable again; called by the link."""
         self._link = None
         self._timer.cancel()
         self._end_docking(LinkLost(f"the link to {self._name} was lost"))
@@ -200,7 +200,7 @@ class Create2Driver(LinkedDriver):
         values["skill.running"] = "" if self._docking is None else "dock"
         if self._docking is not None and values["dock.on"]:
             self._on_docked()
-        # The robot sends no time.
+        # The robot sends no time stamps, so the time of arrival is used.
         self._observed(values, now)
 
     def _on_safety_event(self, event: str) -> None:
@@ -211,7 +211,7 @@ class Create2Driver(LinkedDriver):
         self.log.warn("{robot} left {mode} mode: {event}", robot=self._name, mode=self._options.mode, event=event)
 
     def _start(self) -> None:
-        # A robot with an incomplete command takes the first of these bytes as the missing data.
+        # A robot that has received an incomplete command reads the first of these bytes as the missing data.
         self._send(bytes((codec.START,)) * 5)
         self._reader = codec.StreamReader(PACKET_IDS)
         self._odometry.discard_counts()
@@ -238,9 +238,9 @@ class Create2Driver(LinkedDriver):
         self._silence_s = min(2.0 * self._silence_s, MAX_SILENCE_S)
         has_noise = self._counts["bytes"] > self._bytes_at_start and not self._is_up
         self._set_problem(
-            f"it sends, but no frames; is {self._options.baud} baud right, and is it a Create 2?"
+            f"the device sends data, but no frames; is {self._options.baud} baud correct, and is it a Create 2?"
             if has_noise
-            else "it sends nothing; is it switched on, and the cable in?"
+            else "the robot sends nothing; is it switched on, and is the cable plugged in?"
         )
         self._end_docking(LinkLost(f"{self._name} does not answer"))
         if self._is_up:

@@ -9,9 +9,9 @@ WHEEL_BASE_MM = 235.0
 """Distance between the wheels in mm."""
 WHEEL_BASE_M, M_PER_COUNT = WHEEL_BASE_MM / 1000.0, MM_PER_COUNT / 1000.0
 SPEED_WINDOW_S = 0.12
-"""Window of the mean speeds in seconds; one count within one frame would be 30 mm/s."""
+"""Seconds over which speeds are averaged; within one frame, a single count would mean 30 mm/s."""
 MAX_WHEEL_SPEED_MPS = 0.8
-"""Top speed of a wheel in m/s; larger changes of the counts are invalid."""
+"""Maximum speed of a wheel in m/s; counts that imply a higher speed are invalid."""
 JUMP_TOLERANCE_M = 0.05
 """Tolerance in metres for frames that arrive late and together."""
 
@@ -30,13 +30,13 @@ class Odometry:
         self._recent_steps: list[tuple[float, float, float]] = []
 
     def discard_counts(self) -> None:
-        """Keep the pose and discard the counts: the next ones may come from a restarted robot."""
+        """Keep the pose, but discard the last counts: the next counts may come from a restarted robot."""
         self._last = None
         self._recent_steps = []
         self.vx = self.wz = 0.0
 
     def update(self, left: int, right: int, now: float) -> None:
-        """Take the wheels' counts at ``now``; implausible jumps do not move the pose."""
+        """Update the pose from the encoder counts at ``now``; ignore implausible jumps."""
         before, self._last = self._last, (left, right)
         if before is None:
             self._recent_steps = [(now, 0.0, 0.0)]

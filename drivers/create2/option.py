@@ -1,4 +1,4 @@
-"""Options of the kind "create2"; each error names the remedy."""
+"""Options of the kind "create2"; each error says how to correct it."""
 
 from __future__ import annotations
 
@@ -12,9 +12,9 @@ from drivers.option import Device, convert_options
 from drivers.reading import Description
 
 Baud = Literal[57600, 115200]
-"""Slower lines cannot carry a frame within the 15 ms of the robot's interval."""
+"""The supported baud rates; slower lines cannot transmit a frame within the robot's interval of 15 ms."""
 Mode = Literal["safe", "full"]
-"""The robot stops at cliffs by itself (safe), or does not (full)."""
+"""In ``safe`` mode the robot stops at cliffs by itself, in ``full`` mode it does not."""
 SKILLS = ("dock", "beep")
 
 
@@ -30,7 +30,7 @@ class Options:
 
 
 def parse_options(table: Mapping[str, object]) -> Options:
-    """Convert and check ``table``; raise ``UsageError`` that names the key and the remedy."""
+    """Convert and check ``table``; raise ``UsageError`` with the key, the problem and the remedy."""
     return convert_options("create2", table, Options)
 
 

@@ -44,7 +44,7 @@ HOME_BASE = 2
 
 
 def get_mode(frame: Mapping[str, int]) -> str:
-    """Return the mode, ``off passive safe full``; the wheels obey commands in the last two."""
+    """Return the mode, ``off passive safe full``; the wheels obey commands only in the modes safe and full."""
     return MODES[frame["mode"]]
 
 

@@ -1,11 +1,13 @@
-"""The process of the dead man's switch: it outlives a frozen node and halts the robot.
+"""The process of the dead man's switch, which halts the robot if the node freezes or ends.
 
-The node sends it, over a socket that is its standard input, the bytes that halt the robot, their destination, and the
-end of the motion in force.  When that time passes without a newer message, or the socket closes while a motion is in
-force, the process writes those bytes, three times.  It ends with the node.
+The node sends messages to the socket that is the standard input of this process: the bytes that halt the robot, their
+destination, and the end of the motion in force. When that time passes and no newer message has arrived, or when the
+socket closes while a motion is in force, this process sends these bytes to the robot, three times. It ends with the
+node.
 
-It starts without site packages and imports almost nothing (``_socket`` and ``_signal`` avoid the imports of ``socket``
-and ``signal``), so it is ready within about 30 ms and takes about 9 MiB, of which less than 4 are private.
+The process starts without site packages and imports almost nothing, so it is ready within about 30 ms and takes about
+9 MiB of memory, of which less than 4 are private. ``_socket`` and ``_signal`` avoid the imports of ``socket`` and
+``signal``.
 """
 
 from __future__ import annotations
@@ -18,22 +20,23 @@ import time
 from struct import Struct
 
 HEADER = Struct("<cdI")
-"""Header of each message of the node: kind, time, and number of bytes that follow."""
+"""Header of each message from the node: kind, time, and number of bytes that follow."""
 SET_LINK, SET_SERVER, ARM, DISARM, LINK_LOST = b"g", b"c", b"u", b"r", b"l"
 """Kinds of messages.
 
-``SET_LINK`` carries a descriptor and the bytes that halt; ``SET_SERVER`` host, port and a request, separated by NUL.
+``SET_LINK`` contains a descriptor and the bytes that halt; ``SET_SERVER`` contains host, port and a request, separated
+by NUL.
 """
 HALTED = b"."
 """Sent to the node after each halt."""
 GRACE_S = 0.05
-"""Seconds after the end of a motion within which a running node reports rest; after that it counts as frozen."""
+"""Seconds after the end of a motion within which the node must report rest; otherwise it is regarded as frozen."""
 HALT_REPEAT_S, HALT_COUNT = 0.1, 3
-"""Interval and number of repetitions of a halt: one written into the middle of a partly written command is lost."""
+"""Interval and number of halts: a halt that is written into the middle of an incomplete command is lost."""
 ANSWER_S = 0.25
 """Seconds to wait for a server's answer."""
 TICK_S = 0.05
-"""Longest wait while a motion is in force: waits do not progress while the machine is suspended."""
+"""Maximum wait in seconds while a motion is in force: the timer of a wait stops while the machine is suspended."""
 FD_STRUCT = Struct("<i")
 
 
@@ -50,7 +53,7 @@ class SharedLink:
         self._unsent = b""
 
     def send(self, halt: bytes) -> bool:
-        """Write without blocking, bytes left over from the last call first; return False, as nothing confirms it."""
+        """Write without blocking, first the bytes left from the last call; return False: no answer confirms it."""
         data = self._unsent + halt
         try:
             poll = select.poll()
@@ -58,7 +61,7 @@ class SharedLink:
             if poll.poll(0):
                 self._unsent = data[os.write(self._descriptor, data) :]
         except OSError:
-            pass  # the link is dead
+            pass  # the link is broken
         return False
 
     def close(self) -> None:
@@ -102,7 +105,7 @@ class HaltTimer:
         self._next_halt_at = 0.0
 
     def set_halt_command(self, target: SharedLink | CommandServer, halt: bytes) -> None:
-        """Set the connection and the halt command; a motion in force stays in force."""
+        """Set the connection and the halt command; does not affect a motion in force."""
         self._close()
         self._target, self._halt = target, halt
 
@@ -125,7 +128,7 @@ class HaltTimer:
             self._motion_ends_at = moment - GRACE_S
 
     def get_timeout(self, moment: float) -> float | None:
-        """Return the seconds until ``send_due_halts`` is due; None if nothing is in force."""
+        """Return the seconds until ``send_due_halts`` is due; None if no motion is in force."""
         if self._halts_left:
             return max(0.0, self._next_halt_at - moment)
         return None if self._motion_ends_at is None else max(0.0, self._motion_ends_at + GRACE_S - moment)
@@ -151,7 +154,7 @@ class HaltTimer:
 
 
 class MessageParser:
-    """Parses messages of the node, cut at any byte, and applies them to ``halt_timer``."""
+    """Parses messages of the node, however they are split into chunks, and applies them to ``halt_timer``."""
 
     def __init__(self, halt_timer: HaltTimer) -> None:
         self._halt_timer = halt_timer
@@ -159,7 +162,7 @@ class MessageParser:
         self._descriptors: list[int] = []
 
     def feed(self, data: bytes, descriptors: list[int]) -> None:
-        """Take bytes, and the descriptors that arrived with them."""
+        """Process received bytes, and the descriptors that arrived with them."""
         self._descriptors += descriptors
         self._rest += data
         while len(self._rest) >= HEADER.size:
@@ -182,8 +185,8 @@ class MessageParser:
 
 
 def main() -> None:
-    """Run until the node is gone and the robot is at rest."""
-    # Ctrl-C and service managers signal all processes; this one has to end after its node.
+    """Run until the node has ended and the robot is at rest."""
+    # Ctrl-C and service managers send signals to all processes; this process ignores them, to end after its node.
     for number in (_signal.SIGINT, _signal.SIGTERM, _signal.SIGHUP, _signal.SIGQUIT, _signal.SIGTSTP):
         _signal.signal(number, _signal.SIG_IGN)
     node = _socket.socket(fileno=0)
@@ -214,11 +217,11 @@ def report_halt(node: _socket.socket) -> None:
     try:
         node.send(HALTED)
     except OSError:
-        return  # the node is gone; the next read reports it
+        return  # the node has ended; the next read reports it
 
 
 def read_messages(node: _socket.socket, parser: MessageParser) -> bool:
-    """Read all pending messages, so that newer ones count before time does; return whether the node still runs."""
+    """Read all pending messages before the time is checked; return whether the node still runs."""
     while True:
         try:
             data, extras, _, _ = node.recvmsg(65536, _socket.CMSG_SPACE(4 * FD_STRUCT.size))

@@ -1,7 +1,7 @@
-"""Start, feed and reap the process of a dead man's switch from the reactor's thread.
+"""Start, update and reap the process of a dead man's switch from the reactor's thread.
 
-The process shares the robot's open link: its descriptor is passed over a Unix socket.  The process starts with the
-first link and ends with the driver; if it dies, it is replaced with growing delays.
+The process shares the robot's open link: the link's descriptor is passed to it over a Unix socket. The process starts
+with the first link and ends with the driver; if it dies, it is restarted with growing delays.
 """
 
 from __future__ import annotations
@@ -25,11 +25,11 @@ from drivers.link import reactor_or_running
 
 PROGRAM = Path(__file__).resolve().with_name("process.py")
 FLUSH_S = 0.02
-"""Seconds after which sent data has left this process, with one of the reactor's next iterations."""
+"""Seconds after which sent data has left this process, in one of the reactor's next iterations."""
 MIN_RESTART_S, MAX_RESTART_S = 0.1, 5.0
-"""First and longest delay before a process that died is replaced."""
+"""Initial and maximum delay in seconds before a process that died is restarted."""
 REAP_INTERVAL_S, KILL_TIMEOUT_S = 0.01, 1.0
-"""Interval of checks on a process that should end, and the time after which it is killed."""
+"""Interval in seconds at which an ending process is checked, and seconds after which it is killed."""
 
 log = Logger()
 
@@ -37,7 +37,9 @@ log = Logger()
 def create_switch(robot: str) -> DeadManSwitch | None:
     """Return a switch for ``robot``; on a system that cannot run one log a warning and return None."""
     if os.name != "posix" or not hasattr(socket, "send_fds") or not sys.executable or not PROGRAM.exists():
-        log.warn("{robot}: no dead man's switch on this system; if this node freezes, the robot moves on", robot=robot)
+        log.warn(
+            "{robot}: this system has no dead man's switch; if this node freezes, the robot keeps moving", robot=robot
+        )
         return None
     return Supervisor(robot)
 
@@ -92,7 +94,7 @@ class Supervisor:
         self._send(ARM, self._motion_ends_at)
 
     def disarm(self) -> None:
-        """Announce that a halt was sent: nothing is in force once it has left this process."""
+        """Announce that a halt was sent: once the halt has left this process, no motion is in force."""
         if self._motion_ends_at is not None and self._closed is None:
             self._schedule_settle()
 
@@ -165,9 +167,9 @@ class Supervisor:
         except BlockingIOError:
             sent = 0
         except OSError:
-            return  # it died; the next read reports it
+            return  # the process died; the next read reports it
         if sent < len(message) and self._process is not None:
-            # The process does not read.  Kill it; its end is noticed by the next read, which starts another.
+            # The process does not read its messages.  Kill it; the next read notices its end and starts a new process.
             self._process.kill()
 
     # -- process ----------------------------------------------------------------------------------------------------
@@ -209,7 +211,9 @@ class Supervisor:
 
     def _on_no_start(self, error: OSError) -> None:
         if not self._has_warned:
-            self.log.warn("{robot}: no dead man's switch yet, retrying: {error}", robot=self._robot, error=error)
+            self.log.warn(
+                "{robot}: the dead man's switch did not start, retrying: {error}", robot=self._robot, error=error
+            )
         self._has_warned = True
         self._schedule_start()
 
@@ -226,7 +230,7 @@ class Supervisor:
         return "deadman"
 
     def doRead(self) -> None:  # noqa: N802 (Twisted's)
-        """Read a report that it halted the robot, or notice that it died."""
+        """Read the process's report that it halted the robot, or notice that the process died."""
         assert self._socket is not None
         try:
             data = self._socket.recv(4096)
@@ -252,7 +256,7 @@ class Supervisor:
             if now() - self._started_at > MAX_RESTART_S:
                 self._restart_s, self._has_warned = MIN_RESTART_S, False
             if not self._has_warned:
-                self.log.warn("{robot}: its dead man's switch died; starting another one", robot=self._robot)
+                self.log.warn("{robot}: its dead man's switch died; restarting it", robot=self._robot)
             self._has_warned = True
             self._schedule_start()
         else:
@@ -260,7 +264,7 @@ class Supervisor:
         self._reap(0.0)
 
     def _close_socket(self) -> None:
-        """Close the socket, upon which the process ends by itself."""
+        """Close the socket, which makes the process end by itself."""
         if self._socket is not None and self._process is not None:
             self._reactor.removeReader(self)
             self._socket.close()
@@ -268,7 +272,7 @@ class Supervisor:
             self._socket = self._process = None
 
     def _reap(self, patience: float) -> None:
-        """Reap processes that have ended, and kill the others after ``patience`` seconds."""
+        """Reap processes that have ended, and kill those that have not ended after ``patience`` seconds."""
         self._cancel("_reap_timer")
         self._ending_processes = [process for process in self._ending_processes if process.poll() is None]
         if self._ending_processes:

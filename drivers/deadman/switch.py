@@ -1,7 +1,7 @@
 """The interface of a dead man's switch, and an implementation in memory for tests.
 
-A driver reports the bytes that halt its robot, the end of the motion in force, and when the robot is at rest.  The
-switch halts the robot when that time passes without a newer message.
+A driver reports the bytes that halt its robot, the end of the motion in force, and when the robot is at rest.  When
+that end passes and no newer message has arrived, the switch halts the robot.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ class DeadManSwitch(Protocol):
 
     @property
     def halts(self) -> int:
-        """The number of times that it has halted the robot."""
+        """The number of times that the switch has halted the robot."""
 
     def set_halt_command(self, command: HaltCommand) -> None:
         """Set the halt command; call this when a link opens or the command changes."""
@@ -41,7 +41,7 @@ class DeadManSwitch(Protocol):
         """Announce, before a motion is commanded, that it is in force for ``seconds`` from now."""
 
     def disarm(self) -> None:
-        """Announce that a halt was sent: nothing is in force once it has left this process."""
+        """Announce that a halt was sent: once the halt has left this process, no motion is in force."""
 
     def on_link_lost(self) -> None:
         """Announce that the link is lost."""
@@ -52,7 +52,7 @@ class DeadManSwitch(Protocol):
 
 @dataclass
 class MemoryDeadManSwitch:
-    """A switch that only records its calls; ``seconds`` is None while nothing is in force."""
+    """A switch that only records its calls; ``seconds`` is None while no motion is in force."""
 
     halts: int = 0
     command: HaltCommand | None = None
@@ -71,12 +71,12 @@ class MemoryDeadManSwitch:
         self.calls.append("until")
 
     def disarm(self) -> None:
-        """Record that nothing is in force."""
+        """Record that no motion is in force."""
         self.seconds = None
         self.calls.append("rest")
 
     def on_link_lost(self) -> None:
-        """Record that there is no link."""
+        """Record the loss of the link."""
         self.command = None
         self.calls.append("leave")
 

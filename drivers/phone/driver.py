@@ -1,4 +1,4 @@
-"""Driver of a visitor's phone: its pictures are handed in by the web node; it senses, and its visitor moves it."""
+"""Driver of a visitor's phone, which senses and is moved by its visitor; the web node provides its pictures."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from drivers.reading import Description, Frame, Value
 MANIFEST = Manifest()
 
 TARGET_KEYS = ("target.bearing", "target.distance")
-"""Position of the red target in the page's detection: radians, left positive, and metres; NaN if it is not seen."""
+"""Position of the red target as detected by the page: radians, left positive, and metres; NaN if not seen."""
 
 
 class PhoneDriver(SensingDriver):
@@ -31,7 +31,7 @@ class PhoneDriver(SensingDriver):
         self._started_at = 0.0
 
     def process_picture(self, jpeg: bytes, width: int, height: int, values: Mapping[str, float]) -> None:
-        """Take one picture with its measurements; dropped before ``connect`` and after the end."""
+        """Publish one picture with its measurements; ignored before ``connect`` and after ``disconnect``."""
         if self.state in ("idle", "closed"):
             return
         if self.state != "ready" and self.state != "stopped":

@@ -13,9 +13,10 @@ from drivers.reading import Description
 from formats.convert import Unit
 
 FIELD_OF_VIEW_DEG = 65.0
-"""Field of view across the longer side of the picture.  No browser reports it; phones have 60 to 75 degrees."""
+"""Assumed field of view across the longer side of the picture, which no browser reports; phones have 60 to 75
+degrees."""
 MIN_SIDE_PX, MAX_SIDE_PX = 16, 640
-"""Smallest and largest side of a picture, in pixels."""
+"""Minimum and maximum width and height of a picture, in pixels."""
 Side = Annotated[int, Meta(ge=MIN_SIDE_PX, le=MAX_SIDE_PX), Unit("pixels")]
 TASK_FPS = 10.0
 """Pictures per second that are requested from a phone with a task."""
@@ -23,7 +24,7 @@ TASK_FPS = 10.0
 
 @dataclass(frozen=True)
 class Options:
-    """The pictures' size in pixels, and whether the phone reports its orientation and position."""
+    """The size of the pictures in pixels, and whether the phone reports its orientation and position."""
 
     width: Side = 208
     height: Side = 156
@@ -32,12 +33,12 @@ class Options:
 
 
 def parse_options(table: Mapping[str, object]) -> Options:
-    """Convert and check ``table``; raise ``UsageError`` that names the key and the remedy."""
+    """Convert and check ``table``; raise ``UsageError`` with the key, the problem and the remedy."""
     return convert_options("phone", table, Options)
 
 
 def make_description(options: Options) -> Description:
-    """Return the description of the phone; it has no motor, so it has no actions."""
+    """Return the description of the phone, which has no motors and therefore no actions."""
     lens = "fov_h_deg" if options.width >= options.height else "fov_v_deg"
     camera = {"width": options.width, "height": options.height, "fps": TASK_FPS, lens: FIELD_OF_VIEW_DEG}
     capabilities: dict[str, Mapping[str, float | str]] = {"camera": camera}

@@ -22,7 +22,7 @@ class Brain:
 
     robot: PyroRobot
     pauseTime = 0.1
-    """Seconds from step to step."""
+    """Seconds between two steps."""
 
     def __init__(self, name: str = "brain", engine: Engine | None = None, **arguments: Any) -> None:
         self.name = name
@@ -36,9 +36,9 @@ class Brain:
     def __getattr__(self, name: str) -> Any:
         """Delegate to the robot: ``self.move(0.5, 0.0)`` is ``self.robot.move(0.5, 0.0)``."""
         if name == "robot":
-            raise AttributeError("this brain has no engine and therefore no robot")
+            raise AttributeError("this brain has no engine and therefore no robot; run it with an Engine")
         if name not in DELEGATED_METHODS:
-            raise AttributeError(f"a brain has no {name}")
+            raise AttributeError(f"a brain has no attribute {name!r}")
         return getattr(self.robot, name)
 
     def setup(self, **arguments: Any) -> None:
@@ -46,7 +46,7 @@ class Brain:
 
     def step(self) -> None:
         """Make one decision; called after the robot was updated."""
-        raise NotImplementedError(f"{type(self).__name__} has no step")
+        raise NotImplementedError(f"{type(self).__name__} must define the method step()")
 
     def destroy(self) -> None:
         """Release the resources of ``setup``."""
@@ -82,7 +82,7 @@ class Engine:
         self._loop: LoopingCall | None = None
 
     def run(self, init: Callable[[Engine], Brain]) -> Deferred[None]:
-        """Create the brain and step it; fires when it has quit, fails with its exception.  Finally, stop the robot."""
+        """Create the brain and run its steps; fires when it quits, fails with its exception; then stop the robot."""
         self.robot.update()
         self.robot.localize()
         brain = self.brain = init(self)

@@ -11,7 +11,7 @@ from drivers.reading import Frame, Value
 from formats.jpeg import read_size
 
 Blob = tuple[int, int, int, int, int]
-"""Left, top, right and bottom in pixels from the upper left corner, and the area; all 0 for none."""
+"""Left, top, right and bottom in pixels from the upper left corner, and the area; all 0 if no blob was found."""
 Filter = Callable[["Camera"], Any]
 TOLERANCE = 30
 DEPTH = 3
@@ -20,10 +20,10 @@ DEPTH = 3
 class Camera(Device):
     """The camera; ``width`` and ``height`` in pixels, ``depth`` bytes per pixel.
 
-    ``addFilter`` takes the name ``match`` (red, green, blue, tolerance: marks pixels of about that colour), the name
-    ``blobify`` (channel, low, high, sort, size, draw, count: the largest blobs of marked pixels, or of that brightness
-    if none are marked), or a function of this camera.  All filters run on each new picture, and ``filterResults`` has
-    their results.
+    ``addFilter`` accepts one of two names or a function of this camera. ``match`` (red, green, blue, tolerance) marks
+    pixels of about that colour. ``blobify`` (channel, low, high, sort, size, draw, count) finds the largest blobs of
+    marked pixels, or of pixels of that brightness if none are marked. All filters run on each new picture, and
+    ``filterResults`` contains their results.
     """
 
     depth = DEPTH
@@ -41,7 +41,7 @@ class Camera(Device):
 
     @property
     def data(self) -> bytes:
-        """The newest picture, three bytes per pixel (red, green, blue), row by row; empty before the first."""
+        """The newest picture, three bytes per pixel (red, green, blue), row by row; empty before the first picture."""
         return b"" if self._load_picture() is None else bytes(self._image.tobytes())
 
     def addFilter(self, name: str | Filter, *arguments: float) -> None:
@@ -58,12 +58,12 @@ class Camera(Device):
         self._filters, self.filterResults = [], []
 
     def apply(self, name: str, *arguments: float) -> Any:
-        """Run one filter now; for functions given to ``addFilter``."""
+        """Run one filter now; a function that was given to ``addFilter`` may call this."""
         whole = [int(value) for value in arguments]
         return self._match(*whole) if name == "match" else self._blobify(*whole)
 
     def process_frame(self, frame: Frame | None) -> None:
-        """Take a picture if it is new, and run the filters on it."""
+        """Store a picture if it is new, and run the filters on it."""
         if frame is None or frame.seq == self._seq:
             return
         self._seq, self._frame, self._image, self._marked = frame.seq, frame, None, None

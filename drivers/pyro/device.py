@@ -13,7 +13,7 @@ DIRECTIONS: Mapping[str, float] = {
     **{"front_left": 45.0, "left": 90.0, "back_left": 135.0, "back": 180.0},
     **{"back_right": -135.0, "right": -90.0, "front_right": -45.0},
 }
-"""Direction of a ranger by its name, in degrees; other names have ``NAME_deg`` in the capability."""
+"""Direction of a ranger by its name, in degrees; for other names the capability contains ``NAME_deg``."""
 UNITS = ("ROBOTS", "METERS", "CM", "MM", "SCALED", "RAW")
 ALIASES = {"M": "METERS", "ROBOT": "ROBOTS"}
 DEFAULT_ARC_RAD = math.radians(20.0)
@@ -33,7 +33,7 @@ GROUPS: Mapping[str, tuple[float, float]] = {
     "back": (157.5, 202.5),
     "back-all": (112.5, 247.5),
 }
-"""Range of each group in degrees, from its right to its left edge."""
+"""The right and the left edge of each group of sensors, in degrees."""
 
 
 class Geometry(NamedTuple):
@@ -47,9 +47,9 @@ class Geometry(NamedTuple):
 
 
 class SensorValue:
-    """One reading: ``metres`` from the sensor, or ``most``, its maximum, if nothing is in range.
+    """One reading: ``metres`` from the sensor, or ``most``, the sensor's maximum, if nothing is in range.
 
-    ``unit`` is the unit of ``value``; ``radius`` is the robot's.  ``noise`` is 0: no noise is added.
+    ``unit`` is the unit of ``value``; ``radius`` is the radius of the robot. ``noise`` is 0: no noise is added.
     """
 
     noise = 0.0
@@ -103,7 +103,7 @@ def parse_unit(name: str) -> str:
 
 
 class Device:
-    """A device of ``type``; ``update`` passes it the newest sensor values."""
+    """A device of ``type``; ``update`` gives the device the newest sensor values."""
 
     def __init__(self, kind: str) -> None:
         self.type = kind
@@ -116,7 +116,7 @@ class Device:
         self.values: Mapping[str, Value] = {}
 
     def update(self, values: Mapping[str, Value], now: float) -> None:
-        """Take the newest sensor values."""
+        """Store the newest sensor values."""
         self.values, self.timestamp = values, now
 
     def getSensorValue(self, pos: int) -> SensorValue:
@@ -128,7 +128,7 @@ class Device:
 
 
 class SensorArray(Device):
-    """A device of several sensors; ``places`` maps a key of an observation to the position of the sensor."""
+    """A device with several sensors; ``places`` maps a key of an observation to the geometry of that sensor."""
 
     units = "ROBOTS"
     rawunits = "METERS"
@@ -141,7 +141,7 @@ class SensorArray(Device):
         self._keys: list[str] = []
 
     def update(self, values: Mapping[str, Value], now: float) -> None:
-        """Take the newest sensor values; the sensors are numbered from the left."""
+        """Store the newest sensor values; the sensors are numbered from the left."""
         super().update(values, now)
         self._keys = [key for key in self._places if key in values]
 
@@ -156,7 +156,7 @@ class SensorArray(Device):
 
     @property
     def groups(self) -> dict[str, tuple[int, ...]]:
-        """The names of the groups, and the positions of their sensors."""
+        """The names of the groups, and the numbers of their sensors."""
         found = {"all": tuple(range(len(self)))}
         for name, (low, high) in GROUPS.items():
             found[name] = tuple(one.pos for one in self if _is_within(one.angle(), low, high))
@@ -197,7 +197,7 @@ class SensorArray(Device):
 
     @property
     def pos(self) -> list[int]:
-        """The positions of the sensors."""
+        """The numbers of the sensors."""
         return [one.pos for one in self]
 
     @property
@@ -224,7 +224,7 @@ class SensorArray(Device):
         return [one.angle(unit) for one in self]
 
     def span(self, start: float, stop: float, units: str = "degrees") -> list[SensorValue]:
-        """Return the sensors between two angles, given in any order."""
+        """Return the sensors between two angles, which may be given in any order."""
         low, high = min(start, stop), max(start, stop)
         return [one for one in self if (angle := one.angle(units)) is not None and low <= angle <= high]
 
@@ -239,7 +239,7 @@ class Bumper(SensorArray):
 
 
 class Battery(Device):
-    """The battery: ``level`` 0 to 1, ``volts``; None if the robot does not report it."""
+    """The battery: ``level`` from 0 to 1, and ``volts``; None if the robot does not report the value."""
 
     @property
     def level(self) -> float | None:
@@ -253,7 +253,7 @@ class Battery(Device):
 
 
 class Pose(NamedTuple):
-    """Pan (-1 to 1, left positive), tilt (-1 to 0, down negative), zoom (none), roll (0 to 1: the second tilt)."""
+    """Pan (-1 to 1, left positive), tilt (-1 to 0, down negative), zoom (unused), roll (0 to 1: second tilt joint)."""
 
     pan: float
     tilt: float
@@ -262,11 +262,11 @@ class Pose(NamedTuple):
 
 
 AXES = {"pan": "pan", "tilt": "tilt", "roll": "nod"}
-"""Names of axes in brains, and the robot's names."""
+"""The robot's names of the axes, by their names in brains."""
 
 
 class Ptz(Device):
-    """A head; ``look`` turns joints to radians, ``limits`` are the robot's (``pan_min``, ``pan_max`` ...)."""
+    """A head; ``look`` turns joints to angles in radians within ``limits`` (``pan_min``, ``pan_max`` ...)."""
 
     supports = ("pan", "tilt", "roll")
 
@@ -284,7 +284,7 @@ class Ptz(Device):
         self._turn(tilt=share)
 
     def roll(self, share: float) -> None:
-        """Turn the second tilt."""
+        """Turn the second tilt joint."""
         self._turn(roll=share)
 
     def zoom(self, share: float) -> None:
@@ -295,7 +295,7 @@ class Ptz(Device):
         self._turn(pan=0.0, tilt=0.0, roll=0.0)
 
     def setPose(self, pan: float, tilt: float, zoom: float = 0.0, roll: float | None = None) -> None:
-        """Set all axes at once; the zoom is ignored."""
+        """Set all axes together; the zoom is ignored."""
         self._turn(pan=pan, tilt=tilt, **({} if roll is None else {"roll": roll}))
 
     @property
@@ -322,9 +322,10 @@ class Ptz(Device):
 
 
 def make_ranger(description: Description, values: Mapping[str, Value]) -> SensorArray | None:
-    """Return the range sensors of a robot; None without any.
+    """Return the range sensors of a robot; None if it has none.
 
-    They are named ``laser`` if there are more than four, ``ir`` on a dog with a near and a far one, else ``sonar``.
+    The device is named ``laser`` if it has more than four sensors, ``ir`` on a dog with a near and a far ranger, and
+    otherwise ``sonar``.
     """
     capability = description.capabilities.get("ranger")
     names = [key.removeprefix("range.") for key in values if key.startswith("range.")]
@@ -340,7 +341,7 @@ def make_ranger(description: Description, values: Mapping[str, Value]) -> Sensor
 
 
 def make_bumper(description: Description, values: Mapping[str, Value]) -> Bumper | None:
-    """Return the bumpers of a robot; None without any."""
+    """Return the bumpers of a robot; None if it has none."""
     names = [key.removeprefix("bump.") for key in values if key.startswith("bump.")]
     if not names:
         return None

@@ -3,9 +3,9 @@
 All calls are synchronous.  On the reactor's thread they call the driver directly; for another thread pass
 ``partial(blockingCallFromThread, reactor)`` as ``call``.
 
-The robot is not part of a team: it moves under the lowest token, so a robot that has obeyed a team refuses it
-(``StaleCommand``), and it stops half a second after the last call of its brain.  While its link is lost or its
-motors are off it ignores motion commands, and the log says why.
+The robot is not part of a team: its commands have the lowest token, so a robot that has obeyed a team refuses them
+(``StaleCommand``). The robot stops half a second after the last call of its brain. While its link is lost or its
+motors are off, motion commands are ignored and the reason is logged.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ from drivers.reading import Observation, Value
 
 TOKEN = 1
 TTL_S = 0.5
-"""Seconds after the last move or update of its brain after which the robot stops."""
+"""Seconds after the brain's last move or update after which the robot stops."""
 FEATURES = {
     "continuous-movement": "base2d",
     "range-sensor": "ranger",
@@ -34,7 +34,7 @@ FEATURES = {
     "mono-sound": "sound",
     "visual-feedback": "leds",
 }
-"""Names of features in brains, and the corresponding capabilities."""
+"""The capability of each feature, by the name of the feature in brains."""
 RANGERS = ("ir", "sonar", "laser")
 LEGS = {"left front": "LFr", "right front": "RFr", "left back": "LBk", "right back": "RBk"}
 JOINTS = {"rotator": "rotor", "rotor": "rotor", "elevator": "elvtr", "knee": "knee"}
@@ -44,12 +44,12 @@ RunFunction = Callable[[Callable[[], Any]], Any]
 
 
 def run_directly(call: Callable[[], Any]) -> Any:
-    """Call ``call`` on the reactor's thread, without waiting for asynchronous results."""
+    """Call ``call`` in this thread, the reactor's, and do not wait for asynchronous results."""
     return call()
 
 
 class PyroRobot:
-    """One robot; ``clock`` is its driver's.
+    """One robot; ``clock`` is the clock of its driver.
 
     ``call`` runs a function on the driver's thread and returns its result.  Speeds are fractions of the robot's limits,
     -1 to 1: ahead, to the left and counter-clockwise are positive.
@@ -77,16 +77,16 @@ class PyroRobot:
     # -- the link ---------------------------------------------------------------------------------------------------
 
     def connect(self) -> Any:
-        """Open the link and switch the motors on; on the reactor's thread return a Deferred that fires then.
+        """Open the link and switch the motors on; on the reactor's thread, return a Deferred that fires when done.
 
-        If the link is already open, as after an emergency stop at the robot, only the motors are switched on.
+        If the link is already open, for example after an emergency stop at the robot, only switch the motors on.
         """
         if self.driver.state not in ("idle", "closed"):
             return self._call(self.driver.enable)
         return self._call(lambda: self.driver.connect().addCallback(lambda _: self._on_connected()))
 
     def disconnect(self) -> Any:
-        """Stop, and close the link."""
+        """Stop the robot, and close the link."""
         return self._call(self.driver.disconnect)
 
     def _on_connected(self) -> Deferred[bool]:
@@ -217,13 +217,13 @@ class PyroRobot:
         return self._find_devices(kind)[index]
 
     def startDevice(self, name: str, **_options: object) -> Device:
-        """Update a device again; a number after its type is ignored (``camera0``)."""
+        """Start updating a device again; a number after its type is ignored (``camera0``)."""
         device = self._find_devices(name.rstrip("0123456789"))[0]
         device.active, device.state = 1, "started"
         return device
 
     def removeDevice(self, kind: str, index: int | None = None) -> None:
-        """Stop updating a device; its last values stay."""
+        """Stop updating a device; it keeps its last values."""
         for device in self._find_devices(kind.rstrip("0123456789"))[slice(index, None if index is None else index + 1)]:
             device.active, device.state = 0, "stopped"
 
@@ -241,7 +241,7 @@ class PyroRobot:
         return int(kind in self.devices or (kind == "range" and self._range is not None))
 
     def requires(self, wanted: str | Sequence[str]) -> int:
-        """Return 1 if the robot has all of these features and devices; raise ``ImportError`` that lists the others."""
+        """Return 1 if the robot has all of these features and devices; raise ``ImportError`` with the missing ones."""
         names = [wanted] if isinstance(wanted, str) else list(wanted)
         lacking = [name for name in names if not (self.supports(name) or self.hasA(name))]
         if lacking:
@@ -260,7 +260,7 @@ class PyroRobot:
         return self._range
 
     def __getattr__(self, name: str) -> list[Any]:
-        """Return the started devices of a type: ``robot.camera[0]``; ``AttributeError`` lists the known types."""
+        """Return the started devices of a type, as in ``robot.camera[0]``; ``AttributeError`` lists the known types."""
         if name.startswith("_") or name not in self._devices:
             raise AttributeError(
                 f"this robot has no {name}"
@@ -276,7 +276,7 @@ class PyroRobot:
         return self._devices[kind]
 
     def _format_device_names(self) -> str:
-        return ", ".join(sorted(self._devices)) or "nothing before it is connected"
+        return ", ".join(sorted(self._devices)) or "no devices before it is connected"
 
     def _create_devices(self, seen: Observation) -> None:
         description = self.driver.description
@@ -332,7 +332,7 @@ class PyroRobot:
         return self._invoke(name)
 
     def setWalk(self, name: str) -> Any:
-        """Choose another walk; raise ``Unsupported`` if the robot has only one."""
+        """Choose a walk; raise ``Unsupported`` if the robot has only one."""
         return self._invoke("walk", name=name)
 
     def _read_value(self, key: str, prefix: str, name: str) -> float:

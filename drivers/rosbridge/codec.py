@@ -18,13 +18,13 @@ from drivers.reading import Value
 from formats.jpeg import read_size
 
 MAX_DISTANCE_M, MAX_SPEED, MAX_ACCELERATION_MPS2 = 1e6, 100.0, 1000.0
-"""Largest plausible readings: metres, m/s or rad/s, and m/s2."""
+"""Maximum plausible readings: distance in metres, speed in m/s or rad/s, acceleration in m/s2."""
 MAX_READINGS = 20_000
-"""Most readings in a scan."""
+"""Maximum number of readings in a scan."""
 MAX_VALUES = 2**16
-"""Most values in a message; a scan with its intensities has 40,000."""
+"""Maximum number of values in a message; a scan with its intensities has 40,000."""
 MAX_NUMBER_CHARS = 400
-"""Most characters of a number; the largest float in full has 309."""
+"""Maximum number of characters of a number; the largest float, written in full, has 309."""
 CHARGING = 1
 """``power_supply_status`` of sensor_msgs/BatteryState."""
 
@@ -39,7 +39,7 @@ class TopicMessage:
 
 @dataclass(frozen=True)
 class ServiceResponse:
-    """The answer of a service to call ``id``; after a failure ``values`` has the reason as ``error``."""
+    """The answer of a service to the call ``id``; after a failure ``values`` contains the reason as ``error``."""
 
     id: str
     values: Mapping[str, Any]
@@ -71,7 +71,7 @@ def make_twist(vx: float, vy: float, wz: float) -> dict[str, Any]:
 
 
 def make_twist_stamped(vx: float, vy: float, wz: float) -> dict[str, Any]:
-    """Return a geometry_msgs/TwistStamped of ROS 2; its stamp is 0, which bases treat as "now", as clocks differ."""
+    """Return a geometry_msgs/TwistStamped of ROS 2 with stamp 0, which bases treat as "now", because clocks differ."""
     return {"header": {"stamp": {"sec": 0, "nanosec": 0}, "frame_id": "base_link"}, "twist": make_twist(vx, vy, wz)}
 
 
@@ -88,7 +88,7 @@ def decode_message(data: bytes) -> Message:
     except (ValueError, RecursionError) as error:
         raise BadFrame(f"{len(data)} bytes are not valid JSON: {type(error).__name__}") from error
     if not isinstance(operation, dict):
-        raise BadFrame("the JSON value is not an operation")
+        raise BadFrame("the message is JSON, but not an operation of rosbridge")
     match operation:
         case {"op": "publish", "topic": str(topic), "msg": dict(message)}:
             return TopicMessage(topic, message)
@@ -132,8 +132,8 @@ def convert_scan(
 ) -> dict[str, Value]:
     """Convert sensor_msgs/LaserScan to the nearest distance in each sector (centre and full width in rad), in metres.
 
-    ``turn`` is the rotation of the scanner on the robot.  Readings below ``range_min`` (0.0 is a common value for "no
-    echo"), above ``range_max`` and null count as no echo; a sector without any echo is NaN.  Raises ``BadFrame``.
+    ``turn`` is the rotation of the scanner on the robot.  Readings below ``range_min`` (often 0.0), above
+    ``range_max`` or null mean "no echo"; a sector without any echo is NaN.  Raises ``BadFrame``.
     """
     first, step = _read_number(message, "angle_min", 10.0), _read_number(message, "angle_increment", 10.0)
     low, high = _read_number(message, "range_min", MAX_DISTANCE_M), _read_number(message, "range_max", MAX_DISTANCE_M)
@@ -180,10 +180,12 @@ def convert_battery(message: Mapping[str, Any], full: float = 1.0) -> dict[str, 
     if _is_number(message.get("percentage")):
         level = _read_number(message, "percentage", 1e6) / full
         if not 0.0 <= level <= 1.01:
-            raise BadFrame(f"the battery level {level:g} is not from 0 to 1; set battery_full to its value when full")
+            raise BadFrame(
+                f"the battery level {level:g} is not from 0 to 1; set battery_full to the level of a full battery"
+            )
         values["power.level"] = min(level, 1.0)
     if not values:
-        raise BadFrame("a battery without values")
+        raise BadFrame("the battery message contains no known value (voltage, current, percentage)")
     values["power.charging"] = message.get("power_supply_status") == CHARGING
     return values
 
@@ -194,7 +196,7 @@ def decode_picture(message: Mapping[str, Any]) -> tuple[bytes, int, int]:
     try:
         data = base64.b64decode(text, validate=True) if isinstance(text, str) else b""
     except ValueError as error:
-        raise BadFrame("a picture is not base64") from error
+        raise BadFrame("the picture is not base64") from error
     size = read_size(data)
     if size is None:
         raise BadFrame(f"a picture is not a complete JPEG; its format is {shorten(message.get('format'), 40)!r}")
@@ -217,7 +219,7 @@ def convert_quaternion(quaternion: Mapping[str, Any]) -> tuple[float, float, flo
     """Return roll, pitch and yaw in rad; raise ``BadFrame`` if the quaternion is not a rotation."""
     x, y, z, w = (_read_number(quaternion, axis, 2.0) for axis in "xyzw")
     if not 0.9 < x * x + y * y + z * z + w * w < 1.1:
-        raise BadFrame("an orientation is not a rotation")
+        raise BadFrame("the orientation is not a rotation")
     roll = math.atan2(2 * (w * x + y * z), 1 - 2 * (x * x + y * y))
     pitch = math.asin(max(-1.0, min(1.0, 2 * (w * y - z * x))))
     return roll, pitch, math.atan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z))
@@ -233,7 +235,7 @@ def _parse_float(text: str) -> float:
 
 def _check_length(text: str) -> str:
     if len(text) > MAX_NUMBER_CHARS:
-        raise ValueError(f"a number of {len(text)} characters")
+        raise ValueError(f"a number has {len(text)} characters, which is too long")
     return text
 
 
@@ -257,5 +259,5 @@ def _read_number(message: Mapping[str, Any], name: str, most: float) -> float:
 
 
 def _is_number(value: Any) -> bool:
-    # Excludes integers beyond the range of floats, null, NaN and infinities.
+    # This excludes integers beyond the range of floats, null, NaN and infinities.
     return isinstance(value, (int, float)) and not isinstance(value, bool) and -1e300 < value < 1e300

@@ -28,21 +28,21 @@ from drivers.timer import Timer
 MANIFEST = Manifest()
 
 REPEAT_S = 0.1
-"""Interval in seconds at which a velocity is repeated: most bases stop by themselves without one."""
+"""Interval in seconds at which a velocity is repeated: most bases stop if they receive none."""
 TYPE_TIMEOUT_S = 1.0
 """Seconds to wait for the type of the velocity topic."""
 SERVICE_TIMEOUT_S = 5.0
 MESSAGE_TTL_S = 2.0
-"""Seconds for which the last message of a topic is valid; then its keys are omitted."""
+"""Seconds for which the last message of a topic is valid; after that, its keys are omitted."""
 TYPE_SERVICE = "/rosapi/topic_type"
 
 
 class RosbridgeDriver(BaseDriver):
     """One robot.
 
-    ROS has no motors to switch: ``enable`` and ``disable`` set a lock in this driver (``estop.engaged``) and call the
-    service ``motor_service`` if the options name one.  The driver repeats the velocity while it is in force, and sends
-    zero at its end.  When the link is lost, only the base itself can stop: see docs/robots.
+    ROS defines no motor switch: ``enable`` and ``disable`` set a lock in this driver (``estop.engaged``) and call the
+    service ``motor_service`` if that option is set. The driver repeats the velocity as long as the motion is in force,
+    and then sends a zero velocity. When the link is lost, only the base itself can stop the robot: see docs/robots.
     """
 
     STALE_S = 0.5
@@ -96,7 +96,7 @@ class RosbridgeDriver(BaseDriver):
         return self._call_service(self._options.services[name], **arguments).addCallback(scalars)
 
     def diagnostics(self) -> dict[str, float]:
-        """As for every driver; ``age.SOURCE`` is the age of a topic's last message in s, ``faults`` is the link's."""
+        """The counters of every driver, each topic's ``age.SOURCE`` of the last message, and the link's ``faults``."""
         now = self._clock.seconds()
         ages = {f"age.{source}": now - at for source, (at, _) in self._source_values.items()}
         return {**super().diagnostics(), "bytes": self._bridge.bytes, "faults": self._bridge.faults, **ages}
@@ -200,7 +200,7 @@ class RosbridgeDriver(BaseDriver):
             self._start_with_type(self._options.velocity_type == "twist_stamped")
 
     def bridge_down(self) -> None:
-        """Reset the motion here, as the base should do itself; called by the bridge."""
+        """Reset the motion, as the base should also do by itself; called by the bridge."""
         self._stop_repeating()
         self._type_timer.cancel()
         self._is_stamped = None
@@ -241,7 +241,7 @@ class RosbridgeDriver(BaseDriver):
             case "battery":
                 values = codec.convert_battery(content, self._options.battery_full)
         stamp = codec.read_stamp(content)
-        # Topics arrive slightly out of order; a large step back means that the clock was set.
+        # Topics may arrive slightly out of order; a large step back means that the robot's clock was set.
         if stamp is not None and (stamp > self._t_robot or self._t_robot - stamp > 1.0):
             self._t_robot = stamp
         if source == "image":
@@ -251,7 +251,7 @@ class RosbridgeDriver(BaseDriver):
         now = self._clock.seconds()
         self._source_values[source] = (now, values)
         if self._is_stamped is None:
-            return  # not ready: it cannot be driven before the type is known
+            return  # not ready: the robot cannot be driven before the type is known
         seen: dict[str, Value] = {ENGAGED: not self._has_motors}
         for at, some in self._source_values.values():
             if now - at <= MESSAGE_TTL_S:
@@ -287,14 +287,16 @@ class RosbridgeDriver(BaseDriver):
         if known is not None:
             self._start_with_type(known)
             return
-        # The topic has no subscriber yet, or another type; the base may still be starting.
+        # The topic has no subscriber yet, or a different type; the base may still be starting.
         state = f"is {found}" if found else "has no subscriber"
-        self._warn_once(f"{topic} {state}; is velocity_topic right? retrying")
+        self._warn_once(f"{topic} {state}; is velocity_topic correct? Retrying")
         self._type_timer.set(TYPE_TIMEOUT_S, self._request_type)
 
     def _on_no_type(self) -> None:
         default = "TwistStamped" if self._was_stamped else "Twist"
-        self._warn_once(f"rosapi does not report the type of the velocity: using {default}; or set velocity_type")
+        self._warn_once(
+            f"rosapi does not report the type of the velocity topic; using {default}; to change it, set velocity_type"
+        )
         self._start_with_type(self._was_stamped)
 
     def _on_other_type(self, is_stamped: bool, found: str) -> None:
@@ -302,7 +304,7 @@ class RosbridgeDriver(BaseDriver):
             self._advertise(is_stamped)  # the answer arrived late
             return
         wanted, topic = "twist_stamped" if is_stamped else "twist", self._options.velocity_topic
-        self._warn_once(f'{topic} is {found}, so it would not move: write velocity_type = "{wanted}" or "auto"')
+        self._warn_once(f'{topic} is {found}, so the robot would not move; write velocity_type = "{wanted}" or "auto"')
 
     def _start_with_type(self, is_stamped: bool) -> None:
         self._advertise(is_stamped)

@@ -85,14 +85,14 @@ class Bridge:
         return succeed(None) if self._reconnector is None else self._reconnector.disconnect()
 
     def send(self, payload: bytes) -> None:
-        """Send one message; does nothing without a rosbridge."""
+        """Send one message; does nothing if no rosbridge is connected."""
         if self._is_up and self._link is not None:
             self._link.send(self._socket.encode_text(payload))
 
     # -- called by the link -----------------------------------------------------------------------------------------
 
     def link_up(self, link: Link) -> None:
-        """Start the handshake, after a delay if the server was not a rosbridge before."""
+        """Start the handshake, after a delay if the server of the last attempt was not a rosbridge."""
         self._link = link
         self._ignores_data = True
         wait = self._retry_at - self._clock.seconds()
@@ -108,22 +108,22 @@ class Bridge:
         self._on_down()
 
     def data_received(self, data: bytes) -> None:
-        """Take bytes."""
+        """Process received bytes."""
         self.bytes += len(data)
         socket, link, frames = self._socket, self._link, self._socket.frames
         if self._ignores_data:
-            return  # after a fault or hang_up; the link closes soon
+            return  # after a fault or ``disconnect``; the link closes soon
         messages, reply = socket.receive_data(data)
         if socket.frames > frames or (socket.is_open and not self._is_up):
-            # Only complete frames count: bytes may belong to a frame with a corrupt length.
+            # Only a complete frame shows that the server responds: bytes may belong to a frame with a corrupt length.
             self._last_frame_at = self._clock.seconds()
         if reply and link is not None and not link.is_busy:
-            link.send(reply)  # dropped if busy, or replies to a peer that does not read would accumulate
+            link.send(reply)  # dropped if busy; otherwise replies to a peer that does not read would accumulate
         if socket.is_open and not self._is_up and not socket.fault:
             self._on_up()
         for message in messages:
             if not self._is_up:
-                return  # the owner closed the bridge
+                return  # the caller closed the bridge
             self._retry_s, self._logged_reason = MIN_RETRY_S, ""
             self._owner.bridge_received(message)
         if socket.fault and not self._ignores_data:
@@ -153,7 +153,7 @@ class Bridge:
         self._schedule_ping()
 
     def _on_fault(self, reason: str) -> None:
-        """Keep the link open for a delay before closing it, to limit attempts at a server that is not rosbridge."""
+        """Close the link after a delay, which limits the rate of attempts at a server that is not rosbridge."""
         self.faults += 1
         if reason != self._logged_reason:
             self.log.warn("rosbridge at {host}:{port}: {reason}", host=self._host, port=self._port, reason=reason)

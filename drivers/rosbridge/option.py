@@ -28,7 +28,7 @@ SECTORS: Mapping[str, tuple[float, float]] = {
     "right": (-90.0, 40.0),
     "front_right": (-45.0, 40.0),
 }
-"""Centre and full width of each sector in degrees, left positive."""
+"""The centre and the full width of each sector of a scan in degrees, left positive."""
 ROS_TYPES = {
     "odometry": "nav_msgs/Odometry",
     "scan": "sensor_msgs/LaserScan",
@@ -36,9 +36,9 @@ ROS_TYPES = {
     "battery": "sensor_msgs/BatteryState",
     "image": "sensor_msgs/CompressedImage",
 }
-"""Sources of observations, and the types of their topics in ROS 1; ROS 2 adds ``/msg/``."""
+"""Sources of observations, and the types of their topics in ROS 1; in ROS 2 the types contain ``/msg/``."""
 RATES_HZ = {"odometry": 20.0, "scan": 10.0, "imu": 20.0, "battery": 1.0}
-"""Highest requested rate of each source in Hz."""
+"""Maximum requested rate of each source in Hz."""
 
 
 def _check_skills(services: Mapping[str, str]) -> Mapping[str, str]:
@@ -58,10 +58,10 @@ def _check_full(value: float) -> float:
 class Options:
     """The robot; an empty topic means that the robot does not have it.
 
-    ``velocity_type`` "auto" asks the robot (rosapi).  ``max_vx`` and ``max_vy`` are in m/s, ``max_wz`` in rad/s,
-    ``radius`` in m.  ``scan_turn`` is the rotation of the scanner on the robot in degrees, ``battery_full`` the
-    percentage of a full battery.  ``motor_service`` (std_srvs/SetBool) switches the motors of robots that have it;
-    ``services`` maps skills to services without arguments (std_srvs/Trigger).
+    With ``velocity_type`` "auto" the driver asks the robot (rosapi) for the type.  ``max_vx`` and ``max_vy`` are in
+    m/s, ``max_wz`` in rad/s, ``radius`` in m.  ``scan_turn`` is the rotation of the scanner on the robot in degrees,
+    ``battery_full`` the percentage of a full battery.  ``motor_service`` (std_srvs/SetBool) switches the motors, on
+    robots that have such a service; ``services`` maps skills to services without arguments (std_srvs/Trigger).
     """
 
     host: Annotated[str, Meta(min_length=1, max_length=253), PRINTABLE] = "127.0.0.1"
@@ -98,7 +98,7 @@ class Options:
 
     @property
     def topics(self) -> dict[str, str]:
-        """Sources of observations, and their topics; includes the image at rate 0."""
+        """The sources of observations, and their topics; includes the image topic even at frame rate 0."""
         return {name: topic for name in ROS_TYPES if (topic := str(getattr(self, f"{name}_topic")))}
 
     def convert_type_name(self, name: str) -> str:
@@ -107,10 +107,10 @@ class Options:
 
 
 def parse_options(table: Mapping[str, object]) -> Options:
-    """Convert and check ``table``; raise ``UsageError`` that names the key and the remedy."""
+    """Convert and check ``table``; raise ``UsageError`` with the key, the problem and the remedy."""
     options = convert_options("rosbridge", table, Options)
     if not any(topic for name, topic in options.topics.items() if name in ("odometry", "scan", "imu")):
-        raise UsageError('driver "rosbridge": set odometry_topic, scan_topic or imu_topic, to detect a silent robot')
+        raise UsageError('driver "rosbridge": odometry_topic, scan_topic and imu_topic are all empty; set one of them')
     return options
 
 

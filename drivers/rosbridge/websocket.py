@@ -7,7 +7,7 @@ from wsproto.events import AcceptConnection, RejectConnection, Request
 from formats.websocket import WebSocketEnd
 
 MAX_MESSAGE_BYTES = 4 * 1024 * 1024
-"""Largest message in bytes: fits a compressed picture of 2 megapixels in base64."""
+"""Maximum message in bytes: enough for a compressed picture of 2 megapixels in base64."""
 
 
 class WebSocket(WebSocketEnd):

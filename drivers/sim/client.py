@@ -30,16 +30,17 @@ REPLY_TIMEOUT_S = 2.0
 KEEP_ALIVE_S = 0.5
 
 Snapshot = Mapping[str, Any]
-"""The true state: ``t``, ``walls`` (width, height), ``dogs`` (each name, x, y, heading, moving, stripes), ``target``
-(x, y, radius) or None, ``collisions``.
+"""The true state: ``t``, ``walls`` (width, height), ``dogs`` (for each dog name, x, y, heading, moving, stripes),
+``target`` (x, y, radius) or None, ``collisions``.
 """
 
 
 class SimulatorClient:
     """A client that receives the state of the world ``rate`` times per second and can change it.
 
-    The Deferred of an order fires with True when the simulator has carried it out; it fails with ``UsageError`` if the
-    simulator refuses it, with ``LinkLost`` without a link, with ``NoReply`` after ``REPLY_TIMEOUT_S``.
+    The Deferred of a command fires with True when the simulator has executed the command. It fails with ``UsageError``
+    if the simulator refuses the command, with ``LinkLost`` if no link is open, and with ``NoReply`` after
+    ``REPLY_TIMEOUT_S``.
     """
 
     log = Logger()
@@ -73,9 +74,9 @@ class SimulatorClient:
         return self._snapshot
 
     def connect(self) -> Deferred[Snapshot]:
-        """Open the link and keep it open; fires with the first snapshot, even if the simulator starts much later."""
+        """Open the link and keep it open; fires with the first snapshot, whenever the simulator starts."""
         if self._reconnector is not None:
-            return fail(UsageError("this operator is already connected or connecting; use it as it is"))
+            return fail(UsageError("this client is already connected or connecting; do not call connect() again"))
         self._connecting = Deferred(lambda _: None)
         connecting = self._connecting
         self._reconnector = self._connector.connect(self._host, self._port, self)
@@ -94,15 +95,15 @@ class SimulatorClient:
         return self._subscribers.add(callback)
 
     def place_target(self, x: float, y: float) -> Deferred[bool]:
-        """Put the red target at this place, in metres from the lower left corner."""
+        """Put the red target at this position, in metres from the lower left corner."""
         return self._send_command("place_target", float(x), float(y))
 
     def place_target_at_random(self) -> Deferred[bool]:
-        """Put the red target at a free place, at clearly different distances from the dogs."""
+        """Put the red target at a free position, at clearly different distances from the dogs."""
         return self._send_command("place_target_at_random")
 
     def place_target_later(self, seconds: float) -> Deferred[bool]:
-        """Put the red target at a free place after ``seconds`` of simulated time, unless it is moved before."""
+        """Put the red target at a free position after ``seconds`` of simulated time, unless it is moved earlier."""
         return self._send_command("place_target_later", float(seconds))
 
     def clear_target(self) -> Deferred[bool]:
@@ -110,11 +111,11 @@ class SimulatorClient:
         return self._send_command("clear_target")
 
     def move_dog(self, name: str, x: float, y: float, heading: float) -> Deferred[bool]:
-        """Move a dog to this place, heading in radians."""
+        """Move a dog to this position, with the heading in radians."""
         return self._send_command("move_dog", name, float(x), float(y), float(heading))
 
     def scatter(self, seed: int) -> Deferred[bool]:
-        """Move all dogs to random free places; the same seed gives the same places."""
+        """Move all dogs to random free positions; the same seed gives the same positions."""
         return self._send_command("scatter", seed)
 
     def break_robot_link(self, name: str) -> Deferred[bool]:
@@ -133,7 +134,7 @@ class SimulatorClient:
         self._keep_alive()
 
     def link_down(self) -> None:
-        """Drop the snapshot and fail open orders; called by the link."""
+        """Drop the snapshot and fail pending commands; called by the link."""
         self._link = None
         self._snapshot = None
         self._keep_alive_timer.cancel()
@@ -141,7 +142,7 @@ class SimulatorClient:
             self._finish_command(number, LinkLost("the link to the simulator was lost"))
 
     def data_received(self, data: bytes) -> None:
-        """Take bytes from the simulator; called by the link."""
+        """Process bytes from the simulator; called by the link."""
         for message in self._reader.read(data):
             if isinstance(message, WorldSnapshot):
                 self._on_snapshot(message.snapshot)
@@ -162,7 +163,7 @@ class SimulatorClient:
 
     def _send_command(self, verb: str, *arguments: Value) -> Deferred[bool]:
         if self._link is None:
-            return fail(LinkLost(f"no link to the simulator at {self._host}:{self._port}; is it running?"))
+            return fail(LinkLost(f"the simulator at {self._host}:{self._port} is not connected; is it running?"))
         self._command_number += 1
         number = self._command_number
         done: Deferred[bool] = Deferred()

@@ -55,8 +55,8 @@ class Motors(_Message, tag="motors", frozen=True):
 class Drive(_Message, tag="drive", frozen=True):
     """From a driver: move at these velocities (m/s, m/s, rad/s) for ``ttl`` seconds under fencing ``token``.
 
-    ``sent`` is the driver's estimate of the simulator's time when the command left: the stamp of the newest frame plus
-    its age.  Delay on the network therefore shortens a command and does not shift it.
+    ``sent`` is the simulator's time at which the command left, as estimated by the driver: the stamp of the newest
+    frame plus the age of that frame. A delay on the network therefore shortens the motion; it does not end later.
     """
 
     vx: Number
@@ -72,7 +72,7 @@ class Halt(_Message, tag="halt", frozen=True):
 
 
 class KeepAlive(_Message, tag="alive", frozen=True):
-    """From either client: keep-alive; the simulator releases the robot after some seconds without data."""
+    """From drivers and the operator: keep-alive; the simulator releases the robot after some seconds without data."""
 
 
 class WorldCommand(_Message, tag="order", frozen=True):
@@ -109,14 +109,14 @@ class WorldSnapshot(_Message, tag="truth", frozen=True):
 
 
 class CommandResult(_Message, tag="done", frozen=True):
-    """From the simulator: the order was carried out, or ``problem`` says why not."""
+    """From the simulator: the command was executed, or ``problem`` is the reason why not."""
 
     number: Count
     problem: Text
 
 
 class Refused(_Message, tag="refused", frozen=True):
-    """From the simulator: the robot is not available; with ``lasting`` a retry cannot help."""
+    """From the simulator: the robot is not available; if ``lasting``, a retry is useless."""
 
     reason: Text
     lasting: bool
@@ -138,7 +138,7 @@ class _Target(TypedDict):
 
 
 class _Snapshot(TypedDict):
-    """The parts of a snapshot that the map and the judge read without further checks; it may have more."""
+    """The fields of a snapshot that the map and the judge read without further checks; further fields may exist."""
 
     t: Number
     walls: tuple[Number, Number]
@@ -162,7 +162,7 @@ Message = (
     | Refused
 )
 _ENCODER = msgpack.Encoder(enc_hook=float)
-"""Encodes NumPy's numbers as floats."""
+"""The encoder, which converts NumPy's numbers to floats."""
 _DECODER: msgpack.Decoder[Message] = msgpack.Decoder(Message)
 
 

@@ -38,7 +38,7 @@ class SimDriver(LinkedDriver):
     """One dog of the simulator, over links that ``connector`` opens.
 
     After ``connect`` the motors are off and ``estop.engaged`` is true until ``enable``.  ``connect`` fails with
-    ``Unsupported`` if the simulator has no such robot; while another driver holds it, the request is repeated.
+    ``Unsupported`` if the simulator has no such robot; while another driver uses the robot, the request is repeated.
     """
 
     def __init__(self, options: Options | Mapping[str, object], connector: Connector, clock: IReactorTime) -> None:
@@ -85,7 +85,7 @@ class SimDriver(LinkedDriver):
         self._keep_alive()
 
     def link_down(self) -> None:
-        """Reset the motion here, as the simulator does itself; called by the link."""
+        """Reset the motion, as the simulator also does; called by the link."""
         self._link = None
         self._timer.cancel()
         self._down()

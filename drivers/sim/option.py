@@ -1,4 +1,4 @@
-"""Options of the kind "sim"; each error names the remedy."""
+"""Options of the kind "sim"; each error says how to correct it."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ class Options:
 
 
 def parse_options(table: Mapping[str, object]) -> Options:
-    """Convert and check ``table``; raise ``UsageError`` that names the key and the remedy."""
+    """Convert and check ``table``; raise ``UsageError`` with the key, the problem and the remedy."""
     return convert_options("sim", table, Options)
 
 

@@ -1,1 +1,1 @@
-"""The demonstration of the thesis: a team of processes, a judge of both experiments, and repeated trials."""
+"""The demonstration of the thesis: a team of processes, a check of both experiments, and repeated trials."""

@@ -1,6 +1,6 @@
 """Write the configuration files of the demonstration's nodes.
 
-This module knows the format of the files that ``twistd swarm-node --config FILE`` reads, and nothing of their effect.
+This module only writes the format of the files that ``twistd swarm-node --config FILE`` reads.
 """
 
 from __future__ import annotations
@@ -28,8 +28,9 @@ FAULTS: Table = {"allow": True}
 class Location:
     """The network location of one process of a demonstration; by default all are on one machine.
 
-    ``host`` is the address on which it listens, ``entry`` the address of the bootstrap and web node and ``yard`` the
-    address of the robot simulator as this process sees them, and ``enter`` the command prefix that runs it there.
+    ``host`` is the address on which the process listens. ``entry`` is the address at which it reaches the bootstrap
+    and web node, ``yard`` the address at which it reaches the robot simulator. ``enter`` is the command prefix that
+    runs the process at this location.
     """
 
     host: str = LOOPBACK
@@ -86,7 +87,7 @@ class Plan:
 
     @property
     def emulated_robots(self) -> str:
-        """The robots that the simulator emulates in addition to its own dogs, as TOML; empty if there are none."""
+        """The robots that the simulator emulates in addition to its own dogs, as TOML; may be empty."""
         return encode_toml({name: robot.simulator_table for name, robot in self.robots.items() if robot.kind != "sim"})
 
     def _make_node_table(self, name: str, kind: str, description: str, roles: list[str]) -> Table:
@@ -121,7 +122,7 @@ class Plan:
 
 
 def encode_toml(tables: Mapping[str, Table]) -> str:
-    """Encode ``tables`` as TOML; values are texts, numbers, lists of them, or one more level of tables."""
+    """Encode ``tables`` as TOML; values are strings, numbers, lists of these, or tables with such values."""
     lines: list[str] = []
     for title, table in tables.items():
         lines.append(f"[{title}]")
@@ -135,5 +136,5 @@ def _encode_value(value: object) -> str:
         return "{ " + ", ".join(f"{key} = {_encode_value(item)}" for key, item in value.items()) + " }"
     if isinstance(value, list | tuple):
         return "[" + ", ".join(_encode_value(item) for item in value) + "]"
-    # JSON texts, numbers, booleans and lists are valid TOML, except DEL, which JSON does not escape.
+    # JSON strings, numbers, booleans and lists are valid TOML, except for DEL, which JSON does not escape.
     return json.dumps(value, ensure_ascii=False).replace("\x7f", "\\u007f")

@@ -1,8 +1,8 @@
 """The demonstration: three dogs, two web nodes and a robot simulator as six processes of this machine.
 
 ``python -m sim.demo`` runs the team until Ctrl-C.  With ``--headless`` it runs both experiments of the thesis, checks
-them against the true positions of the dogs, and exits with 0 or 1.  The nodes decide everything; this module starts
-them, observes, places the target, and kills a node in experiment 2.
+them against the true positions of the dogs, and exits with 0 or 1.  The nodes make all decisions; this module starts
+the nodes, observes them, places the target, and kills a node in experiment 2.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ from sim.demo.state_changes import describe_changes, find_present
 
 START_LIMIT_S = 40.0
 SEARCH_S = 3.0
-"""Seconds that the dogs search before the target is placed."""
+"""Seconds for which the dogs search before the target is placed."""
 POLL_S = 0.05
 
 
@@ -119,7 +119,7 @@ class Demonstration:
             snapshot = self._operator.snapshot
             if target_at <= now and snapshot is not None:
                 target_at = float("inf")
-                # The page may place the target itself; it has done so by now.
+                # The web node may place the target itself; if so, it has done this by now.
                 if snapshot["target"] is None:
                     await self._operator.place_target_at_random()
                     self._report("the red target is placed")
@@ -136,7 +136,7 @@ class Demonstration:
         return run
 
     async def _inject_failure(self, victim: str) -> None:
-        """Let the approaching dog fail: its node, or the link between its node and the robot."""
+        """Make the approaching dog fail: kill its node, or break the link between its node and the robot."""
         if self._loses_link:
             self._report(f"{victim} has come nearer; the link between its node and the robot is lost")
             await self._operator.break_robot_link(victim)
@@ -148,7 +148,7 @@ class Demonstration:
             self._processes.kill(victim)
 
     def watch_processes(self) -> None:
-        """Report a process that ends; the team restarts it."""
+        """Report each process that ends; ``ProcessGroup`` restarts it."""
         missing = set(self._processes.list_ended())
         for name in sorted(missing - self._ended):
             log = self._plan.run_dir / f"{name}.log"
@@ -171,7 +171,7 @@ class Demonstration:
         while not holds():
             self._check_processes()
             if self._reactor.seconds() > end:
-                raise DemoError(f"{problem} after {limit_s:g} s; the logs are in {self._plan.run_dir}/")
+                raise DemoError(f"{problem} after {limit_s:g} s; see the logs in {self._plan.run_dir}/")
             await self._pause(POLL_S)
 
     async def _pause(self, seconds: float) -> None:
@@ -255,7 +255,7 @@ async def _run(reactor: Any, args: argparse.Namespace) -> None:
     try:
         with lock_run_dir(args.run_dir.absolute()):
             folder = args.run_dir.absolute()
-            # For this machine alone browsers trust http, so TLS is not needed.
+            # Browsers trust plain http to this machine, so a page for this machine only needs no TLS.
             with_tls = args.tls or (has_tls() and not args.headless and args.web_host != LOOPBACK)
             if args.tls and not has_tls():
                 raise DemoError("--tls needs libraries that are not installed; run: pip install 'swarm-node[tls]'")

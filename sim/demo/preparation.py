@@ -1,4 +1,4 @@
-"""Prepare the folder and the ports of a demonstration before anything starts."""
+"""Prepare the folder and the ports of a demonstration before its processes start."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ SERVER_PORTS = 5
 ANY_ADDRESS = "0.0.0.0"
 MARKER_FILE = ".swarm-demo"
 CODE_LETTERS = "abcdefghjkmnpqrstuvwxyz"
-"""Letters of a sign-in code; none resembles another or a digit."""
+"""Letters of a sign-in code; no letter resembles another letter or a digit."""
 
 
 class DemoError(Exception):
@@ -29,9 +29,9 @@ class DemoError(Exception):
 
 
 def lock_run_dir(run_dir: Path) -> TextIO:
-    """Create or empty ``run_dir`` and lock it; returns the lock, which is held until it is closed.
+    """Create or empty ``run_dir`` and lock it; return the lock, which is held until it is closed.
 
-    Refuses a folder with anything but an earlier demonstration.
+    Refuses a folder that contains anything other than an earlier demonstration.
     """
     mark = run_dir / MARKER_FILE
     try:
@@ -76,9 +76,9 @@ def make_plan(
     with_tls: bool = False,
     robot: str = "sim",
 ) -> Plan:
-    """Return a plan with free ports; reports each usual port that is busy.
+    """Return a plan with free ports; report each usual port that is busy.
 
-    ``usual``: try the usual ports first, for interactive use; otherwise all ports are arbitrary, so that several
+    ``usual``: try the usual ports first, for interactive use; otherwise use arbitrary ports, so that several
     demonstrations can start at the same time.  ``with_tls``: also serve the pages over TLS.  ``robot``: a key of
     ``sim.demo.robots.ROBOT_SETS``.
     """
@@ -87,7 +87,8 @@ def make_plan(
     except OSError as error:
         remedy = "set --web-host to an address of this machine, or 0.0.0.0 for all of them"
         raise DemoError(f"cannot serve the page on {web_host} ({error.strerror}); {remedy}") from error
-    # Free on every address, as page and robots may use different ones; without the requested port.
+    # The ports must be free on every address, because page and robots may use different addresses; the requested port
+    # is excluded.
     found = free_ports.find_free_ports("tcp", ANY_ADDRESS, 1 + SERVER_PORTS + MAX_PORTS * len(DOGS))
     spare = iter([one for one in found if one != web_port])
     if web_port:
@@ -97,7 +98,7 @@ def make_plan(
     reserve = free_ports.choose_port("tcp", web_host, web + 1 if usual and web < 65535 else 0, spare)
     tls = (0, 0)
     if with_tls:
-        # The ports of the page are not bound yet, so they would look free.
+        # The ports of the pages are not bound yet, so they would be found as free.
         preferred_port = TLS_PORT if usual and not {TLS_PORT, TLS_PORT + 1} & {web, reserve} else 0
         first = free_ports.choose_port("tcp", web_host, preferred_port, spare)
         tls = (first, free_ports.choose_port("tcp", web_host, first + 1 if first == preferred_port else 0, spare))

@@ -22,7 +22,7 @@ from twisted.runner.procmon import ProcessMonitor
 
 TAIL_LINES = 12
 RESTART_S = 30.0
-"""Delay before a process is restarted: longer than another robot needs to finish on a busy machine."""
+"""Seconds before a process is restarted: longer than another robot needs to finish the task on a busy machine."""
 
 
 class ProcessGroup:
@@ -45,7 +45,7 @@ class ProcessGroup:
         self._tails: dict[str, deque[str]] = {}
         self._stopped: Deferred[None] | None = None
         monitor = ProcessMonitor(reactor)
-        # With an infinite threshold the monitor regards every end as too early, and waits for the delay set here.
+        # With an infinite threshold the monitor regards every end as too early, and restarts after the delay set here.
         monitor.threshold = inf  # type: ignore[assignment]
         monitor.minRestartDelay = monitor.maxRestartDelay = RESTART_S  # type: ignore[assignment]
         monitor.killTime = 4
@@ -53,9 +53,10 @@ class ProcessGroup:
         self._monitor = monitor
 
     def add(self, name: str, arguments: Sequence[str], enter: Sequence[str] = ()) -> None:
-        """Add a process; it starts at once if the team runs.  Raises ``KeyError`` if the name is taken.
+        """Add a process, which starts immediately if the group runs. Raises ``KeyError`` if the name is taken.
 
-        ``enter`` is a command prefix that has to exec the command (as ``nsenter`` does), so that signals reach it.
+        ``enter`` is a command prefix that has to exec the command (as ``nsenter`` does), so that signals reach the
+        command.
         """
         if name not in self._logs:
             self._logs[name] = (self._run_dir / f"{name}.log").open("a", encoding="utf-8", buffering=1)
@@ -68,7 +69,7 @@ class ProcessGroup:
         self._monitor.startService()
 
     def stop(self) -> Deferred[None]:
-        """End every process, by force after four seconds; fires when all have ended.  May be called repeatedly."""
+        """End every process, after four seconds with SIGKILL; fires when all have ended. May be called repeatedly."""
         done: Deferred[None] = Deferred()
         if self._stopped is None:
             self._stopped = done
@@ -131,5 +132,5 @@ class ProcessGroup:
 
 
 def make_child_command(arguments: Sequence[str]) -> list[str]:
-    """Return the command line that runs Python ``arguments``, and that ends with this process (``parent_monitor``)."""
+    """Return the command of a Python process with ``arguments`` that ends with this process (``parent_monitor``)."""
     return [sys.executable, "-m", "sim.demo.parent_monitor", *arguments]

@@ -17,7 +17,7 @@ ROBOT_SETS = {
     "rosbridge": ("rosbridge", "rosbridge", "rosbridge"),
     "sim": ("sim", "sim", "sim"),
 }
-"""The kinds of the three robots, by the value of ``--robot``."""
+"""The kinds of the three robots for each value of ``--robot``."""
 MAX_PORTS = 8
 """Maximum number of TCP ports of a robot and its parts."""
 AIBO_SERVICES = ("main", "estop", "state", "walk", "head", "camera")
@@ -36,7 +36,7 @@ class Robot:
 
     @property
     def driver_table(self) -> dict[str, Any]:
-        """The table ``[driver]`` of its node."""
+        """The table ``[driver]`` of the robot's node."""
         return {"kind": self.kind, "options": self.options, **({"parts": self.parts} if self.parts else {})}
 
     @property
@@ -48,7 +48,7 @@ class Robot:
 def make_robots(
     robot_set: str, names: tuple[str, ...], folder: Path, ports: Iterator[int], yard_port: int
 ) -> dict[str, Robot]:
-    """Return the robots of ``robot_set`` by name; they take ports from ``ports`` and put cables into ``folder``."""
+    """Return the robots of ``robot_set`` by name, with ports from ``ports`` and serial devices in ``folder``."""
     makers: dict[str, Callable[[str], Robot]] = {
         "aibo": lambda name: _make_aibo(name, ports),
         "bittle": lambda name: _make_bittle(name, folder, ports),

@@ -14,7 +14,7 @@ def describe_changes(before: State, after: State) -> list[str]:
 
 
 def find_present(state: State) -> dict[str, State]:
-    """Return the devices in the network, by name."""
+    """Return the devices that are in the network, by name."""
     return {str(device["name"]): device for device in _rows(state, "devices") if not _is_gone(device)}
 
 

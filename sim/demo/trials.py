@@ -25,7 +25,7 @@ from typing import Any, Protocol
 from sim.demo.experiment import Experiment
 
 POLL_S = 0.032
-"""Virtual seconds between two evaluations of the team: one sensor frame."""
+"""Virtual seconds between two evaluations of the team: the interval of sensor frames."""
 LIMIT_S = 120.0
 SETTLE_S = 1.0
 
@@ -53,7 +53,7 @@ class DemoTeam(Protocol):
         """Kill a node."""
 
     def stop(self) -> None:
-        """End everything."""
+        """Stop the team."""
 
 
 MakeTeam = Callable[[int], DemoTeam]
@@ -61,10 +61,10 @@ MakeTeam = Callable[[int], DemoTeam]
 
 @dataclass
 class Outcome:
-    """The result of one trial; times in seconds since the task was assigned, ``takeover`` since the kill.
+    """The result of one trial; times are in seconds since the task was assigned, ``takeover`` since the kill.
 
-    ``found`` says whether every dog reported before the task ended, ``agreed`` whether all agents named the same one,
-    ``right`` whether the nearest dog went, ``held`` whether all conditions of the experiment hold.
+    ``found``: every dog reported before the task ended. ``agreed``: all agents selected the same dog. ``right``: the
+    nearest dog approached the target. ``held``: all conditions of the experiment are met.
     """
 
     seed: int
@@ -84,7 +84,7 @@ class Outcome:
 
 
 def run_trial(make_team: MakeTeam, experiment: int, seed: int, pictures: Path | None = None) -> Outcome:
-    """Run one experiment from ``seed``; draw each phase into the folder ``pictures`` if it is given."""
+    """Run one experiment from ``seed``; if the folder ``pictures`` is given, draw a picture of each phase into it."""
     team = make_team(seed)
     team.scatter(seed)
     draw = _make_draw(team, pictures, experiment, seed)
@@ -116,7 +116,7 @@ Draw = Callable[[str, str], None]
 
 
 def _record_times(outcome: Outcome, state: dict[str, Any], truth: dict[str, Any], now: float, draw: Draw) -> None:
-    """Record the times at which all dogs have found the target and all agents name the same dog."""
+    """Record the times at which all dogs have found the target, and at which all agents have selected the same dog."""
     group = state["groups"][0] if state["groups"] else None
     if truth["target"] is not None:
         draw("2-with-target", "The target is placed while they search")
@@ -148,13 +148,13 @@ def _make_draw(team: DemoTeam, folder: Path | None, experiment: int, seed: int) 
 
 
 def percentile(values: Sequence[float], share: float) -> float:
-    """Return the smallest of ``values`` that at least the share ``share`` of them does not exceed."""
+    """Return the smallest of ``values`` such that at least the share ``share`` of all values does not exceed it."""
     ordered = sorted(values)
     return ordered[max(0, math.ceil(share * len(ordered)) - 1)]
 
 
 def format_table(outcomes: Iterable[Outcome]) -> str:
-    """Return one line per experiment: counts held, found, agreed, right; times as median (95th percentile)."""
+    """Return one line per experiment: counts of held, found, agreed and right; times as median (95th percentile)."""
     rows = [f"{'':12}{'trials':>7}{'held':>7}{'found':>7}{'agreed':>8}{'right':>7}"]
     rows[0] += "".join(f"{name:>16}" for name in ("find s", "agree s", "reach s", "take over s"))
     every = list(outcomes)
@@ -177,7 +177,7 @@ def _run_job(job: tuple[MakeTeam, int, int, Path | None]) -> Outcome:
 
 
 def run_real(count: int, seed: int, run_dir: Path) -> list[bool]:
-    """Run both experiments with real processes ``count`` times; returns whether each run passed."""
+    """Run both experiments with real processes ``count`` times; return for each run whether it passed."""
     held = []
     for number in range(count):
         command = [sys.executable, "-m", "sim.demo", "--headless", "--seed", str(seed + number), "--run-dir"]
@@ -188,7 +188,7 @@ def run_real(count: int, seed: int, run_dir: Path) -> list[bool]:
 def parse_count(text: str) -> int:
     """Parse a non-negative integer of the command line."""
     if not (text.isdecimal() and len(text) <= 9):
-        raise argparse.ArgumentTypeError(f"must be a whole number from 0 on, is {text!r}")
+        raise argparse.ArgumentTypeError(f"must be a whole number of at least 0, is {text!r}")
     return int(text)
 
 

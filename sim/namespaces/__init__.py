@@ -1,1 +1,1 @@
-"""An emulated internet of network namespaces: sites behind NAT routers, impaired links, and real nodes."""
+"""Emulate an internet with network namespaces: sites behind NAT routers, impaired links, and real nodes."""

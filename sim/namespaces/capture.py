@@ -4,7 +4,7 @@
         ...
     seen.found([b"red target"]), seen.traffic["198.18.1.2:7000"].amplification
 
-``python -m sim.namespaces.capture INTERFACE FILE`` is the process on the host; it does not need ``tcpdump``.
+``python -m sim.namespaces.capture INTERFACE FILE`` is the process on the host that captures; ``tcpdump`` is not needed.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ IPV4, UDP = 0x0800, 17
 
 @dataclass
 class Traffic:
-    """Datagrams and their payload in bytes, from a peer (``received``) and to it (``sent``)."""
+    """Datagrams and their payload in bytes, from a peer (``received``) and to that peer (``sent``)."""
 
     received: int = 0
     received_bytes: int = 0
@@ -42,7 +42,7 @@ class Traffic:
 
     @property
     def amplification(self) -> float:
-        """Bytes sent per byte received; infinite for a peer that sent nothing."""
+        """Bytes sent to the peer per byte received from it; infinite for a peer that sent nothing."""
         if not self.sent_bytes:
             return 0.0
         return self.sent_bytes / self.received_bytes if self.received_bytes else float("inf")
@@ -81,12 +81,12 @@ class Capture:
         return whole
 
     def find_plain_text(self, words: Iterable[bytes]) -> list[bytes]:
-        """Return those of ``words`` that occur in the captured frames in plain text."""
+        """Return the ``words`` that occur in the captured frames in plain text."""
         return find_words(self.file.read_bytes(), words)
 
 
 def find_words(passed: bytes, words: Iterable[bytes]) -> list[bytes]:
-    """Return those of ``words`` that occur in ``passed`` in any case, or as UTF-16."""
+    """Return the ``words`` that occur in ``passed``, in upper or lower case, or as UTF-16."""
     text = passed.lower()
     return [w for w in words if w.lower() in text or w.decode().lower().encode("utf-16-le") in text]
 
@@ -108,14 +108,14 @@ def parse_datagram(frame: bytes) -> tuple[str, str, bytes] | None:
         return None
     udp = 14 + 4 * (frame[14] & 15)
     if int.from_bytes(frame[20:22]) & 0x1FFF or len(frame) < udp + 8:
-        return None  # a later fragment has no ports
+        return None  # a fragment after the first one has no ports
     source_port, target_port, length = struct.unpack_from("!HHH", frame, udp)
     source, target = socket.inet_ntoa(frame[26:30]), socket.inet_ntoa(frame[30:34])
     return f"{source}:{source_port}", f"{target}:{target_port}", frame[udp + 8 : udp + length]
 
 
 def capture(interface: str, out: BinaryIO, orders: int, ready: Any) -> dict[str, Traffic]:
-    """Write frames to ``out`` until the file ``orders`` ends; returns the traffic by peer."""
+    """Write frames to ``out`` until the file ``orders`` ends; return the traffic by peer."""
     raw = socket.socket(socket.AF_PACKET, socket.SOCK_RAW, socket.htons(ETH_P_ALL))
     raw.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 8 << 20)
     raw.bind((interface, 0))

@@ -1,8 +1,9 @@
 """The demonstration across an emulated internet: ``make demo NAT=1``, or ``python -m sim.namespaces.demo``.
 
-The computers of two dogs are each behind a NAT router, one of them symmetric.  The third is on the LAN of the bootstrap
-and web node, whose router forwards two ports.  The browser is behind a fourth router.  Each robot is connected to its
-computer by a separate link to the robot simulator.  Both experiments of the thesis run as on one machine.
+The computers of two dogs are each behind a NAT router; one of these routers is symmetric. The computer of the third
+dog is on the LAN of the bootstrap and web node, whose router forwards two ports. The browser is behind a fourth
+router. Each robot is connected to its computer by a separate link to the robot simulator. Both experiments of the
+thesis run as in the demonstration on one machine.
 """
 
 from __future__ import annotations
@@ -30,7 +31,7 @@ from sim.namespaces.nat import NatKind
 NODE_PORT, WEB_PORT, YARD_PORT, ROBOT_PORT = 7000, 8080, 7400, 7500
 HOME, KINDS = "home", (NatKind.PORT, NatKind.SYM)
 HOSTS = {BOOTSTRAP: "home1", RESERVE: "home2", DOGS[2]: "home3", DOGS[0]: "far1", DOGS[1]: "farther1", JUDGE: "cafe1"}
-"""The host of each process."""
+"""The host of each process, by the name of the process."""
 SITES = (
     Site(HOME, NatKind.PORT, 3),
     Site("far", KINDS[0]),
@@ -40,7 +41,7 @@ SITES = (
 
 
 def connect_robots(net: Internet) -> dict[str, Location]:
-    """Connect the robots to their computers and forward the ports of the home; returns the location of each process."""
+    """Connect the robots to their computers and forward ports of the home's router; return each process's location."""
     net.add_isolated_host(SIMULATOR)
     cables = {name: net.connect_cable(host, SIMULATOR)[1] for name, host in HOSTS.items()}
     inside = net.address(HOSTS[BOOTSTRAP])
@@ -64,13 +65,13 @@ def make_namespace_plan(run_dir: Path, robot: str, places: dict[str, Location], 
 
 
 def _with_cable_address(robot: Robot, simulator_host: str) -> Robot:
-    """Return ``robot`` with the address of the simulator's end of its cable."""
+    """Return ``robot`` with the address of the simulator's end of the robot's cable."""
     there = json.loads(json.dumps({"options": robot.options, "parts": robot.parts}).replace(LOOPBACK, simulator_host))
     return replace(robot, options=there["options"], parts=tuple(there["parts"]))
 
 
 def run_inside(args: argparse.Namespace) -> None:
-    """Run and judge both experiments; called on the host of the browser."""
+    """Run and check both experiments; called on the host of the browser."""
     from twisted.internet.base import ReactorBase
     from twisted.internet.defer import Deferred
     from twisted.internet.task import react
@@ -120,7 +121,7 @@ def main(arguments: Sequence[str] = tuple(sys.argv[1:])) -> int:
     if why:
         sys.stderr.write(f"!!!\n!!! NO DEMONSTRATION ACROSS NAMESPACES HERE: {why}\n!!!\n")
         return 2
-    # The namespaces are removed when the block is left, so signals must leave it.
+    # The namespaces are removed at the end of the ``with`` block, so signals must end the block.
     for number in (signal.SIGTERM, signal.SIGINT):
         signal.signal(number, lambda *_: sys.exit(130))
     with Internet(SITES, args.seed) as net:

@@ -13,7 +13,7 @@ class Impairments:
 
     ``loss``, ``dup``, ``reorder`` and ``corrupt`` are percentages; ``burst`` is the mean number of consecutive losses
     (1: independent losses); ``delay`` and ``jitter`` (a standard deviation) are milliseconds; ``rate`` is kbit/s
-    (0: unlimited), with a queue of ``queue`` milliseconds, beyond which frames are lost.
+    (0: unlimited), with a queue of ``queue`` milliseconds; frames that would wait longer are lost.
     """
 
     loss: float = 0.0
@@ -32,9 +32,9 @@ class Impairments:
                 raise ValueError(f"{name} must be a percentage from 0 to 100, not {getattr(self, name)!r}")
         for name in ("delay", "jitter", "rate", "queue"):
             if not 0.0 <= getattr(self, name) < math.inf:
-                raise ValueError(f"{name} must be a number from 0 on, not {getattr(self, name)!r}")
+                raise ValueError(f"{name} must be a number of at least 0, not {getattr(self, name)!r}")
         if not 1.0 <= self.burst < math.inf:
-            raise ValueError(f"burst must be a number of frames from 1 on, not {self.burst!r}")
+            raise ValueError(f"burst must be a number of frames of at least 1, not {self.burst!r}")
 
     @property
     def is_perfect(self) -> bool:
@@ -54,7 +54,7 @@ class LinkDirection:
 
     @property
     def impairments(self) -> Impairments:
-        """The present impairments."""
+        """The current impairments of this direction."""
         return self._impairments
 
     @impairments.setter
@@ -67,7 +67,7 @@ class LinkDirection:
         return {"passed": self.passed, "lost": self.lost, "bytes": self.passed_bytes}
 
     def draw_delivery_times(self, size: int, now: float) -> list[float]:
-        """Return the delivery times of a frame of ``size`` bytes: none if it is lost, two if it is duplicated."""
+        """Return the delivery times of a frame of ``size`` bytes: none for a lost frame, two for a duplicated one."""
         impairments = self._impairments
         if impairments.is_perfect:
             self.passed += 1
@@ -84,7 +84,7 @@ class LinkDirection:
                 return []
             self._free_at = begins + size * 8 / (impairments.rate * 1000)
             moment = self._free_at
-        # A reordered frame overtakes delayed ones.
+        # A reordered frame is not delayed, so it overtakes delayed frames.
         if not self._draw(impairments.reorder):
             spread = self._rng.gauss(0.0, impairments.jitter) if impairments.jitter else 0.0
             moment += max(0.0, impairments.delay + spread) / 1000
@@ -93,14 +93,14 @@ class LinkDirection:
         return [moment] * (2 if self._draw(impairments.dup) else 1)
 
     def corrupt_frame(self, frame: bytes, header: int) -> bytes:
-        """Return ``frame``; if it is corrupted, with one bit after its first ``header`` bytes flipped."""
+        """Return ``frame``, with one flipped bit after its first ``header`` bytes if it is to be corrupted."""
         if len(frame) <= header or not self._draw(self._impairments.corrupt):
             return frame
         place = self._rng.randrange(header, len(frame))
         return frame[:place] + bytes([frame[place] ^ 1 << self._rng.randrange(8)]) + frame[place + 1 :]
 
     def _is_lost(self) -> bool:
-        """Draw a loss (Gilbert-Elliott): the bad state loses all, and begins often enough for the loss rate."""
+        """Draw whether a frame is lost (Gilbert-Elliott: all frames are lost in the bad state, none otherwise)."""
         loss, burst = self._impairments.loss / 100, self._impairments.burst
         if burst <= 1.0 or not 0.0 < loss < 1.0:
             return self._draw(100 * loss)

@@ -5,8 +5,8 @@
         net.impair("b", loss=30)
 
 Hosts are named after their site: ``a1``, ``b1``, ``b2``; ``pub`` is the public host, ``a-gw`` the router of ``a``.  No
-address is routed out of the namespaces (198.18.0.0/15, RFC 2544), and leaving the block ends every process that was
-started in them.
+address (198.18.0.0/15, RFC 2544) is routed out of the namespaces. The end of the block ends every process that was
+started in the namespaces.
 """
 
 from __future__ import annotations
@@ -42,11 +42,11 @@ class Site:
 
 
 class Internet:
-    """The sites within a ``with`` block; ``seed`` is the seed of losses.  Raises ``NamespacesUnavailable``."""
+    """The sites within a ``with`` block; ``seed`` determines the losses. Raises ``NamespacesUnavailable``."""
 
     def __init__(self, sites: Sequence[Site], seed: int = 1) -> None:
         if len(sites) > MAX_SITES or len({site.name for site in sites}) < len(sites):
-            raise ValueError(f"at most {MAX_SITES} sites, with different names")
+            raise ValueError(f"an internet must have at most {MAX_SITES} sites, with different names")
         self.sites = {site.name: site for site in sites}
         self._numbers = {site.name: number for number, site in enumerate(sites, start=1)}
         self._seed = seed
@@ -84,7 +84,7 @@ class Internet:
                 if pipe is not None:
                     pipe.close()
         self._processes.clear()
-        # The wide area last, as it owns the user namespace of the others.
+        # The namespace of the wide area is closed last, because it owns the user namespace of all others.
         for name in sorted(self._namespaces, key=lambda name: name == ""):
             self._namespaces.pop(name).close()
 
@@ -92,7 +92,7 @@ class Internet:
 
     @property
     def hosts(self) -> list[str]:
-        """All hosts, including the public one, without routers."""
+        """All hosts, including the public host, but not the routers."""
         return list(self._addresses)
 
     def address(self, host: str) -> str:
@@ -112,14 +112,14 @@ class Internet:
         return self._namespaces[host].command(arguments)
 
     def start(self, host: str, arguments: Sequence[str], **options: Any) -> subprocess.Popen[Any]:
-        """Start a program on ``host``, with options of ``Popen``; it is killed by ``close`` at the latest."""
+        """Start a program on ``host``, with options of ``Popen``; ``close`` kills the program if it still runs."""
         options = {"stdin": subprocess.DEVNULL, "cwd": ROOT, "env": make_environment(), **options}
         process = subprocess.Popen(self.command(host, arguments), **options)
         self._processes.append(process)
         return process
 
     def run(self, host: str, arguments: Sequence[str], timeout: float = 60.0) -> subprocess.CompletedProcess[str]:
-        """Run a program on ``host`` to its end."""
+        """Run a program on ``host`` and wait for its end."""
         return subprocess.run(
             self.command(host, arguments),
             cwd=ROOT,
@@ -135,7 +135,8 @@ class Internet:
     def impair(self, site: str, way: Direction = "both", to: str = "", **figures: float) -> None:
         """Impair the link of a site (or of ``pub``) according to ``figures`` (see ``Impairments``).
 
-        ``way`` is relative to the site.  With ``to`` only the direction from this site to that one is impaired.
+        ``way`` is the direction as seen from the site. With ``to``, only the direction from ``site`` to ``to`` is
+        impaired.
         """
         impairments = asdict(Impairments(**figures))
         for port in self._ports_of(site):
@@ -148,7 +149,7 @@ class Internet:
                     self._send_order(do="weather", port=port, to="", is_up=is_up, weather=impairments)
 
     def cut(self, site: str, way: Direction = "both", to: str = "") -> None:
-        """Block traffic into a site, out of it, or both; with ``to`` only from this site to that one."""
+        """Block traffic into a site, out of the site, or both; with ``to`` only from ``site`` to ``to``."""
         self.impair(site, way, to, loss=100.0)
 
     def heal(self, site: str) -> None:
@@ -156,7 +157,7 @@ class Internet:
         self.impair(site)
 
     def read_counts(self) -> dict[str, Any]:
-        """Return frames passed and lost and bytes carried so far, by link name and by ``up`` and ``down``."""
+        """Return the total frames passed, frames lost and bytes passed, by link name and by ``up`` and ``down``."""
         counts: dict[str, Any] = self._send_order(do="count")
         return counts
 
@@ -167,13 +168,13 @@ class Internet:
     # -- routers ----------------------------------------------------------------------------------------------------
 
     def reset_mappings(self, site: str) -> None:
-        """Drop all mappings of a router, as its restart does."""
+        """Drop all mappings of a router, as a restart of the router does."""
         self._get_router(site).run(
             f"conntrack -F 2>/dev/null || true\nnft -f - <<'END'\nflush ruleset\n{self._make_rules(site)}END\n"
         )
 
     def renumber(self, site: str) -> str:
-        """Change the external address of a router, as providers do; returns the new one."""
+        """Change the external address of a router, as internet providers do; return the new address."""
         number = self._numbers[site]
         self._move_count += 1
         new, old = f"198.18.{1 + self._move_count % 9}.{number}", self._external[site]
@@ -193,7 +194,7 @@ class Internet:
         self._get_router(site).run(f"echo {seconds} >{folder}\necho {seconds} >{folder}_stream\n")
 
     def move(self, host: str, site: str) -> str:
-        """Move a host to another site, as a phone leaves Wi-Fi; returns its new address there."""
+        """Move a host to another site, like a phone that leaves Wi-Fi; return its address in the new site."""
         if NatKind.NONE in (self.sites[site].kind, self.sites[self._site_of_host[host]].kind):
             raise ValueError(f"{host} can only move between sites with a router")
         self._namespaces[host].run(f"ip link del {WAN}\n")
@@ -212,7 +213,7 @@ class Internet:
         self._make_namespace(name)
 
     def connect_cable(self, host: str, other: str) -> tuple[str, str]:
-        """Connect two hosts by a separate link, as a robot and its computer; returns their addresses on it."""
+        """Connect two hosts by a separate link, like a robot and its computer; return their addresses on this link."""
         self._cables += 1
         name, first = f"cable{self._cables}", 4 * self._cables
         ends = [
@@ -257,7 +258,7 @@ class Internet:
         return namespace
 
     def _disable_ipv6(self, namespace: Namespace) -> None:
-        # IPv6 would send unsolicited datagrams.
+        # With IPv6, the hosts would send unsolicited datagrams.
         namespace.run("for f in /proc/sys/net/ipv6/conf/*/disable_ipv6; do echo 1 >$f; done\nip link set lo up\n")
 
     def _connect_wan(self, name: str, addresses: Sequence[str]) -> None:
@@ -266,7 +267,7 @@ class Internet:
         self._ports[name] = interface
         wide, room = self._namespaces[""], self._namespaces[name]
         wide.run(f"ip link add {interface} type veth peer name {WAN} netns {room.pid}\nip link set {interface} up\n")
-        # The switch copies raw frames: they must have their checksums, and must not exceed the frame size.
+        # The switch copies raw frames, so the sender must compute their checksums and limit their size (no offloading).
         given = "".join(f"ip address add {address}/16 dev {WAN}\n" for address in addresses)
         room.run(
             f"ethtool -K {WAN} tx off tso off gso off gro off >/dev/null 2>&1 || true\nip link set {WAN} up\n{given}"

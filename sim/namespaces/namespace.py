@@ -1,8 +1,9 @@
-"""Hold a network namespace open by a process.
+"""Create network namespaces, each held open by a process.
 
-A namespace has no name that other processes could see: it ends with its holder, and so do its interfaces.
-The holder ends at the end of its input, so nothing remains however this process ends, and two runs cannot conflict.
-Without privileges the first room creates a user namespace that contains all others.
+A namespace has no name that other processes could see. The namespace and its interfaces exist until the process that
+holds it ends. The holder ends when its standard input is closed, so nothing remains however this process ends, and two
+runs cannot conflict. Without privileges, the first namespace is created in a new user namespace, which contains all
+others.
 """
 
 from __future__ import annotations
@@ -23,7 +24,7 @@ TOOLS = {
 }
 """The required tools, with their Debian packages."""
 PATH = os.pathsep.join((os.environ.get("PATH", ""), "/usr/sbin", "/sbin"))
-"""Other users than root often lack the sbin folders in PATH; the tools work in a user namespace."""
+"""PATH with the sbin folders, which users other than root often lack; the tools work in a user namespace."""
 OWN_USER_FLAGS = ("--user", "--map-root-user")
 SCRIPT_LIMIT_S = 20.0
 
@@ -33,7 +34,7 @@ class NamespacesUnavailable(Exception):
 
 
 class Namespace:
-    """A network namespace; ``inside`` is one of the same user namespace, or None for the first.
+    """A network namespace, in the user namespace of ``inside``; None for the first namespace.
 
     Raises ``NamespacesUnavailable``.
     """
@@ -62,23 +63,23 @@ class Namespace:
 
     @property
     def entry_command(self) -> tuple[str, ...]:
-        """The command prefix that runs a program in the room."""
+        """The command prefix that runs a program in the namespace."""
         user = ("--user", "--preserve-credentials") if self._is_own_user else ()
         return ("nsenter", f"--target={self.pid}", *user, "--net", "--")
 
     @property
     def inner_entry_command(self) -> tuple[str, ...]:
-        """The prefix for a process that is already in another room of the same internet."""
+        """The command prefix for a process that is already in another namespace of the same internet."""
         return ("nsenter", f"--target={self.pid}", "--net", "--")
 
     def command(self, arguments: Sequence[str]) -> list[str]:
-        """Return the command that runs ``arguments`` in the room; started by this process, it ends with it."""
+        """Return the command that runs ``arguments`` in the namespace; the command ends when this process ends."""
         # The parent may end before PDEATHSIG is set.
         checked = ("sh", "-c", '[ "$PPID" = "$0" ] && exec "$@"', str(os.getpid()))
         return [*self.entry_command, "setpriv", "--pdeathsig=KILL", "--", *checked, *arguments]
 
     def run(self, script: str) -> str:
-        """Run a shell script in the room; returns its output; raises ``RuntimeError`` at the first failing command."""
+        """Run a shell script in the namespace and return its output; raise ``RuntimeError`` if a command fails."""
         done = subprocess.run(
             [*self.entry_command, "sh", "-e"],
             input=script,
@@ -106,26 +107,26 @@ def make_environment() -> dict[str, str]:
 
 
 def find_unavailable_reason() -> str:
-    """Return why namespaces are not available on this machine; empty if they are."""
+    """Return the reason why namespaces are not available on this machine; empty if they are available."""
     missing = sorted({package for tool, package in TOOLS.items() if shutil.which(tool, path=PATH) is None})
     if missing:
-        return f"missing tools; install them: apt install {' '.join(missing)}"
+        return f"required tools are missing; install them: apt install {' '.join(missing)}"
     try:
         first = Namespace()
     except NamespacesUnavailable as error:
         return str(error)
     try:
-        # A container may allow namespaces and still forbid these.
+        # A container may allow namespaces, but forbid these operations.
         first.run("ip link add probe type veth\nip link del probe\nnft list ruleset >/dev/null\n")
     except RuntimeError as error:
-        return f"namespaces are allowed, but not the required operations in them: {error}"
+        return f"namespaces are allowed, but the required operations in a namespace are not: {error}"
     finally:
         first.close()
     return ""
 
 
 def _start_holder(command: list[str]) -> subprocess.Popen[str] | str:
-    """Return the holder once it is in its namespace, else its error output."""
+    """Return the holder when it has entered its namespace, or its error output if it failed."""
     pipe = subprocess.PIPE
     try:
         holder = subprocess.Popen(command, stdin=pipe, stdout=pipe, stderr=pipe, text=True, env=make_environment())

@@ -1,7 +1,7 @@
 """Define kinds of NAT routers as rules for ``nft``.
 
-Terms of RFC 4787: a *mapping* is the external port of an internal socket; *filtering* decides which external datagrams
-may enter through it.
+Terms of RFC 4787: a *mapping* is the external port of an internal socket; filtering* decides which external datagrams
+may enter through this port.
 """
 
 from __future__ import annotations
@@ -33,12 +33,14 @@ class NatKind(Enum):
     FULL = "full"
     """One mapping for all peers, no filter ("full cone")."""
     ADDR = "addr"
-    """One mapping; accepts datagrams from addresses to which the host has sent ("restricted cone")."""
+    """One mapping for all peers; accepts datagrams only from addresses to which the host has sent ("restricted
+    cone")."""
     PORT = "port"
-    """One mapping; accepts datagrams from addresses and ports to which the host has sent ("port restricted")."""
+    """One mapping for all peers; accepts datagrams only from address and port pairs to which the host has sent ("port
+    restricted")."""
     LEAKY = "leaky"
-    """As ``port``, but unsolicited datagrams reach the router and create connection tracking entries: a peer that sends
-    first prevents the mapping.  This is a Linux router with masquerading and no firewall."""
+    """Like ``port``, but an unsolicited datagram reaches the router and creates a connection tracking entry, so a peer
+    that sends first prevents the mapping of the host. This is a Linux router with masquerading and no firewall."""
     SYM = "sym"
     """A different, random mapping for each peer ("symmetric")."""
     NOUDP = "noudp"
@@ -46,18 +48,18 @@ class NatKind(Enum):
 
     @property
     def description(self) -> str:
-        """A description for people."""
+        """A short description of this kind for tables."""
         return _DESCRIPTIONS[self]
 
     def make_rules(self, forwards: Sequence[PortForward] = ()) -> str:
-        """Return the rule set of such a router, with the port forwardings ``forwards``."""
+        """Return the rule set of a router of this kind, with the port forwardings ``forwards``."""
         outward = f'oifname "{WAN}" masquerade' + (" fully-random" if self is NatKind.SYM else "")
         memory = inward = through = ""
         shield = "" if self is NatKind.LEAKY else f'iifname "{WAN}" ct state new drop'
         if self is NatKind.NOUDP:
             through = "meta l4proto udp drop"
         elif self in (NatKind.FULL, NatKind.ADDR):
-            # The kernel's NAT filters by address and port, so a map keeps the owner of each port.
+            # The kernel's NAT always filters by address and port, so a map stores the host that owns each port.
             timed = f"flags dynamic,timeout; timeout {MAPPING_TIMEOUT_S}s; size 65535;"
             memory = f"map owner {{ type inet_service : ipv4_addr; {timed} }}\n"
             memory += f"set written {{ type ipv4_addr . inet_service; {timed} }}"

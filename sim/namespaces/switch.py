@@ -1,8 +1,9 @@
 """Switch the frames of the wide area between the sites in one process, with link impairments.
 
-``python -m sim.namespaces.switch SEED NAME=INTERFACE ..`` connects these interfaces of its namespace by raw sockets, so
-the kernel needs no traffic control.  Orders arrive as JSON lines, and each is echoed when it is in force; the process
-ends with its input.  A frame passes three lines: out of its site, between the two sites, and into the other site.
+``python -m sim.namespaces.switch SEED NAME=INTERFACE ..`` connects these interfaces of its namespace by raw sockets,
+so the kernel needs no traffic control. The process reads orders as JSON lines and echoes each order when it has taken
+effect; it ends with its input. A frame passes three simulated links: out of its site, between the two sites, and into
+the other site.
 """
 
 from __future__ import annotations
@@ -36,7 +37,7 @@ PCAP_HEADER = struct.pack("=IHHiIII", 0xA1B2C3D4, 2, 4, 0, 0, SNAPLEN_BYTES, 1)
 
 
 class Port:
-    """One interface of a site, with a line for each direction."""
+    """One interface of a site, with a simulated link for each direction."""
 
     def __init__(self, name: str, interface: str, rng: Random) -> None:
         self.name = name
@@ -57,7 +58,7 @@ class Port:
 
 
 class Switch:
-    """All ports; a frame goes to the port of its receiver if that is known, else to all."""
+    """All ports; a frame is sent to the port of its receiver, or to all ports if that is not known."""
 
     def __init__(self, ports: dict[str, str], rng: Random) -> None:
         self._rng = rng
@@ -112,7 +113,8 @@ class Switch:
 
     def _forward_frame(self, lines: list[LinkDirection], port: Port, frame: bytes, now: float) -> None:
         if frame[12:14] == ETHERTYPE_ARP:
-            # ARP is exempt unless the line is cut: real long-distance lines have none, and a retry takes a second.
+            # ARP is not impaired unless the link is cut: real long-distance links have no ARP, and a retry takes a
+            # second.
             if not any(line.impairments.loss == 100.0 for line in lines):
                 self._send_frame(port, frame)
             return
@@ -159,7 +161,7 @@ class Switch:
 
 
 def make_pcap_record(frame: bytes) -> bytes:
-    """Return a frame as a pcap record with the present time."""
+    """Return a frame as a pcap record with the current time."""
     now = time.time()
     return struct.pack("=IIII", int(now), int(now % 1 * 1_000_000), len(frame), len(frame)) + frame
 

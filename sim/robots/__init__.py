@@ -1,1 +1,1 @@
-"""The robot simulator: a map with robots, cameras and sensors, and the robots' side of each driver's protocol."""
+"""The robot simulator: a map with robots, cameras and sensors, and emulators of the robots' protocols."""

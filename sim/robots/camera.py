@@ -1,4 +1,4 @@
-"""Rendering of a dog's camera with the painter's algorithm: 208x160 pixels, 56.9 by 45.2 degrees as on the ERS-7."""
+"""Render a dog's camera with the painter's algorithm: 208x160 pixels, 56.9 by 45.2 degrees like the ERS-7."""
 
 from __future__ import annotations
 
@@ -36,13 +36,13 @@ _GREY: Colour = (150, 146, 140)
 _DARK: Colour = (58, 54, 52)
 _LIGHT = np.array([0.42, 0.27, 0.87])
 _FACES = ((2, 0, 4, 6), (1, 3, 7, 5), (0, 1, 5, 4), (3, 2, 6, 7), (4, 5, 7, 6))
-"""The back, front, right, left and top of a box by its corners, counter-clockwise seen from outside."""
+"""The back, front, right, left and top of a box as indices of corners, counter-clockwise seen from outside."""
 
 Span = tuple[float, float]
 
 
 class Camera:
-    """The cameras of all dogs of ``world``; the noise comes from ``rng``, so a seed gives the same pictures."""
+    """The cameras of all dogs of ``world``; ``rng`` generates the noise, so equal seeds give equal pictures."""
 
     def __init__(self, rng: Random, world: World) -> None:
         self._world = world
@@ -125,7 +125,7 @@ def _make_joints(width: float, height: float) -> Points:
 class _Mesh:
     """Faces of four ``corners`` each, in the dog's frame; a face is visible from the side of its normal.
 
-    The first ``count`` faces are independent; ``marks`` lists, for each of them, the faces that are painted on it.
+    The first ``count`` faces are drawn on their own; ``marks`` lists, for each of these, the faces painted on it.
     """
 
     corners: Points
@@ -137,7 +137,7 @@ class _Mesh:
 
 
 def _make_dog_mesh(stripes: int) -> _Mesh:
-    """Build a simplified ERS-7: body, head with ``stripes`` yellow stripes, ears, legs, tail, the shade below."""
+    """Build a simplified ERS-7: body, head with ``stripes`` yellow stripes, ears, legs, tail, and the shadow below."""
     faces: list[Points] = []
     plain: list[Colour] = []
     bands: list[list[Points]] = []

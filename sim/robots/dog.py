@@ -45,7 +45,7 @@ class Dog:
         self.shape = pymunk.Circle(self.body, FOOTPRINT_RADIUS_M)
         self.shape.friction = 0.3
         self.shape.collision_type = DOG
-        # Rays ignore shapes of the same group: a dog does not measure the distance to itself.
+        # Rays ignore shapes of the dog's own group: a dog does not measure the distance to itself.
         self.shape.filter = pymunk.ShapeFilter(group=number)
         self.motion = REST
         """The velocity in the dog's frame after the newest substep."""
@@ -114,7 +114,7 @@ class Dog:
         self.motion = Motion(cos * vx + sin * vy, cos * vy - sin * vx, float(self.body.angular_velocity))
 
     def place(self, x: float, y: float, heading: float) -> None:
-        """Move the dog to this place, at rest."""
+        """Move the dog to this position, at rest."""
         self.body.position = x, y
         self.body.angle = heading
         self.body.velocity = 0.0, 0.0

@@ -1,7 +1,7 @@
-"""Dogs of the simulator that emulate other kinds of robot, each with the kind's own protocol.
+"""Simulated dogs that emulate other kinds of robot, each with the protocol of that kind.
 
-A robot is given as the settings of its driver (``kind``, ``options``, ``parts``): the emulator listens at the
-addresses to which that driver connects.  ``dialect`` is the version of an "aibo"'s Tekkotsu, "T4" or "T2".
+A robot is described by the settings of its driver (``kind``, ``options``, ``parts``): the emulator listens at the
+addresses to which that driver connects. For the kind "aibo", ``dialect`` is the version of Tekkotsu, "T4" or "T2".
 """
 
 from __future__ import annotations
@@ -27,14 +27,14 @@ ROBOT_KEYS = ("kind", "options", "parts", "dialect")
 
 
 def emulated_kinds() -> list[str]:
-    """Return the kinds of robot that have an emulator: a module of their name in ``sim.robots.emulator``."""
+    """Return the kinds of robot that have an emulator: a module of the kind's name in ``sim.robots.emulator``."""
     return [kind for kind in list_built_in_kinds() if find_spec(f"sim.robots.emulator.{kind}") is not None]
 
 
 class EmulatedRobots:
     """The emulated robots of ``table``, which maps names of dogs to settings of drivers.
 
-    Raises ``UsageError`` if the simulator has no such dog, or no emulator of such a robot.
+    Raises ``UsageError`` if the simulator does not have such a dog, or an emulator of such a robot.
     """
 
     def __init__(self, reactor: Any, rng: random.Random, simulator: RobotSimulator, table: Mapping[str, Table]) -> None:
@@ -54,17 +54,17 @@ class EmulatedRobots:
         simulator.add_order("plug", self.plug, (str,))
 
     def start(self) -> None:
-        """Start all servers; raise ``UsageError`` that names the robot if an address is not available."""
+        """Start all servers; raise ``UsageError`` with the robot's name if an address is not available."""
         for name, transports in self._servers.items():
             for transport in transports:
                 try:
                     transport.start()
                 except FileExistsError as error:
                     raise UsageError(
-                        f"[{name}] {error.filename2} is there already; end its program, or choose another port"
+                        f"[{name}] {error.filename2} already exists; end its program, or choose another port"
                     ) from None
                 except (CannotListenError, OSError) as error:
-                    raise UsageError(f"[{name}] it cannot be served: {error}; choose another address") from None
+                    raise UsageError(f"[{name}] the emulator cannot listen: {error}; choose another address") from None
 
     def stop(self) -> Deferred[Any]:
         """Stop all servers; fires when every address is free."""
@@ -84,7 +84,7 @@ class EmulatedRobots:
 
     def _set_silent(self, name: str, is_silent: bool) -> None:
         if name not in self._servers:
-            raise NotPossible(f"{name!r} does not emulate a robot; these do: {', '.join(self._servers)}")
+            raise NotPossible(f"{name!r} does not emulate a robot; the emulating dogs are {', '.join(self._servers)}")
         for transport in self._servers[name]:
             transport.faults.half_open = is_silent
 
@@ -92,7 +92,7 @@ class EmulatedRobots:
 def _check_robot(name: str, robot: Any) -> list[tuple[str, Table]]:
     """Return kind and options of the robot and of each of its parts; raise ``UsageError`` if ``robot`` is invalid."""
     if not isinstance(robot, Mapping) or not isinstance(robot.get("kind"), str):
-        raise UsageError(f'[{name}] must name a kind, as in kind = "aibo"')
+        raise UsageError(f'[{name}] must have a kind, as in kind = "aibo"')
     for key in robot:
         if key not in ROBOT_KEYS:
             raise UsageError(f"[{name}] has an unknown key {key!r}; known are {', '.join(ROBOT_KEYS)}")

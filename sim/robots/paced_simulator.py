@@ -1,8 +1,8 @@
-"""A simulated world with a clock and with drivers over connections; independent of the kind of its robots.
+"""A simulated world with a clock and with connections of drivers, for any kind of robots.
 
 Each robot obeys one driver at a time, through its own gate: a command expires after its time to live, even if the
-driver is gone, and the robot stops when the connection closes.  The gate outlives its drivers: it refuses tokens
-lower than the highest obeyed one over new connections as well, and the robot reports that token to each driver.
+driver has ended, and the robot stops when the connection closes. The gate is kept when drivers change: over new
+connections it also refuses tokens lower than the highest obeyed token, which the robot reports to each driver.
 """
 
 from __future__ import annotations
@@ -35,13 +35,13 @@ from sim.robots.rendering import HEIGHT, WIDTH
 from sim.robots.world import TICK_S
 
 SILENCE_LIMIT_S = 3.0
-"""Seconds without data after which a client is disconnected, and its robot is free for another."""
+"""Seconds without data after which a client is disconnected, so that another client can use its robot."""
 MAX_LATE_S = 1.0
-"""Delay in seconds up to which the simulator catches up with real time."""
+"""Maximum delay in seconds that the simulator makes up for; a longer delay is skipped."""
 MAX_TTL_S = 10.0
 MAX_FPS = 30.0
 MAX_LISTED_ROBOTS = 12
-"""Number of robots up to which a message lists all of them."""
+"""Maximum number of robots that a message lists completely."""
 
 
 class RobotMotion(Protocol):
@@ -55,9 +55,9 @@ class RobotMotion(Protocol):
 
 
 class PacedSimulator:
-    """A simulated world with the robots ``names``, which ``legs`` moves, and at most ``most`` connections.
+    """A simulated world with the robots ``names``, moved by ``legs``, and at most ``most`` connections.
 
-    ``start`` starts its time on ``clock``, ``attach`` adds a connection; subclasses implement ``_simulate``.
+    ``start`` starts the simulated time on ``clock``, ``attach`` adds a connection; subclasses implement ``_simulate``.
     """
 
     log = Logger()
@@ -80,12 +80,12 @@ class PacedSimulator:
         return [name for name in self._gates if name in self._drivers]
 
     def start(self) -> None:
-        """Start time."""
+        """Start the simulated time."""
         self._origin = self._clock.seconds() - self._ticks * TICK_S
         self._schedule()
 
     def stop(self) -> None:
-        """Stop time, and close all connections."""
+        """Stop the simulated time, and close all connections."""
         if self._pending is not None:
             self._pending.cancel()
             self._pending = None
@@ -109,14 +109,14 @@ class PacedSimulator:
     # -- for subclasses ---------------------------------------------------------------------------------------------
 
     def _simulate(self, late: float) -> int:
-        """Simulate the due tick and, of those missed in ``late`` seconds, as many as wanted; return their number."""
+        """Simulate the due tick, and some of the ticks missed in ``late`` seconds; return the number of ticks."""
         raise NotImplementedError
 
     def _on_other(self, session: Session, message: Message) -> None:
         """Handle a message that is not from a driver."""
 
     def _reserve_robot(self, name: str) -> None:
-        """Reserve a robot for an emulator, so that no driver can hold it; raise ``UsageError`` for an unknown robot."""
+        """Reserve a robot for an emulator, so that no driver can use it; raise ``UsageError`` for an unknown robot."""
         if name not in self._gates:
             raise UsageError(f"no robot is named {name!r} in this simulator; it has {self._list_names()}")
         self._reserved.add(name)
@@ -195,11 +195,11 @@ class PacedSimulator:
         elif hello.robot not in self._gates:
             problem = f"no robot is named {hello.robot!r} in this simulator; it has {self._list_names()}"
         elif hello.robot in self._reserved:
-            problem = f"{hello.robot} is reached as a robot of another kind here; correct the driver's kind"
+            problem = f"{hello.robot} emulates a robot of another kind; correct the kind of the driver"
         elif self._drivers.get(hello.robot, session) is not session:
             problem, is_lasting = f"{hello.robot} is in use by another driver", False
         elif session.robot not in (None, hello.robot):
-            problem = f"this connection holds {session.robot} already"
+            problem = f"this connection already uses {session.robot}"
         if problem:
             session.send(Refused(problem, is_lasting))
             session.link.close()
@@ -218,7 +218,7 @@ class PacedSimulator:
                 self._halt(name)
             case Drive() if session.has_motors:
                 now = self._now()
-                # Delay on the network shortens a command; a time stamp in the future does not extend it.
+                # A delay on the network shortens a command; a time stamp in the future does not extend the command.
                 deadline = min(message.sent, now) + min(message.ttl, MAX_TTL_S)
                 try:
                     self._gates[name].admit(Permit(message.token, deadline), now)
@@ -239,13 +239,13 @@ class PacedSimulator:
             self._halt(session.robot)
 
     def _list_names(self) -> str:
-        """Return the names of the robots, or the first and the last of many."""
+        """Return the names of the robots; of many robots, only the first and the last name."""
         names = list(self._gates)
         return ", ".join(names) if len(names) <= MAX_LISTED_ROBOTS else f"{names[0]} to {names[-1]}"
 
 
 class Session:
-    """A connection of a driver that holds ``robot``, of an operator, or of a client before its first message."""
+    """A connection of a driver that uses ``robot``, of an operator, or of a client before its first message."""
 
     def __init__(
         self, link: Link, on_message: Callable[[Session, Message], None], on_down: Callable[[Session], None], now: float
@@ -268,7 +268,7 @@ class Session:
         self.link.send(encode_message(message))
 
     def data_received(self, data: bytes) -> None:
-        """Take bytes from the client."""
+        """Process bytes from the client."""
         for message in self._reader.read(data):
             if self._is_down:
                 return
@@ -282,19 +282,19 @@ class Session:
 
 
 class PeriodicTimer:
-    """A timer with ``rate`` events per second of simulated time; none at rate 0."""
+    """A timer with ``rate`` events per second of simulated time; no events at rate 0."""
 
     def __init__(self, rate: float) -> None:
         self._period = 1.0 / rate if rate > 0 else 0.0
         self._next_at = 0.0
 
     def is_due(self, t: float) -> bool:
-        """Return whether an event is due at ``t``; called once per tick, it keeps the average rate."""
+        """Return whether an event is due at ``t``; if called once per tick, the average rate is exact."""
         # The tolerance prevents rounding from delaying an event that falls exactly on a tick.
         if not self._period or t < self._next_at - 1e-6:
             return False
         self._next_at += self._period
         if self._next_at < t:
-            # The first event, or one after a pause: missed events are skipped.
+            # This is the first event, or an event after a pause: missed events are skipped.
             self._next_at = t + self._period
         return True

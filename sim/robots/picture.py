@@ -1,4 +1,4 @@
-"""The map of the simulator as a PNG, in the style of the thesis' Figures 5.3 to 5.7."""
+"""Draw the map of the simulator as a PNG, in the style of Figures 5.3 to 5.7 of the thesis."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from sim.robots.rendering import Colour, Image
 
 WIDTH, HEIGHT = 640, 520
 _OVERSAMPLING = 3
-"""Oversampling factor: the drawing is larger by this factor and then reduced, for smooth edges."""
+"""Oversampling factor: the drawing is made larger by this factor and then reduced, for smooth edges."""
 _MARGIN = 26
 _CAPTION = 40
 _FLOOR: Colour = (146, 172, 158)
@@ -46,7 +46,7 @@ def draw_map(snapshot: Mapping[str, Any], caption: str = "") -> bytes:
         _draw_caption(image, caption)
     done, data = cv2.imencode(".png", image)
     if not done:
-        raise RuntimeError("the picture cannot be encoded")
+        raise RuntimeError("OpenCV cannot encode the picture")
     return data.tobytes()
 
 
@@ -158,7 +158,7 @@ def _draw_name(image: Image, sheet: _Canvas, dog: Mapping[str, Any]) -> None:
 
 
 def _draw_caption(image: Image, caption: str) -> None:
-    """Write the caption at the bottom, centred, reduced if it is too long."""
+    """Write the caption at the bottom, centred, in smaller letters if it is too long."""
     width, size = image.shape[1], 0.55
     (wide, _), _ = cv2.getTextSize(caption, _FONT, size, 1)
     if wide > width - 20:

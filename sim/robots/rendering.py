@@ -24,7 +24,7 @@ NEAR_PLANE_M = 0.02
 SKIRTING_M = 0.03
 
 Colour = tuple[int, int, int]
-"""Blue, green, red, the order of OpenCV."""
+"""A colour as blue, green and red, the order of OpenCV."""
 Points = NDArray[np.float64]
 Image = NDArray[np.uint8]
 
@@ -51,7 +51,7 @@ _NOISE_SHEETS = 8
 _SCALE = (-FOCAL_X_PIXELS * (1 << SUBPIXEL_BITS), -FOCAL_Y_PIXELS * (1 << SUBPIXEL_BITS))
 _MIDDLE = ((WIDTH / 2 - 0.5) * (1 << SUBPIXEL_BITS), (HEIGHT / 2 - 0.5) * (1 << SUBPIXEL_BITS))
 
-# One thread draws a frame in well under a millisecond; a pool of threads would only contend for the cores.
+# One thread draws a frame in less than a millisecond; more threads would only compete for the processor cores.
 cv2.setNumThreads(1)
 
 
@@ -84,7 +84,7 @@ def project(seen: Points) -> NDArray[np.int32]:
 
 
 def fill_polygon(image: Image, seen: list[list[float]], colour: Colour) -> None:
-    """Fill a convex polygon, clipped at the near plane; for few corners, plain numbers are faster than arrays."""
+    """Fill a convex polygon, clipped at the near plane; with few corners, plain numbers are faster than arrays."""
     if all(corner[0] < NEAR_PLANE_M for corner in seen):
         return
     if any(corner[0] < NEAR_PLANE_M for corner in seen):
@@ -135,7 +135,7 @@ def draw_target(image: Image, view: CameraFrame, x: float, y: float, radius: flo
 
 
 class Room:
-    """An empty room of ``width`` by ``depth`` metres, and the sensor noise of a camera; ``rng`` generates the noise."""
+    """Draws an empty room of ``width`` by ``depth`` metres, and the noise of a camera, which ``rng`` generates."""
 
     def __init__(self, rng: Random, width: float, depth: float, wall_height: float) -> None:
         self._rng = rng
@@ -177,12 +177,12 @@ def encode_jpeg(image: Image, is_halved: bool = False) -> bytes:
         image = np.asarray(cv2.resize(image, (WIDTH // 2, HEIGHT // 2), interpolation=cv2.INTER_AREA), np.uint8)
     done, data = cv2.imencode(".jpg", image, [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY])
     if not done:
-        raise RuntimeError("the picture cannot be encoded")
+        raise RuntimeError("OpenCV cannot encode the picture")
     return data.tobytes()
 
 
 def _make_backdrop() -> Image:
-    """Return the background: plain above the horizon, below it the floor, which is lighter towards the lens."""
+    """Return the background: a plain area above the horizon, and the floor below, which is lighter near the lens."""
     image = np.empty((HEIGHT, WIDTH, 3), np.uint8)
     image[:] = _BACKGROUND
     ramp = np.linspace(0.0, 1.0, HEIGHT - HEIGHT // 2)[:, None]

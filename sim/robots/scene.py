@@ -18,12 +18,12 @@ MAX_STRIPES = 5
 
 
 class SceneError(ValueError):
-    """The scene is invalid; the message names the file, the key and the remedy."""
+    """The scene is invalid; the message contains the file, the key and the remedy."""
 
 
 @dataclass(frozen=True)
 class DogPlacement:
-    """Initial pose of one dog, and the number of yellow ``stripes`` on its head, which distinguish it."""
+    """Initial pose of one dog, and the number of yellow ``stripes`` on its head, which distinguish the dogs."""
 
     name: str
     x: float
@@ -69,7 +69,7 @@ def load_scene(name: str) -> Scene:
 
 
 def parse_scene(text: str, source: str) -> Scene:
-    """Parse the scene in the JSON ``text``; ``source`` names it in errors."""
+    """Parse the scene in the JSON ``text``; errors contain ``source`` as its name."""
     try:
         fields = json.loads(text)
     except (ValueError, RecursionError) as error:
@@ -119,7 +119,7 @@ def _check_apart(placements: tuple[DogPlacement, ...], source: str) -> None:
 
 
 class _Table:
-    """A JSON object with typed access to its fields, and errors that name the position."""
+    """A JSON object with typed access to its fields; errors contain the location of the object in the file."""
 
     def __init__(self, fields: object, where: str) -> None:
         if not isinstance(fields, Mapping):
@@ -136,5 +136,5 @@ class _Table:
     def read_text(self, key: str) -> str:
         value = self.fields.get(key)
         if not isinstance(value, str) or not 1 <= len(value) <= 32:
-            raise SceneError(f"{self._where}: {key} must be a text of 1 to 32 characters, not {value!r}")
+            raise SceneError(f"{self._where}: {key} must be a string of 1 to 32 characters, not {value!r}")
         return value

@@ -1,7 +1,7 @@
 """Sensors of one simulated dog: rangers, accelerometer, odometry, compass, power.
 
-Geometry and ranges are the ERS-7's in the stance of its stock walk (body 0.105 m above the floor, neck drawn back, so
-that the nose is inside the footprint).  The compass, which an ERS-7 lacks, is mounted on the back.
+Geometry and ranges are those of an ERS-7 in the stance of its stock walk: the body is 0.105 m above the floor, and the
+neck is drawn back, so the nose is inside the footprint. The compass, which a real ERS-7 lacks, is mounted on the back.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ class Sensors:
         self._samples: dict[str, list[float]] = {key: [] for key in SAMPLED_KEYS}
         self._newest = dict.fromkeys(SAMPLED_KEYS, math.nan)
         self._odometry = [0.0, 0.0, 0.0]
-        # Each dog's stride differs slightly from its nominal length, so its odometry drifts steadily.
+        # Each dog's stride differs slightly from the nominal length, so its odometry drifts steadily.
         self._stride_error = 1.0 + rng.gauss(0.0, 0.01)
         self._turn_error = 1.0 + rng.gauss(0.0, 0.01)
         self._power = 1.0
@@ -66,7 +66,7 @@ class Sensors:
         self._power = max(0.0, self._power - SUBSTEP_S / BATTERY_S * (1.0 if moving else 0.5))
 
     def values(self) -> dict[str, float | bool]:
-        """Return the newest values under the keys of an observation, NaN for nothing in range."""
+        """Return the newest values under the keys of an observation; a range is NaN if nothing is in range."""
         vx, vy, wz = self._dog.motion
         x, y, yaw = self._odometry
         return {
@@ -90,7 +90,7 @@ class Sensors:
         return taken
 
     def _read_ranger(self, distance: float | None, limits: tuple[float, float]) -> float:
-        """Return an infrared reading: noise grows with distance, too near reads as the minimum, too far as NaN."""
+        """Return an infrared reading, with noise that grows with distance; too near gives the minimum, too far NaN."""
         noise = self._rng.gauss(0.0, 1.0)
         if distance is None:
             return math.nan

@@ -32,7 +32,7 @@ EXIT_USAGE = 2
 
 
 def main(arguments: list[str] | None = None, output: TextIO = sys.stdout, errors: TextIO = sys.stderr) -> int:
-    """Run a simulator until it is interrupted; return the exit code: 0, or 2 with one line that names the remedy."""
+    """Run a simulator until it is interrupted; return the exit code: 0, or 2 after an error message of one line."""
     parser = argparse.ArgumentParser(
         prog="swarm yard", description='Simulate robot dogs for the driver "sim" and for emulators.'
     )
@@ -55,8 +55,8 @@ def main(arguments: list[str] | None = None, output: TextIO = sys.stdout, errors
         table = _read_table(args.robots)
     except (SceneError, UsageError) as error:
         return _print_error(errors, str(error))
-    # Twisted's timers use the wall clock by default: a step of it would freeze or race the simulation.  Commands from
-    # before a suspension of the machine must have expired when it resumes.
+    # By default Twisted's timers use the wall clock, whose steps would freeze or race the simulation. The clock used
+    # here also counts suspended time, so old commands have expired when the machine resumes.
     ReactorBase.seconds = staticmethod(
         partial(time.clock_gettime, time.CLOCK_BOOTTIME) if hasattr(time, "CLOCK_BOOTTIME") else time.monotonic
     )
@@ -93,7 +93,7 @@ def main(arguments: list[str] | None = None, output: TextIO = sys.stdout, errors
     reactor.addSystemEventTrigger("before", "shutdown", simulator.stop)
     dogs = ", ".join(simulator.world.dogs)
     line = f"yard {scene.name} ready on {address.host}:{address.port}: {dogs}"
-    # Printed after signal handlers are installed: a reader of this line may end the process at once.
+    # Print this line after the signal handlers are installed: its reader may end the process immediately.
     reactor.callWhenRunning(print, line, file=output, flush=True)
     reactor.run()
     return 0
@@ -110,7 +110,7 @@ def _read_table(path: Path | None) -> dict[str, Any]:
 
 
 def _make_emulators(reactor: Any, seed: int, simulator: RobotSimulator, table: dict[str, Any]) -> Any:
-    """Return the emulators of ``table``; without any, their modules are not imported, to save memory."""
+    """Return the emulators of ``table``; for an empty table the modules are not imported, to save memory."""
     if not table:
         return None
     from sim.robots.emulated_robots import EmulatedRobots

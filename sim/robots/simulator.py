@@ -25,7 +25,7 @@ MAX_RATE_HZ = 1.0 / TICK_S
 class RobotSimulator(PacedSimulator):
     """The simulator of a ``scene``.
 
-    ``world`` is the true state; tests may read it directly, operators receive it over a link.
+    ``world`` is the true state: tests may read it directly, and operators receive it over a link.
     """
 
     def __init__(self, clock: IReactorTime, rng: Random, scene: Scene) -> None:
@@ -45,7 +45,7 @@ class RobotSimulator(PacedSimulator):
         }
 
     def get_true_state(self) -> dict[str, object]:
-        """Return the true state, and of each dog the numbers of commands that its gate accepted and refused."""
+        """Return the true state, including the numbers of commands that each dog's gate accepted and refused."""
         snapshot = self.world.snapshot()
         counts = [
             {"token": gate.token or 0, "accepted": gate.accepted, "refused": sum(gate.refused.values())}
@@ -55,9 +55,9 @@ class RobotSimulator(PacedSimulator):
         return {**snapshot, "dogs": [{**dog, **count} for dog, count in zip(dogs, counts, strict=True)]}
 
     def reserve_for_emulator(self, name: str, limits: Mapping[str, tuple[float, float]]) -> SimulatedDog:
-        """Transfer a dog to an emulator, which moves it within ``limits``; drivers can no longer hold it.
+        """Reserve a dog for an emulator, which moves the dog within ``limits``; drivers can no longer use the dog.
 
-        Raises ``UsageError`` if there is no such dog.
+        Raises ``UsageError`` if the dog does not exist.
         """
         self._reserve_robot(name)
         dog = self.world.dogs[name]
@@ -65,13 +65,13 @@ class RobotSimulator(PacedSimulator):
         return SimulatedDog(self.world, dog, self._sensors[name], self._camera)
 
     def add_order(self, verb: str, work: Callable[..., None], kinds: tuple[type, ...]) -> None:
-        """Add the operator's order ``verb``, with arguments of ``kinds``."""
+        """Add the operator's command ``verb``, with arguments of the types ``kinds``."""
         self._orders[verb] = (work, kinds)
 
     def _simulate(self, late: float) -> int:
         due = 1 + max(0, math.floor(late / TICK_S + 1e-6))
         for left in range(due - 1, -1, -1):
-            # A late simulator drops pictures, never physics.
+            # A late simulator skips pictures, but never a step of the physics.
             self._tick(with_pictures=left == 0)
         return due
 
@@ -107,9 +107,9 @@ class RobotSimulator(PacedSimulator):
                 session.send(CommandResult(message.number, self._execute(message)))
 
     def _execute(self, order: WorldCommand) -> str:
-        """Execute the operator's order; return the problem, or an empty string."""
+        """Execute the operator's command; return the problem, or an empty string."""
         if order.verb not in self._orders:
-            return f"unknown order {order.verb!r}; known are {', '.join(self._orders)}"[:200]
+            return f"unknown command {order.verb!r}; known are {', '.join(self._orders)}"[:200]
         work, kinds = self._orders[order.verb]
         if len(order.arguments) != len(kinds) or not all(
             type(value) is kind for value, kind in zip(order.arguments, kinds, strict=True)

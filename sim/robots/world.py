@@ -1,6 +1,6 @@
 """Physics of the walled world, in steps of 8 ms; deterministic for a given seed.
 
-Has no sensors, pictures or connections.  Metres, radians, seconds; x to the right, y up.
+This module has no sensors, pictures or connections. Units are metres, radians and seconds; x is to the right, y up.
 """
 
 from __future__ import annotations
@@ -23,13 +23,13 @@ TICK_S = SUBSTEPS * SUBSTEP_S
 WALL_THICKNESS_M = 0.04
 MAX_TRIES = 2000
 CLEARANCE_M, DISTANCE_GAP_M, FROM_WALLS_M = 0.75, 0.25, 0.25
-"""Metres that a random target keeps from the dogs, between its distances to two of them, and from the walls."""
+"""Minimum distances in metres for a random target: to a dog; between its distances to two dogs; to a wall."""
 MAX_DELAY_S = 3600.0
-"""Longest delay in seconds of placing a target later."""
+"""Maximum delay in seconds after which a target can be placed."""
 
 
 class NotPossible(ValueError):
-    """The operator's command is not possible; the message names the reason and the remedy."""
+    """The operator's command is not possible; the message contains the reason and the remedy."""
 
 
 @dataclass(frozen=True)
@@ -53,7 +53,7 @@ class World:
         self._steps = 0
         self._place_target_at = math.inf
         self._space = pymunk.Space()
-        # The library's default slop is for pixels: in metres, bodies would overlap by 10 cm.
+        # The library's default is meant for pixels: in metres, bodies would overlap by 10 cm.
         self._space.collision_slop = 0.001
         self._target_shape: pymunk.Shape | None = None
         self._build_walls()
@@ -71,7 +71,7 @@ class World:
 
     @property
     def walls(self) -> list[tuple[float, float, float, float]]:
-        """The inner faces of the walls as x1, y1, x2, y2, counter-clockwise from the lower one."""
+        """The inner faces of the walls as x1, y1, x2, y2, counter-clockwise from the lower wall."""
         width, height = self.scene.width, self.scene.height
         corners = [(0.0, 0.0), (width, 0.0), (width, height), (0.0, height)]
         return [(*corners[i], *corners[(i + 1) % 4]) for i in range(4)]
@@ -80,7 +80,7 @@ class World:
         """Simulate ``SUBSTEP_S`` seconds."""
         if self.t >= self._place_target_at:
             self._place_target_at = math.inf
-            with suppress(NotPossible):  # no place is free, and no caller waits for an answer
+            with suppress(NotPossible):  # no position is free, and no caller waits for an answer
                 self.place_target_at_random()
         for dog in self.dogs.values():
             dog.accelerate(SUBSTEP_S)
@@ -105,7 +105,7 @@ class World:
         return None if hit is None else hit.alpha * reach
 
     def place_target(self, x: float, y: float) -> None:
-        """Move the target to this place; raise ``NotPossible`` if a dog or a wall is in the way."""
+        """Move the target to this position; raise ``NotPossible`` if a dog or a wall is in the way."""
         radius = self.scene.target_radius
         self._check_inside("the target", x, y, radius)
         for dog in self.dogs.values():
@@ -120,10 +120,10 @@ class World:
         self._space.add(shape)
 
     def place_target_at_random(self) -> None:
-        """Move the target to a free place, ``CLEARANCE_M`` from every dog, so that one dog is clearly the nearest.
+        """Move the target to a free position, ``CLEARANCE_M`` from every dog, so that one dog is clearly the nearest.
 
-        The distances to the dogs differ pairwise by ``DISTANCE_GAP_M``.  If no place satisfies both, the best one is
-        used; raises ``NotPossible`` if no place is free.
+        The distances to the dogs differ pairwise by ``DISTANCE_GAP_M``. If no position meets both conditions, the best
+        position is used. Raises ``NotPossible`` if no position is free.
         """
         best, best_fit = None, -math.inf
         for _ in range(MAX_TRIES):
@@ -142,7 +142,7 @@ class World:
         self.place_target(*best)
 
     def place_target_later(self, seconds: float) -> None:
-        """Move the target to a free place after ``seconds``, unless it is placed or removed before."""
+        """Move the target to a free position after ``seconds``, unless it has been placed or removed by then."""
         if not 0.0 <= seconds <= MAX_DELAY_S:
             raise NotPossible(f"the delay of the target must be from 0 to {MAX_DELAY_S:g} s, not {seconds:g}")
         self._place_target_at = self.t + seconds
@@ -155,7 +155,7 @@ class World:
         self.target = self._target_shape = None
 
     def move_dog(self, name: str, x: float, y: float, heading: float) -> None:
-        """Move a dog to this place; raise ``NotPossible`` for an unknown dog or a place in use."""
+        """Move a dog to this position; raise ``NotPossible`` for an unknown dog or an occupied position."""
         dog = self.dogs.get(name)
         if dog is None:
             raise NotPossible(f"no dog is named {name!r}; known are {', '.join(self.dogs)}")
@@ -173,7 +173,7 @@ class World:
         self._place_dog(dog, x, y, heading)
 
     def scatter(self, seed: int, clearance: float = 0.45, from_walls: float = 0.3) -> None:
-        """Move all dogs to random free places, at rest; the same ``seed`` gives the same places."""
+        """Move all dogs to random free positions, at rest; the same ``seed`` gives the same positions."""
         rng = Random(seed)
         taken = [] if self.target is None else [(self.target.x, self.target.y)]
         places = []
@@ -228,7 +228,7 @@ class World:
     def _build_walls(self) -> None:
         half = WALL_THICKNESS_M / 2
         for x1, y1, x2, y2 in self.walls:
-            # Thickness prevents tunnelling; the wall lies outside, so its inner face is the boundary.
+            # The thickness prevents tunnelling; the wall is outside of the boundary, which is its inner face.
             length = math.hypot(x2 - x1, y2 - y1)
             out_x, out_y = half * (y2 - y1) / length, -half * (x2 - x1) / length
             wall = pymunk.Segment(self._space.static_body, (x1 + out_x, y1 + out_y), (x2 + out_x, y2 + out_y), half)

@@ -1,1 +1,1 @@
-"""Simulate whole teams in one process in virtual time: production nodes in an environment that follows from a seed."""
+"""Simulate whole teams in one process in virtual time: production nodes in an environment determined by a seed."""

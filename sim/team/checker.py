@@ -1,11 +1,12 @@
 """Check the invariants of a history of events.
 
-Some workloads compare their observations with the true state of the team (lookups, values, takeovers, tasks), which no
-history contains.  They check it themselves (``Workload.find_violations``), under the same letters if the invariant is
-the same.
+The workloads for lookups, values, takeovers and tasks compare their observations with the true state of the team,
+which a history does not contain. They check their invariants themselves (``Workload.find_violations``), and use the
+same names for the same invariants.
 
-Invariants have the letters and numbers of the documentation: E for execution, D for durability, T for tuples, R for the
-wire.  Each is a function of the events; a request without an answer counts as "maybe".
+An invariant is named as in the documentation, by a letter and a number: E for execution, D for durability, T for
+tuples, R for the wire. Each invariant is a function of the events; a request without an answer may or may not have
+been executed.
 """
 
 from __future__ import annotations
@@ -22,14 +23,14 @@ EventKinds = tuple[type[Event], ...]
 
 
 def _find_invariants(part: ModuleType) -> tuple[tuple[str, Invariant], ...]:
-    """Return the invariants of a module: its functions named by a letter and a digit."""
+    """Return the invariants of a module: its functions whose names are a letter and a digit."""
     return tuple((name.upper(), found) for name, found in vars(part).items() if re.fullmatch(r"[a-z]\d", name))
 
 
 PARTS: tuple[tuple[EventKinds, tuple[tuple[str, Invariant], ...]], ...] = tuple(
     (part.KINDS, _find_invariants(part)) for part in (execution, agreement, durability, tuple_space, wire)
 )
-"""For each part of a team the relevant events and its invariants; E5 applies to devices and to agents."""
+"""The event classes and the invariants of each part of a team; E5 is checked for devices and for agents."""
 
 
 def find_violations(events: Iterable[Event]) -> list[str]:

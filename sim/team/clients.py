@@ -1,6 +1,6 @@
 """Clients that write, remove and read slots at the nodes of a team, and record requests and answers.
 
-Clients judge nothing: the checker does, by the history (``sim.team.invariant.durability``).
+Clients do not check the results: the checker does, with the history (``sim.team.invariant.durability``).
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from sim.team.history import History
 from sim.team.invariant.durability import Slot
 
 WRITE, REMOVE, READ = "write", "remove", "read"
-"""Operations, by the names that the checker uses."""
+"""The operations, with the names that the checker uses."""
 
 
 T = TypeVar("T")
@@ -61,7 +61,7 @@ class Clients:
         concern: ConsistencyLevel = "majority",
         act: str = WRITE,
     ) -> None:
-        """Write the next number into a slot of the ``node`` at ``place``, or remove it if ``act`` is ``REMOVE``."""
+        """Write the next number to a slot of the ``node`` at ``place``, or remove the slot (``act`` is ``REMOVE``)."""
         slot = Slot(key, node.identity.public, name)
         self._write_counts[slot] += 1
         count = self._write_counts[slot]
@@ -72,8 +72,8 @@ class Clients:
     def read(
         self, place: int, life: int, node: EntangledNode, key: bytes, concern: ReadConsistency = "majority"
     ) -> Deferred[list[Record]]:
-        """Read at the ``node`` at ``place`` in its ``life``; fires with the records, or with [] on failure."""
-        # Each life counts as another client, as a node may forget its own reads.
+        """Read at the ``node`` at ``place`` in its life ``life``; fires with the records, or with [] on failure."""
+        # Each life is a separate client, because a restarted node may forget its own reads.
         number = self._record_request((place, life), READ, key, concern)
         return node.get(key, concern).addCallbacks(self._on_records, self._on_failure, (number,), {}, (number,))
 

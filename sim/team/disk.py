@@ -1,4 +1,4 @@
-"""Simulate a store in a file: writes are durable after a delay, and a loss of power loses pending ones."""
+"""Simulate a store in a file: writes are durable after a delay, and a loss of power loses pending writes."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ FULL_MESSAGE = "database or disk is full"
 
 
 class SurvivingMemory(MemoryStore):
-    """A store that keeps everything for its next life."""
+    """A store whose whole content survives the end of its node."""
 
     def get_surviving(self) -> tuple[list[Record], dict[str, bytes]]:
         """Return the records and notes that would survive a loss of power now."""
@@ -24,7 +24,7 @@ class SurvivingMemory(MemoryStore):
 
 
 class SimulatedDisk(SurvivingMemory):
-    """A store that loses pending writes on a loss of power; while ``is_full`` nothing can be written."""
+    """A store that loses pending writes on a loss of power; while ``is_full`` is set, nothing can be written."""
 
     def __init__(self, clock: IReactorTime, rng: random.Random) -> None:
         super().__init__()
@@ -46,7 +46,7 @@ class SimulatedDisk(SurvivingMemory):
         return self._trouble
 
     def put(self, record: Record, expires_at: float) -> bool:
-        """Store ``record`` if it beats the one in its slot; see ``Store.put``."""
+        """Store ``record`` if it is newer than the record in its slot; see ``Store.put``."""
         if self._trouble and record.supersedes(self.get_slot(record.slot)):
             raise _make_error(self._trouble)
         return super().put(record, expires_at)
@@ -69,7 +69,7 @@ class SimulatedDisk(SurvivingMemory):
             self._schedule()
 
     def mark_durable(self) -> None:
-        """Make the present content durable."""
+        """Make the current content durable."""
         self.durable, self.durable_notes = (
             {slot: record for slot, record in self._pending.items() if record},
             dict(self._notes),
@@ -82,7 +82,7 @@ class SimulatedDisk(SurvivingMemory):
         return list(self.durable.values()), self.durable_notes
 
     def close(self) -> None:
-        """Write pending changes if possible, and then nothing more."""
+        """Write pending changes if possible; later changes are not written."""
         self._commit()
         self.lose_power()
 
@@ -127,9 +127,9 @@ class SimulatedDisk(SurvivingMemory):
 
 
 def restore_store(store: SurvivingMemory, later: SurvivingMemory, now: float) -> SurvivingMemory:
-    """Fill ``later`` with the content that survives the node with ``store``: team records and notes, but no leases.
+    """Fill ``later`` with the content of ``store`` that survives its node: team records and notes, but no leases.
 
-    Team records expire a whole ttl after ``now``, as a file does not know the time since its last use.
+    Team records expire a whole TTL after ``now``, because the time since the last use of a file is not known.
     """
     records, notes = store.get_surviving()
     later.origin = "kept"

@@ -1,8 +1,8 @@
 """Draw durations of sessions and absences from distributions with a given median.
 
-When an observation starts, sessions are already in progress: their remaining durations are not fresh draws, as long
-sessions are more likely to be observed (the inspection paradox).  ``draw_remaining`` draws these, so that the churn
-rate is the same from the first second on.
+When an observation starts, sessions are already in progress. Their durations have a different distribution, because
+long sessions are more likely to be in progress (the inspection paradox). ``draw_remaining`` draws the remaining
+durations of these sessions, so the churn rate is the same from the first second on.
 """
 
 from __future__ import annotations
@@ -12,7 +12,7 @@ import random
 from dataclasses import dataclass
 
 SHAPES = {"exponential": 1.0, "weibull": 0.5}
-"""Weibull with a shape of 0.5 fits measurements of file-sharing networks: most nodes leave soon, some stay long."""
+"""The shape of each kind; Weibull with 0.5 fits measurements of file-sharing networks: most sessions are short."""
 KINDS = (*SHAPES, "fixed")
 
 
@@ -41,7 +41,7 @@ class DurationDistribution:
         if self.kind == "fixed":
             return self.median * rng.random()
         shape = SHAPES[self.kind]
-        # Weighted by length, the exponential behind the Weibull becomes a gamma variable.
+        # If sessions are weighted by length, the exponential variable of the Weibull becomes a gamma variable.
         whole = self._scale * rng.gammavariate(1 + 1 / shape, 1.0) ** (1 / shape)
         return float(whole * rng.random())
 

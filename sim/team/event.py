@@ -1,8 +1,8 @@
-"""Events of a run, as plain facts without judgement.
+"""Define the events of a run; an event does not say whether it violates an invariant.
 
-``at`` is the time on the simulator's clock, in seconds.  A ``place`` hosts nodes one after the other, and numbers their
-lives; ``task`` is the name of a task.  A request and its answer are two events with the same ``number``, as other
-events happen in between.
+``at`` is the time on the simulator's clock, in seconds. A ``place`` is the number of a simulated host, on which nodes
+run one after the other; each run of a node is a *life*, and lives are numbered per place. ``task`` is the name of a
+task. A request and its answer are separate events with the same ``number``, because other events happen in between.
 """
 
 from __future__ import annotations
@@ -43,9 +43,9 @@ class Answered(Event):
 
 @dataclass(frozen=True, slots=True)
 class Unanswered(Event):
-    """The client gave up: the operation may have been carried out, or may be later.
+    """The client gave up: the operation may have been executed, or may still be executed.
 
-    ``is_unavailable``: the client was told that too few replicas are available.
+    ``is_unavailable``: the client got the error that too few replicas are available.
     """
 
     number: int
@@ -58,7 +58,7 @@ class Unanswered(Event):
 
 @dataclass(frozen=True, slots=True)
 class Born(Event):
-    """A life began; the node has this public key, id and address (empty if not needed)."""
+    """A life began: a node with this public key, id and address (empty if not needed) started."""
 
     place: int
     life: int = 0
@@ -69,7 +69,7 @@ class Born(Event):
 
 @dataclass(frozen=True, slots=True)
 class Died(Event):
-    """A life ended; ``forgets``: the next life may lack stored data."""
+    """A life ended: the node stopped; ``forgets``: the next node may lack stored data."""
 
     place: int
     forgets: bool = False
@@ -85,7 +85,7 @@ class Settled(Event):
 
 @dataclass(frozen=True, slots=True)
 class Assumptions(Event):
-    """The assumptions from now on: lease ttl, clock drift, stopping time of robots, maximum network delay."""
+    """The assumptions from now on: TTL of leases, clock drift, stopping time of robots, maximum network delay."""
 
     ttl: float
     drift: float
@@ -95,7 +95,7 @@ class Assumptions(Event):
 
 @dataclass(frozen=True, slots=True)
 class LeaseWon(Event):
-    """An agent believes that it holds a lease, with a token that is new to it."""
+    """An agent obtained a lease, with a token that the agent has not held yet."""
 
     task: str
     place: int
@@ -104,7 +104,7 @@ class LeaseWon(Event):
 
 @dataclass(frozen=True, slots=True)
 class LeaseHeld(Event):
-    """``place`` won or renewed its lease; ``others`` also believe that they hold it, each by its own clock."""
+    """``place`` won or renewed a lease; the places ``others`` also hold this lease, each by its own clock."""
 
     task: str
     place: int
@@ -115,7 +115,8 @@ class LeaseHeld(Event):
 class CommandSent(Event):
     """An agent sent a command.
 
-    Its lease ends at ``ends_at`` by its own clock, and at ``true_end`` by an equal clock that was never suspended.
+    The agent's lease ends at ``ends_at`` by the agent's clock, and at ``true_end`` by an equal clock that was never
+    suspended.
     """
 
     task: str
@@ -126,7 +127,7 @@ class CommandSent(Event):
 
 @dataclass(frozen=True, slots=True)
 class CommandReceived(Event):
-    """The gate of a device accepted or refused a command; the device moves until ``until`` without a further one."""
+    """The gate of a device accepted or refused a command; without further commands it moves until ``until``."""
 
     task: str
     place: int
@@ -138,7 +139,7 @@ class CommandReceived(Event):
 
 @dataclass(frozen=True, slots=True)
 class RobotStopped(Event):
-    """An agent stopped its robot, which stands still from ``still_at`` on."""
+    """An agent stopped its robot; the robot stands still from ``still_at`` on."""
 
     task: str
     place: int
@@ -156,7 +157,7 @@ class MajorityReachable(Event):
 
 @dataclass(frozen=True, slots=True)
 class CommandExpected(Event):
-    """A command with a token ``above`` this one must follow within ``within`` seconds after ``since``."""
+    """A command with a higher token than ``above`` must follow within ``within`` seconds after ``since``."""
 
     task: str
     why: str
@@ -170,7 +171,7 @@ class CommandExpected(Event):
 
 @dataclass(frozen=True, slots=True)
 class FaultFree(Event):
-    """This run has no faults and a perfect network; messages reach all nodes ``within`` so many seconds."""
+    """This run has no faults and a perfect network; messages reach all nodes within ``within`` seconds."""
 
     within: float
 
@@ -186,7 +187,7 @@ class ActiveTasks(Event):
 
 @dataclass(frozen=True, slots=True)
 class OutcomeStored(Event):
-    """A majority of replicas has the outcome of a task."""
+    """A majority of replicas stores the outcome of a task."""
 
     task: str
     outcome: str
@@ -201,7 +202,7 @@ class OutcomeExpired(Event):
 
 @dataclass(frozen=True, slots=True)
 class OpenTask(Event):
-    """At the end: an agent regards a task as open, and is in this state of it."""
+    """At the end of the run: an agent regards a task as open, and is in this state in the task."""
 
     task: str
     place: int
@@ -210,7 +211,7 @@ class OpenTask(Event):
 
 
 class Report(NamedTuple):
-    """A report used in a decision: its agent, its age, and its cost (None: not able)."""
+    """A report used in a decision: its agent, its age, and its cost (None: the agent cannot do the task)."""
 
     agent: str
     name: str
@@ -221,7 +222,7 @@ class Report(NamedTuple):
 
 @dataclass(frozen=True, slots=True)
 class Decided(Event):
-    """An agent decided a round by these reports, its own first; ``basis`` is the whole input."""
+    """An agent decided a round from these reports, its own report first; ``basis`` is the whole input."""
 
     place: int
     group: str
@@ -237,7 +238,7 @@ class Decided(Event):
 
 @dataclass(frozen=True, slots=True)
 class Stored(Event):
-    """The store of a place has new content in a slot; another ``memory`` may lack content of an older one."""
+    """The store of a place has new content in a slot; a store with a new number ``memory`` may lack older content."""
 
     place: int
     memory: int
@@ -251,7 +252,7 @@ class Stored(Event):
 
 @dataclass(frozen=True, slots=True)
 class ContactKnown(Event):
-    """A node has a contact in its table."""
+    """A node has a contact in its routing table."""
 
     place: int
     public: bytes
@@ -260,7 +261,7 @@ class ContactKnown(Event):
 
 @dataclass(frozen=True, slots=True)
 class MembersListed(Event):
-    """At the end: the ids of the members that a node regards as alive, in its order."""
+    """At the end of the run: the ids of the members that a node regards as alive, in the node's order."""
 
     place: int
     ids: tuple[bytes, ...]
@@ -271,7 +272,7 @@ class MembersListed(Event):
 
 @dataclass(frozen=True, slots=True)
 class TupleStored(Event):
-    """A replica holds a tuple, on which these members decide."""
+    """A replica stores a tuple; these council members decide on its taker."""
 
     mark: Hashable
     fields: Hashable
@@ -291,14 +292,14 @@ class VoteAccepted(Event):
 
 @dataclass(frozen=True, slots=True)
 class LivingMembers(Event):
-    """The living members, with their incarnations: a new incarnation has forgotten its votes."""
+    """The living council members, with their incarnations: a new incarnation has forgotten its votes."""
 
     members: tuple[tuple[bytes, bytes], ...]
 
 
 @dataclass(frozen=True, slots=True)
 class AnswerRepeated(Event):
-    """A member had another request for the tuple that it accepted for ``taker``, and answered this (None: invalid)."""
+    """A member that had accepted ``taker`` for a tuple answered a further request with ``answer`` (None: invalid)."""
 
     fields: Hashable
     taker: bytes
@@ -310,7 +311,7 @@ class AnswerRepeated(Event):
 
 @dataclass(frozen=True, slots=True)
 class InvalidDatagram(Event):
-    """An invalid datagram, which must change nothing, reached a node: digests of the node's state, and its reaction."""
+    """An invalid datagram, which must change nothing, reached a node: digests of its state, and its reactions."""
 
     place: int
     kind: str
@@ -325,7 +326,7 @@ class InvalidDatagram(Event):
 
 @dataclass(frozen=True, slots=True)
 class RequestExecuted(Event):
-    """A node executed the request ``request``, which may happen once per life."""
+    """A node executed the request ``request``, which is permitted only once per life of the node."""
 
     place: int
     life: int
@@ -334,7 +335,7 @@ class RequestExecuted(Event):
 
 @dataclass(frozen=True, slots=True)
 class UnvalidatedTraffic(Event):
-    """At the end: bytes sent to an unvalidated address, and bytes received from it."""
+    """At the end of the run: bytes sent to an unvalidated address, and bytes received from this address."""
 
     sent: int
     received: int
@@ -342,7 +343,7 @@ class UnvalidatedTraffic(Event):
 
 @dataclass(frozen=True, slots=True)
 class TableSize(Event):
-    """The number of entries in a table of a node, and its limit ``cap``."""
+    """The number of entries in a table of a node, and the limit ``cap`` of the table."""
 
     place: int
     what: str

@@ -1,4 +1,4 @@
-"""Record the events of a run in their order, without judgement; events are only appended."""
+"""Record the events of a run in their order, for the checker; events are only appended."""
 
 from __future__ import annotations
 
@@ -11,8 +11,8 @@ from sim.team.event import Answered, Asked, Event, Unanswered
 class History:
     """The events of one run; ``seconds`` returns the time of the simulator's clock.
 
-    Clients record their requests and answers; ``sim.team.checker`` judges them afterwards.  A request without an answer
-    stays open: it may have been carried out.
+    Clients record their requests and answers; ``sim.team.checker`` checks these afterwards. A request without an
+    answer remains open: it may have been executed.
     """
 
     def __init__(self, seconds: Callable[[], float]) -> None:
@@ -31,7 +31,7 @@ class History:
         self.events.append(kind(self._seconds(), *facts))
 
     def record_request(self, client: Hashable, what: str, subject: Hashable, argument: object = None) -> int:
-        """Append a client's request; returns its number, for the answer."""
+        """Append a client's request; return the number of the request, for its answer."""
         self._request_count += 1
         self.events.append(Asked(self._seconds(), self._request_count, client, what, subject, argument))
         return self._request_count

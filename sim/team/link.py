@@ -1,7 +1,8 @@
 """Model the links between the nodes of a team: LAN, Wi-Fi or internet, with bursts, queues and losses.
 
-State is kept per sender and receiver, not per pair, as ten thousand nodes have fifty million pairs.  So a burst belongs
-to a sender's radio, a queue to an access link, and the distance of two nodes follows from their positions.
+State is stored per sender and per receiver, not per pair, because ten thousand nodes have fifty million pairs. So a
+loss burst affects a sender, a queue belongs to an access link, and the distance of two nodes follows from their
+positions.
 """
 
 from __future__ import annotations
@@ -19,11 +20,11 @@ from middleware.entangled.network.network import Address
 
 KINDS = ("none", "lan", "wifi", "internet")
 MEAN_RTT_S = 0.156
-"""Mean round-trip time of the King data set in seconds, as in the simulations that results are compared with."""
+"""Mean round-trip time of the King data set in seconds, as in the published simulations used for comparison."""
 ACCESS_DELAY_S = 0.0125
 """Mean one-way delay of a node's access link in seconds, for every peer."""
 SIDE_S = (MEAN_RTT_S / 2 - 2 * ACCESS_DELAY_S) / 0.521405
-"""Side of the square of node positions, in seconds one way; 0.5214 is the mean distance in a unit square."""
+"""Side of the square of node positions, as one-way delay in seconds; 0.5214 is the mean distance in a unit square."""
 SPREAD = 0.05
 """Relative variation of the delays of one pair."""
 LOST: tuple[float, ...] = ()
@@ -34,18 +35,18 @@ class LinkSettings:
     """``[link]``: the links between the nodes."""
 
     kind: Annotated[str, one_of(KINDS)] = "lan"
-    """``none``: no delay.  ``lan``: 0.2 to 0.6 ms.  ``wifi``: 1 ms and more, 5 ms on average.  ``internet``: by the
-    positions of nodes, with a mean round-trip time of 156 ms."""
+    """The one-way delay. ``none``: 0. ``lan``: 0.2 to 0.6 ms. ``wifi``: at least 1 ms, 5 ms on average. ``internet``:
+    depends on the positions of the nodes; the mean round-trip time is 156 ms."""
 
     loss: Annotated[float, Meta(ge=0.0, le=0.9)] = 0.0
     """Share of datagrams lost in each direction."""
 
     burst: Annotated[float, Meta(ge=0.0, le=10.0), Unit("seconds")] = 0.0
-    """Mean duration in seconds of a sender's loss burst, at the mean rate of ``loss`` (Gilbert-Elliott); 0: independent
-    losses."""
+    """Mean duration in seconds of a sender's loss bursts (Gilbert-Elliott), with ``loss`` as the mean loss rate; 0:
+    independent losses."""
 
     asymmetry: Annotated[float, Meta(ge=0.0, le=1.0)] = 0.0
-    """Relative difference of losses: one direction of a pair loses this share more than ``loss``, the other less."""
+    """Relative asymmetry of losses: one direction of a pair loses more than ``loss`` by this share, the other less."""
 
     duplicate: Annotated[float, Meta(ge=0.0, le=0.9)] = 0.0
     """Share of datagrams that arrive twice."""
@@ -57,7 +58,7 @@ class LinkSettings:
     """Bytes per second that a node can send; 0: unlimited."""
 
     queue: Annotated[float, Meta(ge=0.001, le=60.0), Unit("seconds")] = 0.5
-    """Maximum queueing time of a datagram in seconds; it is lost if it would wait longer."""
+    """Maximum queueing time of a datagram in seconds; a datagram that would wait longer is lost."""
 
 
 class TeamLink:
@@ -77,7 +78,7 @@ class TeamLink:
         self._is_plain = not (settings.duplicate or settings.reorder or settings.bandwidth)
 
     def draw_delays(self, source: Address, to: Address, size: int, now: float, rng: random.Random) -> Sequence[float]:
-        """Return the delay of each copy of a datagram in seconds; empty if it is lost."""
+        """Return the delay of each copy of a datagram in seconds; empty if the datagram is lost."""
         if self._loss and self._is_lost(source, to, now, rng):
             return LOST
         if self.extra_loss and rng.random() < self.extra_loss:
@@ -112,7 +113,7 @@ class TeamLink:
             loss = min(0.99, loss * (1 + settings.asymmetry if source < to else 1 - settings.asymmetry))
         if not settings.burst:
             return rng.random() < loss
-        # A two-state Markov chain in continuous time: the state now follows from the last observed one.
+        # A two-state Markov chain in continuous time: the current state is drawn from the last observed state.
         since, was_bad = self._bursts.get(source, (-1e9, False))
         remembered = math.exp((since - now) / (settings.burst * (1 - loss)))
         is_bad = rng.random() < loss + ((1.0 if was_bad else 0.0) - loss) * remembered

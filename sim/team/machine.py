@@ -1,7 +1,8 @@
-"""Simulate the computer of one node, with its own clock: it can drift, be frozen or suspended, and die.
+"""Simulate the computer of one node: its clock can drift, and the computer can be frozen, be suspended and die.
 
-It is the clock of the node, and receives the node's datagrams and the bytes of its robot.  Nothing runs on a frozen
-machine.  When it continues, overdue timers run first, then it receives pending data, as a reactor does after SIGCONT.
+The machine is the clock of its node, and receives the node's datagrams and the bytes of its robot. Nothing runs on a
+frozen machine. When the machine continues, overdue timers run first, then pending data is received, as in a reactor
+after SIGCONT.
 """
 
 from __future__ import annotations
@@ -17,10 +18,10 @@ from drivers.link import Connector, Link, LinkClient, Reconnector
 from middleware.entangled.network.network import Address, Network, Receiver, find_ports
 
 MIN_DELAY_S = 1e-6
-"""Minimum delay of a timer in seconds, unless it is 0.  A remainder from rounding between two clocks may be too small
-to advance the simulator's clock: code that waits for it repeatedly would wait for ever."""
+"""Minimum delay of a timer in seconds, unless the delay is 0. A delay that is only a rounding error between two clocks
+may be too small to advance the simulator's clock, and code that repeats such a wait would never end."""
 MAX_QUEUED_DATAGRAMS = 200
-"""Maximum number of datagrams queued for a frozen machine; others are dropped, as by a full socket buffer."""
+"""Maximum number of datagrams queued for a frozen machine; more are dropped, as by a full socket buffer."""
 
 
 @implementer(IDelayedCall)
@@ -55,7 +56,7 @@ class _MachineCall:
         return self._state == "waiting"
 
     def cancel(self) -> None:
-        """Unschedule the call; raises ``AlreadyCalled`` or ``AlreadyCancelled``."""
+        """Cancel the call; raises ``AlreadyCalled`` or ``AlreadyCancelled``."""
         self._check()
         self._state = "cancelled"
         if self.inner is not None and self.inner.active():
@@ -90,7 +91,7 @@ class Machine:
     """A computer whose clock runs ``rate`` times as fast as the simulator's clock, and starts at ``offset``."""
 
     COUNTS_SUSPENSION = True
-    """Whether its clock continues during a suspension (CLOCK_BOOTTIME does, CLOCK_MONOTONIC does not)."""
+    """Whether the clock continues during a suspension (CLOCK_BOOTTIME continues, CLOCK_MONOTONIC does not)."""
 
     def __init__(self, world: IReactorTime, rate: float = 1.0, offset: float = 0.0) -> None:
         self.rate = rate
@@ -99,7 +100,7 @@ class Machine:
         self.overdue_calls: list[_MachineCall] = []
         self._pending_input: list[tuple[Callable[..., object], tuple[Any, ...]]] = []
         self._clock = world
-        # The clock's value at the last change of its rate, and the simulator's time of it.
+        # The clock's value at the last change of its rate, and the simulator's time of that change.
         self._base_value = offset
         self._base_time = 0.0
         self._suspended_s = 0.0
@@ -110,17 +111,17 @@ class Machine:
         return self.to_machine_time(self._clock.seconds())
 
     def to_machine_time(self, moment: float) -> float:
-        """Return the value of its clock at a ``moment`` of the simulator's clock, if its rate stays the same."""
+        """Return the value of this clock at ``moment`` of the simulator's clock, if the rate does not change."""
         if self._stopped_at is not None:
             moment = self._stopped_at
         return self._base_value + self.rate * (moment - self._base_time)
 
     def to_simulator_time(self, shown: float) -> float:
-        """Return the simulator's time at which the clock shows ``shown``, if its rate stays the same."""
+        """Return the simulator's time at which this clock shows ``shown``, if the rate does not change."""
         return self._base_time + (shown - self._base_value) / self.rate
 
     def to_unsuspended_time(self, shown: float) -> float:
-        """Return the simulator's time at which the clock would show ``shown`` without any suspension."""
+        """Return the simulator's time at which this clock would show ``shown`` if it had never been suspended."""
         return self.to_simulator_time(shown) - self._suspended_s
 
     def set_rate(self, rate: float) -> None:
@@ -173,7 +174,7 @@ class Machine:
                 receive(*arguments)
 
     def die(self) -> None:
-        """Stop for ever."""
+        """Stop permanently."""
         self.is_alive = False
         self.overdue_calls.clear()
         self._pending_input.clear()

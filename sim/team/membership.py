@@ -1,4 +1,4 @@
-"""Workload that checks the minimum: living nodes have joined the network and have contacts."""
+"""Workload: check only that joined nodes have contacts."""
 
 from __future__ import annotations
 

@@ -9,8 +9,8 @@ from middleware.errors import BadSetting
 from sim.team.scenario import Scenario
 
 KIB_PER_NODE = {"entangled": 250, "swarm": 1000}
-"""KiB per node, rounded up from measurements: 231 per node of 1,000 peers of the library; 937 per node of 120 whole
-device nodes, each of which reads the whole directory when it joins."""
+"""KiB per node by kind, rounded up from measurements: 231 KiB in a team of 1,000 peers of the library; 937 KiB in a
+team of 120 complete device nodes, each of which reads the whole directory when it joins."""
 BASE_BYTES = 60 * 2**20
 """Memory of the interpreter and all modules in bytes."""
 USABLE_SHARE = 0.9
@@ -39,7 +39,7 @@ def measure_free_bytes(read: Read) -> int:
 
 
 def measure_resident_bytes(read: Read) -> int:
-    """Return the resident memory of this process in bytes; 0 if the system does not tell."""
+    """Return the resident memory of this process in bytes; 0 if the system does not report it."""
     with suppress(OSError, ValueError, StopIteration):
         line = next(line for line in read("/proc/self/status").splitlines() if line.startswith("VmRSS:"))
         return int(line.split()[1]) * 1024

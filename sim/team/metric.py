@@ -1,6 +1,6 @@
 """Define the figures that a run measures, and their targets.  Pure.
 
-A rate has the number of trials: no event in n trials means a rate below 3/n with a confidence of 95 %.
+A rate includes the number of trials: no event in n trials means a rate below 3/n with a confidence of 95 %.
 """
 
 from __future__ import annotations
@@ -11,7 +11,7 @@ from collections.abc import Iterable, Sequence
 from dataclasses import asdict, dataclass, replace
 
 ZERO_EVENTS_FACTOR = 3.0
-"""Upper bound of the number of events with 95 % confidence if none was seen (the rule of three)."""
+"""Upper bound of the expected number of events, with 95 % confidence, if no event was seen (the rule of three)."""
 _BOUND = re.compile(r"\s*(<=|>=)\s*(\S+)\s*")
 
 
@@ -23,7 +23,7 @@ class Bound:
     is_maximum: bool = True
 
     def is_met(self, value: float) -> bool:
-        """Return whether ``value`` is within the bound; NaN is not."""
+        """Return whether ``value`` is within the bound; False for NaN."""
         return value <= self.value if self.is_maximum else value >= self.value
 
     def __str__(self) -> str:
@@ -42,9 +42,9 @@ def parse_bound(text: str) -> Bound:
 class Metric:
     """A measured ``value`` in ``unit``; None if nothing was measured.
 
-    ``target`` is the target as text, or empty; ``holds`` whether it is met, None without a target.  ``n`` is the number
-    of trials, 0 if that has no meaning.  ``is_exact``: the value follows from the seed, in contrast to time and memory
-    of the machine that runs the simulation.
+    ``target`` is the target as text, or empty; ``holds`` is whether the target is met, None if there is no target.
+    ``n`` is the number of trials, 0 if the figure has no trials. ``is_exact``: the value follows from the seed, unlike
+    time and memory of the machine that runs the simulation.
     """
 
     name: str
@@ -85,7 +85,7 @@ def make_share(name: str, good: int, n: int) -> Metric:
 
 
 def percentile(values: Sequence[float], part: float) -> float | None:
-    """Return the smallest of ``values`` that the share ``part`` of them does not exceed; None without values."""
+    """Return the smallest of ``values`` that at least the share ``part`` of them does not exceed; None if empty."""
     ordered = sorted(values)
     return ordered[max(0, math.ceil(part * len(ordered)) - 1)] if ordered else None
 

@@ -12,7 +12,7 @@ BAR_WIDTH = 24
 OFTEN, RARELY = 0.2, 10.0
 """Seconds between two updates on a terminal, and between two lines elsewhere."""
 METRICS_INTERVAL_S = 2.0
-"""Seconds between two evaluations of the workloads' figures, as some of them are expensive."""
+"""Seconds between two evaluations of the workloads' figures, some of which are expensive."""
 
 
 class Progress:
@@ -51,7 +51,7 @@ class Progress:
         self._write(self.format_line(run, (moment - then) / (now - before)))
 
     def format_line(self, run: Run, pace: float) -> str:
-        """Return the progress as one line, with the figures that have targets; missed ones are marked.
+        """Return the progress as one line, with the figures that have targets; missed targets are marked.
 
         ``pace`` is the speed relative to real time.
         """

@@ -1,4 +1,4 @@
-"""Report the result of a run with the command that repeats it; sample figures, and write the trace."""
+"""Report the result of a run, with the command that repeats the run; sample figures, and write the trace."""
 
 from __future__ import annotations
 
@@ -15,9 +15,9 @@ from sim.team.scenario import Scenario
 VERSION = 1
 MAX_SHOWN_VIOLATIONS = 20
 MAX_SAMPLES = 240
-"""Number of samples of a run; if a run takes longer than expected, every other one is dropped."""
+"""Maximum number of samples of a run; if a run takes longer than expected, every other sample is dropped."""
 METRICS_EVERY = 6
-"""Figures of workloads are taken in every sixth sample only, as some are expensive."""
+"""The figures of workloads, some of which are expensive, are included only in every sixth sample."""
 
 Series = dict[str, list[tuple[float, float]]]
 
@@ -124,7 +124,7 @@ def format_json(scenario: Scenario, outcome: Outcome, cost: Cost, line: str, ser
 
 
 def _replace_infinite(series: Series) -> dict[str, Sequence[tuple[float, float | None]]]:
-    """Return ``series`` with None for values that are not finite, as JSON has none."""
+    """Return ``series`` with None for values that are not finite, which JSON cannot represent."""
     return {
         name: [(moment, value if abs(value) != float("inf") and value == value else None) for moment, value in points]
         for name, points in series.items()
@@ -132,7 +132,7 @@ def _replace_infinite(series: Series) -> dict[str, Sequence[tuple[float, float |
 
 
 MAX_LINES = 200_000
-"""Maximum number of lines; after them only the last line follows, with the number of omitted ones."""
+"""Maximum number of lines; further lines are omitted, and the last line contains their number."""
 
 
 class Trace:

@@ -1,4 +1,4 @@
-"""Run a scenario from the first node to the verdict; it can be stopped at any time and then gives a partial result."""
+"""Run a scenario from the first node to the result; a run that is stopped early gives a partial result."""
 
 from __future__ import annotations
 
@@ -25,8 +25,9 @@ MAX_VIOLATIONS = 1000
 EPSILON_S = 1e-9
 """Tolerance in seconds for rounding errors of summed steps."""
 LONG_S, SHORT_S, MIN_GRAIN_S = 0.5, 0.1, 1e-4
-"""Real seconds for one grain: above ``LONG_S`` the grain becomes finer, so that a user can stop the run soon, and below
-``SHORT_S`` coarser.  ``MIN_GRAIN_S`` is the finest one in seconds of the team's time."""
+"""The real time that a grain (one step of the team's time) should take: above ``LONG_S`` seconds grains become
+shorter, so that a user can stop the run soon; below ``SHORT_S`` they become longer. ``MIN_GRAIN_S`` is the shortest
+grain in seconds of the team's time."""
 
 Phase = str
 JOINING, SETTLING, RUNNING, REPAIRING, ASKING, DONE = "joining", "settling", "running", "repairing", "asking", "done"
@@ -59,9 +60,9 @@ class Outcome:
 class Run:
     """One run of a ``scenario``.
 
-    ``looked`` is called after each slice, at times that follow from the seed, and may stop the run.  ``watched`` is
-    called more often on a slow machine, according to the real time ``seconds``, and may stop the run as well.
-    ``grown`` is called when all nodes exist: after that most of the memory has their lifetime.
+    ``looked`` is called after each slice, at times that follow from the seed, and may stop the run. ``watched`` is
+    called at intervals of the real time ``seconds``, and may also stop the run. ``grown`` is called when all nodes
+    exist: most of the memory that is allocated by then lives as long as the nodes.
     """
 
     _log = Logger()
@@ -80,7 +81,7 @@ class Run:
         self.team = Team(scenario, seed)
         self.phase: Phase = JOINING
         self.began_at: float | None = None
-        """The time on the team's clock when the team was complete and had settled."""
+        """The time on the team's clock at which the team was complete and had settled."""
         self.workloads: list[tuple[str, Workload]] = [
             (name, kinds[name].make(self.team, settings)) for name, settings in scenario.loads
         ]
@@ -147,7 +148,7 @@ class Run:
     # -- inside -----------------------------------------------------------------------------------------------------
 
     def _on_log_event(self, event: LogEvent) -> None:
-        """Record a failure that a node logged as a violation, as no client would notice it."""
+        """Record a failure that a node logged as a violation, because no client would notice the failure."""
         failure = event.get("log_failure")
         if failure is not None and len(self.violations) < MAX_VIOLATIONS:
             name, moment = failure.type.__name__, self.team.clock.seconds()
@@ -193,7 +194,7 @@ class Run:
         self._advance(FINAL_REQUESTS_S if self.workloads else 0.0)
 
     def _find_unmatched_targets(self, figures: list[Metric]) -> list[str]:
-        """Return the targets that match no figure."""
+        """Return the targets that do not match any figure."""
         names = [figure.name for figure in figures]
         unmatched = [] if self.phase != DONE else [name for name, _ in self.scenario.targets if name not in names]
         return [f"targets: nothing measured {name!r}; there are {', '.join(names) or 'none'}" for name in unmatched]

@@ -1,6 +1,6 @@
 """Load scenarios from TOML files, and validate them before the run.
 
-Every error is a ``BadSetting`` with the file and line, the key, the problem and the remedy.
+Every error is a ``BadSetting`` with the file, the line, the key, the problem and the remedy.
 """
 
 from __future__ import annotations
@@ -47,10 +47,10 @@ class Join:
     """Number of nodes in a batch."""
 
     known: Annotated[int, Meta(ge=1, le=20)] = 2
-    """Number of joined nodes that a newcomer knows; the first nodes know only the first one."""
+    """Number of joined nodes that a joining node knows; the earliest nodes know only the first node."""
 
     within: Annotated[float, Meta(ge=1.0, le=86_400.0), Unit("seconds")] = 120.0
-    """Seconds after the last node started within which all must have joined; a later node is a violation."""
+    """Seconds after the start of the last node within which all nodes must have joined; otherwise it is a violation."""
 
     settle: Annotated[float, Meta(ge=0.0, le=86_400.0), Unit("seconds")] = 10.0
     """Seconds after all have joined before anything is measured."""
@@ -67,7 +67,7 @@ class Sessions:
     """Median duration of a session in seconds."""
 
     away: Annotated[float, Meta(ge=0.1, le=1e7), Unit("seconds")] = 10.0
-    """Median time in seconds until the next session at that place, with the same distribution."""
+    """Median time in seconds until the next session at the same place, with the same distribution."""
 
     goodbye: Annotated[float, Meta(ge=0.0, le=1.0)] = 0.0
     """Share of sessions that end with a graceful leave; the others end like a loss of power."""
@@ -102,7 +102,7 @@ class Nats:
     """``[nat]``: nodes behind NAT routers."""
 
     share: Annotated[float, Meta(ge=0.0, le=0.9)] = 0.0
-    """Share of nodes that are each behind a router; the first ones never are."""
+    """Share of nodes that are each behind their own router; the first nodes never are."""
 
     kinds: Annotated[tuple[str, ...], some_of(NAT_KINDS)] = ("port",)
     """The kinds of routers, assigned in turn (``network.nat_router``)."""
@@ -113,7 +113,7 @@ class Scenario:
     """A scenario."""
 
     about: Annotated[str, Meta(max_length=200), PRINTABLE] = ""
-    """A description for people, one line."""
+    """A description in one line."""
 
     nodes: Annotated[int, Meta(ge=1, le=MAX_NODES)] = 10
     """Number of places in the team; ``--nodes`` replaces it."""
@@ -125,20 +125,20 @@ class Scenario:
     """Duration after the team has settled."""
 
     lead: Annotated[float, Meta(ge=0.0, le=1e7), Unit("seconds")] = 0.0
-    """Seconds of that before the workloads start."""
+    """Seconds at the start of this duration before the workloads start."""
 
     repair: Annotated[float, Meta(ge=0.0, le=1e6), Unit("seconds")] = 0.0
-    """Seconds after that, with all faults ended, before the final requests."""
+    """Seconds from the end of all faults until the final requests."""
 
     step: Annotated[float, Meta(ge=0.01, le=60.0), Unit("seconds")] = 0.5
     """Seconds between two steps of the workloads."""
 
     lease: Annotated[float, Meta(ge=0.1, le=60.0), Unit("seconds")] = 1.0
-    """Seconds for which leased records of a node outlive its last renewal."""
+    """Seconds after the last renewal for which leased records of a node are valid."""
 
     disks: bool = False
-    """Whether nodes have simulated disks, which commit with a delay, can be full, and lose pending writes with the
-    power; without them a node keeps everything for its next life."""
+    """Whether nodes have simulated disks, which commit with a delay, can be full, and lose pending writes when the
+    power fails. Otherwise all data of a node survives a restart."""
 
     join: Join = Join()
     link: LinkSettings = LinkSettings()
@@ -178,9 +178,9 @@ def list_names() -> list[str]:
 
 
 def load_scenario(name: str, settings: Settings, changes: Mapping[str, object] = {}) -> Scenario:  # noqa: B006  (never changed)
-    """Load a scenario by name or file; ``changes`` are keys of the command line that override the file.
+    """Load a scenario by name or file; ``changes`` are values of the command line that override the file.
 
-    ``settings`` has the kinds of workloads.  Raises ``BadSetting``.
+    ``settings`` contains the kinds of workloads. Raises ``BadSetting``.
     """
     path = _find_path(name)
     if not name.endswith(".toml") and not path.exists():
@@ -191,7 +191,7 @@ def load_scenario(name: str, settings: Settings, changes: Mapping[str, object] =
         text = path.read_text(encoding="utf-8")
     except OSError as error:
         problem = f"cannot be read: {error.strerror or error}"
-        raise BadSetting(str(path), "", problem, "name a scenario, such as steady, or a file") from error
+        raise BadSetting(str(path), "", problem, "choose the name of a scenario, such as steady, or a file") from error
     except UnicodeDecodeError as error:
         raise BadSetting(str(path), "", "is not UTF-8 text", "save it in UTF-8") from error
     return parse_scenario(text, str(path), path.stem, settings, changes)
@@ -205,7 +205,7 @@ def find_position(name: str, where: str, key: str) -> str:
 
 
 def make_remedy(word: str, known: Sequence[str]) -> str:
-    """Return a remedy for an unknown word: the nearest of ``known``, or all of them."""
+    """Return a remedy for an unknown word: the nearest word in ``known``, or all words in it."""
     near = get_close_matches(word, known, n=1)
     return f"the nearest is {near[0]}" if near else f"there are {', '.join(known)}"
 
@@ -260,10 +260,12 @@ class _Reader:
         return Scenario(**parts, name=name)
 
     def check(self, scenario: Scenario) -> None:
-        """Raise ``BadSetting`` for values that are invalid together."""
+        """Raise ``BadSetting`` for values that are valid on their own, but not together."""
         link, nat, join = scenario.link, scenario.nat, scenario.join
         if scenario.lead and scenario.lead >= scenario.seconds:
-            raise self.make_error("", "lead", f"is not below the {scenario.seconds:g} s of the run", "increase seconds")
+            raise self.make_error(
+                "", "lead", f"must be less than seconds, which is {scenario.seconds:g}", "increase seconds"
+            )
         if link.burst and not link.loss:
             raise self.make_error(
                 "link", "burst", "has no effect without loss", "write loss = 0.05, or leave burst out"
@@ -291,7 +293,7 @@ class _Reader:
         """Return the error with its line."""
         whole = f"{where}.{key}".strip(".")
         above, _, last = whole.rpartition(".")
-        # A table has a header, or is a key of the table above it; an inline table is on the line of its key.
+        # A table has a header or is a key of its parent table; an inline table is on the line of its key.
         places = (where, key), (whole, ""), (above, last), (where, ""), ("", where.partition(".")[0])
         line = next((self._lines[place] for place in places if place in self._lines), 0)
         table = f"[[fault]] {where.split()[1]} " if where.startswith("fault ") else f"[{where}] " if where else ""
@@ -345,7 +347,7 @@ class _Reader:
 
 
 def _find_lines(text: str) -> Iterator[tuple[tuple[str, str], int]]:
-    """Yield the line of each (table, key), and of each table with an empty key; a [[fault]] is "fault N"."""
+    """Yield the line of each (table, key), and of each table as (table, ""); the table of a [[fault]] is "fault N"."""
     where, faults = "", 0
     for number, line in enumerate(text.splitlines(), 1):
         if header := re.match(r"\s*\[\[?\s*([\w.\" -]+?)\s*\]\]?\s*(#.*)?$", line):

@@ -1,7 +1,7 @@
 """Run one random schedule of nodes with losses, partitions, kills and restarts, observed by workloads.
 
-Everything follows from the seed.  Finally all faults end and killed nodes restart, and after the repair interval the
-workloads give their verdicts.
+Everything follows from the seed. At the end all faults end and killed nodes restart; after the repair interval the
+workloads check their results.
 """
 
 from __future__ import annotations
@@ -29,8 +29,9 @@ REPAIR_S = 45.0
 class Schedule:
     """The run of ``seed``: nodes, network conditions and faults.
 
-    ``workloads`` are made when the nodes exist.  ``rng`` belongs to the first workload; the others have their own
-    generators, so that a seed that shows a bug keeps showing it.  ``world`` makes the nodes; ``trim`` reduces the run.
+    ``workloads`` are created when the nodes exist. The first workload uses ``rng``, and each further workload has its
+    own generator, so that a seed that reveals a bug continues to do so. ``world`` creates the nodes; ``trim`` reduces
+    the run.
     """
 
     def __init__(self, seed: int, world: type[EntangledTeam] = EntangledTeam, trim: Reduction = NO_REDUCTION) -> None:
@@ -99,7 +100,7 @@ class Schedule:
         return found + find_violations(self.history)
 
     def restart(self, place: int) -> None:
-        """Restart the node of a place with the store of its former life."""
+        """Restart the node of a place with the store that it had before."""
         self.restarting.discard(place)
         others = sorted({*self.alive(), place})
         self.team.restart(place, [one for one in self.rng.sample(others, min(2, len(others))) if one != place])
@@ -108,7 +109,7 @@ class Schedule:
 
     def _draw_faults(self, generator: random.Random) -> list[TimedFault]:
         places, faults = list(range(self.n)), []
-        # Permanent failures never exceed a minority of the smallest replica set.
+        # The nodes that fail permanently are never more than a minority of the smallest replica set.
         mortal = generator.sample(places, max(0, (min(self.n, 8) - 1) // 2))
         for _ in range(generator.randrange(1, 6)):
             at = generator.uniform(0.0, self.seconds * 0.8)
@@ -128,7 +129,7 @@ class Schedule:
         return faults
 
     def _draw_minority_faults(self, generator: random.Random) -> list[TimedFault]:
-        """Cut off a minority, which newcomers join until they are a majority together."""
+        """Cut off a minority, which new nodes join until both together are a majority."""
         few = generator.sample(range(self.n), (self.n - 1) // 2)
         newcomers = range(self.n, 2 * self.n - 2 * len(few) + 1)
         at = generator.uniform(2.0, self.seconds * 0.5)
@@ -141,7 +142,7 @@ class Schedule:
         if fault.kind == "join":
             known: Sequence[int] = fault.places[1:]
             if not {*self.alive(), *self.restarting}.intersection(known):
-                known = self.alive()[:1]  # a newcomer that knows only dead nodes could not join
+                known = self.alive()[:1]  # a new node that knows only dead nodes could not join
             self.team.restart(len(self.team.nodes), known)
             self.n += 1
         elif fault.kind == "cut":

@@ -1,7 +1,7 @@
-"""Keep a seed log: a file with one line of JSON per range of seeds, to which lines are only appended.
+"""Write and read a seed log: a file with one line of JSON for each range of seeds, to which lines are only appended.
 
-The file is valid after every line, however the run ended: an incomplete last line (after a loss of power) is skipped
-when reading, and removed when appending.
+The file is valid however the last run ended: an incomplete last line (after a loss of power) is skipped when reading,
+and removed when appending.
 """
 
 from __future__ import annotations
@@ -17,9 +17,10 @@ from middleware.errors import BadSetting
 
 @dataclass(frozen=True)
 class SeedRun:
-    """The result of running ``count`` seeds from ``first`` on: the failed ones, and the duration in seconds.
+    """The result of running ``count`` seeds from ``first`` on: the failed seeds, and the duration in seconds.
 
-    ``what`` names the workloads if they differ from those of the seeds; ``commit`` ends with + if the tree had changes.
+    ``what`` lists the workloads if they were not selected by the seeds; ``commit`` ends with + if the source tree had
+    uncommitted changes.
     """
 
     date: str
@@ -44,12 +45,12 @@ def parse_entries(text: str, file: str) -> list[SeedRun]:
         except (ValueError, TypeError, KeyError) as error:
             if line and number <= text.count("\n"):
                 problem = f"line {number} is not a seed log entry ({error})"
-                raise BadSetting(file, "--log", problem, "name another file, or remove the line") from None
+                raise BadSetting(file, "--log", problem, "choose another file, or remove the line") from None
     return found
 
 
 def find_missing(seeds: range, logged: Iterable[SeedRun], what: str) -> list[int]:
-    """Return the ``seeds`` that no entry with the same workloads has, whatever its commit."""
+    """Return the ``seeds`` that are in no entry with the same workloads, for any commit."""
     done = {seed for one in logged if one.what == what for seed in range(one.first, one.first + one.count)}
     return [seed for seed in seeds if seed not in done]
 

@@ -1,6 +1,6 @@
 """Shrink a failing run: fewest faults, no network impairments, fewest workloads, shortest duration.
 
-This module knows nothing of runs: the caller gives the number of faults, and tells whether a reduced run still fails.
+This module does not start runs: the caller provides the number of faults, and determines whether a reduced run fails.
 """
 
 from __future__ import annotations
@@ -11,15 +11,16 @@ from dataclasses import dataclass, replace
 Fails = Callable[["Reduction"], bool]
 
 DURATION_SHARES = (0.125, 0.25, 0.5, 0.75)
-"""The shares of its length to which a run is shortened, shortest first."""
+"""The shares of its duration to which a run is shortened, shortest first."""
 
 
 @dataclass(frozen=True)
 class Reduction:
     """A reduction of a run.
 
-    ``keep`` are the indices of the remaining faults (None: all), ``calm`` removes network impairments, ``only`` are the
-    remaining workloads (empty: those of the seed), and faults and workloads end after ``seconds`` (None: as drawn).
+    ``keep`` are the indices of the remaining faults (None: all), ``calm`` removes network impairments, ``only`` are
+    the remaining workloads (empty: those of the seed). Faults and workloads end after ``seconds`` (None: the duration
+    of the seed).
     """
 
     keep: tuple[int, ...] | None = None
@@ -42,8 +43,8 @@ NO_REDUCTION = Reduction()
 def reduce_run(whole: Reduction, faults: int, workloads: Sequence[str], seconds: float, fails: Fails) -> Reduction:
     """Return the smallest failing reduction of a run with ``faults`` faults that lasts ``seconds``.
 
-    Faults are removed first, then network impairments, workloads, and time.  ``fails`` may return False when its time
-    budget is used up; the result is then the last reduction that failed.
+    Faults are removed first, then network impairments and workloads, and then the duration is reduced. ``fails`` may
+    return False when its time budget is used up; the result is then the last reduction that failed.
     """
     kept = minimize(range(faults) if whole.keep is None else whole.keep, lambda keep: fails(replace(whole, keep=keep)))
     left = replace(whole, keep=kept)
@@ -66,7 +67,7 @@ def _keep_workloads(trim: Reduction, workloads: Sequence[str], numbers: Sequence
 def minimize(numbers: Sequence[int], fails: Callable[[tuple[int, ...]], bool]) -> tuple[int, ...]:
     """Return a 1-minimal subset of ``numbers`` that still fails (ddmin, Zeller and Hildebrandt, 2002).
 
-    The empty set is tried first, then halves are removed, then smaller and smaller parts.
+    First the empty set is tried; then halves are removed, then smaller and smaller parts.
     """
     kept, parts = tuple(numbers), 2
     if not kept or fails(()):

@@ -1,7 +1,8 @@
-"""Nodes of one process in virtual time: clock, switchboard, the nodes' lives, and state that survives a node.
+"""Run nodes in one process in virtual time: clock, switchboard, starts and ends of nodes, and data that survives.
 
-``Simulation`` is the base of every simulated team; ``EntangledTeam`` has nodes of the library, ``SwarmTeam`` whole
-device nodes.  A team with a scenario is ``sim.team.team.Team``.
+``Simulation`` is the base of every simulated team; ``EntangledTeam`` has nodes of the library, ``SwarmTeam`` complete
+device nodes. A node starts and ends at a *place*, several times if it restarts; each time is a *life*.  A team with a
+scenario is ``sim.team.team.Team``.
 """
 
 from __future__ import annotations
@@ -38,7 +39,7 @@ JOIN_S = 0.3
 CAPABILITIES = {"camera": {"width": 208}}
 
 LifeWatcher = Callable[[int, Any], object]
-"""Called with a place and its node."""
+"""Called with a place and the node that starts or ends there."""
 
 
 class Simulation:
@@ -49,7 +50,7 @@ class Simulation:
         self.clock = HeapClock()
         self.switchboard = Switchboard(self.clock, self.make_rng("board"), conditions)
         self.history = History(self.clock.seconds)
-        """The events for the checker: lives of nodes, and clients' requests and answers."""
+        """The events for the checker: starts and ends of nodes, and clients' requests and answers."""
         self.total_traffic = TrafficCounters()
         """The traffic of all nodes together."""
         self.stores: dict[int, Store] = {}
@@ -57,7 +58,7 @@ class Simulation:
         self.living: dict[int, Any] = {}
         """The living nodes by place."""
         self.life_numbers: Counter[int] = Counter()
-        """The number of the present or last life by place."""
+        """The number of the current or last life, by place."""
         self.on_birth: list[LifeWatcher] = []
         self.on_death: list[LifeWatcher] = []
 
@@ -78,7 +79,7 @@ class Simulation:
         return Identity(self.make_rng(str(place)).randbytes(32))
 
     def make_life_rng(self, place: int) -> random.Random:
-        """Return a random generator that differs from the generators of former lives."""
+        """Return a random generator for the next life of a place, different from those of earlier lives."""
         self.life_count += 1
         return self.make_rng(f"{place}/{self.life_count}")
 
@@ -93,11 +94,11 @@ class Simulation:
     # -- lives ------------------------------------------------------------------------------------------------------
 
     def alive(self) -> list[int]:
-        """Return the places with running nodes, frozen ones included."""
+        """Return the places with running nodes, including frozen nodes."""
         return sorted(self.living)
 
     def watch_lives(self, born: LifeWatcher, died: LifeWatcher) -> None:
-        """Call ``born`` with every living node and each later one before it starts, and ``died`` at each end."""
+        """Call ``born`` for all running nodes and for each later node before it starts, and ``died`` at each end."""
         self.on_birth.append(born)
         self.on_death.append(died)
         for place in self.alive():
@@ -132,7 +133,7 @@ class EntangledTeam(Simulation):
             self.run(JOIN_S)
 
     def make_node(self, place: int, lease: float = 1.0) -> EntangledNode:
-        """Return a node of this place for its next life, not started."""
+        """Return a node for the next life of this place, not started."""
         network = self.network(place)
         identity, store = self.identity(place), self.store(place)
         return EntangledNode(identity, TEAM_KEY, network, store, self.clock, self.make_life_rng(place), lease)
@@ -149,11 +150,11 @@ class EntangledTeam(Simulation):
         return node
 
     def get_store_number(self, place: int) -> int:
-        """Return the number of the node's store; a new one may lack unacknowledged writes."""
+        """Return the number of the node's store; a store with a new number may lack unacknowledged writes."""
         return 0
 
     def kill(self, place: int, forgets: bool = False) -> None:
-        """Kill a node like a loss of power; its store stays as it is.
+        """Kill a node as by a loss of power; its store does not change.
 
         ``forgets``: the next life may lack stored data.
         """
@@ -162,7 +163,7 @@ class EntangledTeam(Simulation):
         self.nodes[place].stop_silently()
 
     def restart(self, place: int, known: Sequence[int] = (0,)) -> EntangledNode:
-        """Start the next life of a node with the store of the last one; the first life for a new place."""
+        """Start the next node at a place, with the store of the last one; at a new place, start the first node."""
         node = self.make_node(place)
         if place == len(self.nodes):
             self.nodes.append(node)

@@ -1,7 +1,7 @@
 """Simulate nodes with stores in real SQLite files that lose power between any two instructions.
 
-The writer has no thread: it commits at times of the simulated clock, so that a run follows from its seed.  A kill
-leaves the files as they are, possibly with a torn commit at their end; the next life opens a copy.
+The writer has no thread: it commits at times of the simulated clock, so a run follows from its seed. A kill does not
+change the files, which may end with an incomplete commit; the next life of the node opens a copy.
 """
 
 from __future__ import annotations
@@ -29,14 +29,14 @@ from sim.team.simulation import EntangledTeam
 
 FILE_SUFFIXES = ("", "-wal")
 MEMORY_FOLDER = "/dev/shm"
-"""A folder in memory, if the machine has it: the tests do not depend on the real disk."""
+"""A folder in memory, used if the machine has it, so that the tests do not depend on the speed of the disk."""
 
 Content = dict[Slot | str, Record | bytes | None]
 """The content of slots and notes."""
 
 
 class ClockedWriter(Writer):
-    """A writer that commits at times of its clock; with ``fault`` set, every commit fails for that reason."""
+    """A writer that commits at times of its clock; if ``fault`` is set, every commit fails for that reason."""
 
     def __init__(self, path: str, connection: sqlite3.Connection, clock: HeapClock, rng: random.Random) -> None:
         super().__init__(path, connection, lambda tell: clock.callLater(0.0, tell))
@@ -46,7 +46,7 @@ class ClockedWriter(Writer):
         self._timer: IDelayedCall | None = None
 
     def start(self, statements: list[Any]) -> None:
-        """Start to write, ``statements`` first."""
+        """Start writing; ``statements`` are executed first."""
         self._pending.statements += statements
         self._schedule()
 
@@ -72,11 +72,11 @@ class ClockedWriter(Writer):
         self._schedule()
 
     def commit_unacknowledged(self) -> None:
-        """Commit all pending changes without an acknowledgement: the power fails meanwhile."""
+        """Commit all pending changes, but acknowledge none: the power fails during the commit."""
         self._commit(self._pending)
 
     def abandon(self) -> None:
-        """Stop at once."""
+        """Stop immediately."""
         self._is_closing = True
         if self._timer is not None and self._timer.active():
             self._timer.cancel()
@@ -150,8 +150,8 @@ class CheckedStore(SqliteStore):
 class SqliteTeam(EntangledTeam):
     """Nodes with stores in files of a temporary folder.
 
-    ``planned_corruption`` maps places to the kind of corruption ("row" or "file") at their next kill; ``lost`` lists
-    acknowledged writes that were missing in the next life, ``undetected`` corruption that was not detected.
+    ``planned_corruption`` maps places to the kind of corruption ("row" or "file") at their next kill. ``lost`` lists
+    acknowledged writes that were missing after the restart, ``undetected`` corruptions that were not detected.
     """
 
     def __init__(self, n: int, seed: int = 1, conditions: LinkConditions = PERFECT) -> None:
@@ -190,7 +190,7 @@ class SqliteTeam(EntangledTeam):
         return store
 
     def kill(self, place: int, forgets: bool = True) -> None:
-        """Kill a node as a loss of power does: its file stays as it is, or has half a commit.
+        """Kill a node as by a loss of power: its file does not change, or has an incomplete commit.
 
         The next life may lack recent writes that are not in the file yet, and the file may be corrupted.
         """
@@ -223,7 +223,7 @@ class SqliteTeam(EntangledTeam):
         self._folder.cleanup()
 
     def compare_content(self, place: int) -> list[str]:
-        """Compare a node's memory with the content that its file would give after a kill now."""
+        """Compare a node's memory with the content that would be read from its file after a kill now."""
         store, path = self.get_store(place), f"{self._get_path(place)}-copy"
         _copy_files(self._get_path(place), path)
         copy = self._open_store(path)
@@ -232,7 +232,7 @@ class SqliteTeam(EntangledTeam):
         found = []
         if here != there:
             found.append(
-                f"node {place}: its file lacks {len(here - there)} records, and has {len(there - here)} too many"
+                f"node {place}: its file lacks {len(here - there)} records, and has {len(there - here)} wrong records"
             )
         copy.abandon()
         return found
@@ -248,7 +248,7 @@ class SqliteTeam(EntangledTeam):
 
         class Store(CheckedStore):
             make_writer = staticmethod(
-                # Only the file name, without the folder: refusals name it to peers, and the folder varies.
+                # Use the file name without the folder, which varies: errors that are sent to peers contain this name.
                 lambda path, connection, deliver: ClockedWriter(Path(path).name, connection, clock, rng)
             )
 
@@ -257,7 +257,7 @@ class SqliteTeam(EntangledTeam):
         return store
 
     def _corrupt_file(self, path: str, kind: str) -> bool:
-        """Corrupt a row or the file; returns whether there was content to corrupt."""
+        """Corrupt a row or the file; return False if there was no content to corrupt."""
         with closing(sqlite3.connect(path, isolation_level=None)) as connection:
             rows = [row for (row,) in connection.execute("SELECT id FROM records WHERE value IS NOT NULL ORDER BY id")]
             if not rows:

@@ -1,7 +1,8 @@
 """Run a function for many seeds, on all cores of this machine or on several machines; results keep their order.
 
-Several machines are connected by Dask (the extra ``[sweep]``): ``dask scheduler`` on one, and ``dask worker ADDRESS
---nworkers auto`` on each, started in the same source tree as here, which is verified before anything runs.
+Several machines are connected by Dask (the extra ``[sweep]``): run ``dask scheduler`` on one machine, and ``dask
+worker ADDRESS --nworkers auto`` on each, in the same version of the source tree as here. The versions are compared
+before the run.
 """
 
 from __future__ import annotations
@@ -24,9 +25,9 @@ T = TypeVar("T")
 
 ROOT = Path(__file__).resolve().parents[2]
 PACKAGES = ("formats", "middleware", "agents", "drivers", "sim", "benchmarks", "tests")
-"""The packages that affect a run; other files of the trees may differ."""
+"""The packages that affect a run; other files of the source trees may differ."""
 QUEUED_PER_WORKER = 4
-"""Number of runs submitted in advance per worker, so that none is idle."""
+"""Number of runs submitted in advance per worker, so that no worker is idle."""
 
 _run_lock = threading.Lock()
 _is_collector_set: list[bool] = []
@@ -43,13 +44,13 @@ def run_seeds(seeds: Sequence[int], one: Callable[[int], T], jobs: int, schedule
         limit_garbage_collection()
         yield from map(one, seeds)
     else:
-        # Spawned, not forked: a fork would inherit threads and a reactor's signal handlers.
+        # The workers are spawned, not forked: a fork would inherit threads and a reactor's signal handlers.
         with multiprocessing.get_context("spawn").Pool(jobs, _init_worker) as pool:
             yield from pool.imap(one, seeds)
 
 
 def limit_garbage_collection() -> None:
-    """Collect garbage rarely, as most objects of a run live until its end."""
+    """Collect garbage rarely, because most objects of a run live until its end."""
     gc.freeze()
     gc.set_threshold(200_000, 20, 20)
 
@@ -63,13 +64,13 @@ def hash_sources() -> str:
 
 
 def _init_worker() -> None:
-    """Initialize a worker process: it ignores Ctrl-C, as its parent ends it."""
+    """Initialize a worker process: it ignores Ctrl-C, because its parent process ends it."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     limit_garbage_collection()
 
 
 def _run_exclusively(one: Callable[[int], T], seed: int) -> T:
-    """Run ``one`` exclusively in this process, as runs modify shared state."""
+    """Run ``one``, never twice at the same time in this process, because runs modify shared state."""
     with _run_lock:
         if not _is_collector_set:
             limit_garbage_collection()

@@ -1,7 +1,7 @@
-"""A simulated team: places with nodes in their present lives, with one virtual clock and one switchboard.
+"""A simulated team: numbered places at which nodes run, with one virtual clock and one switchboard.
 
-The nodes are production code; only clock, network, store and random generators are simulated.  Everything follows from
-the scenario and the seed: ``digest`` is the same on every machine, whatever else the process does.
+The nodes are production code; only clock, network, store and random generators are simulated. Everything follows from
+the scenario and the seed, so ``digest`` is the same on every machine.
 """
 
 from __future__ import annotations
@@ -40,7 +40,7 @@ def get_entangled(node: Node) -> EntangledNode:
 
 
 class PlaceState:
-    """The state of a place that is kept from life to life; ``wall_error`` is the error of its wall clock."""
+    """The state of a place that survives its nodes; ``wall_error`` is the error of its wall clock in seconds."""
 
     __slots__ = ("address", "identity", "store", "traffic", "wall_error", "rate", "nat", "machine", "join_waiters")
 
@@ -54,7 +54,7 @@ class PlaceState:
         self.nat: NatRouter | None = None
         self.machine: Machine | None = None
         self.join_waiters: list[Deferred[bool]] | None = None
-        """Deferreds that wait for the node to join; None if it has joined."""
+        """Deferreds that fire when the node has joined; None if it has already joined."""
 
 
 class Team(Simulation):
@@ -82,11 +82,11 @@ class Team(Simulation):
 
     @property
     def places(self) -> range:
-        """All places, also those without a living node."""
+        """All places, including places without a running node."""
         return range(len(self._places))
 
     def get_joined(self) -> list[int]:
-        """Return the places whose nodes have joined, in no particular order; must not be modified."""
+        """Return the places whose nodes have joined, in arbitrary order; the caller must not modify the result."""
         return self._joined
 
     def address(self, place: int) -> Address:
@@ -94,7 +94,7 @@ class Team(Simulation):
         return self._places[place].address
 
     def node(self, place: int) -> Node:
-        """Return the node at a place in its present life; raises ``KeyError`` if there is none."""
+        """Return the running node at a place; raise ``KeyError`` if no node runs there."""
         return self.living[place]
 
     def get_entangled(self, place: int) -> EntangledNode:
@@ -106,15 +106,15 @@ class Team(Simulation):
         return self._places[place].identity
 
     def traffic(self, place: int) -> TrafficCounters:
-        """Return the traffic of the node at a place over all its lives."""
+        """Return the total traffic of all nodes that ran at a place."""
         return self._places[place].traffic
 
     def get_state(self, place: int) -> PlaceState:
-        """Return the state of a place that is kept from life to life."""
+        """Return the state of a place that survives its nodes."""
         return self._places[place]
 
     def when_joined(self, place: int) -> Deferred[bool]:
-        """Fire with True when the node at a place has joined, or with False if it ends before."""
+        """Fire with True when the node at a place has joined, or with False if the node ends before it has joined."""
         done: Deferred[bool] = Deferred()
         waiting = self._places[place].join_waiters
         if place not in self.living:
@@ -147,7 +147,7 @@ class Team(Simulation):
     # -- joining ----------------------------------------------------------------------------------------------------
 
     def start_all(self) -> float:
-        """Start the nodes as the scenario says; returns the seconds until the last one starts."""
+        """Start the nodes according to the scenario; return the seconds until the last node starts."""
         join, moment = self.scenario.join, 0.0
         for place in self.places:
             if place and (
@@ -175,7 +175,7 @@ class Team(Simulation):
     # -- lives ------------------------------------------------------------------------------------------------------
 
     def start(self, place: int, known: Sequence[int] | None = None) -> Node:
-        """Start the next life of a node; it joins through the ``known`` places (None: some joined ones)."""
+        """Start a node at a place; it joins through the nodes at the places ``known`` (None: some joined nodes)."""
         if place in self.living:
             raise ValueError(f"the node at place {place} is alive")
         here = self._places[place]
@@ -200,13 +200,13 @@ class Team(Simulation):
         return node
 
     def add(self, known: Sequence[int] | None = None) -> int:
-        """Start a new node at a new place; returns the place."""
+        """Start a new node at a new place; return the place."""
         place = self._new_place()
         self.start(place, known)
         return place
 
     def kill(self, place: int) -> None:
-        """Kill a node like a loss of power; its disk stays as it is."""
+        """Kill a node as by a loss of power; its disk does not change."""
         node = self._end_node(place, "killed")
         here = self._places[place]
         if here.machine is not None:
@@ -216,7 +216,7 @@ class Team(Simulation):
         node.stop_silently()
 
     def leave(self, place: int) -> None:
-        """Let a node leave gracefully; a frozen one is killed."""
+        """Let a node leave gracefully; a frozen node is killed."""
         machine = self._places[place].machine
         if machine is not None and machine.is_frozen:
             self.kill(place)
@@ -229,12 +229,12 @@ class Team(Simulation):
         self._places[place].store.close()
 
     def replace(self, place: int) -> None:
-        """Give the place of an ended node to a new one, with another identity and an empty store."""
+        """Start a new node, with a new identity and an empty store, at the place of a node that has ended."""
         if place in self.living:
             raise ValueError(f"the node at place {place} is alive")
         here = self._places[place]
         here.identity = self._make_identity(place, self.life_numbers[place])
-        here.store = self._make_store(place)  # empty, so the next life starts with nothing
+        here.store = self._make_store(place)  # an empty store for the new node
 
     def freeze(self, place: int) -> None:
         """Freeze a node; raises ``ValueError`` if the scenario has no simulated machines."""
@@ -284,7 +284,7 @@ class Team(Simulation):
         if self.scenario.has_machines:
             clock = here.machine = Machine(self.clock, here.rate)
             network = MachineNetwork(here.machine, port)
-        rng = self.make_rng(f"{place}/{self.life_numbers[place] + 1}")  # never the numbers of a former life
+        rng = self.make_rng(f"{place}/{self.life_numbers[place] + 1}")  # different numbers in each life
 
         def wall() -> float:
             return self.clock.seconds() + here.wall_error
@@ -296,7 +296,7 @@ class Team(Simulation):
         return SwarmNode(device, here.identity, TEAM_KEY, known, network, here.store, clock, rng, wall, lease)
 
     def _draw_known(self, place: int) -> list[int]:
-        """Return the places that a new node knows: some that have joined, or the first one."""
+        """Return the places of the nodes that a new node knows: some joined nodes, or the first node."""
         others = self._joined if self._joined else [other for other in list(self.living)[:1] if other != place]
         count = min(self.scenario.join.known, len(others))
         if self.scenario.nat.share:  # nodes behind a router cannot be reached without an introduction

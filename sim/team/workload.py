@@ -11,25 +11,25 @@ from sim.team.team import Team
 
 
 class Workload:
-    """A workload, created before the first node joins; ``Simulation.watch_lives`` tells it of births and deaths.
+    """A workload, created before the first node joins; ``Simulation.watch_lives`` reports starts and ends of nodes.
 
-    It records requests and answers in the history, which the checker judges.
+    The workload records requests and answers in the history, for the checker.
     """
 
     def step(self) -> None:
         """Act; called repeatedly while the faults last."""
 
     def make_final_requests(self) -> None:
-        """Make the final requests, after the faults and the repair interval; 10 s remain for the answers."""
+        """Make the final requests, after the faults and the repair interval; answers are awaited for 10 s."""
 
     def find_violations(self) -> list[str]:
-        """Record the final state; returns the violations that only this workload can judge, one line each."""
+        """Record the final state; return the violations that only this workload can detect, one line each."""
         return []
 
     def collect_metrics(self) -> list[Metric]:
         """Return the figures so far; called repeatedly during the run, and at its end.
 
-        All names are present from the beginning, so that targets can be validated; values are None until measured.
+        The result always contains all names, so that targets can be validated; a value is None until it is measured.
         """
         return []
 

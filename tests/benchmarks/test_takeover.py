@@ -18,9 +18,9 @@ class CommandLineTests(SynchronousTestCase):
         blocked = Path(self.mktemp())
         blocked.write_text("a file", encoding="utf-8")
         for words, said in (
-            ("--count x", "--count: must be a whole number from 0 on, is 'x'"),
-            ("--count -1", "--count: must be a whole number from 0 on, is '-1'"),
-            ("--jobs -1", "--jobs: must be a whole number from 0 on, is '-1'"),
+            ("--count x", "--count: must be a whole number of at least 0, is 'x'"),
+            ("--count -1", "--count: must be a whole number of at least 0, is '-1'"),
+            ("--jobs -1", "--jobs: must be a whole number of at least 0, is '-1'"),
             ("--loss 2", "--loss: must be a share from 0 to 1, is '2'"),
             ("--loss some", "--loss: must be a share from 0 to 1, is 'some'"),
             ("--loss nan", "--loss: must be a share from 0 to 1, is 'nan'"),

@@ -116,7 +116,7 @@ class WaitTests(SynchronousTestCase):
                 factory.buildProtocol(None)
                 self.assertEqual(line.problem, "")
                 self.lose(reactor)
-                self.assertIn("closes each new connection at once", line.problem)
+                self.assertIn("closes each new connection", line.problem)
                 (call,) = reactor.getDelayedCalls()
                 found.append(round(call.getTime() - reactor.seconds(), 6))
                 reactor.advance(found[-1] + 1e-5)

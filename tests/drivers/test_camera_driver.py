@@ -210,7 +210,7 @@ class PictureSourceTests(SynchronousTestCase):
         self.assertIn("plugged", str(self.assertRaises(LinkLost, none.open)))
         self.assertIn("no such", str(self.assertRaises(LinkLost, CaptureSource(Options("x"), lambda: Lens()).open)))
         busy = self.capture(Lens(is_open=False))
-        self.assertIn("else may be using", str(self.assertRaises(LinkLost, busy.open)))
+        self.assertIn("program may be using", str(self.assertRaises(LinkLost, busy.open)))
         lens = Lens(Picture(10, 10))
         lens.can_encode = False
         source = self.capture(lens)

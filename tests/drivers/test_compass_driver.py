@@ -104,7 +104,9 @@ class CompassDriverTests(Conformance, RobotCase):
         driver.log = log = KeptLog()
         connected = driver.connect()
         self.pass_time(SILENCE_S + 0.1)
-        self.assertEqual(driver.problem, "nothing answers at 10.0.0.8:10110; is it on, and in this network?")
+        self.assertEqual(
+            driver.problem, "nothing answers at 10.0.0.8:10110; is the compass switched on, and in this network?"
+        )
         self.connector.is_open, self.faults.half_open = True, True
         self.pass_time(60.0)
         self.assertIn("sends nothing", driver.problem)
@@ -148,7 +150,7 @@ class CompassDriverTests(Conformance, RobotCase):
             for client in self.compass.clients:
                 client.output.send(b"\x00\xf8\x80\x0d")
             self.pass_time(0.1)
-        self.assertEqual(driver.problem, "it sends, but no sentences; is 9600 baud right?")
+        self.assertEqual(driver.problem, "the device sends data, but no sentences; is 9600 baud right?")
         self.assertGreater(driver.diagnostics()["bad_frames"], 500)
         driver.disconnect()
         self.failureResultOf(connected, LinkLost)

@@ -24,7 +24,7 @@ class GreetingTests(SynchronousTestCase):
             (b"HTTP/1.1 404 Not Found\r\n\r\n", "404"),
             (b"SSH-2.0-OpenSSH_9\r\n\r\n", "SSH-2.0"),
             (answer_to(WebSocket("x").opening()), "no rosbridge"),
-            (b"HTTP/1.1 1" + b"0" * (MAX_HEAD_BYTES + 1), "no end"),
+            (b"HTTP/1.1 1" + b"0" * (MAX_HEAD_BYTES + 1), "longer than"),
         ):
             one = WebSocket("h")
             answer = answer_to(one.opening())

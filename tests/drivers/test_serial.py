@@ -101,12 +101,12 @@ class SerialTests(SynchronousTestCase):
         """A device that cannot be opened is retried with growing delays; each cause is logged in one line."""
         line = self.line()
         for number, words in (
-            (errno.ENOENT, "no such device"),
+            (errno.ENOENT, "does not exist"),
             (errno.EACCES, "no permission"),
             (errno.EAGAIN, "busy"),
             (errno.EBUSY, "busy"),
-            (errno.EISDIR, "no serial device"),
-            (errno.ENOTTY, "no serial device"),
+            (errno.EISDIR, "not a serial device"),
+            (errno.ENOTTY, "not a serial device"),
         ):
             self.error = OSError(number, "as the system says")
             self.clock.pump([0.1] * 30)

@@ -54,7 +54,7 @@ class GreetingTests(SynchronousTestCase):
         one.receive_data(b"GET /" + b"x" * (MAX_HEAD_BYTES - 6))
         self.assertEqual(one.fault, "")
         one.receive_data(b"x")
-        self.assertIn("no end", one.fault)
+        self.assertIn("longer than", one.fault)
 
 
 class FrameTests(SynchronousTestCase):

@@ -297,8 +297,8 @@ class KeeperTests(TestCase):
     async def test_names_what_cannot_be_started(self) -> None:
         """If no switch can be started, or each switch ends immediately, this is logged once and retried."""
         for program, words in (
-            ("/nowhere/python", "no dead man's switch yet"),
-            ("/bin/false", "starting another one"),
+            ("/nowhere/python", "dead man's switch did not start"),
+            ("/bin/false", "restarting it"),
         ):
             self.keeper = Supervisor("robot", reactor)
             self.keeper.log = log = KeptLog()  # type: ignore[assignment]

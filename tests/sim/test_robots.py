@@ -99,7 +99,7 @@ class RobotsTests(SimulatorCase):
         driver = SimDriver({"robot": "dog1"}, self.simulator.connector(), self.clock)
         failed = driver.connect()
         self.pass_time(0.5)
-        self.assertIn("reached as a robot of another kind", self.failureResultOf(failed).getErrorMessage())
+        self.assertIn("emulates a robot of another kind", self.failureResultOf(failed).getErrorMessage())
 
     def test_refuses_what_it_cannot_play(self) -> None:
         """An unknown dog, a kind without emulator, an unknown dialect and invalid options are rejected.
@@ -151,7 +151,7 @@ class RobotsTests(SimulatorCase):
         before = len(os.listdir("/dev/fd"))
         table = {"dog2": {"kind": "create2", "options": {"port": "/nowhere/at/all"}}}
         robots = EmulatedRobots(MemoryReactorClock(), Random(1), self.simulator, table)
-        with self.assertRaisesRegex(UsageError, r"\[dog2\] it cannot be served: .*/nowhere/at/all"):
+        with self.assertRaisesRegex(UsageError, r"\[dog2\] the emulator cannot listen: .*/nowhere/at/all"):
             robots.start()
         robots.stop()
         self.assertEqual(len(os.listdir("/dev/fd")), before)

@@ -213,7 +213,7 @@ class SimulatorTests(SynchronousTestCase):
             self.assertEqual((refusal.lasting, client.is_open), (is_lasting, False))
         self.assertEqual(self.simulator.driven_robots, ["dog1"])
         self.client.say(Hello(VERSION, "dog2", 0.0))
-        self.assertEqual(self.client.heard[-1], Refused("this connection holds dog1 already", True))
+        self.assertEqual(self.client.heard[-1], Refused("this connection already uses dog1", True))
         self.assertEqual(self.simulator.driven_robots, [])
 
     def test_drops_for_a_client_that_does_not_read(self) -> None:

@@ -1,4 +1,4 @@
-"""Rendering of the cameras of a crowd: walls, the red target, and the other robots as grey cylinders."""
+"""Render the cameras of a crowd: walls, the red target, and the other robots as grey cylinders."""
 
 from __future__ import annotations
 
@@ -27,10 +27,10 @@ from sim.robots.rendering import (
 from sim.robots.scene import FOOTPRINT_RADIUS_M
 
 CLEAR_M = 4.0
-"""Distance in metres within which other robots are drawn; farther ones are drawn only if they may hide the target."""
+"""Distance in metres within which other robots are drawn; farther robots are drawn only if they may hide the target."""
 FARTHEST_M = 12.0
 WEDGE, SIDE = 0.6, 0.35
-"""Bounds of the lateral distance of objects in the picture: this fraction of the distance ahead, plus these metres."""
+"""Maximum lateral distance of objects in the picture: this fraction of the distance ahead, plus this many metres."""
 _SEAMS = np.array([1.0, 0.55, -0.35, -1.0])
 _GREYS: tuple[Colour, ...] = ((118, 114, 108), (172, 168, 162), (138, 134, 128))
 _STEEPEST = 1.4

@@ -21,9 +21,10 @@ from sim.robots.scene import SceneError
 from sim.robots.world import TICK_S, NotPossible
 
 MakeTeam = Callable[[int, int, CrowdScene, Controller, Callable[[], float]], SearchTeam]
-"""Creates a team from seed, number of agents, ground, the controller of the other robots, and a stopwatch."""
+"""Creates a team from the seed, the number of agents, the scene, the controller of the other robots, and a
+stopwatch."""
 TARGET_DISTANCE_M = 0.6
-"""Distance in metres from the centre of the target within which a robot counts as being at it."""
+"""Distance in metres from the centre of the target within which a robot has reached the target."""
 
 
 def main(arguments: Sequence[str], make_team: MakeTeam | None = None) -> int:
@@ -46,10 +47,10 @@ def main(arguments: Sequence[str], make_team: MakeTeam | None = None) -> int:
     if not 0 < args.seconds <= 86400:
         parser.error(f"--seconds must be more than 0 and at most 86400, not {args.seconds:g}")
     if args.agents and make_team is None:
-        parser.error("--agents is not available here; say swarm crowd instead")
+        parser.error("--agents is not available in this command; use swarm crowd")
     for path in (args.picture, args.json):
         if path is not None and not path.parent.is_dir():
-            parser.error(f"{path} cannot be written: there is no folder {path.parent}; create it")
+            parser.error(f"{path} cannot be written: the folder {path.parent} does not exist; create it")
     try:
         scene = make_square_scene(args.bodies, args.room)
         if args.agents and make_team is not None:
@@ -61,7 +62,7 @@ def main(arguments: Sequence[str], make_team: MakeTeam | None = None) -> int:
 
 def _run_search(args: argparse.Namespace, scene: CrowdScene, make_team: MakeTeam) -> int:
     if not 1 <= args.agents <= scene.robots:
-        raise SceneError(f"--agents must be from 0 to {scene.robots}, the robots here, not {args.agents}")
+        raise SceneError(f"--agents must be from 0 to {scene.robots}, the number of robots, not {args.agents}")
     started_at = time.process_time()
     controller = CONTROLLERS[args.controller or "wander"]
     team = make_team(args.seed, args.agents, scene, controller, time.process_time)

@@ -17,15 +17,15 @@ from sim.robots.scene import FOOTPRINT_RADIUS_M
 
 HALF_VIEW_RAD = math.radians(56.9) / 2
 SIGHT_M = 3.0
-"""Distance in metres at which a robot has_target the target, unless another robot hides it."""
+"""Distance in metres up to which a robot sees the target, unless another robot hides the target."""
 OBSTACLE_DISTANCE_M = 0.45
-"""Distance in metres from the centre within which something ahead is an obstacle."""
+"""Distance in metres from the robot's centre within which something ahead is an obstacle."""
 ARRIVAL_DISTANCE_M = 0.35
 WALK_MPS, TURN_RADPS = 0.16, 1.6
 
 
 class Readings:
-    """Sensor values of the robots from number ``first`` on; contains nothing that a robot could not measure itself."""
+    """Sensor values of the robots from number ``first`` on: only values that a robot could measure itself."""
 
     def __init__(self, crowd: Crowd, first: int = 0) -> None:
         self._crowd = crowd
@@ -38,7 +38,7 @@ class Readings:
 
     @property
     def number(self) -> NDArray[np.int64]:
-        """The number of each robot, which lets robots with equal sensor values differ."""
+        """The number of each robot, so that robots with equal sensor values can act differently."""
         return np.arange(self._crowd.scene.robots)[self._own]
 
     @property
@@ -66,12 +66,12 @@ class Readings:
         distance = bearing.copy()
         if target is not None:
             dx, dy = target.x - crowd.x, target.y - crowd.y
-            # A robot that hides the target from one within ``SIGHT_M`` is nearer, so it is in this set as well.
+            # A robot that hides the target from a robot in this set is nearer to the target, so it is also in this set.
             near = np.flatnonzero(dx * dx + dy * dy < SIGHT_M * SIGHT_M)
             dx, dy = dx[near], dy[near]
             far, towards = np.hypot(dx, dy), np.arctan2(dy, dx)
             off = np.remainder(towards - crowd.heading[near] + math.pi, math.tau) - math.pi
-            # Seen from the target, a nearer robot hides those behind it within the angle that it covers.
+            # As seen from the target, a nearer robot hides all robots behind it within the angle that it covers.
             apart = np.abs(np.remainder(towards[:, None] - towards + math.pi, math.tau) - math.pi)
             covers = np.arcsin(np.minimum(FOOTPRINT_RADIUS_M / far, 1.0))
             is_hidden = ((apart < covers) & (far < far[:, None])).any(axis=1)
@@ -90,7 +90,7 @@ def stand(senses: Readings) -> Floats:
 
 
 def disperse(senses: Readings) -> Floats:
-    """Move away from anything near; stand if nothing is."""
+    """Move away from everything that is near; stand if nothing is near."""
     ranges = senses.ranges
     angle = np.arange(ranges.shape[1]) * (math.tau / ranges.shape[1])
     press = 1.0 - ranges / RAY_LENGTH_M
@@ -118,7 +118,7 @@ def wander(senses: Readings) -> Floats:
     ranges = senses.ranges
     half = ranges.shape[1] // 2
     left, right = ranges[:, 1 : half + 1].sum(axis=1), ranges[:, -half:].sum(axis=1)
-    # If both sides are equal, the number decides, or two robots would mirror each other for ever.
+    # If both sides are equally open, the robot's number decides; otherwise two robots could mirror each other forever.
     side = np.where(left == right, np.where(senses.number % 2 == 0, 1.0, -1.0), np.sign(left - right))
     is_free = _find_nearest_ahead(ranges) > OBSTACLE_DISTANCE_M
     return _make_velocities(np.where(is_free, WALK_MPS, 0.0), np.where(is_free, 0.0, TURN_RADPS * side))
@@ -146,7 +146,7 @@ CONTROLLERS: dict[str, Controller] = {
 
 
 def _find_nearest_ahead(ranges: Floats) -> Floats:
-    """Return the smallest of the ray ahead and its two neighbours, which are shortened to the width of the robot."""
+    """Return the smallest range of the ray ahead and its two neighbours, which count only within the robot's width."""
     return np.minimum(ranges[:, 0], np.minimum(ranges[:, 1], ranges[:, -1]) * 1.2)
 
 

@@ -21,9 +21,9 @@ from sim.robots.world import TICK_S, NotPossible, Target
 
 RAYS = 8
 RAY_LENGTH_M = 1.7
-"""Length of a ray from the centre of a robot, in metres; slightly more than its far ranger reaches from the nose."""
+"""Length in metres of a ray from a robot's centre; slightly more than the range of the far ranger, at the front."""
 MAX_PUSHES = 12
-"""Most iterations of pushing overlapping robots apart in one step; only dense crowds need more than one."""
+"""Maximum iterations of pushing overlapping robots apart in one step; only dense crowds need more than one."""
 CORRECTED_SHARE = 0.9
 """Fraction of an overlap that an iteration removes; in a dense crowd robots are pushed from all sides."""
 SLOP_M = 0.0001
@@ -79,7 +79,7 @@ class Crowd:
         return self._rays.cast(self.x, self.y, self.heading, discs)
 
     def place_target(self, x: float, y: float) -> None:
-        """Move the target to this place; raise ``NotPossible`` if a robot or a wall is in the way."""
+        """Move the target to this position; raise ``NotPossible`` if a robot or a wall is in the way."""
         scene = self.scene
         radius = scene.target_radius
         if not (radius <= x <= scene.width - radius and radius <= y <= scene.height - radius):
@@ -94,16 +94,16 @@ class Crowd:
         self.ranges = self.cast_rays()
 
     def place_target_at_random(self) -> None:
-        """Move the target to a free place near the centre; raise ``NotPossible`` if there is none."""
+        """Move the target to a free position near the centre; raise ``NotPossible`` if no position is free."""
         width, height = self.scene.width, self.scene.height
         for _ in range(1000):
             x, y = (float(self._rng.uniform(0.35, 0.65)) * side for side in (width, height))
             if np.hypot(self.x - x, self.y - y).min() >= FOOTPRINT_RADIUS_M + 2 * self.scene.target_radius:
                 return self.place_target(x, y)
-        raise NotPossible("no place is free near the centre; give the robots more room")
+        raise NotPossible("no position near the centre is free; use a larger area per robot")
 
     def move(self, number: int, x: float, y: float, heading: float) -> None:
-        """Move a robot to this place, at rest; raise ``NotPossible`` if another robot or a wall is in the way."""
+        """Move a robot to this position, at rest; raise ``NotPossible`` if another robot or a wall is in the way."""
         scene = self.scene
         inside = (
             FOOTPRINT_RADIUS_M <= x <= scene.width - FOOTPRINT_RADIUS_M
@@ -127,7 +127,7 @@ class Crowd:
         return state.hexdigest()
 
     def measure_overlap(self) -> float:
-        """Return the largest overlap of two robots in metres; 0 without any."""
+        """Return the largest overlap of two robots in metres; 0 if no robots overlap."""
         one, other = self._neighbours.find_pairs(self.x, self.y)
         gaps = np.hypot(self.x[other] - self.x[one], self.y[other] - self.y[one])
         return max(0.0, 2 * FOOTPRINT_RADIUS_M - float(gaps.min(initial=math.inf)))
@@ -169,7 +169,7 @@ class Crowd:
         self._keep_inside()
 
     def _push_from_target(self) -> bool:
-        """Push robots out of the target; return whether there was any."""
+        """Push robots out of the target; return whether any robot was pushed."""
         if self.target is None:
             return False
         dx, dy = self.x - self.target.x, self.y - self.target.y

@@ -17,7 +17,7 @@ INK = {
     "agents that have found it": "#e08a1e",
     "the one that goes": "#1f8a4c",
 }
-"""Kinds of robots and their colours; a robot without a kind has the first."""
+"""Kinds of robots and their colours; a robot without a kind has the first colour."""
 TARGET = "#d02228"
 
 
@@ -48,7 +48,7 @@ def draw_svg(
         parts.append(f'<path d="M{" L".join(at(*place) for place in trail)}" fill="none" stroke="#1f8a4c"/>')
     rows = list(zip(crowd.x.tolist(), crowd.y.tolist(), crowd.heading.tolist(), strict=True))
     for kind in present_kinds:
-        # One path per kind: a disc is a stroke of zero length with round ends, its nose a short line.
+        # One path per kind: a disc is a stroke of zero length with round ends; the mark of its heading is a short line.
         poses = [rows[body] for body in range(scene.robots) if kinds.get(body, OTHER) == kind]
         discs = "".join(f"M{at(x, y)}h0" for x, y, _ in poses)
         wide = f'stroke-width="{2 * FOOTPRINT_RADIUS_M * scale:.2f}" stroke-linecap="round"'

@@ -20,8 +20,8 @@ Disc = tuple[float, float, float]
 class Rays:
     """``count`` rays of ``reach`` metres from the centre of each robot, at equal angles; ray 0 points ahead.
 
-    The rays that meet a disc are computed for each disc, so the cost grows with the number of obstacles and not with
-    the number of rays.
+    For each disc, the rays that meet it are computed, so the cost grows with the number of discs, not with the number
+    of rays.
     """
 
     def __init__(self, width: float, height: float, count: int, reach: float) -> None:
@@ -59,7 +59,7 @@ class Rays:
         return ranges
 
     def _shorten(self, ranges: Floats, observers: Indices, bearing: Floats, distance: Floats, radius: float) -> None:
-        """Shorten the rays of ``observers`` that meet one disc each, at ``bearing`` (0 is ahead) and ``distance``."""
+        """Shorten the rays of ``observers``, each of which meets a disc at ``bearing`` (0: ahead) and ``distance``."""
         half = np.arcsin(np.minimum(radius / distance, 1.0)) / self._between
         middle = bearing / self._between
         first = np.ceil(middle - half)
@@ -73,7 +73,7 @@ class Rays:
             far = distance[met]
             lateral = far * np.sin(off)
             along = far * np.cos(off) - np.sqrt(np.maximum(radius * radius - lateral * lateral, 0.0))
-            # Several robots can shorten the same ray; the smallest distance wins.
+            # Several discs can shorten the same ray; the smallest distance is kept.
             np.minimum.at(flat, observers[met] * self._count + ray.astype(np.int64) % self._count, along)
             nth += 1
             met = met[count[met] > nth]
@@ -95,8 +95,8 @@ class Rays:
 class Neighbours:
     """The pairs of bodies with centres within ``reach`` metres of each other.
 
-    The search radius is larger by ``skin`` metres, so the list stays valid until a body has moved half of that: the
-    search is needed only once in some dozens of steps.
+    The search radius is larger by ``skin`` metres, so the list of pairs stays valid until a body has moved by half of
+    ``skin``: a search is needed only once in some dozens of steps.
     """
 
     def __init__(self, reach: float, skin: float) -> None:
@@ -105,7 +105,7 @@ class Neighbours:
         self._cached_pairs: tuple[Floats, Floats, Indices, Indices] | None = None
 
     def find_pairs(self, x: Floats, y: Floats) -> tuple[Indices, Indices]:
-        """Return each pair once, as two rows of numbers; some may be farther apart than ``reach``."""
+        """Return each pair once, as two rows of numbers; some pairs may be farther apart than ``reach``."""
         if self._cached_pairs is not None:
             then_x, then_y, one, other = self._cached_pairs
             moved = (x - then_x) ** 2 + (y - then_y) ** 2
@@ -118,8 +118,8 @@ class Neighbours:
 
 def find_near_pairs(x: Floats, y: Floats, reach: float) -> tuple[Indices, Indices]:
     """Return the pairs within ``reach``, each once."""
-    # In an array sorted by cells of that size, candidates lie in two runs: the rest of the cell with the next one
-    # above, and the three adjacent cells in the next column.
+    # In an array sorted by cells of size ``reach``, the candidates for a body are in two ranges: the rest of its cell
+    # and the next cell above, and the three adjacent cells in the next column.
     column = np.floor(x / reach).astype(np.int64)
     row = np.floor(y / reach).astype(np.int64)
     rows = int(row.max()) + 3

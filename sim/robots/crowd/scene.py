@@ -15,7 +15,7 @@ Floats = NDArray[np.float64]
 MAX_ROBOTS = 100_000
 MAX_SIDE_M = 2000.0
 GAP_M = 0.02
-"""Smallest gap in metres between two robots at the start."""
+"""Minimum gap in metres between two robots at the start."""
 CELL_M = 2 * FOOTPRINT_RADIUS_M + GAP_M
 AREA_M2 = 4.0
 """Default area per robot in square metres."""
@@ -54,7 +54,7 @@ class CrowdScene:
             raise SceneError(
                 f"{self.robots} robots of {200 * FOOTPRINT_RADIUS_M:.0f} cm do not fit into"
                 f" {self.width:g} x {self.height:g} m: "
-                f"there is room for {places}; use at most {places} robots, or {side:g} x {side:g} m"
+                f"at most {places} fit; use at most {places} robots, or {side:g} x {side:g} m"
             )
 
     def draw_poses(self, rng: np.random.Generator) -> tuple[Floats, Floats, Floats]:
@@ -71,7 +71,7 @@ class CrowdScene:
 
 
 def make_square_scene(robots: int, room: float = AREA_M2) -> CrowdScene:
-    """Return a square ground with ``room`` square metres per robot; raise ``SceneError`` if that is too little."""
+    """Return a square scene with ``room`` square metres per robot; raise ``SceneError`` if that is too little."""
     if type(robots) is not int or not 1 <= robots <= MAX_ROBOTS:
         raise SceneError(f"bodies must be a whole number from 1 to {MAX_ROBOTS}, not {robots!r}")
     if not (isinstance(room, int | float) and CELL_M**2 <= room <= 1000.0):

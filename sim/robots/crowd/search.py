@@ -1,6 +1,6 @@
-"""The thesis' experiment with hundreds of agents: they search a red target, and one of them approaches it.
+"""The experiment of the thesis with hundreds of agents, which search a red target until one of them approaches it.
 
-The caller provides the team; this module measures the positions of the robots and the statements of the agents.
+The caller provides the team; this module measures the positions of the robots and the reports of the agents.
 """
 
 from __future__ import annotations
@@ -20,29 +20,29 @@ SLICES = 10
 PLACE_TARGET_S = 5.0
 """Seconds after the task's assignment at which the target is placed, during the search."""
 SLACK_M = 0.1
-"""Fraction by which another agent may be nearer than the selected one: reports contain measurement errors."""
+"""Fraction by which another agent may be nearer than the selected agent: reports contain measurement errors."""
 
 
 @dataclass(frozen=True)
 class AgentStatus:
-    """The statement of one agent: its distance to the target (None if unknown), and the name of the assigned agent."""
+    """The state of one agent: its distance to the target (None if unknown), and the agent that it assigned."""
 
     cost: float | None
     assigned: str
 
 
 class SearchTeam(Protocol):
-    """Agents with robots in a crowd, on one clock in virtual time."""
+    """The agents whose robots are in a crowd, on one clock in virtual time."""
 
     clock: Any
     switchboard: Any
     simulator: CrowdSimulator
 
     def assign(self) -> None:
-        """Assign the task to all able agents."""
+        """Publish the task for all agents that can do it."""
 
     def get_statuses(self) -> Mapping[str, AgentStatus]:
-        """Return the statement of each participating agent, by its name."""
+        """Return the state of each participating agent, by its name."""
 
     def find_finisher(self) -> str | None:
         """Return the agent that completed the task, None while it is open."""
@@ -55,10 +55,10 @@ class SearchTeam(Protocol):
 class Outcome:
     """Results and cost of a search; times in virtual seconds since the task was assigned, cost in CPU seconds.
 
-    ``found`` is the number of agents that knew the target at the time of the agreement, or at the end; ``right`` says
-    whether none of them was much nearer than the selected agent.  Parts of ``cost``: ``moving`` for robots, rays and
-    controllers, ``telling`` for sensor frames and pictures, ``agents`` for nodes, drivers and agents.  ``trail`` is the
-    path of the selected robot.
+    ``found`` is the number of agents that had found the target at the time of the agreement, or at the end; ``right``:
+    no agent among these was much nearer than the selected agent.  ``cost`` has the parts ``moving`` (robots, rays and
+    controllers), ``telling`` (sensor frames and pictures) and ``agents`` (nodes, drivers and agents).  ``trail`` is
+    the path of the selected robot.
     """
 
     seed: int
@@ -97,7 +97,7 @@ def run_search(
     team.assign()
     while outcome.seconds < limit and outcome.reach is None and not is_over():
         for _ in range(SLICES):
-            if not is_over():  # half a second of a large team may take a minute
+            if not is_over():  # half a virtual second of a large team may take a minute
                 team.clock.advance(POLL_S / SLICES)
         outcome.seconds = round(team.clock.seconds() - started_at, 3)
         outcome.datagrams = team.switchboard.counters["sent"] - sent

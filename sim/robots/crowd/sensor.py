@@ -1,6 +1,7 @@
-"""Sensors of those robots of a crowd that have a driver, under the keys of a simulated dog, computed with arrays.
+"""The sensors of the robots of a crowd that have drivers, computed with arrays.
 
-Noise, drift and battery are as in ``sim.robots.sensor``; one sample per step instead of four.
+The values have the keys of a simulated dog. Noise, drift and battery are as in ``sim.robots.sensor``, but each step
+has one sample instead of four.
 """
 
 from __future__ import annotations
@@ -34,7 +35,7 @@ _KEYS = (
     "power.level",
 )
 _STEADY = 0.05 * math.sqrt(SUBSTEP_S / TICK_S)
-"""Standard deviation of a stride, reduced because one step here counts for four."""
+"""Standard deviation of a stride, reduced because one step here replaces four substeps."""
 
 
 class CrowdSensors:
@@ -83,7 +84,7 @@ class CrowdSensors:
         self._moving = moving.tolist()
 
     def values(self, number: int) -> dict[str, Value]:
-        """Return the newest values of the robot ``number``, NaN for nothing in range."""
+        """Return the newest values of the robot ``number``; a range is NaN if nothing is in range."""
         return {**dict(zip(_KEYS, self._rows[number], strict=True)), "base.moving": self._moving[number]}
 
     def _update_odometry(self, moving: Floats, vx: Floats, vy: Floats, wz: Floats, noise: Floats) -> None:
@@ -106,6 +107,6 @@ def _normalize_angle(angle: Floats) -> Floats:
 
 
 def _read_ranger(gap: Floats, limits: tuple[float, float], noise: Floats) -> Floats:
-    """Return infrared readings: noise grows with distance, too near reads as the minimum, too far as NaN."""
+    """Return infrared readings, with noise that grows with distance; too near gives the minimum, too far NaN."""
     measured = gap + noise * (0.001 + 0.004 * gap)
     return np.where(measured > limits[1], math.nan, np.maximum(measured, limits[0]))

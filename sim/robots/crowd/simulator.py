@@ -29,9 +29,9 @@ CONTACT_GAP_M = 0.001
 class CrowdSimulator(PacedSimulator):
     """A simulator of many robots, on ``scene``.
 
-    The first ``driven`` robots, ``robot1`` and so on, obey drivers and stand still without one; ``controller`` moves
-    the others.  ``stopwatch`` measures the time spent in moving robots (``moving_s``) and in sending drivers
-    (``reporting_s``) the sensor values.
+    The first ``driven`` robots (``robot1`` and so on) obey their drivers; such a robot stands still if it has no
+    driver. ``controller`` moves all other robots. ``stopwatch`` measures the time spent on moving the robots
+    (``moving_s``) and on sending sensor values to the drivers (``reporting_s``).
     """
 
     def __init__(
@@ -44,7 +44,9 @@ class CrowdSimulator(PacedSimulator):
         stopwatch: Callable[[], float] = lambda: 0.0,
     ) -> None:
         if type(driven) is not int or not 0 <= driven <= scene.robots:
-            raise SceneError(f"driven must be a whole number from 0 to {scene.robots}, the robots here, not {driven!r}")
+            raise SceneError(
+                f"driven must be a whole number from 0 to {scene.robots}, the number of robots, not {driven!r}"
+            )
         self.crowd = Crowd(rng.getrandbits(64), scene)
         self.names = [f"robot{number}" for number in range(1, driven + 1)]
         self.moving_s = self.reporting_s = 0.0
@@ -57,7 +59,7 @@ class CrowdSimulator(PacedSimulator):
         super().__init__(clock, self.names, self, driven + SPARE_CONNECTIONS)
 
     def reserve_for_emulator(self, name: str) -> CrowdRobot:
-        """Transfer a robot to an emulator; drivers can no longer hold it.
+        """Reserve a robot for an emulator, so that drivers can no longer use the robot.
 
         Raises ``UsageError`` if no such robot can have a driver.
         """
@@ -73,7 +75,7 @@ class CrowdSimulator(PacedSimulator):
         self.crowd.commands[self._numbers[name]] = 0.0
 
     def _simulate(self, late: float) -> int:
-        """Simulate one tick, even if several are late: the next one follows at once, with newly received commands."""
+        """Simulate one tick, even if several are due: the next one follows immediately, with newer commands."""
         started_at = self._stopwatch()
         self._stop_expired(self.crowd.t)
         self.crowd.commands[len(self.names) :] = self._controller(self._other_readings)
@@ -93,7 +95,7 @@ class CrowdSimulator(PacedSimulator):
 
 
 class CrowdRobot:
-    """The robot ``number`` of ``crowd``; without a gate, like a robot that does not know tokens."""
+    """The robot ``number`` of ``crowd``; it has no gate, like a robot whose protocol has no tokens."""
 
     def __init__(self, number: int, crowd: Crowd, sensors: CrowdSensors, cameras: CrowdCameras) -> None:
         self._number = number

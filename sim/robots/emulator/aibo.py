@@ -58,10 +58,10 @@ class AiboServer:
         self._open[number] = self._reactor.listenTCP(number, factory, interface=self._interface)
 
     def _update_ports(self) -> None:
-        """Open and close ports to match the dog: a port with a client accepts no second one.
+        """Open and close ports to match the dog's state: a port with a client accepts no second client.
 
-        The dog calls this while a link opens or closes, so it does not raise: a port that is still closing, or that
-        another program uses, is opened later.
+        The dog calls this method while a link opens or closes, so the method does not raise: a port that is still
+        closing, or that another program uses, is opened later.
         """
         if self._udp is None:
             return

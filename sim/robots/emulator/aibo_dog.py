@@ -1,7 +1,7 @@
 """The dog's side of Tekkotsu's protocol, for a simulated robot.
 
-It serves main control and the emergency stop from the start and the other ports after they are selected, accepts one
-client per port, starts with its motors off, and stops 3 s after the last walk command.
+The emulator serves main control and the emergency stop from the start, and each other port after its server is
+selected. It accepts one client per port, starts with the motors off, and stops 3 s after the last walk command.
 """
 
 from __future__ import annotations
@@ -28,16 +28,16 @@ FRAME_S = 0.032
 CAMERA_S = 1.0 / 30.0
 DEAD_MAN_S = 3.0
 NATIVE_SIZE = (208, 160)
-"""Native size of the camera; the default is half the width and height."""
+"""Native size of the camera picture; the default size is half of this width and height."""
 DARK_JPEG = b"\xff\xd8\xff\xc0\x00\x0b\x08\x00\x50\x00\x68\x01\x01\x11\x00" + bytes(64) + b"\xff\xd9"
 """The picture of a simulated robot without a camera: the header of a JPEG of 104 x 80 pixels."""
 EMULATED_PORTS = {**PORTS, "gains": 10032}
 
 
 class AiboEmulator:
-    """One emulated dog; ``accept`` takes its TCP links, ``on_datagram`` its UDP datagrams.
+    """One emulated dog; ``accept`` receives its TCP links, ``on_datagram`` its UDP datagrams.
 
-    ``on_ports`` is notified when the listening ports may have changed, for a server on real sockets.
+    ``on_ports`` is called when the listening ports may have changed, for a server on real sockets.
     """
 
     def __init__(
@@ -75,7 +75,7 @@ class AiboEmulator:
         self._repeat(CAMERA_S, self._send_picture, "camera")
 
     def stop(self) -> None:
-        """Switch the dog off, which breaks every link."""
+        """Switch the dog off, which breaks all links."""
         for timer in self._timers.values():
             timer.cancel()
         self._stop_walk()
@@ -94,7 +94,7 @@ class AiboEmulator:
         self.start()
 
     def press_back_button(self) -> None:
-        """Press its back button twice, which toggles the emergency stop."""
+        """Press the back button twice, which toggles the emergency stop."""
         self._set_engaged(not self.is_engaged)
 
     def is_listening(self, port: int) -> bool:
@@ -144,7 +144,7 @@ class AiboEmulator:
                         self.head[letter] = max(-1.0, min(value, 1.0))
 
     def on_client_lost(self, client: _Client) -> None:
-        """Handle the loss of a client: its port listens again, and its walk continues until the time-out."""
+        """Handle the loss of a client: its port listens again, and the walk continues until the time-out."""
         if self.clients.get(client.service) is client:
             del self.clients[client.service]
             self.on_ports()
@@ -269,7 +269,7 @@ class AiboEmulator:
             self.on_ports()
 
     def _repeat(self, seconds: float, act: Callable[[], None], name: str) -> None:
-        # Times are computed from the start, so delays do not accumulate.
+        # Due times are computed from the start time, so delays do not accumulate.
         due = self._clock.seconds() + seconds
 
         def turn() -> None:
@@ -299,7 +299,7 @@ class _Client:
 
 
 class MemoryPorts:
-    """Opens links in memory to any port; ``is_open`` False refuses all, ``cut`` breaks links."""
+    """Opens links in memory to any port; with ``is_open`` False all are refused; ``cut`` breaks open links."""
 
     def __init__(self, clock: IReactorTime, dog: AiboEmulator, delay: float) -> None:
         self.is_open = True

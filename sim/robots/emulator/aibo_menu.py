@@ -27,7 +27,7 @@ CLASSES = {
     "head": ("org.tekkotsu.mon.HeadPointGUI", "HeadPointGUI"),
     "camera": ("org.tekkotsu.mon.VisionGUI", "RawVisionGUI"),
 }
-"""Java class and name that a client loads for each server."""
+"""The Java class and the name that a client loads for each server."""
 NAMES = {
     "estop": "EStopControllerBehavior",
     "state": "World State Serializer",
@@ -61,7 +61,7 @@ class AiboMenu:
         self.reset()
 
     def reset(self) -> None:
-        """Restore the state after power-on: only the emergency stop runs, and nothing on an old dog."""
+        """Restore the state after power-on: only the emergency stop runs, or no server on a dog with Tekkotsu 2.x."""
         self.running = set() if self._is_old else {"estop"}
         self.settings.clear()
 

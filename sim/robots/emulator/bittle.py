@@ -25,16 +25,16 @@ from sim.robots.emulator.transport import EmulatorServer, PtyEmulatorServer, Tab
 
 VERSIONS = {"biboard": "B10_250712", "nyboard": "N_250224"}
 UNFINISHED_S = 0.01
-"""Seconds after which a command without its end is executed."""
+"""Seconds after which a command without an end byte is executed."""
 BOOT_S = 1.5
 POSTURE_S, BEHAVIOUR_S = 0.1, 1.0
 NYBOARD_S = 0.04
 """Seconds of output that the web server of a NyBoard returns."""
 MAX_REQUEST_BYTES = 4096
 MAX_TASKS = 50
-"""Number of tasks that the board stores; a query for an older one is an error."""
+"""Number of tasks that the board stores; a query for an older task is an error."""
 FAR_DEGREES = 270
-"""Limit of joint angles; the firmware clips commands."""
+"""Limit of joint angles in degrees, to which the firmware clips commands."""
 UNSUPPORTED_TOKENS = frozenset("csa!")
 """Tokens that change the robot permanently, which a driver never sends."""
 
@@ -42,7 +42,7 @@ UNSUPPORTED_TOKENS = frozenset("csa!")
 class Bittle:
     """One dog; ``accept`` is its serial port, ``accept_http`` its web server.
 
-    ``faults`` corrupts its output; with ``resets`` opening the port restarts the board, as with most boards.
+    ``faults`` corrupts the dog's output; with ``resets``, opening the port restarts the board, as on most boards.
     ``received_commands`` are the received commands in order.
     """
 
@@ -105,7 +105,7 @@ class Bittle:
         self._output.link = None
 
     def reboot(self) -> None:
-        """Restart: lie down at once, ignore data during ``BOOT_S``, and send the banner."""
+        """Restart: lie down immediately, ignore data during ``BOOT_S``, then send the banner."""
         self.stop()
         self._rest.clear()
         self._queue.clear()
@@ -119,7 +119,7 @@ class Bittle:
             timer.cancel()
 
     def execute(self, command: bytes, say: Callable[[str], None]) -> None:
-        """Execute a command after the queued ones; ``say`` gets each line of the answer."""
+        """Execute a command after the queued commands; ``say`` gets each line of the answer."""
         if self._boot_timer.is_set:
             return
         self._queue.append((command, say))

@@ -42,9 +42,9 @@ class _Client(Client):
 class MjpegCamera(Broadcast[_Client]):
     """One camera, which serves any path.
 
-    ``faults`` corrupts its data.  ``status`` other than ``200 OK`` refuses clients; without ``has_length`` only
-    boundaries separate the pictures; ``is_chunked`` selects chunked encoding, as on an ESP32-CAM.  Pictures are dropped
-    for a client that does not read them, and omitted if the robot has none.
+    ``faults`` corrupts the data. A ``status`` other than ``200 OK`` refuses clients. Without ``has_length`` only
+    boundaries separate the pictures. ``is_chunked`` selects chunked encoding, as on an ESP32-CAM. Pictures are dropped
+    for a client that does not read them; a robot without a camera sends none.
     """
 
     make_client = _Client

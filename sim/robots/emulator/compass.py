@@ -16,11 +16,11 @@ from sim.robots.emulator.transport import EmulatorServer, PtyEmulatorServer, Tab
 
 
 class NmeaCompass(Broadcast[Client]):
-    """One compass, on a cable or on the network.  North is along the map's y axis.
+    """One compass, on a cable or on the network; north is the direction of the map's y axis.
 
-    ``kinds`` are the sentences of each report.  The sensor is off by ``deviation``, magnetic north by ``variation``, in
-    degrees to the east; ``HDG`` contains both, ``HDM`` is corrected by the deviation.  For a robot without
-    ``compass.heading`` the field is empty.  ``faults`` corrupts the data.
+    ``kinds`` are the sentences of each report. ``deviation`` is the error of the sensor and ``variation`` the error of
+    magnetic north, in degrees to the east; ``HDG`` contains both values, and ``HDM`` is corrected by the deviation.
+    For a robot without ``compass.heading`` the heading is empty. ``faults`` corrupts the data.
     """
 
     make_client = Client

@@ -30,9 +30,10 @@ OFF, PASSIVE, SAFE, FULL = range(4)
 
 
 class Create2:
-    """One robot; ``accept`` is its serial port.  Without a cable it keeps its motion, like the real one.
+    """One robot; ``accept`` connects its serial port. Without a cable the robot keeps its motion, like a real robot.
 
-    ``faults`` corrupts its output; ``reboot`` is a power cut; ``left`` and ``right`` are its wheel encoders, in counts.
+    ``faults`` corrupts its output; ``reboot`` interrupts its power; ``left`` and ``right`` are its wheel encoders, in
+    counts.
     """
 
     def __init__(self, robot: SimulatedRobot, clock: IReactorTime, rng: random.Random) -> None:
@@ -68,7 +69,7 @@ class Create2:
         self._output.link = None
 
     def reboot(self) -> None:
-        """Interrupt its power: it stops, sends its boot text, is off, and forgets its stream."""
+        """Interrupt the power: the robot stops, sends its boot text, is in mode off, and no longer streams."""
         self._halt()
         self.mode, self._ids, self._is_streaming = OFF, (), False
         self.left = self.right = 0.0
@@ -166,7 +167,7 @@ class Create2:
             self._output.send(codec.encode_stream_frame(self._ids, self._make_packets(sensed)))
 
     def _check_safety(self, sensed: Mapping[str, Value]) -> None:
-        """Leave safe mode like the real robot: a cliff ahead, a lifted wheel, a charger."""
+        """Leave safe mode for the reasons of the real robot: a cliff ahead, a lifted wheel, a charger."""
         if self.mode != SAFE:
             return
         ahead = sum(self._wheels) > 0

@@ -12,11 +12,11 @@ from sim.robots.sensor import Sensors
 from sim.robots.world import World
 
 BUMPER_OVERLAP_RAD = math.radians(10.0)
-"""Angle in radians: contacts within it on either side of the centre press both halves of a bumper."""
+"""Angle in radians on either side of the centre within which a contact presses both halves of a bumper."""
 
 
 class SimulatedDog:
-    """``dog`` of ``world``, with its sensors and its camera; without a gate, like a robot that does not know tokens."""
+    """``dog`` of ``world``, with its sensors and its camera; it has no gate, like a robot without tokens."""
 
     def __init__(self, world: World, dog: Dog, senses: Sensors, camera: Camera) -> None:
         self._world = world

@@ -14,7 +14,7 @@ from sim.robots.emulator.simulated_robot import SimulatedRobot
 
 
 class FaultyOutput:
-    """One link to a driver, or none; without a link data is lost."""
+    """The output to a driver: one link, or none, in which case data is lost."""
 
     def __init__(self, clock: IReactorTime, rng: random.Random, faults: StreamFaults, link: Link | None = None) -> None:
         self.link = link
@@ -57,7 +57,7 @@ AnyClient = TypeVar("AnyClient", bound=Client)
 
 
 class Broadcast(Generic[AnyClient]):
-    """A device that sends data ``rate`` times per second (``_broadcast``) to ``clients``; ``faults`` corrupts it.
+    """A device that sends data ``rate`` times per second (``_broadcast``) to ``clients``; ``faults`` corrupts the data.
 
     ``accept`` adds a client.
     """
@@ -96,7 +96,7 @@ class Broadcast(Generic[AnyClient]):
         raise NotImplementedError
 
     def _on_time(self) -> None:
-        # Times are computed from the start, so delays do not accumulate.
+        # Due times are computed from the start time, so delays do not accumulate.
         now = self._clock.seconds()
         self._due = max(self._due + self._interval, now)
         self._timer.set(self._due - now, self._on_time)

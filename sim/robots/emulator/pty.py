@@ -15,14 +15,14 @@ from drivers.link import Accept, Receiver
 MAX_BACKLOG_BYTES = 512
 """Number of unread bytes above which the port is busy; about the buffer of a real adapter."""
 PTY_FOLDER = "/dev/pts/"
-"""Target of links left behind by a port that could not remove them."""
+"""Folder of the targets of symbolic links; such a link may be left behind by a port that could not remove it."""
 
 
 class PtyPort(abstract.FileDescriptor):
-    """A port at ``path``; the receiver that ``accept`` returns gets the data written to it, until ``close``.
+    """A port at ``path``; the receiver that ``accept`` returns gets the data written to the port, until ``close``.
 
-    ``link`` is the path of a symbolic link, which is created and later removed.  A link left behind by another port is
-    replaced; any other file there, such as a real device, raises ``FileExistsError``.
+    ``link`` is the path of a symbolic link to the port, which is created and later removed. A link left behind by
+    another port is replaced; any other file at this path, such as a real device, raises ``FileExistsError``.
     """
 
     def __init__(self, reactor: Any, accept: Accept, link: str = "") -> None:
@@ -54,7 +54,7 @@ class PtyPort(abstract.FileDescriptor):
         return len(self.dataBuffer) + self._tempDataLen > MAX_BACKLOG_BYTES
 
     def send(self, data: bytes) -> None:
-        """Send data; it is lost while the port is busy, as on a cable."""
+        """Send data; while the port is busy, data is lost, as on a cable."""
         if self.connected and not self.is_busy:
             self.write(data)
 

@@ -23,7 +23,7 @@ from sim.robots.emulator.simulated_robot import SimulatedRobot
 from sim.robots.emulator.transport import EmulatorServer, Table, TcpEmulatorServer
 
 COMMAND_TIMEOUT_S = 0.5
-"""Seconds without a velocity after which the base stops, like most robots' bases."""
+"""Seconds without a velocity after which the base stops, like the bases of most robots."""
 TICK_S = 0.02
 TYPE_SERVICE = "/rosapi/topic_type"
 BEAMS = 24
@@ -39,15 +39,15 @@ TOPICS: Mapping[str, tuple[str, float]] = {
     "/battery_state": ("sensor_msgs/BatteryState", 1.0),
     "/camera/image_raw/compressed": ("sensor_msgs/CompressedImage", 12.5),
 }
-"""Published topics: type and rate in Hz."""
+"""The published topics, with type and rate in Hz."""
 
 
 class RosbridgeRobot:
     """One robot; ``accept`` is called by a listening port or a ``MemoryConnector``.
 
     ``velocity_type`` is the type of ``/cmd_vel``; messages of another type are silently ignored, as in ROS.
-    ``has_rosapi`` enables the query of that type, which takes ``rosapi_s`` seconds; ``ignored_count`` counts ignored
-    messages.
+    ``has_rosapi`` enables the query of that type, which is answered after ``rosapi_s`` seconds; ``ignored_count``
+    counts ignored messages.
     """
 
     def __init__(
@@ -88,7 +88,7 @@ class RosbridgeRobot:
         self._ticks = 0
 
     def accept(self, link: Link) -> Receiver:
-        """Accept a client; several are possible."""
+        """Accept a client, in addition to others."""
         client = _Client(self, FaultyOutput(self._clock, self._rng, self.faults, link))
         self._clients.append(client)
         return client
@@ -134,7 +134,7 @@ class RosbridgeRobot:
             self._stop_timer.set(COMMAND_TIMEOUT_S, self._on_no_command)
 
     def run_service(self, name: str, arguments: Any) -> tuple[bool, Any]:
-        """Run a service; return whether it succeeded, and its values."""
+        """Run a service; return whether it succeeded, and the values of its answer."""
         if name == TYPE_SERVICE and self.has_rosapi:
             topic = str(arguments.get("topic")) if isinstance(arguments, dict) else ""
             if topic == "/cmd_vel":
@@ -191,7 +191,7 @@ class RosbridgeRobot:
             case "/battery_state":
                 level = _read_number(sensed.get("power.level"), 1.0)
                 volts = _read_number(sensed.get("power.volts"), 11.0 + 1.6 * level)
-                # The current is not measured: NaN, which rosbridge sends as null.
+                # The current is not measured; real rosbridge sends NaN as null.
                 return {"header": header, "voltage": volts, "current": None, "percentage": level} | {
                     "power_supply_status": 1 if sensed.get("power.charging") else 2,
                     "present": True,

@@ -41,7 +41,7 @@ class ServeFunction(Protocol):
 
 
 class TcpEmulatorServer:
-    """An emulator behind one TCP port; both start and stop together."""
+    """An emulator behind one TCP port; emulator and port start and stop together."""
 
     def __init__(self, reactor: Any, emulator: Any, accept: Accept, host: str, port: int) -> None:
         self.faults = emulator.faults
@@ -87,5 +87,5 @@ class PtyEmulatorServer:
 
 
 def _start_emulator(emulator: Any) -> None:
-    """Start an emulator that has a method ``start``; others run from their creation."""
+    """Start an emulator that has a method ``start``; an emulator without it runs from its creation."""
     getattr(emulator, "start", lambda: None)()

@@ -9,7 +9,7 @@ from middleware.entangled.network.network import Address
 
 
 def isolate(hosts: Iterable[str]) -> Callable[[Address, Address], bool]:
-    """Block all datagrams between ``hosts`` and other nodes; ``hosts`` reach each other."""
+    """Block all datagrams between ``hosts`` and other nodes; ``hosts`` can still reach each other."""
     inside = frozenset(hosts)
     return lambda source, to: (source.host in inside) != (to.host in inside)
 
@@ -32,7 +32,7 @@ def block_host(host: str) -> Callable[[Address, Address], bool]:
 
 
 def block_pairs(share: float, salt: str) -> Callable[[Address, Address], bool]:
-    """Block the share ``share`` of all pairs, selected by ``salt``; both nodes of a pair may reach a third one."""
+    """Block the share ``share`` of all pairs, selected by ``salt``; both nodes of a pair may reach a third node."""
     bound = int(share * 2**32)
 
     def stands(source: Address, to: Address) -> bool:

@@ -12,7 +12,7 @@ from sim.team.faults.settings import Fault
 from sim.team.team import Node, Team
 
 FEW = 2
-"""Number of nodes that always stay, as a single node would have no network to return to."""
+"""Number of nodes that never leave, so that other nodes have a network to which they can return."""
 
 
 class TeamFaults:
@@ -30,7 +30,7 @@ class TeamFaults:
         self._pending_undos: dict[int, Callable[[], None]] = {}
         self._number = 0
         self._away: dict[int, int] = {}
-        """Places whose nodes will restart, each with the number of the life that ended."""
+        """Places whose nodes will restart, each with the number of the life that has ended."""
         self._handlers: dict[str, Callable[[Fault], None]] = {
             "crash": partial(self._end_lives, kill=True),
             "leave": partial(self._end_lives, kill=False),
@@ -49,7 +49,7 @@ class TeamFaults:
         }
 
     def begin(self) -> None:
-        """Start the sessions of a complete team, and schedule the faults."""
+        """Start the sessions when the team is complete, and schedule the faults."""
         team, stays = self._team, self._sessions.session_durations
         self._is_on = True
         if stays is not None:
@@ -113,7 +113,7 @@ class TeamFaults:
             self._handlers[fault.kind](fault)
 
     def _draw_places(self, fault: Fault) -> list[int]:
-        """Draw the nodes that a fault affects, in the order of its spread."""
+        """Draw the nodes that a fault affects, in the order in which it spreads."""
         here = sorted(self._team.get_joined())
         if fault.places:
             return [place for place in fault.places if place in self._team.living]
@@ -121,7 +121,7 @@ class TeamFaults:
         return self._rng.sample(here, min(count, len(here)))
 
     def _spread(self, fault: Fault, work: list[Callable[[], None]]) -> None:
-        """Run all of ``work``, spread over the duration ``fault.over``."""
+        """Run all calls of ``work``, spread over ``fault.over`` seconds."""
         for turn, each in enumerate(work):
             if fault.over:
                 self._team.schedule(turn * fault.over / len(work), partial(self._run_if_active, each))
@@ -133,7 +133,7 @@ class TeamFaults:
             work()
 
     def _undo_after(self, seconds: float, undo: Callable[[], None]) -> None:
-        """Call ``undo`` after ``seconds``, or earlier by ``end``."""
+        """Call ``undo`` after ``seconds``, or in ``end`` if that is earlier."""
         self._number += 1
         self._pending_undos[self._number] = undo
         self._team.schedule(seconds, partial(self._undo_fault, self._number))

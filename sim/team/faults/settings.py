@@ -26,7 +26,7 @@ KEYS_BY_KIND: dict[str, tuple[str, ...]] = {
     "weather": ("lasts", "amount"),
     "rebind": _AFFECTED_KEYS,
 }
-"""The kinds of faults, with the further keys that each accepts."""
+"""The kinds of faults, each with the further keys that it accepts."""
 KINDS = tuple(KEYS_BY_KIND)
 LASTING = ("cut", "deaf", "mute", "clog", "pairs", "freeze", "rate", "full", "weather")
 """The kinds that require a duration."""
@@ -38,22 +38,23 @@ KINDS_WITH_PLACES = tuple(kind for kind, taken in KEYS_BY_KIND.items() if "place
 class Fault:
     """``[[fault]]``: one fault.
 
-    Affected nodes are drawn by the seed: a number (``count``) or ``share`` of living nodes; or they are listed by
-    number in ``places``, from 0 on.
+    The affected nodes are either a random selection of living nodes, given by number (``count``) or by ``share``, or
+    the nodes at ``places``, which are numbered from 0.
     """
 
     kind: Annotated[str, one_of(KINDS)]
-    """``crash``: loss of power.  ``leave``: graceful leave.  ``freeze``: like SIGSTOP.  ``cut``: partition of the nodes
-    from all others; ``deaf``: no datagrams to them; ``mute``: no datagrams from them; ``clog``: each of them alone.
-    ``pairs``: a share of all pairs is cut.  ``step``: wall clocks are set by ``amount`` seconds.  ``rate``: clocks
-    run ``amount`` times as fast.  ``full``: disks are full.  ``crowd``: ``count`` newcomers.  ``weather``: the share
-    ``amount`` of all datagrams is lost in addition.  ``rebind``: routers drop their mappings."""
+    """``crash``: loss of power. ``leave``: graceful leave. ``freeze``: like SIGSTOP. ``cut``: the affected nodes are
+    partitioned from all other nodes. ``deaf``: no datagrams reach the affected nodes. ``mute``: no datagrams of the
+    affected nodes are delivered. ``clog``: each affected node is isolated. ``pairs``: a share of all pairs of nodes is
+    cut. ``step``: wall clocks are changed by ``amount`` seconds. ``rate``: clocks run ``amount`` times as fast.
+    ``full``: disks are full. ``crowd``: ``count`` new nodes join. ``weather``: network conditions worsen, and the
+    share ``amount`` of all datagrams is lost in addition. ``rebind``: routers drop their mappings."""
 
     at: Annotated[float, Meta(ge=0.0, le=1e7), Unit("seconds")]
     """Start in seconds after the team has settled."""
 
     lasts: Annotated[float, Meta(ge=0.0, le=1e7), Unit("seconds")] = 0.0
-    """Duration in seconds; afterwards the fault ends, and crashed nodes restart from disk.  0: permanent."""
+    """Duration in seconds, after which the fault ends and crashed nodes restart from disk; 0: permanent."""
 
     count: Annotated[int, Meta(ge=0, le=100_000)] = 0
     """Number of affected nodes."""
@@ -62,13 +63,13 @@ class Fault:
     """Share of affected nodes."""
 
     places: Annotated[tuple[Annotated[int, Meta(ge=0)], ...], UNIQUE] = ()
-    """Affected nodes by number."""
+    """The numbers of the affected nodes."""
 
     amount: Annotated[float, Meta(ge=-1e7, le=1e7)] = 0.0
     """Strength of the fault; its meaning depends on the kind."""
 
     over: Annotated[float, Meta(ge=0.0, le=1e6), Unit("seconds")] = 0.0
-    """Seconds over which the fault spreads from node to node; 0: all at once."""
+    """Seconds over which the fault spreads from node to node; 0: it affects all nodes at the same time."""
 
     def __str__(self) -> str:
         whom = ",".join(map(str, self.places)) or (f"{self.share:.0%}" if self.share else str(self.count or ""))
@@ -80,14 +81,14 @@ Problem = tuple[str, str, str]
 
 
 def find_problem(fault: Fault, nodes: int, seconds: float) -> Problem | None:
-    """Return the error of a fault in such a team, as key, problem and remedy; None if it is valid."""
+    """Return the error of a fault in a team of ``nodes`` that runs ``seconds``, as key, problem and remedy, or None."""
     chosen = sum(map(bool, (fault.count, fault.share, fault.places)))
     kind = fault.kind
     for key in (*_AFFECTED_KEYS, "lasts", "over", "amount"):
         if getattr(fault, key) and key not in KEYS_BY_KIND[kind]:
             return key, f"is not valid for {kind}", f"leave it out; {kind} takes {', '.join(KEYS_BY_KIND[kind])}"
     if fault.at > seconds:
-        return "at", f"is after the end, {seconds:g} s", "increase seconds, or decrease at"
+        return "at", f"is after the end of the run, at {seconds:g} s", "increase seconds, or decrease at"
     if kind in LASTING and not fault.lasts:
         return "lasts", f"is required for {kind}", "write lasts = 10"
     if kind in KINDS_WITH_PLACES and chosen != 1:
@@ -97,7 +98,7 @@ def find_problem(fault: Fault, nodes: int, seconds: float) -> Problem | None:
     if kind == "crowd" and not fault.count:
         return "count", "must be the number of newcomers", "write count = 100"
     if any(place >= nodes for place in fault.places):
-        return "places", f"names {max(fault.places)}, but there are 0 to {nodes - 1}", "leave it out"
+        return "places", f"contains {max(fault.places)}, but the team has the places 0 to {nodes - 1}", "leave it out"
     if kind in KINDS_WITH_PLACES and fault.count > nodes:
         return "count", f"is more than the {nodes} nodes", "use a smaller number"
     if kind == "crash" and not fault.lasts and (fault.count == nodes or fault.share == 1.0):

@@ -10,7 +10,7 @@ from sim.team.shrinking import Reduction
 
 @dataclass(frozen=True)
 class TimedFault:
-    """A fault of ``kind`` that affects ``places`` from ``at`` to ``until``, in seconds of its schedule."""
+    """A fault of ``kind`` that affects ``places`` from ``at`` to ``until``, in seconds since the schedule's start."""
 
     at: float
     until: float
@@ -32,7 +32,7 @@ class Timeline:
         )
 
     def pop_due(self, now: float) -> Iterator[tuple[TimedFault, bool]]:
-        """Yield each fault that starts (False) or ends (True) until ``now``, once."""
+        """Yield each fault that has started (False) or ended (True) by ``now``, each only once."""
         while self._pending and self._pending[0][0] <= now:
             _, is_end, _, fault = self._pending.pop(0)
             yield fault, is_end

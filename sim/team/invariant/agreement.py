@@ -9,11 +9,11 @@ from sim.team.event import ActiveTasks, Asked, Born, Decided, Event, FaultFree, 
 KINDS = Asked, Born, FaultFree, ActiveTasks, OutcomeStored, OutcomeExpired, OpenTask, Decided
 """The events that these invariants use."""
 RECENT = 1.0
-"""E7: seconds between two decisions of an agent within which it must not use an older report of the same agent."""
+"""E7: within this many seconds after a decision, an agent must not use an older report of the same participant."""
 
 
 def e4(events: Iterable[Event]) -> Iterator[str]:
-    """No lost task: each submitted task ends, all agents learn of its end, and none starts it again."""
+    """No lost task: each submitted task ends, all agents learn of its end, and no agent starts the task again."""
     submitted: dict[Hashable, None] = {}
     over: set[Hashable] = set()
     states: dict[str, dict[int, str]] = {}
@@ -38,7 +38,7 @@ def e4(events: Iterable[Event]) -> Iterator[str]:
 
 
 def e5(events: Iterable[Event]) -> Iterator[str]:
-    """No ghost among agents: in a calm network no agent continues a task after it must have learned of its end."""
+    """No ghost among agents: without faults no agent continues a task when it must have learned of the task's end."""
     within: float | None = None
     ended: dict[str, OutcomeStored] = {}
     for event in events:
@@ -54,7 +54,7 @@ def e5(events: Iterable[Event]) -> Iterator[str]:
 
 
 def e6(events: Iterable[Event]) -> Iterator[str]:
-    """No flapping: a holder yields only to a bid that is better by the hysteresis."""
+    """No flapping: a holder gives up the task only for a bid that is better by the hysteresis."""
     for event in events:
         if not isinstance(event, Decided) or event.assigned is None or event.holder in (None, event.assigned):
             continue
@@ -65,7 +65,7 @@ def e6(events: Iterable[Event]) -> Iterator[str]:
 
 
 def e7(events: Iterable[Event]) -> Iterator[str]:
-    """Agreement: equal reports lead to equal decisions, and no agent goes back to an older report."""
+    """Agreement: equal reports lead to equal decisions, and no agent uses an older report after a newer one."""
     agreed: dict[Hashable, str] = {}
     used: dict[tuple[int, str], tuple[float, dict[str, tuple[int, int]]]] = {}
     for event in events:
@@ -77,6 +77,6 @@ def e7(events: Iterable[Event]) -> Iterator[str]:
             used[event.place, event.group] = event.at, {one.agent: (one.epoch, one.serial) for one in others}
             for other in others:
                 if event.at - before < RECENT and (other.epoch, other.serial) < known.get(other.agent, (0, 0)):
-                    yield f"{me.name} decides by a report of {other.name} that is older than one it had used"
+                    yield f"{me.name} uses a report of {other.name} that is older than a report that it has used"
             if event.assigned is not None and agreed.setdefault(event.basis, event.assigned) != event.assigned:
-                yield f"of the same reports {me.name} names another than the others"
+                yield f"from the same reports {me.name} selects a different agent from the others"

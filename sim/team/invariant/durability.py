@@ -1,7 +1,8 @@
 """Invariants of durability, D1 to D7: clients' writes and reads, contents of stores, and contacts of nodes.
 
-A client numbers its writes of a slot 1, 2, 3 ...; a removal is a write without a value.  An unacknowledged write may
-have happened, so a read may show it; no read may show a value older than one acknowledged or read before.
+A client numbers its writes to a slot 1, 2, 3 ...; a removal is a write without a value. An unacknowledged write may
+have happened, so a read may return it. No read may return an older value than a value that was acknowledged or read
+earlier.
 """
 
 from __future__ import annotations
@@ -27,7 +28,7 @@ class Slot(NamedTuple):
 
 @dataclass
 class _Known:
-    """The state of a slot: the last write started, the highest acknowledged one, and the last read of each client."""
+    """The state of a slot: the last started write, the highest acknowledged write, and the last read of each client."""
 
     last_started: int = 0
     last_acknowledged: int = 0
@@ -44,7 +45,7 @@ class _PendingRead:
 
 
 def _check_reads(events: Iterable[Event]) -> Iterator[tuple[str, str]]:
-    """Yield the violations of D1 to D4 in all reads, each with its invariant."""
+    """Yield the violations of D1 to D4 in all reads, each with the name of its invariant."""
     slots: dict[Slot, _Known] = {}
     by_key: dict[Hashable, list[Slot]] = {}
     writing: dict[int, tuple[_Known, int]] = {}
@@ -89,7 +90,7 @@ def _check_read(
         slot, there = slots[place], shown.get(place)
         where = f"{asked.argument} read of {place.key.hex()[:6]} {place.owner.hex()[:4]}/{place.name} at {asked.at:.1f}"
         if there is None:
-            # Absence is correct only if a removal may be the newest write, or nothing was acknowledged yet.
+            # An empty result is correct only if a removal may be the newest write, or no write was acknowledged yet.
             is_removed = any(number not in slot.values for number in range(max(floor, 1), slot.last_started + 1))
             if floor and not is_removed and (is_sure or not shown):
                 yield "D1", f"{where}: {floor} was acknowledged or read, but nothing is found"
@@ -104,24 +105,24 @@ def _select(invariant: str, events: Iterable[Event]) -> Iterator[str]:
 
 
 def d1(events: Iterable[Event]) -> Iterator[str]:
-    """Durability: an acknowledged value is found, or the read reports that it is unavailable."""
+    """Durability: an acknowledged value is found, or the read reports that the value is unavailable."""
     return _select("D1", events)
 
 
 def d2(events: Iterable[Event]) -> Iterator[str]:
-    """Freshness: a majority read shows nothing older than the values acknowledged or read before it started."""
+    """Freshness: a majority read returns no older values than those acknowledged or read before it started."""
     return _select("D2", events)
 
 
 def d3(events: Iterable[Event]) -> Iterator[str]:
-    """No resurrection: no older value returns after a removal was acknowledged."""
+    """No resurrection: after a removal was acknowledged, no older value is read."""
     return _select("D3", events)
 
 
 def d4(events: Iterable[Event]) -> Iterator[str]:
     """Owner only: reads and stores contain what the owner signed, with growing sequence numbers.
 
-    An owner never uses a number twice, in any of its lives, unless it has lost its store.
+    An owner never uses a sequence number twice, even after restarts, unless it has lost its store.
     """
     yield from _select("D4", events)
     held: dict[tuple[int, int, Hashable], tuple[int, bytes]] = {}
@@ -151,7 +152,7 @@ def d4(events: Iterable[Event]) -> Iterator[str]:
 
 
 def d5(events: Iterable[Event]) -> Iterator[str]:
-    """Table hygiene: a contact is another node of this team, at its address."""
+    """Valid contacts: each contact in a routing table is another node of this team, with its correct address."""
     places: dict[bytes, tuple[int, str]] = {}
     for event in events:
         if isinstance(event, Born):
@@ -163,7 +164,7 @@ def d5(events: Iterable[Event]) -> Iterator[str]:
 
 
 def d6(events: Iterable[Event]) -> Iterator[str]:
-    """Exact lookup: after the repair interval a lookup finds the k closest live nodes, closest first."""
+    """Exact lookup: after the repair interval a lookup finds the k closest living nodes, closest first."""
     living: dict[int, bytes] = {}
     looking: dict[int, Asked] = {}
     for event in events:

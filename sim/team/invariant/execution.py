@@ -38,16 +38,16 @@ KINDS = (
 )
 """The events that these invariants use."""
 ROUGH = 0.06
-"""E1: tolerance as a share of the ttl for durations measured by a device's clock that is 5 % off."""
+"""E1: tolerance, as a share of the TTL, for durations measured by a device whose clock has an error of 5 %."""
 BOUNDED = 0.01
-"""Maximum clock drift for which E2 and E5 must hold; E1 holds for any drift."""
+"""Maximum clock drift for which E2 and E5 must hold; E1 must hold for any drift."""
 EPSILON_S = 1e-6
 
 
 def e1(events: Iterable[Event]) -> Iterator[str]:
-    """Fenced effects: tokens of leases and of accepted commands never fall, and no command is accepted after its lease.
+    """Fenced effects: tokens of leases and accepted commands never decrease; no command is accepted after its lease.
 
-    If members lose their stores, tokens of leases may fall, but still not those of accepted commands.
+    If members lose their stores, the tokens of leases may decrease, but not the tokens of accepted commands.
     """
     granted: dict[str, int] = {}
     taken: dict[str, int] = {}
@@ -72,9 +72,11 @@ def e1(events: Iterable[Event]) -> Iterator[str]:
 
 
 def e2(events: Iterable[Event]) -> Iterator[str]:
-    """One lease: when a lease is won or renewed, no other agent holds it by its own clock, and no other robot moves.
+    """One lease: when an agent wins or renews a task's lease, no other agent holds it and no other robot moves.
 
-    Checking at these times suffices, as every overlap includes one of them.
+    Whether another agent holds the lease is determined by that agent's clock; robots of other tasks may move. It is
+    enough to check at these times, because if two leases overlap, the overlap begins when one of them is won or
+    renewed.
     """
     still: dict[tuple[str, int], float] = {}
     is_bounded, stop_time = True, 0.0
@@ -95,7 +97,7 @@ def e2(events: Iterable[Event]) -> Iterator[str]:
 
 
 def e3(events: Iterable[Event]) -> Iterator[str]:
-    """Takeover: after a failure that leaves the rest intact, a command with a higher token is accepted in time."""
+    """Takeover: after the failure of an agent only, a command with a higher token is accepted in time."""
     waited: list[CommandExpected] = []
     for event in events:
         if isinstance(event, CommandExpected):
@@ -105,16 +107,16 @@ def e3(events: Iterable[Event]) -> Iterator[str]:
             for one in heard:
                 waited.remove(one)
                 if event.at - one.since > one.within:
-                    yield f"{one.why}, another acts {event.at - one.since:.2f} s later"
+                    yield f"{one.why}, another agent acts {event.at - one.since:.2f} s later"
     for one in waited:
-        yield f"{one.why}, another acts never"
+        yield f"{one.why}, no other agent acts"
 
 
 def e5(events: Iterable[Event]) -> Iterator[str]:
-    """No ghost at the device: after the end of a task was acknowledged its device obeys no agent; the end is recorded.
+    """No ghost at the device: when the end of a task is acknowledged, it is recorded, and its device obeys no agent.
 
-    An agent that ends another agent's task waits for the end of that lease by its clock: with unbounded clocks a device
-    may obey for the difference of a fast and a slow clock over a ttl.
+    An agent that ends another agent's task waits by its own clock until that agent's lease has ended. With unbounded
+    clock drift a device may therefore obey longer, by the difference of a fast and a slow clock over one TTL.
     """
     closing: dict[int, str] = {}
     over: dict[str, float] = {}
@@ -130,13 +132,13 @@ def e5(events: Iterable[Event]) -> Iterator[str]:
             case Unanswered(_, number, why) if number in closing:
                 yield f"the end of {closing.pop(number)} is not recorded: {why}"
             case CommandReceived(at, task, place, _, True) if task in over and at > over[task] + tolerance:
-                yield f"the device of {task} obeys {place} at {at:.2f}, it ended at {over[task]:.2f}"
+                yield f"the device of {task} obeys {place} at {at:.2f}, the task ended at {over[task]:.2f}"
     for task in closing.values():
         yield f"the end of {task} is never acknowledged"
 
 
 def e8(events: Iterable[Event]) -> Iterator[str]:
-    """No zombie: no agent sends a command under an expired lease, or acts on or holds two tasks at once."""
+    """No zombie: no agent sends a command under an expired lease, or acts on two tasks or holds two leases at once."""
     terms = Assumptions(0.0, 0.0, 0.0, 0.0, 0.0)
     for event in events:
         match event:
@@ -151,7 +153,7 @@ def e8(events: Iterable[Event]) -> Iterator[str]:
 
 
 def e9(events: Iterable[Event]) -> Iterator[str]:
-    """Minority: an agent without a connection to the majority wins no lease, and stops by the end of its lease."""
+    """Minority: an agent that cannot reach a majority wins no lease, and stops by the end of its lease."""
     cut: dict[tuple[str, int], float] = {}
     terms = Assumptions(0.0, 0.0, 0.0, 0.0, 0.0)
     for event in events:

@@ -20,13 +20,13 @@ from sim.team.event import (
 KINDS = Asked, Answered, Unanswered, Settled, TupleStored, VoteAccepted, LivingMembers, AnswerRepeated
 """The events that these invariants use."""
 WAKE_LIMIT_S = 1.0
-"""T6: seconds within which a waiting client is notified."""
+"""T6: seconds within which a waiting client must be notified."""
 PUT, TAKE, SURVEY, WAIT, RING = "put", "take", "survey", "wait", "ring"
-"""Client operations: put a tuple, take some, read all, wait for the bell tuple, put the bell tuple."""
+"""Client operations: put a tuple, take tuples, read all tuples, wait for the bell tuple, put the bell tuple."""
 
 
 class _TupleSpaceState:
-    """The state of all tuples in the part of the history read so far."""
+    """The state of all tuples after the events that have been applied."""
 
     def __init__(self) -> None:
         self.tuples: dict[Hashable, TupleStored] = {}
@@ -44,19 +44,19 @@ class _TupleSpaceState:
                 self.members = dict(members)
 
     def find_takers(self, mark: Hashable) -> set[bytes]:
-        """Return all takers that a majority of the council ever accepted under one ballot."""
+        """Return all takers that a majority of the council has ever accepted under the same ballot."""
         quorum = len(self.tuples[mark].council) // 2 + 1
         return {taker for (_, taker), members in self.votes[mark].items() if len(members) >= quorum}
 
     def can_decide(self, stored_tuple: TupleStored) -> bool:
-        """Return whether a majority of its council lives and has not lost its votes."""
+        """Return whether a majority of the tuple's council lives and has not lost its votes."""
         members = zip(stored_tuple.council, stored_tuple.incarnations, strict=True)
         able = [member for member, incarnation in members if self.members.get(member) == incarnation]
         return 2 * len(able) > len(stored_tuple.council)
 
 
 def t1(events: Iterable[Event]) -> Iterator[str]:
-    """One taker: no tuple is confirmed to two takers, neither by two majorities nor in answers to clients."""
+    """One taker: no tuple is confirmed to two takers, either by two majorities or in answers to clients."""
     space, confirmed = _TupleSpaceState(), defaultdict[Hashable, list[str]](list)
     taking: dict[int, Asked] = {}
     for event in events:
@@ -119,7 +119,7 @@ def _find_unseen(
 
 
 def t3(events: Iterable[Event]) -> Iterator[str]:
-    """Finality: a confirmed take is visible in every survey that starts later."""
+    """Finality: a survey that starts after a confirmed take does not return the taken tuple."""
     space = _TupleSpaceState()
     requests: dict[int, Asked] = {}
     confirmed: dict[Hashable, str] = {}
@@ -147,7 +147,7 @@ def t3(events: Iterable[Event]) -> Iterator[str]:
 
 
 def t4(events: Iterable[Event]) -> Iterator[str]:
-    """Same answer: a member that accepted the decided value repeats it whenever it is asked."""
+    """Same answer: a member that accepted the decided value repeats this value in every later answer."""
     for event in events:
         if isinstance(event, AnswerRepeated) and event.answer != event.taker:
             value = event.answer.hex()[:6] if event.answer else event.answer
@@ -155,7 +155,7 @@ def t4(events: Iterable[Event]) -> Iterator[str]:
 
 
 def t5(events: Iterable[Event]) -> Iterator[str]:
-    """Given back: at the end no acknowledged tuple is held by a dead taker if its council can decide."""
+    """Returned claims: at the end no acknowledged tuple is held by a dead taker if its council can decide."""
     space = _TupleSpaceState()
     putting: dict[int, Hashable] = {}
     acknowledged: set[Hashable] = set()
@@ -175,7 +175,7 @@ def t5(events: Iterable[Event]) -> Iterator[str]:
 
 
 def t6(events: Iterable[Event]) -> Iterator[str]:
-    """Wake: a client that waits when the bell tuple is put is notified within a second, unless it dies meanwhile."""
+    """Wake-up: a client that waits when the bell tuple is put is notified within a second, unless its node dies."""
     waiting: dict[int, Asked] = {}
     heard: dict[int, float] = {}
     ringing: dict[int, float | None] = {}

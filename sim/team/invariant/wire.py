@@ -1,4 +1,4 @@
-"""Invariants of the wire, R1 to R4: invalid datagrams, requests that may run once, bytes, and tables."""
+"""Invariants of the wire, R1 to R4: invalid datagrams, repeated requests, amplification, and table sizes."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ KINDS = Asked, Answered, InvalidDatagram, RequestExecuted, UnvalidatedTraffic, T
 
 
 def r1(events: Iterable[Event]) -> Iterator[str]:
-    """Counters only: an invalid datagram changes no other state of a node, and causes no log entry or error."""
+    """Counters only: an invalid datagram changes a node's counters, but no other state, and causes no log or error."""
     for event in events:
         if not isinstance(event, InvalidDatagram):
             continue
@@ -25,7 +25,7 @@ def r1(events: Iterable[Event]) -> Iterator[str]:
 
 
 def r2(events: Iterable[Event]) -> Iterator[str]:
-    """At most once: a request that changes something runs at most once, and an answer implies that it ran."""
+    """At most once: a request that changes state is executed at most once, and an answer proves its execution."""
     runs: Counter[tuple[int, int, int]] = Counter()
     lives: dict[int, int] = {}
     requests: dict[int, Asked] = {}
@@ -46,7 +46,7 @@ def r2(events: Iterable[Event]) -> Iterator[str]:
 
 
 def r3(events: Iterable[Event]) -> Iterator[str]:
-    """No amplification: an unvalidated address gets no more bytes than it sent, and other addresses get none."""
+    """No amplification: an unvalidated address gets at most as many bytes as it sent, and other addresses get none."""
     for event in events:
         if isinstance(event, InvalidDatagram):
             size = len(event.datagram)

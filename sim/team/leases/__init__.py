@@ -1,1 +1,1 @@
-"""Simulated agents, acceptors and devices of task leases; a schedule takes some milliseconds."""
+"""Simulate the agents, acceptors and devices of task leases only; a schedule takes some milliseconds."""

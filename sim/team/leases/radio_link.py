@@ -12,9 +12,9 @@ from sim.team.simulation import FIRST_PORT
 
 @dataclass(frozen=True)
 class LinkQuality:
-    """The quality of a radio link: one-way ``delay`` plus exponential ``jitter`` in seconds; shares lost and doubled.
+    """The quality of a radio link: one-way ``delay`` plus exponential ``jitter`` (s), shares of loss and duplicates.
 
-    With ``burst`` the losses have the same rate and occur in bursts of that mean length (Gilbert-Elliott).
+    With ``burst``, losses occur at the same rate, but in bursts of this mean length (Gilbert-Elliott).
     """
 
     delay: float = 0.002
@@ -28,9 +28,9 @@ DEFAULT_QUALITY = LinkQuality()
 
 
 class RadioLink:
-    """The link between all places; ``cut`` has the directed pairs of places that are disconnected.
+    """The link between all places; ``cut`` contains the directed pairs of places that are disconnected.
 
-    Datagrams in flight when a pair is cut arrive.
+    Datagrams that are in flight when a pair is cut still arrive.
     """
 
     def __init__(self, air: LinkQuality = DEFAULT_QUALITY) -> None:
@@ -40,7 +40,7 @@ class RadioLink:
 
     @property
     def quality(self) -> LinkQuality:
-        """The present quality."""
+        """The current quality."""
         return self._quality
 
     @quality.setter
@@ -50,11 +50,11 @@ class RadioLink:
 
     @property
     def max_delay(self) -> float:
-        """The delay in seconds within which all but one in twenty thousand datagrams arrive."""
+        """The delay in seconds that only one in twenty thousand datagrams exceeds."""
         return self._slowest.delay + 10 * self._slowest.jitter
 
     def draw_delays(self, source: Address, to: Address, size: int, now: float, rng: random.Random) -> Sequence[float]:
-        """Return the delay of each copy of a datagram in seconds; empty if it is lost."""
+        """Return the delay of each copy of a datagram in seconds; empty if the datagram is lost."""
         air, is_cut = self._quality, (source.port - FIRST_PORT, to.port - FIRST_PORT) in self.cut
         copies = 2 if air.duplicate and rng.random() < air.duplicate else 1
         return [

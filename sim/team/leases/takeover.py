@@ -1,4 +1,4 @@
-"""Takeover trials: one lease holder and its standbys on a link of one-way 20 ms + Exp(10 ms), with clocks off by 1 %.
+"""Measure takeovers: a lease holder and its standbys, a one-way delay of 20 ms + Exp(10 ms), clock errors of 1 %.
 
 ``python -m sim.team.leases.takeover [--trials 500] [--hours 24]`` prints the results of leases alone; ``make
 bench-takeover`` prints the results of whole teams.
@@ -20,7 +20,7 @@ NEVER_S = 1e12
 
 
 def make_team(seed: int, loss: float, ttl: float, stand_bys: int = 2) -> LeaseTeam:
-    """Return a team of three council members and of agents, the first of which holds the lease."""
+    """Return a team of three council members and several agents; the first agent holds the lease."""
     rng = random.Random(f"takeover/{seed}")
     agents = 1 + stand_bys
     rates = [1.0 + rng.uniform(-DRIFT, DRIFT) for _ in range(agents + 3)]
@@ -46,7 +46,7 @@ def find_holder(team: LeaseTeam) -> int | None:
 
 
 def measure_takeover(seed: int, loss: float = 0.1, ttl: float = 1.5, is_polite: bool = False) -> float:
-    """Return the virtual seconds from the holder's death (or leave) until another agent holds the lease."""
+    """Return the virtual seconds from the holder's death (or graceful leave) until another agent holds the lease."""
     team = make_team(seed, loss, ttl)
     gone = find_holder(team) or 0
     started_at = team.clock.seconds()
@@ -62,7 +62,7 @@ def measure_takeover(seed: int, loss: float = 0.1, ttl: float = 1.5, is_polite: 
 
 
 def count_false_takeovers(seed: int, hours: float, loss: float = 0.2, ttl: float = 1.5) -> tuple[int, float]:
-    """Return how often a healthy holder lost its lease in ``hours``, and the datagrams per second."""
+    """Return how often a healthy holder lost its lease within ``hours``, and the datagrams per second."""
     team = make_team(seed, loss, ttl)
     before, sent = team.recorder.wins, team.switchboard.counters["sent"]
     team.clock.advance(3600.0 * hours)
@@ -84,7 +84,7 @@ CASES = (
     ("executor leaves, no loss", 0.0, 1.5, True, (0.2, 0.2)),
     ("executor leaves, loss 10 %", 0.1, 1.5, True, (0.2, math.inf)),
 )
-"""The cases: loss, ttl, whether the holder leaves gracefully, and the targets of p50 and p99 in seconds."""
+"""The cases: title, loss, TTL, whether the holder leaves gracefully, and the targets of p50 and p99 in seconds."""
 MAX_MESSAGES_PER_S = 12.0
 
 

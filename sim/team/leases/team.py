@@ -1,7 +1,7 @@
-"""Places with machines, acceptors, agents and devices on a simulated link, for schedules and trials of leases.
+"""Simulate machines, acceptors, agents and devices on a radio link, for schedules and trials of leases.
 
-``LeaseNode`` is one life of a place, ``LeaseTeam`` all places, ``LeaseRecorder`` records the events for the checker (E1
-to E9).
+A place is a machine on which nodes run one after the other. ``LeaseNode`` is one run (life) of a node, ``LeaseTeam``
+contains all places, and ``LeaseRecorder`` records the events for the checker (E1 to E9).
 """
 
 from __future__ import annotations
@@ -49,7 +49,7 @@ LINK_DELAY_S = 0.001
 
 
 class LeaseNode:
-    """One life of a place: its acceptor, its lease clients, its robot."""
+    """One life of the node at a place: its acceptor, its lease clients, its robot."""
 
     def __init__(self, world: LeaseTeam, place: int, machine: Machine, store: Store, rng: random.Random) -> None:
         self.world = world
@@ -98,7 +98,7 @@ class LeaseNode:
         return self.lease_clients[task_id]
 
     def has_lease(self, task_id: str) -> bool:
-        """Return whether this agent lives and believes that it holds the lease."""
+        """Return whether this agent lives and, by its own clock, holds the lease."""
         lease_client = self.lease_clients.get(task_id)
         return lease_client is not None and lease_client.lease is not None and self.machine.is_alive
 
@@ -115,7 +115,8 @@ class LeaseNode:
             if lease is not None:
                 now = self.machine.seconds()
                 permit = Permit(lease.token, lease.deadline)
-                # As in a driver: the device's last known time, and the remaining duration of the lease.
+                # As in a driver, a command contains the device's last known time and the remaining duration of the
+                # lease.
                 device_time = self.world.clock.seconds() - self._rng.random() * 0.02
                 self.machine.callLater(
                     SEND_DELAY_S, self._send_command, task_id, permit, device_time, lease.deadline - now
@@ -130,7 +131,7 @@ class LeaseNode:
         except StaleCommand:
             return
         if lease_client.lease is None and not lease_client.token:
-            return  # the lease was released meanwhile
+            return  # the lease was released during the delay
         self.world.recorder.on_command_sent(self, task_id, permit)
         self.world.clock.callLater(
             LINK_DELAY_S, self.world.recorder.on_command, self, task_id, permit, device_time, remaining
@@ -171,7 +172,7 @@ class LeaseNode:
 
 
 class LeaseRecorder:
-    """The history of a team, and for each task its device's gate, the accepted commands, and the number of wins."""
+    """The history of a team, and for each task the gate of its device, its accepted commands, and its lease wins."""
 
     def __init__(self, world: LeaseTeam) -> None:
         self.history = world.history
@@ -212,14 +213,14 @@ class LeaseRecorder:
             self.history.record(LeaseWon, task_id, bidder.place, lease.token)
 
     def on_command_sent(self, bidder: LeaseNode, task_id: str, permit: Permit) -> None:
-        """Record a command that an agent sends under its lease, possibly just after it was frozen."""
+        """Record a command that an agent sends under its lease, possibly directly after a freeze of its machine."""
         truly = bidder.machine.to_unsuspended_time(permit.deadline)
         self.history.record(
             CommandSent, task_id, bidder.place, bidder.machine.to_simulator_time(permit.deadline), truly
         )
 
     def on_command(self, bidder: LeaseNode, task_id: str, permit: Permit, device_time: float, remaining: float) -> None:
-        """Let the device, which all agents share, accept or refuse a command."""
+        """Let the device of the task, which all agents share, accept or refuse a command."""
         now, gate = self._world.clock.seconds(), self.device_gates[task_id]
         deadline = min(device_time, now) + remaining
         truly, is_accepted = bidder.machine.to_unsuspended_time(permit.deadline), True
@@ -234,18 +235,18 @@ class LeaseRecorder:
         self.history.record(CommandReceived, task_id, bidder.place, permit.token, is_accepted, deadline, truly)
 
     def get_highest_token(self, place: int, task_id: str) -> int:
-        """Return the highest token that the robot of a place has obeyed, as it reports to its agent."""
+        """Return the highest token that the robot of a place has obeyed, as the robot reports it to its agent."""
         return max((token for _, token, one in self.accepted[task_id] if one == place), default=0)
 
     def stop_robot(self, place: int, task_id: str) -> None:
-        """Stop the robot of an agent; a stop does not overtake a command on the link."""
+        """Stop the robot of an agent; the stop does not overtake earlier commands on the link."""
         self._world.clock.callLater(LINK_DELAY_S, self._record_stop, place, task_id)
 
     def _record_stop(self, place: int, task_id: str) -> None:
         self.history.record(RobotStopped, task_id, place, self._world.clock.seconds() + self._world.stop_time)
 
     def record_reachability(self) -> None:
-        """Record which agents lost or regained the connection to a majority of the council, in both directions."""
+        """Record which agents lost or regained a bidirectional connection to a majority of the council."""
         for task_id, charter in self._world.charters.items():
             places = [self._world.get_place(member) for member in charter.members]
             for agent in self._world.agents:
@@ -268,9 +269,9 @@ class _CallDatagram(bytes):
 
 
 class LeaseTeam(Simulation):
-    """Places whose clocks run at ``rates``; the first ``agents`` of them have agents.  ``seed`` seeds all generators.
+    """Places whose clocks run at ``rates``; the first ``agents`` places have agents. ``seed`` seeds all generators.
 
-    ``stop_time`` is the time that a robot needs to stand still, ``drift`` the maximum error of a clock.
+    ``stop_time`` is the time that a robot needs to come to rest, ``drift`` the maximum error of a clock's rate.
     """
 
     def __init__(
@@ -311,7 +312,7 @@ class LeaseTeam(Simulation):
         self.nodes = [self.start_life(place) for place in range(self.n)]
 
     def add_task(self, task_id: str, council: Sequence[int]) -> None:
-        """Add a task with a pinned council."""
+        """Add a task with a fixed council."""
         members = tuple(self.contacts[place] for place in council)
         self.charters[task_id] = create_charter(self.operator, task_id, members)
         self.recorder.add_task(task_id)
@@ -323,7 +324,7 @@ class LeaseTeam(Simulation):
         return self._places[contact.public]
 
     def get_charter(self, place: int, task_id: str) -> Charter:
-        """Return the council that the task's records prove."""
+        """Return the charter of the task's current council, as its records would prove it."""
         return self.charters[task_id]
 
     def on_council_changed(self, task_id: str, council: LeaseProposer) -> None:
@@ -333,13 +334,13 @@ class LeaseTeam(Simulation):
             self.recorder.record_reachability()
 
     def send(self, source: int, to: int, call: Callable[[], object]) -> None:
-        """Make a call at the receiver, if the link delivers it."""
+        """Run ``call`` at the receiver if the link delivers the datagram."""
         self._ports[source].send(_CallDatagram(call), self.address(to))
 
     def ask(
         self, me: LeaseNode, to: int, method: str, arguments: tuple[Any, ...], answered: Callable[[object], object]
     ) -> None:
-        """Carry a request and its answer."""
+        """Deliver a request and its answer."""
 
         def arrive() -> None:
             peer = self.nodes[to]
@@ -360,7 +361,7 @@ class LeaseTeam(Simulation):
         self.send(me.place, to, arrive)
 
     def notify(self, source: int, contact: Contact, method: str, arguments: tuple[Any, ...]) -> None:
-        """Carry a notification."""
+        """Deliver a notification."""
         to = self.get_place(contact)
 
         def arrive() -> None:
@@ -371,18 +372,18 @@ class LeaseTeam(Simulation):
     # -- lives ------------------------------------------------------------------------------------------------------
 
     def is_up(self, place: int) -> bool:
-        """Return whether a machine runs."""
+        """Return whether the machine at a place runs."""
         return self.nodes[place].machine.is_alive and not self.nodes[place].machine.is_frozen
 
     def kill(self, place: int) -> None:
-        """Kill a machine like a loss of power; its store remains."""
+        """Kill a machine as by a loss of power; its store remains."""
         self.nodes[place].machine.die()
         if not self.has_stores:
             self.stores.pop(place, None)
         self.history.record(Died, place, not self.has_stores)
 
     def start_life(self, place: int) -> LeaseNode:
-        """Return the next life at a place."""
+        """Start and return the next life of the node at a place."""
         rng = self.make_life_rng(place)
         self.history.record(Born, place, self.life_count)
         machine = Machine(self.clock, self._rates[place], rng.uniform(0.0, 1e4))

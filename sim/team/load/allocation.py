@@ -1,7 +1,7 @@
-"""Run the contest for one task: its bidders, their decisions, and the holder of its lease.
+"""Run the auction of one task: its bidders, their decisions, and the holder of its lease.
 
-Bidders act like agents (``agents.engagement``) with robots that never move: the agent named by the announced bids
-claims the lease, the next two are standbys, and an agent that is no longer named releases the lease.
+Bidders act like agents (``agents.engagement``) whose robots never move: the agent that wins by the announced bids
+claims the lease, the next two agents are standbys, and a holder that no longer wins releases the lease.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ _NEAREST = Nearest()
 
 @dataclass
 class Bidder:
-    """A bidder: its cost, the agent that it regards as assigned, and the time of its last change."""
+    """A bidder: its cost, the agent that it regards as assigned, and the time at which that agent last changed."""
 
     agent: BiddingAgent
     cost: float
@@ -43,10 +43,10 @@ class Bidder:
 class TaskAllocation:
     """One task among the agents of ``places``, each at a random distance from its target.
 
-    All bid within ``spread`` seconds; with ``claims`` they also claim the lease, otherwise the contest ends with the
-    decision.  ``began_at`` is the time of the first bid, ``held_at`` the time at which the lease was first held;
-    ``overlaps`` counts leases won while another agent held the lease; ``start_failure`` says why the contest did not
-    start.
+    All agents bid within ``spread`` seconds. With ``claims`` the selected agents also claim the lease; otherwise the
+    auction ends with the decision. ``began_at`` is the time of the first bid, ``held_at`` the time at which the lease
+    was first held. ``overlaps`` counts leases won while another agent held the lease. ``start_failure`` is the reason
+    why the auction did not start.
     """
 
     def __init__(
@@ -73,7 +73,7 @@ class TaskAllocation:
         self.bidders = {agent.uuid: Bidder(agent, rng.uniform(1.0, MAX_COST)) for agent in present}
 
     async def begin(self) -> None:
-        """Pin a council, and let all agents bid."""
+        """Choose a council, and let all agents bid."""
         try:
             self.task = task = await next(iter(self.bidders.values())).agent.pin_council(self.task)
         except EntangledError as error:
@@ -89,7 +89,7 @@ class TaskAllocation:
         return self.began_at + self.task.waiting_period
 
     def list_present(self) -> list[Bidder]:
-        """Return the bidders whose nodes live."""
+        """Return the bidders whose nodes are alive."""
         return [bidder for bidder in self.bidders.values() if self._agents.is_alive(bidder.agent)]
 
     def find_best(self) -> str | None:

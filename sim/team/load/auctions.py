@@ -1,6 +1,6 @@
 """Workload: auctions of one task at a time among all agents; measures time to agreement, and messages.
 
-Times count from the end of the waiting period, which starts with the first bid.
+Times are measured from the end of the waiting period, which starts with the first bid.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ from sim.team.team import Team
 
 @dataclass(frozen=True)
 class AuctionSettings:
-    """``[load.auctions]``: successive tasks for which all agents bid."""
+    """``[load.auctions]``: tasks for which all agents bid, one after the other."""
 
     count: Annotated[int, Meta(ge=1, le=10_000)] = 3
     """Total number of auctions."""
@@ -35,7 +35,7 @@ class AuctionSettings:
     """Waiting period for bids after the first one, in seconds."""
 
     spread: Annotated[float, Meta(ge=0.0, le=60.0), Unit("seconds")] = 0.1
-    """Interval in seconds within which all agents bid."""
+    """Seconds within which all agents bid."""
 
 
 class Auctions(ClientWorkload):
@@ -75,7 +75,7 @@ class Auctions(ClientWorkload):
         return self.start_failures
 
     def collect_metrics(self) -> list[Metric]:
-        """Return the share of agents that are right, the time until then, and the number of messages."""
+        """Return the share of agents that decided correctly, their times to decide, and the number of messages."""
         n = len(self.right_shares)
         return [
             Metric("auctions.right", mean(self.right_shares), "share", n=n),
@@ -95,7 +95,7 @@ class Auctions(ClientWorkload):
         task = Task(f"auction {self._begun}", "none", "nothing", waiting_period=self._settings.waiting)
         rng = self._team.make_rng(f"auction/{self._begun}")
         places = self._joined.list_places()
-        rng.shuffle(places)  # the first one requests the council
+        rng.shuffle(places)  # the first agent requests the council
         allocation = TaskAllocation(task, self._agents, places, self._clock, rng, self._settings.spread)
         self._allocation = allocation
         Deferred.fromCoroutine(allocation.begin())
@@ -121,10 +121,10 @@ class Auctions(ClientWorkload):
         allocation.end()
 
     def _traffic_since_start(self, agent: BiddingAgent) -> tuple[int, int, int]:
-        """Return a node's datagrams sent and handled since the auction started, and its bytes of requests."""
+        """Return a node's sent and handled datagrams, and its bytes of requests, since the auction started."""
         sent, handled, volume = self._before.get(agent.place, (0, 0, 0))
         now_sent, now_handled, now_volume = _read_counts(agent)
-        if now_handled < handled:  # another life
+        if now_handled < handled:  # the node was restarted
             return now_sent, now_handled, now_volume
         return now_sent - sent, now_handled - handled, now_volume - volume
 

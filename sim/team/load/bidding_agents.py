@@ -1,7 +1,8 @@
-"""Bid and claim for the agent of each place, whatever the kind of its node.
+"""Bid and claim leases for the agent of each place, for both kinds of nodes.
 
-A swarm node contains the services for bidding and leases; a bare node of the library gets the same ones, connected in
-the same way.  So an auction among ten thousand nodes can be measured with the rest of a swarm node or without it.
+A swarm node contains the services for bidding and leases; a bare node of the library gets the same services, connected
+in the same way. An auction among ten thousand nodes can therefore be measured with complete swarm nodes or with bare
+nodes.
 """
 
 from __future__ import annotations
@@ -32,20 +33,20 @@ from middleware.tasks.task import Task
 from sim.team.team import Node, Team, get_entangled
 
 BID_PREFIX, SEARCHED_BYTES = b"bid.", 64
-"""The start of the names of methods that carry bids, and the bytes of a message that are searched for it."""
+"""The prefix of the methods for bids, and the number of bytes of a message that are searched for this prefix."""
 
 
 class CountingEndpoint:
     """A ``RequestSender`` over ``endpoint`` that counts the datagrams of bidding, ``sent`` and ``received``.
 
-    Nodes also send heartbeats, pings and answers, often in step, so the total traffic does not show the cost of an
-    auction.
+    Nodes also send heartbeats, pings and answers, often at the same times, so the total traffic does not show the cost
+    of an auction.
     """
 
     def __init__(self, endpoint: Endpoint) -> None:
         self._endpoint = endpoint
         self.sent = self.received = self.bytes = 0
-        # Only the request table below knows the number of retransmissions.
+        # Only the endpoint's request table counts the retransmissions.
         requester = endpoint._requester
         requester._send = self._make_counting_send(requester._send)
 
@@ -57,7 +58,7 @@ class CountingEndpoint:
     def ask(
         self, contact: Contact, method: str, *arguments: object, timeout: float | None = None, changes: bool = False
     ) -> Deferred[Any]:
-        """Send a request; its answer counts as a datagram."""
+        """Send a request; its answer is counted as a datagram."""
         asked = self._endpoint.ask(contact, method, *arguments, timeout=timeout, changes=changes)
         return asked.addCallbacks(self._count_answer, self._count_refusal)
 
@@ -66,7 +67,7 @@ class CountingEndpoint:
         self._endpoint.notify(contact, method, *arguments)
 
     def count_request(self, is_answered: bool = True) -> None:
-        """Count a received request, once per arrival, and its answer."""
+        """Count a received request, each time it arrives, and its answer."""
         self.received += 1
         self.sent += is_answered
 
@@ -104,13 +105,13 @@ class BiddingServices:
 
     @cached_property
     def council_manager(self) -> CouncilManager:
-        """The councils of tasks, as ``SwarmNode.council_manager``; a reconfiguration is not recorded."""
+        """The councils of tasks, like ``SwarmNode.council_manager``; a reconfiguration is not recorded."""
         seen = self._node.store, self._clock, self._rng, self._born_at
         return CouncilManager(self._node, *seen, on_change=lambda task: None, may_be_member=lambda public: True)
 
     @cached_property
     def auction_service(self) -> AuctionService:
-        """The auctions of the node, as ``SwarmNode.auction_service``."""
+        """The auctions of the node, like ``SwarmNode.auction_service``."""
         node = self._node
 
         def size() -> int:
@@ -131,7 +132,7 @@ class BiddingServices:
 
 
 class BiddingAgent:
-    """The bidding and claiming part of the agent of one place, for one life of its ``node``; ``counter`` counts."""
+    """The bidding and claiming part of the agent at one place, for one ``node``; ``counter`` counts datagrams."""
 
     def __init__(self, place: int, node: Node, clock: IReactorTime, rng: random.Random) -> None:
         self.place = place
@@ -142,7 +143,7 @@ class BiddingAgent:
         self._services: BiddingServices | SwarmNode = (
             node if isinstance(node, SwarmNode) else BiddingServices(node, self.counter, clock, rng)
         )
-        # Exposed as by a swarm node, but counted; all are idempotent, so each arrival is answered.
+        # The methods are exposed as in a swarm node, but counted; all are idempotent, so each arrival is answered.
         expose = bare.endpoint.expose
         expose("bid.offer", self._answer_offer, changes=True, idempotent=True)
         expose("bid.announce", self._answer_announcement, changes=True, idempotent=True)
@@ -157,11 +158,11 @@ class BiddingAgent:
         return self._services.council_manager.make_lease_client(task, changed, 0)
 
     async def pin_council(self, task: Task) -> Task:
-        """Return the new ``task`` with a pinned council."""
+        """Return the new ``task`` with a council."""
         return await self._services.council_manager.choose_council(task)
 
     def stop(self) -> None:
-        """Stop the services of a bare node after its end; a swarm node stops its own."""
+        """Stop the services of a bare node after its end; a swarm node stops its own services."""
         if isinstance(self._services, BiddingServices):
             self._services.stop()
 
@@ -187,7 +188,7 @@ class BiddingAgent:
 
 
 class BiddingAgents:
-    """The agents of a team (``get_bidding_agents``), made as nodes are born."""
+    """The agents of a team (``get_bidding_agents``); an agent is created when its node starts."""
 
     def __init__(self, team: Team) -> None:
         self._clock = team.clock
@@ -197,7 +198,7 @@ class BiddingAgents:
         team.watch_lives(self._on_birth, self._on_death)
 
     def get(self, place: int) -> BiddingAgent | None:
-        """Return the agent of a place; None if its node does not live."""
+        """Return the agent of a place; None if its node is not alive."""
         return self._present.get(place)
 
     def list_present(self) -> list[BiddingAgent]:
@@ -224,7 +225,7 @@ _AGENTS_BY_TEAM: WeakKeyDictionary[Team, BiddingAgents] = WeakKeyDictionary()
 
 
 def get_bidding_agents(team: Team) -> BiddingAgents:
-    """Return the agents of ``team``, shared by all workloads, as a node has one handler for bids."""
+    """Return the agents of ``team``, which all workloads share, because a node has only one handler for bids."""
     known = _AGENTS_BY_TEAM.get(team)
     if known is None:
         known = _AGENTS_BY_TEAM[team] = BiddingAgents(team)

@@ -1,4 +1,4 @@
-"""Collect the workloads that scenarios can name."""
+"""Collect the workloads that a scenario can select."""
 
 from __future__ import annotations
 

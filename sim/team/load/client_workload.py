@@ -14,7 +14,7 @@ from sim.team.workload import Workload
 
 
 class Pacer:
-    """A pacer: ``rate`` operations per second after the first call of ``due``; ``most`` in total, 0 for no limit."""
+    """A pacer: ``rate`` operations per second from the first ``take_due`` on; ``most`` in total (0: unlimited)."""
 
     def __init__(self, clock: IReactorTime, rate: float, most: int = 0) -> None:
         self._clock = clock
@@ -25,7 +25,7 @@ class Pacer:
 
     @property
     def is_over(self) -> bool:
-        """Whether the total number is reached."""
+        """Whether the total number of operations has been reached."""
         return bool(self._max_total) and self._taken >= self._max_total
 
     def take_due(self) -> int:
@@ -46,8 +46,8 @@ BITS = 8 * ID_BYTES
 class NodeIdIndex:
     """The sorted ids of the living nodes.
 
-    Ids with a common prefix are adjacent in numerical order, so the ids closest to a key are found without a full scan:
-    they are in the narrowest such range around the key that has enough ids.
+    Ids with a common prefix are adjacent in numerical order, so the ids closest to a key are found without a full
+    scan: they are in the range of the longest prefix of the key that enough ids share.
     """
 
     def __init__(self) -> None:
@@ -60,13 +60,13 @@ class NodeIdIndex:
         return self._find(int.from_bytes(node_id)) is not None
 
     def add(self, node_id: bytes) -> None:
-        """Add an id, if it is new."""
+        """Add an id if it is not in the index."""
         number = int.from_bytes(node_id)
         if self._find(number) is None:
             insort(self._numbers, number)
 
     def remove(self, node_id: bytes) -> None:
-        """Remove an id, if it exists."""
+        """Remove an id if it is in the index."""
         place = self._find(int.from_bytes(node_id))
         if place is not None:
             del self._numbers[place]
@@ -80,7 +80,7 @@ class NodeIdIndex:
             low = goal >> (BITS - bits) << (BITS - bits)
             next_first = bisect_left(self._numbers, low, first, end)
             next_end = bisect_left(self._numbers, low + (1 << (BITS - bits)), next_first, end)
-            if next_end - next_first <= count:  # as ``without`` may be one of them
+            if next_end - next_first <= count:  # because ``without`` may be one of these ids
                 break
             first, end = next_first, next_end
         near = [number for number in self._numbers[first:end] if number != passed]
@@ -107,15 +107,15 @@ class JoinedNodes:
         return len(self._order)
 
     def node(self, place: int) -> EntangledNode:
-        """Return the joined node of a place; raises ``KeyError`` if there is none."""
+        """Return the joined node of a place; raise ``KeyError`` if no node has joined there."""
         return self._nodes[place]
 
     def is_alive(self, place: int, life: EntangledNode) -> bool:
-        """Return whether ``life`` still lives; a node that returned to its place is another life."""
+        """Return whether the node ``life`` at a place is still alive; a restarted node is a different object."""
         return self._nodes.get(place) is life
 
     def any(self, rng: random.Random, count: int = 1) -> list[int]:
-        """Return ``count`` different random places, or all if there are fewer."""
+        """Return ``count`` different random places, or all places if there are fewer."""
         return rng.sample(self._order, min(count, len(self._order)))
 
     def list_places(self) -> list[int]:
@@ -140,7 +140,7 @@ class JoinedNodes:
         del self._nodes[place]
         self.id_index.remove(get_entangled(node).identity.node_id)
         gap, last = self._place_in_order.pop(place), self._order.pop()
-        if last != place:  # the last place fills the gap, as a shift would move ten thousand
+        if last != place:  # the last place fills the gap; a shift would move up to ten thousand entries
             self._order[gap] = last
             self._place_in_order[last] = gap
 

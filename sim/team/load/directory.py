@@ -1,6 +1,6 @@
 """Workload: readers list all devices; measures the time, and the distribution of device records over nodes.
 
-It examines the stores, so it does not depend on the keys of the directory.
+The workload examines the stores of the nodes, so it does not depend on the keys of the directory.
 """
 
 from __future__ import annotations
@@ -46,7 +46,7 @@ class Directory(ClientWorkload):
         self._max_listed = 0
 
     def step(self) -> None:
-        """Let the next reader list all devices, if it is time."""
+        """Let the next reader list all devices, if the next listing is due."""
         now = self._clock.seconds()
         if now < self._next_at:
             return
@@ -60,11 +60,11 @@ class Directory(ClientWorkload):
         self._start_listing(chosen[0])
 
     def make_final_requests(self) -> None:
-        """End the last reader."""
+        """Record the result of the last reader."""
         self._end()
 
     def collect_metrics(self) -> list[Metric]:
-        """Return the devices per node, the share of the busiest node, and the readers' times and completeness."""
+        """Return the device records per node, the share at the busiest node, and the times and results of readers."""
         held = []
         for place in self._team.alive():
             store = self._team.get_entangled(place).store

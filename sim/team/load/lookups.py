@@ -1,14 +1,14 @@
 """Workload: random nodes look up other nodes; measures success, hops and time.
 
-As in the studies with which results are compared (Li et al., INFOCOM 2005), the target is the id of a random node that
-lives and has joined, and a lookup succeeds if that node is the first of the result within the time limit.  If the
-searching node or the target dies meanwhile, the trial is void.
+As in the published studies used for comparison (Li et al., INFOCOM 2005), the target is the id of a random joined
+node, and a lookup succeeds if this node is the first of the result within the time limit. If the searching node or the
+target dies during the lookup, the trial is void.
 
-``seconds`` count until the whole result is available, the k closest; ``reach_times`` until the target itself has
-answered, as in those studies.
+``seconds`` are measured until the whole result (the k closest nodes) is available, ``reach_times`` until the target
+itself has answered, as in those studies.
 
-In a quiet network, random keys are looked up in addition: the result is exact if it has the k closest of all living
-nodes in their order (invariant D6).
+In a quiet network, random keys are looked up in addition: the result is exact if it contains the k closest of all
+living nodes in order of distance (invariant D6).
 """
 
 from __future__ import annotations
@@ -45,7 +45,7 @@ class LookupSettings:
     """Time limit of a lookup in seconds."""
 
     exact: Annotated[int, Meta(ge=0, le=100_000)] = 100
-    """Number of random keys looked up at the end in a quiet network, with exact results required."""
+    """Number of random keys that are looked up at the end in a quiet network; these results must be exact."""
 
 
 @dataclass
@@ -85,7 +85,7 @@ class Lookups(ClientWorkload):
                 self._start_lookup(*pair)
 
     def make_final_requests(self) -> None:
-        """Look up random keys, with exact results required."""
+        """Look up random keys; these results must be exact."""
         self._count_late()
         self._is_settled = True
         for _ in range(self._settings.exact if len(self._joined) > 1 else 0):
@@ -104,7 +104,8 @@ class Lookups(ClientWorkload):
         """Return success, exactness, hops, requests and times."""
         self._count_late()
         n = self.found + self.missed + self.late
-        # Two hops at least: the first names the target, and the second confirms that it is alive.
+        # At least two hops: the first finds the address of the target, and the second confirms that the target is
+        # alive.
         most = max(2.0, math.log2(max(2, len(self._joined))) / 2)
         figures = [
             make_share("lookups.success", self.found, n),
@@ -135,7 +136,7 @@ class Lookups(ClientWorkload):
     def _on_answer(self, contacts: list[Contact], number: int) -> None:
         trial = self._open.pop(number, None)
         if trial is None:
-            return  # it exceeded the time limit
+            return  # the lookup exceeded the time limit
         took = self._clock.seconds() - trial.began
         if self._is_void(trial):
             self.void += 1
@@ -146,7 +147,7 @@ class Lookups(ClientWorkload):
         else:
             self.found += 1
             self.seconds.append(took)
-            # The target answered this lookup, or sent a datagram up to ``overlay.RECORD_INTERVAL_S`` before.
+            # The target answered this lookup, or sent a datagram up to ``overlay.RECORD_INTERVAL_S`` earlier.
             self.reach_times.append(took - min(took, trial.life.overlay.silence(contacts[0])))
             looked = next((one for one in reversed(trial.life.overlay.lookups) if one.key == trial.target), None)
             if looked is not None:
@@ -186,7 +187,7 @@ class Lookups(ClientWorkload):
 
     def _on_exact_failure(self, failure: Failure, place: int) -> None:
         failure.trap(EntangledError)
-        self._record_inexact(f"D6: node {place} finds nobody: {failure.getErrorMessage()}")
+        self._record_inexact(f"D6: the lookup of node {place} fails: {failure.getErrorMessage()}")
 
     def _record_inexact(self, line: str) -> None:
         self.inexact += 1

@@ -1,7 +1,7 @@
-"""Workload: clients write, remove and read a few slots; the checker judges the answers.
+"""Workload: clients write, remove and read a few slots; the checker checks the answers.
 
-Only the share of answered requests is measured here.  Correctness, freshness and durability are D1 to D4 and D7 of
-``sim.team.invariant.durability``, over the team's history.
+Only the share of answered requests is measured here. Correctness, freshness and durability are checked in the team's
+history, as D1 to D4 and D7 of ``sim.team.invariant.durability``.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ NAME = "r"
 """Name of the slot that each node has under a key."""
 OPERATIONS = (WRITE, WRITE, REMOVE, READ, READ, READ)
 MAX_READERS = 32
-"""Number of nodes that read everything at the end; not all, in a network of thousands."""
+"""Maximum number of nodes that read all keys at the end."""
 
 
 @dataclass(frozen=True)
@@ -55,13 +55,13 @@ class Records(ClientWorkload):
                     self._clients.write(place, self._joined.node(place), key, NAME, act=act)
 
     def make_final_requests(self) -> None:
-        """Let many nodes read everything."""
+        """Let many nodes read all keys."""
         for place in self._joined.any(self._rng, MAX_READERS):
             for key in self._keys:
                 self._read(place, key)
 
     def collect_metrics(self) -> list[Metric]:
-        """Return the shares of answered requests; the others may have been carried out."""
+        """Return the shares of answered requests; unanswered requests may have been executed."""
         asked, answered = self._clients.request_counts, self._clients.answer_counts
         return [
             make_share("records.acknowledged", answered[WRITE] + answered[REMOVE], asked[WRITE] + asked[REMOVE]),

@@ -1,8 +1,8 @@
 """Workload: lease holders die at random times; measures the time until another agent holds the lease.
 
-Each trial is a separate task with three agents: one holds the lease and two are standbys, as in a team.  Several trials
-may run at once.  A trial does not count if a majority of the task's council is dead as well, as no agent may take over
-then (invariant E3).
+Each trial is a separate task with three agents: one holds the lease and two are standbys, as in a team.  Several
+trials may run at the same time. A trial is not counted if a majority of the task's council is also dead, because no
+agent may take over then (invariant E3).
 """
 
 from __future__ import annotations
@@ -71,13 +71,13 @@ class Takeovers(ClientWorkload):
         self.missed_count = self.overlaps = self.void_count = 0
 
     def step(self) -> None:
-        """Start the trials that are due, while there are agents without a trial."""
+        """Start the trials that are due, as long as agents without a trial are available."""
         self._due += self._pace.take_due()
         while self._due and self._start_trial():
             self._due -= 1
 
     def find_violations(self) -> list[str]:
-        """Return leases held by two agents at once (E2), and tasks without a takeover (E3)."""
+        """Return the leases held by two agents at the same time (E2), and the tasks without a takeover (E3)."""
         found = [f"E2: {self.overlaps} times two agents held one lease"] if self.overlaps else []
         return found + ([f"E3: {self.missed_count} tasks were not taken over"] if self.missed_count else [])
 
@@ -106,7 +106,7 @@ class Takeovers(ClientWorkload):
         return True
 
     async def _prepare(self, trial: TakeoverTrial) -> None:
-        """Let the first agent hold the lease and the others be standbys, then schedule the holder's death."""
+        """Let the first agent claim the lease and the other agents be standbys, then schedule the holder's death."""
         try:
             trial.task = await trial.agents[0].pin_council(trial.task)
         except EntangledError:
@@ -128,7 +128,7 @@ class Takeovers(ClientWorkload):
             (place for place, lease_client in enumerate(trial.lease_clients) if lease_client.lease is not None), None
         )
         if holder is None or not all(self._agents.is_alive(agent) for agent in trial.agents):
-            self.void_count += 1  # a fault of the scenario came first
+            self.void_count += 1  # a fault of the scenario affected the trial earlier
             self._end(trial)
             return
         trial.dead_agent, trial.died_at = trial.agents[holder], self._clock.seconds()

@@ -1,6 +1,6 @@
-"""Workload: many tasks at once, each with the bids of a few agents that sense it (Assumption 1) and with one holder.
+"""Workload: many simultaneous tasks; for each, a few agents that sense it bid (Assumption 1), and one holds the lease.
 
-Each task runs completely: council, bids, announcement, claim.
+Each task has all phases: council, bids, announcement, claim.
 """
 
 from __future__ import annotations
@@ -55,7 +55,7 @@ class Tasks(ClientWorkload):
         self._right = 0
 
     def step(self) -> None:
-        """Publish all tasks when it is time."""
+        """Publish all tasks when they are due."""
         now = self._clock.seconds()
         if self._due_at is None:
             self._due_at = now + self._settings.after
@@ -71,14 +71,14 @@ class Tasks(ClientWorkload):
                 Deferred.fromCoroutine(allocation.begin())
 
     def make_final_requests(self) -> None:
-        """Count the holders of each task, and end the contests."""
+        """Count the holders of each task, and end the auctions."""
         self._counted = [len(allocation.find_holders()) for allocation in self._allocations]
         self._right = self._count_nearest_holders()
         for allocation in self._allocations:
             allocation.end()
 
     def find_violations(self) -> list[str]:
-        """Return tasks without a holder, and tasks held by two agents at once (E2)."""
+        """Return the tasks without a holder, and the tasks held by two agents at the same time (E2)."""
         found = [f"E2: two held {c.task.task_id} at once" for c in self._allocations if c.overlaps]
         found += [
             f"{allocation.task.task_id} is held by {held} agents"
@@ -90,7 +90,7 @@ class Tasks(ClientWorkload):
         return found[:MAX_LISTED] + ([f"and {more} more tasks"] if more > 0 else [])
 
     def collect_metrics(self) -> list[Metric]:
-        """Return the share of tasks with exactly one holder, and the times until they had one."""
+        """Return the share of tasks with exactly one holder, and the times until the tasks had a holder."""
         n = len(self._allocations)
         held = self._counted or [len(allocation.find_holders()) for allocation in self._allocations]
         right = self._right if self._counted else self._count_nearest_holders()

@@ -1,7 +1,7 @@
 """Workload: observe the traffic of a team; measures datagrams, bytes, contacts, and the simulation's CPU and memory.
 
-CPU time and memory are those of the process that runs all nodes, divided by their number; they depend on the machine,
-and on the other workloads of the scenario.
+CPU time and memory are those of the process that runs all nodes, divided by the number of nodes. Both depend on the
+machine and on the other workloads of the scenario.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ class TrafficSettings:
     """``[load.traffic]``: the sampled nodes."""
 
     sample: Annotated[int, Meta(ge=1, le=100_000)] = 200
-    """Number of nodes with counted contacts at the end; bytes are counted for all nodes."""
+    """Number of nodes whose contacts are counted at the end; bytes are counted for all nodes."""
 
 
 def measure_resident_bytes() -> int:
@@ -34,7 +34,7 @@ def measure_resident_bytes() -> int:
     try:
         with open("/proc/self/statm", encoding="ascii") as file:
             return int(file.read().split()[1]) * PAGE_BYTES
-    except OSError:  # other systems: the maximum so far
+    except OSError:  # on other systems use the peak memory
         most = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
         return most if sys.platform == "darwin" else most * 1024
 

@@ -1,12 +1,13 @@
-"""Workload: store values, let some of their holders die at once, and read the values at other nodes.
+"""Workload: store values, kill some of their holders simultaneously, and read the values at other nodes.
 
-``deaths`` selects the deaths: "quorum" kills one less than acknowledged the value, which an acknowledged value must
-survive (invariant D1); "none" leaves deaths to the faults of the scenario, for a comparison of the loss of half of a
-network with the model 2 ** -k.  A read may return the value or "unavailable", but never "not found"; a value that
-cannot be read for ``patience`` seconds is lost.
+With ``deaths`` "quorum", all but one of the nodes that acknowledged the value are killed; an acknowledged value must
+survive this (invariant D1). With "none", only the faults of the scenario kill nodes, for example to compare the loss
+of half of a network with the model 2 ** -k. A read may return the value or "unavailable", but never "not found"; a
+value that cannot be read for ``patience`` seconds is lost.
 
-Without deaths a random reader looks up the holders of each value before it is read; the figure is the share of the
-holders (among the k closest) that it finds.  Lookups of KAD in the field found 18 % (Kang et al., 2009).
+With "none", a random reader looks up the holders of each value before the value is read; the figure is the share of
+the holders (among the k closest nodes) that the reader finds. Lookups of KAD in the field found 18 % (Kang et al.,
+2009).
 """
 
 from __future__ import annotations
@@ -48,17 +49,18 @@ class ValueSettings:
     """Values stored per second."""
 
     deaths: Annotated[str, one_of((NONE, QUORUM))] = NONE
-    """``quorum``: kill one less than acknowledged the value, at once; ``none``: only the faults of the scenario."""
+    """``quorum``: kill all but one of the nodes that acknowledged the value; ``none``: only the faults of the
+    scenario."""
 
     age: Annotated[float, Meta(ge=0.0, le=86_400.0), Unit("seconds")] = 5.0
-    """Seconds from these deaths until a value is read; without deaths it is read at the end."""
+    """Seconds from these deaths until a value is read; with ``none`` values are read at the end."""
 
     away: Annotated[float, Meta(ge=1.0, le=86_400.0), Unit("seconds")] = 30.0
-    """Seconds after which a new node takes the place of each dead one."""
+    """Seconds after which each dead node is replaced by a new node."""
 
     patience: Annotated[float, Meta(ge=0.0, le=3600.0), Unit("seconds")] = 90.0
-    """Seconds of attempts before a value counts as lost.  Dead members count in majorities for at least half a minute,
-    so values that many of them held may be unavailable for this time."""
+    """Seconds for which reads are retried before a value is regarded as lost. Dead replicas are part of a majority for
+    at least half a minute, so a value whose holders are mostly dead may be unavailable for this time."""
 
 
 @dataclass
@@ -112,7 +114,7 @@ class Values(ClientWorkload):
             self._read(value)
 
     def find_violations(self) -> list[str]:
-        """Return lost values and wrong "not found" answers; with "none" the faults may exceed the tolerance."""
+        """Return lost values and wrong "not found" answers; empty with "none": faults may exceed the tolerance."""
         return self._violations if self._settings.deaths == QUORUM else []
 
     def collect_metrics(self) -> list[Metric]:
@@ -169,7 +171,7 @@ class Values(ClientWorkload):
         return holders
 
     def _kill(self, value: Value) -> None:
-        """Kill as many of the nodes that acknowledged the value as it must survive."""
+        """Kill as many of the nodes that acknowledged the value as the value must survive."""
         held = self._find_holders(value)
         dying = self._rng.sample(held, min(value.acknowledged - 1, len(held) - 1)) if held else []
         for place in dying:
@@ -184,7 +186,7 @@ class Values(ClientWorkload):
             self._team.start(place)
 
     def _count_holders(self, value: Value) -> None:
-        """Let a random node look up the holders, and count those that it finds."""
+        """Let a random node look up the holders, and count the holders that it finds."""
         held = [self._joined.node(place) for place in self._find_holders(value)]
         life = self._choose_reader()
         if life is None or not held:

@@ -22,7 +22,7 @@ NAME = "watched"
 
 @dataclass(frozen=True)
 class WatchSettings:
-    """``[load.watches]``: the numbers of keys and watchers."""
+    """``[load.watches]``: the numbers of keys and watchers, and the rate of changes."""
 
     keys: Annotated[int, Meta(ge=1, le=100_000)] = 10
     """Number of watched keys."""
@@ -73,7 +73,7 @@ class Watches(ClientWorkload):
         self.seconds: list[float] = []
 
     def step(self) -> None:
-        """Keep the number of watchers of each key, and make the changes that are due."""
+        """Replace dead watchers, and make the changes that are due."""
         for key in self._keys:
             self._add_watchers(key)
         for _ in range(self._pace.take_due()):
@@ -133,7 +133,7 @@ class Watches(ClientWorkload):
         life.put(key, NAME, b"%d" % number).addErrback(lambda failure: self._on_put_failed(failure, number))
 
     def _on_put_failed(self, failure: Failure, number: int) -> None:
-        """Drop a change that no replica acknowledged; watchers may see a partially acknowledged one."""
+        """Drop a change that was not acknowledged; watchers may nevertheless receive it."""
         failure.trap(EntangledError)
         if not failure.check(NotAcknowledged):
             self._open = [change for change in self._open if change.number != number]

@@ -1,4 +1,4 @@
-"""``sim scale``: measure the cost and latencies of teams of several sizes, and draw them next to theoretical values."""
+"""``sim scale``: measure cost and latencies of teams of several sizes, and plot them next to theoretical values."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ Measure = Callable[[int, SurveySettings, ProgressCallbacks], SizeResult]
 def measure_in_fork(nodes: int, settings: SurveySettings, watcher: ProgressCallbacks) -> SizeResult:
     """Measure a team of that size in a separate process; raises ``MeasurementStopped``.
 
-    Memory freed by one team would otherwise be reused for the next one, which would then seem to need less.
+    In the same process, memory freed by one team would be reused by the next team, which would seem to need less.
     """
     return run_in_fork(
         partial(measure_size, nodes, settings, watcher), MeasurementStopped, is_stopped=watcher.is_stopped
@@ -38,7 +38,7 @@ def measure_in_fork(nodes: int, settings: SurveySettings, watcher: ProgressCallb
 
 
 def run_scale(arguments: Sequence[str], world: Environment, measure: Measure = measure_in_fork) -> int:
-    """Measure the sizes that are missing in the record, print and draw all; returns 1 if a target is missed.
+    """Measure the sizes that are missing in the file, print and plot all; return 1 if a target is missed.
 
     Raises ``BadSetting``.
     """

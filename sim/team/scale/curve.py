@@ -12,7 +12,7 @@ from sim.team.scale.theory import Published, Theory
 
 @dataclass(frozen=True)
 class Curve:
-    """``metric`` under ``title`` in ``unit``; ``bound`` is its target, ``bounds_by_size`` has other ones."""
+    """The curve of ``metric``, in ``unit``; ``bound`` is its target, ``bounds_by_size`` the targets of single sizes."""
 
     metric: str
     title: str
@@ -24,7 +24,7 @@ class Curve:
     """Whether the theoretical curve is the target."""
     bound: Bound | None = None
     min_nodes: int = 0
-    """Number of nodes from which on the target applies."""
+    """Minimum number of nodes for which the target applies."""
     bounds_by_size: tuple[tuple[int, Bound], ...] = ()
     published: Sequence[Published] = ()
 
@@ -36,7 +36,7 @@ class Curve:
 
 
 LARGE_NODES = 1000
-"""Number of nodes from which on the targets of cost apply."""
+"""Minimum number of nodes for which the targets of cost apply."""
 
 CURVES = (
     Curve("lookups.success", "Lookups that find their node within 4 s", "share", bound=Bound(0.999, is_maximum=False)),

@@ -1,4 +1,4 @@
-"""Draw the curves as SVG over the number of nodes, with logarithmic axes if the values allow it.  Pure."""
+"""Draw the curves as SVG over the number of nodes, with logarithmic axes where the values permit. Pure."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ MAX_LINEAR_RATIO = 8.0
 
 
 def draw_svg(curves: Sequence[Curve], points: Mapping[str, Points], note: str) -> str:
-    """Return a plot of every curve that has points; ``note`` is added below all of them."""
+    """Return a plot of every curve that has points; ``note`` is written below the plots."""
     present = [curve for curve in curves if points.get(curve.metric)]
     rows = math.ceil(len(present) / COLUMNS)
     parts = []
@@ -117,7 +117,7 @@ def _draw_plot(curve: Curve, points: Points) -> str:
 
 
 def _list_sizes(low: int, high: int) -> list[int]:
-    """Return sizes from ``low`` to ``high``, in steps of a quarter."""
+    """Return sizes from ``low`` to ``high``, each a quarter larger than the previous one."""
     found, n = [], float(low)
     while n < high:
         found.append(round(n))
@@ -126,7 +126,7 @@ def _list_sizes(low: int, high: int) -> list[int]:
 
 
 def _list_ticks(low: float, high: float, is_log: bool) -> list[float]:
-    """Return round values between both."""
+    """Return round values between ``low`` and ``high``, for the labels of an axis."""
     if is_log:
         first, last = math.floor(math.log10(low)), math.ceil(math.log10(high))
         steps = (1, 3) if last - first <= 4 else (1,)

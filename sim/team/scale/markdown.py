@@ -11,7 +11,7 @@ from sim.team.scale.drawing import Points
 
 MILLION = 1_000_000
 MIN_FIT_NODES = 100
-"""Number of nodes from which on sizes are used for the extrapolation; below, every node knows all others."""
+"""Minimum size that is used for the extrapolation; in smaller teams every node knows all others."""
 MIN_FIT_SIZES = 3
 """Minimum number of sizes for the extrapolation."""
 
@@ -28,7 +28,7 @@ def extrapolate(points: Points, nodes: int = MILLION) -> float | None:
 
 
 def format_markdown(curves: Sequence[Curve], points: Mapping[str, Points]) -> str:
-    """Return a table with one row per curve and one column per size; values that miss their targets are bold."""
+    """Return a table with a row for each curve and a column for each size; values that miss their targets are bold."""
     present = [curve for curve in curves if points.get(curve.metric)]
     sizes = sorted({n for curve in present for n, _ in points[curve.metric]})
     lines = [

@@ -1,8 +1,9 @@
 """Measure all figures of a team of one size, one after the other.
 
-Nodes adapt their timeouts to observed round-trip times, so a team keeps the links on which it was formed.  One team of
-bare nodes has internet links, for cost and lookups, another one fast links, for which the targets of auctions and
-takeovers are defined.  A third team of whole nodes measures the directory, as bare nodes have no devices.
+Nodes adapt their timeouts to observed round-trip times, so the links of a team are not changed after its formation.
+Three teams are measured. Bare nodes on internet links give cost and lookups. Bare nodes on fast links, for which those
+targets are defined, give auctions and takeovers. Complete nodes give the directory, because bare nodes have no
+devices.
 """
 
 from __future__ import annotations
@@ -42,7 +43,7 @@ class SurveySettings:
 
     seed: int = 1
     settle: float = 30.0
-    """Seconds from the last join until the team counts as quiet."""
+    """Seconds from the last join until the team is regarded as quiet."""
     quiet: float = 20.0
     """Seconds without requests in which traffic is counted."""
     lookups: float = 10.0
@@ -50,7 +51,7 @@ class SurveySettings:
     rate: float = 30.0
     """Lookups per second."""
     exact: int = 1000
-    """Number of keys with exact results required."""
+    """Number of keys for which the lookup must be exact."""
     auctions: int = 3
     """Number of auctions in which all agents bid."""
     takeovers: int = 100
@@ -120,7 +121,7 @@ class SizeMeasurement:
         """Measure cost and lookups, with bare nodes on internet links."""
         team = Team(self._scenario, self._settings.seed)
         cost = Traffic(team, TrafficSettings())
-        get_bidding_agents(team)  # the services for bids need memory too
+        get_bidding_agents(team)  # create the services for bids, which also need memory
         asking = Lookups(team, LookupSettings(rate=self._settings.rate, exact=self._settings.exact))
         self._say("nodes join")
         self._form_team(team)
@@ -138,7 +139,7 @@ class SizeMeasurement:
         team = Team(self._scenario, settings.seed)
         team.switchboard.link_model = RadioLink(LinkQuality(DELAY_S, JITTER_S, settings.loss))
         bidding = Auctions(team, AuctionSettings(count=settings.auctions, every=4.0))
-        # The rate limits the nodes that are away at once to a number that a small team tolerates.
+        # This rate limits the nodes that are away at the same time to a number that a small team tolerates.
         rate = min(5.0, max(0.12, nodes / 200))
         dying = Takeovers(team, TakeoverSettings(count=settings.takeovers, rate=rate, away=AWAY_S))
         self._say("nodes join for a task")

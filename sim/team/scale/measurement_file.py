@@ -1,4 +1,4 @@
-"""Keep the measured sizes in a JSON file, from which an interrupted run continues."""
+"""Store the measured sizes in a JSON file, so that an interrupted run can be continued."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ class MeasurementFile:
             self._new_path.unlink()
         except OSError as error:
             problem = f"cannot write {error.filename}: {error.strerror}"
-            raise BadSetting("command line", "--out", problem, "name a folder that you can write to") from error
+            raise BadSetting("command line", "--out", problem, "choose a folder to which you can write") from error
 
     def read(self) -> None:
         """Read the file; raises ``BadSetting`` if it is invalid or was measured with other settings."""

@@ -1,6 +1,6 @@
 """Theoretical values of the curves, and values of published simulations.  Pure.
 
-If no published values are known, values of this project's own simulations on consensus are used.
+If no published values are known, values of this project's simulations of consensus are used.
 """
 
 from __future__ import annotations
@@ -23,15 +23,15 @@ class Published(NamedTuple):
 
 
 def hops(nodes: float) -> float:
-    """Return the target of lookups: half of the bits that distinguish so many nodes.
+    """Return the target for the hops of a lookup: half of the bits that distinguish so many nodes.
 
-    Two hops at least: the first names the target, and the second confirms that it is alive.
+    At least two hops: the first finds the address of the target, and the second confirms that the target is alive.
     """
     return max(2.0, math.log2(nodes) / 2)
 
 
 def contacts(nodes: float) -> float:
-    """Return the contacts in a full table: k in each half, quarter, ... until fewer nodes are left."""
+    """Return the contacts in a full routing table: k from each half, quarter, ... of the ids with at least k nodes."""
     found, left = 0.0, nodes
     while left > 1:
         left /= 2
@@ -45,7 +45,7 @@ def tree(nodes: float) -> float:
 
 
 ROUND_S = 0.03
-"""Mean one-way delay in seconds on the link of these simulations."""
+"""Mean one-way delay in seconds of the link in these simulations."""
 _ROUNDS = {3: 3.2, 10: 5.8, 30: 10, 100: 15, 300: 19, 1000: 24, 3000: 29, 10_000: 32.5}
 _BUSIEST = {3: 6, 10: 20, 30: 46, 100: 72, 300: 101, 1000: 126, 3000: 152, 10_000: 183}
 
@@ -66,7 +66,7 @@ def takeover(nodes: float) -> float:
 
 
 def share(nodes: float) -> float:
-    """Return the share of a directory at each of k holders, if it is spread evenly over all nodes."""
+    """Return the share of the directory at each node, if k copies are spread evenly over all nodes."""
     return min(1.0, K / nodes)
 
 

@@ -1,7 +1,7 @@
-"""Trials of a tuple space with one list of records instead of replicas, so that thousands of tuples take a minute.
+"""Run trials of a tuple space with one list of records instead of replicas, so that thousands of tuples take a minute.
 
-Acceptors, tuple spaces and the endpoints between them are production code; only records are not replicated: one list
-holds all of them, and watchers are notified of changes with a delay.  These trials test councils, not replicas.
+Acceptors, tuple spaces and the endpoints between them are production code. Only records are not replicated: one list
+contains all records, and watchers are notified of changes with a delay. These trials test councils, not replicas.
 """
 
 from __future__ import annotations
@@ -48,7 +48,7 @@ class SharedStoreNode:
         """Do nothing: all nodes know each other."""
 
     def stop_silently(self) -> None:
-        """Leave without notice."""
+        """Stop without notifying other nodes."""
         self.endpoint.stop()
         self.watches.clear()
 
@@ -58,11 +58,11 @@ class SharedStoreNode:
         return defer.succeed(select_closest(others, target, 8))
 
     def find_newest(self, contact: Contact) -> Contact:
-        """Return ``contact``: addresses do not change here."""
+        """Return ``contact``, because addresses do not change in these trials."""
         return contact
 
     def put(self, key: bytes, name: str, value: bytes | None) -> Deferred[int]:
-        """Store a record after a delay, unless this node dies before."""
+        """Store a record after a delay, unless this node has died by then."""
         sequence = self._trial.next_sequence(Slot(key, self.identity.public, name))
         record = Record(key, name, self.identity.public, sequence, "team", 60.0, value).sign(self.identity)
         done: Deferred[int] = Deferred()
@@ -92,7 +92,7 @@ class SharedStoreNode:
         return watch
 
     def refresh(self, watch: SharedStoreWatch) -> None:
-        """Do nothing: pushes are never lost here."""
+        """Do nothing, because pushes are never lost in these trials."""
 
 
 class SharedStoreWatch:
@@ -107,7 +107,7 @@ class SharedStoreWatch:
         self._changed = changed
 
     def notify(self, records: list[Record]) -> None:
-        """Notify the watcher, if the watch has not ended."""
+        """Notify the watcher unless the watch has ended."""
         if self in self._node.watches:
             self.records = records
             self._changed(records)

@@ -22,7 +22,7 @@ STEP_S = 0.25
 MAX_WAITING = 24
 """Approximate number of tuples waiting to be taken."""
 MAX_DOWN = 2
-"""Maximum number of dead nodes: less than a majority of any council and of the holders of any record."""
+"""Maximum number of dead nodes: less than a majority of any council and of any record's replicas."""
 
 
 class TakingTrial(Simulation):
@@ -59,14 +59,14 @@ class TakingTrial(Simulation):
     # -- nodes ------------------------------------------------------------------------------------------------------
 
     def make_node(self, place: int, identity: Identity, rng: Any) -> EntangledNode:
-        """Return the next life of the node at this place, with the store of the last one, not started."""
+        """Return the next node of this place, not started, with the store of the previous node."""
         network = self.network(place)
         node = EntangledNode(identity, TEAM_KEY, network, self.store(place), self.clock, rng)
         node.replica.on_record.add(self.recorder.record_tuple)
         return node
 
     def start(self, place: int) -> None:
-        """Start the node of this place, if it does not live."""
+        """Start the node of this place if it is not running."""
         if place in self.living or place == self.dead_place:
             return
         identity, rng = self.identity(place), self.make_life_rng(place)
@@ -80,7 +80,7 @@ class TakingTrial(Simulation):
             self.take(place)
 
     def kill(self, place: int) -> None:
-        """Kill the node of this place between two instructions, like a loss of power."""
+        """Kill the node of this place between two instructions, as by a loss of power."""
         if place in self.living:
             node, space = self.end_life(place), self.spaces.pop(place)
             self.switchboard.kill(self.address(place))
@@ -134,7 +134,7 @@ class TakingTrial(Simulation):
             self.read_all(self.trial_rng.choice(self.alive()))
 
     def read_all(self, place: int) -> None:
-        """Read all tuples; in a quiet network the result must not contain tuples taken before."""
+        """Read all tuples; in a quiet network the result must not contain tuples that were taken earlier."""
         is_quiet = self.switchboard.conditions is self.quiet_conditions or not (
             self.lossy_conditions.loss or self.churn
         )
@@ -164,7 +164,7 @@ class TakingTrial(Simulation):
             space.claim(("job", int, ANY), lease=1.0, timeout=5.0).addBoth(self.on_claimed, place, space, asked)
 
     def on_claimed(self, claim: object, place: int, space: TupleSpace, asked: int) -> None:
-        """Work on a claim: mostly confirm it, sometimes too late, sometimes never."""
+        """Process a claim: usually confirm the claim, sometimes too late, sometimes never."""
         fate, work = self.trial_rng.random(), self.trial_rng.uniform(0.0, 0.3)
         if not isinstance(claim, Claim) or fate < 0.1:
             self.on_taken(None, place, space, asked)
@@ -204,7 +204,7 @@ class TakingTrial(Simulation):
     # -- results ----------------------------------------------------------------------------------------------------
 
     def is_stored(self, stored_tuple: StoredTuple) -> bool:
-        """Return whether a living node holds this tuple; an unacknowledged one may vanish with its nodes."""
+        """Return whether a living node stores this tuple; an unacknowledged tuple may be lost with its nodes."""
         held = [node.store.get_slot(stored_tuple.tuple_id.slot) for node in self.living.values()]
         return any(record is not None and parse_record(record) == stored_tuple for record in held)
 

@@ -1,4 +1,4 @@
-"""Record every vote of every council member of a tuple space, over all lives of its nodes, for the checker."""
+"""Record every vote of every council member of a tuple space, including restarted members, for the checker."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ INCARNATION = "decree/incarnation"
 
 
 class VoteRecorder:
-    """Records every acceptance of every council member, in all of its lives."""
+    """Records every acceptance of every council member, before and after restarts."""
 
     def __init__(self, history: History) -> None:
         self._history = history
@@ -33,7 +33,7 @@ class VoteRecorder:
         self.votes: dict[TupleId, dict[tuple[int, bytes, bytes], set[bytes]]] = defaultdict(lambda: defaultdict(set))
 
     def record_tuple(self, record: Record) -> None:
-        """Record a tuple that a replica holds."""
+        """Record a tuple that a replica stores."""
         content = parse_record(record)
         if isinstance(content, StoredTuple):
             if content.tuple_id not in self.tuples:
@@ -84,7 +84,7 @@ class VoteRecorder:
         self.votes[place][ballot].add(member)
 
     def record_members(self, nodes: Iterable[EntangledNode]) -> None:
-        """Record the living members and their incarnations; a request would start their acceptors."""
+        """Record the living members and their incarnations without requests, which would start the acceptors."""
         members = [
             (node.identity.public, node.take_acceptor._incarnation or node.store.get_note(INCARNATION) or b"")
             for node in nodes
@@ -92,7 +92,7 @@ class VoteRecorder:
         self._history.record(event.LivingMembers, tuple(members))
 
     def find_takers(self, place: TupleId) -> set[bytes]:
-        """Return all takers that a majority of the council ever accepted; more than one is a violation."""
+        """Return all takers that a majority of the council has ever accepted; more than one taker is a violation."""
         quorum = len(self.tuples[place].council) // 2 + 1
         return {value for (_, _, value), members in self.votes[place].items() if len(members) >= quorum}
 

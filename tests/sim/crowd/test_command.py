@@ -153,8 +153,8 @@ class CommandTests(SynchronousTestCase):
             (("--seconds", "nan"), "--seconds must be"),
             (("--seed", "-1"), "--seed must be"),
             (("--controller", "dance"), "invalid choice"),
-            (("--agents", "3"), "say swarm crowd instead"),
-            (("--picture", "/nowhere/at/all.svg"), "there is no folder"),
+            (("--agents", "3"), "use swarm crowd"),
+            (("--picture", "/nowhere/at/all.svg"), "does not exist"),
             (("--bodies", "121", "--room", "0.0677", "--seconds", "1"), "no place is free"),
         ):
             code, told = self.run_with(*words)

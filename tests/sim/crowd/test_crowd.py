@@ -103,7 +103,7 @@ class CrowdSceneTests(SynchronousTestCase):
     def test_too_small_is_refused_with_the_remedy(self) -> None:
         """The error for a map that is too small contains the number of robots that fit, and a sufficient size."""
         error = self.assertRaises(SceneError, CrowdScene, 1000, 5.0, 5.0)
-        self.assertIn("there is room for 361; use at most 361 robots, or 8.4 x 8.4 m", str(error))
+        self.assertIn("at most 361 fit; use at most 361 robots, or 8.4 x 8.4 m", str(error))
         self.assertEqual(CrowdScene(361, 5.0, 5.0).robots, 361)
         self.assertEqual(CrowdScene(1000, 8.4, 8.4).robots, 1000)
 

@@ -143,5 +143,5 @@ class TrialTests(SynchronousTestCase):
             self.assertEqual(caught.exception.code, 2)
             self.assertNotIn("Traceback", errors.getvalue())
             self.assertIn(
-                "must be a whole number from 0 on" if "--count" in words else "cannot create", errors.getvalue()
+                "must be a whole number of at least 0" if "--count" in words else "cannot create", errors.getvalue()
             )
