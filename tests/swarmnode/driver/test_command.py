@@ -163,8 +163,8 @@ class DriverCommandTests(SynchronousTestCase):
         for words, told in (
             (["drive", *BLIND.split()], "is not a terminal"),
             (["drive", "--kind", "camera"], "a robot of kind camera does not move"),
-            (["drive"], "name the robot by --kind"),
-            (["probe", "--kind", "aibo", "--config", "x.toml"], "not both"),
+            (["drive"], "no robot is selected"),
+            (["probe", "--kind", "aibo", "--config", "x.toml"], "only one of them"),
             (["probe", "--kind", "warp"], "known are aibo"),
             (["probe", "--kind", "aibo"], "option host is missing"),
             (["probe", "--kind", "aibo", "--option", "host"], "KEY=VALUE"),

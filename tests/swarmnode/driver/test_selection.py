@@ -58,7 +58,7 @@ class SerialDeviceTests(SynchronousTestCase):
         self.assertEqual(told.count("no permission"), 1)
 
     def test_nothing_is_said_as_well(self) -> None:
-        """Without serial devices the output says that a robot in the network must be named."""
+        """Without serial devices the output says that a robot in the network needs its address."""
         self.assertIn("has to be named", "\n".join(format_serial_devices([])))
 
 
