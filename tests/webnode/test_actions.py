@@ -115,7 +115,7 @@ class ActionTests(SynchronousTestCase):
         """A message is answered with its recipients; a device that left in the meantime is reported as an error."""
         self.assertEqual(self.ask("POST", "message", {"text": "sit"}), (202, {"delivered": [], "failed": {}}))
         self.assertEqual(self.ask("POST", "devices/01/message", {"text": "sit"})[1]["id"], "01")
-        left = Refusal("device", "dog1 left during the request", "wait until it is back", 409)
+        left = Refusal("device", "dog1 left during the request", "wait until the device is back", 409)
 
         def lost(*wish: object) -> Deferred[Any]:
             return fail(left)
