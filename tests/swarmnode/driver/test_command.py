@@ -109,7 +109,7 @@ class DriverCommandTests(SynchronousTestCase):
         """A probe reports that world states are lost."""
         self.dog.faults.drop = 0.5
         _, output, _ = self.ground.swarm_driver(f"probe {BLIND}")
-        self.assertIn("! it is slow", output)
+        self.assertIn("! the robot is slow", output)
 
     def test_probe_is_interrupted_in_order(self) -> None:
         """Ctrl-C ends a probe with the results so far."""

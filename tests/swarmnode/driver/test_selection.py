@@ -59,7 +59,7 @@ class SerialDeviceTests(SynchronousTestCase):
 
     def test_nothing_is_said_as_well(self) -> None:
         """Without serial devices the output says that a robot in the network needs its address."""
-        self.assertIn("has to be named", "\n".join(format_serial_devices([])))
+        self.assertIn("needs its address", "\n".join(format_serial_devices([])))
 
 
 class UnitTests(SynchronousTestCase):
