@@ -1,4 +1,4 @@
-"""``sim run``: run a scenario and judge it."""
+"""``sim run``: run a scenario, and check it against its targets and the invariants."""
 
 from __future__ import annotations
 
@@ -65,7 +65,7 @@ def run(arguments: Sequence[str], world: Environment, kinds: WorkloadKinds = KIN
     check_targets(scenario, [metric.name for metric in scenario_run.collect_metrics()], args.scenario)
     faults: list[tuple[float, str]] = []
     with ExitStack() as files:
-        # Opened before the run, so that a missing folder is reported at once and not after an hour.
+        # Opened before the run, so that a missing folder is reported immediately and not after an hour.
         json_out = _open_file(args.json, "--json", files)
         trace_out = _open_file(args.trace, "--trace", files)
         picture_out = _open_file(args.picture, "--picture", files)
@@ -103,15 +103,16 @@ def check_targets(scenario: Scenario, known: Sequence[str], origin: str) -> None
 def _parse_arguments(arguments: Sequence[str]) -> argparse.Namespace:
     parser = argparse.ArgumentParser(
         prog="sim run",
-        description="Run a scenario with whole nodes in this process and judge it; Ctrl-C gives the partial result.",
-        epilog="Exit code: 0 success, 1 a target or an invariant is missed, 2 it cannot be run, 130 interrupted.",
+        description="Run a scenario with whole nodes in this process, and check it; Ctrl-C prints the partial result.",
+        epilog="Example: sim run --scenario steady --nodes 100 --seed 7.  Exit code: 0: success; 1: a target or an "
+        "invariant is missed; 2: the scenario cannot be run; 130: interrupted.",
     )
     parser.add_argument("--scenario", required=True, metavar="NAME", help=f"{', '.join(list_names())}, or a .toml file")
     parser.add_argument("--seed", type=int, default=1, metavar="N", help="seed of all random numbers (default 1)")
-    parser.add_argument("--nodes", type=int, metavar="N", help="number of nodes, instead of the scenario's")
-    parser.add_argument("--json", type=Path, metavar="FILE", help="write the report as JSON")
-    parser.add_argument("--trace", type=Path, metavar="FILE", help="write the events, one line of JSON each")
-    parser.add_argument("--picture", type=Path, metavar="FILE", help="write the figures over time as SVG")
+    parser.add_argument("--nodes", type=int, metavar="N", help="number of nodes (default: that of the scenario)")
+    parser.add_argument("--json", type=Path, metavar="FILE", help="write the report to FILE as JSON")
+    parser.add_argument("--trace", type=Path, metavar="FILE", help="write the events to FILE, one line of JSON each")
+    parser.add_argument("--picture", type=Path, metavar="FILE", help="write the figures over time to FILE as SVG")
     return parser.parse_args(arguments)
 
 
@@ -122,4 +123,4 @@ def _open_file(path: Path | None, key: str, files: ExitStack) -> TextIO | None:
         return files.enter_context(path.open("w", encoding="utf-8"))
     except OSError as error:
         problem = f"cannot write {path}: {error.strerror or error}"
-        raise BadSetting("command line", key, problem, "name a file in an existing folder") from error
+        raise BadSetting("command line", key, problem, "choose a file in an existing folder") from error

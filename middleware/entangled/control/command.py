@@ -19,8 +19,9 @@ from middleware.entangled.control.socket_path import NoControl, check_owner, che
 
 EXIT_FAILED, EXIT_USAGE = 1, 2
 FIELDS_HELP = """fields:     7  1.5  true  null  "7"  words       valid JSON, otherwise text
-templates:  _  any;  ?int ?float ?str ?bytes ?bool  a type;  >5  <=5  !=red  in:a,b  prefix:job-  a predicate"""
-KEYS_HELP = "A key is any text, or id: followed by 40 hexadecimal digits."
+templates:  _  any;  ?int ?float ?str ?bytes ?bool  a type;  >5  <=5  !=red  in:a,b  prefix:job-  a predicate
+example:    swarm tuple get job ?int --wait 10"""
+KEYS_HELP = "A key is any text, or id: followed by 40 hexadecimal digits.  Example: swarm dht put greeting hello"
 
 SendRequest = Callable[[Path, dict[str, Any]], Iterator[dict[str, Any]]]
 
@@ -31,7 +32,11 @@ def make_parser(group: str) -> argparse.ArgumentParser:
     common.add_argument("--node", metavar="NAME", help="name of the node, if several run on this machine")
     common.add_argument("--json", action="store_true", help="print JSON, one line per answer")
     if group == "rpc":
-        rpc = argparse.ArgumentParser(prog="swarm rpc", parents=[common], description="Call a method of a node.")
+        rpc = argparse.ArgumentParser(
+            prog="swarm rpc",
+            parents=[common],
+            description="Call a method of a node.  Example: swarm rpc 192.168.1.10:8484 ping",
+        )
         rpc.add_argument("node_asked", metavar="NODE", help="HOST:PORT, or the first digits of a known node's id")
         rpc.add_argument("method", help="name of the method, such as ping")
         rpc.add_argument("arguments", nargs="*", default=[], help="valid JSON, otherwise text")
@@ -58,16 +63,31 @@ def make_parser(group: str) -> argparse.ArgumentParser:
 def _add_dht_commands(verb: Callable[[str, str], argparse.ArgumentParser]) -> None:
     get = verb("get", "Print the records under a key.")
     get.add_argument("key")
-    get.add_argument("--concern", choices=("fast", "majority"), default="majority", help="one replica, or a majority")
+    get.add_argument(
+        "--concern", choices=("fast", "majority"), default="majority", help="number of replicas that must reply"
+    )
     put = verb("put", "Store a value under a key, in this node's own slot.")
     put.add_argument("key")
     put.add_argument("value", help="text, - for standard input, or @FILE")
     put.add_argument("--name", default="", help="name of this node's slot under the key")
     put.add_argument(
-        "--lifetime", choices=("team", "leased"), default="team", help="keep it when this node leaves, or remove it"
+        "--lifetime",
+        choices=("team", "leased"),
+        default="team",
+        help="team: keep the value when this node leaves; leased: remove it",
     )
-    put.add_argument("--concern", choices=("one", "majority", "all"), default="majority", help="required replicas")
-    put.add_argument("--expect", type=int, metavar="SEQUENCE", help="store only if the slot has it; 0: empty slot")
+    put.add_argument(
+        "--concern",
+        choices=("one", "majority", "all"),
+        default="majority",
+        help="number of replicas that must store the value",
+    )
+    put.add_argument(
+        "--expect",
+        type=int,
+        metavar="SEQUENCE",
+        help="store only if the slot has this sequence number; 0: only if it is empty",
+    )
     remove = verb("remove", "Remove this node's value under a key.")
     remove.add_argument("key")
     remove.add_argument("--name", default="")
@@ -87,7 +107,7 @@ def _add_keyword_commands(verb: Callable[[str, str], argparse.ArgumentParser]) -
 def _add_tuple_commands(verb: Callable[[str, str], argparse.ArgumentParser]) -> None:
     put = verb("put", "Put a tuple into the space.")
     put.add_argument("fields", nargs="+", metavar="FIELD")
-    put.add_argument("--ttl", type=float, metavar="SECONDS", help="remove it after that time")
+    put.add_argument("--ttl", type=float, metavar="SECONDS", help="remove the tuple after this time")
     get = verb("get", "Take a matching tuple out of the space.")
     read = verb("read", "Print a matching tuple without taking it.")
     for each in (get, read):
