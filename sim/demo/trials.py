@@ -1,4 +1,4 @@
-"""Repeat both experiments of the thesis with many seeds, and report.  Example: swarm trials --count 20 --seed 1.
+"""Repeat both experiments of the thesis with many seeds; write a table, and pictures of each phase.
 
 ``swarm trials --count 20 --seed 1`` runs real nodes, agents and drivers and the robot simulator in virtual time;
 ``--real 3`` adds runs with real processes (``sim.demo``).  The caller provides the team.
@@ -194,7 +194,11 @@ def parse_count(text: str) -> int:
 
 def main(arguments: Sequence[str], make_team: MakeTeam) -> int:
     """Run the command line; returns 0 if every trial passed."""
-    parser = argparse.ArgumentParser(prog="swarm trials", description=__doc__.splitlines()[0] if __doc__ else None)
+    parser = argparse.ArgumentParser(
+        prog="swarm trials",
+        description="Repeat both experiments of the thesis with many seeds; write a table, and pictures of each phase.",
+        epilog="Example: swarm trials --count 20 --seed 1",
+    )
     parser.add_argument(
         "--count", type=parse_count, default=20, help="trials of each experiment in virtual time (default: %(default)s)"
     )

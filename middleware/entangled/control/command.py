@@ -22,6 +22,7 @@ FIELDS_HELP = """fields:     7  1.5  true  null  "7"  words       valid JSON, ot
 templates:  _  any;  ?int ?float ?str ?bytes ?bool  a type;  >5  <=5  !=red  in:a,b  prefix:job-  a predicate
 example:    swarm tuple get job ?int --wait 10"""
 KEYS_HELP = "A key is any text, or id: followed by 40 hexadecimal digits.  Example: swarm dht put greeting hello"
+KEYWORD_HELP = "Example: swarm keyword search red ball"
 
 SendRequest = Callable[[Path, dict[str, Any]], Iterator[dict[str, Any]]]
 
@@ -46,13 +47,14 @@ def make_parser(group: str) -> argparse.ArgumentParser:
     build = {"dht": _add_dht_commands, "tuple": _add_tuple_commands, "keyword": _add_keyword_commands}[group]
     top = argparse.ArgumentParser(
         prog=f"swarm {group}",
-        epilog=FIELDS_HELP if group == "tuple" else KEYS_HELP if group == "dht" else None,
+        epilog={"tuple": FIELDS_HELP, "dht": KEYS_HELP, "keyword": KEYWORD_HELP}[group],
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
     verbs = top.add_subparsers(dest="verb", required=True, metavar="VERB")
 
-    def verb(name: str, purpose: str) -> argparse.ArgumentParser:
-        subparser = verbs.add_parser(name, help=purpose, description=purpose, parents=[common])
+    def verb(name: str, purpose: str, example: str) -> argparse.ArgumentParser:
+        epilog = f"Example: swarm {group} {name} {example}"
+        subparser = verbs.add_parser(name, help=purpose, description=purpose, epilog=epilog, parents=[common])
         subparser.set_defaults(verb=f"{group} {name}")
         return subparser
 
@@ -60,13 +62,13 @@ def make_parser(group: str) -> argparse.ArgumentParser:
     return top
 
 
-def _add_dht_commands(verb: Callable[[str, str], argparse.ArgumentParser]) -> None:
-    get = verb("get", "Print the records under a key.")
+def _add_dht_commands(verb: Callable[[str, str, str], argparse.ArgumentParser]) -> None:
+    get = verb("get", "Print the records under a key.", "greeting")
     get.add_argument("key")
     get.add_argument(
         "--concern", choices=("fast", "majority"), default="majority", help="number of replicas that must reply"
     )
-    put = verb("put", "Store a value under a key, in this node's own slot.")
+    put = verb("put", "Store a value under a key, in this node's own slot.", "greeting hello")
     put.add_argument("key")
     put.add_argument("value", help="text, - for standard input, or @FILE")
     put.add_argument("--name", default="", help="name of this node's slot under the key")
@@ -88,28 +90,30 @@ def _add_dht_commands(verb: Callable[[str, str], argparse.ArgumentParser]) -> No
         metavar="SEQUENCE",
         help="store only if the slot has this sequence number; 0: only if it is empty",
     )
-    remove = verb("remove", "Remove this node's value under a key.")
+    remove = verb("remove", "Remove this node's value under a key.", "greeting")
     remove.add_argument("key")
     remove.add_argument("--name", default="")
-    verb("find", "Print the nodes closest to a key.").add_argument("key")
-    verb("watch", "Print the records under a key on each change, until Ctrl-C.").add_argument("key")
+    verb("find", "Print the nodes closest to a key.", "greeting").add_argument("key")
+    verb("watch", "Print the records under a key on each change, until Ctrl-C.", "greeting").add_argument("key")
 
 
-def _add_keyword_commands(verb: Callable[[str, str], argparse.ArgumentParser]) -> None:
-    publish = verb("publish", "Publish data under every word of a name.")
+def _add_keyword_commands(verb: Callable[[str, str, str], argparse.ArgumentParser]) -> None:
+    publish = verb("publish", "Publish data under every word of a name.", "'red ball' @ball.json")
     publish.add_argument("name")
     publish.add_argument("value", help="text, - for standard input, or @FILE")
-    verb("search", "Print the publications with all of the words.").add_argument("words", nargs="+")
-    verb("watch", "Print the publications with a word on each change, until Ctrl-C.").add_argument("words")
-    verb("remove", "Remove this node's publication under a name.").add_argument("name")
+    verb("search", "Print the publications whose names contain all of the words.", "red ball").add_argument(
+        "words", nargs="+"
+    )
+    verb("watch", "Print the publications with a word on each change, until Ctrl-C.", "ball").add_argument("words")
+    verb("remove", "Remove this node's publication under a name.", "'red ball'").add_argument("name")
 
 
-def _add_tuple_commands(verb: Callable[[str, str], argparse.ArgumentParser]) -> None:
-    put = verb("put", "Put a tuple into the space.")
+def _add_tuple_commands(verb: Callable[[str, str, str], argparse.ArgumentParser]) -> None:
+    put = verb("put", "Put a tuple into the space.", "job 7 --ttl 60")
     put.add_argument("fields", nargs="+", metavar="FIELD")
     put.add_argument("--ttl", type=float, metavar="SECONDS", help="remove the tuple after this time")
-    get = verb("get", "Take a matching tuple out of the space.")
-    read = verb("read", "Print a matching tuple without taking it.")
+    get = verb("get", "Take a matching tuple out of the space.", "job ?int --wait 10")
+    read = verb("read", "Print a matching tuple without taking it.", "job ?int --all")
     for each in (get, read):
         each.add_argument("template", nargs="+", metavar="FIELD")
         each.add_argument("--wait", type=float, metavar="SECONDS", help="wait for a matching tuple for that time")

@@ -1,4 +1,4 @@
-"""Simulate a crowd of robots with one controller, or a search by agents.  Example: swarm crowd --bodies 200 --seed 7."""
+"""Simulate a crowd of robots with one controller, or a search by agents (``swarm crowd``)."""
 
 from __future__ import annotations
 
@@ -30,7 +30,8 @@ def main(arguments: Sequence[str], make_team: MakeTeam | None = None) -> int:
     """Run the simulation; return 0 if the target was reached, 1 if not, 2 for invalid arguments."""
     parser = argparse.ArgumentParser(
         prog="python -m sim.robots.crowd" if make_team is None else "swarm crowd",
-        description=(__doc__ or "").splitlines()[0],
+        description="Simulate a crowd of robots with one controller, or a search by hundreds of agents.",
+        epilog="Example: swarm crowd --bodies 200 --seconds 30 --seed 7",
     )
     parser.add_argument("--bodies", type=int, default=1000, help="number of robots (default %(default)s)")
     parser.add_argument("--room", type=float, default=AREA_M2, help="square metres per robot (default %(default)g)")

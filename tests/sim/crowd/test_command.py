@@ -160,7 +160,7 @@ class CommandTests(SynchronousTestCase):
         for agents in ("10", "-1"):
             code, told = self.run_with("--bodies", "9", "--agents", agents, team=PlayedTeam)
             self.assertEqual(code, 2, told)
-            self.assertIn("--agents must be from 0 to 9", told)
+            self.assertIn("--agents must be from 0 to the number of robots, 9", told)
 
 
 class PictureTests(SynchronousTestCase):
