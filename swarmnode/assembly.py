@@ -109,7 +109,7 @@ def _check_robot(settings: Settings) -> None:
 
 
 def _make_device(settings: Settings) -> Device:
-    """Return the device as set in ``settings``; kind and capabilities default to those of its driver."""
+    """Return the device as set in ``settings``; its driver provides the default kind and capabilities."""
     node, wanted = settings.node, settings.driver
     kind, capabilities = node.kind, dict(node.capabilities)
     if wanted.kind:

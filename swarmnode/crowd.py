@@ -88,7 +88,7 @@ class CrowdTeam(Simulation):
         return {name: AgentStatus(me.cost, named.get(me.assigned, "")) for name, me in every.items()}
 
     def find_finisher(self) -> str | None:
-        """Return the name of the agent that ended the task, or None as long as the task is open."""
+        """Return the name of the agent that ended the task, or None if the task is open."""
         if self._task_watch is None or self._task is None:
             return None
         outcome = find_outcome(self._task, self._task_watch.records)

@@ -1,6 +1,6 @@
 """``swarm deploy``: push modules to a team, roll them back and show their state.
 
-The node on this machine signs each pushed module and stores it in a slot of its own.  Other nodes run the module if
+The node on this machine signs each pushed module and stores it under the node's key.  Other nodes run the module if
 their settings list this node's key in ``[deployment] operators``.
 """
 

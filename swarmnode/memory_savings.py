@@ -11,7 +11,7 @@ STARTUP_S = 3.0
 
 
 def block_tls_import() -> None:
-    """Hide pyOpenSSL from Twisted, which would load it into every process with a reactor, where it takes 13 MiB.
+    """Hide pyOpenSSL from Twisted, which would load 13 MiB into every process with a reactor.
 
     Call this before the reactor is imported; if pyOpenSSL is loaded already, nothing changes.
     """

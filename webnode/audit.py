@@ -73,7 +73,7 @@ class AuditLog:
         return self._counts
 
     def _count_repetitions(self, key: tuple[str, str, str], now: float) -> int | None:
-        """Return how many repetitions were suppressed since the last line; None if this one is suppressed as well."""
+        """Return the number of repetitions suppressed since the last line; None if this one is suppressed, too."""
         known = self._repeated.get(key)
         if known is not None and 0.0 <= now - known[0] < QUIET_S:
             known[1] += 1

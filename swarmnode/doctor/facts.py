@@ -114,7 +114,7 @@ class Facts:
 
     @property
     def answers(self) -> tuple[Answer, ...]:
-        """All replies, those of known nodes first; an address is listed once."""
+        """All replies, first the replies of known nodes; an address is listed once."""
         found = [probe.answer for probe in self.known if probe.answer is not None]
         found += [] if self.lan is None else list(self.lan.answers)
         return tuple({answer.address: answer for answer in reversed(found)}.values())[::-1]

@@ -159,7 +159,7 @@ export function make(root, { model, go }) {
       } catch (error) {
         if (run !== mine) return;
         failing = true;
-        // Messages of the node are for the user; those of the browser are not.
+        // Show messages of the node to the user, but not messages of the browser.
         setText(trouble, text("error.trying_again", { problem: error.status ? error.message : text("error.no_answer_now") }));
         await pause(error.status ? RETRY_REFUSED_MS : RETRY_MS);
       }

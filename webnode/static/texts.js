@@ -12,7 +12,7 @@ const calendar = new Intl.DateTimeFormat(locale, { dateStyle: "medium" });
 const moment = new Intl.DateTimeFormat(locale, { weekday: "long", hour: "2-digit", minute: "2-digit" });
 const numbers = new Map();
 
-// Format with `digits` fractional digits, by default with those that the number has, at most three.
+// Format with `digits` fractional digits, by default with all digits of the number, at most three.
 export function formatNumber(value, digits) {
   if (!numbers.has(digits)) {
     const options = { minimumFractionDigits: digits, maximumFractionDigits: digits, useGrouping: "min2" };

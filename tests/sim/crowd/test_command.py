@@ -150,7 +150,7 @@ class CommandTests(SynchronousTestCase):
             (("--seconds", "nan"), "--seconds must be"),
             (("--seed", "-1"), "--seed must be"),
             (("--controller", "dance"), "invalid choice"),
-            (("--agents", "3"), "say swarm crowd instead"),
+            (("--agents", "3"), "run swarm crowd instead"),
             (("--picture", "/nowhere/at/all.svg"), "there is no folder"),
             (("--bodies", "121", "--room", "0.0677", "--seconds", "1"), "no place is free"),
         ):
